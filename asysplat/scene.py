@@ -1,0 +1,309 @@
+"""The three values that pass between the rooms: Cameras, Views and Gaussians.
+
+Shapes are checked when a value is made; `validate()` also looks at the numbers (finite, in range,
+rotations orthonormal) and is called once, where data enters.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Self
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from asysplat.errors import InputError
+
+ORTHONORMAL_TOLERANCE = 1e-3
+
+
+class _TensorRecord:
+    """A frozen dataclass of tensors (and of other such records) that moves and stacks as one."""
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """Apply `function` to every tensor; None and plain numbers stay as they are."""
+        changed = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                changed[field.name] = function(value)
+            elif isinstance(value, _TensorRecord):
+                changed[field.name] = value.map(function)
+        return replace(self, **changed)
+
+    def to(self, *args, **kwargs) -> Self:
+        """`Tensor.to` for every tensor."""
+        return self.map(lambda tensor: tensor.to(*args, **kwargs))
+
+    @classmethod
+    def stack(cls, records: Sequence[Self]) -> Self:
+        """Stack records of equal shapes along a new first dimension."""
+        stacked = {}
+        for field in fields(cls):
+            values = [getattr(record, field.name) for record in records]
+            if isinstance(values[0], _TensorRecord):
+                stacked[field.name] = type(values[0]).stack(values)
+            elif all(isinstance(value, Tensor) for value in values):
+                stacked[field.name] = torch.stack(values)
+            elif all(value == values[0] for value in values if not isinstance(value, Tensor)):
+                # A field that some scenes lack is dropped for the whole batch.
+                has_tensor = any(isinstance(value, Tensor) for value in values)
+                stacked[field.name] = None if has_tensor else values[0]
+            else:
+                raise InputError(
+                    f"{cls.__name__}.{field.name} differs within one batch ({values}): "
+                    "give all scenes of a batch the same size."
+                )
+        return cls(**stacked)
+
+
+@dataclass(frozen=True)
+class Cameras(_TensorRecord):
+    """Pinhole cameras, OpenCV axes: x right, y down, z forward; the first pixel's centre is +0.5.
+
+    Args:
+        intrinsics: [..., V, 3, 3] in pixels.
+        cam_to_world: [..., V, 4, 4] rigid transforms, in scene units.
+        height, width: image size in pixels, shared by all views.
+    """
+
+    intrinsics: Float[Tensor, "*batch V 3 3"]
+    cam_to_world: Float[Tensor, "*batch V 4 4"]
+    height: int
+    width: int
+
+    def __post_init__(self):
+        _check_shape("Cameras.intrinsics", self.intrinsics, (3, 3))
+        _check_shape("Cameras.cam_to_world", self.cam_to_world, (4, 4))
+        if self.intrinsics.shape[:-2] != self.cam_to_world.shape[:-2]:
+            raise InputError(
+                f"Cameras.intrinsics has shape {tuple(self.intrinsics.shape)} and cam_to_world "
+                f"{tuple(self.cam_to_world.shape)}: give one 3x3 and one 4x4 matrix a view."
+            )
+        if self.height < 1 or self.width < 1:
+            raise InputError(
+                f"Cameras.height and width are {self.height} and {self.width}: "
+                "an image needs at least one pixel."
+            )
+
+    @property
+    def num_views(self) -> int:
+        return self.intrinsics.shape[-3]
+
+    @property
+    def centers(self) -> Float[Tensor, "*batch V 3"]:
+        return self.cam_to_world[..., :3, 3]
+
+    def select(self, views: Sequence[int] | Tensor) -> Self:
+        """The named views, in the given order."""
+        index = torch.as_tensor(views, device=self.intrinsics.device)
+        return replace(
+            self,
+            intrinsics=self.intrinsics.index_select(-3, index),
+            cam_to_world=self.cam_to_world.index_select(-3, index),
+        )
+
+    def rays(self) -> tuple[Float[Tensor, "*batch V H W 3"], Float[Tensor, "*batch V H W 3"]]:
+        """World-space origins and unit directions through every pixel centre."""
+        options = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
+        y, x = torch.meshgrid(
+            torch.arange(self.height, **options) + 0.5,
+            torch.arange(self.width, **options) + 0.5,
+            indexing="ij",
+        )
+        fx, fy = self.intrinsics[..., 0, 0, None, None], self.intrinsics[..., 1, 1, None, None]
+        cx, cy = self.intrinsics[..., 0, 2, None, None], self.intrinsics[..., 1, 2, None, None]
+        in_camera = torch.stack(
+            torch.broadcast_tensors((x - cx) / fx, (y - cy) / fy, torch.ones_like(x)), dim=-1
+        )
+        directions = torch.einsum("...ij,...hwj->...hwi", self.cam_to_world[..., :3, :3], in_camera)
+        directions = torch.nn.functional.normalize(directions, dim=-1)
+        return self.centers[..., None, None, :].expand_as(directions), directions
+
+    def validate(self, name: str = "Cameras") -> Self:
+        """Return self if every number can be used.
+
+        Raises:
+            InputError: NaN or infinity, a focal length <= 0, a rotation that is not orthonormal
+                or a last row other than 0 0 0 1; it names the field and the view.
+        """
+        _check_finite(f"{name}.intrinsics", self.intrinsics, 2)
+        _check_finite(f"{name}.cam_to_world", self.cam_to_world, 2)
+        focal = torch.stack((self.intrinsics[..., 0, 0], self.intrinsics[..., 1, 1]), -1)
+        _check_all(
+            f"{name}.intrinsics",
+            (focal > 0).all(-1),
+            "has a focal length <= 0: give fx and fy in pixels, both positive",
+        )
+        rotation = self.cam_to_world[..., :3, :3]
+        identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+        error = (rotation @ rotation.mT - identity).abs().amax((-1, -2))
+        proper = (error < ORTHONORMAL_TOLERANCE) & (torch.linalg.det(rotation) > 0)
+        _check_all(
+            f"{name}.cam_to_world",
+            proper,
+            "has a rotation that is not orthonormal with determinant +1: remove scale, shear and "
+            "mirroring from its upper left 3x3 block",
+        )
+        last_row = self.cam_to_world.new_tensor([0.0, 0.0, 0.0, 1.0])
+        _check_all(
+            f"{name}.cam_to_world",
+            (self.cam_to_world[..., 3, :] - last_row).abs().amax(-1) < ORTHONORMAL_TOLERANCE,
+            "has a last row other than 0 0 0 1: give camera-to-world, row-major",
+        )
+        return self
+
+
+@dataclass(frozen=True)
+class Views(_TensorRecord):
+    """Posed photographs.
+
+    Args:
+        cameras: V cameras.
+        images: [..., V, 3, H, W] RGB in [0, 1].
+        depths: [..., V, H, W] along the camera's z axis, in scene units; 0 where unknown.
+        masks: [..., V, H, W], True where the pixel counts.
+    """
+
+    cameras: Cameras
+    images: Float[Tensor, "*batch V 3 H W"]
+    depths: Float[Tensor, "*batch V H W"] | None = None
+    masks: Bool[Tensor, "*batch V H W"] | None = None
+
+    def __post_init__(self):
+        batch = self.cameras.intrinsics.shape[:-2]
+        size = (self.cameras.height, self.cameras.width)
+        _check_exact("Views.images", self.images, (*batch, 3, *size))
+        for name in ("depths", "masks"):
+            if getattr(self, name) is not None:
+                _check_exact(f"Views.{name}", getattr(self, name), (*batch, *size))
+
+    @property
+    def num_views(self) -> int:
+        return self.cameras.num_views
+
+    def select(self, views: Sequence[int] | Tensor) -> Self:
+        """The named views, in the given order."""
+        index = torch.as_tensor(views, device=self.images.device)
+
+        def pick(tensor: Tensor | None, dim: int) -> Tensor | None:
+            return None if tensor is None else tensor.index_select(dim, index)
+
+        return replace(
+            self,
+            cameras=self.cameras.select(index),
+            images=pick(self.images, -4),
+            depths=pick(self.depths, -3),
+            masks=pick(self.masks, -3),
+        )
+
+    def validate(self, name: str = "Views") -> Self:
+        """Return self if every number can be used.
+
+        Raises:
+            InputError: as `Cameras.validate`, and for images outside [0, 1] or depths below 0.
+        """
+        self.cameras.validate(f"{name}.cameras")
+        _check_finite(f"{name}.images", self.images, 3)
+        _check_all(
+            f"{name}.images",
+            ((self.images >= 0) & (self.images <= 1)).all(-1).all(-1).all(-1),
+            "has values outside [0, 1]: divide 8-bit images by 255",
+        )
+        if self.depths is not None:
+            _check_finite(f"{name}.depths", self.depths, 2)
+            _check_all(
+                f"{name}.depths",
+                (self.depths >= 0).all(-1).all(-1),
+                "has negative values: give distances along the camera's z axis, 0 where unknown",
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class Gaussians(_TensorRecord):
+    """3D Gaussians, ready to render: every activation is already applied.
+
+    Args:
+        means: [..., N, 3] in scene units.
+        quats: [..., N, 4] rotations, wxyz; normalised by the renderer.
+        scales: [..., N, 3] standard deviations > 0, in scene units.
+        opacities: [..., N] in (0, 1).
+        sh: [..., N, K, 3] spherical harmonics, K = 1, 4, 9 or 16; colour = 0.5 + sum_k sh_k Y_k.
+    """
+
+    means: Float[Tensor, "*batch N 3"]
+    quats: Float[Tensor, "*batch N 4"]
+    scales: Float[Tensor, "*batch N 3"]
+    opacities: Float[Tensor, "*batch N"]
+    sh: Float[Tensor, "*batch N K 3"]
+
+    def __post_init__(self):
+        batch = self.opacities.shape
+        _check_exact("Gaussians.means", self.means, (*batch, 3))
+        _check_exact("Gaussians.quats", self.quats, (*batch, 4))
+        _check_exact("Gaussians.scales", self.scales, (*batch, 3))
+        if self.sh.shape[-2] not in (1, 4, 9, 16):
+            raise InputError(
+                f"Gaussians.sh has {self.sh.shape[-2]} coefficients: "
+                "give 1, 4, 9 or 16 (degree 0 to 3)."
+            )
+        _check_exact("Gaussians.sh", self.sh, (*batch, self.sh.shape[-2], 3))
+
+    @property
+    def num_gaussians(self) -> int:
+        return self.opacities.shape[-1]
+
+    def scale_by(self, factor: float) -> Self:
+        """The same scene in units that are `factor` times smaller."""
+        return replace(self, means=self.means * factor, scales=self.scales * factor)
+
+    def keep(self, mask: Bool[Tensor, "N"]) -> Self:
+        """The Gaussians where `mask` is True; for one scene, without batch dimensions."""
+        return self.map(lambda tensor: tensor[mask])
+
+    def crop(self, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> Self:
+        """The Gaussians whose mean lies in the closed box from `lower` to `upper`."""
+        return self.keep(((self.means >= lower) & (self.means <= upper)).all(-1))
+
+    def validate(self, name: str = "Gaussians") -> Self:
+        """Return self if every number can be rendered.
+
+        Raises:
+            InputError: NaN or infinity, a scale <= 0, an opacity outside (0, 1].
+        """
+        for field in fields(self):
+            tensor = getattr(self, field.name)
+            _check_finite(f"{name}.{field.name}", tensor, tensor.ndim - self.opacities.ndim)
+        _check_all(f"{name}.scales", (self.scales > 0).all(-1), "is <= 0: apply exp to log-scales")
+        _check_all(
+            f"{name}.opacities",
+            (self.opacities > 0) & (self.opacities <= 1),
+            "lies outside (0, 1]: apply the sigmoid to logits",
+        )
+        return self
+
+
+def _check_shape(name: str, tensor: Tensor, last: tuple[int, ...]) -> None:
+    if tensor.ndim <= len(last) or tuple(tensor.shape[-len(last) :]) != last:
+        expected = ", ".join(map(str, last))
+        raise InputError(f"{name} has shape {tuple(tensor.shape)}: expected [..., V, {expected}].")
+
+
+def _check_exact(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(tensor.shape) != tuple(shape):
+        raise InputError(f"{name} has shape {tuple(tensor.shape)}: expected {tuple(shape)}.")
+
+
+def _check_all(name: str, good: Tensor, complaint: str) -> None:
+    """Raise for the first False of `good`, naming its index."""
+    if not bool(good.all()):
+        index = tuple(torch.nonzero(~good)[0].tolist())
+        raise InputError(f"{name}[{', '.join(map(str, index))}] {complaint}.")
+
+
+def _check_finite(name: str, tensor: Tensor, item_dims: int) -> None:
+    good = tensor.isfinite()
+    for _ in range(item_dims):
+        good = good.all(-1)
+    _check_all(name, good, "holds NaN or infinity: repair or remove that entry")
