@@ -1,0 +1,31 @@
+"""What every test gets: a seed, the shared data if it is there, and no GPU test without a GPU."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+REPO = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of shared photographs and weights; a test that asks for it is skipped without."""
+    folder = Path(os.environ.get("ASYSPLAT_SHARED", REPO.parent / "shared"))
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent: set ASYSPLAT_SHARED")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    torch.manual_seed(0)
+
+
+def pytest_collection_modifyitems(items):
+    if torch.cuda.is_available():
+        return
+    for item in items:
+        if item.get_closest_marker("gpu"):
+            item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
