@@ -1,0 +1,89 @@
+"""ImageNet features for LPIPS and for a perceptual loss, from files that are already here.
+
+Nothing is downloaded: a machine without the files runs without these measures.
+"""
+
+import pickle
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torchvision.models import alexnet, vgg16
+
+from asysplat.errors import InputError
+
+BUILDERS = {"alexnet": alexnet, "vgg16": vgg16}
+# torchvision's own files in torch's hub cache; the part after the dash is a hash.
+HUB_FILES = {"alexnet": "alexnet-owt-*.pth", "vgg16": "vgg16-*.pth"}
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+VGG16_TAPS = (3, 8, 15, 22, 29)  # ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 within `vgg16().features`
+
+
+def find_backbone(
+    name: Literal["alexnet", "vgg16"], weights: Path | None
+) -> dict[str, Tensor] | None:
+    """torchvision's ImageNet weights of the convolutions: `features.N.weight` and `.bias`, fp32.
+
+    Looks in torch's hub cache, then for `<name>_features_fp16.pth` in the folder `weights`.
+    None if neither has them.
+
+    Raises:
+        InputError: the file found cannot be read or holds something else.
+    """
+    candidates = sorted((Path(torch.hub.get_dir()) / "checkpoints").glob(HUB_FILES[name]))
+    if weights is not None:
+        candidates.append(weights / f"{name}_features_fp16.pth")
+    path = next((candidate for candidate in candidates if candidate.is_file()), None)
+    return None if path is None else _load_features(name, path)
+
+
+def _load_features(name: str, path: Path) -> dict[str, Tensor]:
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise InputError(
+            f"{path} cannot be read as weights of {name}: delete it or copy it again."
+        ) from error
+    with torch.device("meta"):
+        expected = BUILDERS[name]().features.state_dict(prefix="features.")
+    for key, tensor in expected.items():
+        found = state.get(key) if isinstance(state, dict) else None
+        if not isinstance(found, Tensor) or found.shape != tensor.shape:
+            raise InputError(
+                f"{path} has no {key} of shape {tuple(tensor.shape)}: "
+                f"give torchvision's ImageNet weights of {name}."
+            )
+    return {key: state[key].float() for key in expected}
+
+
+class VGGFeatures(nn.Module):
+    """Frozen VGG16 activations after ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016).
+
+    Args:
+        weights: what `find_backbone("vgg16", ...)` returned.
+    """
+
+    def __init__(self, weights: dict[str, Tensor]):
+        super().__init__()
+        # On meta, because vgg16() would also fill 124 M classifier weights at random.
+        with torch.device("meta"):
+            self.features = vgg16().features[: VGG16_TAPS[-1] + 1]
+        state = {key: weights[f"features.{key}"] for key in self.features.state_dict()}
+        self.features.load_state_dict(state, assign=True)
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None])
+        self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None])
+        self.requires_grad_(False).eval()
+
+    def forward(self, images: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
+        """Five activations of `images` in [0, 1], of 64 to 512 channels at 1 to 1/16 the size."""
+        x = (images - self.mean) / self.std
+        activations = []
+        for index, layer in enumerate(self.features):
+            x = layer(x)
+            if index in VGG16_TAPS:
+                activations.append(x)
+        return activations

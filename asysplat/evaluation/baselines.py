@@ -1,0 +1,38 @@
+"""What one gets for nothing: read every PSNR beside these."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.scene import Cameras, Views
+
+
+def mean_colour(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
+    """For every target, one flat image: the mean colour of all input pixels of its scene."""
+    colour = inputs.images.mean((-4, -2, -1))
+    return colour[..., None, :, None, None].expand_as(targets.images)
+
+
+def nearest_view(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
+    """For every target, a copy of the input view nearest to it; images of one size.
+
+    Nearest has the smallest distance / spread + angle / pi: distance between the camera centres,
+    spread = largest distance between two input centres, angle between the viewing directions.
+    Where all inputs share one centre, the angle alone decides.
+    """
+    nearest = _dissimilarity(targets.cameras, inputs.cameras).argmin(-1)
+    return inputs.images.take_along_dim(nearest[..., None, None, None], dim=-4)
+
+
+def _dissimilarity(targets: Cameras, inputs: Cameras) -> Float[Tensor, "*batch Vt Vi"]:
+    spread = _distances(inputs.centers, inputs.centers).amax((-2, -1), keepdim=True)
+    distance = _distances(targets.centers, inputs.centers)
+    cosine = targets.cam_to_world[..., :3, 2] @ inputs.cam_to_world[..., :3, 2].mT
+    angle = cosine.clamp(-1, 1).acos()
+    return distance / spread.where(spread > 0, torch.inf) + angle / torch.pi
+
+
+def _distances(
+    a: Float[Tensor, "*batch A 3"], b: Float[Tensor, "*batch B 3"]
+) -> Float[Tensor, "*batch A B"]:
+    return (a[..., :, None, :] - b[..., None, :, :]).norm(dim=-1)

@@ -1,0 +1,79 @@
+"""Parameters, FLOPs and memory."""
+
+import math
+import resource
+import sys
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
+
+GB = 1e9
+NORMS = (nn.LayerNorm, nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
+
+
+def count_parameters(module: nn.Module) -> int:
+    """Number of scalars among the module's parameters, frozen ones included."""
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def module_flops(net: nn.Module, run: Callable[[], object]) -> int:
+    """FLOPs of one `run()`, which calls `net`, as the paper counts them.
+
+    2 x multiply-adds of Linear, Conv1d and Conv2d modules, 4 operations an element for LayerNorm
+    and BatchNorm. Not counted, as a profiler of modules does not see them: attention products,
+    scans, RMSNorm, activations, biases, and depthwise Conv1d (Mamba runs it in a fused kernel).
+    Works on the meta device.
+    """
+    total = 0
+
+    def count(module: nn.Module, _inputs: object, output: Tensor) -> None:
+        nonlocal total
+        total += output.numel() * _flops_per_output(module)
+
+    counted = [module for module in net.modules() if _flops_per_output(module)]
+    hooks = [module.register_forward_hook(count) for module in counted]
+    try:
+        run()
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return total
+
+
+def _flops_per_output(module: nn.Module) -> int:
+    """What `module_flops` counts for one element of the module's output."""
+    if isinstance(module, NORMS):
+        return 4
+    if isinstance(module, nn.Linear):
+        return 2 * module.in_features
+    if isinstance(module, nn.Conv1d) and module.groups == module.in_channels:
+        return 0
+    if isinstance(module, (nn.Conv1d, nn.Conv2d)):
+        return 2 * module.in_channels // module.groups * math.prod(module.kernel_size)
+    return 0
+
+
+def true_flops(run: Callable[[], object]) -> int:
+    """FLOPs of one `run()` with every matrix product, einsum and attention included.
+
+    Right on the meta device only, which needs no memory: on a CPU attention counts as 0
+    (pytorch issue 195460). Scans count where they are matrix products; element-wise work never.
+    """
+    with FlopCounterMode(display=False) as counter:
+        run()
+    return counter.get_total_flops()
+
+
+def peak_memory_gb(device: torch.device | str) -> float:
+    """Peak memory in units of 1e9 bytes.
+
+    On CUDA what tensors held since the last `torch.cuda.reset_peak_memory_stats`, elsewhere the
+    resident set of the whole process since it began.
+    """
+    if torch.device(device).type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / GB
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    bytes_per_unit = 1 if sys.platform == "darwin" else 1024
+    return peak * bytes_per_unit / GB

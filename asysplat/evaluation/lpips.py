@@ -1,0 +1,54 @@
+"""LPIPS v0.1 (Zhang et al. 2018), without a download."""
+
+import warnings
+from pathlib import Path
+from typing import Literal
+
+import lpips
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.evaluation.backbones import find_backbone
+
+
+def load_lpips(net: Literal["alex", "vgg"], weights: Path | None) -> lpips.LPIPS | None:
+    """The frozen LPIPS network, or None where its backbone is not on this machine.
+
+    Build it once and keep it. `weights` is a folder that may hold the backbone
+    (see `find_backbone`); the linear heads come with the lpips package.
+    """
+    backbone = find_backbone("alexnet" if net == "alex" else "vgg16", weights)
+    if backbone is None:
+        return None
+    # On meta, because the package would fill a whole torchvision model at random, 0.55 GB for VGG;
+    # the warning is about an argument that it gives to torchvision.
+    with torch.device("meta"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        network = lpips.LPIPS(net=net, pretrained=False, pnet_rand=True, verbose=False)
+    network.scaling_layer = lpips.ScalingLayer()
+    # The package's slices keep torchvision's layer numbers: slice2.5.bias is features.5.bias.
+    names = {key: "features." + key.split(".", 1)[1] for key in network.net.state_dict()}
+    network.net.load_state_dict({k: backbone[name] for k, name in names.items()}, assign=True)
+    path = Path(lpips.__file__).parent / "weights" / "v0.1" / f"{net}.pth"
+    heads = torch.load(path, map_location="cpu", weights_only=True)
+    heads = {key.removeprefix("lin"): tensor for key, tensor in heads.items()}
+    network.lins.load_state_dict(heads, assign=True)
+    return network.requires_grad_(False).eval()
+
+
+def lpips_distance(
+    network: lpips.LPIPS,
+    rendered: Float[Tensor, "*batch V 3 H W"],
+    target: Float[Tensor, "*batch V 3 H W"],
+) -> Float[Tensor, "*batch V"]:
+    """LPIPS of each image; images in [0, 1] (`rendered` is clamped), at least 32x32 pixels.
+
+    One image at a time: VGG's activations of one pair at 540x960 take about 1.5 GB.
+    """
+    pairs = zip(
+        rendered.float().clamp(0, 1).flatten(0, -4), target.float().flatten(0, -4), strict=True
+    )
+    with torch.autocast(rendered.device.type, enabled=False):
+        distances = [network(a[None], b[None], normalize=True).squeeze() for a, b in pairs]
+    return torch.stack(distances).reshape(rendered.shape[:-3])

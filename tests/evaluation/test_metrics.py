@@ -1,0 +1,110 @@
+import math
+
+import pytest
+import torch
+from torchmetrics.image import StructuralSimilarityIndexMeasure
+
+from asysplat.errors import InputError
+from asysplat.evaluation.metrics import PROTOCOL, abs_rel, delta1, psnr, ssim
+
+
+def test_psnr_of_known_errors():
+    target = torch.full((2, 3, 3, 4, 5), 0.5)
+    offsets = torch.tensor([[0.1, 0.01, 0.0], [0.5, 0.25, 2.0]])
+    rendered = target + offsets[..., None, None, None]
+    # Identical images stop at 100 dB; an offset of 2 is clamped to white, an error of 0.5.
+    expected = [[20, 40, 100], [6.0206, 12.0412, 6.0206]]
+    torch.testing.assert_close(psnr(rendered, target), torch.tensor(expected), atol=1e-3, rtol=0)
+
+
+def test_psnr_is_per_image_and_of_noise_with_known_variance():
+    target = torch.full((2, 3, 128, 128), 0.5)
+    sigma = torch.tensor([0.02, 0.1])
+    rendered = target + sigma[:, None, None, None] * torch.randn_like(target)
+    expected = -20 * sigma.log10()
+    torch.testing.assert_close(psnr(rendered, target), expected, atol=0.1, rtol=0)
+
+
+def test_low_precision_input_is_measured_in_fp32():
+    target = torch.rand(1, 3, 16, 16).bfloat16()
+    assert psnr(target, target).dtype == torch.float32
+    assert psnr(target, target).item() == pytest.approx(100)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        noisy = target.float() + 0.1 * torch.randn(1, 3, 16, 16)
+        inside = ssim(noisy, target)
+    torch.testing.assert_close(inside, ssim(noisy, target), rtol=0, atol=0)
+
+
+def slow_ssim(a, b):
+    """Wang et al. 2004 straight from the formula: one window after another."""
+    x = torch.arange(11, dtype=torch.float64) - 5
+    window = torch.exp(-(x**2) / (2 * 1.5**2))
+    window = window[:, None] * window
+    window /= window.sum()
+    values = []
+    for channel in range(3):
+        for i in range(a.shape[-2] - 10):
+            for j in range(a.shape[-1] - 10):
+                p = a[channel, i : i + 11, j : j + 11].double()
+                q = b[channel, i : i + 11, j : j + 11].double()
+                mp, mq = (window * p).sum(), (window * q).sum()
+                vp, vq = (window * (p - mp) ** 2).sum(), (window * (q - mq) ** 2).sum()
+                cov = (window * (p - mp) * (q - mq)).sum()
+                luminance = (2 * mp * mq + 1e-4) / (mp**2 + mq**2 + 1e-4)
+                values.append(luminance * (2 * cov + 9e-4) / (vp + vq + 9e-4))
+    return torch.stack(values).mean().item()
+
+
+def test_ssim_is_wangs():
+    a = torch.rand(2, 1, 3, 14, 16)
+    b = (a + 0.2 * torch.randn_like(a)).clamp(0, 1)
+    found = ssim(b, a)
+    assert found.shape == (2, 1)
+    for scene in range(2):
+        expected = slow_ssim(b[scene, 0], a[scene, 0])
+        assert found[scene, 0].item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_ssim_tends_to_torchmetrics_where_the_border_is_small():
+    a = torch.rand(1, 3, 200, 200)
+    b = (a + 0.2 * torch.randn_like(a)).clamp(0, 1)
+    whole = StructuralSimilarityIndexMeasure(data_range=1.0)(b, a)
+    assert ssim(b, a).item() == pytest.approx(whole.item(), abs=2e-3)
+
+
+def test_ssim_of_identical_and_of_smallest_images():
+    image = torch.rand(3, 3, 11, 11)
+    torch.testing.assert_close(ssim(image, image), torch.ones(3))
+    with pytest.raises(InputError, match="10x30"):
+        ssim(torch.rand(1, 3, 10, 30), torch.rand(1, 3, 10, 30))
+
+
+def test_depth_errors_over_known_pixels():
+    target = torch.tensor([[[2.0, 4.0], [0.0, 10.0]], [[0.0, 0.0], [0.0, 0.0]]])
+    depth = torch.tensor([[[2.2, 6.0], [9.0, 9.0]], [[1.0, 1.0], [1.0, 1.0]]])
+    error = abs_rel(depth, target)
+    assert error[0].item() == pytest.approx((0.1 + 0.5 + 0.1) / 3)
+    share = delta1(depth, target)
+    assert share[0].item() == pytest.approx(2 / 3)
+    assert error[1].isnan() and share[1].isnan()
+
+
+def test_delta1_is_strict_and_two_sided():
+    target = torch.full((1, 1, 6), 4.0)
+    depth = torch.tensor([[[5.0, 3.2, 4.99, 3.21, 0.0, -4.0]]])
+    assert delta1(depth, target).item() == pytest.approx(2 / 6)
+
+
+def test_median_alignment_removes_the_scale_of_each_view():
+    target = torch.rand(2, 4, 3, 5) + 1
+    target[..., 0, 0] = 0
+    depth = target * torch.tensor([0.5, 3.0, 1.0, 20.0])[:, None, None]
+    depth[..., 0, 0] = 1e6  # unknown: must not move the median
+    assert abs_rel(depth, target)[:, 3].min() > 10
+    torch.testing.assert_close(abs_rel(depth, target, "median"), torch.zeros(2, 4))
+    torch.testing.assert_close(delta1(depth, target, alignment="median"), torch.ones(2, 4))
+
+
+def test_every_metric_has_a_protocol():
+    assert set(PROTOCOL) == {"psnr", "ssim", "lpips", "absrel", "delta1"}
+    assert math.isclose(psnr(torch.ones(1, 3, 1, 1), torch.zeros(1, 3, 1, 1)).item(), 0.0)
