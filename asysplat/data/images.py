@@ -1,0 +1,182 @@
+"""Photographs, depth maps and masks from files, without lens distortion and at the asked size.
+
+Pixel positions count from the image's corner: the first pixel's centre is at +0.5. Nothing is ever
+written, and the exif orientation is not applied: calibrations speak of the pixels as stored.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Shaped, UInt8
+from numpy import ndarray
+from PIL import Image
+
+from asysplat.errors import InputError
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How one photograph's pixels follow from directions.
+
+    Args:
+        width, height: the photograph's size in pixels.
+        fx, fy, cx, cy: pinhole intrinsics in pixels.
+        distortion: OpenCV's k1 k2 p1 p2 k3, or k1 k2 k3 k4 of its fisheye model.
+        fisheye: which of the two models `distortion` belongs to.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    fisheye: bool = False
+
+    @property
+    def is_distorted(self) -> bool:
+        # Even with all coefficients 0, a fisheye is not a pinhole.
+        return self.fisheye or any(self.distortion)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height), from the file's header alone.
+
+    Raises:
+        InputError: the file is missing, empty or not an image.
+    """
+    return _read(path, lambda image: image.size)
+
+
+def load_photograph(path: Path) -> UInt8[ndarray, "h w 3"]:
+    """RGB in 0..255; transparent pixels are laid on white.
+
+    Raises:
+        InputError: the file is damaged, or holds more than 8 bits of grey (a depth map).
+    """
+    return _read(path, _to_rgb)
+
+
+def load_depth(path: Path) -> Float32[ndarray, "h w"]:
+    """The stored integers of a one-channel (16-bit) image; 0 where unknown.
+
+    Raises:
+        InputError: the file is damaged or has several channels.
+    """
+    stored = _read(path, np.asarray)
+    if stored.ndim != 2:
+        raise InputError(
+            f"{path} has {stored.shape[-1]} channels: give depth as a 16-bit PNG with one channel."
+        )
+    return stored.astype(np.float32)
+
+
+def load_mask(path: Path) -> Bool[ndarray, "h w"]:
+    """True where the stored value is not 0.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    return _read(path, lambda image: np.asarray(image.convert("L")) > 0)
+
+
+def undistort(
+    pixels: Shaped[ndarray, "h w *channels"], lens: Lens, nearest: bool = False
+) -> Shaped[ndarray, "h w *channels"]:
+    """The image a pinhole camera with the lens's own fx, fy, cx, cy would have taken.
+
+    `pixels` may be smaller or larger than the photograph, as depth maps are, if it shows the same
+    field of view. Beyond the photograph's border the nearest pixel is repeated, or, with `nearest`
+    (for depths and masks, which must not be mixed), the value is 0.
+    """
+    if not lens.is_distorted:
+        return pixels
+    x, y = _undistortion_maps(lens, pixels.shape[1], pixels.shape[0])
+    if nearest:
+        return cv2.remap(pixels, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+    return cv2.remap(pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def resize_and_crop(
+    pixels: Shaped[ndarray, "h w *channels"], height: int, width: int, nearest: bool = False
+) -> Shaped[ndarray, "height width *channels"]:
+    """The largest centred part with the asked proportions, resampled to `height` x `width`.
+
+    Antialiased (Lanczos), or the pixel under each new centre with `nearest`.
+    """
+    _, *box = _centred_box(pixels.shape[1], pixels.shape[0], height, width)
+    method = Image.Resampling.NEAREST if nearest else Image.Resampling.LANCZOS
+    return np.asarray(Image.fromarray(pixels).resize((width, height), method, tuple(box)))
+
+
+def resized_intrinsics(lens: Lens, height: int, width: int) -> Float[ndarray, "3 3"]:
+    """The pinhole matrix that belongs to the output of `resize_and_crop`."""
+    scale, left, top, _, _ = _centred_box(lens.width, lens.height, height, width)
+    return np.array(
+        [
+            [lens.fx * scale, 0.0, (lens.cx - left) * scale],
+            [0.0, lens.fy * scale, (lens.cy - top) * scale],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def _centred_box(
+    old_width: int, old_height: int, height: int, width: int
+) -> tuple[float, float, float, float, float]:
+    """The scale, and left, top, right, bottom in old pixels; fractions keep it exactly centred."""
+    scale = max(width / old_width, height / old_height)
+    left = max(0.0, (old_width - width / scale) / 2)
+    top = max(0.0, (old_height - height / scale) / 2)
+    return scale, left, top, old_width - left, old_height - top
+
+
+@lru_cache(maxsize=2)
+def _undistortion_maps(
+    lens: Lens, width: int, height: int
+) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
+    """Where to look in the distorted image for each undistorted pixel."""
+    scale_x, scale_y = width / lens.width, height / lens.height
+    # OpenCV puts the first pixel's centre at 0.
+    matrix = np.array(
+        [
+            [lens.fx * scale_x, 0.0, lens.cx * scale_x - 0.5],
+            [0.0, lens.fy * scale_y, lens.cy * scale_y - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    model = cv2.fisheye if lens.fisheye else cv2
+    return model.initUndistortRectifyMap(
+        matrix, np.array(lens.distortion), np.eye(3), matrix, (width, height), cv2.CV_32FC1
+    )
+
+
+def _to_rgb(image: Image.Image) -> UInt8[ndarray, "h w 3"]:
+    if image.mode.startswith(("I", "F")):
+        raise ValueError(f"it has mode {image.mode}; save it as 8-bit RGB")
+    if image.has_transparency_data:
+        image = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
+    return np.asarray(image.convert("RGB"))
+
+
+def _read(path: Path, extract: Callable[[Image.Image], Any]) -> Any:
+    """What `extract` makes of the opened image, with every failure as one InputError."""
+    if not path.is_file():
+        raise InputError(f"{path} does not exist: put the image there, or drop its frame.")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path} is empty (0 bytes): copy it again, or drop its frame.")
+    try:
+        with Image.open(path) as image:
+            return extract(image)
+    # Damaged files make Pillow raise anything from OSError to SyntaxError.
+    except Exception as error:
+        raise InputError(
+            f"{path} cannot be read as an image ({error}): copy it again, or drop its frame."
+        ) from error

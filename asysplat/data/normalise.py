@@ -1,0 +1,50 @@
+"""One world frame and scale for every scene, so that networks meet like with like."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.scene import Views
+
+
+def normalise(inputs: Views, targets: Views) -> tuple[Views, Views, float]:
+    """Put the world's origin at the mean input camera and the farthest input at distance 1.
+
+    The mean pose has the mean of the centres and the mean of the forward and down axes, made
+    orthonormal by Gram-Schmidt (as Long-LRM, arXiv 2410.12781). One scene, without batch dimension.
+
+    Returns:
+        inputs and targets in the new frame, depths included, and the factor that lengths were
+        multiplied by; 1 where all inputs stand in one place.
+    """
+    poses = inputs.cameras.cam_to_world.double()
+    centers = poses[:, :3, 3]
+    mean_pose = torch.eye(4, dtype=poses.dtype, device=poses.device)
+    mean_pose[:3, :3] = _mean_rotation(poses[:, :3, :3])
+    mean_pose[:3, 3] = centers.mean(0)
+    radius = (centers - centers.mean(0)).norm(dim=-1).max()
+    # Below this, what differs between the centres is rounding.
+    apart = radius > 1e-6 * centers.abs().max()
+    scale = 1 / radius.item() if apart else 1.0
+    world_to_mean = torch.linalg.inv(mean_pose)
+    return _moved(inputs, world_to_mean, scale), _moved(targets, world_to_mean, scale), scale
+
+
+def _mean_rotation(rotations: Float[Tensor, "V 3 3"]) -> Float[Tensor, "3 3"]:
+    forward, down = rotations[:, :, 2].mean(0), rotations[:, :, 1].mean(0)
+    right = torch.linalg.cross(down, forward)
+    # On a full circle the forward axes cancel: any camera's axes are then as good.
+    if right.norm() < 1e-3:
+        return rotations[0]
+    forward, right = forward / forward.norm(), right / right.norm()
+    return torch.stack((right, torch.linalg.cross(forward, right), forward), dim=-1)
+
+
+def _moved(views: Views, world_to_mean: Float[Tensor, "4 4"], scale: float) -> Views:
+    poses = world_to_mean @ views.cameras.cam_to_world.double()
+    poses[:, :3, 3] *= scale
+    cameras = replace(views.cameras, cam_to_world=poses.to(views.cameras.cam_to_world))
+    depths = None if views.depths is None else views.depths * scale
+    return replace(views, cameras=cameras, depths=depths)

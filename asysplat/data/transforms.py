@@ -1,0 +1,227 @@
+"""Reader of `transforms.json`, the format of instant-ngp and nerfstudio.
+
+https://github.com/NVlabs/instant-ngp/blob/master/docs/nerf_dataset_tips.md
+https://docs.nerf.studio/quickstart/data_conventions.html
+"""
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from asysplat.data.images import Lens, image_size
+from asysplat.data.photographs import Photograph, PhotographCapture
+from asysplat.errors import InputError
+from asysplat.scene import ORTHONORMAL_TOLERANCE
+
+PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+MILLIMETRES = 0.001  # nerfstudio's default unit of stored depths
+
+
+class TransformsCapture(PhotographCapture):
+    """A folder with a `transforms.json`.
+
+    Opening it reads the file and the images' headers, so whatever is wrong shows before training
+    starts. Frames are ordered by the numbers in their file names (2 before 10), or, where a name
+    has no number, as in the file.
+
+    Args:
+        root: the folder, or the json file itself. Paths in the file are relative to its folder.
+        height, width: the size of every view, in pixels.
+
+    Raises:
+        InputError: anything in the file or beside it that cannot be used, or fewer than two frames.
+    """
+
+    def __init__(self, root: Path | str, height: int, width: int):
+        file = Path(root).absolute()
+        if file.suffix != ".json":
+            file = file / "transforms.json"
+        super().__init__(file.parent.name, read_photographs(file), height, width)
+
+
+def read_photographs(file: Path) -> list[Photograph]:
+    """All entries of one `transforms.json`, checked against the headers of their images."""
+    scene = _read_json(file)
+    photographs = []
+    shared = None  # the first image that does not state its own size: the others must match it
+    for index, entry in enumerate(scene["frames"]):
+        if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+            raise InputError(f"{file}, frame {index} has no file_path: name its image.")
+        where = f"{file}, frame {index} ({entry['file_path']})"
+        image = _find_image(file.parent / entry["file_path"])
+        size = image_size(image)
+        if not ("w" in entry and "h" in entry):
+            shared = shared or (image, size)
+            _check_equal_size(image, size, *shared)
+        photographs.append(_photograph({**scene, **entry}, image, size, file.parent, where))
+    if all(re.search(r"\d", photograph.image.stem) for photograph in photographs):
+        photographs.sort(key=lambda photograph: _natural_order(photograph.image))
+    return photographs
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    if not file.is_file():
+        raise InputError(
+            f"{file} does not exist: give a folder with a transforms.json, or the json file."
+        )
+    text = file.read_text(encoding="utf-8-sig", errors="replace")
+    if not text.strip():
+        raise InputError(f"{file} is empty: write it again.")
+    try:
+        scene = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{file} is not JSON ({error}): repair or write it again.") from error
+    if not isinstance(scene, dict) or not isinstance(scene.get("frames"), list):
+        raise InputError(f'{file} has no list "frames": give one entry an image.')
+    if len(scene["frames"]) < 2:
+        raise InputError(
+            f"{file} has {len(scene['frames'])} frame(s): a scene needs at least two views."
+        )
+    return scene
+
+
+def _photograph(
+    settings: dict[str, Any], image: Path, size: tuple[int, int], folder: Path, where: str
+) -> Photograph:
+    stated = (settings.get("w", size[0]), settings.get("h", size[1]))
+    if stated != size:
+        raise InputError(
+            f"{where}: w x h is {stated[0]} x {stated[1]}, but the image is {size[0]} x {size[1]}: "
+            "give intrinsics for the images' own resolution."
+        )
+    return Photograph(
+        image=image,
+        lens=_lens(settings, *size, where),
+        cam_to_world=_opencv_pose(settings.get("transform_matrix"), where),
+        depth=_beside(folder, settings, "depth_file_path", size, where),
+        depth_unit=_number(settings, "depth_unit_scale_factor", where, default=MILLIMETRES),
+        mask=_beside(folder, settings, "mask_path", size, where),
+    )
+
+
+def _lens(settings: dict[str, Any], width: int, height: int, where: str) -> Lens:
+    model = settings.get("camera_model", "OPENCV")
+    fisheye = model == "OPENCV_FISHEYE" or bool(settings.get("is_fisheye", False))
+    if not fisheye and model not in PERSPECTIVE_MODELS:
+        raise InputError(
+            f"{where}: camera_model is {model!r}: undistort the images to PINHOLE, or use one of "
+            f"{', '.join(PERSPECTIVE_MODELS)}, OPENCV_FISHEYE."
+        )
+    # The formats disagree on what a perspective k4 means.
+    if not fisheye and _number(settings, "k4", where, default=0.0) != 0:
+        raise InputError(f"{where}: k4 is only known for OPENCV_FISHEYE: undistort the images.")
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    fx, fy = _focal(settings, width, height, where)
+    return Lens(
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fy,
+        cx=_number(settings, "cx", where, default=width / 2),
+        cy=_number(settings, "cy", where, default=height / 2),
+        distortion=tuple(_number(settings, name, where, default=0.0) for name in names),
+        fisheye=fisheye,
+    )
+
+
+def _focal(settings: dict[str, Any], width: int, height: int, where: str) -> tuple[float, float]:
+    """fx and fy in pixels, from lengths, else from fields of view; one stands for both."""
+    found = {}
+    for axis, pixels in (("x", width), ("y", height)):
+        if f"fl_{axis}" in settings:
+            found[axis] = _number(settings, f"fl_{axis}", where)
+        elif f"camera_angle_{axis}" in settings:
+            angle = _number(settings, f"camera_angle_{axis}", where)
+            found[axis] = 0.5 * pixels / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
+    if not found:
+        raise InputError(f"{where} has no intrinsics: give fl_x in pixels, or camera_angle_x.")
+    fx = found.get("x", found.get("y"))
+    fy = found.get("y", fx)
+    if fx <= 0 or fy <= 0:
+        raise InputError(
+            f"{where}: fl_x or fl_y (or camera_angle_x, camera_angle_y) is out of range: "
+            "give lengths > 0 in pixels, or angles between 0 and pi."
+        )
+    return fx, fy
+
+
+def _opencv_pose(stored: Any, where: str) -> Float[ndarray, "4 4"]:
+    """Camera-to-world with OpenCV axes, its rotation made exactly orthonormal."""
+    where = f"{where}: transform_matrix"
+    try:
+        matrix = np.array(stored, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (4, 4):
+        raise InputError(f"{where} is not 4x4: give camera-to-world as four rows of four numbers.")
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{where} holds NaN or infinity: drop this frame or repair its pose.")
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > ORTHONORMAL_TOLERANCE:
+        raise InputError(f"{where} has last row {matrix[3].tolist()}: it must be 0 0 0 1.")
+    rotation = matrix[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise InputError(
+            f"{where} is not a rotation (R Rᵀ is {error:.2g} from the identity, the determinant is "
+            f"{np.linalg.det(rotation):.3g}): remove scale, shear and mirroring from it."
+        )
+    left, _, right = np.linalg.svd(rotation)
+    # OpenGL's y points up and its z backward.
+    matrix[:3, :3] = left @ right * (1, -1, -1)
+    matrix[3] = (0, 0, 0, 1)
+    return matrix
+
+
+def _number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
+    value = settings.get(key, default)
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{where}: {key} is {value!r}: give a finite number.")
+    return float(value)
+
+
+def _find_image(path: Path) -> Path:
+    """`path`, or the file it means when the extension was left out."""
+    if path.is_file():
+        return path
+    candidates = (path.with_name(path.name + suffix) for suffix in (".png", ".jpg"))
+    return next((candidate for candidate in candidates if candidate.is_file()), path)
+
+
+def _beside(
+    folder: Path, settings: dict[str, Any], key: str, size: tuple[int, int], where: str
+) -> Path | None:
+    """The depth map or mask that `key` names, of any size that shows the whole photograph."""
+    name = settings.get(key)
+    if name is None:
+        return None
+    if not isinstance(name, str):
+        raise InputError(f"{where}: {key} is {name!r}: give a file name, or leave it out.")
+    path = folder / name
+    width, height = image_size(path)
+    if abs(width * size[1] / size[0] - height) > 1:
+        raise InputError(
+            f"{where}: {path} is {width} x {height} and the image {size[0]} x {size[1]}: "
+            f"give a {key} with the image's proportions."
+        )
+    return path
+
+
+def _check_equal_size(
+    image: Path, size: tuple[int, int], first: Path, first_size: tuple[int, int]
+) -> None:
+    if size != first_size:
+        raise InputError(
+            f"{first} is {first_size[0]} x {first_size[1]} and {image} is {size[0]} x {size[1]}: "
+            "give images of one size, or w, h and intrinsics in every frame."
+        )
+
+
+def _natural_order(path: Path) -> list[str | int]:
+    parts = re.split(r"(\d+)", path.as_posix())
+    return [int(part) if part.isdecimal() else part for part in parts]

@@ -1,0 +1,180 @@
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from asysplat.data.images import (
+    Lens,
+    image_size,
+    load_depth,
+    load_mask,
+    load_photograph,
+    resize_and_crop,
+    resized_intrinsics,
+    undistort,
+)
+from asysplat.errors import InputError
+
+WIDE = {"width": 160, "height": 120, "fx": 100.0, "fy": 105.0, "cx": 82.0, "cy": 57.5}
+BARREL = Lens(**WIDE, distortion=(-0.25, 0.06, 0.002, -0.003, 0.01))
+FISHEYE = Lens(**WIDE, distortion=(0.05, -0.02, 0.01, -0.002), fisheye=True)
+
+
+def distort(points: np.ndarray, lens: Lens) -> np.ndarray:
+    """The lens equations of the OpenCV manual, on pinhole pixel positions [..., 2]."""
+    x, y = (points[..., 0] - lens.cx) / lens.fx, (points[..., 1] - lens.cy) / lens.fy
+    r2 = x * x + y * y
+    if lens.fisheye:
+        theta = np.arctan(np.sqrt(r2))
+        powers = sum(k * theta ** (2 * i + 2) for i, k in enumerate(lens.distortion))
+        factor = theta * (1 + powers) / np.sqrt(np.maximum(r2, 1e-12))
+        x, y = x * factor, y * factor
+    else:
+        k1, k2, p1, p2, k3 = lens.distortion
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        )
+    return np.stack((x * lens.fx + lens.cx, y * lens.fy + lens.cy), -1)
+
+
+def pixel_centres(width: int, height: int) -> np.ndarray:
+    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+
+
+def blob(centres: np.ndarray, position: np.ndarray) -> np.ndarray:
+    return np.exp(-((centres - position) ** 2).sum(-1) / (2 * 2.0**2))
+
+
+def centroid(image: np.ndarray) -> np.ndarray:
+    centres = pixel_centres(image.shape[1], image.shape[0])
+    return (centres * image[..., None]).sum((0, 1)) / image.sum()
+
+
+@pytest.mark.parametrize("lens", [BARREL, FISHEYE], ids=["opencv", "fisheye"])
+def test_undistorted_dots_stand_on_the_straight_grid(lens):
+    centres = pixel_centres(lens.width, lens.height)
+    for dot in [(20, 20), (140, 20), (82, 57.5), (25, 100), (140, 95)]:
+        seen = distort(np.array(dot, dtype=float), lens)
+        photograph = blob(centres, seen).astype(np.float32)
+        found = centroid(undistort(photograph, lens) ** 2)
+        assert np.abs(found - dot).max() < 0.1
+    assert np.abs(distort(np.array([20.0, 20.0]), lens) - 20).max() > 2
+
+
+def test_a_photograph_of_straight_lines_has_straight_lines_again():
+    position = distort(pixel_centres(160, 120), BARREL)
+    # What a distorting camera sees of a vertical edge at x = 30.5, inverted by fixed-point steps.
+    straight = pixel_centres(160, 120)
+    for _ in range(30):
+        straight = straight - (distort(straight, BARREL) - pixel_centres(160, 120))
+    assert np.abs(position - pixel_centres(160, 120)).max() > 4
+    photograph = np.clip(straight[..., 0] - 30, 0, 1).astype(np.float32)
+    found = undistort(photograph, BARREL)
+    edges = np.array([np.interp(0.5, row[:60], np.arange(60) + 0.5) for row in found[10:-10]])
+    assert np.abs(edges - 30.5).max() < 0.2
+
+
+def test_nearest_undistortion_mixes_nothing_and_is_zero_outside():
+    stored = np.random.default_rng(0).integers(1, 9, (60, 80)).astype(np.float32)
+    pincushion = Lens(**WIDE, distortion=(0.3, 0.0, 0.0, 0.0, 0.0))
+    flat = undistort(stored, pincushion, nearest=True)
+    assert set(np.unique(flat)) <= set(range(9)) and flat[0, 0] == 0
+    # Half the photograph's size, so every position halves.
+    x, y = distort(np.array([61.0, 41.0]), pincushion) / 2
+    assert flat[20, 30] == stored[int(y), int(x)]
+
+
+def test_a_lens_without_distortion_returns_the_same_pixels():
+    pixels = np.zeros((120, 160, 3), np.uint8)
+    assert undistort(pixels, Lens(**WIDE, distortion=(0.0,) * 5)) is pixels
+
+
+@pytest.mark.parametrize("height, width", [(40, 60), (60, 40), (64, 64), (150, 300)])
+def test_content_and_intrinsics_move_together(height, width):
+    lens = Lens(**WIDE)
+    matrix = resized_intrinsics(lens, height, width)
+    for point in [(0.1, 0.05, 1.0), (-0.2, -0.1, 1.2), (0.15, -0.12, 0.9)]:
+        x, y, z = point
+        before = np.array([lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy])
+        image = blob(pixel_centres(160, 120), before).astype(np.float32)
+        after = (matrix @ point)[:2] / z
+        found = centroid(np.maximum(resize_and_crop(image, height, width), 0))
+        assert np.abs(found - after).max() < 0.05
+
+
+def test_shrinking_averages():
+    checker = (np.indices((64, 64)).sum(0) % 2 * 255).astype(np.uint8)
+    small = resize_and_crop(checker, 16, 16)
+    assert np.abs(small.astype(int) - 127).max() <= 2
+
+
+def test_the_own_size_changes_nothing():
+    pixels = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
+    assert np.array_equal(resize_and_crop(pixels, 12, 16), pixels)
+    expected = [[100, 0, 82], [0, 105, 57.5], [0, 0, 1]]
+    assert np.array_equal(resized_intrinsics(Lens(**WIDE), 120, 160), expected)
+
+
+def test_nearest_takes_the_pixel_under_each_centre():
+    depth = np.arange(36, dtype=np.float32).reshape(6, 6)
+    assert np.array_equal(resize_and_crop(depth, 2, 2, nearest=True), depth[[1, 4]][:, [1, 4]])
+
+
+def test_transparency_is_laid_on_white(tmp_path):
+    pixels = np.zeros((2, 3, 4), np.uint8)
+    pixels[0], pixels[1] = (200, 100, 0, 255), (200, 100, 0, 0)
+    pixels[0, 0, 3] = 51
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    loaded = load_photograph(tmp_path / "a.png")
+    assert loaded[0, 1].tolist() == [200, 100, 0] and loaded[1, 1].tolist() == [255] * 3
+    assert np.abs(loaded[0, 0].astype(int) - (244, 224, 204)).max() <= 1
+
+
+def test_exif_orientation_is_not_applied(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (20, 10)).save(tmp_path / "a.jpg", exif=exif)
+    assert image_size(tmp_path / "a.jpg") == (20, 10)
+    assert load_photograph(tmp_path / "a.jpg").shape == (10, 20, 3)
+
+
+def test_depth_keeps_sixteen_bits_and_mask_keeps_what_is_not_zero(tmp_path):
+    stored = np.array([[0, 1, 300], [40000, 65535, 7]], np.uint16)
+    cv2.imwrite(str(tmp_path / "depth.png"), stored)
+    assert np.array_equal(load_depth(tmp_path / "depth.png"), stored)
+    Image.fromarray(np.array([[0, 1, 255]], np.uint8)).save(tmp_path / "mask.png")
+    assert load_mask(tmp_path / "mask.png").tolist() == [[False, True, True]]
+
+
+def test_unusable_files_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"gone\.png does not exist"):
+        image_size(tmp_path / "gone.png")
+    (tmp_path / "empty.png").touch()
+    with pytest.raises(InputError, match=r"empty\.png is empty \(0 bytes\)"):
+        image_size(tmp_path / "empty.png")
+    (tmp_path / "text.png").write_text("not an image")
+    with pytest.raises(InputError, match=r"text\.png cannot be read"):
+        image_size(tmp_path / "text.png")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_cut_off_file_has_a_size_and_no_pixels(tmp_path, suffix):
+    whole = tmp_path / f"whole{suffix}"
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(whole)
+    cut = tmp_path / f"cut{suffix}"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    assert image_size(cut) == (64, 64)
+    with pytest.raises(InputError, match=rf"cut\{suffix} cannot be read"):
+        load_photograph(cut)
+
+
+def test_depth_and_photograph_are_not_taken_for_each_other(tmp_path):
+    cv2.imwrite(str(tmp_path / "depth.png"), np.full((2, 2), 40000, np.uint16))
+    with pytest.raises(InputError, match="8-bit RGB"):
+        load_photograph(tmp_path / "depth.png")
+    Image.new("RGB", (2, 2)).save(tmp_path / "photograph.png")
+    with pytest.raises(InputError, match="3 channels"):
+        load_depth(tmp_path / "photograph.png")

@@ -1,0 +1,324 @@
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from asysplat.data.capture import Capture
+from asysplat.data.transforms import TransformsCapture
+from asysplat.errors import InputError
+
+WIDTH, HEIGHT = 24, 16
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def pose(index: int) -> np.ndarray:
+    """Camera-to-world, OpenGL axes."""
+    angle = 0.1 * index
+    matrix = np.eye(4)
+    matrix[:3, :3] = cv2.Rodrigues(np.array([0.3, angle, -0.2]))[0]
+    matrix[:3, 3] = (index, 0.5, -2)
+    return matrix
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Writes four noise images and a transforms.json after `change(content)`; gives the folder."""
+    content = {
+        **{"w": WIDTH, "h": HEIGHT, "fl_x": 20.0, "fl_y": 21.0, "cx": 12.5, "cy": 7.5},
+        "frames": [
+            {"file_path": f"images/{i}.png", "transform_matrix": pose(i).tolist()} for i in range(4)
+        ],
+    }
+    (tmp_path / "images").mkdir()
+    for i in range(4):
+        noise = np.random.default_rng(i).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / f"images/{i}.png")
+
+    def write(change=lambda content: None):
+        change(content)
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+        return tmp_path
+
+    return write
+
+
+def open_scene(folder, height=HEIGHT, width=WIDTH) -> TransformsCapture:
+    return TransformsCapture(folder, height, width)
+
+
+def test_cameras_and_images_are_the_file_s(scene):
+    folder = scene()
+    capture = open_scene(folder)
+    assert isinstance(capture, Capture)
+    assert capture.name == folder.name and capture.num_frames == 4
+    cameras = capture.cameras.validate()
+    expected = np.stack([pose(i) @ FLIP for i in range(4)])
+    assert np.abs(cameras.cam_to_world.numpy() - expected).max() < 1e-6
+    assert cameras.intrinsics[2].tolist() == [[20, 0, 12.5], [0, 21, 7.5], [0, 0, 1]]
+    views = capture.views([2, 0]).validate()
+    stored = np.asarray(Image.open(folder / "images/2.png"))
+    assert np.array_equal((views.images[0] * 255).round().byte().permute(1, 2, 0), stored)
+    assert torch.equal(views.cameras.cam_to_world[1], cameras.cam_to_world[0])
+    assert views.depths is None and views.masks is None
+
+
+def test_nothing_is_written(scene):
+    folder = scene()
+    before = sorted((path, path.stat().st_mtime_ns) for path in folder.rglob("*"))
+    open_scene(folder, 8, 8).views([0, 1, 2, 3])
+    assert sorted((path, path.stat().st_mtime_ns) for path in folder.rglob("*")) == before
+
+
+def test_the_json_file_itself_may_be_named(scene):
+    folder = scene()
+    (folder / "transforms.json").rename(folder / "transforms_train.json")
+    capture = open_scene(folder / "transforms_train.json")
+    assert capture.num_frames == 4 and capture.name == folder.name
+
+
+def test_field_of_view_alone_is_enough(scene):
+    def change(content):
+        for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
+            del content[key]
+        content["camera_angle_x"] = 1.0
+
+    intrinsics = open_scene(scene(change)).cameras.intrinsics[0]
+    focal = WIDTH / 2 / math.tan(0.5)
+    expected = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+    torch.testing.assert_close(intrinsics, expected)
+
+
+def test_a_frame_s_own_intrinsics_and_size_win(scene):
+    def change(content):
+        content["frames"][1] |= {"w": 48, "h": 32, "fl_x": 50.0, "fl_y": 52.0, "cx": 25, "cy": 15}
+
+    folder = scene(change)
+    Image.new("RGB", (48, 32), (255, 0, 0)).save(folder / "images/1.png")
+    capture = open_scene(folder)
+    assert capture.cameras.intrinsics[1].tolist() == [[25, 0, 12.5], [0, 26, 7.5], [0, 0, 1]]
+    assert capture.cameras.intrinsics[0, 0, 0] == 20
+    assert capture.views([1]).images[0, :, 8, 8].tolist() == [1, 0, 0]
+
+
+def test_resize_and_crop_reach_the_cameras(scene):
+    cameras = open_scene(scene(), height=8, width=8).cameras
+    # Scaled by 1/2 to 12 x 8, then 2 columns cut from each side.
+    assert cameras.intrinsics[0].tolist() == [[10, 0, 4.25], [0, 10.5, 3.75], [0, 0, 1]]
+
+
+def test_frames_follow_their_numbers(scene):
+    names = ["b10", "b2", "b1", "b9"]
+
+    def change(content):
+        for frame, name in zip(content["frames"], names, strict=True):
+            frame["file_path"] = f"./images/{name}"
+
+    folder = scene(change)
+    for i, name in enumerate(names):
+        (folder / f"images/{i}.png").rename(folder / f"images/{name}.png")
+    assert open_scene(folder).cameras.centers[:, 0].tolist() == [2, 1, 3, 0]
+
+
+def test_unnumbered_frames_keep_the_file_s_order(scene):
+    names = ["door", "arch", "wall", "roof"]
+
+    def change(content):
+        for frame, name in zip(content["frames"], names, strict=True):
+            frame["file_path"] = f"images/{name}"
+
+    folder = scene(change)
+    for i, name in enumerate(names):
+        (folder / f"images/{i}.png").rename(folder / f"images/{name}.jpg")
+    assert open_scene(folder).cameras.centers[:, 0].tolist() == [0, 1, 2, 3]
+
+
+def test_depths_and_masks(scene):
+    def change(content):
+        content["frames"][0] |= {"depth_file_path": "depth.png", "mask_path": "mask.png"}
+
+    folder = scene(change)
+    stored = np.arange(6 * 4, dtype=np.uint16).reshape(4, 6) * 1000
+    cv2.imwrite(str(folder / "depth.png"), stored)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[4:, :5] = 1
+    Image.fromarray(mask).save(folder / "mask.png")
+    views = open_scene(folder).views([0, 1]).validate()
+    enlarged = torch.from_numpy(stored.astype(np.float32)).kron(torch.ones(4, 4)) * 0.001
+    torch.testing.assert_close(views.depths[0], enlarged)
+    assert views.depths[1].max() == 0
+    assert np.array_equal(views.masks[0], mask > 0) and bool(views.masks[1].all())
+
+
+def test_depth_unit_is_read(scene):
+    def change(content):
+        content["depth_unit_scale_factor"] = 0.5
+        content["frames"][0]["depth_file_path"] = "depth.png"
+
+    folder = scene(change)
+    cv2.imwrite(str(folder / "depth.png"), np.full((HEIGHT, WIDTH), 7, np.uint16))
+    assert open_scene(folder).views([0]).depths.unique().tolist() == [3.5]
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_distortion_moves_pixels_and_masks_what_no_lens_saw(scene, model):
+    capture = open_scene(scene(lambda content: content.update(camera_model=model, k1=0.6)))
+    plain = open_scene(scene(lambda content: content.update(camera_model="PINHOLE", k1=0.0)))
+    views, straight = capture.views([0]), plain.views([0])
+    assert (views.images - straight.images).abs().max() > 0.1
+    assert bool(views.masks[0, 8, 12]) and not bool(views.masks.all()) and straight.masks is None
+    assert torch.equal(capture.cameras.intrinsics, plain.cameras.intrinsics)
+
+
+def test_rotations_are_made_orthonormal(scene):
+    def change(content):
+        for frame in content["frames"]:
+            frame["transform_matrix"][0][0] += 4e-4
+
+    rotation = open_scene(scene(change)).cameras.cam_to_world[:, :3, :3].double()
+    residual = rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)
+    assert residual.abs().max() < 1e-6
+
+
+def set_frame(**values):
+    return lambda content: content["frames"][2].update(values)
+
+
+def set_scene(**values):
+    return lambda content: content.update(values)
+
+
+def drop(*keys):
+    return lambda content: [content.pop(key) for key in keys]
+
+
+BROKEN = {
+    "no frames": (drop("frames"), r'transforms\.json has no list "frames"'),
+    "empty frames": (set_scene(frames=[]), r"transforms\.json has 0 frame"),
+    "one frame": (lambda content: content["frames"].__delitem__(slice(1, None)), r"has 1 frame"),
+    "no path": (set_frame(file_path=None), r"frame 2 has no file_path"),
+    "missing image": (set_frame(file_path="images/7.png"), r"7\.png does not exist"),
+    "no pose": (set_frame(transform_matrix=None), r"frame 2 \(images/2\.png\).*not 4x4"),
+    "3x4": (set_frame(transform_matrix=pose(0)[:3].tolist()), r"frame 2 .*not 4x4"),
+    "ragged": (set_frame(transform_matrix=[[1, 2], [3]]), r"frame 2 .*not 4x4"),
+    "nan": (set_frame(transform_matrix=(pose(0) * np.nan).tolist()), r"frame 2 .*NaN"),
+    "transposed": (set_frame(transform_matrix=pose(1).T.tolist()), r"frame 2 .*last row"),
+    "scaled": (
+        set_frame(transform_matrix=(np.diag([2.0, 2, 2, 1]) @ pose(0)).tolist()),
+        r"frame 2 .*is 3 from the identity",
+    ),
+    "mirrored": (
+        set_frame(transform_matrix=(np.diag([-1.0, 1, 1, 1]) @ pose(0)).tolist()),
+        r"frame 2 .*determinant is -1",
+    ),
+    "no intrinsics": (drop("fl_x", "fl_y"), r"has no intrinsics: give fl_x"),
+    "negative focal": (set_scene(fl_x=-5), r"fl_x.*out of range"),
+    "wide angle": (
+        lambda content: (drop("fl_x")(content), content.update(camera_angle_x=4)),
+        r"camera_angle_x.*out of range",
+    ),
+    "text for a number": (set_scene(cx="12"), r"cx is '12'"),
+    "camera model": (set_scene(camera_model="EQUIRECTANGULAR"), r"camera_model is 'EQUIRECT"),
+    "k4": (set_scene(k4=0.1), r"k4 is only known for OPENCV_FISHEYE"),
+    "other resolution": (set_scene(w=48, h=32), r"48 x 32, but the image is 24 x 16"),
+    "missing depth": (set_frame(depth_file_path="d.png"), r"d\.png does not exist"),
+    "mask no path": (set_frame(mask_path=5), r"mask_path is 5"),
+}
+
+
+@pytest.mark.parametrize("change, message", BROKEN.values(), ids=BROKEN.keys())
+def test_a_broken_file_is_refused_when_opened(scene, change, message):
+    with pytest.raises(InputError, match=message):
+        open_scene(scene(change))
+
+
+@pytest.mark.parametrize(
+    "text, message", [("", "is empty"), ("{", "is not JSON"), ("[]", "no list")]
+)
+def test_an_unreadable_file_is_refused(tmp_path, text, message):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(InputError, match=rf"transforms\.json.*{message}"):
+        open_scene(tmp_path)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"transforms\.json does not exist"):
+        open_scene(tmp_path)
+
+
+def test_an_empty_image_is_refused_when_opened(scene):
+    folder = scene()
+    (folder / "images/2.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"2\.png is empty"):
+        open_scene(folder)
+
+
+def test_images_of_two_sizes_are_both_named(scene):
+    folder = scene()
+    Image.new("RGB", (30, 16)).save(folder / "images/2.png")
+    with pytest.raises(InputError, match=r"0\.png is 24 x 16 and .*2\.png is 30 x 16"):
+        open_scene(folder)
+
+
+def test_depth_of_other_proportions_is_refused(scene):
+    folder = scene(set_frame(depth_file_path="depth.png"))
+    cv2.imwrite(str(folder / "depth.png"), np.zeros((16, 16), np.uint16))
+    with pytest.raises(InputError, match=r"depth\.png is 16 x 16 and the image 24 x 16"):
+        open_scene(folder)
+
+
+def test_a_cut_off_image_is_named_when_read(scene):
+    folder = scene()
+    image = folder / "images/2.png"
+    image.write_bytes(image.read_bytes()[:300])
+    capture = open_scene(folder)
+    capture.views([0, 1])
+    with pytest.raises(InputError, match=r"2\.png cannot be read"):
+        capture.views([2])
+
+
+def epipolar_error(views) -> float:
+    """The median symmetric epipolar distance of SIFT matches between two views, in pixels."""
+    images = (views.images * 255).byte().permute(0, 2, 3, 1).numpy()
+    sift = cv2.SIFT_create(1500)
+    keys, words = zip(*(sift.detectAndCompute(image, None) for image in images), strict=True)
+    pairs = cv2.BFMatcher().knnMatch(*words, k=2)
+    good = [first for first, second in pairs if first.distance < 0.7 * second.distance]
+    assert len(good) > 100
+    # SIFT, as all of OpenCV, puts the first pixel's centre at 0.
+    a = np.array([keys[0][match.queryIdx].pt for match in good]) + 0.5
+    b = np.array([keys[1][match.trainIdx].pt for match in good]) + 0.5
+    a, b = np.c_[a, np.ones(len(a))], np.c_[b, np.ones(len(b))]
+    poses = views.cameras.cam_to_world.double().numpy()
+    intrinsics = views.cameras.intrinsics.double().numpy()
+    relative = np.linalg.inv(poses[1]) @ poses[0]
+    x, y, z = relative[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    inverse = np.linalg.inv(intrinsics)
+    fundamental = inverse[1].T @ cross @ relative[:3, :3] @ inverse[0]
+    lines_b, lines_a = a @ fundamental.T, b @ fundamental
+    residual = np.abs((b * lines_b).sum(-1))
+    distances = [residual / np.linalg.norm(lines[:, :2], axis=-1) for lines in (lines_a, lines_b)]
+    return float(np.median(np.mean(distances, axis=0)))
+
+
+def test_real_photographs_meet_their_cameras(shared, tmp_path):
+    folder = shared / "data/fox"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent")
+    frames = [0, 6]
+    capture = TransformsCapture(folder, height=720, width=405)
+    assert capture.num_frames == 50
+    assert epipolar_error(capture.views(frames).validate()) < 0.5
+    # Smaller, with another shape: intrinsics and pixels must still agree.
+    assert epipolar_error(TransformsCapture(folder, 480, 360).views(frames)) < 0.5
+
+    unflipped = json.loads((folder / "transforms.json").read_text())
+    for frame in unflipped["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ FLIP).tolist()
+        frame["file_path"] = str(folder / frame["file_path"])
+    (tmp_path / "transforms.json").write_text(json.dumps(unflipped))
+    assert epipolar_error(TransformsCapture(tmp_path, 720, 405).views(frames)) > 5
