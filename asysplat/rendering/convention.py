@@ -1,0 +1,29 @@
+"""The constants that decide which Gaussians a pixel sees; a PSNR depends on them."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Convention:
+    """Cut-offs of alpha compositing.
+
+    Args:
+        alpha_max: alpha is clamped to this value.
+        alpha_min: a smaller alpha is skipped.
+        transmittance_min: the Gaussian that would push the transmittance below this value is
+            dropped, with all behind it.
+        eps2d: variance added to every projected Gaussian, in pixels squared.
+        near: Gaussians whose mean has a depth <= near are culled, in scene units.
+        frustum_margin: the Jacobian is taken inside the view widened by this share on each side.
+    """
+
+    alpha_max: float = 0.99
+    alpha_min: float = 1 / 255
+    transmittance_min: float = 1e-4
+    eps2d: float = 0.3
+    near: float = 0.01
+    frustum_margin: float = 0.15
+
+
+# diff-gaussian-rasterization (Kerbl et al. 2023) and gsplat 1.6; their near planes differ.
+INRIA = Convention()

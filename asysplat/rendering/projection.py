@@ -1,0 +1,190 @@
+"""3D Gaussians to 2D splats: what each image sees, where, and how large (EWA splatting)."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from asysplat.rendering.convention import INRIA
+from asysplat.rendering.sh import sh_colors
+from asysplat.scene import Cameras, Gaussians
+
+BOUNDS_MARGIN = 1e-3  # pixels; more than the rounding of an extent
+
+
+@dataclass(frozen=True)
+class Splats:
+    """M visible pairs (image, Gaussian), sorted by image, then by depth, then by index.
+
+    Args:
+        images: [M] index of the image, batch and views flattened.
+        xy: [M, 2] centre in pixels.
+        whitening: [M, 3] = (a, b, c); a pixel at (dx, dy) from the centre has
+            alpha = opacity * exp(-((a dx + b dy)^2 + (c dy)^2) / 2).
+        opacities: [M].
+        colors: [M, 3], >= 0.
+        depths: [M] z in the camera's frame, in scene units.
+        first, last: [M, 2] inclusive range (x, y) of the pixels that can have alpha >= 1/255.
+    """
+
+    images: Int[Tensor, "M"]
+    xy: Float[Tensor, "M 2"]
+    whitening: Float[Tensor, "M 3"]
+    opacities: Float[Tensor, "M"]
+    colors: Float[Tensor, "M 3"]
+    depths: Float[Tensor, "M"]
+    first: Int[Tensor, "M 2"]
+    last: Int[Tensor, "M 2"]
+
+
+class _Footprint(NamedTuple):
+    offsets: Tensor  # [..., 3] mean - camera centre, world axes
+    depths: Tensor  # [...]
+    xy: Tensor  # [..., 2]
+    whitening: Tensor  # [..., 3]
+    deviations: Tensor  # [..., 2] standard deviations along x and y, in pixels
+
+
+def project(gaussians: Gaussians, cameras: Cameras) -> Splats:
+    """Splats of every view of every scene.
+
+    Args:
+        gaussians: with one batch dimension, [B, N].
+        cameras: [B, V], zero skew; image b * V + v is view v of scene b.
+
+    Culled, with gradient 0: depth <= near, opacity < 1/255, no pixel centre in reach, and
+    whatever does not project to finite numbers (NaN, infinity, a zero quaternion).
+    """
+    size = (cameras.width, cameras.height)
+    images, indices = _visible(gaussians, cameras)
+    # Only visible pairs enter the graph, so nothing that was culled can send a NaN back.
+    opacities = gaussians.opacities.flatten().index_select(0, indices)
+    footprint = _footprint(
+        *(
+            field.flatten(0, 1).index_select(0, indices)
+            for field in (gaussians.means, gaussians.quats, gaussians.scales)
+        ),
+        cameras.cam_to_world.flatten(0, 1).index_select(0, images),
+        cameras.intrinsics.flatten(0, 1).index_select(0, images),
+        size,
+    )
+    first, last = _pixel_range(footprint, opacities, size)
+    sh = gaussians.sh.flatten(0, 1).index_select(0, indices)
+    return Splats(
+        images=images,
+        xy=footprint.xy,
+        whitening=footprint.whitening,
+        opacities=opacities,
+        colors=sh_colors(sh, footprint.offsets),
+        depths=footprint.depths,
+        first=first.long(),
+        last=last.long(),
+    )
+
+
+@torch.no_grad()
+def _visible(gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Image and flat Gaussian index of every visible pair, in the order of `Splats`."""
+    size = (cameras.width, cameras.height)
+    footprint = _footprint(
+        gaussians.means[:, None],
+        gaussians.quats[:, None],
+        gaussians.scales[:, None],
+        cameras.cam_to_world[:, :, None],
+        cameras.intrinsics[:, :, None],
+        size,
+    )
+    opacities = gaussians.opacities[:, None]
+    first, last = _pixel_range(footprint, opacities, size)
+    # Written so that NaN compares false.
+    visible = (
+        (footprint.depths > INRIA.near)
+        & (opacities >= INRIA.alpha_min)
+        & (first <= last).all(-1)
+        & footprint.whitening.isfinite().all(-1)
+        & gaussians.sh.isfinite().flatten(2).all(-1)[:, None]
+    ).flatten(0, 1)
+    depths = footprint.depths.flatten(0, 1).where(visible, torch.inf)
+    order = torch.argsort(depths, dim=-1, stable=True)
+    images, ranks = torch.nonzero(
+        torch.arange(depths.shape[1], device=depths.device) < visible.sum(-1, keepdim=True),
+        as_tuple=True,
+    )
+    scenes = images // cameras.num_views
+    return images, order[images, ranks] + scenes * gaussians.num_gaussians
+
+
+def _footprint(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    cam_to_world: Tensor,
+    intrinsics: Tensor,
+    size: tuple[int, int],
+) -> _Footprint:
+    """Project; all arguments broadcast over their leading dimensions."""
+    rotation = cam_to_world[..., :3, :3]
+    # Relative to the camera first: exact for scenes far from the origin.
+    offsets = means - cam_to_world[..., :3, 3]
+    x, y, z = (offsets[..., None] * rotation).sum(-2).unbind(-1)
+    tangents = torch.stack((x / z, y / z), -1)
+    focal = torch.stack((intrinsics[..., 0, 0], intrinsics[..., 1, 1]), -1)
+    principal = intrinsics[..., :2, 2]
+
+    size = focal.new_tensor(size)
+    margin = INRIA.frustum_margin * size
+    clamped = torch.clamp(
+        tangents, (-principal - margin) / focal, (size - principal + margin) / focal
+    )
+    # Rows of J R^T: how the pixel moves with the mean, in world axes.
+    jacobian = (focal / z[..., None])[..., None, :] * (
+        rotation[..., :2] - rotation[..., 2:] * clamped[..., None, :]
+    )
+    axes = _rotations(quats) * scales[..., None, :]
+    row_x = (jacobian[..., 0, None] * axes).sum(-2)
+    row_y = (jacobian[..., 1, None] * axes).sum(-2)
+    whitening, deviations = _whiten(row_x, row_y)
+    return _Footprint(offsets, z, tangents * focal + principal, whitening, deviations)
+
+
+def _whiten(row_x: Tensor, row_y: Tensor) -> tuple[Tensor, Tensor]:
+    """Whitening (a, b, c) and standard deviations of the covariance M M^T + eps I, M = (x; y).
+
+    The Cholesky factor of the inverse. The determinant is a sum of squares (Cauchy-Binet), so no
+    needle makes it cancel to zero, and it is divided by Syy early, so no large scale overflows.
+    """
+    eps = INRIA.eps2d
+    xx, xy, yy = ((p * q).sum(-1) for p, q in ((row_x, row_x), (row_x, row_y), (row_y, row_y)))
+    var_y = yy + eps
+    deviation_y = var_y.sqrt()
+    minors = torch.linalg.cross(row_x, row_y / deviation_y[..., None]).square().sum(-1)
+    a = (minors + eps * (1 + xx / var_y)).rsqrt()
+    whitening = torch.stack((a, -a * xy / var_y, 1 / deviation_y), -1)
+    return whitening, torch.stack(((xx + eps).sqrt(), deviation_y), -1)
+
+
+def _rotations(quats: Tensor) -> Tensor:
+    """[..., 4] wxyz of any length to [..., 3, 3]."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+@torch.no_grad()
+def _pixel_range(
+    footprint: _Footprint, opacities: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """First and last pixel (x, y) whose centre the box around alpha >= 1/255 holds."""
+    reach = (2 * (opacities / INRIA.alpha_min).log().clamp_min(0)).sqrt()
+    extent = footprint.deviations * reach[..., None] + BOUNDS_MARGIN
+    size = extent.new_tensor(size)
+    zero = torch.zeros_like(size)
+    first = (footprint.xy - extent - 0.5).ceil().clamp(zero, size)
+    last = (footprint.xy + extent - 0.5).floor().clamp(zero - 1, size - 1)
+    return first, last

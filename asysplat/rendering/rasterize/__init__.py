@@ -1,0 +1,1 @@
+"""Splats and tile lists to images: one module per backend, all with the same `rasterize`."""

@@ -1,0 +1,142 @@
+"""Alpha compositing in plain torch, on any device and in any float type.
+
+Tiles with lists of similar length are padded and composited together, in groups small enough to
+stay in the processor's cache. The backward pass recomputes what the forward pass computed, so only
+the inputs are kept.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from asysplat.rendering.convention import INRIA
+from asysplat.rendering.projection import Splats
+from asysplat.rendering.tiles import TileLists
+
+TILE_SIZE = 4
+GROUP_ELEMENTS = 1 << 16  # (splat, pixel) pairs of one group, for temporaries of 256 KiB
+
+
+def rasterize(
+    splats: Splats, values: Float[Tensor, "M C"], lists: TileLists
+) -> Float[Tensor, "T C P"]:
+    """Composite sum_i w_i values_i at every pixel of every tile, front to back.
+
+    Args:
+        splats: M splats, sorted by depth within their image.
+        values: what each splat shows.
+        lists: from `assign_tiles`; P = size * size pixels a tile, row by row.
+
+    w_i = alpha_i prod_{j<i} (1 - alpha_j), Kerbl et al. 2023, with the cut-offs of INRIA.
+    """
+    packed = torch.cat((splats.xy, splats.whitening, splats.opacities[:, None], values), -1)
+    # The last row is what padding shows: opacity 0.
+    packed = torch.nn.functional.pad(packed, (0, 0, 0, 1))
+    return _Rasterize.apply(packed, lists)
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, packed: Tensor, lists: TileLists) -> Tensor:
+        ctx.save_for_backward(packed)
+        ctx.lists = lists
+        pixels = lists.size**2
+        out = packed.new_zeros(len(lists.lengths), packed.shape[1] - 6, pixels)
+        for group in _groups(lists):
+            block = _Block(packed[group.splats], group.origins, lists.size)
+            out[group.tiles] = block.values.mT @ block.weights()
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_out: Tensor) -> tuple[Tensor, None]:
+        (packed,) = ctx.saved_tensors
+        lists = ctx.lists
+        # One slot for each intersection, then a sum in a fixed order: the same bits every time.
+        slots = packed.new_empty(len(lists.splats) + 1, packed.shape[1])
+        for group in _groups(lists):
+            block = _Block(packed[group.splats], group.origins, lists.size)
+            slots[group.slots] = block.backward(grad_out[group.tiles])
+        return torch.zeros_like(packed).index_add_(0, lists.splats, slots[:-1]), None
+
+
+class _Group(NamedTuple):
+    tiles: Tensor  # [t]
+    origins: Tensor  # [t, 2]
+    slots: Tensor  # [t, K] intersection, or the number of intersections where padded
+    splats: Tensor  # [t, K] splat, or the number of splats where padded
+
+
+def _groups(lists: TileLists) -> Iterator[_Group]:
+    """All tiles that have splats, longest list first, in groups of about GROUP_ELEMENTS pairs."""
+    origins = lists.origins()
+    starts = lists.lengths.cumsum(0) - lists.lengths
+    count = len(lists.splats)
+    padded = torch.nn.functional.pad(lists.splats, (0, 1), value=-1)
+    lengths, order = torch.sort(lists.lengths, descending=True, stable=True)
+    lengths = lengths.tolist()
+    begin, end = 0, len(lengths) - lengths.count(0)
+    while begin < end:
+        longest = lengths[begin]
+        size = max(1, GROUP_ELEMENTS // (longest * lists.size**2))
+        tiles = order[begin : min(begin + size, end)]
+        rank = torch.arange(longest, device=tiles.device)
+        inside = rank < lists.lengths[tiles, None]
+        slots = torch.where(inside, starts[tiles, None] + rank, count)
+        yield _Group(tiles, origins[tiles], slots, padded[slots])
+        begin += size
+
+
+class _Block:
+    """K depth-ordered splats on each of t tiles: alphas, weights and their gradients."""
+
+    def __init__(self, packed: Tensor, origins: Tensor, size: int):
+        """packed [t, K, 6 + C] and origins [t, 2]; all temporaries are [t, K, P]."""
+        self.x, self.y, self.a, self.b, self.c, self.opacity = packed[..., :6].unbind(-1)
+        self.values = packed[..., 6:]
+        corner = origins[:, None].to(packed.dtype) + 0.5
+        self.dx, self.dy = corner[..., 0] - self.x, corner[..., 1] - self.y
+        # u = a dx + b dy and v = c dy are affine in the pixel: one small product each.
+        step = torch.arange(size, dtype=packed.dtype, device=packed.device)
+        j, i = (grid.flatten() for grid in torch.meshgrid(step, step, indexing="ij"))
+        self.basis = torch.stack((torch.ones_like(i), i, j))
+        self.u = torch.stack((self.a * self.dx + self.b * self.dy, self.a, self.b), -1) @ self.basis
+        self.v = torch.stack((self.c * self.dy, self.c), -1) @ self.basis[::2]
+        exponent = (self.u * self.u).addcmul_(self.v, self.v).mul_(-0.5)
+        alpha = exponent.exp_().mul_(self.opacity[..., None]).clamp_max_(INRIA.alpha_max)
+        self.alpha = alpha.mul_(alpha >= INRIA.alpha_min)
+        self.transmittance = torch.cumprod(1 - alpha, 1)  # behind each splat
+        # It never grows, so dropping below the limit drops everything behind as well.
+        self.alpha.mul_(self.transmittance >= INRIA.transmittance_min)
+
+    def weights(self) -> Tensor:
+        """alpha times the transmittance in front of each splat."""
+        weights = self.alpha.clone()
+        weights[:, 1:] *= self.transmittance[:, :-1]
+        return weights
+
+    def backward(self, grad_out: Tensor) -> Tensor:
+        """Gradient of `packed`, from the gradient [t, C, P] of the composited values."""
+        weights = self.weights()
+        share = weights * (self.values @ grad_out)  # of each splat in grad . out
+        grad_values = weights @ grad_out.mT
+        behind = share.sum(1, keepdim=True) - share.cumsum(1)
+        # alpha dL/dalpha; 0 where alpha is clamped.
+        grad = share.addcmul_(behind, self.alpha / (1 - self.alpha), value=-1)
+        grad.mul_(self.alpha < INRIA.alpha_max)
+        u0, a, b = ((-grad * self.u) @ self.basis.T).unbind(-1)
+        v0, c = ((-grad * self.v) @ self.basis[::2].T).unbind(-1)
+        grad_opacity = grad.sum(-1) / self.opacity.clamp_min(INRIA.alpha_min)
+        grads = (
+            -self.a * u0,
+            -self.b * u0 - self.c * v0,
+            a + self.dx * u0,
+            b + self.dy * u0,
+            c + self.dy * v0,
+            grad_opacity,
+        )
+        return torch.cat((torch.stack(grads, -1), grad_values), -1)

@@ -1,0 +1,61 @@
+"""Which splats touch which tile of the image."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from asysplat.rendering.projection import Splats
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Depth-ordered splats of every tile; tiles are numbered image by image, row by row.
+
+    Args:
+        size: tiles are size x size pixels.
+        images, rows, columns: the grid of tiles.
+        splats: [I] splat of every intersection, sorted by tile, then by depth.
+        lengths: [T] number of intersections of each tile.
+    """
+
+    size: int
+    images: int
+    rows: int
+    columns: int
+    splats: Int[Tensor, "I"]
+    lengths: Int[Tensor, "T"]
+
+    def origins(self) -> Int[Tensor, "T 2"]:
+        """Pixel (x, y) at each tile's upper left corner."""
+        tile = torch.arange(len(self.lengths), device=self.lengths.device)
+        column, row = tile % self.columns, tile // self.columns % self.rows
+        return torch.stack((column, row), -1) * self.size
+
+    def untile(
+        self, values: Float[Tensor, "T C P"], height: int, width: int
+    ) -> Float[Tensor, "images C {height} {width}"]:
+        """Values of all tiles' pixels to images."""
+        grid = values.unflatten(0, (self.images, self.rows, self.columns))
+        grid = grid.unflatten(-1, (self.size, self.size))
+        return grid.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)[..., :height, :width]
+
+
+@torch.no_grad()
+def assign_tiles(splats: Splats, images: int, height: int, width: int, size: int) -> TileLists:
+    """Sort the splats of `images` images into tiles of size x size pixels."""
+    rows, columns = -(-height // size), -(-width // size)
+    first, last = splats.first // size, splats.last // size
+    # A range that rounding emptied since the visibility test gives no intersection.
+    spans = (last - first + 1).clamp_min(0)
+    counts = spans.prod(-1)
+    splat = torch.repeat_interleave(counts)
+    step = torch.arange(len(splat), device=splat.device) - (counts.cumsum(0) - counts)[splat]
+    # Splats come in depth order within their image, and a stable sort by tile keeps it.
+    corner = (splats.images * rows + first[:, 1]) * columns + first[:, 0]
+    span_x = spans[splat, 0]
+    tile = corner[splat] + step // span_x * columns + step % span_x
+    order = torch.argsort(tile, stable=True)
+    lengths = torch.bincount(tile, minlength=images * rows * columns)
+    return TileLists(size, images, rows, columns, splat[order], lengths)
