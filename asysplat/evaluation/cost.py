@@ -58,8 +58,9 @@ def _flops_per_output(module: nn.Module) -> int:
 def true_flops(run: Callable[[], object]) -> int:
     """FLOPs of one `run()` with every matrix product, einsum and attention included.
 
-    Right on the meta device only, which needs no memory: on a CPU attention counts as 0
-    (pytorch issue 195460). Scans count where they are matrix products; element-wise work never.
+    Run it on the meta device, which needs no memory: elsewhere the kernel that torch picks may be
+    unknown to its counter (some releases count attention on a CPU as 0). Scans count where
+    they are matrix products; element-wise work never.
     """
     with FlopCounterMode(display=False) as counter:
         run()

@@ -47,10 +47,10 @@ class Attention(nn.Module):
         self.out = nn.Linear(width, width, bias=False)
 
     def forward(self, x):
-        q, k, v = self.qkv(self.norm(x)).unflatten(-1, (3, self.heads, -1)).movedim(-3, 0).mT
-        q, k, v = (t.movedim(-1, -2).movedim(-3, -2) for t in (q, k, v))
+        qkv = self.qkv(self.norm(x)).unflatten(-1, (3, self.heads, -1))
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)
         y = nn.functional.scaled_dot_product_attention(q, k, v)
-        return x + self.out(y.movedim(-3, -2).flatten(-2))
+        return x + self.out(y.transpose(1, 2).flatten(-2))
 
 
 def test_attention_products_are_in_the_true_count_only():
