@@ -6,7 +6,7 @@ rotations orthonormal) and is called once, where data enters.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,11 +16,13 @@ from asysplat.errors import InputError
 
 ORTHONORMAL_TOLERANCE = 1e-3
 
+Record = TypeVar("Record", bound="_TensorRecord")
+
 
 class _TensorRecord:
     """A frozen dataclass of tensors (and of other such records) that moves and stacks as one."""
 
-    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
+    def map(self: Record, function: Callable[[Tensor], Tensor]) -> Record:
         """Apply `function` to every tensor; None and plain numbers stay as they are."""
         changed = {}
         for field in fields(self):
@@ -31,12 +33,12 @@ class _TensorRecord:
                 changed[field.name] = value.map(function)
         return replace(self, **changed)
 
-    def to(self, *args, **kwargs) -> Self:
+    def to(self: Record, *args, **kwargs) -> Record:
         """`Tensor.to` for every tensor."""
         return self.map(lambda tensor: tensor.to(*args, **kwargs))
 
     @classmethod
-    def stack(cls, records: Sequence[Self]) -> Self:
+    def stack(cls: type[Record], records: Sequence[Record]) -> Record:
         """Stack records of equal shapes along a new first dimension."""
         stacked = {}
         for field in fields(cls):
@@ -94,13 +96,20 @@ class Cameras(_TensorRecord):
     def centers(self) -> Float[Tensor, "*batch V 3"]:
         return self.cam_to_world[..., :3, 3]
 
-    def select(self, views: Sequence[int] | Tensor) -> Self:
+    def select(self, views: Sequence[int] | Tensor) -> "Cameras":
         """The named views, in the given order."""
         index = torch.as_tensor(views, device=self.intrinsics.device)
         return replace(
             self,
             intrinsics=self.intrinsics.index_select(-3, index),
             cam_to_world=self.cam_to_world.index_select(-3, index),
+        )
+
+    def resized(self, height: int, width: int) -> "Cameras":
+        """The same cameras with `height` x `width` pixels over the same field of view."""
+        factors = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
+        return replace(
+            self, intrinsics=factors[:, None] * self.intrinsics, height=height, width=width
         )
 
     def rays(self) -> tuple[Float[Tensor, "*batch V H W 3"], Float[Tensor, "*batch V H W 3"]]:
@@ -120,7 +129,7 @@ class Cameras(_TensorRecord):
         directions = torch.nn.functional.normalize(directions, dim=-1)
         return self.centers[..., None, None, :].expand_as(directions), directions
 
-    def validate(self, name: str = "Cameras") -> Self:
+    def validate(self, name: str = "Cameras") -> "Cameras":
         """Return self if every number can be used.
 
         Raises:
@@ -182,7 +191,7 @@ class Views(_TensorRecord):
     def num_views(self) -> int:
         return self.cameras.num_views
 
-    def select(self, views: Sequence[int] | Tensor) -> Self:
+    def select(self, views: Sequence[int] | Tensor) -> "Views":
         """The named views, in the given order."""
         index = torch.as_tensor(views, device=self.images.device)
 
@@ -197,7 +206,7 @@ class Views(_TensorRecord):
             masks=pick(self.masks, -3),
         )
 
-    def validate(self, name: str = "Views") -> Self:
+    def validate(self, name: str = "Views") -> "Views":
         """Return self if every number can be used.
 
         Raises:
@@ -254,19 +263,19 @@ class Gaussians(_TensorRecord):
     def num_gaussians(self) -> int:
         return self.opacities.shape[-1]
 
-    def scale_by(self, factor: float) -> Self:
+    def scale_by(self, factor: float) -> "Gaussians":
         """The same scene in units that are `factor` times smaller."""
         return replace(self, means=self.means * factor, scales=self.scales * factor)
 
-    def keep(self, mask: Bool[Tensor, "N"]) -> Self:
+    def keep(self, mask: Bool[Tensor, "N"]) -> "Gaussians":
         """The Gaussians where `mask` is True; for one scene, without batch dimensions."""
         return self.map(lambda tensor: tensor[mask])
 
-    def crop(self, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> Self:
+    def crop(self, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> "Gaussians":
         """The Gaussians whose mean lies in the closed box from `lower` to `upper`."""
         return self.keep(((self.means >= lower) & (self.means <= upper)).all(-1))
 
-    def validate(self, name: str = "Gaussians") -> Self:
+    def validate(self, name: str = "Gaussians") -> "Gaussians":
         """Return self if every number can be rendered.
 
         Raises:

@@ -18,6 +18,11 @@ def shared() -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    return REPO
+
+
 @pytest.fixture(autouse=True)
 def seed():
     torch.manual_seed(0)

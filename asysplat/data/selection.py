@@ -8,6 +8,8 @@ import numpy as np
 
 from asysplat.errors import InputError
 
+HELD_OUT_STEP = 8
+
 
 @dataclass(frozen=True)
 class Split:
@@ -69,6 +71,26 @@ def training_split(
     if rng.random() < 0.5:
         return Split(inputs[::-1], targets[::-1])
     return Split(inputs, targets)
+
+
+def held_out(num_frames: int) -> list[int]:
+    """Every 8th frame from the first on: tested, never trained on (paper, Suppl. A)."""
+    return list(range(0, num_frames, HELD_OUT_STEP))
+
+
+def held_out_split(num_frames: int, num_inputs: int, num_targets: int) -> Split:
+    """Inputs evenly over the frames that are not held out, targets evenly over those that are.
+
+    There are at most `num_targets` targets. Deterministic.
+
+    Raises:
+        InputError: the sequence is too short.
+    """
+    targets = held_out(num_frames)
+    others = sorted(set(range(num_frames)) - set(targets))
+    num_targets = min(num_targets, len(targets))
+    _check_length(len(others), num_inputs, 0)
+    return Split(_spread(others, num_inputs), _spread(targets, num_targets))
 
 
 def _spread(frames: Sequence[int], count: int) -> list[int]:

@@ -1,0 +1,28 @@
+"""Images to Gaussians: plain torch modules, every ablated part a component of its own."""
+
+from asysplat.models.asysplat import AsySplat, build_asysplat
+from asysplat.models.attention import FullAttention, SparseAttention
+from asysplat.models.bilateral import CoarseReadsFine, FineReadsCoarse, NoLink
+from asysplat.models.head import GaussianHead
+from asysplat.models.mamba2 import BiMamba2
+from asysplat.models.mamba_vision import MambaVision
+from asysplat.models.shapes import StageShape, Widths
+from asysplat.models.source import CoarseSource, FineSource, MergedSource
+
+__all__ = [
+    "AsySplat",
+    "BiMamba2",
+    "CoarseReadsFine",
+    "CoarseSource",
+    "FineReadsCoarse",
+    "FineSource",
+    "FullAttention",
+    "GaussianHead",
+    "MambaVision",
+    "MergedSource",
+    "NoLink",
+    "SparseAttention",
+    "StageShape",
+    "Widths",
+    "build_asysplat",
+]

@@ -1,0 +1,11 @@
+"""The operators that a reconstruction spends its time in.
+
+Each is a folder: `reference.py` reads like the formula and takes float64, the other files are
+faster forms that are tested against it.
+"""
+
+from asysplat.ops.grid_attention import grid_attention
+from asysplat.ops.selective_scan import selective_scan
+from asysplat.ops.ssd import ssd
+
+__all__ = ["grid_attention", "selective_scan", "ssd"]

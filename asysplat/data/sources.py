@@ -1,0 +1,114 @@
+"""Where scenes come from: which captures train, validate and test, and which of their frames."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+
+from asysplat.data.capture import Capture
+from asysplat.data.procedural import ProceduralScene, split_seed
+from asysplat.data.selection import (
+    Split,
+    evaluation_split,
+    held_out,
+    held_out_split,
+    training_split,
+)
+from asysplat.data.transforms import TransformsCapture
+from asysplat.errors import InputError
+
+
+@dataclass(frozen=True)
+class Task:
+    """One reconstruction: the frames of a capture that are given and those to predict."""
+
+    capture: Capture
+    split: Split
+
+
+class Source(Protocol):
+    """What the data module draws from."""
+
+    def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
+        """A random training task; the same generator gives the same task."""
+        ...
+
+    def evaluation(self, stage: Literal["val", "test"], inputs: int, targets: int) -> list[Task]:
+        """The fixed tasks of a stage, none of whose target frames was ever trained on."""
+        ...
+
+
+class ProceduralSource:
+    """Endless training scenes, and validation and test scenes whose seeds never meet them.
+
+    Args:
+        height, width: of every view, in pixels.
+        num_frames: length of each camera path.
+        window: how many consecutive frames a training task is drawn from, least and most.
+        val_scenes, test_scenes: how many scenes each stage has.
+    """
+
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        num_frames: int,
+        window: Sequence[int],
+        val_scenes: int,
+        test_scenes: int,
+    ):
+        self.height, self.width, self.num_frames = height, width, num_frames
+        self.window = (window[0], window[1])
+        self.counts = {"val": val_scenes, "test": test_scenes}
+
+    def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
+        scene = self._scene("train", int(rng.integers(2**31)))
+        return Task(scene, training_split(self.num_frames, inputs, targets, self.window, rng))
+
+    def evaluation(self, stage: Literal["val", "test"], inputs: int, targets: int) -> list[Task]:
+        split = evaluation_split(self.num_frames, inputs, targets)
+        return [Task(self._scene(stage, index), split) for index in range(self.counts[stage])]
+
+    def _scene(self, split: Literal["train", "val", "test"], index: int) -> ProceduralScene:
+        return ProceduralScene(split_seed(split, index), self.height, self.width, self.num_frames)
+
+
+class TransformsSource:
+    """Scenes on disk with a `transforms.json` each: every 8th frame is tested, the rest trains.
+
+    Args:
+        root: one scene, or a folder of scenes.
+        height, width: of every view, in pixels.
+        window: as for ProceduralSource.
+
+    Raises:
+        InputError: no scene, or one that cannot be used.
+    """
+
+    def __init__(self, root: str, height: int, width: int, window: Sequence[int]):
+        folder = Path(root)
+        single = folder.suffix == ".json" or (folder / "transforms.json").exists()
+        scenes = [folder] if single else sorted(p.parent for p in folder.glob("*/transforms.json"))
+        if not scenes:
+            raise InputError(
+                f"data.root={root} has no transforms.json, nor has any folder in it: "
+                "name a scene's folder or a folder of scenes."
+            )
+        self.window = (window[0], window[1])
+        self.captures = [TransformsCapture(scene, height, width) for scene in scenes]
+
+    def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
+        capture = self.captures[rng.integers(len(self.captures))]
+        frames = sorted(set(range(capture.num_frames)) - set(held_out(capture.num_frames)))
+        split = training_split(len(frames), inputs, targets, self.window, rng)
+        return Task(
+            capture, Split([frames[i] for i in split.inputs], [frames[i] for i in split.targets])
+        )
+
+    def evaluation(self, stage: Literal["val", "test"], inputs: int, targets: int) -> list[Task]:
+        return [
+            Task(capture, held_out_split(capture.num_frames, inputs, targets))
+            for capture in self.captures
+        ]

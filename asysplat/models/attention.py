@@ -1,0 +1,137 @@
+"""Attention blocks: full and sparse self-attention over all views, cross-attention in a frame.
+
+All are pre-norm with an MLP, bias-free, and apply RMSNorm to queries and keys (paper, Suppl. A).
+"""
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from asysplat.models.shapes import StageShape
+from asysplat.ops import grid_attention
+
+
+class MLP(nn.Sequential):
+    def __init__(self, width: int, ratio: int, bias: bool = False):
+        super().__init__(
+            nn.Linear(width, ratio * width, bias=bias),
+            nn.GELU(),
+            nn.Linear(ratio * width, width, bias=bias),
+        )
+
+
+class QueryKeyNorm(nn.Module):
+    """RMSNorm of queries and keys, shared by the heads, in fp32."""
+
+    def __init__(self, head_width: int):
+        super().__init__()
+        self.query = nn.RMSNorm(head_width, eps=1e-6)
+        self.key = nn.RMSNorm(head_width, eps=1e-6)
+
+    def forward(self, q: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+        with torch.autocast(q.device.type, enabled=False):
+            return self.query(q.float()).to(q.dtype), self.key(k.float()).to(k.dtype)
+
+
+class SelfAttention(nn.Module):
+    """x + o(attn(qkv(LN x))), then x + MLP(LN x), over the tokens that share a grid place."""
+
+    def __init__(self, shape: StageShape, grid: int = 1):
+        super().__init__()
+        self.grid, self.head_width = grid, shape.head_width
+        self.norm = nn.LayerNorm(shape.width, bias=False)
+        self.qkv = nn.Linear(shape.width, 3 * shape.width, bias=False)
+        self.qk_norm = QueryKeyNorm(shape.head_width)
+        self.out = nn.Linear(shape.width, shape.width, bias=False)
+        self.mlp_norm = nn.LayerNorm(shape.width, bias=False)
+        self.mlp = MLP(shape.width, shape.mlp_ratio)
+
+    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
+        q, k, v = self.qkv(self.norm(tokens)).unflatten(-1, (3, -1, self.head_width)).unbind(-3)
+        q, k = self.qk_norm(q, k)
+        tokens = tokens + self.out(grid_attention(q, k, v, self.grid).flatten(-2))
+        return tokens + self.mlp(self.mlp_norm(tokens))
+
+
+class FullAttention(SelfAttention):
+    """The letter t: every token attends to all tokens of all views."""
+
+    def __init__(self, shape: StageShape):
+        super().__init__(shape, grid=1)
+
+
+class SparseAttention(nn.Module):
+    """The letter s: convolutions within a frame, then attention within a grid place (Sec. 3.3).
+
+    Args:
+        grid: p_g.
+        conv_blocks: the two conv blocks that repair what the grid takes apart.
+        group_width: channels of one group of the convolutions at the paper's head width of 64;
+            it shrinks with the heads.
+    """
+
+    def __init__(
+        self, shape: StageShape, grid: int = 2, conv_blocks: bool = True, group_width: int = 32
+    ):
+        super().__init__()
+        group_width = max(1, group_width * shape.head_width // 64)
+        self.convs = ConvBlocks(shape.width, group_width) if conv_blocks else nn.Identity()
+        self.attention = SelfAttention(shape, grid)
+
+    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
+        return self.attention(self.convs(tokens))
+
+
+class ConvBlocks(nn.Module):
+    """x + two of [grouped Conv 3x3, BatchNorm, GELU], on every frame by itself."""
+
+    def __init__(self, width: int, group_width: int):
+        super().__init__()
+        self.blocks = nn.Sequential()
+        for _ in range(2):
+            self.blocks.append(
+                nn.Conv2d(width, width, 3, padding=1, groups=width // group_width, bias=False)
+            )
+            self.blocks.append(nn.BatchNorm2d(width))
+            self.blocks.append(nn.GELU())
+
+    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
+        maps = rearrange(tokens, "b v h w d -> (b v) d h w")
+        return tokens + rearrange(self.blocks(maps), "(b v) d h w -> b v h w d", b=len(tokens))
+
+
+class CrossAttention(nn.Module):
+    """x + o(attn(q(LN x), kv(LN context))), then x + MLP(LN x), within each frame.
+
+    Args:
+        shape: of the tokens that read.
+        context_width: of the tokens that are read.
+        inner_width: of queries, keys and values.
+    """
+
+    def __init__(self, shape: StageShape, context_width: int, inner_width: int):
+        super().__init__()
+        self.head_width = shape.head_width
+        self.norm = nn.LayerNorm(shape.width, bias=False)
+        self.context_norm = nn.LayerNorm(context_width, bias=False)
+        self.query = nn.Linear(shape.width, inner_width, bias=False)
+        self.key_value = nn.Linear(context_width, 2 * inner_width, bias=False)
+        self.qk_norm = QueryKeyNorm(shape.head_width)
+        self.out = nn.Linear(inner_width, shape.width, bias=False)
+        self.mlp_norm = nn.LayerNorm(shape.width, bias=False)
+        self.mlp = MLP(shape.width, shape.mlp_ratio)
+
+    def forward(
+        self, tokens: Float[Tensor, "B V h w d"], context: Float[Tensor, "B V h2 w2 c"]
+    ) -> Float[Tensor, "B V h w d"]:
+        q = self._heads(self.query(self.norm(tokens)))
+        k, v = map(self._heads, self.key_value(self.context_norm(context)).chunk(2, dim=-1))
+        q, k = self.qk_norm(q, k)
+        read = rearrange(F.scaled_dot_product_attention(q, k, v), "n H l p -> n l (H p)")
+        tokens = tokens + self.out(read.reshape(*tokens.shape[:-1], -1))
+        return tokens + self.mlp(self.mlp_norm(tokens))
+
+    def _heads(self, x: Tensor) -> Tensor:
+        return rearrange(x, "b v h w (H p) -> (b v) H (h w) p", p=self.head_width)

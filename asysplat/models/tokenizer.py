@@ -1,0 +1,38 @@
+"""Photographs and Plücker rays to tokens (paper, Sec. 3.2)."""
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from asysplat.scene import Views
+
+PIXEL_CHANNELS = 9
+
+
+def pixel_features(views: Views) -> Float[Tensor, "B V H W 9"]:
+    """RGB in [-1, 1], ray moment o x d and unit direction d of every pixel."""
+    origins, directions = views.cameras.rays()
+    colours = rearrange(views.images, "b v c h w -> b v h w c") * 2 - 1
+    return torch.cat((colours, torch.linalg.cross(origins, directions), directions), dim=-1)
+
+
+class Tokenizer(nn.Module):
+    """Linear embedding of p x p patches, then LayerNorm.
+
+    Args:
+        patch: p_c or p_f, in pixels.
+        width: d_c or d_f.
+    """
+
+    def __init__(self, patch: int, width: int):
+        super().__init__()
+        self.patch = patch
+        self.embed = nn.Linear(PIXEL_CHANNELS * patch**2, width, bias=False)
+        self.norm = nn.LayerNorm(width)
+
+    def forward(self, pixels: Float[Tensor, "B V H W 9"]) -> Float[Tensor, "B V h w d"]:
+        patches = rearrange(
+            pixels, "b v (h p) (w q) c -> b v h w (p q c)", p=self.patch, q=self.patch
+        )
+        return self.norm(self.embed(patches))

@@ -1,0 +1,97 @@
+"""Widths that give a share of the parameters to the geometry branch, at an unchanged total."""
+
+from collections.abc import Callable
+from itertools import combinations_with_replacement
+
+import numpy as np
+from torch import nn
+
+from asysplat.errors import InputError
+from asysplat.models.shapes import Widths
+
+SHARE_TOLERANCE = 0.015
+TOTAL_TOLERANCE = 0.01
+
+Build = Callable[[Widths, int], nn.Module]
+
+
+def solve_widths(build: Build, base: Widths, layers: int, ratio: float) -> tuple[Widths, int]:
+    """Widths and appearance layers whose model has the total of `base` and the asked share.
+
+    The number of layers changes only where the widths alone, multiples of the head width, do not
+    reach the ratio. Parameter counts are quadratic polynomials in the widths: a few models on the
+    meta device determine them, and the search is then free.
+
+    Args:
+        build: widths, appearance layers -> model with a `geometry_share()`.
+        base: the widths that set the total, together with
+        layers: N_v, the layers of an appearance stage.
+        ratio: parameters of the geometry branch over all.
+
+    Raises:
+        InputError: nothing comes within 0.015 of the ratio and 1 % of the total.
+    """
+    budget, _ = _count(build(base, layers))
+    candidates = _candidates(base)
+    terms = _quadratic_terms(candidates / base.head)
+    # Among the widths that fit, those that keep the proportions of the stages.
+    shape_error = np.log(candidates[:, :-1] / np.array(base.stages)).std(axis=1)
+    closest = (np.inf, 0.0)
+    for count in sorted(range(1, 3 * layers + 1), key=lambda n: (abs(n - layers), -n)):
+        coefficients = _fit_counts(lambda widths, n=count: build(widths, n), base)
+        total, geometry = (terms @ coefficients).T
+        share_error = np.abs(geometry / total - ratio) / SHARE_TOLERANCE
+        error = np.maximum(share_error, np.abs(total / budget - 1) / TOTAL_TOLERANCE)
+        best = int(np.argmin(np.where(error < 1, error / 2 + shape_error, 1e3 + error)))
+        if error[best] < 1:
+            *stages, fine = (int(width) for width in candidates[best])
+            return Widths(tuple(stages), fine, base.head), count
+        closest = min(closest, (error[best], geometry[best] / total[best]))
+    raise InputError(
+        f"geometry_ratio={ratio} cannot be met within {SHARE_TOLERANCE} at this total: "
+        f"ask for {closest[1]:.3f}, the closest share, or for another width."
+    )
+
+
+def _candidates(base: Widths) -> np.ndarray:
+    """[n, stages + 1] multiples of the head width around the base."""
+    limits = [int(1.8 * width / base.head) + 1 for width in base.stages]
+    stages = np.stack(np.meshgrid(*(np.arange(1, m + 1) for m in limits), indexing="ij"), -1)
+    stages = stages.reshape(-1, len(base.stages))
+    stages = stages[(np.diff(stages, axis=1) >= 0).all(axis=1)]
+    fine = np.arange(1, 4 * base.fine // base.head + 1)
+    rows = np.repeat(stages, len(fine), axis=0)
+    return np.column_stack((rows, np.tile(fine, len(stages)))) * base.head
+
+
+def _quadratic_terms(widths: np.ndarray) -> np.ndarray:
+    """All products of at most two of the columns, and 1."""
+    padded = np.column_stack((np.ones(len(widths)), widths))
+    pairs = combinations_with_replacement(range(padded.shape[1]), 2)
+    return np.stack([padded[:, i] * padded[:, j] for i, j in pairs], axis=1)
+
+
+def _fit_counts(build: Callable[[Widths], nn.Module], base: Widths) -> np.ndarray:
+    """Coefficients [terms, 2] of the total and of the geometry branch."""
+    samples = _samples(len(base.stages) + 1)
+    counts = []
+    for row in samples:
+        *stages, fine = (int(value) * base.head for value in row)
+        counts.append(_count(build(Widths(tuple(stages), fine, base.head))))
+    return np.linalg.solve(_quadratic_terms(samples), np.array(counts, dtype=np.float64))
+
+
+def _samples(columns: int) -> np.ndarray:
+    """As many points as a quadratic has coefficients, in general position: the base, one step and
+    two steps along each axis, and one step along each pair. The steps of different axes differ so
+    that no two stages are ever equally wide, where the projection between them would vanish."""
+    base = 2.0 + 4 * np.arange(columns)
+    axes = np.eye(columns)
+    single = [base + step * axis for axis in axes for step in (1, 2)]
+    pairs = [base + axes[i] + axes[j] for i in range(columns) for j in range(i + 1, columns)]
+    return np.stack([base, *single, *pairs])
+
+
+def _count(model: nn.Module) -> tuple[int, float]:
+    total = sum(p.numel() for p in model.parameters())
+    return total, total * model.geometry_share()

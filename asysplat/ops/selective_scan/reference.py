@@ -1,0 +1,23 @@
+"""The selective scan as its formula reads, one token after the other."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def selective_scan_reference(
+    x: Float[Tensor, "B L D"],
+    dt: Float[Tensor, "B L D"],
+    A: Float[Tensor, "D N"],
+    B: Float[Tensor, "B L N"],
+    C: Float[Tensor, "B L N"],
+    D: Float[Tensor, "D"],
+) -> Float[Tensor, "B L D"]:
+    """See `asysplat.ops.selective_scan`."""
+    state = x.new_zeros(x.shape[0], *A.shape)
+    outputs = []
+    for t in range(x.shape[1]):
+        decay = torch.exp(dt[:, t, :, None] * A)
+        state = decay * state + (dt[:, t] * x[:, t])[..., None] * B[:, t, None, :]
+        outputs.append(torch.einsum("bdn,bn->bd", state, C[:, t]) + D * x[:, t])
+    return torch.stack(outputs, dim=1)

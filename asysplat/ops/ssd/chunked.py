@@ -1,0 +1,59 @@
+"""SSD in chunks: matrix products within a chunk, a short recurrence between chunks.
+
+Dao and Gu 2024, Section 6. Decays stay in the log domain and every exponent is <= 0.
+"""
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.ops.recurrence import linear_recurrence
+
+CHUNK = 64
+
+
+def ssd_chunked(
+    x: Float[Tensor, "B L H P"],
+    dt: Float[Tensor, "B L H"],
+    A: Float[Tensor, "H"],
+    B: Float[Tensor, "B L N"],
+    C: Float[Tensor, "B L N"],
+    D: Float[Tensor, "H"],
+) -> Float[Tensor, "B L H P"]:
+    """See `asysplat.ops.ssd`."""
+    length = x.shape[1]
+    skip = D[:, None] * x
+    # Padded tokens have dt = 0: they neither decay the state nor add to it.
+    x, dt, B, C = (_into_chunks(tensor) for tensor in (x, dt, B, C))
+    log_decay = torch.cumsum(dt * A, dim=2)  # [b c q h], since the chunk's start
+    inputs = x * dt[..., None]
+
+    scores = (C @ B.mT)[..., None] * _decay_between(log_decay)  # [b c t s h]
+    y = torch.einsum("bctsh,bcshp->bcthp", scores, inputs)
+
+    if x.shape[1] > 1:
+        to_end = torch.exp(log_decay[:, :, -1:] - log_decay)
+        added = torch.einsum("bcsn,bcsh,bcshp->cbhpn", B, to_end, inputs)
+        decay = rearrange(torch.exp(log_decay[:, :, -1]), "b c h -> c b h 1 1")
+        states = linear_recurrence(decay.expand_as(added), added)
+        before = F.pad(states[:-1], (0, 0, 0, 0, 0, 0, 0, 0, 1, 0))
+        carried = torch.einsum("bctn,cbhpn->bcthp", C, before)
+        y = y + carried * torch.exp(log_decay)[..., None]
+    return rearrange(y, "b c q h p -> b (c q) h p")[:, :length] + skip
+
+
+def _into_chunks(tensor: Tensor) -> Tensor:
+    """[b L ...] -> [b c CHUNK ...], padded with zeros at the end."""
+    missing = -tensor.shape[1] % CHUNK
+    if missing:
+        tensor = F.pad(tensor, (0, 0) * (tensor.ndim - 2) + (0, missing))
+    return tensor.unflatten(1, (-1, CHUNK))
+
+
+def _decay_between(log_decay: Float[Tensor, "b c q h"]) -> Float[Tensor, "b c q q h"]:
+    """exp of the decay from token s to token t >= s; 0 where s is later than t."""
+    difference = log_decay[:, :, :, None] - log_decay[:, :, None]
+    later = torch.ones(difference.shape[2:4], dtype=torch.bool, device=log_decay.device).triu(1)
+    return torch.exp(difference.masked_fill(later[..., None], -torch.inf))

@@ -1,0 +1,25 @@
+"""The SSD recurrence as its formula reads, one token after the other."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def ssd_reference(
+    x: Float[Tensor, "B L H P"],
+    dt: Float[Tensor, "B L H"],
+    A: Float[Tensor, "H"],
+    B: Float[Tensor, "B L N"],
+    C: Float[Tensor, "B L N"],
+    D: Float[Tensor, "H"],
+) -> Float[Tensor, "B L H P"]:
+    """See `asysplat.ops.ssd`."""
+    batch, length, heads, head_width = x.shape
+    state = x.new_zeros(batch, heads, head_width, B.shape[-1])
+    outputs = []
+    for t in range(length):
+        decay = torch.exp(dt[:, t] * A)[..., None, None]
+        new = torch.einsum("bh,bhp,bn->bhpn", dt[:, t], x[:, t], B[:, t])
+        state = decay * state + new
+        outputs.append(torch.einsum("bhpn,bn->bhp", state, C[:, t]) + D[:, None] * x[:, t])
+    return torch.stack(outputs, dim=1)

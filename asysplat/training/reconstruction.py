@@ -1,0 +1,99 @@
+"""The LightningModule: it wires a network, the renderer and the losses, and nothing else."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor, nn
+
+from asysplat.evaluation.metrics import psnr
+from asysplat.rendering import Rendering, render
+from asysplat.scene import Gaussians
+from asysplat.training.losses import ReconstructionLoss
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a network made of a batch: handed to the callbacks, which measure and draw it."""
+
+    gaussians: Gaussians
+    rendering: Rendering
+
+
+class Reconstruction(lightning.LightningModule):
+    """Predict Gaussians from the input views, render the targets, compare.
+
+    Args:
+        net: views -> Gaussians.
+        loss: of a rendering against the target views.
+        learning_rate: its peak; linear warm-up, then a cosine to zero at `total_steps`.
+        weight_decay: of matrices; vectors (norms, biases, A, dt, D) have none.
+        betas: of AdamW.
+        warmup_steps, total_steps: in optimizer steps.
+        background: RGB behind the Gaussians.
+    """
+
+    def __init__(
+        self,
+        net: nn.Module,
+        loss: ReconstructionLoss,
+        learning_rate: float,
+        weight_decay: float,
+        betas: tuple[float, float],
+        warmup_steps: int,
+        total_steps: int,
+        background: tuple[float, float, float],
+    ):
+        super().__init__()
+        self.net, self.loss = net, loss
+        self.learning_rate, self.weight_decay, self.betas = learning_rate, weight_decay, betas
+        self.warmup_steps, self.total_steps = warmup_steps, total_steps
+        self.register_buffer("background", torch.tensor(background), persistent=False)
+
+    def reconstruct(self, batch: dict[str, Any], depth: bool) -> Outcome:
+        """Gaussians of the inputs and their rendering at the target cameras."""
+        gaussians = self.net(batch["inputs"])
+        return Outcome(
+            gaussians, render(gaussians, batch["targets"].cameras, self.background, depth=depth)
+        )
+
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
+        rendering = self.reconstruct(batch, depth=self.loss.needs_depth).rendering
+        terms = self.loss(rendering, batch["targets"])
+        size = len(batch["scene"])
+        self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
+        quality = psnr(rendering.image.detach(), batch["targets"].images).mean()
+        self.log("train/psnr", quality, prog_bar=True, batch_size=size)
+        return terms["loss"]
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> Outcome:
+        return self.reconstruct(batch, depth=True)
+
+    def test_step(self, batch: dict[str, Any], batch_idx: int) -> Outcome:
+        return self.reconstruct(batch, depth=True)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        matrices = [p for p in self.parameters() if p.ndim >= 2]
+        vectors = [p for p in self.parameters() if p.ndim < 2]
+        optimizer = torch.optim.AdamW(
+            [
+                {"params": matrices, "weight_decay": self.weight_decay},
+                {"params": vectors, "weight_decay": 0.0},
+            ],
+            lr=self.learning_rate,
+            betas=tuple(self.betas),
+        )
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self.learning_rate_factor)
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": schedule, "interval": "step"},
+        }
+
+    def learning_rate_factor(self, step: int) -> float:
+        """Linear warm-up to 1, then half a cosine to 0."""
+        if step < self.warmup_steps:
+            return (step + 1) / self.warmup_steps
+        progress = (step - self.warmup_steps) / max(1, self.total_steps - self.warmup_steps)
+        return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))

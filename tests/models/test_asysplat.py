@@ -1,0 +1,189 @@
+"""The whole network: the paper's parameter counts, what it reads, and its components."""
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from asysplat.errors import InputError
+from asysplat.models.layer_mix import parse_layer_mix
+from asysplat.scene import Cameras, Views
+
+
+def network(*overrides, repository, device="cpu"):
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        config = compose("train", list(overrides))
+    with torch.device(device):
+        return instantiate(config.model)
+
+
+@pytest.fixture
+def build(repository):
+    return lambda *overrides, device="cpu": network(
+        *overrides, repository=repository, device=device
+    )
+
+
+TINY = ["width=0.125", "model.blocks.m.state_size=8", "model.layers=1m1s"]
+
+
+def make_views(batch=(2,), views=3, height=32, width=64):
+    intrinsics = torch.tensor([[50.0, 0, width / 2], [0, 50.0, height / 2], [0, 0, 1]])
+    pose = torch.eye(4).expand(*batch, views, 4, 4).clone()
+    pose[..., :3, 3] = 0.3 * torch.randn(*batch, views, 3)
+    cameras = Cameras(intrinsics.expand(*batch, views, 3, 3), pose, height, width)
+    return Views(cameras, torch.rand(*batch, views, 3, height, width))
+
+
+# Architecture rows of the paper and their parameters in this layout, in units of 1e6.
+PAPER_ROWS = {
+    (): 98.11,
+    ("model.layers=4m4t",): 94.40,
+    ("model.blocks.s.conv_blocks=false",): 94.40,
+    ("model.layers=7m1s",): 86.84,
+    ("model.layers=7m1t",): 85.91,
+    ("model.layers=8t",): 105.72,
+    ("model/source=fine",): 98.11,
+    ("model/source=coarse",): 96.05,
+    ("model/links=only_fine_to_coarse",): 92.96,
+    ("model/links=only_coarse_to_fine",): 90.96,
+    ("model/appearance=none",): 94.10,
+}
+
+
+@pytest.mark.parametrize("overrides", PAPER_ROWS, ids=lambda row: " ".join(row) or "4m4s")
+def test_parameters_at_full_width(build, overrides):
+    net = build("scale=paper", "width=1", *overrides, device="meta")
+    millions = sum(p.numel() for p in net.parameters()) / 1e6
+    assert round(millions, 2) == PAPER_ROWS[overrides]
+
+
+def test_geometry_share_of_the_paper(build):
+    assert abs(build("scale=paper", device="meta").geometry_share() - 0.905) < 0.001
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.7, 0.9])
+@pytest.mark.parametrize("width", [0.25, 1.0])
+def test_geometry_ratio(build, ratio, width):
+    base = build(f"width={width}", device="meta")
+    net = build(f"width={width}", f"geometry_ratio={ratio}", device="meta")
+    total, expected = (sum(p.numel() for p in n.parameters()) for n in (net, base))
+    assert abs(net.geometry_share() - ratio) < 0.02
+    assert abs(total / expected - 1) < 0.01
+
+
+def test_geometry_ratio_that_cannot_be_met(build):
+    with pytest.raises(InputError, match=r"geometry_ratio=0\.999"):
+        build("geometry_ratio=0.999", device="meta")
+
+
+def test_one_gaussian_per_output_pixel_at_its_ray(build):
+    views = make_views()
+    net = build(*TINY)
+    gaussians = net(views).validate()
+    assert gaussians.means.shape == (2, 3 * 16 * 32, 3)
+    camera = views.cameras.resized(16, 32)
+    means = gaussians.means.view(2, 3, 16, 32, 3)
+    local = torch.einsum(
+        "bvij,bvhwi->bvhwj",
+        views.cameras.cam_to_world[..., :3, :3],
+        means - camera.centers[..., None, None, :],
+    )
+    pixels = torch.einsum("bvij,bvhwj->bvhwi", camera.intrinsics, local / local[..., 2:])
+    y, x = torch.meshgrid(torch.arange(16) + 0.5, torch.arange(32) + 0.5, indexing="ij")
+    torch.testing.assert_close(pixels[..., 0], x.expand(2, 3, 16, 32), atol=1e-3, rtol=0)
+    torch.testing.assert_close(pixels[..., 1], y.expand(2, 3, 16, 32), atol=1e-3, rtol=0)
+
+
+def test_untrained_colours_are_the_photographs(build):
+    views = make_views()
+    dc = build(*TINY)(views).sh[..., 0, :] * 0.28209479 + 0.5
+    photographs = torch.nn.functional.avg_pool2d(views.images.flatten(0, 1), 2)
+    expected = photographs.permute(0, 2, 3, 1).reshape(2, -1, 3)
+    assert (dc - expected).abs().mean() < 0.02
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (2, 2)])
+def test_leading_batch_dimensions(build, batch):
+    net = build(*TINY).eval()
+    views = make_views(batch=batch)
+    gaussians = net(views)
+    assert gaussians.opacities.shape[:-1] == batch
+    first = views.map(lambda tensor: tensor[(0,) * len(batch)])
+    expected = net(first).means
+    torch.testing.assert_close(gaussians.means[(0,) * len(batch)], expected)
+
+
+COMPONENTS = [
+    "model/source=fine",
+    "model/source=coarse",
+    "model/links=only_fine_to_coarse",
+    "model/links=only_coarse_to_fine",
+    "model/links=none",
+    "model/appearance=none",
+    "model.blocks.s.conv_blocks=false",
+    "model.layers=1m1t",
+    "model.layers=2t",
+]
+
+
+@pytest.mark.parametrize("override", COMPONENTS)
+def test_every_component_trains(build, override):
+    net = build(*TINY, override)
+    gaussians = net(make_views())
+    (gaussians.means.mean() + gaussians.sh.square().mean()).backward()
+    grads = [p.grad for p in net.head.parameters()]
+    assert all(g.isfinite().all() and g.abs().sum() > 0 for g in grads)
+
+
+def test_views_exchange_only_through_the_geometry_branch(build):
+    """With the coarse tokens out of play, what one view predicts ignores the others."""
+    views = make_views(batch=())
+    changed = views.images.clone()
+    changed[1] = torch.rand_like(changed[1])
+    other = Views(views.cameras, changed)
+
+    def moved(*overrides):
+        torch.manual_seed(0)
+        net = build(*TINY, *overrides).eval()
+        first_view = 16 * 32
+        return (net(views).opacities - net(other).opacities)[:first_view].abs().max()
+
+    assert moved() > 0
+    assert moved("model/source=fine", "model/links=only_fine_to_coarse") == 0
+
+
+def test_bfloat16_autocast_keeps_gaussians_in_fp32(build):
+    views = make_views()
+    net = build(*TINY).eval()
+    with torch.autocast("cpu", torch.bfloat16):
+        gaussians = net(views)
+    assert gaussians.means.dtype == torch.float32
+    torch.testing.assert_close(gaussians.means, net(views).means, atol=0.1, rtol=0.05)
+
+
+def test_double_precision_agrees(build):
+    views = make_views()
+    net = build(*TINY).eval()
+    single = net(views)
+    double = net.double()(views.to(torch.float64))
+    assert double.means.dtype == torch.float64
+    torch.testing.assert_close(single.means, double.means.float(), atol=1e-4, rtol=1e-4)
+
+
+def test_resolution_that_the_patches_do_not_take(build):
+    with pytest.raises(InputError, match="set 64x64"):
+        build(*TINY)(make_views(height=48, width=40))
+
+
+@pytest.mark.parametrize(
+    ("word", "layers"), [("4m4s", "mmmmssss"), ("7m+1t", "mmmmmmmt"), ("1s2m", "smm")]
+)
+def test_layer_mix(word, layers):
+    assert "".join(parse_layer_mix(word, {"m", "s", "t"})) == layers
+
+
+@pytest.mark.parametrize("word", ["", "4x4s", "m4", "0m", "4m-4s"])
+def test_layer_mix_that_cannot_be_read(word):
+    with pytest.raises(InputError, match="such as 4m4s"):
+        parse_layer_mix(word, {"m", "s", "t"})

@@ -1,0 +1,101 @@
+"""Both scans: every form against the sequential reference in float64, and its gradients."""
+
+import pytest
+import torch
+
+from asysplat.errors import InputError
+from asysplat.ops import selective_scan, ssd
+
+
+def ssd_arguments(batch=2, length=7, heads=3, head_width=4, state=5, dtype=torch.float64):
+    return (
+        torch.randn(batch, length, heads, head_width, dtype=dtype),
+        torch.rand(batch, length, heads, dtype=dtype),
+        -torch.rand(heads, dtype=dtype) - 0.1,
+        torch.randn(batch, length, state, dtype=dtype),
+        torch.randn(batch, length, state, dtype=dtype),
+        torch.randn(heads, dtype=dtype),
+    )
+
+
+def selective_arguments(batch=2, length=7, channels=3, state=5, dtype=torch.float64):
+    return (
+        torch.randn(batch, length, channels, dtype=dtype),
+        torch.rand(batch, length, channels, dtype=dtype),
+        -torch.rand(channels, state, dtype=dtype) - 0.1,
+        torch.randn(batch, length, state, dtype=dtype),
+        torch.randn(batch, length, state, dtype=dtype),
+        torch.randn(channels, dtype=dtype),
+    )
+
+
+SCANS = {
+    "ssd": (ssd, ssd_arguments, "chunked"),
+    "selective_scan": (selective_scan, selective_arguments, "recurrent"),
+}
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_one_token_is_the_formula(name):
+    scan, make, _ = SCANS[name]
+    x, dt, A, B, C, D = make(length=1)
+    gain = (B * C).sum(-1)
+    expand = (..., None) if name == "ssd" else (...,)
+    weight = (dt * gain[..., None])[expand] + (D[:, None] if name == "ssd" else D)
+    torch.testing.assert_close(scan(x, dt, A, B, C, D, backend="reference"), weight * x)
+
+
+@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("length", [1, 17, 63, 64, 65, 200])
+@pytest.mark.parametrize("reverse", [False, True])
+def test_fast_form_equals_reference(name, length, reverse):
+    scan, make, fast = SCANS[name]
+    arguments = make(length=length)
+    expected = scan(*arguments, backend="reference", reverse=reverse)
+    torch.testing.assert_close(scan(*arguments, backend=fast, reverse=reverse), expected)
+    single = scan(*(a.float() for a in arguments), backend=fast, reverse=reverse)
+    assert (single - expected).norm() / expected.norm() < 2e-6
+
+
+@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("backend", ["reference", "fast"])
+def test_gradcheck(name, backend):
+    scan, make, fast = SCANS[name]
+    length = 5 if backend == "reference" else 66
+    arguments = make(batch=1, length=length, state=2)
+    for tensor in arguments:
+        tensor.requires_grad_()
+    backend = fast if backend == "fast" else backend
+    assert torch.autograd.gradcheck(
+        lambda *a: scan(*a, backend=backend, reverse=True), arguments, fast_mode=True
+    )
+
+
+@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("step", [1e-8, 1e3])
+def test_extreme_steps_stay_finite(name, step):
+    scan, make, _ = SCANS[name]
+    x, dt, A, B, C, D = make(length=130, dtype=torch.float32)
+    arguments = [x, torch.full_like(dt, step), A * 1e4, B, C, D]
+    for tensor in arguments:
+        tensor.requires_grad_()
+    y = scan(*arguments)
+    y.sum().backward()
+    assert y.isfinite().all()
+    assert all(tensor.grad.isfinite().all() for tensor in arguments)
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_half_precision_is_computed_in_fp32(name):
+    scan, make, _ = SCANS[name]
+    arguments = [a.bfloat16() for a in make(length=100)]
+    y = scan(*arguments)
+    assert y.dtype == torch.bfloat16
+    torch.testing.assert_close(y, scan(*(a.float() for a in arguments)).bfloat16())
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_unknown_backend(name):
+    scan, make, _ = SCANS[name]
+    with pytest.raises(InputError, match="backend='fast'"):
+        scan(*make(), backend="fast")
