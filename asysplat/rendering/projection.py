@@ -104,6 +104,7 @@ def _visible(gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
         & (opacities >= INRIA.alpha_min)
         & (first <= last).all(-1)
         & footprint.whitening.isfinite().all(-1)
+        & (footprint.whitening[..., 0] > 0)
         & gaussians.sh.isfinite().flatten(2).all(-1)[:, None]
     ).flatten(0, 1)
     depths = footprint.depths.flatten(0, 1).where(visible, torch.inf)
@@ -128,7 +129,7 @@ def _footprint(
     rotation = cam_to_world[..., :3, :3]
     # Relative to the camera first: exact for scenes far from the origin.
     offsets = means - cam_to_world[..., :3, 3]
-    x, y, z = (offsets[..., None] * rotation).sum(-2).unbind(-1)
+    x, y, z = (offsets[..., None, :] @ rotation).squeeze(-2).unbind(-1)
     tangents = torch.stack((x / z, y / z), -1)
     focal = torch.stack((intrinsics[..., 0, 0], intrinsics[..., 1, 1]), -1)
     principal = intrinsics[..., :2, 2]
@@ -139,13 +140,11 @@ def _footprint(
         tangents, (-principal - margin) / focal, (size - principal + margin) / focal
     )
     # Rows of J R^T: how the pixel moves with the mean, in world axes.
-    jacobian = (focal / z[..., None])[..., None, :] * (
-        rotation[..., :2] - rotation[..., 2:] * clamped[..., None, :]
+    jacobian = (focal / z[..., None])[..., None] * (
+        rotation.mT[..., :2, :] - clamped[..., None] * rotation.mT[..., 2:, :]
     )
-    axes = _rotations(quats) * scales[..., None, :]
-    row_x = (jacobian[..., 0, None] * axes).sum(-2)
-    row_y = (jacobian[..., 1, None] * axes).sum(-2)
-    whitening, deviations = _whiten(row_x, row_y)
+    rows = jacobian @ _rotations(quats) * scales[..., None, :]
+    whitening, deviations = _whiten(*rows.unbind(-2))
     return _Footprint(offsets, z, tangents * focal + principal, whitening, deviations)
 
 

@@ -27,10 +27,9 @@ class TileLists:
     splats: Int[Tensor, "I"]
     lengths: Int[Tensor, "T"]
 
-    def origins(self) -> Int[Tensor, "T 2"]:
-        """Pixel (x, y) at each tile's upper left corner."""
-        tile = torch.arange(len(self.lengths), device=self.lengths.device)
-        column, row = tile % self.columns, tile // self.columns % self.rows
+    def origins(self, tiles: Int[Tensor, "t"]) -> Int[Tensor, "t 2"]:
+        """Pixel (x, y) at the upper left corner of the given tiles."""
+        column, row = tiles % self.columns, tiles // self.columns % self.rows
         return torch.stack((column, row), -1) * self.size
 
     def untile(
@@ -52,10 +51,10 @@ def assign_tiles(splats: Splats, images: int, height: int, width: int, size: int
     counts = spans.prod(-1)
     splat = torch.repeat_interleave(counts)
     step = torch.arange(len(splat), device=splat.device) - (counts.cumsum(0) - counts)[splat]
-    # Splats come in depth order within their image, and a stable sort by tile keeps it.
     corner = (splats.images * rows + first[:, 1]) * columns + first[:, 0]
     span_x = spans[splat, 0]
     tile = corner[splat] + step // span_x * columns + step % span_x
+    # Splats come in depth order within their image, and a stable sort by tile keeps it.
     order = torch.argsort(tile, stable=True)
     lengths = torch.bincount(tile, minlength=images * rows * columns)
     return TileLists(size, images, rows, columns, splat[order], lengths)

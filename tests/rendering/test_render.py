@@ -1,12 +1,14 @@
 """The reference renderer against a per-pixel loop, analytic values and finite differences."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from asysplat.errors import InputError
 from asysplat.rendering import render
+from asysplat.rendering.rasterize import reference
 from asysplat.scene import Cameras, Gaussians
 
 INPUTS = ("means", "quats", "scales", "opacities", "sh", "cam_to_world", "intrinsics", "background")
@@ -258,6 +260,67 @@ def test_half_precision_is_computed_in_float32(dtype):
     )
     out.image.sum().backward()
     assert gaussians.means.grad.dtype == dtype and gaussians.means.grad.isfinite().all()
+
+
+def test_any_tiles_and_groups_give_the_same_image(monkeypatch):
+    gaussians, cameras = make_scene(count=60, views=2, height=19)
+
+    def run():
+        means = gaussians.means.clone().requires_grad_()
+        out = render(replace(gaussians, means=means), cameras)
+        return out.image, *torch.autograd.grad(out.image.square().sum(), means)
+
+    before = run()
+    monkeypatch.setattr(reference, "GROUP_ELEMENTS", 1)
+    torch.testing.assert_close(run(), before)
+    monkeypatch.setattr(reference, "TILE_SIZE", 7)
+    torch.testing.assert_close(run(), before)
+
+
+def test_equal_depths_are_drawn_in_the_order_of_their_index():
+    gaussians, cameras = make_scene(count=2)
+    gaussians = gaussians.map(lambda t: t[:1].repeat(2, *(1,) * (t.ndim - 1)))
+    gaussians.sh[1] = 1
+    alone = render(gaussians.map(lambda t: t[:1]), cameras)
+    both = render(gaussians, cameras)
+    behind = render(gaussians.map(lambda t: t[1:]), cameras)
+    expected = alone.image + (1 - alone.alpha) * behind.image
+    torch.testing.assert_close(both.image, expected)
+
+
+def test_a_needle_has_the_alpha_of_float64():
+    _, cameras = make_scene(count=1, views=1, height=32, width=32)
+    needle = Gaussians(
+        means=torch.tensor([[0.01, 0.02, 3.0]]),
+        quats=torch.tensor([[math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]]),
+        scales=torch.tensor([[1e3, 1e-4, 1e-4]]),
+        opacities=torch.tensor([0.8]),
+        sh=torch.zeros(1, 1, 3),
+    )
+    cameras = Cameras(cameras.intrinsics, torch.eye(4, dtype=torch.float64)[None], 32, 32)
+    exact = render(needle.to(torch.float64), cameras).alpha
+    assert (exact > 0.5).sum() > 30  # it crosses the image
+    alpha = render(needle, cameras.to(torch.float32)).alpha
+    torch.testing.assert_close(alpha.double(), exact, rtol=0, atol=2e-3)
+
+
+def test_a_huge_gaussian_covers_the_screen():
+    gaussians, cameras = make_scene(count=1, dtype=torch.float32)
+    gaussians.scales.fill_(1e10)
+    gaussians.map(lambda t: t.requires_grad_())
+    out = render(gaussians, cameras)
+    torch.testing.assert_close(out.alpha, gaussians.opacities.detach().expand(1, 13, 17))
+    out.image.sum().backward()
+    assert all(getattr(gaussians, name).grad.isfinite().all() for name in INPUTS[:5])
+
+
+def test_the_unit_of_length_does_not_matter():
+    gaussians, cameras = make_scene(dtype=torch.float32)
+    before = render(gaussians, cameras)
+    cameras.cam_to_world[:, :3, 3] *= 8
+    after = render(gaussians.scale_by(8.0), cameras)
+    torch.testing.assert_close(after.image, before.image, rtol=0, atol=1e-6)
+    torch.testing.assert_close(after.depth, 8 * before.depth)
 
 
 def test_two_runs_give_the_same_bits():

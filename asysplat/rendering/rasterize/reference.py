@@ -6,7 +6,6 @@ the inputs are kept.
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -18,7 +17,7 @@ from asysplat.rendering.projection import Splats
 from asysplat.rendering.tiles import TileLists
 
 TILE_SIZE = 4
-GROUP_ELEMENTS = 1 << 16  # (splat, pixel) pairs of one group, for temporaries of 256 KiB
+GROUP_ELEMENTS = 1 << 17  # (splat, pixel) pairs of one group: temporaries of 512 KiB
 
 
 def rasterize(
@@ -46,9 +45,9 @@ class _Rasterize(torch.autograd.Function):
         ctx.lists = lists
         pixels = lists.size**2
         out = packed.new_zeros(len(lists.lengths), packed.shape[1] - 6, pixels)
-        for group in _groups(lists):
-            block = _Block(packed[group.splats], group.origins, lists.size)
-            out[group.tiles] = block.values.mT @ block.weights()
+        for tiles, splats in _groups(lists, len(packed) - 1):
+            block = _Block(_rows(packed, splats), lists.origins(tiles), lists.size)
+            out.index_copy_(0, tiles, block.values.mT @ block.weights())
         return out
 
     @staticmethod
@@ -56,27 +55,22 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, grad_out: Tensor) -> tuple[Tensor, None]:
         (packed,) = ctx.saved_tensors
         lists = ctx.lists
-        # One slot for each intersection, then a sum in a fixed order: the same bits every time.
-        slots = packed.new_empty(len(lists.splats) + 1, packed.shape[1])
-        for group in _groups(lists):
-            block = _Block(packed[group.splats], group.origins, lists.size)
-            slots[group.slots] = block.backward(grad_out[group.tiles])
-        return torch.zeros_like(packed).index_add_(0, lists.splats, slots[:-1]), None
+        grad = torch.zeros_like(packed)
+        for tiles, splats in _groups(lists, len(packed) - 1):
+            block = _Block(_rows(packed, splats), lists.origins(tiles), lists.size)
+            rows = block.backward(grad_out.index_select(0, tiles))
+            # On a CPU this sums in a fixed order: the same bits every time.
+            grad.index_add_(0, splats.flatten(), rows.flatten(0, 1))
+        return grad, None
 
 
-class _Group(NamedTuple):
-    tiles: Tensor  # [t]
-    origins: Tensor  # [t, 2]
-    slots: Tensor  # [t, K] intersection, or the number of intersections where padded
-    splats: Tensor  # [t, K] splat, or the number of splats where padded
+def _groups(lists: TileLists, padding: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Tiles [t] and their splats [t, K], in groups of about GROUP_ELEMENTS (splat, pixel) pairs.
 
-
-def _groups(lists: TileLists) -> Iterator[_Group]:
-    """All tiles that have splats, longest list first, in groups of about GROUP_ELEMENTS pairs."""
-    origins = lists.origins()
+    Covers all tiles that have splats, longest list first; shorter ones end in `padding`.
+    """
+    padded = torch.nn.functional.pad(lists.splats, (0, 1), value=padding)
     starts = lists.lengths.cumsum(0) - lists.lengths
-    count = len(lists.splats)
-    padded = torch.nn.functional.pad(lists.splats, (0, 1), value=-1)
     lengths, order = torch.sort(lists.lengths, descending=True, stable=True)
     lengths = lengths.tolist()
     begin, end = 0, len(lengths) - lengths.count(0)
@@ -85,10 +79,19 @@ def _groups(lists: TileLists) -> Iterator[_Group]:
         size = max(1, GROUP_ELEMENTS // (longest * lists.size**2))
         tiles = order[begin : min(begin + size, end)]
         rank = torch.arange(longest, device=tiles.device)
-        inside = rank < lists.lengths[tiles, None]
-        slots = torch.where(inside, starts[tiles, None] + rank, count)
-        yield _Group(tiles, origins[tiles], slots, padded[slots])
+        slots = torch.where(rank < lists.lengths[tiles, None], starts[tiles, None] + rank, -1)
+        yield tiles, padded[slots]
         begin += size
+
+
+def _rows(packed: Tensor, index: Tensor) -> Tensor:
+    return packed.index_select(0, index.flatten()).unflatten(0, index.shape)
+
+
+def _keep_at_least(values: Tensor, gate: Tensor, limit: float) -> None:
+    """Set values to 0 where gate < limit; one vectorised pass, several times faster than where."""
+    below = torch.nextafter(gate.new_tensor(limit), gate.new_zeros(())).item()
+    torch.ops.aten.threshold_backward.grad_input(values, gate, below, grad_input=values)
 
 
 class _Block:
@@ -107,11 +110,12 @@ class _Block:
         self.u = torch.stack((self.a * self.dx + self.b * self.dy, self.a, self.b), -1) @ self.basis
         self.v = torch.stack((self.c * self.dy, self.c), -1) @ self.basis[::2]
         exponent = (self.u * self.u).addcmul_(self.v, self.v).mul_(-0.5)
-        alpha = exponent.exp_().mul_(self.opacity[..., None]).clamp_max_(INRIA.alpha_max)
-        self.alpha = alpha.mul_(alpha >= INRIA.alpha_min)
-        self.transmittance = torch.cumprod(1 - alpha, 1)  # behind each splat
+        self.alpha = exponent.exp_().mul_(self.opacity[..., None]).clamp_max_(INRIA.alpha_max)
+        _keep_at_least(self.alpha, self.alpha, INRIA.alpha_min)
+        self.passed = 1 - self.alpha
+        self.transmittance = self.passed.cumprod(1)  # behind each splat
         # It never grows, so dropping below the limit drops everything behind as well.
-        self.alpha.mul_(self.transmittance >= INRIA.transmittance_min)
+        _keep_at_least(self.alpha, self.transmittance, INRIA.transmittance_min)
 
     def weights(self) -> Tensor:
         """alpha times the transmittance in front of each splat."""
@@ -126,10 +130,11 @@ class _Block:
         grad_values = weights @ grad_out.mT
         behind = share.sum(1, keepdim=True) - share.cumsum(1)
         # alpha dL/dalpha; 0 where alpha is clamped.
-        grad = share.addcmul_(behind, self.alpha / (1 - self.alpha), value=-1)
-        grad.mul_(self.alpha < INRIA.alpha_max)
-        u0, a, b = ((-grad * self.u) @ self.basis.T).unbind(-1)
-        v0, c = ((-grad * self.v) @ self.basis[::2].T).unbind(-1)
+        grad = share.addcmul_(behind, self.alpha / self.passed, value=-1)
+        if bool((self.opacity >= INRIA.alpha_max).any()):
+            grad.mul_(self.alpha < INRIA.alpha_max)
+        u0, a, b = -(self.u.mul_(grad) @ self.basis.T).movedim(-1, 0)
+        v0, c = -(self.v.mul_(grad) @ self.basis[::2].T).movedim(-1, 0)
         grad_opacity = grad.sum(-1) / self.opacity.clamp_min(INRIA.alpha_min)
         grads = (
             -self.a * u0,
