@@ -1,0 +1,183 @@
+"""Rays against boxes, spheres, a room's walls, a terrain and the sky dome.
+
+Points and directions are component-major, [3, R], so that every operation runs over long rows.
+Directions need no unit length: a hit at t lies at origin + t * direction. A miss is infinity.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+MARCH_STEPS = 24
+REFINE_STEPS = 8
+TINY = 1e-20  # keeps rays along a face from dividing 0 by 0
+NEAREST = 0.1  # no hit is nearer than this: cameras keep their distance
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Solid boxes; the rows of `axes` are a box's own axes in the world."""
+
+    centers: Float[Tensor, "B 3"]
+    halves: Float[Tensor, "B 3"]
+    axes: Float[Tensor, "B 3 3"]
+
+    def _local(self, vectors: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
+        axes_first = self.axes.transpose(0, 1).reshape(-1, 3)
+        return (axes_first @ vectors).view(3, -1, vectors.shape[1])
+
+    def _local_points(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
+        centers = torch.einsum("bij,bj->ib", self.axes, self.centers)
+        return self._local(points) - centers[..., None]
+
+    def hit(
+        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
+    ) -> Float[Tensor, "B R"]:
+        """Where each ray enters each box (slab test; Kay and Kajiya, 1986)."""
+        inverse = 1 / (self._local(directions) + TINY)
+        middle = -self._local_points(origins) * inverse
+        reach = self.halves.T[..., None] * inverse.abs()
+        enter, leave = (middle - reach).amax(0), (middle + reach).amin(0)
+        return torch.where((enter <= leave) & (enter > 0), enter, torch.inf)
+
+    def facing(self, points: Float[Tensor, "3 R"], box: Int[Tensor, " R"]) -> Int[Tensor, " R"]:
+        """Which axis of its box each point's face looks along."""
+        to_box = self.axes / self.halves[..., None]
+        offset = points - self.centers.T.index_select(1, box)
+        local = (to_box.permute(1, 2, 0).index_select(2, box) * offset).sum(1)
+        x, y, z = local.abs()
+        return torch.where(z > torch.maximum(x, y), 2, (y > x).long())
+
+    def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
+        """From each point to the nearest box; 0 inside."""
+        outside = (self._local_points(points).abs() - self.halves.T[..., None]).clamp(min=0)
+        return (outside * outside).sum(0).amin(0).sqrt()
+
+
+@dataclass(frozen=True)
+class Spheres:
+    """Solid spheres."""
+
+    centers: Float[Tensor, "S 3"]
+    radii: Float[Tensor, " S"]
+
+    def hit(
+        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
+    ) -> Float[Tensor, "S R"]:
+        """Where each ray enters each sphere."""
+        nearest, half_chord = self._chord(origins, directions)
+        enter = nearest - half_chord
+        return torch.where(enter > 0, enter, torch.inf)
+
+    def leave(
+        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
+    ) -> Float[Tensor, "S R"]:
+        """Where each ray leaves each sphere, for origins inside."""
+        nearest, half_chord = self._chord(origins, directions)
+        return nearest + half_chord
+
+    def _chord(
+        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
+    ) -> tuple[Float[Tensor, "S R"], Float[Tensor, "S R"]]:
+        """The middle of the chord that each ray cuts, and half its length; NaN for a miss."""
+        square = (directions * directions).sum(0)
+        to_center = self.centers[..., None] - origins
+        nearest = (to_center * directions).sum(1) / square
+        missed_by = to_center - nearest[:, None] * directions
+        left = self.radii[:, None] ** 2 - (missed_by * missed_by).sum(1)
+        return nearest, (left / square).sqrt()
+
+    def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
+        """From each point to the nearest sphere; 0 inside."""
+        offset = points - self.centers[..., None]
+        return ((offset * offset).sum(1).sqrt() - self.radii[:, None]).amin(0).clamp(min=0)
+
+
+@dataclass(frozen=True)
+class Room:
+    """The inside of an axis-aligned box."""
+
+    lower: Float[Tensor, " 3"]
+    upper: Float[Tensor, " 3"]
+
+    def hit(
+        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
+    ) -> tuple[Float[Tensor, " R"], Int[Tensor, " R"]]:
+        """Where each ray, which starts inside, meets a wall, and which: +x -x +y -y +z -z."""
+        forward = directions > 0
+        ahead = torch.where(forward, self.upper[:, None] - origins, origins - self.lower[:, None])
+        t, axis = (ahead / directions.abs()).min(0)
+        return t, 2 * axis + 1 - forward.gather(0, axis[None])[0].long()
+
+    def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
+        """From each point inside to the nearest wall."""
+        return torch.minimum(points - self.lower[:, None], self.upper[:, None] - points).amin(0)
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """A height field over the square [-extent, extent]^2, bilinear between its samples.
+
+    Args:
+        field: height and its slopes along x and y, rows along y.
+    """
+
+    field: Float[Tensor, "3 N N"]
+    extent: float
+
+    def sample(
+        self, x: Float[Tensor, "T R"], y: Float[Tensor, "T R"], channels: slice
+    ) -> Float[Tensor, "C T R"]:
+        """The named channels of the field, those of the border outside the square."""
+        return torch.nn.functional.grid_sample(
+            self.field[None, channels],
+            torch.stack((x, y), -1)[None] / self.extent,
+            padding_mode="border",
+            align_corners=True,
+        )[0]
+
+    def above(self, points: Float[Tensor, "3 T R"]) -> Float[Tensor, "T R"]:
+        """How far each point lies above the ground."""
+        x, y, z = points
+        return z - self.sample(x, y, slice(0, 1))[0]
+
+    def normals(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 R"]:
+        """Unit normals of the ground below each point, smooth across samples."""
+        slopes = self.sample(points[0, None], points[1, None], slice(1, 3))[:, 0]
+        upward = torch.cat((-slopes, torch.ones_like(slopes[:1])))
+        return upward * (upward * upward).sum(0).rsqrt()
+
+    def hit(
+        self,
+        origins: Float[Tensor, "3 #R"],
+        directions: Float[Tensor, "3 R"],
+        limits: Float[Tensor, " R"],
+    ) -> Float[Tensor, " R"]:
+        """Where each ray first dives under the ground before its limit.
+
+        Steps grow with distance; the step that crosses is narrowed by false position (Illinois).
+        """
+        progress = torch.linspace(0, 1, MARCH_STEPS, device=limits.device)[:, None]
+        t = NEAREST * (limits / NEAREST) ** progress
+        above = self.above(origins[:, None] + t * directions[:, None])
+        # The largest countdown among the steps under the ground belongs to the first of them.
+        countdown = torch.arange(MARCH_STEPS, 0, -1.0, device=limits.device)[:, None]
+        latest = torch.where(above < 0, countdown, 0).amax(0, keepdim=True).long()
+        crossed = latest[0] > 0
+        after = (MARCH_STEPS - latest).clamp(1, MARCH_STEPS - 1)
+        before = after - 1
+        low, high = t.gather(0, before), t.gather(0, after)
+        gap_low, gap_high = above.gather(0, before), above.gather(0, after)
+        for _ in range(REFINE_STEPS):
+            middle = low + (high - low) * (gap_low / (gap_low - gap_high)).clamp(0, 1)
+            gap = self.above(origins[:, None] + middle * directions[:, None])
+            over = gap > 0
+            low, high = torch.where(over, middle, low), torch.where(over, high, middle)
+            # Halving the side that stays makes the next guess fall beyond the root.
+            gap_low, gap_high = (
+                torch.where(over, gap, gap_low / 2),
+                torch.where(over, gap_high / 2, gap),
+            )
+        return torch.where(crossed, middle[0], torch.inf)

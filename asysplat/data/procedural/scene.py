@@ -1,0 +1,135 @@
+"""A room or a place outdoors, made from a seed: photographs with exact depths, without a file."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.data.procedural import layout as layouts
+from asysplat.data.procedural.path import hand_held_path
+from asysplat.data.procedural.world import World
+from asysplat.errors import InputError
+from asysplat.scene import Cameras, Views
+
+SPLITS = ("train", "val", "test")
+RAYS_IN_CACHE = 4096
+PROBE_FRAMES = 4  # that the light meter looks at
+PROBE_SIZE = 16  # pixels a side of those
+DARKEST = 1e-3  # light below this is black
+CONTRAST = 1.1  # standard deviation of a walk's log light before the film's S-curve
+BRIGHTNESS = -0.2  # mean of the same
+
+
+def split_seed(split: Literal["train", "val", "test"], index: int) -> int:
+    """The seed of scene `index` of a split: splits take every third number, so they never meet.
+
+    Raises:
+        InputError: unknown split or negative index.
+    """
+    if split not in SPLITS:
+        raise InputError(f"split is {split!r}: expected one of {', '.join(SPLITS)}.")
+    if index < 0:
+        raise InputError(f"index is {index}: scenes are numbered from 0.")
+    return 3 * index + SPLITS.index(split)
+
+
+class ProceduralScene:
+    """A `Capture` of a made-up place: textured boxes, spheres, walls or hills, along a walk.
+
+    One unit is a metre, z is up. The same seed gives the same place and walk on every device, and
+    the same bits on a CPU.
+
+    Args:
+        seed: any integer >= 0; see `split_seed`.
+        height, width: of the images, pixels.
+        num_frames: how finely the walk is sampled.
+        device: where images are made.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        height: int,
+        width: int,
+        num_frames: int = 96,
+        device: str | torch.device = "cpu",
+    ):
+        rng = np.random.default_rng(seed)
+        self.name = f"procedural-{seed}"
+        self.num_frames = num_frames
+        indoors = rng.random() < 0.5
+        half = rng.uniform((2.8, 2.8, 1.3), (4.0, 4.0, 1.6))
+        radius = 0.58 * half[:2].min() if indoors else rng.uniform(2.4, 3.2)
+        poses = hand_held_path(rng, num_frames, radius)
+        walk = poses[:, :2, 3]
+        layout = (
+            layouts.furnished_room(rng, walk, half) if indoors else layouts.outdoor_place(rng, walk)
+        )
+        self.cameras = _cameras(poses, rng.uniform(60, 75), height, width).to(device)
+        self._world = World(layout, rng, self.cameras.intrinsics.device)
+        self._expose()
+
+    def views(self, frames: Sequence[int]) -> Views:
+        """The named frames, with the exact depth of every pixel centre's ray."""
+        cameras = self.cameras.select(list(frames))
+        light, depths = self._shoot(cameras)
+        return Views(cameras, self._develop(light), depths)
+
+    def _shoot(self, cameras: Cameras) -> tuple[Float[Tensor, "V 3 H W"], Float[Tensor, "V H W"]]:
+        """Light and depth at every pixel."""
+        size = (cameras.height, cameras.width)
+        in_camera = _pixel_directions(cameras)
+        light = in_camera.new_empty(cameras.num_views, 3, size[0] * size[1])
+        depths = in_camera.new_empty(cameras.num_views, size[0] * size[1])
+        at_once = RAYS_IN_CACHE if in_camera.device.type == "cpu" else in_camera.shape[1]
+        pixel = 1 / cameras.intrinsics[0, 0, 0].item()
+        for view, pose in enumerate(cameras.cam_to_world):
+            directions = pose[:3, :3] @ in_camera
+            for start in range(0, directions.shape[1], at_once):
+                part = slice(start, start + at_once)
+                light[view, :, part], depths[view, part] = self._world.trace(
+                    pose[:3, 3:], directions[:, part], pixel
+                )
+        return light.unflatten(-1, size), depths.unflatten(-1, size)
+
+    def _develop(self, light: Float[Tensor, "V 3 H W"]) -> Float[Tensor, "V 3 H W"]:
+        """Film: an S-curve of the logarithm of light, into [0, 1]."""
+        return torch.sigmoid(light.clamp(min=DARKEST).log() * self._gamma - self._threshold)
+
+    def _expose(self) -> None:
+        """Set exposure and contrast once for the whole walk, as a photographer would."""
+        frames = np.linspace(0, self.num_frames - 1, PROBE_FRAMES).round().astype(int)
+        probe = _resized(self.cameras.select(frames.tolist()), PROBE_SIZE)
+        levels = self._shoot(probe)[0].clamp(min=DARKEST).log()
+        self._gamma = CONTRAST / levels.std()
+        self._threshold = self._gamma * levels.mean() - BRIGHTNESS
+
+
+def _cameras(poses: np.ndarray, fov: float, height: int, width: int) -> Cameras:
+    """Square pixels, the principal point in the middle, `fov` degrees along the longer side."""
+    focal = max(height, width) / 2 / np.tan(np.radians(fov) / 2)
+    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    intrinsics = torch.as_tensor(matrix, dtype=torch.float32)
+    cam_to_world = torch.as_tensor(poses, dtype=torch.float32)
+    return Cameras(intrinsics.repeat(len(poses), 1, 1), cam_to_world, height, width)
+
+
+def _resized(cameras: Cameras, size: int) -> Cameras:
+    """The same fields of view with size x size pixels."""
+    scale = cameras.intrinsics.new_tensor([size / cameras.width, size / cameras.height, 1.0])
+    return Cameras(cameras.intrinsics * scale[:, None], cameras.cam_to_world, size, size)
+
+
+def _pixel_directions(cameras: Cameras) -> Float[Tensor, "3 R"]:
+    """Camera-space directions through the pixel centres, of z = 1, so that t is the depth."""
+    options = {"dtype": torch.float32, "device": cameras.intrinsics.device}
+    y, x = torch.meshgrid(
+        torch.arange(cameras.height, **options) + 0.5,
+        torch.arange(cameras.width, **options) + 0.5,
+        indexing="ij",
+    )
+    (fx, _, cx), (_, fy, cy), _ = cameras.intrinsics[0]
+    return torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(x))).flatten(1)

@@ -1,0 +1,199 @@
+"""Surfaces that look like plaster, brick, planks, tiles, cloth or grass, from one formula.
+
+A material is a grid of cells (bricks, planks, checks; one huge cell for plain ones) with joints,
+over fractal noise that blends two colours. Everything is band-limited by the pixel's footprint.
+"""
+
+import colorsys
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+LATTICE = 64  # the noise lattice repeats after this many points
+OCTAVES = 6
+PERSISTENCE = 0.75  # 1 would be the 1/f amplitude spectrum of photographs; our edges add the rest
+PLAIN = 1e6  # a cell so large that its joints are never seen
+
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Material:
+    """How one surface looks; lengths in metres, colours linear RGB."""
+
+    base: Colour
+    accent: Colour
+    cell: tuple[float, float] = (PLAIN, PLAIN)
+    shift: float = 0.0  # of each row of cells against the one below, in cells
+    joint: float = 0.0  # width of the joints
+    variation: float = 0.0  # of brightness from cell to cell
+    checker: float = 0.0  # brightness difference of a chequered pattern
+    grain: tuple[float, float] = (1.0, 1.0)  # lattice points of the coarsest noise a metre
+
+    def row(self) -> list[float]:
+        plain = (self.shift, self.joint, self.variation, self.checker)
+        return [*self.base, *self.accent, *self.cell, *plain, *self.grain]
+
+
+def hsv(hue: float, saturation: float, value: float) -> Colour:
+    return colorsys.hsv_to_rgb(hue % 1.0, saturation, value)
+
+
+def plaster(rng: np.random.Generator) -> Material:
+    hue, value = rng.uniform(0.02, 0.18), rng.uniform(0.45, 0.8)
+    if rng.random() < 0.3:
+        hue = rng.uniform(0.4, 0.65)
+    saturation = rng.uniform(0.05, 0.35)
+    return Material(hsv(hue, saturation, value), hsv(hue + 0.03, saturation, 0.55 * value))
+
+
+def bricks(rng: np.random.Generator) -> Material:
+    hue, value = rng.uniform(0.0, 0.09), rng.uniform(0.25, 0.6)
+    saturation, height = rng.uniform(0.15, 0.6), rng.uniform(0.1, 0.3)
+    return Material(
+        hsv(hue, saturation, value),
+        hsv(hue + 0.02, saturation, 0.5 * value),
+        cell=(height * rng.uniform(1.8, 3.0), height),
+        shift=0.5,
+        joint=0.12 * height,
+        variation=0.5,
+    )
+
+
+def planks(rng: np.random.Generator) -> Material:
+    hue, value = rng.uniform(0.04, 0.11), rng.uniform(0.2, 0.6)
+    saturation, width = rng.uniform(0.3, 0.6), rng.uniform(0.12, 0.35)
+    return Material(
+        hsv(hue, saturation, value),
+        hsv(hue, saturation + 0.1, 0.45 * value),
+        cell=(rng.uniform(1.2, 2.5), width),
+        shift=0.37,
+        joint=0.05 * width,
+        variation=0.6,
+        grain=(0.7, 5.0),
+    )
+
+
+def tiles(rng: np.random.Generator) -> Material:
+    hue, value, size = rng.uniform(), rng.uniform(0.35, 0.7), rng.uniform(0.25, 0.6)
+    saturation = rng.uniform(0.05, 0.35)
+    return Material(
+        hsv(hue, saturation, value),
+        hsv(hue + 0.05, saturation, 0.65 * value),
+        cell=(size, size),
+        joint=0.03,
+        variation=0.2,
+        checker=rng.choice([0.0, 0.6, 1.1]),
+    )
+
+
+def cloth(rng: np.random.Generator) -> Material:
+    """Plain or striped, of any hue."""
+    hue, value = rng.uniform(), rng.uniform(0.25, 0.8)
+    saturation = rng.uniform(0.3, 0.7)
+    striped = rng.random() < 0.5
+    return Material(
+        hsv(hue, saturation, value),
+        hsv(hue + rng.uniform(-0.08, 0.08), saturation, 0.5 * value),
+        cell=(PLAIN, rng.uniform(0.1, 0.3)) if striped else (PLAIN, PLAIN),
+        checker=0.9 if striped else 0.0,
+        grain=(1.5, 1.5),
+    )
+
+
+def grass(rng: np.random.Generator) -> Material:
+    hue, value = rng.uniform(0.12, 0.28), rng.uniform(0.25, 0.45)
+    earth = hsv(rng.uniform(0.06, 0.11), 0.5, 0.5 * value)
+    return Material(hsv(hue, rng.uniform(0.4, 0.65), value), earth, grain=(0.7, 0.7))
+
+
+def leaves(rng: np.random.Generator) -> Material:
+    hue, value = rng.uniform(0.1, 0.32), rng.uniform(0.2, 0.4)
+    return Material(
+        hsv(hue, 0.65, 1.3 * value), hsv(hue + 0.05, 0.7, 0.25 * value), grain=(3.0, 3.0)
+    )
+
+
+def stone(rng: np.random.Generator) -> Material:
+    hue, value = rng.uniform(0.05, 0.15), rng.uniform(0.35, 0.6)
+    return Material(hsv(hue, 0.15, value), hsv(hue, 0.25, 0.4 * value), grain=(2.0, 2.0))
+
+
+def noise_lattice(rng: np.random.Generator) -> Float[np.ndarray, "2 N N"]:
+    """Two channels of uniform numbers in [-1, 1]; the first row and column repeat at the end."""
+    lattice = rng.uniform(-1, 1, (2, LATTICE, LATTICE))
+    return np.pad(lattice, ((0, 0), (0, 1), (0, 1)), mode="wrap")
+
+
+def fractal_noise(
+    lattice: Float[Tensor, "2 N N"], uv: Float[Tensor, "2 R"], footprint: Float[Tensor, " R"]
+) -> Float[Tensor, "2 R"]:
+    """Value noise over OCTAVES octaves, about unit amplitude, without what a pixel cannot resolve.
+
+    Args:
+        uv: in lattice points of the coarsest octave.
+        footprint: the pixel's width in the same unit.
+    """
+    octave = torch.arange(OCTAVES, device=uv.device)
+    frequency = 2.0**octave
+    # Lattices of different octaves are shifted against each other, lest their points coincide.
+    point = uv * frequency[:, None, None] + 17.3 * octave[:, None, None]
+    corner = point.floor()
+    step = point - corner
+    step = step * step * (3 - 2 * step)
+    place = (torch.remainder(corner, LATTICE) + step) * (2 / LATTICE) - 1
+    noise = torch.nn.functional.grid_sample(
+        lattice[None], place.permute(0, 2, 1)[None], align_corners=True
+    )[0]
+    resolved = (2 - 2 * footprint * frequency[:, None]).clamp(0, 1)
+    return (noise * (resolved * PERSISTENCE ** octave[:, None])).sum(1)
+
+
+def cell_pattern(
+    lattice: Float[Tensor, "2 N N"],
+    uv: Float[Tensor, "2 R"],
+    footprint: Float[Tensor, " R"],
+    cell: Float[Tensor, "2 R"],
+    shift: Float[Tensor, " R"],
+    joint: Float[Tensor, " R"],
+) -> tuple[Float[Tensor, " R"], Float[Tensor, " R"], Float[Tensor, " R"]]:
+    """A grid of cells: a random tone a cell and a chequered one in [-1, 1], and joint coverage.
+
+    Tones fade towards a cell's edge over the footprint, so that edges do not alias.
+    """
+    in_cells = uv / cell
+    row = in_cells[1].floor()
+    across = torch.stack((in_cells[0] + shift * row, in_cells[1]))
+    corner = across.floor()
+    to_edge = ((0.5 - (across - corner - 0.5).abs()) * cell).amin(0)
+    fade = (2 * to_edge / footprint).clamp(0, 1) * (2 - footprint / cell.amin(0)).clamp(0, 1)
+    index: Int[Tensor, "2 R"] = torch.remainder(corner, LATTICE).long()
+    tone = lattice[0, index[0], index[1]]
+    parity = 1 - 2 * torch.remainder(corner.sum(0), 2)
+    covered = ((joint + footprint) / 2 - to_edge) / footprint
+    covered = torch.minimum(covered.clamp(min=0), (joint / footprint).clamp(max=1))
+    return tone * fade, parity * fade, covered
+
+
+def albedo(
+    lattice: Float[Tensor, "2 N N"],
+    rows: Float[Tensor, "K R"],
+    uv: Float[Tensor, "2 R"],
+    footprint: Float[Tensor, " R"],
+) -> Float[Tensor, "3 R"]:
+    """Linear colour of each hit.
+
+    Args:
+        rows: `Material.row` of each hit's surface.
+        uv: place on the surface, metres.
+        footprint: width of the pixel on the surface, metres.
+    """
+    base, accent, cell, (shift, joint, variation, checker), grain = rows.split((3, 3, 2, 4, 2))
+    noise = fractal_noise(lattice, uv * grain, footprint * grain.amax(0))
+    tone, parity, covered = cell_pattern(lattice, uv, footprint, cell, shift, joint)
+    mix = (0.5 + 0.5 * noise[0]).clamp(0, 1)
+    brightness = torch.exp(0.2 * noise[1] + variation * tone + checker * parity / 2)
+    return (base + (accent - base) * mix) * brightness * (1 - 0.6 * covered)

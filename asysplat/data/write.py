@@ -1,0 +1,85 @@
+"""Views to disk, in the layout of nerfstudio: transforms.json beside images/ and depth/."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from asysplat.errors import InputError
+from asysplat.scene import Views
+
+MILLIMETRES = 1000  # depth steps a scene unit
+FARTHEST = 2**16 - 1  # what a 16-bit image can hold
+
+
+def write_transforms(views: Views, folder: Path) -> None:
+    """Write one scene: transforms.json, images/NNNNN.png, and depth/NNNNN.png where known.
+
+    Matrices are camera-to-world with OpenGL axes (x right, y up, z backward). cx and cy are in
+    pixels with the first pixel's centre at +0.5, as in `Cameras`. Depths are 16-bit PNG of
+    thousandths of a scene unit along the camera's z axis, 0 where unknown. Format:
+    https://docs.nerf.studio/quickstart/data_conventions.html
+
+    Raises:
+        InputError: views with a batch dimension, or a folder that holds a transforms.json already.
+    """
+    if views.images.ndim != 4:
+        raise InputError(
+            f"Views.images has shape {tuple(views.images.shape)}: expected [V, 3, H, W], so write "
+            "the scenes of a batch one by one."
+        )
+    target = folder / "transforms.json"
+    if target.exists():
+        raise InputError(f"{target} exists: name a new folder, nothing is overwritten.")
+    views = views.to("cpu")
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    frames = []
+    poses = _opengl(views.cameras.cam_to_world)
+    for index, (pose, matrix) in enumerate(zip(poses, views.cameras.intrinsics, strict=True)):
+        name = f"{index:05d}.png"
+        frame = {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
+        _write_image(folder / "images" / name, views.images[index])
+        if views.depths is not None:
+            (folder / "depth").mkdir(exist_ok=True)
+            frame["depth_file_path"] = f"depth/{name}"
+            _write_depth(folder / "depth" / name, views.depths[index])
+        frames.append(frame | _pinhole(matrix))
+    target.write_text(json.dumps(_with_shared_intrinsics(views, frames), indent=1))
+
+
+def _opengl(cam_to_world: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
+    """The same cameras with the y and z axes turned about."""
+    return cam_to_world * cam_to_world.new_tensor([1.0, -1.0, -1.0, 1.0])
+
+
+def _pinhole(matrix: Float[Tensor, "3 3"]) -> dict[str, float]:
+    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+    return {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+
+
+def _with_shared_intrinsics(views: Views, frames: list[dict]) -> dict:
+    """The whole file; intrinsics that all frames share are named once, at the top."""
+    top = {"camera_model": "PINHOLE", "w": views.cameras.width, "h": views.cameras.height}
+    if views.depths is not None:
+        top["depth_unit_scale_factor"] = 1 / MILLIMETRES
+    for name in ("fl_x", "fl_y", "cx", "cy"):
+        if len({frame[name] for frame in frames}) == 1:
+            top[name] = frames[0][name]
+            for frame in frames:
+                del frame[name]
+    return top | {"frames": frames}
+
+
+def _write_image(path: Path, image: Float[Tensor, "3 H W"]) -> None:
+    levels = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    Image.fromarray(levels.permute(1, 2, 0).numpy()).save(path)
+
+
+def _write_depth(path: Path, depth: Float[Tensor, "H W"]) -> None:
+    """Depths beyond what 16 bits hold are written as 0, unknown."""
+    steps = (depth.double() * MILLIMETRES).round().numpy()
+    Image.fromarray(np.where(steps > FARTHEST, 0, steps).astype(np.uint16)).save(path)

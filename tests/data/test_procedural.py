@@ -1,0 +1,196 @@
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from asysplat.data.capture import Capture
+from asysplat.data.procedural import ProceduralScene, split_seed
+from asysplat.data.procedural.geometry import Boxes, Room, Spheres, Terrain
+from asysplat.data.procedural.path import hand_held_path
+from asysplat.errors import InputError
+
+SEEDS = range(8)
+
+
+@cache
+def scene(seed: int) -> ProceduralScene:
+    return ProceduralScene(seed, 48, 48)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Images this small gain nothing from threads, and lose much where other tests run too."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def rays(count: int = 200) -> torch.Tensor:
+    """Directions about the x axis."""
+    return torch.stack((torch.ones(count), *(torch.rand(2, count) - 0.5)))
+
+
+def test_a_seed_gives_the_same_bits():
+    first, second = (ProceduralScene(5, 16, 24).views([0, 95, 3]) for _ in range(2))
+    assert torch.equal(first.images, second.images)
+    assert torch.equal(first.depths, second.depths)
+    assert torch.equal(first.cameras.cam_to_world, second.cameras.cam_to_world)
+    assert not torch.equal(first.images, ProceduralScene(6, 16, 24).views([0, 95, 3]).images)
+
+
+def test_it_is_a_capture():
+    short = ProceduralScene(3, 8, 8, num_frames=10)
+    assert isinstance(short, Capture)
+    assert (short.name, short.num_frames, short.cameras.num_views) == ("procedural-3", 10, 10)
+    views = short.views([7, 2]).validate()
+    assert torch.equal(views.cameras.cam_to_world, short.cameras.cam_to_world[[7, 2]])
+
+
+def test_half_of_the_seeds_are_rooms():
+    # Nothing in a room is farther than its diagonal; the sky is 60 m away.
+    farthest = [scene(seed).views([0, 48]).depths.max() for seed in range(16)]
+    assert 4 <= sum(depth < 12 for depth in farthest) <= 12
+
+
+def test_splits_never_meet():
+    seeds = [{split_seed(split, index) for index in range(300)} for split in ("train", "val")]
+    seeds.append({split_seed("test", index) for index in range(300)})
+    assert len(set.union(*seeds)) == 900
+    assert split_seed("train", 10**12) == 3 * 10**12
+
+
+def test_a_negative_index_is_refused():
+    with pytest.raises(InputError, match="numbered from 0"):
+        split_seed("train", -1)
+
+
+def test_spheres_are_hit_where_algebra_says():
+    spheres = Spheres(torch.tensor([[3.0, 0.2, -0.1]]), torch.tensor([0.9]))
+    directions = rays()
+    t = spheres.hit(torch.zeros(3, 1), directions)[0]
+    gap = (t * directions - spheres.centers.T).norm(dim=0) - 0.9
+    seen = t.isfinite()
+    assert 20 < seen.sum() < 180
+    assert gap[seen].abs().max() < 1e-5
+    closest = torch.linalg.cross(spheres.centers.T.expand_as(directions), directions, dim=0)
+    misses = closest.norm(dim=0) / directions.norm(dim=0) > 0.9
+    assert torch.equal(misses, ~seen)
+
+
+def test_boxes_are_hit_where_algebra_says():
+    cos, sin = np.cos(0.4), np.sin(0.4)
+    axes = torch.tensor([[[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]], dtype=torch.float32)
+    boxes = Boxes(torch.tensor([[3.0, 0.2, -0.1]]), torch.tensor([[0.5, 0.8, 0.6]]), axes)
+    directions = rays()
+    t = boxes.hit(torch.zeros(3, 1), directions)[0]
+    seen = t.isfinite()
+    assert 20 < seen.sum() < 180
+    points = (t * directions)[:, seen]
+    local = axes[0] @ (points - boxes.centers.T) / boxes.halves.T
+    torch.testing.assert_close(local.abs().amax(0), torch.ones(len(local[0])))
+    face = boxes.facing(points, torch.zeros(points.shape[1], dtype=torch.long))
+    assert torch.equal(face, local.abs().argmax(0))
+    # Just before the hit a ray is outside, and a missing ray never comes inside.
+    assert (boxes.distance(points * 0.999) > 0).all()
+    along = directions[:, ~seen, None] * torch.linspace(0, 5, 400)
+    assert boxes.distance(along.flatten(1)).min() > 0
+
+
+def test_walls_are_hit_where_algebra_says():
+    room = Room(torch.tensor([-1.0, -2.0, 0.0]), torch.tensor([3.0, 2.0, 2.5]))
+    origin = torch.tensor([[0.5], [0.0], [1.0]])
+    directions = torch.tensor([[2.0, -1.0, 0.1], [0.1, 4.0, 0.1], [0.0, 1.0, -1.0]]).T
+    t, wall = room.hit(origin, directions.contiguous())
+    torch.testing.assert_close(t, torch.tensor([1.25, 0.5, 1.0]))
+    assert wall.tolist() == [0, 2, 5]
+
+
+def test_rays_meet_the_terrain_on_its_surface():
+    axis = torch.linspace(-10, 10, 21)
+    x, y = torch.meshgrid(axis, axis, indexing="xy")
+    heights = 0.2 * x + 0.3 * torch.sin(y)
+    terrain = Terrain(torch.stack((heights, torch.full_like(x, 0.2), 0.3 * torch.cos(y))), 10.0)
+    directions = rays()
+    origin = torch.tensor([[-5.0], [0.0], [1.5]])
+    t = terrain.hit(origin, directions, torch.full((200,), 14.0))
+    seen = t.isfinite()
+    points = (origin + t * directions)[:, seen]
+    assert 80 < seen.sum() < 180
+    assert terrain.above(points[:, None]).abs().max() < 1e-3
+    assert (directions[2, ~seen] > 0).all()
+    torch.testing.assert_close(terrain.normals(points).norm(dim=0), torch.ones(int(seen.sum())))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_neighbouring_frames_reproject_onto_each_other(seed):
+    views = scene(seed).views([40, 43])
+    agree, error = reprojection(views)
+    assert agree > 0.85
+    assert error < 0.04
+
+
+def test_wrong_depths_do_not_reproject():
+    views = scene(3).views([40, 52])
+    good, _ = reprojection(views)
+    views.depths[0] *= 1.3
+    bad, _ = reprojection(views)
+    assert good > 0.5 > bad
+
+
+def reprojection(views) -> tuple[float, float]:
+    """Of the first view's pixels that the second could see: agreeing share, mean colour error."""
+    size = views.cameras.height
+    y, x = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
+    pixels = torch.stack((x, y, torch.ones_like(x))).flatten(1)
+    unproject = views.cameras.intrinsics[0].inverse() @ pixels * views.depths[0].flatten()
+    first, second = views.cameras.cam_to_world
+    world = first[:3, :3] @ unproject + first[:3, 3:]
+    camera = second[:3, :3].T @ (world - second[:3, 3:])
+    projected = views.cameras.intrinsics[1] @ camera
+    place = projected[:2] / projected[2] * (2 / size) - 1
+    inside = (place.abs() < 1 - 1 / size).all(0) & (camera[2] > 0)
+    both = torch.cat((views.images[1], views.depths[1][None]))[None]
+    grid = place.T[None, None]
+    seen = torch.nn.functional.grid_sample(both, grid, align_corners=False)[0, :, 0]
+    same = (seen[3] / camera[2] - 1).abs() < 0.02
+    error = (seen[:3] - views.images[0].flatten(1)).abs().mean(0)
+    return same[inside].float().mean().item(), error[inside & same].mean().item()
+
+
+def test_images_have_the_statistics_of_photographs():
+    images = torch.stack([scene(seed).views([0, 30, 60]).images for seed in SEEDS])
+    deviation = images.flatten(2).std(2).mean(1)
+    assert 0.35 < images.mean() < 0.55
+    assert (deviation > 0.15).all() and (deviation < 0.28).all()
+    # Most energy is in low frequencies: half the resolution keeps most of the variance.
+    halved = torch.nn.functional.avg_pool2d(images.flatten(0, 2), 2)
+    assert halved.var() > 0.85 * images.var()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_walk_is_smooth_and_keeps_clear(seed):
+    cameras = scene(seed).cameras
+    poses = cameras.cam_to_world
+    steps = [(after - before)[:3, 3].norm() for before, after in pairwise(poses)]
+    assert 0.005 < max(steps) < 0.15
+    cosines = ((poses[1:, :3, :3] * poses[:-1, :3, :3]).sum((1, 2)) - 1) / 2
+    assert torch.rad2deg(cosines.clamp(max=1).arccos()).max() < 4
+    span = torch.cdist(cameras.centers, cameras.centers).max()
+    assert 1.5 < span < 5.5
+    assert scene(seed).views(range(0, 96, 8)).depths.min() > 0.3
+
+
+def test_the_walk_looks_at_its_targets_level():
+    poses = hand_held_path(np.random.default_rng(0), 50, 2.0)
+    rotations = poses[:, :3, :3]
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (50, 1, 1)), atol=1e-12
+    )
+    # Image "down" points down in the world, and the roll is slight.
+    assert (rotations[:, 2, 1] < -0.8).all()
+    assert np.abs(rotations[:, 2, 0]).max() < 0.05
+    inward = -poses[:, :2, 3] / np.linalg.norm(poses[:, :2, 3], axis=1, keepdims=True)
+    assert (np.sum(inward * rotations[:, :2, 2], axis=1) > 0.7).all()
