@@ -124,6 +124,14 @@ def test_rays_meet_the_terrain_on_its_surface():
     torch.testing.assert_close(terrain.normals(points).norm(dim=0), torch.ones(int(seen.sum())))
 
 
+def test_a_guess_right_on_the_terrain_is_kept():
+    terrain = Terrain(torch.zeros(3, 3, 3), 20.0)
+    origin = torch.tensor([[-5.0], [0.0], [1.0]])
+    directions = torch.tensor([[1.0, 0.0, -0.125], [1.0, 0.0, -0.25], [1.0, 0.0, 0.0]]).T
+    t = terrain.hit(origin, directions, torch.full((3,), 14.0))
+    torch.testing.assert_close(t, torch.tensor([8.0, 4.0, torch.inf]))
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_neighbouring_frames_reproject_onto_each_other(seed):
     views = scene(seed).views([40, 43])

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-MARCH_STEPS = 24
+MARCH_STEPS = 18
 REFINE_STEPS = 8
-TINY = 1e-20  # keeps rays along a face from dividing 0 by 0
-NEAREST = 0.1  # no hit is nearer than this: cameras keep their distance
+TINY = 1e-20  # keeps 0 from being divided by 0
+NEAREST = 0.5  # no ray meets the ground before this t: cameras are at eye level
 
 
 @dataclass(frozen=True)
@@ -25,19 +25,23 @@ class Boxes:
     axes: Float[Tensor, "B 3 3"]
 
     def _local(self, vectors: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
-        axes_first = self.axes.transpose(0, 1).reshape(-1, 3)
-        return (axes_first @ vectors).view(3, -1, vectors.shape[1])
+        return (self._axes_first() @ vectors).view(3, -1, vectors.shape[1])
 
-    def _local_points(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
-        centers = torch.einsum("bij,bj->ib", self.axes, self.centers)
-        return self._local(points) - centers[..., None]
+    def _to_centers(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
+        """From each point to each box's centre, along the box's axes."""
+        centers = torch.einsum("bij,bj->ib", self.axes, self.centers).reshape(-1, 1)
+        offsets = torch.addmm(centers, self._axes_first(), points, alpha=-1)
+        return offsets.view(3, -1, points.shape[1])
+
+    def _axes_first(self) -> Float[Tensor, "axes 3"]:
+        return self.axes.transpose(0, 1).reshape(-1, 3)
 
     def hit(
         self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
     ) -> Float[Tensor, "B R"]:
         """Where each ray enters each box (slab test; Kay and Kajiya, 1986)."""
         inverse = 1 / (self._local(directions) + TINY)
-        middle = -self._local_points(origins) * inverse
+        middle = self._to_centers(origins) * inverse
         reach = self.halves.T[..., None] * inverse.abs()
         enter, leave = (middle - reach).amax(0), (middle + reach).amin(0)
         return torch.where((enter <= leave) & (enter > 0), enter, torch.inf)
@@ -52,7 +56,7 @@ class Boxes:
 
     def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
         """From each point to the nearest box; 0 inside."""
-        outside = (self._local_points(points).abs() - self.halves.T[..., None]).clamp(min=0)
+        outside = (self._to_centers(points).abs() - self.halves.T[..., None]).clamp(min=0)
         return (outside * outside).sum(0).amin(0).sqrt()
 
 
@@ -171,7 +175,7 @@ class Terrain:
         low, high = t.gather(0, before), t.gather(0, after)
         gap_low, gap_high = above.gather(0, before), above.gather(0, after)
         for _ in range(REFINE_STEPS):
-            middle = low + (high - low) * (gap_low / (gap_low - gap_high)).clamp(0, 1)
+            middle = low + (high - low) * gap_low / (gap_low - gap_high).clamp(min=TINY)
             gap = self.above(origins[:, None] + middle * directions[:, None])
             over = gap > 0
             low, high = torch.where(over, middle, low), torch.where(over, high, middle)
