@@ -11,14 +11,14 @@ from asysplat.errors import InputError
 from asysplat.rendering.projection import Splats, project
 from asysplat.rendering.rasterize import reference
 from asysplat.rendering.tiles import assign_tiles
-from asysplat.scene import Cameras, Gaussians
+from asysplat.scene import Cameras, Gaussians, TensorRecord
 
 BACKENDS = {"reference": reference}
 ALPHA_TINY = 1e-6  # an alpha below 1/255 is exactly 0, so any value between will do
 
 
 @dataclass(frozen=True)
-class Rendering:
+class Rendering(TensorRecord):
     """What `render` returns, in float32, or in float64 for float64 inputs.
 
     Args:
@@ -44,8 +44,9 @@ def render(
 ) -> Rendering:
     """Render every view, by alpha compositing in depth order (Kerbl et al. 2023).
 
-    Differentiable in all fields of `gaussians` and `cameras`, and in `background`. Half-precision
-    inputs are computed in float32, also under autocast.
+    Differentiable in all fields of `gaussians` and `cameras`, and in `background`; a Gaussian that
+    is culled (see `project`) has gradient 0. Half-precision inputs are computed in float32, also
+    under autocast. On a CPU the same inputs give the same bits on any number of threads.
 
     Args:
         gaussians: [..., N].
