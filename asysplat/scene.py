@@ -16,10 +16,10 @@ from asysplat.errors import InputError
 
 ORTHONORMAL_TOLERANCE = 1e-3
 
-Record = TypeVar("Record", bound="_TensorRecord")
+Record = TypeVar("Record", bound="TensorRecord")
 
 
-class _TensorRecord:
+class TensorRecord:
     """A frozen dataclass of tensors (and of other such records) that moves and stacks as one."""
 
     def map(self: Record, function: Callable[[Tensor], Tensor]) -> Record:
@@ -29,7 +29,7 @@ class _TensorRecord:
             value = getattr(self, field.name)
             if isinstance(value, Tensor):
                 changed[field.name] = function(value)
-            elif isinstance(value, _TensorRecord):
+            elif isinstance(value, TensorRecord):
                 changed[field.name] = value.map(function)
         return replace(self, **changed)
 
@@ -43,7 +43,7 @@ class _TensorRecord:
         stacked = {}
         for field in fields(cls):
             values = [getattr(record, field.name) for record in records]
-            if isinstance(values[0], _TensorRecord):
+            if isinstance(values[0], TensorRecord):
                 stacked[field.name] = type(values[0]).stack(values)
             elif all(isinstance(value, Tensor) for value in values):
                 stacked[field.name] = torch.stack(values)
@@ -60,7 +60,7 @@ class _TensorRecord:
 
 
 @dataclass(frozen=True)
-class Cameras(_TensorRecord):
+class Cameras(TensorRecord):
     """Pinhole cameras, OpenCV axes: x right, y down, z forward; the first pixel's centre is +0.5.
 
     Args:
@@ -164,7 +164,7 @@ class Cameras(_TensorRecord):
 
 
 @dataclass(frozen=True)
-class Views(_TensorRecord):
+class Views(TensorRecord):
     """Posed photographs.
 
     Args:
@@ -230,7 +230,7 @@ class Views(_TensorRecord):
 
 
 @dataclass(frozen=True)
-class Gaussians(_TensorRecord):
+class Gaussians(TensorRecord):
     """3D Gaussians, ready to render: every activation is already applied.
 
     Args:

@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
 from asysplat.errors import InputError
 
 HELD_OUT_STEP = 8
+HELD_OUT_START = {"test": 0, "val": 4}
 
 
 @dataclass(frozen=True)
@@ -73,24 +75,35 @@ def training_split(
     return Split(inputs, targets)
 
 
-def held_out(num_frames: int) -> list[int]:
-    """Every 8th frame from the first on: tested, never trained on (paper, Suppl. A)."""
-    return list(range(0, num_frames, HELD_OUT_STEP))
+def held_out(num_frames: int, stage: Literal["val", "test"]) -> list[int]:
+    """Every 8th frame: from the first on for the test (paper, Suppl. A), from the fifth for
+    validation."""
+    return list(range(HELD_OUT_START[stage], num_frames, HELD_OUT_STEP))
 
 
-def held_out_split(num_frames: int, num_inputs: int, num_targets: int) -> Split:
-    """Inputs evenly over the frames that are not held out, targets evenly over those that are.
+def trained(num_frames: int) -> list[int]:
+    """The frames that no stage holds out."""
+    out = held_out(num_frames, "val") + held_out(num_frames, "test")
+    return sorted(set(range(num_frames)) - set(out))
 
-    There are at most `num_targets` targets. Deterministic.
+
+def held_out_split(
+    num_frames: int, num_inputs: int, num_targets: int, stage: Literal["val", "test"]
+) -> Split:
+    """Inputs evenly over the trained frames, at most `num_targets` targets evenly over those held
+    out. Deterministic.
 
     Raises:
         InputError: the sequence is too short.
     """
-    targets = held_out(num_frames)
-    others = sorted(set(range(num_frames)) - set(targets))
+    inputs, targets = trained(num_frames), held_out(num_frames, stage)
     num_targets = min(num_targets, len(targets))
-    _check_length(len(others), num_inputs, 0)
-    return Split(_spread(others, num_inputs), _spread(targets, num_targets))
+    if len(inputs) < num_inputs or not targets:
+        raise InputError(
+            f"The sequence has {num_frames} frames, of which {len(inputs)} are not held out for "
+            f"{stage}: set data.inputs to at most that, or give a longer sequence."
+        )
+    return Split(_spread(inputs, num_inputs), _spread(targets, num_targets))
 
 
 def _spread(frames: Sequence[int], count: int) -> list[int]:

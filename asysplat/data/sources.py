@@ -12,8 +12,8 @@ from asysplat.data.procedural import ProceduralScene, split_seed
 from asysplat.data.selection import (
     Split,
     evaluation_split,
-    held_out,
     held_out_split,
+    trained,
     training_split,
 )
 from asysplat.data.transforms import TransformsCapture
@@ -76,7 +76,8 @@ class ProceduralSource:
 
 
 class TransformsSource:
-    """Scenes on disk with a `transforms.json` each: every 8th frame is tested, the rest trains.
+    """Scenes on disk with a `transforms.json` each. Of every 8 frames the first is tested and the
+    fifth validates; the others are given as inputs and trained on.
 
     Args:
         root: one scene, or a folder of scenes.
@@ -101,7 +102,7 @@ class TransformsSource:
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         capture = self.captures[rng.integers(len(self.captures))]
-        frames = sorted(set(range(capture.num_frames)) - set(held_out(capture.num_frames)))
+        frames = trained(capture.num_frames)
         split = training_split(len(frames), inputs, targets, self.window, rng)
         return Task(
             capture, Split([frames[i] for i in split.inputs], [frames[i] for i in split.targets])
@@ -109,6 +110,6 @@ class TransformsSource:
 
     def evaluation(self, stage: Literal["val", "test"], inputs: int, targets: int) -> list[Task]:
         return [
-            Task(capture, held_out_split(capture.num_frames, inputs, targets))
+            Task(capture, held_out_split(capture.num_frames, inputs, targets, stage))
             for capture in self.captures
         ]

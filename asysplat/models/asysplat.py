@@ -98,7 +98,7 @@ class AsySplat(nn.Module):
     def forward(self, views: Views) -> Gaussians:
         """Views [..., V] with sides that are multiples of `size_multiple` -> Gaussians [..., N],
         N = V H W (p_f / p_c)^2."""
-        self._check_size(views)
+        self.check_size(views.cameras.height, views.cameras.width)
         batch = views.images.shape[:-4]
         views = with_one_batch_dimension(views)
         pixels = pixel_features(views)
@@ -128,8 +128,9 @@ class AsySplat(nn.Module):
         appearance = sum(p.numel() for p in self.appearance.parameters())
         return 1 - appearance / sum(p.numel() for p in self.parameters())
 
-    def _check_size(self, views: Views) -> None:
-        height, width, multiple = views.cameras.height, views.cameras.width, self.size_multiple
+    def check_size(self, height: int, width: int) -> None:
+        """Raise InputError unless both sides are multiples of `size_multiple`."""
+        multiple = self.size_multiple
         if height % multiple or width % multiple:
             raise InputError(
                 f"data.height x data.width is {height}x{width}, but this model takes multiples of "

@@ -3,7 +3,6 @@
 All are pre-norm with an MLP, bias-free, and apply RMSNorm to queries and keys (paper, Suppl. A).
 """
 
-import torch
 import torch.nn.functional as F
 from einops import rearrange
 from jaxtyping import Float
@@ -11,6 +10,7 @@ from torch import Tensor, nn
 
 from asysplat.models.shapes import StageShape
 from asysplat.ops import grid_attention
+from asysplat.ops.precision import without_autocast
 
 
 class MLP(nn.Sequential):
@@ -31,7 +31,7 @@ class QueryKeyNorm(nn.Module):
         self.key = nn.RMSNorm(head_width, eps=1e-6)
 
     def forward(self, q: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
-        with torch.autocast(q.device.type, enabled=False):
+        with without_autocast(q):
             return self.query(q.float()).to(q.dtype), self.key(k.float()).to(k.dtype)
 
 

@@ -11,6 +11,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from asysplat.ops.precision import without_autocast
 from asysplat.scene import Cameras, Gaussians, Views
 
 SH_C0 = 0.28209479177387814  # Y_0, so that colour = 0.5 + SH_C0 * sh_0
@@ -57,7 +58,7 @@ class GaussianHead(nn.Module):
             p=self.patch,
             q=self.patch,
         )
-        with torch.autocast(raw.device.type, enabled=False):
+        with without_autocast(raw):
             return self._activate(raw.to(views.images.dtype), views)
 
     def _activate(self, raw: Float[Tensor, "B V h w z"], views: Views) -> Gaussians:

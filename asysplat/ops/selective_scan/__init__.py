@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.ops.precision import without_autocast
 from asysplat.ops.selective_scan.recurrent import selective_scan_recurrent
 from asysplat.ops.selective_scan.reference import selective_scan_reference
 
@@ -44,6 +45,6 @@ def selective_scan(
     arguments = [tensor.to(dtype) for tensor in (x, dt, A, B, C, D)]
     if reverse:
         arguments = [t.flip(1) if t.ndim == 3 else t for t in arguments]
-    with torch.autocast(x.device.type, enabled=False):
+    with without_autocast(x):
         y = _BACKENDS[backend](*arguments)
     return (y.flip(1) if reverse else y).to(x.dtype)

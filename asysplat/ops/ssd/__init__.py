@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.ops.precision import without_autocast
 from asysplat.ops.ssd.chunked import ssd_chunked
 from asysplat.ops.ssd.reference import ssd_reference
 
@@ -40,6 +41,6 @@ def ssd(
     arguments = [tensor.to(dtype) for tensor in (x, dt, A, B, C, D)]
     if reverse:
         arguments = [t.flip(1) if t.ndim >= 3 else t for t in arguments]
-    with torch.autocast(x.device.type, enabled=False):
+    with without_autocast(x):
         y = _BACKENDS[backend](*arguments)
     return (y.flip(1) if reverse else y).to(x.dtype)

@@ -1,0 +1,45 @@
+"""What a number hides: input, target, rendered, error and depth beside each other."""
+
+from matplotlib.figure import Figure
+
+from asysplat.evaluation.baselines import nearest_view
+from asysplat.evaluation.metrics import psnr
+from asysplat.rendering import Rendering
+from asysplat.scene import Views
+
+ERROR_RANGE = 0.5  # an error of this much is shown white
+
+
+def comparison(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
+    """A row for each target view of one scene, without batch dimension.
+
+    Columns: the nearest input, the target, the rendering with its PSNR, the absolute error, the
+    rendered inverse depth and, where the data has it, the true one on the same scale.
+    """
+    nearest = nearest_view(inputs, targets)
+    quality = psnr(rendering.image, targets.images)
+    columns = 5 if targets.depths is None else 6
+    rows = targets.num_views
+    aspect = targets.cameras.height / targets.cameras.width
+    figure = Figure(figsize=(2 * columns, 2 * aspect * rows + 0.3), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    titles = ("nearest input", "target", "rendered", "error", "inverse depth", "true inverse depth")
+    for axis, title in zip(axes[0], titles, strict=False):
+        axis.set_title(title, fontsize=9)
+    for view, row in enumerate(axes):
+        target = targets.images[view]
+        error = (rendering.image[view].clamp(0, 1) - target).abs().mean(0)
+        disparities = [1 / rendering.depth[view].clamp_min(1e-3)]
+        if targets.depths is not None:
+            disparities.append(1 / targets.depths[view].clamp_min(1e-3))
+        nearest_is_bright = disparities[-1].flatten().quantile(0.99).item()
+        for axis, image in zip(row, (nearest[view], target, rendering.image[view]), strict=False):
+            axis.imshow(image.clamp(0, 1).permute(1, 2, 0).cpu().float())
+        row[2].set_xlabel(f"{quality[view]:.1f} dB", fontsize=8)
+        row[3].imshow(error.cpu().float(), cmap="magma", vmin=0, vmax=ERROR_RANGE)
+        for axis, disparity in zip(row[4:], disparities, strict=True):
+            axis.imshow(disparity.cpu().float(), cmap="viridis", vmin=0, vmax=nearest_is_bright)
+        for axis in row:
+            axis.set_xticks([])
+            axis.set_yticks([])
+    return figure

@@ -1,0 +1,123 @@
+"""Measures every validation and test image, beside what one gets for nothing."""
+
+import csv
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor
+
+from asysplat.evaluation import baselines
+from asysplat.evaluation.lpips import load_lpips, lpips_distance
+from asysplat.evaluation.metrics import PROTOCOL, abs_rel, delta1, psnr, ssim
+from asysplat.training.reconstruction import Outcome
+
+Row = dict[str, str | float]
+
+
+class Metrics(lightning.Callback):
+    """PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image: to the logger, metrics.csv.
+
+    Args:
+        folder: of the run; metrics.csv is written there after the test.
+        weights: folder that may hold AlexNet for LPIPS; without it that column is missing.
+    """
+
+    def __init__(self, folder: str, weights: str):
+        self.folder, self.weights = Path(folder), Path(weights)
+        self.rows: list[Row] = []
+        self.results: dict[str, float] = {}
+
+    def setup(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str
+    ) -> None:
+        if hasattr(self, "lpips"):
+            return
+        self.lpips = load_lpips("alex", self.weights)
+        if self.lpips is None and trainer.is_global_zero:
+            warnings.warn(
+                "AlexNet is neither in torch's hub cache nor in paths.weights: "
+                "the run goes on without LPIPS.",
+                stacklevel=2,
+            )
+
+    def measure(self, rendered: Tensor, target: Tensor) -> dict[str, Tensor]:
+        """Image metrics, [B, V] each."""
+        values = {"psnr": psnr(rendered, target), "ssim": ssim(rendered, target)}
+        if self.lpips is not None:
+            values["lpips"] = lpips_distance(self.lpips.to(target.device), rendered, target)
+        return values
+
+    def _add(self, batch: dict[str, Any], outcome: Outcome) -> None:
+        inputs, targets = batch["inputs"], batch["targets"]
+        values = self.measure(outcome.rendering.image, targets.images)
+        if targets.depths is not None:
+            values["absrel"] = abs_rel(outcome.rendering.depth, targets.depths)
+            values["delta1"] = delta1(outcome.rendering.depth, targets.depths)
+        for name in ("mean_colour", "nearest_view"):
+            free = self.measure(getattr(baselines, name)(inputs, targets), targets.images)
+            values.update({f"{name}/{metric}": value for metric, value in free.items()})
+        for index, scene in enumerate(batch["scene"]):
+            for view in range(targets.num_views):
+                numbers = {name: value[index, view].item() for name, value in values.items()}
+                self.rows.append({"scene": scene, "view": view, **numbers})
+
+    def on_validation_epoch_start(self, *_: Any) -> None:
+        self.rows = []
+
+    on_test_epoch_start = on_validation_epoch_start
+
+    def on_validation_batch_end(
+        self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
+    ) -> None:
+        self._add(batch, outputs)
+
+    on_test_batch_end = on_validation_batch_end
+
+    def on_validation_epoch_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule
+    ) -> None:
+        means = average(gather(trainer, self.rows))
+        module.log_dict({f"val/{name}": means[name] for name in PROTOCOL if name in means})
+
+    def on_test_epoch_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule
+    ) -> None:
+        rows = gather(trainer, self.rows)
+        means, data = average(rows), trainer.datamodule.name
+        for name, value in means.items():
+            baseline = "/" in name
+            key = f"baseline/{data}/{name}" if baseline else f"test/{data}/{name}"
+            self.results[key] = value
+        module.log_dict(self.results)
+        if trainer.is_global_zero:
+            write_csv(self.folder / "metrics.csv", rows)
+
+
+def gather(trainer: lightning.Trainer, rows: list[Row]) -> list[Row]:
+    """The rows of all processes; every process takes part."""
+    if trainer.world_size == 1:
+        return rows
+    per_process: list[list[Row]] = [[] for _ in range(trainer.world_size)]
+    torch.distributed.all_gather_object(per_process, rows)
+    return [row for part in per_process for row in part]
+
+
+def average(rows: Iterable[Row]) -> dict[str, float]:
+    """The mean of every numeric column over the images that have it."""
+    columns: dict[str, list[float]] = {}
+    for row in rows:
+        for name, value in row.items():
+            if name not in ("scene", "view"):
+                columns.setdefault(name, []).append(value)
+    return {name: torch.tensor(values).nanmean().item() for name, values in columns.items()}
+
+
+def write_csv(path: Path, rows: list[Row]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)

@@ -1,0 +1,63 @@
+"""Pictures of every validation and of the test: to TensorBoard and as PNG beside the metrics."""
+
+from pathlib import Path
+from typing import Any
+
+import lightning
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from asysplat.evaluation.pictures import comparison
+from asysplat.training.reconstruction import Outcome
+
+
+class Pictures(lightning.Callback):
+    """One comparison of the first scenes of each validation and test.
+
+    Args:
+        folder: of the run; pictures go to its sub-folder `pictures`.
+        scenes: how many scenes to draw.
+    """
+
+    def __init__(self, folder: str, scenes: int):
+        self.folder, self.scenes = Path(folder) / "pictures", scenes
+
+    def on_validation_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        module: lightning.LightningModule,
+        outputs: Outcome,
+        batch: Any,
+        index: int,
+        *_: Any,
+    ) -> None:
+        if not trainer.sanity_checking:
+            self._draw(trainer, "val", outputs, batch, index)
+
+    def on_test_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        module: lightning.LightningModule,
+        outputs: Outcome,
+        batch: Any,
+        index: int,
+        *_: Any,
+    ) -> None:
+        self._draw(trainer, "test", outputs, batch, index)
+
+    def _draw(
+        self, trainer: lightning.Trainer, stage: str, outcome: Outcome, batch: Any, index: int
+    ) -> None:
+        if index >= self.scenes or not trainer.is_global_zero:
+            return
+        first = (
+            record.map(lambda tensor: tensor[0].detach())
+            for record in (batch["inputs"], batch["targets"], outcome.rendering)
+        )
+        figure = comparison(*first)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        step = "" if stage == "test" else f"-{trainer.global_step:06d}"
+        figure.savefig(self.folder / f"{stage}-{index}{step}.png", dpi=100)
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                name = f"{stage}/{batch['scene'][0] if stage == 'test' else index}"
+                logger.experiment.add_figure(name, figure, trainer.global_step)

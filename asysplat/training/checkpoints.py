@@ -1,0 +1,56 @@
+"""Which checkpoint a run goes on from, and whether it fits."""
+
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from asysplat.errors import InputError
+
+
+def find_checkpoint(asked: str | None, runs: Path) -> Path | None:
+    """The checkpoint that `ckpt_path` names.
+
+    Args:
+        asked: None, a file, or "last": the newest `last.ckpt` below `runs`.
+
+    Raises:
+        InputError: there is none.
+    """
+    if asked is None:
+        return None
+    if asked != "last":
+        if not Path(asked).is_file():
+            raise InputError(f"ckpt_path={asked} does not exist: name a .ckpt file, or last.")
+        return Path(asked)
+    found = sorted(runs.rglob("checkpoints/last.ckpt"), key=lambda path: path.stat().st_mtime)
+    if not found:
+        raise InputError(
+            f"ckpt_path=last found no checkpoints/last.ckpt in {runs}: "
+            "leave ckpt_path out to start a new run, or set name= to that of the run."
+        )
+    print(f"going on from {found[-1]}")
+    return found[-1]
+
+
+def check_checkpoint(path: Path | None, module: nn.Module) -> None:
+    """Compare names and shapes, so that a mistake shows before training.
+
+    Raises:
+        InputError: the file cannot be read, or was written by another model.
+    """
+    if path is None:
+        return
+    try:
+        state = torch.load(path, map_location="meta", weights_only=True)["state_dict"]
+    except Exception as error:
+        raise InputError(f"{path} cannot be read as a checkpoint ({error}).") from error
+    expected = module.state_dict()
+    for name in sorted(expected.keys() | state.keys()):
+        there, here = state.get(name), expected.get(name)
+        if there is None or here is None or there.shape != here.shape:
+            sizes = [None if t is None else tuple(t.shape) for t in (there, here)]
+            raise InputError(
+                f"{path} does not fit this model: {name} is {sizes[0]} there and {sizes[1]} here; "
+                "give the options that the run was started with (see its config.yaml)."
+            )

@@ -1,0 +1,43 @@
+"""What a run leaves: metrics.json, and a table on the terminal."""
+
+import json
+import math
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+METRICS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "absrel": "AbsRel"}
+METRICS["delta1"] = "delta<1.25"
+
+
+def write_json(path: Path, results: dict[str, float]) -> None:
+    """Flat and sorted, NaN as null; complete or not there at all."""
+    finite = {key: value if math.isfinite(value) else None for key, value in results.items()}
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
+    partial.replace(path)
+
+
+def print_summary(results: dict[str, float], data: str, folder: Path) -> None:
+    """The test beside what one gets for nothing, the costs, the pictures; the folder last."""
+    sources = {
+        "trained": f"test/{data}",
+        "nearest view, copied": f"baseline/{data}/nearest_view",
+        "mean colour": f"baseline/{data}/mean_colour",
+    }
+    shown = [name for name in METRICS if f"test/{data}/{name}" in results]
+    table = Table("", *(METRICS[name] for name in shown), title=f"test scenes: {data}")
+    for label, prefix in sources.items():
+        values = [results.get(f"{prefix}/{name}") for name in shown]
+        table.add_row(label, *("" if v is None else f"{v:.3f}" for v in values))
+    console = Console()
+    console.print(table)
+    console.print(
+        f"{results['cost/parameters'] / 1e6:.2f}M parameters, "
+        f"{results['cost/geometry_share']:.1%} in the geometry branch; "
+        f"{results['cost/gaussians']:.0f} Gaussians a scene; "
+        f"{results.get('cost/seconds_per_step', math.nan):.2f} s a step"
+    )
+    console.print(f"pictures: {folder / 'pictures'}", soft_wrap=True)
+    console.print(f"run: {folder}", soft_wrap=True)

@@ -1,0 +1,60 @@
+"""TensorBoard: readable first page, filled hparams tab."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from lightning.pytorch.loggers import TensorBoardLogger
+from omegaconf import DictConfig, OmegaConf
+
+CHOICES = (
+    "name",
+    "seed",
+    "width",
+    "state_size",
+    "geometry_ratio",
+    "steps",
+    "model.layers",
+    "data.name",
+    "data.inputs",
+    "data.height",
+    "data.width",
+    "data.batch_size",
+    "training.learning_rate",
+    "training.loss.perceptual",
+    "training.loss.depth",
+)
+HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
+
+LAYOUT = {
+    "quality": {
+        "PSNR (dB)": ["Multiline", ["train/psnr", "val/psnr"]],
+        "SSIM": ["Multiline", ["val/ssim"]],
+        "LPIPS": ["Multiline", ["val/lpips"]],
+        "AbsRel": ["Multiline", ["val/absrel"]],
+    },
+    "training": {
+        "loss": ["Multiline", ["train/loss", "train/mse", "train/perceptual", "train/depth"]],
+        "gradient norm": ["Multiline", ["train/grad_norm"]],
+        "learning rate": ["Multiline", ["train/learning_rate"]],
+    },
+}
+
+
+def make_logger(folder: Path) -> TensorBoardLogger:
+    """A logger whose "custom scalars" page shows quality first."""
+    logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
+    logger.experiment.add_custom_scalars(LAYOUT)
+    return logger
+
+
+def log_choices(logger: TensorBoardLogger, config: DictConfig) -> None:
+    """The hparams tab; its metrics must be named before they are known."""
+    choices = {key: OmegaConf.select(config, key) for key in CHOICES}
+    logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in HPARAMS_METRICS})
+
+
+def log_outcome(logger: TensorBoardLogger, results: Mapping[str, float], data: str) -> None:
+    """The test's numbers to the hparams tab."""
+    found = {f"hp/{name}": results.get(f"test/{data}/{name}") for name in HPARAMS_METRICS}
+    logger.log_metrics({name: value for name, value in found.items() if value is not None})
+    logger.save()

@@ -1,0 +1,57 @@
+"""Fit, then test, one configuration: python train.py model=asysplat_4m4s scale=laptop"""
+
+import sys
+from pathlib import Path
+
+import hydra
+import lightning
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from asysplat.errors import InputError
+from asysplat.training.checkpoints import check_checkpoint, find_checkpoint
+from asysplat.training.summary import print_summary, write_json
+from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
+
+
+@hydra.main(config_path="conf", config_name="train", version_base="1.3")
+def main(config: DictConfig) -> float | None:
+    try:
+        return train(config)
+    except InputError as error:
+        sys.exit(f"error: {error}")
+
+
+def train(config: DictConfig) -> float | None:
+    """Train and test; returns the test PSNR, which a sweep may optimise."""
+    for key in OmegaConf.missing_keys(config):
+        raise InputError(f"{key} is not set: add {key}=... to the command.")
+    folder = Path(config.paths.run)
+    lightning.seed_everything(config.seed, workers=True, verbose=False)
+    checkpoint = find_checkpoint(config.ckpt_path, Path(config.paths.logs) / config.name)
+    data = instantiate(config.data)
+    data.setup()
+    net = instantiate(config.model)
+    net.check_size(data.height, data.width)
+    module = instantiate(config.training, net=net)
+    check_checkpoint(checkpoint, module)
+
+    OmegaConf.save(config, folder / "config.yaml", resolve=True)
+    callbacks = instantiate(config.callbacks)
+    logger = make_logger(folder)
+    log_choices(logger, config)
+    trainer = instantiate(config.trainer, callbacks=list(callbacks.values()), logger=logger)
+    trainer.fit(module, data, ckpt_path=checkpoint)
+    trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
+    trainer.test(module, data, verbose=False)
+
+    results = callbacks.costs.values | callbacks.metrics.results
+    if trainer.is_global_zero:
+        write_json(folder / "metrics.json", results)
+        log_outcome(logger, results, data.name)
+        print_summary(results, data.name, folder)
+    return results.get(f"test/{data.name}/psnr")
+
+
+if __name__ == "__main__":
+    main()
