@@ -8,7 +8,7 @@ import lightning
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from asysplat.errors import InputError
+from asysplat.errors import InputError, input_error_behind
 from asysplat.training.checkpoints import check_checkpoint, find_checkpoint
 from asysplat.training.summary import print_summary, write_json
 from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
@@ -18,8 +18,11 @@ from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
 def main(config: DictConfig) -> float | None:
     try:
         return train(config)
-    except InputError as error:
-        sys.exit(f"error: {error}")
+    except Exception as error:
+        mistake = input_error_behind(error)
+        if mistake is None:
+            raise
+        sys.exit(f"error: {mistake}")
 
 
 def train(config: DictConfig) -> float | None:

@@ -7,3 +7,11 @@ class InputError(ValueError):
     The message is one sentence that names the field or file, says what was found and what was
     expected, and how to mend it. Scripts print it alone, without a traceback.
     """
+
+
+def input_error_behind(error: BaseException) -> InputError | None:
+    """The InputError that `error` is, or was raised from; Hydra wraps those of constructors."""
+    seen: BaseException | None = error
+    while seen is not None and not isinstance(seen, InputError):
+        seen = seen.__cause__ or seen.__context__
+    return seen

@@ -47,10 +47,11 @@ class TensorRecord:
                 stacked[field.name] = type(values[0]).stack(values)
             elif all(isinstance(value, Tensor) for value in values):
                 stacked[field.name] = torch.stack(values)
-            elif all(value == values[0] for value in values if not isinstance(value, Tensor)):
+            elif any(value is None for value in values):
                 # A field that some scenes lack is dropped for the whole batch.
-                has_tensor = any(isinstance(value, Tensor) for value in values)
-                stacked[field.name] = None if has_tensor else values[0]
+                stacked[field.name] = None
+            elif all(value == values[0] for value in values):
+                stacked[field.name] = values[0]
             else:
                 raise InputError(
                     f"{cls.__name__}.{field.name} differs within one batch ({values}): "
@@ -125,7 +126,9 @@ class Cameras(TensorRecord):
         in_camera = torch.stack(
             torch.broadcast_tensors((x - cx) / fx, (y - cy) / fy, torch.ones_like(x)), dim=-1
         )
-        directions = torch.einsum("...ij,...hwj->...hwi", self.cam_to_world[..., :3, :3], in_camera)
+        # Not a matrix product: autocast would round those to half precision.
+        rotation = self.cam_to_world[..., None, None, :3, :3]
+        directions = (rotation * in_camera[..., None, :]).sum(-1)
         directions = torch.nn.functional.normalize(directions, dim=-1)
         return self.centers[..., None, None, :].expand_as(directions), directions
 

@@ -18,6 +18,9 @@ from PIL import Image
 
 from asysplat.errors import InputError
 
+END_MARKERS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
+TAIL_BYTES = 4096  # room for what some cameras append
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -46,12 +49,12 @@ class Lens:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height), from the file's header alone.
+    """(width, height), from the header; only a file whose end is missing is decoded as well.
 
     Raises:
-        InputError: the file is missing, empty or not an image.
+        InputError: the file is missing, empty, not an image or cut short.
     """
-    return _read(path, lambda image: image.size)
+    return _read(path, _size_if_whole)
 
 
 def load_photograph(path: Path) -> UInt8[ndarray, "h w 3"]:
@@ -164,6 +167,18 @@ def _to_rgb(image: Image.Image) -> UInt8[ndarray, "h w 3"]:
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
     return np.asarray(image.convert("RGB"))
+
+
+def _size_if_whole(image: Image.Image) -> tuple[int, int]:
+    """A file that does not end as its format ends is decoded, which fails if it was cut short."""
+    marker = END_MARKERS.get(image.format or "")
+    if marker:
+        with open(image.filename, "rb") as file:
+            file.seek(0, 2)
+            file.seek(max(0, file.tell() - TAIL_BYTES))
+            if marker not in file.read():
+                image.load()
+    return image.size
 
 
 def _read(path: Path, extract: Callable[[Image.Image], Any]) -> Any:

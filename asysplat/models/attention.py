@@ -23,7 +23,7 @@ class MLP(nn.Sequential):
 
 
 class QueryKeyNorm(nn.Module):
-    """RMSNorm of queries and keys, shared by the heads, in fp32."""
+    """RMSNorm of queries and keys, shared by the heads, in the weights' fp32."""
 
     def __init__(self, head_width: int):
         super().__init__()
@@ -32,7 +32,8 @@ class QueryKeyNorm(nn.Module):
 
     def forward(self, q: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         with without_autocast(q):
-            return self.query(q.float()).to(q.dtype), self.key(k.float()).to(k.dtype)
+            dtype = self.query.weight.dtype
+            return self.query(q.to(dtype)).to(q.dtype), self.key(k.to(dtype)).to(k.dtype)
 
 
 class SelfAttention(nn.Module):

@@ -84,6 +84,7 @@ class Reconstruction(lightning.LightningModule):
             ],
             lr=self.learning_rate,
             betas=tuple(self.betas),
+            fused=True,
         )
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self.learning_rate_factor)
         return {

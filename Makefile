@@ -1,0 +1,20 @@
+.PHONY: demo test format
+PYTHON ?= python3
+ENV := .venv/.ready
+
+demo: $(ENV) ## train a small model on made-up scenes, measure it, draw what it sees
+	.venv/bin/python train.py name=demo
+
+test: $(ENV) ## style and tests
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/python -m pytest
+
+format: $(ENV)
+	.venv/bin/ruff check --fix .
+	.venv/bin/ruff format .
+
+$(ENV): pyproject.toml
+	$(PYTHON) -m venv .venv
+	.venv/bin/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	touch $(ENV)

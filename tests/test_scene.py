@@ -1,0 +1,115 @@
+"""The values that pass between the rooms: shapes, numbers, and what they refuse."""
+
+import pytest
+import torch
+
+from asysplat import Cameras, Gaussians, Views
+from asysplat.errors import InputError
+
+
+def cameras(views=2, height=4, width=6):
+    intrinsics = torch.tensor([[5.0, 0, 3.0], [0, 6.0, 2.0], [0, 0, 1]]).repeat(views, 1, 1)
+    return Cameras(intrinsics, torch.eye(4).repeat(views, 1, 1), height, width)
+
+
+def gaussians(count=5):
+    return Gaussians(
+        torch.randn(count, 3),
+        torch.randn(count, 4),
+        torch.rand(count, 3) + 0.1,
+        torch.full((count,), 0.5),
+        torch.randn(count, 4, 3),
+    )
+
+
+def test_rays_go_through_pixel_centres():
+    origins, directions = cameras().rays()
+    assert origins.shape == directions.shape == (2, 4, 6, 3)
+    expected = torch.tensor([(0.5 - 3) / 5, (3.5 - 2) / 6, 1.0])
+    torch.testing.assert_close(directions[0, 3, 0], expected / expected.norm())
+
+
+def test_rays_of_resized_cameras_are_those_between_the_pixels():
+    _, fine = cameras().rays()
+    _, coarse = cameras().resized(2, 3).rays()
+    block = (fine / fine[..., 2:])[:, :2, :2].mean((1, 2))
+    torch.testing.assert_close((coarse / coarse[..., 2:])[:, 0, 0], block)
+
+
+def test_select_and_stack_and_to():
+    views = Views(cameras(3), torch.rand(3, 3, 4, 6), torch.rand(3, 4, 6))
+    picked = views.select([2, 0])
+    assert torch.equal(picked.images[0], views.images[2])
+    assert torch.equal(picked.depths[1], views.depths[0])
+    batch = Views.stack([views, picked.select([0, 1, 1])])
+    assert batch.images.shape == (2, 3, 3, 4, 6)
+    assert batch.to(torch.float64).cameras.intrinsics.dtype == torch.float64
+
+
+def test_a_field_that_one_scene_lacks_is_dropped_from_the_batch():
+    images = torch.rand(2, 3, 4, 6)
+    with_depth = Views(cameras(), images, torch.rand(2, 4, 6))
+    assert Views.stack([with_depth, Views(cameras(), images)]).depths is None
+
+
+def test_scenes_of_different_sizes_do_not_stack():
+    with pytest.raises(InputError, match="height"):
+        Cameras.stack([cameras(height=4), cameras(height=8)])
+
+
+def test_gaussians_keep_crop_scale():
+    scene = gaussians()
+    right = scene.means[:, 0] > 0
+    assert torch.equal(scene.keep(right).sh, scene.sh[right])
+    box = scene.crop(torch.full((3,), -0.5), torch.full((3,), 0.5))
+    assert box.num_gaussians == int((scene.means.abs() <= 0.5).all(-1).sum())
+    doubled = scene.scale_by(2.0)
+    torch.testing.assert_close(doubled.means, 2 * scene.means)
+    torch.testing.assert_close(doubled.scales, 2 * scene.scales)
+    assert torch.equal(doubled.quats, scene.quats)
+
+
+def broken_pose(change):
+    pose = torch.eye(4).repeat(2, 1, 1)
+    change(pose)
+    return Cameras(cameras().intrinsics, pose, 4, 6)
+
+
+BAD_POSES = {
+    "NaN": lambda pose: pose[1, 0, 3].fill_(float("nan")),
+    "orthonormal": lambda pose: pose[1, 0, 0].fill_(2.0),
+    "determinant": lambda pose: pose[1, 0, 0].fill_(-1.0),
+    "last row": lambda pose: pose[1, 3, 0].fill_(1.0),
+}
+
+
+@pytest.mark.parametrize("complaint", BAD_POSES)
+def test_bad_poses_name_field_and_view(complaint):
+    with pytest.raises(InputError, match=rf"cam_to_world\[1\].*{complaint}"):
+        broken_pose(BAD_POSES[complaint]).validate()
+
+
+def test_bad_images():
+    images = torch.rand(2, 3, 4, 6)
+    with pytest.raises(InputError, match="expected \\(2, 3, 4, 6\\)"):
+        Views(cameras(), images[..., :5])
+    images[1, 0, 0, 0] = 255
+    with pytest.raises(InputError, match=r"images\[1\].*255"):
+        Views(cameras(), images).validate()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "complaint"),
+    [("scales", 0.0, "exp"), ("opacities", 1.5, "sigmoid"), ("means", float("inf"), "infinity")],
+)
+def test_bad_gaussians(field, value, complaint):
+    scene = gaussians()
+    getattr(scene, field)[3] = value
+    with pytest.raises(InputError, match=rf"{field}\[3\].*{complaint}"):
+        scene.validate()
+
+
+def test_unusable_number_of_harmonics():
+    scene = gaussians()
+    with pytest.raises(InputError, match="1, 4, 9 or 16"):
+        Gaussians(scene.means, scene.quats, scene.scales, scene.opacities, torch.rand(5, 5, 3))
