@@ -27,7 +27,7 @@ HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
 
 LAYOUT = {
     "quality": {
-        "PSNR (dB)": ["Multiline", ["train/psnr", "val/psnr"]],
+        "PSNR (dB)": ["Multiline", ["train/psnr", "val/psnr", "val/nearest_view/psnr"]],
         "SSIM": ["Multiline", ["val/ssim"]],
         "LPIPS": ["Multiline", ["val/lpips"]],
         "AbsRel": ["Multiline", ["val/absrel"]],

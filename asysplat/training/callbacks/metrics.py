@@ -81,7 +81,8 @@ class Metrics(lightning.Callback):
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
         means = average(gather(trainer, self.rows))
-        module.log_dict({f"val/{name}": means[name] for name in PROTOCOL if name in means})
+        shown = [*PROTOCOL, "nearest_view/psnr", "mean_colour/psnr"]
+        module.log_dict({f"val/{name}": means[name] for name in shown if name in means})
 
     def on_test_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
