@@ -10,7 +10,7 @@ from asysplat.errors import InputError
 from asysplat.models.shapes import Widths
 
 SHARE_TOLERANCE = 0.015
-TOTAL_TOLERANCE = 0.01
+TOTAL_TOLERANCE = 0.0095  # so that any two totals are within 2 %
 
 Build = Callable[[Widths, int], nn.Module]
 

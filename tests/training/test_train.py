@@ -1,0 +1,171 @@
+"""The script: fit, resume, measure, and what it refuses, on tiny made-up scenes."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+TINY = [
+    *("width=0.125", "state_size=8", "model.layers=1m1s", "steps=4", "validate_every=2"),
+    "trainer.log_every_n_steps=1",
+    *("data.height=32", "data.width=32", "data.inputs=3", "data.targets=2", "data.workers=0"),
+]
+TINY_SCENES = [
+    *("data.num_frames=24", "data.window=[12,24]"),
+    *("data.val_scenes=1", "data.test_scenes=2"),
+]
+
+
+@pytest.fixture
+def train(tmp_path, repository, monkeypatch):
+    """Runs train.py with overrides; logs go below tmp_path."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+    def run(*overrides, scenes=TINY_SCENES):
+        command = [sys.executable, "train.py", *overrides, f"paths.logs={tmp_path}", *scenes]
+        command += [word for word in TINY if word.split("=")[0] not in str(overrides)]
+        return subprocess.run(
+            command, cwd=repository, env=environment, capture_output=True, text=True
+        )
+
+    run.command = [sys.executable, "train.py", f"paths.logs={tmp_path}", *TINY, *TINY_SCENES]
+    run.environment = environment
+    return run
+
+
+def run_folder(result: subprocess.CompletedProcess) -> Path:
+    """The folder that the script prints last."""
+    assert result.returncode == 0, result.stderr
+    label, folder = result.stdout.strip().splitlines()[-1].split(": ", 1)
+    assert label == "run"
+    return Path(folder)
+
+
+def metrics(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_a_run_leaves_what_is_promised(train):
+    folder = run_folder(train())
+    numbers = metrics(folder)
+    for name in ("psnr", "ssim", "absrel", "delta1"):
+        assert isinstance(numbers[f"test/procedural/{name}"], float)
+    assert numbers["baseline/procedural/mean_colour/psnr"] < 30
+    assert numbers["baseline/procedural/nearest_view/psnr"] < 30
+    expected = {"parameters", "geometry_share", "gflops", "gflops_true", "gaussians"}
+    expected |= {"peak_gb"}
+    assert expected <= {key.removeprefix("cost/") for key in numbers if key.startswith("cost/")}
+    assert numbers["cost/gaussians"] == 3 * 16 * 16
+    assert numbers["cost/gflops_true"] > numbers["cost/gflops"] > 0
+
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 2
+    mean = sum(float(row["psnr"]) for row in rows) / len(rows)
+    assert abs(mean - numbers["test/procedural/psnr"]) < 1e-4
+
+    assert yaml.safe_load((folder / "config.yaml").read_text())["steps"] == 4
+    assert {"best.ckpt", "last.ckpt"} <= {p.name for p in (folder / "checkpoints").iterdir()}
+    assert (folder / "pictures" / "test-0.png").stat().st_size > 10_000
+    check_tensorboard(folder / "tensorboard", numbers)
+
+
+def check_tensorboard(folder: Path, numbers: dict) -> None:
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    tags = events.Tags()
+    scalars = set(tags["scalars"])
+    for name in ("train/psnr", "val/psnr", "test/procedural/psnr", "cost/parameters"):
+        assert name in scalars
+    last = events.Scalars("hp/psnr")[-1].value
+    assert abs(last - numbers["test/procedural/psnr"]) < 1e-3
+    assert any(tag.startswith("val/") for tag in tags["images"])
+    plugins = events.summary_metadata
+    assert "custom_scalars__config__" in plugins
+    assert "_hparams_/session_start_info" in plugins
+
+
+def test_killed_and_resumed_ends_with_the_same_bits(train, repository, tmp_path):
+    whole = run_folder(train("name=whole", "steps=6"))
+    process = subprocess.Popen(
+        [*train.command, "name=killed", "steps=6"],
+        cwd=repository,
+        env=train.environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    deadline = time.monotonic() + 300
+    while not list(tmp_path.glob("killed/*/checkpoints/last.ckpt")):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not list(tmp_path.glob("killed/*/metrics.json"))
+    resumed = run_folder(train("name=killed", "steps=6", "ckpt_path=last"))
+    weights = [
+        torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+        for folder in (whole, resumed)
+    ]
+    assert weights[0].keys() == weights[1].keys()
+    for name, tensor in weights[0].items():
+        assert torch.equal(tensor, weights[1][name]), name
+
+
+def test_geometry_ratio_sweep(train, tmp_path):
+    result = train("-m", "geometry_ratio=0.5,0.7,0.9", "model.layers=4m4s", "width=0.25", "steps=1")
+    assert result.returncode == 0, result.stderr
+    found = [metrics(path.parent) for path in sorted(tmp_path.rglob("metrics.json"))]
+    assert len(found) == 3
+    for asked, numbers in zip((0.5, 0.7, 0.9), found, strict=True):
+        assert abs(numbers["cost/geometry_share"] - asked) < 0.02
+    totals = [numbers["cost/parameters"] for numbers in found]
+    assert max(totals) / min(totals) < 1.02
+
+
+def test_a_real_scene(train, shared):
+    scene = shared / "data" / "fox"
+    before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
+    folder = run_folder(train("data=transforms", f"data.root={scene}", scenes=[]))
+    assert metrics(folder)["test/transforms/psnr"] > 5
+    assert "test/transforms/absrel" not in metrics(folder)
+    assert {path: path.stat().st_mtime_ns for path in scene.rglob("*")} == before
+
+
+REFUSED = {
+    "an unknown override": (["widht=1"], "widht"),
+    "an unknown model": (["model=asysplat_9x"], "asysplat_4m4s"),
+    "a size that the patches do not take": (["data.height=40"], "set 64x32"),
+    "an unusable layer mix": (["model.layers=4q"], "such as 4m4s"),
+    "a ratio out of reach": (["geometry_ratio=1.5"], "geometry_ratio=1.5 cannot be met"),
+    "a missing folder": (["data=transforms", "data.root=nowhere"], "data.root=nowhere"),
+    "no folder": (["data=transforms"], "add data.root=..."),
+    "no checkpoint": (["ckpt_path=last", "name=new"], "leave ckpt_path out"),
+    "too many views": (["data.inputs=30"], "has 24 frames"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_mistakes_are_one_clear_sentence(train, case, tmp_path):
+    overrides, words = REFUSED[case]
+    scenes = [] if "data=transforms" in overrides else TINY_SCENES
+    result = train(*overrides, scenes=scenes)
+    assert result.returncode != 0
+    assert words in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not list(tmp_path.rglob("checkpoints"))
+
+
+def test_a_checkpoint_of_another_model(train):
+    folder = run_folder(train("steps=1"))
+    result = train("width=0.25", f"ckpt_path={folder}/checkpoints/last.ckpt")
+    assert result.returncode != 0
+    assert "does not fit this model" in result.stderr and "Traceback" not in result.stderr
