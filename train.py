@@ -1,6 +1,8 @@
 """Fit, then test, one configuration: python train.py model=asysplat_4m4s scale=laptop"""
 
+import logging
 import sys
+import warnings
 from pathlib import Path
 
 import hydra
@@ -25,10 +27,17 @@ def main(config: DictConfig) -> float | None:
         sys.exit(f"error: {mistake}")
 
 
+def quiet_lightning() -> None:
+    """Lightning's tips and deprecations speak to its developers, not to who runs this."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="lightning")
+
+
 def train(config: DictConfig) -> float | None:
     """Train and test; returns the test PSNR, which a sweep may optimise."""
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
+    quiet_lightning()
     folder = Path(config.paths.run)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     checkpoint = find_checkpoint(config.ckpt_path, Path(config.paths.logs) / config.name)
@@ -44,7 +53,7 @@ def train(config: DictConfig) -> float | None:
     logger = make_logger(folder)
     log_choices(logger, config)
     trainer = instantiate(config.trainer, callbacks=list(callbacks.values()), logger=logger)
-    trainer.fit(module, data, ckpt_path=checkpoint)
+    trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
     trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     trainer.test(module, data, verbose=False)
 

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 
 REPO = Path(__file__).resolve().parents[1]
 
@@ -21,6 +23,19 @@ def shared() -> Path:
 @pytest.fixture(scope="session")
 def repository() -> Path:
     return REPO
+
+
+@pytest.fixture(scope="session")
+def build(repository):
+    """The network that `train.py` would build for these overrides."""
+
+    def network(*overrides: str, device: str = "cpu") -> torch.nn.Module:
+        with initialize_config_dir(str(repository / "conf"), version_base=None):
+            config = compose("train", list(overrides))
+        with torch.device(device):
+            return instantiate(config.model)
+
+    return network
 
 
 @pytest.fixture(autouse=True)

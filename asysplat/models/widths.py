@@ -31,6 +31,8 @@ def solve_widths(build: Build, base: Widths, layers: int, ratio: float) -> tuple
     Raises:
         InputError: nothing comes within 0.015 of the ratio and 1 % of the total.
     """
+    if not 0 < ratio < 1:
+        raise InputError(f"geometry_ratio={ratio}: give a share between 0 and 1, such as 0.9.")
     budget, _ = _count(build(base, layers))
     candidates = _candidates(base)
     terms = _quadratic_terms(candidates / base.head)

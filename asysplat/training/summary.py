@@ -37,7 +37,8 @@ def print_summary(results: dict[str, float], data: str, folder: Path) -> None:
         f"{results['cost/parameters'] / 1e6:.2f}M parameters, "
         f"{results['cost/geometry_share']:.1%} in the geometry branch; "
         f"{results['cost/gaussians']:.0f} Gaussians a scene; "
-        f"{results.get('cost/seconds_per_step', math.nan):.2f} s a step"
+        f"{results.get('cost/seconds_per_step', math.nan):.2f} s a step",
+        soft_wrap=True,
     )
     console.print(f"pictures: {folder / 'pictures'}", soft_wrap=True)
     console.print(f"run: {folder}", soft_wrap=True)

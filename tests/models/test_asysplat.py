@@ -2,28 +2,11 @@
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
-from hydra.utils import instantiate
 
 from asysplat.errors import InputError, input_error_behind
 from asysplat.models.layer_mix import parse_layer_mix
 from asysplat.scene import Cameras, Views
-
-
-def network(*overrides, repository, device="cpu"):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        config = compose("train", list(overrides))
-    with torch.device(device):
-        return instantiate(config.model)
-
-
-@pytest.fixture
-def build(repository):
-    return lambda *overrides, device="cpu": network(
-        *overrides, repository=repository, device=device
-    )
-
 
 TINY = ["width=0.125", "model.blocks.m.state_size=8", "model.layers=1m1s"]
 
@@ -73,10 +56,11 @@ def test_geometry_ratio(build, ratio, width):
     assert abs(total / expected - 1) < 0.01
 
 
-def test_geometry_ratio_that_cannot_be_met(build):
+@pytest.mark.parametrize(("ratio", "complaint"), [(1.2, "between 0 and 1"), (0.01, "ask for 0.0")])
+def test_geometry_ratio_that_cannot_be_met(build, ratio, complaint):
     with pytest.raises(InstantiationException) as caught:
-        build("geometry_ratio=1.2", device="meta")
-    assert "geometry_ratio=1.2 cannot be met" in str(input_error_behind(caught.value))
+        build(f"geometry_ratio={ratio}", device="meta")
+    assert complaint in str(input_error_behind(caught.value))
 
 
 def test_one_gaussian_per_output_pixel_at_its_ray(build):
@@ -189,3 +173,13 @@ def test_layer_mix(word, layers):
 def test_layer_mix_that_cannot_be_read(word):
     with pytest.raises(InputError, match="such as 4m4s"):
         parse_layer_mix(word, {"m", "s", "t"})
+
+
+@pytest.mark.gpu
+def test_gpu_agrees_with_cpu(build):
+    views = make_views()
+    net = build(*TINY).eval()
+    expected = net(views)
+    found = net.cuda()(views.to("cuda")).to("cpu")
+    torch.testing.assert_close(found.means, expected.means, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(found.sh, expected.sh, atol=1e-3, rtol=1e-3)

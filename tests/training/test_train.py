@@ -145,7 +145,7 @@ REFUSED = {
     "an unknown model": (["model=asysplat_9x"], "asysplat_4m4s"),
     "a size that the patches do not take": (["data.height=40"], "set 64x32"),
     "an unusable layer mix": (["model.layers=4q"], "such as 4m4s"),
-    "a ratio out of reach": (["geometry_ratio=1.5"], "geometry_ratio=1.5 cannot be met"),
+    "a ratio out of reach": (["geometry_ratio=1.5"], "geometry_ratio=1.5: give a share"),
     "a missing folder": (["data=transforms", "data.root=nowhere"], "data.root=nowhere"),
     "no folder": (["data=transforms"], "add data.root=..."),
     "no checkpoint": (["ckpt_path=last", "name=new"], "leave ckpt_path out"),

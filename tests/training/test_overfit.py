@@ -1,0 +1,38 @@
+"""The whole chain can learn: network, renderer, loss and optimizer on one scene."""
+
+import torch
+
+from asysplat.data.datamodule import collate, load
+from asysplat.data.procedural import ProceduralScene
+from asysplat.data.selection import evaluation_split
+from asysplat.data.sources import Task
+from asysplat.evaluation.metrics import psnr
+from asysplat.training import Reconstruction, ReconstructionLoss
+
+STEPS = 250
+
+
+def test_one_scene_overfitted_passes_30_db(build):
+    scene = ProceduralScene(3, 32, 32)
+    batch = collate([load(Task(scene, evaluation_split(96, 4, 2)))])
+    module = Reconstruction(
+        net=build("width=0.25", "state_size=32", "model.layers=1m1s"),
+        loss=ReconstructionLoss(mse=1.0, perceptual=0.0, depth=0.0),
+        learning_rate=1e-3,
+        weight_decay=0.0,
+        betas=(0.9, 0.95),
+        warmup_steps=10,
+        total_steps=STEPS,
+        background=(0.5, 0.5, 0.5),
+    )
+    options = module.configure_optimizers()
+    optimizer, schedule = options["optimizer"], options["lr_scheduler"]["scheduler"]
+    for _ in range(STEPS):
+        rendering = module.reconstruct(batch, depth=False).rendering
+        optimizer.zero_grad()
+        module.loss(rendering, batch["targets"])["loss"].backward()
+        optimizer.step()
+        schedule.step()
+    with torch.no_grad():
+        rendering = module.eval().reconstruct(batch, depth=False).rendering
+    assert psnr(rendering.image, batch["targets"].images).mean() >= 30
