@@ -3,6 +3,7 @@
 import lightning
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from asysplat.errors import InputError
 from asysplat.training.callbacks import SkipNonFiniteSteps
@@ -25,7 +26,8 @@ class Module(lightning.LightningModule):
         return torch.optim.AdamW(self.parameters(), lr=0.1)
 
     def train_dataloader(self):
-        return [{"scene": ["kitchen"]} for _ in self.scales]
+        batches = [{"scene": ["kitchen"]} for _ in self.scales]
+        return DataLoader(batches, batch_size=None)
 
 
 def fit(scales, tmp_path, **options):
