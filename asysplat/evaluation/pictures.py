@@ -1,5 +1,7 @@
 """What a number hides: input, target, rendered, error and depth beside each other."""
 
+from collections.abc import Mapping, Sequence
+
 from matplotlib.figure import Figure
 
 from asysplat.evaluation.baselines import nearest_view
@@ -42,4 +44,25 @@ def comparison(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
         for axis in row:
             axis.set_xticks([])
             axis.set_yticks([])
+    return figure
+
+
+def learning_curve(rows: Sequence[Mapping[str, float]]) -> Figure:
+    """Validation PSNR over training, above the two baselines that need none.
+
+    Args:
+        rows: one a validation, with minutes, step, psnr, nearest_view/psnr and mean_colour/psnr.
+    """
+    figure = Figure(figsize=(6, 3.6), layout="constrained")
+    axis = figure.subplots()
+    minutes = [row["minutes"] for row in rows]
+    axis.plot(minutes, [row["psnr"] for row in rows], "o-", label="trained")
+    axis.axhline(
+        rows[-1]["nearest_view/psnr"], color="tab:orange", ls="--", label="nearest view, copied"
+    )
+    axis.axhline(rows[-1]["mean_colour/psnr"], color="tab:gray", ls=":", label="mean colour")
+    axis.set(xlabel="minutes of training", ylabel="validation PSNR (dB)")
+    axis.set_title(f"{rows[-1]['step']:.0f} steps", fontsize=9)
+    axis.legend(frameon=False)
+    axis.grid(alpha=0.3)
     return figure

@@ -76,6 +76,9 @@ def test_a_run_leaves_what_is_promised(train):
     assert yaml.safe_load((folder / "config.yaml").read_text())["steps"] == 4
     assert {"best.ckpt", "last.ckpt"} <= {p.name for p in (folder / "checkpoints").iterdir()}
     assert (folder / "pictures" / "test-0.png").stat().st_size > 10_000
+    with (folder / "curve.csv").open() as file:
+        assert [row["step"] for row in csv.DictReader(file)] == ["2", "4"]
+    assert (folder / "pictures" / "curve.png").stat().st_size > 5_000
     check_tensorboard(folder / "tensorboard", numbers)
 
 
