@@ -113,8 +113,8 @@ class Cameras(TensorRecord):
             self, intrinsics=factors[:, None] * self.intrinsics, height=height, width=width
         )
 
-    def rays(self) -> tuple[Float[Tensor, "*batch V H W 3"], Float[Tensor, "*batch V H W 3"]]:
-        """World-space origins and unit directions through every pixel centre."""
+    def pixel_directions(self) -> Float[Tensor, "*batch V H W 3"]:
+        """Camera-space directions through every pixel centre, of z = 1."""
         options = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
         y, x = torch.meshgrid(
             torch.arange(self.height, **options) + 0.5,
@@ -123,12 +123,14 @@ class Cameras(TensorRecord):
         )
         fx, fy = self.intrinsics[..., 0, 0, None, None], self.intrinsics[..., 1, 1, None, None]
         cx, cy = self.intrinsics[..., 0, 2, None, None], self.intrinsics[..., 1, 2, None, None]
-        in_camera = torch.stack(
-            torch.broadcast_tensors((x - cx) / fx, (y - cy) / fy, torch.ones_like(x)), dim=-1
-        )
+        x, y, z = torch.broadcast_tensors((x - cx) / fx, (y - cy) / fy, torch.ones_like(x))
+        return torch.stack((x, y, z), dim=-1)
+
+    def rays(self) -> tuple[Float[Tensor, "*batch V H W 3"], Float[Tensor, "*batch V H W 3"]]:
+        """World-space origins and unit directions through every pixel centre."""
         # Not a matrix product: autocast would round those to half precision.
         rotation = self.cam_to_world[..., None, None, :3, :3]
-        directions = (rotation * in_camera[..., None, :]).sum(-1)
+        directions = (rotation * self.pixel_directions()[..., None, :]).sum(-1)
         directions = torch.nn.functional.normalize(directions, dim=-1)
         return self.centers[..., None, None, :].expand_as(directions), directions
 

@@ -81,7 +81,8 @@ class ProceduralScene:
     def _shoot(self, cameras: Cameras) -> tuple[Float[Tensor, "V 3 H W"], Float[Tensor, "V H W"]]:
         """Light and depth at every pixel."""
         size = (cameras.height, cameras.width)
-        in_camera = _pixel_directions(cameras)
+        # All frames share their intrinsics; directions of z = 1 make t the depth.
+        in_camera = cameras.select([0]).pixel_directions().flatten(0, 2).T.contiguous()
         light = in_camera.new_empty(cameras.num_views, 3, size[0] * size[1])
         depths = in_camera.new_empty(cameras.num_views, size[0] * size[1])
         at_once = RAYS_IN_CACHE if in_camera.device.type == "cpu" else in_camera.shape[1]
@@ -102,7 +103,7 @@ class ProceduralScene:
     def _expose(self) -> None:
         """Set exposure and contrast once for the whole walk, as a photographer would."""
         frames = np.linspace(0, self.num_frames - 1, PROBE_FRAMES).round().astype(int)
-        probe = _resized(self.cameras.select(frames.tolist()), PROBE_SIZE)
+        probe = self.cameras.select(frames.tolist()).resized(PROBE_SIZE, PROBE_SIZE)
         levels = self._shoot(probe)[0].clamp(min=DARKEST).log()
         self._gamma = CONTRAST / levels.std()
         self._threshold = self._gamma * levels.mean() - BRIGHTNESS
@@ -115,21 +116,3 @@ def _cameras(poses: np.ndarray, fov: float, height: int, width: int) -> Cameras:
     intrinsics = torch.as_tensor(matrix, dtype=torch.float32)
     cam_to_world = torch.as_tensor(poses, dtype=torch.float32)
     return Cameras(intrinsics.repeat(len(poses), 1, 1), cam_to_world, height, width)
-
-
-def _resized(cameras: Cameras, size: int) -> Cameras:
-    """The same fields of view with size x size pixels."""
-    scale = cameras.intrinsics.new_tensor([size / cameras.width, size / cameras.height, 1.0])
-    return Cameras(cameras.intrinsics * scale[:, None], cameras.cam_to_world, size, size)
-
-
-def _pixel_directions(cameras: Cameras) -> Float[Tensor, "3 R"]:
-    """Camera-space directions through the pixel centres, of z = 1, so that t is the depth."""
-    options = {"dtype": torch.float32, "device": cameras.intrinsics.device}
-    y, x = torch.meshgrid(
-        torch.arange(cameras.height, **options) + 0.5,
-        torch.arange(cameras.width, **options) + 0.5,
-        indexing="ij",
-    )
-    (fx, _, cx), (_, fy, cy), _ = cameras.intrinsics[0]
-    return torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(x))).flatten(1)

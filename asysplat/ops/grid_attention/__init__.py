@@ -4,6 +4,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.ops.dispatch import pick_backend
 from asysplat.ops.grid_attention.reference import grid_attention_reference
 from asysplat.ops.grid_attention.sdpa import grid_attention_sdpa
 
@@ -30,12 +31,11 @@ def grid_attention(
     Raises:
         InputError: a token map whose sides are not multiples of `grid`, or an unknown backend.
     """
-    if backend not in _BACKENDS:
-        raise InputError(f"grid_attention backend={backend!r}: expected one of {list(_BACKENDS)}.")
+    form = pick_backend("grid_attention", _BACKENDS, backend)
     height, width = q.shape[2:4]
     if height % grid or width % grid:
         raise InputError(
             f"grid_attention got a token map of {height}x{width}: both sides must be multiples "
             f"of the grid, {grid}; change the resolution or the patch size."
         )
-    return _BACKENDS[backend](q, k, v, grid)
+    return form(q, k, v, grid)

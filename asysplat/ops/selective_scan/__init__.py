@@ -1,11 +1,9 @@
 """Selective scan of Mamba (Gu and Dao 2023, Eq. 2), as MambaVision uses it within a frame."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.errors import InputError
-from asysplat.ops.precision import without_autocast
+from asysplat.ops.dispatch import pick_backend, run_scan
 from asysplat.ops.selective_scan.recurrent import selective_scan_recurrent
 from asysplat.ops.selective_scan.reference import selective_scan_reference
 
@@ -39,12 +37,5 @@ def selective_scan(
     Raises:
         InputError: an unknown backend.
     """
-    if backend not in _BACKENDS:
-        raise InputError(f"selective_scan backend={backend!r}: expected one of {list(_BACKENDS)}.")
-    dtype = torch.promote_types(x.dtype, torch.float32)
-    arguments = [tensor.to(dtype) for tensor in (x, dt, A, B, C, D)]
-    if reverse:
-        arguments = [t.flip(1) if t.ndim == 3 else t for t in arguments]
-    with without_autocast(x):
-        y = _BACKENDS[backend](*arguments)
-    return (y.flip(1) if reverse else y).to(x.dtype)
+    form = pick_backend("selective_scan", _BACKENDS, backend)
+    return run_scan(form, x, dt, A, B, C, D, reverse)

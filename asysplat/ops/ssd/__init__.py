@@ -1,11 +1,9 @@
 """State-space duality of Mamba2 (Dao and Gu 2024, Eq. 1 with scalar A per head)."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.errors import InputError
-from asysplat.ops.precision import without_autocast
+from asysplat.ops.dispatch import pick_backend, run_scan
 from asysplat.ops.ssd.chunked import ssd_chunked
 from asysplat.ops.ssd.reference import ssd_reference
 
@@ -35,12 +33,5 @@ def ssd(
     Raises:
         InputError: an unknown backend.
     """
-    if backend not in _BACKENDS:
-        raise InputError(f"ssd backend={backend!r}: expected one of {list(_BACKENDS)}.")
-    dtype = torch.promote_types(x.dtype, torch.float32)
-    arguments = [tensor.to(dtype) for tensor in (x, dt, A, B, C, D)]
-    if reverse:
-        arguments = [t.flip(1) if t.ndim >= 3 else t for t in arguments]
-    with without_autocast(x):
-        y = _BACKENDS[backend](*arguments)
-    return (y.flip(1) if reverse else y).to(x.dtype)
+    form = pick_backend("ssd", _BACKENDS, backend)
+    return run_scan(form, x, dt, A, B, C, D, reverse)
