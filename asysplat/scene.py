@@ -211,6 +211,12 @@ class Views(TensorRecord):
             masks=pick(self.masks, -3),
         )
 
+    def masked(self, rendered: Float[Tensor, "*batch V 3 H W"]) -> Float[Tensor, "*batch V 3 H W"]:
+        """`rendered` where pixels count, the photographs elsewhere: no error, no gradient there."""
+        if self.masks is None:
+            return rendered
+        return torch.where(self.masks[..., None, :, :], rendered, self.images)
+
     def validate(self, name: str = "Views") -> "Views":
         """Return self if every number can be used.
 

@@ -113,3 +113,12 @@ def test_unusable_number_of_harmonics():
     scene = gaussians()
     with pytest.raises(InputError, match="1, 4, 9 or 16"):
         Gaussians(scene.means, scene.quats, scene.scales, scene.opacities, torch.rand(5, 5, 3))
+
+
+def test_masked_pixels_are_neither_error_nor_gradient():
+    mask = torch.rand(2, 4, 6) > 0.5
+    views = Views(cameras(), torch.rand(2, 3, 4, 6), masks=mask)
+    rendered = torch.rand(2, 3, 4, 6, requires_grad=True)
+    (views.masked(rendered) - views.images).square().sum().backward()
+    assert torch.equal((rendered.grad != 0).all(1), mask)
+    assert torch.equal((rendered.grad == 0).all(1), ~mask)

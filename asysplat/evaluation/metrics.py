@@ -14,6 +14,7 @@ SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 DELTA = 1.25
 
+# Pixels that a view's mask excludes are shown as in the photograph before any image metric.
 # Written beside the numbers: the same images differ by dB and hundredths between protocols.
 PROTOCOL = {
     "psnr": "RGB in [0, 1], rendering clamped, from each image's own MSE (at most 100 dB), "

@@ -48,11 +48,11 @@ class ReconstructionLoss(nn.Module):
 
     def forward(self, rendering: Rendering, targets: Views) -> dict[str, Tensor]:
         """The weighted sum under "loss", and each term that is on, unweighted."""
-        terms = {}
+        terms, image = {}, targets.masked(rendering.image)
         if self.mse:
-            terms["mse"] = F.mse_loss(rendering.image, targets.images)
+            terms["mse"] = F.mse_loss(image, targets.images)
         if self._vgg:
-            terms["perceptual"] = self._perceptual(rendering.image, targets.images)
+            terms["perceptual"] = self._perceptual(image, targets.images)
         if self.needs_depth and targets.depths is not None and rendering.depth is not None:
             terms["depth"] = disparity_loss(rendering.depth, rendering.alpha, targets.depths)
         return {"loss": sum(getattr(self, name) * term for name, term in terms.items()), **terms}

@@ -7,13 +7,16 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from asysplat.evaluation.metrics import PROTOCOL
+
 METRICS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "absrel": "AbsRel"}
 METRICS["delta1"] = "delta<1.25"
 
 
 def write_json(path: Path, results: dict[str, float]) -> None:
-    """Flat and sorted, NaN as null; complete or not there at all."""
+    """Flat and sorted, NaN as null, each metric's protocol beside it; complete or not there."""
     finite = {key: value if math.isfinite(value) else None for key, value in results.items()}
+    finite |= {f"protocol/{name}": text for name, text in PROTOCOL.items()}
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
     partial.replace(path)

@@ -64,6 +64,7 @@ def test_a_run_leaves_what_is_promised(train):
     expected = {"parameters", "geometry_share", "gflops", "gflops_true", "gaussians"}
     expected |= {"peak_gb"}
     assert expected <= {key.removeprefix("cost/") for key in numbers if key.startswith("cost/")}
+    assert "window 11x11" in numbers["protocol/ssim"]
     assert numbers["cost/gaussians"] == 3 * 16 * 16
     assert numbers["cost/gflops_true"] > numbers["cost/gflops"] > 0
 

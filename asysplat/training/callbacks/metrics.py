@@ -13,6 +13,7 @@ from torch import Tensor
 from asysplat.evaluation import baselines
 from asysplat.evaluation.lpips import load_lpips, lpips_distance
 from asysplat.evaluation.metrics import PROTOCOL, abs_rel, delta1, psnr, ssim
+from asysplat.scene import Views
 from asysplat.training.reconstruction import Outcome
 
 Row = dict[str, str | float]
@@ -44,8 +45,9 @@ class Metrics(lightning.Callback):
                 stacklevel=2,
             )
 
-    def measure(self, rendered: Tensor, target: Tensor) -> dict[str, Tensor]:
+    def measure(self, rendered: Tensor, targets: Views) -> dict[str, Tensor]:
         """Image metrics, [B, V] each."""
+        rendered, target = targets.masked(rendered), targets.images
         values = {"psnr": psnr(rendered, target), "ssim": ssim(rendered, target)}
         if self.lpips is not None:
             values["lpips"] = lpips_distance(self.lpips.to(target.device), rendered, target)
@@ -53,12 +55,12 @@ class Metrics(lightning.Callback):
 
     def _add(self, batch: dict[str, Any], outcome: Outcome) -> None:
         inputs, targets = batch["inputs"], batch["targets"]
-        values = self.measure(outcome.rendering.image, targets.images)
+        values = self.measure(outcome.rendering.image, targets)
         if targets.depths is not None:
             values["absrel"] = abs_rel(outcome.rendering.depth, targets.depths)
             values["delta1"] = delta1(outcome.rendering.depth, targets.depths)
         for name in ("mean_colour", "nearest_view"):
-            free = self.measure(getattr(baselines, name)(inputs, targets), targets.images)
+            free = self.measure(getattr(baselines, name)(inputs, targets), targets)
             values.update({f"{name}/{metric}": value for metric, value in free.items()})
         for index, scene in enumerate(batch["scene"]):
             for view in range(targets.num_views):
