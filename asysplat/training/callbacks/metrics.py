@@ -120,7 +120,9 @@ def average(rows: Iterable[Row]) -> dict[str, float]:
 
 
 def write_csv(path: Path, rows: list[Row]) -> None:
+    """A line an image; a scene without depths leaves those columns empty."""
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        columns = dict.fromkeys(name for row in rows for name in row)
+        writer = csv.DictWriter(file, fieldnames=list(columns))
         writer.writeheader()
         writer.writerows(rows)
