@@ -43,5 +43,6 @@ def print_summary(results: dict[str, float], data: str, folder: Path) -> None:
         f"{results.get('cost/seconds_per_step', math.nan):.2f} s a step",
         soft_wrap=True,
     )
-    console.print(f"pictures: {folder / 'pictures'}", soft_wrap=True)
+    for picture in sorted((folder / "pictures").glob("test-*.png")):
+        console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"run: {folder}", soft_wrap=True)

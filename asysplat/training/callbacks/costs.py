@@ -26,6 +26,9 @@ class Costs(lightning.Callback):
         self.seconds: list[float] = []
 
     def on_fit_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        if module.device.type == "cuda":
+            # Jobs of a sweep share a process, and the peak would be that of the largest.
+            torch.cuda.reset_peak_memory_stats(module.device)
         scene = trainer.datamodule.evaluation["val"][0]["inputs"]
         self.values = static_costs(module.net, scene)
         for logger in trainer.loggers:
