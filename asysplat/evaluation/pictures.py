@@ -2,7 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 
+import torch
+from jaxtyping import Float
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from asysplat.evaluation.baselines import nearest_view
 from asysplat.evaluation.metrics import psnr
@@ -31,20 +34,25 @@ def comparison(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
     for view, row in enumerate(axes):
         target = targets.images[view]
         error = (rendering.image[view].clamp(0, 1) - target).abs().mean(0)
-        disparities = [1 / rendering.depth[view].clamp_min(1e-3)]
+        disparities = [disparity(rendering.depth[view])]
         if targets.depths is not None:
-            disparities.append(1 / targets.depths[view].clamp_min(1e-3))
+            disparities.append(disparity(targets.depths[view]))
         nearest_is_bright = disparities[-1].flatten().quantile(0.99).item()
         for axis, image in zip(row, (nearest[view], target, rendering.image[view]), strict=False):
             axis.imshow(image.clamp(0, 1).permute(1, 2, 0).cpu().float())
         row[2].set_xlabel(f"{quality[view]:.1f} dB", fontsize=8)
         row[3].imshow(error.cpu().float(), cmap="magma", vmin=0, vmax=ERROR_RANGE)
-        for axis, disparity in zip(row[4:], disparities, strict=True):
-            axis.imshow(disparity.cpu().float(), cmap="viridis", vmin=0, vmax=nearest_is_bright)
+        for axis, values in zip(row[4:], disparities, strict=True):
+            axis.imshow(values.cpu().float(), cmap="viridis", vmin=0, vmax=nearest_is_bright)
         for axis in row:
             axis.set_xticks([])
             axis.set_yticks([])
     return figure
+
+
+def disparity(depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """1 / depth, and 0, as for the farthest, where there is none."""
+    return torch.where(depth > 0, 1 / depth.where(depth > 0, 1), 0)
 
 
 def learning_curve(rows: Sequence[Mapping[str, float]]) -> Figure:

@@ -36,13 +36,14 @@ def print_summary(results: dict[str, float], data: str, folder: Path) -> None:
         table.add_row(label, *("" if v is None else f"{v:.3f}" for v in values))
     console = Console()
     console.print(table)
-    console.print(
-        f"{results['cost/parameters'] / 1e6:.2f}M parameters, "
-        f"{results['cost/geometry_share']:.1%} in the geometry branch; "
-        f"{results['cost/gaussians']:.0f} Gaussians a scene; "
-        f"{results.get('cost/seconds_per_step', math.nan):.2f} s a step",
-        soft_wrap=True,
-    )
+    costs = [
+        f"{results['cost/parameters'] / 1e6:.2f}M parameters",
+        f"{results['cost/geometry_share']:.1%} of them in the geometry branch",
+        f"{results['cost/gaussians']:.0f} Gaussians a scene",
+    ]
+    if "cost/seconds_per_step" in results:
+        costs.append(f"{results['cost/seconds_per_step']:.2f} s a step")
+    console.print(", ".join(costs), soft_wrap=True)
     for picture in sorted((folder / "pictures").glob("test-*.png")):
         console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"run: {folder}", soft_wrap=True)

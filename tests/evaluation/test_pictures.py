@@ -1,0 +1,36 @@
+"""Pictures: the columns there are, and what is shown where nothing is known."""
+
+import torch
+
+from asysplat import Cameras, Views
+from asysplat.evaluation.pictures import comparison, disparity, learning_curve
+from asysplat.rendering import Rendering
+
+
+def scene(depths=True):
+    intrinsics = torch.tensor([[20.0, 0, 8.0], [0, 20.0, 8.0], [0, 0, 1]]).repeat(2, 1, 1)
+    cameras = Cameras(intrinsics, torch.eye(4).repeat(2, 1, 1), 16, 16)
+    images = torch.rand(2, 3, 16, 16)
+    views = Views(cameras, images, torch.ones(2, 16, 16) if depths else None)
+    return views, Rendering(images, torch.ones(2, 16, 16), torch.full((2, 16, 16), 2.0), {})
+
+
+def test_no_depth_is_shown_as_far_away():
+    found = disparity(torch.tensor([[0.0, 0.5], [2.0, 4.0]]))
+    torch.testing.assert_close(found, torch.tensor([[0.0, 2.0], [0.5, 0.25]]))
+
+
+def test_a_row_for_each_view_and_true_depth_where_known():
+    for depths, columns in ((True, 6), (False, 5)):
+        views, rendering = scene(depths)
+        axes = comparison(views, views, rendering).axes
+        assert len(axes) == 2 * columns
+        assert axes[2].get_xlabel() == "100.0 dB"
+
+
+def test_curve_shows_every_validation():
+    rows = [
+        {"step": s, "minutes": s / 10, "psnr": 15 + s, "nearest_view/psnr": 16} for s in range(3)
+    ]
+    figure = learning_curve([row | {"mean_colour/psnr": 12} for row in rows])
+    assert list(figure.axes[0].lines[0].get_ydata()) == [15, 16, 17]
