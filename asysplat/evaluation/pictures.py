@@ -39,11 +39,13 @@ def comparison(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
             disparities.append(disparity(targets.depths[view]))
         nearest_is_bright = disparities[-1].flatten().quantile(0.99).item()
         for axis, image in zip(row, (nearest[view], target, rendering.image[view]), strict=False):
-            axis.imshow(image.clamp(0, 1).permute(1, 2, 0).cpu().float())
+            axis.imshow(image.clamp(0, 1).permute(1, 2, 0).cpu().float().numpy())
         row[2].set_xlabel(f"{quality[view]:.1f} dB", fontsize=8)
-        row[3].imshow(error.cpu().float(), cmap="magma", vmin=0, vmax=ERROR_RANGE)
+        row[3].imshow(error.cpu().float().numpy(), cmap="magma", vmin=0, vmax=ERROR_RANGE)
         for axis, values in zip(row[4:], disparities, strict=True):
-            axis.imshow(values.cpu().float(), cmap="viridis", vmin=0, vmax=nearest_is_bright)
+            axis.imshow(
+                values.cpu().float().numpy(), cmap="viridis", vmin=0, vmax=nearest_is_bright
+            )
         for axis in row:
             axis.set_xticks([])
             axis.set_yticks([])
@@ -55,7 +57,7 @@ def disparity(depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
     return torch.where(depth > 0, 1 / depth.where(depth > 0, 1), 0)
 
 
-def learning_curve(rows: Sequence[Mapping[str, float]]) -> Figure:
+def learning_curve(rows: Sequence[Mapping[str, float | int]]) -> Figure:
     """Validation PSNR over training, above the two baselines that need none.
 
     Args:

@@ -21,7 +21,7 @@ class Curve(lightning.Callback):
 
     def __init__(self, folder: str):
         self.folder = Path(folder)
-        self.rows: list[dict[str, float]] = []
+        self.rows: list[dict[str, float | int]] = []
 
     def state_dict(self) -> dict[str, Any]:
         return {"rows": self.rows}
@@ -46,7 +46,7 @@ class Curve(lightning.Callback):
             write_curve(self.folder, self.rows)
 
 
-def write_curve(folder: Path, rows: list[dict[str, float]]) -> None:
+def write_curve(folder: Path, rows: list[dict[str, float | int]]) -> None:
     """curve.csv and pictures/curve.png of validations, oldest first."""
     with (folder / "curve.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[-1]))
