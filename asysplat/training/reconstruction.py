@@ -64,6 +64,7 @@ class Reconstruction(lightning.LightningModule):
         terms = self.loss(rendering, batch["targets"])
         size = len(batch["scene"])
         self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
+        self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])
         quality = psnr(rendering.image.detach(), batch["targets"].images).mean()
         self.log("train/psnr", quality, prog_bar=True, batch_size=size)
         return terms["loss"]

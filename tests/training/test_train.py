@@ -88,7 +88,13 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     events.Reload()
     tags = events.Tags()
     scalars = set(tags["scalars"])
-    for name in ("train/psnr", "val/psnr", "test/procedural/psnr", "cost/parameters"):
+    for name in (
+        "train/psnr",
+        "train/learning_rate",
+        "val/psnr",
+        "test/procedural/psnr",
+        "cost/parameters",
+    ):
         assert name in scalars
     last = events.Scalars("hp/psnr")[-1].value
     assert abs(last - numbers["test/procedural/psnr"]) < 1e-3
