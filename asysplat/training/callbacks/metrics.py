@@ -106,7 +106,8 @@ def gather(trainer: lightning.Trainer, rows: list[Row]) -> list[Row]:
         return rows
     per_process: list[list[Row]] = [[] for _ in range(trainer.world_size)]
     torch.distributed.all_gather_object(per_process, rows)
-    return [row for part in per_process for row in part]
+    # Scenes that were dealt out twice, to give every process equally many, count once.
+    return list({(row["scene"], row["view"]): row for part in per_process for row in part}.values())
 
 
 def average(rows: Iterable[Row]) -> dict[str, float]:
