@@ -13,7 +13,7 @@ METRICS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "absrel": "Abs
 METRICS["delta1"] = "delta<1.25"
 
 
-def write_json(path: Path, results: dict[str, float]) -> None:
+def write_json(path: Path, results: dict[str, float | int]) -> None:
     """Flat and sorted, NaN as null, each metric's protocol beside it; complete or not there."""
     finite = {key: value if math.isfinite(value) else None for key, value in results.items()}
     finite |= {f"protocol/{name}": text for name, text in PROTOCOL.items()}
@@ -22,7 +22,7 @@ def write_json(path: Path, results: dict[str, float]) -> None:
     partial.replace(path)
 
 
-def print_summary(results: dict[str, float], data: str, folder: Path) -> None:
+def print_summary(results: dict[str, float | int], data: str, folder: Path) -> None:
     """The test beside what one gets for nothing, the costs, the pictures; the folder last."""
     sources = {
         "trained": f"test/{data}",

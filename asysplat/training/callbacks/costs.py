@@ -22,7 +22,7 @@ class Costs(lightning.Callback):
     """
 
     def __init__(self):
-        self.values: dict[str, float] = {}
+        self.values: dict[str, float | int] = {}
         self.seconds: list[float] = []
 
     def on_fit_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
@@ -53,7 +53,7 @@ class Costs(lightning.Callback):
             logger.log_metrics(self.values, step=trainer.global_step)
 
 
-def static_costs(net: torch.nn.Module, scene: Views) -> dict[str, float]:
+def static_costs(net: torch.nn.Module, scene: Views) -> dict[str, float | int]:
     """Costs of one scene's forward pass, from a copy of the network on the meta device."""
     on_meta = copy.deepcopy(net).to("meta").eval()
     views = scene.to("meta")
