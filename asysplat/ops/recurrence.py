@@ -21,8 +21,8 @@ class _LinearRecurrence(torch.autograd.Function):
         decay, inputs = decay.contiguous(), inputs.contiguous()
         states = torch.empty_like(inputs)
         previous = torch.zeros_like(inputs[0])
-        for now, factor, new in zip(states, decay, inputs, strict=True):
-            previous = torch.addcmul(new, factor, previous, out=now)
+        for state, factor, new in zip(states, decay, inputs, strict=True):
+            previous = torch.addcmul(new, factor, previous, out=state)
         ctx.save_for_backward(decay, states)
         return states
 

@@ -93,6 +93,17 @@ class Reconstruction(lightning.LightningModule):
             "lr_scheduler": {"scheduler": schedule, "interval": "step"},
         }
 
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """By norm. Lightning's own refuses a fused optimizer under autocast, for the sake of
+        fp16's loss scaling, which bf16 does without."""
+        if gradient_clip_val:
+            torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val)
+
     def learning_rate_factor(self, step: int) -> float:
         """Linear warm-up to 1, then half a cosine to 0."""
         if step < self.warmup_steps:

@@ -104,6 +104,17 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     assert "_hparams_/session_start_info" in plugins
 
 
+def test_bfloat16_with_the_perceptual_term(train, shared):
+    perceptual = ["training.loss.perceptual=0.5", f"paths.shared={shared}"]
+    folder = run_folder(train("trainer.precision=bf16-mixed", "steps=2", *perceptual))
+    numbers = metrics(folder)
+    assert numbers["test/procedural/psnr"] > numbers["baseline/procedural/mean_colour/psnr"]
+    assert 0 < numbers["test/procedural/lpips"] < 1
+    weights = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    assert not any("vgg" in name for name in weights)
+    assert all(tensor.dtype != torch.bfloat16 for tensor in weights.values())
+
+
 def test_killed_and_resumed_ends_with_the_same_bits(train, repository, tmp_path):
     whole = run_folder(train("name=whole", "steps=6"))
     process = subprocess.Popen(
