@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.evaluation.backbones import find_backbone
+from asysplat.ops.precision import without_autocast
 
 
 def load_lpips(net: Literal["alex", "vgg"], weights: Path | None) -> lpips.LPIPS | None:
@@ -49,6 +50,6 @@ def lpips_distance(
     pairs = zip(
         rendered.float().clamp(0, 1).flatten(0, -4), target.float().flatten(0, -4), strict=True
     )
-    with torch.autocast(rendered.device.type, enabled=False):
+    with without_autocast(rendered):
         distances = [network(a[None], b[None], normalize=True).squeeze() for a, b in pairs]
     return torch.stack(distances).reshape(rendered.shape[:-3])

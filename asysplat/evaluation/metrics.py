@@ -8,6 +8,7 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from asysplat.errors import InputError
+from asysplat.ops.precision import without_autocast
 
 MSE_FLOOR = 1e-10  # PSNR of identical images is 100 dB, not infinity
 SSIM_WINDOW = 11
@@ -53,7 +54,7 @@ def ssim(rendered: Images, target: Images) -> PerView:
             f"SSIM needs images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, these have "
             f"{height}x{width}: raise the resolution."
         )
-    with torch.autocast(rendered.device.type, enabled=False):
+    with without_autocast(rendered):
         _, similarity = structural_similarity_index_measure(
             rendered.float().clamp(0, 1).flatten(0, -4),
             target.float().flatten(0, -4),

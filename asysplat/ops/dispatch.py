@@ -1,6 +1,7 @@
 """What the operators have in common: picking a back end, and how a scan is entered and left."""
 
 from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -8,11 +9,13 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.ops.precision import without_autocast
 
+Form = TypeVar("Form")
 
-def pick_backend(operator: str, backends: Mapping[str, Callable], backend: str) -> Callable:
-    """The form that `backend` names, or InputError with the names there are."""
+
+def pick_backend(operator: str, backends: Mapping[str, Form], backend: str) -> Form:
+    """What `backend` names, a function or a module, or InputError with the names there are."""
     if backend not in backends:
-        raise InputError(f"{operator} backend={backend!r}: expected one of {list(backends)}.")
+        raise InputError(f"{operator} backend={backend!r}: expected one of {', '.join(backends)}.")
     return backends[backend]
 
 

@@ -8,12 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.ops.dispatch import pick_backend
+from asysplat.ops.precision import without_autocast
 from asysplat.rendering.projection import Splats, project
 from asysplat.rendering.rasterize import reference
 from asysplat.rendering.tiles import assign_tiles
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
-BACKENDS = {"reference": reference}
+BACKENDS = {"auto": reference, "reference": reference}
 ALPHA_TINY = 1e-6  # an alpha below 1/255 is exactly 0, so any value between will do
 
 
@@ -58,22 +60,17 @@ def render(
     Raises:
         InputError: an unknown backend, or shapes that do not fit together.
     """
-    if backend not in ("auto", *BACKENDS):
-        raise InputError(
-            f"render's backend is {backend!r}: choose one of {', '.join(('auto', *BACKENDS))}."
-        )
-    backend = BACKENDS["reference" if backend == "auto" else backend]
+    rasterizer = pick_backend("render", BACKENDS, backend)
     batch = _check_batch(gaussians, cameras, background)
-    device = gaussians.means.device
     dtype = torch.promote_types(gaussians.means.dtype, cameras.cam_to_world.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    with torch.autocast(device.type, enabled=False):
+    with without_autocast(gaussians.means):
         scenes = gaussians.map(lambda t: _one_batch(t.to(dtype), batch))
         views = cameras.map(lambda t: _one_batch(t.to(dtype), batch))
         splats = project(scenes, views)
         images = views.intrinsics.shape[0] * views.num_views
-        lists = assign_tiles(splats, images, cameras.height, cameras.width, backend.TILE_SIZE)
-        tiles = backend.rasterize(splats, _values(splats, depth), lists)
+        lists = assign_tiles(splats, images, cameras.height, cameras.width, rasterizer.TILE_SIZE)
+        tiles = rasterizer.rasterize(splats, _values(splats, depth), lists)
         out = lists.untile(tiles, cameras.height, cameras.width)
         out = out.unflatten(0, (*batch, cameras.num_views))
         image, alpha = out[..., :3, :, :], out[..., 3, :, :]

@@ -2,7 +2,7 @@
 
 import csv
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,12 @@ from torch import Tensor
 
 from asysplat.evaluation import baselines
 from asysplat.evaluation.lpips import load_lpips, lpips_distance
-from asysplat.evaluation.metrics import PROTOCOL, abs_rel, delta1, psnr, ssim
+from asysplat.evaluation.metrics import abs_rel, delta1, psnr, ssim
 from asysplat.scene import Views
 from asysplat.training.reconstruction import Outcome
 
 Row = dict[str, str | float]
+Measure = Callable[[Tensor, Views], dict[str, Tensor]]
 
 
 class Metrics(lightning.Callback):
@@ -53,14 +54,14 @@ class Metrics(lightning.Callback):
             values["lpips"] = lpips_distance(self.lpips.to(target.device), rendered, target)
         return values
 
-    def _add(self, batch: dict[str, Any], outcome: Outcome) -> None:
+    def _add(self, batch: dict[str, Any], outcome: Outcome, measure_free: Measure) -> None:
         inputs, targets = batch["inputs"], batch["targets"]
         values = self.measure(outcome.rendering.image, targets)
         if targets.depths is not None:
             values["absrel"] = abs_rel(outcome.rendering.depth, targets.depths)
             values["delta1"] = delta1(outcome.rendering.depth, targets.depths)
         for name in ("mean_colour", "nearest_view"):
-            free = self.measure(getattr(baselines, name)(inputs, targets), targets)
+            free = measure_free(getattr(baselines, name)(inputs, targets), targets)
             values.update({f"{name}/{metric}": value for metric, value in free.items()})
         for index, scene in enumerate(batch["scene"]):
             for view in range(targets.num_views):
@@ -75,16 +76,19 @@ class Metrics(lightning.Callback):
     def on_validation_batch_end(
         self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
     ) -> None:
-        self._add(batch, outputs)
+        # The curve shows the baselines' PSNR alone.
+        self._add(batch, outputs, lambda image, to: {"psnr": psnr(to.masked(image), to.images)})
 
-    on_test_batch_end = on_validation_batch_end
+    def on_test_batch_end(
+        self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
+    ) -> None:
+        self._add(batch, outputs, self.measure)
 
     def on_validation_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
         means = average(gather(trainer, self.rows))
-        shown = [*PROTOCOL, "nearest_view/psnr", "mean_colour/psnr"]
-        module.log_dict({f"val/{name}": means[name] for name in shown if name in means})
+        module.log_dict({f"val/{name}": value for name, value in means.items()})
 
     def on_test_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule

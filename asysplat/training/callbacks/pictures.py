@@ -30,8 +30,7 @@ class Pictures(lightning.Callback):
         index: int,
         *_: Any,
     ) -> None:
-        if not trainer.sanity_checking:
-            self._draw(trainer, "val", outputs, batch, index)
+        self._draw(trainer, "val", outputs, batch, index)
 
     def on_test_batch_end(
         self,
