@@ -1,5 +1,6 @@
 """Batches of reconstruction tasks, the same for the same seed wherever a run is resumed."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import lightning
@@ -8,6 +9,7 @@ from torch.utils.data import DataLoader, Dataset, Subset
 
 from asysplat.data.normalise import normalise
 from asysplat.data.sources import Source, Task
+from asysplat.errors import InputError
 from asysplat.scene import Views
 
 Sample = dict[str, Any]  # scene: name, inputs: Views, targets: Views; a batch has lists of names
@@ -28,6 +30,7 @@ class SceneDataModule(lightning.LightningDataModule):
         workers: processes that load ahead; 0 loads in the training process.
         seed: of the training tasks.
         steps_per_epoch: steps between two validations.
+        test_sets: further test sets by name, each a function that makes its tasks.
 
     Raises:
         InputError: a task that cannot be loaded; the fixed ones are tried in `setup`.
@@ -45,6 +48,7 @@ class SceneDataModule(lightning.LightningDataModule):
         workers: int,
         seed: int,
         steps_per_epoch: int,
+        test_sets: Mapping[str, Callable[[], list[Task]]] | None = None,
     ):
         super().__init__()
         self.name, self.source = name, source
@@ -52,7 +56,9 @@ class SceneDataModule(lightning.LightningDataModule):
         self.height, self.width = height, width
         self.batch_size, self.workers, self.seed = batch_size, workers, seed
         self.steps_per_epoch = steps_per_epoch
-        self.evaluation: dict[str, list[Sample]] = {}
+        self.test_sets = test_sets or {}
+        self.evaluation: dict[str, list[Sample]] = {}  # val and test of this data set
+        self.tests: dict[str, list[Sample]] = {}  # by test set, this data set first
 
     def setup(self, stage: str | None = None) -> None:
         """Load the validation and test tasks once, and try one training task."""
@@ -61,6 +67,12 @@ class SceneDataModule(lightning.LightningDataModule):
             for name in ("val", "test"):
                 tasks = self.source.evaluation(name, self.inputs, self.targets)
                 self.evaluation[name] = [load(task) for task in tasks]
+            self.tests[self.name] = self.evaluation["test"]
+            for name, make_tasks in self.test_sets.items():
+                try:
+                    self.tests[name] = [load(task) for task in make_tasks()]
+                except InputError as error:
+                    raise InputError(f"data.test_sets.{name}: {error}") from error
 
     def train_dataloader(self) -> DataLoader:
         per_epoch = self.steps_per_epoch * self.batch_size * self.trainer.world_size
@@ -77,8 +89,9 @@ class SceneDataModule(lightning.LightningDataModule):
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.evaluation["val"], collate_fn=collate)
 
-    def test_dataloader(self) -> DataLoader:
-        return DataLoader(self.evaluation["test"], collate_fn=collate)
+    def test_dataloader(self) -> list[DataLoader]:
+        """One a test set, in the order of `tests`."""
+        return [DataLoader(scenes, collate_fn=collate) for scenes in self.tests.values()]
 
 
 class TrainingTasks(Dataset):

@@ -1,9 +1,12 @@
 """What `conf/data` names: a source and the data module that draws from it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 from asysplat.data.datamodule import SceneDataModule
-from asysplat.data.sources import ProceduralSource, TransformsSource
+from asysplat.data.sources import ProceduralSource, Source, Task, TransformsSource
+from asysplat.errors import InputError
 
 
 def procedural_data(
@@ -13,17 +16,82 @@ def procedural_data(
     window: Sequence[int],
     val_scenes: int,
     test_scenes: int,
+    places: str,
     **options,
 ) -> SceneDataModule:
-    """Made-up scenes; arguments are those of ProceduralSource and SceneDataModule."""
-    source = ProceduralSource(height, width, num_frames, window, val_scenes, test_scenes)
-    return SceneDataModule(source=source, height=height, width=width, **options)
+    """Made-up scenes; arguments are those of ProceduralSource and `scene_data`."""
+
+    def source(num_frames: int, test_scenes: int, places: str) -> ProceduralSource:
+        return ProceduralSource(height, width, num_frames, window, val_scenes, test_scenes, places)
+
+    own = {"num_frames": num_frames, "test_scenes": test_scenes, "places": places}
+    return scene_data(source, own, height=height, width=width, **options)
 
 
 def transforms_data(
     root: str, height: int, width: int, window: Sequence[int], **options
 ) -> SceneDataModule:
-    """Scenes with a `transforms.json`; arguments are those of TransformsSource and
-    SceneDataModule."""
-    source = TransformsSource(root, height, width, window)
-    return SceneDataModule(source=source, height=height, width=width, **options)
+    """Scenes with a `transforms.json`; arguments are those of TransformsSource and `scene_data`."""
+
+    def source(root: str) -> TransformsSource:
+        return TransformsSource(root, height, width, window)
+
+    return scene_data(source, {"root": root}, height=height, width=width, **options)
+
+
+def scene_data(
+    make_source: Callable[..., Source],
+    own: dict[str, Any],
+    name: str,
+    inputs: int,
+    targets: int,
+    test_sets: Mapping[str, Any] | None = None,
+    **options,
+) -> SceneDataModule:
+    """A data module that is tested on further sets as well.
+
+    Args:
+        make_source: of the options `own`, in which test sets may differ.
+        test_sets: name -> the options that differ: any of `own`, inputs and targets.
+        name, inputs, targets, options: those of SceneDataModule.
+
+    Raises:
+        InputError: a test set that is called as the data set, or with an unknown option.
+    """
+    main = {"inputs": inputs, "targets": targets, **own}
+    sets = {}
+    for other, changes in (test_sets or {}).items():
+        _check_test_set(other, changes, name, main)
+        sets[other] = partial(_test_tasks, make_source, **{**main, **changes})
+    return SceneDataModule(
+        name=name,
+        source=make_source(**own),
+        inputs=inputs,
+        targets=targets,
+        test_sets=sets,
+        **options,
+    )
+
+
+def _test_tasks(
+    make_source: Callable[..., Source], inputs: int, targets: int, **own: Any
+) -> list[Task]:
+    return make_source(**own).evaluation("test", inputs, targets)
+
+
+def _check_test_set(other: str, changes: Any, name: str, main: Mapping[str, Any]) -> None:
+    if other == name:
+        raise InputError(
+            f"data.test_sets.{other} has the name of the data set itself: call it otherwise."
+        )
+    if not isinstance(changes, Mapping):
+        raise InputError(
+            f"data.test_sets.{other} is {changes!r}: give the options that differ, such as "
+            f"data.test_sets.{other}.inputs=16."
+        )
+    for option in changes:
+        if option not in main:
+            raise InputError(
+                f"data.test_sets.{other}.{option} is no option of a test set: "
+                f"give any of {', '.join(main)}."
+            )

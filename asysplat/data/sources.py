@@ -49,6 +49,7 @@ class ProceduralSource:
         num_frames: length of each camera path.
         window: how many consecutive frames a training task is drawn from, least and most.
         val_scenes, test_scenes: how many scenes each stage has.
+        places: both, rooms or outdoors: of every scene.
     """
 
     def __init__(
@@ -59,8 +60,10 @@ class ProceduralSource:
         window: Sequence[int],
         val_scenes: int,
         test_scenes: int,
+        places: str = "both",
     ):
         self.height, self.width, self.num_frames = height, width, num_frames
+        self.places = places
         self.window = (window[0], window[1])
         self.counts = {"val": val_scenes, "test": test_scenes}
 
@@ -73,7 +76,8 @@ class ProceduralSource:
         return [Task(self._scene(stage, index), split) for index in range(self.counts[stage])]
 
     def _scene(self, split: Literal["train", "val", "test"], index: int) -> ProceduralScene:
-        return ProceduralScene(split_seed(split, index), self.height, self.width, self.num_frames)
+        seed = split_seed(split, index)
+        return ProceduralScene(seed, self.height, self.width, self.num_frames, places=self.places)
 
 
 class TransformsSource:

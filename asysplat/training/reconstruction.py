@@ -72,7 +72,7 @@ class Reconstruction(lightning.LightningModule):
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> Outcome:
         return self.reconstruct(batch, depth=True)
 
-    def test_step(self, batch: dict[str, Any], batch_idx: int) -> Outcome:
+    def test_step(self, batch: dict[str, Any], batch_idx: int, dataloader_idx: int = 0) -> Outcome:
         return self.reconstruct(batch, depth=True)
 
     def configure_optimizers(self) -> dict[str, Any]:

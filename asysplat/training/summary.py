@@ -11,6 +11,11 @@ from asysplat.evaluation.metrics import PROTOCOL
 
 METRICS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "absrel": "AbsRel"}
 METRICS["delta1"] = "delta<1.25"
+SOURCES = {
+    "trained": "test/{}",
+    "nearest view, copied": "baseline/{}/nearest_view",
+    "mean colour": "baseline/{}/mean_colour",
+}
 
 
 def write_json(path: Path, results: dict[str, float | int]) -> None:
@@ -22,20 +27,44 @@ def write_json(path: Path, results: dict[str, float | int]) -> None:
     partial.replace(path)
 
 
-def print_summary(results: dict[str, float | int], data: str, folder: Path) -> None:
-    """The test beside what one gets for nothing, the costs, the pictures; the folder last."""
-    sources = {
-        "trained": f"test/{data}",
-        "nearest view, copied": f"baseline/{data}/nearest_view",
-        "mean colour": f"baseline/{data}/mean_colour",
-    }
+def test_sets(results: dict[str, float | int]) -> list[str]:
+    """The test sets that were measured, in order."""
+    keys = (key.split("/") for key in results)
+    return [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
+
+
+def quality_table(results: dict[str, float | int], data: str) -> Table:
+    """Every metric of a test set, a row each source of images."""
     shown = [name for name in METRICS if f"test/{data}/{name}" in results]
     table = Table("", *(METRICS[name] for name in shown), title=f"test scenes: {data}")
-    for label, prefix in sources.items():
-        values = [results.get(f"{prefix}/{name}") for name in shown]
+    for label, prefix in SOURCES.items():
+        values = [results.get(f"{prefix.format(data)}/{name}") for name in shown]
         table.add_row(label, *("" if v is None else f"{v:.3f}" for v in values))
+    return table
+
+
+def psnr_table(results: dict[str, float | int], names: list[str]) -> Table:
+    """A row a test set, PSNR of each source of images."""
+    table = Table("", *SOURCES, title="other test sets, PSNR (dB)")
+    for name in names:
+        values = [results[f"{prefix.format(name)}/psnr"] for prefix in SOURCES.values()]
+        table.add_row(name, *(f"{value:.3f}" for value in values))
+    return table
+
+
+def print_summary(results: dict[str, float | int], data: str, folder: Path) -> None:
+    """The test beside what one gets for nothing, the costs, the pictures; the folder last.
+
+    Args:
+        results: as metrics.json has them.
+        data: the test set to show in full; of others PSNR alone is shown.
+        folder: of the run.
+    """
     console = Console()
-    console.print(table)
+    console.print(quality_table(results, data))
+    others = [name for name in test_sets(results) if name != data]
+    if others:
+        console.print(psnr_table(results, others))
     costs = [
         f"{results['cost/parameters'] / 1e6:.2f}M parameters",
         f"{results['cost/geometry_share']:.1%} of them in the geometry branch",

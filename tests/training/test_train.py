@@ -70,9 +70,11 @@ def test_a_run_leaves_what_is_promised(train):
 
     with (folder / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 2
-    mean = sum(float(row["psnr"]) for row in rows) / len(rows)
-    assert abs(mean - numbers["test/procedural/psnr"]) < 1e-4
+    assert next(iter(rows[0])) == "set" and len(rows) == 3 * 2 * 2
+    for name in ("procedural", "rooms", "outdoors"):
+        values = [float(row["psnr"]) for row in rows if row["set"] == name]
+        assert len(values) == 2 * 2
+        assert abs(sum(values) / len(values) - numbers[f"test/{name}/psnr"]) < 1e-4
 
     assert yaml.safe_load((folder / "config.yaml").read_text())["steps"] == 4
     assert {"best.ckpt", "last.ckpt"} <= {p.name for p in (folder / "checkpoints").iterdir()}

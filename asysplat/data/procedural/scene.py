@@ -15,6 +15,7 @@ from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 
 SPLITS = ("train", "val", "test")
+PLACES = ("both", "rooms", "outdoors")
 RAYS_IN_CACHE = 4096
 PROBE_FRAMES = 4  # that the light meter looks at
 PROBE_SIZE = 16  # pixels a side of those
@@ -47,6 +48,10 @@ class ProceduralScene:
         height, width: of the images, pixels.
         num_frames: how finely the walk is sampled.
         device: where images are made.
+        places: rooms or outdoors settles what the seed leaves to chance, in both.
+
+    Raises:
+        InputError: unknown places.
     """
 
     def __init__(
@@ -56,11 +61,16 @@ class ProceduralScene:
         width: int,
         num_frames: int = 96,
         device: str | torch.device = "cpu",
+        places: str = "both",
     ):
+        if places not in PLACES:
+            raise InputError(f"data.places is {places!r}: expected one of {', '.join(PLACES)}.")
         rng = np.random.default_rng(seed)
-        self.name = f"procedural-{seed}"
+        self.name = f"{'procedural' if places == 'both' else places}-{seed}"
         self.num_frames = num_frames
-        indoors = rng.random() < 0.5
+        # Drawn even where it is settled, so that what follows stays the same.
+        heads = rng.random() < 0.5
+        indoors = heads if places == "both" else places == "rooms"
         half = rng.uniform((2.8, 2.8, 1.3), (4.0, 4.0, 1.6))
         radius = 0.58 * half[:2].min() if indoors else rng.uniform(2.4, 3.2)
         poses = hand_held_path(rng, num_frames, radius)

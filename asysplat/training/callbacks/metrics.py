@@ -17,6 +17,7 @@ from asysplat.scene import Views
 from asysplat.training.reconstruction import Outcome
 
 Row = dict[str, str | float]
+IMAGE = ("set", "scene", "view")  # which image a row is of
 Measure = Callable[[Tensor, Views], dict[str, Tensor]]
 
 
@@ -54,7 +55,9 @@ class Metrics(lightning.Callback):
             values["lpips"] = lpips_distance(self.lpips.to(target.device), rendered, target)
         return values
 
-    def _add(self, batch: dict[str, Any], outcome: Outcome, measure_free: Measure) -> None:
+    def _add(
+        self, test_set: str, batch: dict[str, Any], outcome: Outcome, measure_free: Measure
+    ) -> None:
         inputs, targets = batch["inputs"], batch["targets"]
         values = self.measure(outcome.rendering.image, targets)
         if targets.depths is not None:
@@ -66,7 +69,7 @@ class Metrics(lightning.Callback):
         for index, scene in enumerate(batch["scene"]):
             for view in range(targets.num_views):
                 numbers = {name: value[index, view].item() for name, value in values.items()}
-                self.rows.append({"scene": scene, "view": view, **numbers})
+                self.rows.append({"set": test_set, "scene": scene, "view": view, **numbers})
 
     def on_validation_epoch_start(self, *_: Any) -> None:
         self.rows = []
@@ -76,13 +79,23 @@ class Metrics(lightning.Callback):
     def on_validation_batch_end(
         self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
     ) -> None:
-        # The curve shows the baselines' PSNR alone.
-        self._add(batch, outputs, lambda image, to: {"psnr": psnr(to.masked(image), to.images)})
+        def measure_free(image: Tensor, to: Views) -> dict[str, Tensor]:
+            """The curve shows the baselines' PSNR alone."""
+            return {"psnr": psnr(to.masked(image), to.images)}
+
+        self._add(trainer.datamodule.name, batch, outputs, measure_free)
 
     def on_test_batch_end(
-        self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
+        self,
+        trainer: Any,
+        module: Any,
+        outputs: Outcome,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
-        self._add(batch, outputs, self.measure)
+        test_set = list(trainer.datamodule.tests)[dataloader_idx]
+        self._add(test_set, batch, outputs, self.measure)
 
     def on_validation_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
@@ -94,11 +107,11 @@ class Metrics(lightning.Callback):
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
         rows = gather(trainer, self.rows)
-        means, data = average(rows), trainer.datamodule.name
-        for name, value in means.items():
-            baseline = "/" in name
-            key = f"baseline/{data}/{name}" if baseline else f"test/{data}/{name}"
-            self.results[key] = value
+        for test_set in trainer.datamodule.tests:
+            means = average(row for row in rows if row["set"] == test_set)
+            for name, value in means.items():
+                kind = "baseline" if "/" in name else "test"
+                self.results[f"{kind}/{test_set}/{name}"] = value
         module.log_dict(self.results)
         if trainer.is_global_zero:
             write_csv(self.folder / "metrics.csv", rows)
@@ -111,7 +124,8 @@ def gather(trainer: lightning.Trainer, rows: list[Row]) -> list[Row]:
     per_process: list[list[Row]] = [[] for _ in range(trainer.world_size)]
     torch.distributed.all_gather_object(per_process, rows)
     # Scenes that were dealt out twice, to give every process equally many, count once.
-    return list({(row["scene"], row["view"]): row for part in per_process for row in part}.values())
+    images = {tuple(row[key] for key in IMAGE): row for part in per_process for row in part}
+    return list(images.values())
 
 
 def average(rows: Iterable[Row]) -> dict[str, float]:
@@ -119,7 +133,7 @@ def average(rows: Iterable[Row]) -> dict[str, float]:
     columns: dict[str, list[float]] = {}
     for row in rows:
         for name, value in row.items():
-            if name not in ("scene", "view"):
+            if name not in IMAGE:
                 columns.setdefault(name, []).append(value)
     return {name: torch.tensor(values).nanmean().item() for name, values in columns.items()}
 

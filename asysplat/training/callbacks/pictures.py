@@ -11,7 +11,7 @@ from asysplat.training.reconstruction import Outcome
 
 
 class Pictures(lightning.Callback):
-    """One comparison of the first scenes of each validation and test.
+    """One comparison of the first scenes of each validation and of the first test set.
 
     Args:
         folder: of the run; pictures go to its sub-folder `pictures`.
@@ -39,9 +39,10 @@ class Pictures(lightning.Callback):
         outputs: Outcome,
         batch: Any,
         index: int,
-        *_: Any,
+        test_set: int = 0,
     ) -> None:
-        self._draw(trainer, "test", outputs, batch, index)
+        if test_set == 0:
+            self._draw(trainer, "test", outputs, batch, index)
 
     def _draw(
         self, trainer: lightning.Trainer, stage: str, outcome: Outcome, batch: Any, index: int
