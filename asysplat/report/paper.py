@@ -1,7 +1,7 @@
 """The paper's tables as values: paper.yaml holds every number that the paper prints."""
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -21,13 +21,19 @@ class Column:
         key: "parameters", "gflops", ..., or "<test set>/<metric>" such as "dl3dv/psnr".
         title: as printed.
         better: "higher" or "lower"; None where neither is.
-        format: of one number, as for str.format.
+        format: of one number in `unit`, as for str.format.
+        unit: what the title's unit is worth, such as 1e6 where it says (M).
     """
 
     key: str
     title: str
     better: str | None
     format: str
+    unit: float = 1.0
+
+    def text(self, value: float) -> str:
+        """`value`, the paper's or ours, as printed."""
+        return self.format.format(value / self.unit)
 
 
 @dataclass(frozen=True)
@@ -48,11 +54,13 @@ class Row:
     """One method of a table.
 
     Args:
-        name: as the paper prints it.
+        name: as the paper prints it, with what sets it apart from the table's other rows.
         paper: column key -> the paper's number.
         run: overrides of train.py that give it; None for a method that is only quoted.
         views, size: input views, height and width that its costs are computed at.
-        post_optimisation: steps on the predicted Gaussians; such rows need evaluate.py.
+        bounds: column key -> what the paper prints where it gives only a bound: "<1".
+        post_optimisation: steps on the Gaussians; such rows need evaluate.py.
+        test_set: of the run, in the place of the stand-in; None for the stand-in.
         unverified: why the layout of this row is not known to be the paper's; None where it is.
         readings: the other layouts of an unverified row.
     """
@@ -62,13 +70,21 @@ class Row:
     run: tuple[str, ...] | None
     views: int
     size: tuple[int, int]
+    bounds: dict[str, str] = field(default_factory=dict)
     post_optimisation: int = 0
+    test_set: str | None = None
     unverified: str | None = None
     readings: tuple[Reading, ...] = ()
 
     @property
     def quoted(self) -> bool:
         return self.run is None
+
+    def text(self, column: Column) -> str:
+        """What the paper prints in `column`; "" where it prints nothing."""
+        if column.key in self.paper:
+            return column.text(self.paper[column.key])
+        return self.bounds.get(column.key, "")
 
 
 @dataclass(frozen=True)
@@ -94,11 +110,9 @@ class Table:
 
 
 @cache
-def load_paper(path: Path = PAPER) -> dict[str, Table]:
+def load_paper() -> dict[str, Table]:
     """Every table by its key, in the paper's order."""
-    raw = OmegaConf.to_container(OmegaConf.load(path))
-    kinds = raw["columns"]
-    return {key: _table(key, entry, kinds) for key, entry in raw["tables"].items()}
+    return {key: _table(key, entry) for key, entry in _raw()["tables"].items()}
 
 
 def find_tables(names: str | Sequence[str]) -> list[Table]:
@@ -113,45 +127,71 @@ def find_tables(names: str | Sequence[str]) -> list[Table]:
         return list(tables.values())
     for word in words:
         if word not in tables:
-            nearest = difflib.get_close_matches(word, tables, n=3, cutoff=0.3) or list(tables)
             raise InputError(
-                f"table={word} is unknown: did you mean {', '.join(nearest)}? "
+                f"table={word} is unknown: did you mean {_nearest(word, tables)}? "
                 "All tables: table=all."
             )
     return [tables[word] for word in words]
 
 
-def _table(key: str, entry: dict, kinds: dict[str, dict]) -> Table:
-    columns = tuple(_column(column, kinds) for column in entry["columns"])
-    rows = tuple(_row(row, entry) for row in entry["rows"])
+def stand_ins(data: str) -> dict[str, str]:
+    """The paper's test set -> the one of ours that stands for it, for a run of data=`data`.
+
+    A test set of the paper that is missing has no stand-in.
+
+    Raises:
+        InputError: no stand-ins are written down for this data set.
+    """
+    known = _raw()["stand_ins"]
+    if data not in known:
+        raise InputError(
+            f"data={data} has no entry under stand_ins in {PAPER.name}: write there which of its "
+            f"test sets stands for which of the paper's, or use {', '.join(known)}."
+        )
+    return known[data]
+
+
+@cache
+def _raw() -> dict:
+    return OmegaConf.to_container(OmegaConf.load(PAPER))
+
+
+def _nearest(word: str, known: Iterable[str]) -> str:
+    return ", ".join(difflib.get_close_matches(word, known, n=3, cutoff=0.3) or known)
+
+
+def _table(key: str, entry: dict) -> Table:
     return Table(
         key,
         str(entry["number"]),
         entry["title"],
         entry["protocol"],
-        columns,
-        rows,
+        tuple(_column(column) for column in entry["columns"]),
+        tuple(_row(row, entry) for row in entry["rows"]),
         entry.get("rank_by"),
     )
 
 
-def _column(key: str, kinds: dict[str, dict]) -> Column:
+def _column(key: str) -> Column:
     """A column's title and direction come from its kind, the last part of its key."""
     *test_set, kind = key.split("/")
-    entry = kinds[kind]
-    title = " ".join([*test_set, entry["title"]])
-    return Column(key, title, entry.get("better"), entry["format"])
+    entry = _raw()["columns"][kind]
+    title = " ".join([*(_raw()["test_sets"][name] for name in test_set), entry["title"]])
+    return Column(key, title, entry.get("better"), entry["format"], float(entry.get("unit", 1)))
 
 
 def _row(row: dict, table: dict) -> Row:
     """A row's views and size are its table's unless it names its own."""
+    printed = dict(zip(table["columns"], row["paper"], strict=True))
     return Row(
         name=row["name"],
-        paper={key: float(value) for key, value in row["paper"].items()},
+        paper={k: float(v) for k, v in printed.items() if isinstance(v, int | float)},
         run=tuple(row["run"]) if "run" in row else None,
         views=row.get("views", table["views"]),
         size=tuple(row.get("size", table["size"])),
+        bounds={k: v for k, v in printed.items() if isinstance(v, str)},
         post_optimisation=row.get("post_optimisation", 0),
+        test_set=row.get("test_set"),
         unverified=row.get("unverified"),
         readings=tuple(
             Reading(reading["name"], tuple(reading["run"])) for reading in row.get("readings", ())

@@ -1,0 +1,141 @@
+"""Every number of paper.yaml against the paper's source."""
+
+import re
+
+import pytest
+
+from asysplat.errors import InputError
+from asysplat.report.paper import Row, Table, find_tables, load_paper, stand_ins
+
+# What the cells before a row's numbers are, where it is more than the name.
+LEADING = {
+    "training_overhead": ("size", "name"),
+    "state_of_the_art": ("name", "post_optimisation"),
+    "replica": ("name", "post_optimisation"),
+    "inference_overhead": ("size", "name"),
+    "more_views": ("name", "views", "poses"),
+    "mamba_ratio": ("mamba", "attention", "name"),
+}
+SUFFIXES = {"": 1, "s": 1, "min": 60, "G": 1, "k": 1e3, "M": 1e6}
+# What a number is worth where the paper's header says so: TFLOPs, Param (M).
+HEADER_UNITS = {
+    ("inference_overhead", "gflops"): 1e3,
+    ("more_views", "parameters"): 1e6,
+    ("mamba_ratio", "parameters"): 1e6,
+}
+
+
+@pytest.fixture(scope="module")
+def tabulars(shared) -> list[list[list[str]]]:
+    """The cells of the paper's tables, as plain text."""
+    source = shared / "paper" / "asysplat.tex"
+    if not source.is_file():
+        pytest.skip(f"{source} is absent")
+    return [
+        read_rows(body)
+        for body in re.findall(r"\\midrule(.*?)\\bottomrule", source.read_text(), re.DOTALL)
+    ]
+
+
+def read_rows(body: str) -> list[list[str]]:
+    """The cells of a tabular's lines; a cell that spans several rows stands in each."""
+    lines = [line for line in re.sub(r"\\midrule|\[0.5pt\]", "", body).split(r"\\") if line.strip()]
+    rows = [line.split("&") for line in lines]
+    for i, cells in enumerate(rows):
+        for j, cell in enumerate(cells):
+            if span := re.search(r"\\multirow{(\d+)}{\*}(.*)", cell, re.DOTALL):
+                for below in rows[i : i + int(span[1])]:
+                    below[j] = span[2]
+    return [[plain(cell) for cell in cells] for cells in rows]
+
+
+def plain(cell: str) -> str:
+    cell = re.sub(r"\\(cellcolor|cite){.*?}|\(Ours\)", "", cell)
+    cell = cell.replace(r"\textless{}", "<").replace(r"\textgreater{}", ">")
+    return re.sub(r"\\textbf|[{}$^~\\]", "", cell).strip()
+
+
+def read_number(cell: str, unit: float) -> tuple[str, float] | None:
+    """("<", ">" or "=", value); None for an empty cell or a dash."""
+    if cell in ("", "-"):
+        return None
+    relation, digits, suffix = re.fullmatch(r"([<>]?)([\d.]+)([a-zA-Z]*)", cell).groups()
+    return relation or "=", round(float(digits) * SUFFIXES[suffix] * unit, 6)
+
+
+def recorded(row: Row, key: str) -> tuple[str, float] | None:
+    if key in row.paper:
+        return "=", row.paper[key]
+    return (row.bounds[key][0], float(row.bounds[key][1:])) if key in row.bounds else None
+
+
+def check_row(table: Table, row: Row, cells: list[str]) -> None:
+    leading = LEADING.get(table.key, ("name",))
+    cell = dict(zip(leading, cells, strict=False))
+    assert cell["name"] in row.name
+    if "views" in cell:
+        assert int(cell["views"]) == row.views
+    if "post_optimisation" in cell:
+        assert read_number(cell["post_optimisation"], 1) in (("=", row.post_optimisation), None)
+    numbers = dict(zip([c.key for c in table.columns], cells[len(leading) :], strict=True))
+    printed = {k: read_number(v, HEADER_UNITS.get((table.key, k), 1)) for k, v in numbers.items()}
+    assert printed == {key: recorded(row, key) for key in numbers}
+
+
+def test_every_number_is_the_papers(tabulars):
+    tables = load_paper().values()
+    for table, rows in zip(tables, tabulars, strict=True):
+        assert len(rows) == len(table.rows)
+        for row, cells in zip(table.rows, rows, strict=True):
+            check_row(table, row, cells)
+
+
+def test_rows_of_a_table_have_their_own_names_and_runs():
+    for table in load_paper().values():
+        assert len({row.name for row in table.rows}) == len(table.rows)
+        ours = [row for row in table.rows if not row.quoted]
+        # What tells two rows of one run apart, beside their sizes, is what is tested.
+        tested = {(row.run, row.size, row.post_optimisation, row.test_set) for row in ours}
+        assert len(tested) == len(ours)
+        assert table.rank_by is None or all(table.rank_by in row.paper for row in table.rows)
+
+
+def test_methods_that_are_only_quoted():
+    quoted = {row.name.split(",")[0] for t in load_paper().values() for row in t.rows if row.quoted}
+    assert quoted == {
+        *("3DGS", "Scaffold-GS", "AnySplat"),
+        *("pixelSplat", "MVSplat", "GS-LRM", "DepthSplat"),
+    }
+
+
+def test_unverified_rows_have_another_reading():
+    rows = [row for table in load_paper().values() for row in table.rows]
+    unverified = [row for row in rows if row.unverified]
+    assert unverified == [row for row in rows if row.readings]
+    assert {row.run[0].removeprefix("model=") for row in unverified} == {
+        *("asysplat_only_fine_to_coarse", "asysplat_only_coarse_to_fine"),
+        *("single_branch", "two_branch", "longlrm_18", "longlrm_24h"),
+    }
+    assert all(reading.run[0] == row.run[0] for row in unverified for reading in row.readings)
+
+
+def test_text_is_in_the_unit_of_the_title():
+    overhead = load_paper()["inference_overhead"]
+    feed_forward, post_optimised = overhead.rows[:2]
+    assert [feed_forward.text(c) for c in overhead.columns] == ["142.0", "<1", "20,200", "26", "8"]
+    assert [post_optimised.text(c) for c in overhead.columns] == ["142.0", "50", "", "31", "8"]
+    assert load_paper()["layers"].columns[1].title == "DL3DV-140 PSNR"
+
+
+def test_a_table_is_found_by_its_name():
+    assert [table.number for table in find_tables("layers,mamba_ratio")] == ["6b", "A2"]
+    assert len(find_tables("all")) == 12
+    with pytest.raises(InputError, match=r"table=layer is unknown: did you mean layers"):
+        find_tables("layer")
+
+
+def test_stand_ins_are_those_of_the_data():
+    assert stand_ins("procedural")["scannetpp"] == "rooms"
+    assert "deep_blending" not in stand_ins("procedural")
+    with pytest.raises(InputError, match="data=nowhere has no entry under stand_ins"):
+        stand_ins("nowhere")
