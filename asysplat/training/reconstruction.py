@@ -1,6 +1,7 @@
 """The LightningModule: it wires a network, the renderer and the losses, and nothing else."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,10 +42,10 @@ class Reconstruction(lightning.LightningModule):
         loss: ReconstructionLoss,
         learning_rate: float,
         weight_decay: float,
-        betas: tuple[float, float],
+        betas: Sequence[float],
         warmup_steps: int,
         total_steps: int,
-        background: tuple[float, float, float],
+        background: Sequence[float],
     ):
         super().__init__()
         self.net, self.loss = net, loss

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from asysplat.data import ProceduralSource, SceneDataModule, TransformsSource
+from asysplat.data import (
+    ProceduralSource,
+    SceneDataModule,
+    TransformsSource,
+    procedural_data,
+    transforms_data,
+)
 from asysplat.data.datamodule import TrainingTasks, collate
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.selection import held_out, held_out_split, trained
@@ -20,6 +26,18 @@ def procedural(**changes):
         "steps_per_epoch": 3,
     }
     return SceneDataModule(**(options | changes))
+
+
+READ_WITH = {
+    **{"inputs": 3, "targets": 2, "height": 16, "width": 16, "window": (12, 24)},
+    **{"batch_size": 2, "workers": 0, "seed": 5, "steps_per_epoch": 3},
+}
+
+
+def with_test_sets(test_sets, **changes):
+    scenes = {"num_frames": 24, "val_scenes": 1, "test_scenes": 2, "places": "both"}
+    options = {"name": "procedural", **READ_WITH, **scenes}
+    return procedural_data(test_sets=test_sets, **(options | changes))
 
 
 class Trainer:
@@ -96,3 +114,59 @@ def test_a_written_scene_trains_like_the_scene_itself(tmp_path):
 def test_a_folder_without_scenes(tmp_path):
     with pytest.raises(InputError, match=r"data\.root"):
         TransformsSource(str(tmp_path), 16, 16, (12, 24))
+
+
+def test_a_test_set_differs_in_its_options_alone():
+    data = with_test_sets({"rooms": {"places": "rooms"}, "more_views": {"inputs": 5}})
+    data.setup()
+    assert list(data.tests) == ["procedural", "rooms", "more_views"]
+    for scenes, loader in zip(data.tests.values(), data.test_dataloader(), strict=True):
+        batches = [batch["scene"] for batch in loader]
+        assert batches == [[scene["scene"]] for scene in scenes] and len(scenes) == 2
+    assert data.tests["procedural"] is data.evaluation["test"]
+    views = {name: scenes[0]["inputs"].num_views for name, scenes in data.tests.items()}
+    assert views == {"procedural": 3, "rooms": 3, "more_views": 5}
+
+
+@pytest.mark.parametrize("places", ["rooms", "outdoors"])
+def test_a_set_of_one_kind_of_place(places):
+    source = ProceduralSource(16, 16, 24, (12, 24), val_scenes=2, test_scenes=3, places=places)
+    tasks = source.evaluation("val", 3, 2) + source.evaluation("test", 3, 2)
+    tasks += [source.training(3, 2, np.random.default_rng(seed)) for seed in range(3)]
+    # Nothing in a room is as far as 12 m, and the sky is 60 m away.
+    farthest = [task.capture.views(task.split.targets).depths.max() for task in tasks]
+    assert all((depth < 12) == (places == "rooms") for depth in farthest)
+    seeds = [int(task.capture.name.removeprefix(f"{places}-")) for task in tasks]
+    assert [seed % 3 for seed in seeds] == 2 * [1] + 3 * [2] + 3 * [0]
+
+
+REFUSED = {
+    "an unknown option": ({"far": {"palces": "rooms"}}, r"data\.test_sets\.far\.palces is no"),
+    "an option of training": ({"far": {"window": [4, 8]}}, r"data\.test_sets\.far\.window is no"),
+    "no options": ({"far": 16}, r"data\.test_sets\.far is 16: give the options"),
+    "the main set's name": ({"procedural": {}}, r"data\.test_sets\.procedural has the name"),
+    "unknown places": ({"far": {"places": "caves"}}, r"data\.test_sets\.far: data\.places is"),
+    "too many views": ({"far": {"inputs": 30}}, r"data\.test_sets\.far: .* 24 frames"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_an_unusable_test_set_is_named(case):
+    test_sets, words = REFUSED[case]
+    with pytest.raises(InputError, match=words):
+        with_test_sets(test_sets).setup()
+
+
+def test_a_test_set_in_another_folder(tmp_path):
+    for seed in (3, 4):
+        scene = ProceduralScene(seed, 16, 16, num_frames=24)
+        write_transforms(scene.views(range(24)), tmp_path / str(seed))
+    options = {"name": "transforms", "root": str(tmp_path / "3"), **READ_WITH}
+    data = transforms_data(test_sets={"other": {"root": str(tmp_path / "4")}}, **options)
+    data.setup()
+    alone = transforms_data(**(options | {"root": str(tmp_path / "4")}))
+    alone.setup()
+    (scene,), (expected,) = data.tests["other"], alone.evaluation["test"]
+    assert torch.equal(scene["targets"].images, expected["targets"].images)
+    with pytest.raises(InputError, match=r"data\.test_sets\.lost: data\.root=.*nowhere"):
+        transforms_data(test_sets={"lost": {"root": f"{tmp_path}/nowhere"}}, **options).setup()

@@ -55,6 +55,23 @@ def test_half_of_the_seeds_are_rooms():
     assert 4 <= sum(depth < 12 for depth in farthest) <= 12
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_places_settle_what_the_seed_leaves_to_chance(seed):
+    drawn, room, outdoors = (
+        ProceduralScene(seed, 16, 16, places=places).views([0, 48])
+        for places in ("both", "rooms", "outdoors")
+    )
+    assert room.depths.max() < 12 < outdoors.depths.max()
+    same, other = (room, outdoors) if drawn.depths.max() < 12 else (outdoors, room)
+    assert torch.equal(drawn.images, same.images) and torch.equal(drawn.depths, same.depths)
+    assert not torch.equal(drawn.images, other.images)
+
+
+def test_unknown_places_are_refused():
+    with pytest.raises(InputError, match=r"data\.places is 'caves'.*both, rooms, outdoors"):
+        ProceduralScene(0, 8, 8, places="caves")
+
+
 def test_splits_never_meet():
     seeds = [{split_seed(split, index) for index in range(300)} for split in ("train", "val")]
     seeds.append({split_seed("test", index) for index in range(300)})

@@ -1,0 +1,117 @@
+"""Several test sets of one model are one run: each set's numbers are those it has alone."""
+
+import csv
+import warnings
+
+import lightning
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from asysplat.training.callbacks import Metrics, Pictures
+from asysplat.training.callbacks.metrics import gather
+from asysplat.training.summary import print_summary
+
+TINY = [
+    *("width=0.125", "state_size=8", "model.layers=1m1s", "paths.run=unused"),
+    *("data.height=32", "data.width=32", "data.inputs=3", "data.targets=2", "data.workers=0"),
+    *("data.num_frames=24", "data.window=[12,24]", "data.val_scenes=1", "data.test_scenes=1"),
+]
+
+
+@pytest.fixture(scope="module")
+def measure(repository, tmp_path_factory):
+    """The test of an untrained model: its results and the folder it wrote."""
+
+    def run(*overrides):
+        with initialize_config_dir(str(repository / "conf"), version_base=None):
+            config = compose("train", [*TINY, *overrides])
+        torch.manual_seed(0)
+        module = instantiate(config.training, net=instantiate(config.model))
+        folder = tmp_path_factory.mktemp("run")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            metrics = Metrics(str(folder), weights=str(folder))
+            trainer = lightning.Trainer(
+                accelerator="cpu",
+                logger=False,
+                callbacks=[metrics, Pictures(str(folder), scenes=2)],
+                enable_progress_bar=False,
+                enable_model_summary=False,
+            )
+            trainer.test(module, instantiate(config.data), verbose=False)
+        return metrics.results, folder
+
+    return run
+
+
+MORE_VIEWS = "+data.test_sets.more_views={inputs: 5, test_scenes: 2}"
+
+
+@pytest.fixture(scope="module")
+def together(measure):
+    return measure(MORE_VIEWS)
+
+
+ALONE = {
+    "procedural": [],
+    "rooms": ["data.places=rooms"],
+    "outdoors": ["data.places=outdoors"],
+    "more_views": ["data.inputs=5", "data.test_scenes=2"],
+}
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_a_set_has_the_numbers_it_has_alone(measure, together, name):
+    expected, _ = measure("data.test_sets=null", f"data.name={name}", *ALONE[name])
+    assert {f"test/{name}/psnr", f"baseline/{name}/nearest_view/ssim"} <= expected.keys()
+    found = {key: value for key, value in together[0].items() if key.split("/")[1] == name}
+    assert found == expected
+
+
+def test_every_image_is_a_row_that_names_its_set(together):
+    results, folder = together
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert next(iter(rows[0])) == "set"
+    counts = {name: sum(row["set"] == name for row in rows) for name in ALONE}
+    assert counts == {"procedural": 2, "rooms": 2, "outdoors": 2, "more_views": 4}
+    values = [float(row["psnr"]) for row in rows if row["set"] == "rooms"]
+    assert abs(sum(values) / 2 - results["test/rooms/psnr"]) < 1e-4
+
+
+def test_only_the_main_set_is_drawn(measure, together):
+    _, alone = measure("data.test_sets=null")
+    (drawn,), (expected,) = ((at / "pictures").iterdir() for at in (together[1], alone))
+    assert drawn.name == "test-0.png" and drawn.read_bytes() == expected.read_bytes()
+
+
+def test_the_summary_shows_every_set(together, capsys):
+    results, folder = together
+    costs = {"cost/parameters": 1e6, "cost/geometry_share": 0.7, "cost/gaussians": 10}
+    print_summary(results | costs, "procedural", folder)
+    printed = capsys.readouterr().out
+    for name in ("rooms", "outdoors", "more_views"):
+        (line,) = (line for line in printed.splitlines() if name in line)
+        for kind in (
+            "test/{}/psnr",
+            "baseline/{}/nearest_view/psnr",
+            "baseline/{}/mean_colour/psnr",
+        ):
+            assert f"{results[kind.format(name)]:.3f}" in line
+
+
+def test_processes_count_an_image_once_in_each_set(monkeypatch):
+    def row(test_set, scene, psnr):
+        return {"set": test_set, "scene": scene, "view": 0, "psnr": psnr}
+
+    mine = [row("main", "a", 10.0), row("more_views", "a", 20.0)]
+    theirs = [row("main", "b", 30.0), row("more_views", "a", 20.0)]
+
+    def all_gather_object(into, _):
+        into[:] = [mine, theirs]
+
+    monkeypatch.setattr(torch.distributed, "all_gather_object", all_gather_object)
+    monkeypatch.setattr(lightning.Trainer, "world_size", 2)
+    assert gather(lightning.Trainer.__new__(lightning.Trainer), mine) == [*mine, theirs[0]]
