@@ -2,22 +2,29 @@
 
 import logging
 import sys
+import traceback
 import warnings
 from pathlib import Path
 
 import hydra
 import lightning
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import CompactHydraException
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError, input_error_behind
-from asysplat.training.checkpoints import check_checkpoint, find_checkpoint
+from asysplat.training.checkpoints import check_checkpoint, find_checkpoint, load_weights
+from asysplat.training.runs import find_run, identity
 from asysplat.training.summary import print_summary, write_json
 from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
 
 
 @hydra.main(config_path="conf", config_name="train", version_base="1.3")
 def main(config: DictConfig) -> float | None:
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        return train_in_sweep(config)
     try:
         return train(config)
     except Exception as error:
@@ -25,6 +32,26 @@ def main(config: DictConfig) -> float | None:
         if mistake is None:
             raise
         sys.exit(f"error: {mistake}")
+
+
+def train_in_sweep(config: DictConfig) -> float | None:
+    """Train unless it was done before. A failure is named at once and the other jobs go on; Hydra
+    ends the sweep with it."""
+    job = HydraConfig.get().job
+    try:
+        finished = find_run(Path(config.paths.logs), config)
+        if finished is None:
+            print(f"job {job.num}: {job.override_dirname}", flush=True)
+            return train(config)
+        print(f"job {job.num}: finished already\nrun: {finished.folder}", flush=True)
+        return finished.results.get(f"test/{config.data.name}/psnr")
+    except Exception as error:
+        mistake = input_error_behind(error)
+        if mistake is None:
+            traceback.print_exc()
+        sentence = f"failed: job {job.num}: {job.override_dirname}: {mistake or repr(error)}"
+        print(sentence, file=sys.stderr, flush=True)
+        raise CompactHydraException(sentence) from None
 
 
 def quiet_lightning() -> None:
@@ -47,6 +74,8 @@ def train(config: DictConfig) -> float | None:
     net.check_size(data.height, data.width)
     module = instantiate(config.training, net=net)
     check_checkpoint(checkpoint, module)
+    load_weights(config.init_path, module)
+    print(f"model: {net.describe()}")
 
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
     callbacks = instantiate(config.callbacks)
@@ -57,7 +86,8 @@ def train(config: DictConfig) -> float | None:
     trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     trainer.test(module, data, verbose=False)
 
-    results = callbacks.costs.values | callbacks.metrics.results
+    results = {"run/identity": identity(config), "run/seed": config.seed}
+    results |= callbacks.costs.values | callbacks.metrics.results
     if trainer.is_global_zero:
         write_json(folder / "metrics.json", results)
         log_outcome(logger, results, data.name)

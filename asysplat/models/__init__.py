@@ -7,6 +7,7 @@ from asysplat.models.head import GaussianHead
 from asysplat.models.mamba2 import BiMamba2
 from asysplat.models.mamba_vision import MambaVision
 from asysplat.models.shapes import StageShape, Widths
+from asysplat.models.single_branch import SingleBranch, build_single_branch
 from asysplat.models.source import CoarseSource, FineSource, MergedSource
 
 __all__ = [
@@ -21,8 +22,10 @@ __all__ = [
     "MambaVision",
     "MergedSource",
     "NoLink",
+    "SingleBranch",
     "SparseAttention",
     "StageShape",
     "Widths",
     "build_asysplat",
+    "build_single_branch",
 ]

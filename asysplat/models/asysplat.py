@@ -1,24 +1,22 @@
 """AsySplat: posed photographs to Gaussians through two asymmetric branches (paper, Sec. 3.2)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 
 from asysplat.errors import InputError
-from asysplat.models.layer_mix import parse_layer_mix
+from asysplat.models.network import Network
 from asysplat.models.shapes import StageShape, Widths
+from asysplat.models.stage import Component, Stage
 from asysplat.models.tokenizer import Tokenizer, pixel_features
 from asysplat.models.widths import solve_widths
 from asysplat.scene import Gaussians, Views
 
 APPEARANCE_MLP_RATIO = 4
 
-Component = Callable[..., nn.Module]
 
-
-class AsySplat(nn.Module):
+class AsySplat(Network):
     """The heavy geometry branch on coarse tokens, the light appearance branch on fine ones.
 
     Every component is a callable that builds a module, so that a configuration can name another.
@@ -54,7 +52,7 @@ class AsySplat(nn.Module):
         patch_coarse: int = 16,
         patch_fine: int = 8,
     ):
-        super().__init__()
+        super().__init__(widths, patch_coarse)
         if patch_coarse % patch_fine:
             raise InputError(
                 f"model.patch_coarse={patch_coarse} is not a multiple of "
@@ -65,8 +63,7 @@ class AsySplat(nn.Module):
                 f"model.stage_ratios has {len(stage_ratios)} entries for {len(widths.stages)} "
                 "stages: give one MLP ratio a stage."
             )
-        self.patch_coarse, self.patch_fine = patch_coarse, patch_fine
-        mix = [blocks[letter] for letter in parse_layer_mix(layers, set(blocks))]
+        self.appearance_layers = appearance_layers
         shapes = [
             StageShape(width, widths.head, ratio)
             for width, ratio in zip(widths.stages, stage_ratios, strict=True)
@@ -76,7 +73,7 @@ class AsySplat(nn.Module):
             {
                 "tokenizer": Tokenizer(patch_coarse, widths.stages[0]),
                 "stages": nn.ModuleList(
-                    GeometryStage(previous.width, shape, mix)
+                    Stage(previous.width, shape, layers, blocks)
                     for previous, shape in zip([shapes[0], *shapes], shapes, strict=False)
                 ),
                 "links": nn.ModuleList(coarse_reads_fine(shape, fine) for shape in shapes),
@@ -95,12 +92,8 @@ class AsySplat(nn.Module):
         self.source = source(widths.stages[-1], widths.fine, patch_coarse // patch_fine)
         self.head = head(widths.stages[-1], patch_coarse, patch_fine)
 
-    def forward(self, views: Views) -> Gaussians:
-        """Views [..., V] with sides that are multiples of `size_multiple` -> Gaussians [..., N],
-        N = V H W (p_f / p_c)^2."""
-        self.check_size(views.cameras.height, views.cameras.width)
-        batch = views.images.shape[:-4]
-        views = with_one_batch_dimension(views)
+    def predict(self, views: Views) -> Gaussians:
+        """Views [B, V] -> Gaussians [B, N], N = V H W (p_f / p_c)^2."""
         pixels = pixel_features(views)
         coarse = self.geometry["tokenizer"](pixels)
         fine = self.appearance["tokenizer"](pixels)
@@ -115,51 +108,19 @@ class AsySplat(nn.Module):
             coarse, fine = geometry(coarse), appearance(fine)
             # Both links read the values from before the exchange (Eq. 3).
             coarse, fine = coarse_reads_fine(coarse, fine), fine_reads_coarse(fine, coarse)
-        gaussians = self.head(self.source(coarse, fine), views)
-        return gaussians.map(lambda field: field.reshape(*batch, *field.shape[1:]))
-
-    @property
-    def size_multiple(self) -> int:
-        """Image sides must be multiples of this: the coarse patch times the largest grid."""
-        return self.patch_coarse * max(getattr(m, "grid", 1) for m in self.modules())
+        return self.head(self.source(coarse, fine), views)
 
     def geometry_share(self) -> float:
         """Parameters outside the appearance branch over all parameters (paper: about 0.9)."""
         appearance = sum(p.numel() for p in self.appearance.parameters())
         return 1 - appearance / sum(p.numel() for p in self.parameters())
 
-    def check_size(self, height: int, width: int) -> None:
-        """Raise InputError unless both sides are multiples of `size_multiple`."""
-        multiple = self.size_multiple
-        if height % multiple or width % multiple:
-            raise InputError(
-                f"data.height x data.width is {height}x{width}, but this model takes multiples of "
-                f"{multiple} (coarse patch times grid): set {-(-height // multiple) * multiple}x"
-                f"{-(-width // multiple) * multiple}, as the paper takes 540 to 544."
-            )
-
-
-class GeometryStage(nn.Module):
-    """Stage s of the geometry branch: project to d_s, then the layer mix (Eq. 1)."""
-
-    def __init__(self, previous_width: int, shape: StageShape, mix: list[Component]):
-        super().__init__()
-        same = previous_width == shape.width
-        self.project = nn.Identity() if same else nn.Linear(previous_width, shape.width)
-        self.layers = nn.Sequential(*(block(shape) for block in mix))
-
-    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w e"]:
-        return self.layers(self.project(tokens))
-
-
-def with_one_batch_dimension(views: Views) -> Views:
-    """[..., V, ...] -> [B, V, ...]."""
-    dims = views.images.ndim - 4  # leading batch dimensions
-    if dims == 1:
-        return views
-    if dims == 0:
-        return views.map(lambda tensor: tensor[None])
-    return views.map(lambda tensor: tensor.flatten(0, dims - 1))
+    def describe(self) -> str:
+        """The sizes and what they come to, in a line."""
+        return (
+            f"{super().describe()}, appearance {self.widths.fine} wide in "
+            f"{self.appearance_layers} layers a stage"
+        )
 
 
 def build_asysplat(
@@ -169,21 +130,28 @@ def build_asysplat(
     appearance_layers: int = 2,
     width: float = 1.0,
     geometry_ratio: float | None = None,
+    parameter_budget: float = 1.0,
     **components,
 ) -> AsySplat:
-    """An AsySplat of the paper's widths times `width`; with `geometry_ratio`, the same total is
-    split between the branches so that the geometry branch holds that share of it.
+    """An AsySplat of the given widths times `width`; with `geometry_ratio`, of the widths that
+    give the geometry branch that share of the same total.
 
     Args:
         stage_widths, fine_width, head_width: d_s, d_f and the head width at width 1.
         appearance_layers: N_v.
         width: multiplies the widths.
-        geometry_ratio: between 0 and 1, or None for the paper's widths.
+        geometry_ratio: between 0 and 1, or None for the given widths.
+        parameter_budget: with a ratio, the total to meet over that of the given widths.
         components: the other arguments of AsySplat.
 
     Raises:
-        InputError: a ratio that no widths reach.
+        InputError: a ratio that no widths reach; a budget without a ratio.
     """
+    if geometry_ratio is None and parameter_budget != 1:
+        raise InputError(
+            f"parameter_budget={parameter_budget} without a geometry_ratio: give both, or change "
+            "width."
+        )
     widths = Widths(tuple(stage_widths), fine_width, head_width).scaled(width)
 
     def build(widths: Widths, layers: int) -> AsySplat:
@@ -192,6 +160,6 @@ def build_asysplat(
     if geometry_ratio is not None:
         with torch.device("meta"):
             widths, appearance_layers = solve_widths(
-                build, widths, appearance_layers, geometry_ratio
+                build, widths, appearance_layers, geometry_ratio, parameter_budget
             )
     return build(widths, appearance_layers)

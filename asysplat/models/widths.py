@@ -15,8 +15,10 @@ TOTAL_TOLERANCE = 0.0095  # so that any two totals are within 2 %
 Build = Callable[[Widths, int], nn.Module]
 
 
-def solve_widths(build: Build, base: Widths, layers: int, ratio: float) -> tuple[Widths, int]:
-    """Widths and appearance layers whose model has the total of `base` and the asked share.
+def solve_widths(
+    build: Build, base: Widths, layers: int, ratio: float, budget: float = 1.0
+) -> tuple[Widths, int]:
+    """Widths and appearance layers whose model meets the budget and has the asked share.
 
     The number of layers changes only where the widths alone, multiples of the head width, do not
     reach the ratio. Parameter counts are quadratic polynomials in the widths: a few models on the
@@ -27,31 +29,40 @@ def solve_widths(build: Build, base: Widths, layers: int, ratio: float) -> tuple
         base: the widths that set the total, together with
         layers: N_v, the layers of an appearance stage.
         ratio: parameters of the geometry branch over all.
+        budget: the total to meet, over that of `base` and `layers`.
 
     Raises:
-        InputError: nothing comes within 0.015 of the ratio and 1 % of the total.
+        InputError: nothing comes within 0.015 of the ratio and 1 % of the total; says what comes
+            closest.
     """
     if not 0 < ratio < 1:
         raise InputError(f"geometry_ratio={ratio}: give a share between 0 and 1, such as 0.9.")
-    budget, _ = _count(build(base, layers))
+    wanted = budget * _count(build(base, layers))[0]
     candidates = _candidates(base)
     terms = _quadratic_terms(candidates / base.head)
     # Among the widths that fit, those that keep the proportions of the stages.
     shape_error = np.log(candidates[:, :-1] / np.array(base.stages)).std(axis=1)
-    closest = (np.inf, 0.0)
+    closest, description = np.inf, ""
     for count in sorted(range(1, 3 * layers + 1), key=lambda n: (abs(n - layers), -n)):
         coefficients = _fit_counts(lambda widths, n=count: build(widths, n), base)
         total, geometry = (terms @ coefficients).T
         share_error = np.abs(geometry / total - ratio) / SHARE_TOLERANCE
-        error = np.maximum(share_error, np.abs(total / budget - 1) / TOTAL_TOLERANCE)
+        error = np.maximum(share_error, np.abs(total / wanted - 1) / TOTAL_TOLERANCE)
         best = int(np.argmin(np.where(error < 1, error / 2 + shape_error, 1e3 + error)))
+        *stages, fine = (int(width) for width in candidates[best])
         if error[best] < 1:
-            *stages, fine = (int(width) for width in candidates[best])
             return Widths(tuple(stages), fine, base.head), count
-        closest = min(closest, (error[best], geometry[best] / total[best]))
+        if error[best] < closest:
+            closest = error[best]
+            description = (
+                f"stages {'/'.join(map(str, stages))} and an appearance branch {fine} wide in "
+                f"{count} layers a stage, with {geometry[best] / total[best]:.3f} of "
+                f"{total[best] / 1e6:.2f}M"
+            )
     raise InputError(
-        f"geometry_ratio={ratio} cannot be met within {SHARE_TOLERANCE} at this total: "
-        f"ask for {closest[1]:.3f}, the closest share, or for another width."
+        f"geometry_ratio={ratio} cannot be met within {SHARE_TOLERANCE} at "
+        f"{wanted / 1e6:.2f}M parameters with heads {base.head} wide: closest come {description}; "
+        "ask for that share, or for another width."
     )
 
 

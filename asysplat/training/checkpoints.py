@@ -54,3 +54,17 @@ def check_checkpoint(path: Path | None, module: nn.Module) -> None:
                 f"{path} does not fit this model: {name} is {sizes[0]} there and {sizes[1]} here; "
                 "give the options that the run was started with (see its config.yaml)."
             )
+
+
+def load_weights(path: str | None, module: nn.Module) -> None:
+    """Start from the weights of `path`, where there is one; optimizer and schedule start anew.
+
+    Raises:
+        InputError: no such file, or one that does not fit.
+    """
+    if path is None:
+        return
+    if not Path(path).is_file():
+        raise InputError(f"init_path={path} does not exist: name a .ckpt file.")
+    check_checkpoint(Path(path), module)
+    module.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["state_dict"])

@@ -18,16 +18,19 @@ SOURCES = {
 }
 
 
-def write_json(path: Path, results: dict[str, float | int]) -> None:
+def write_json(path: Path, results: dict[str, float | int | str]) -> None:
     """Flat and sorted, NaN as null, each metric's protocol beside it; complete or not there."""
-    finite = {key: value if math.isfinite(value) else None for key, value in results.items()}
+    finite = {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in results.items()
+    }
     finite |= {f"protocol/{name}": text for name, text in PROTOCOL.items()}
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
     partial.replace(path)
 
 
-def test_sets(results: dict[str, float | int]) -> list[str]:
+def test_sets(results: dict[str, float | int | str]) -> list[str]:
     """The test sets that were measured, in order."""
     keys = (key.split("/") for key in results)
     return [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
@@ -52,7 +55,7 @@ def psnr_table(results: dict[str, float | int], names: list[str]) -> Table:
     return table
 
 
-def print_summary(results: dict[str, float | int], data: str, folder: Path) -> None:
+def print_summary(results: dict[str, float | int | str], data: str, folder: Path) -> None:
     """The test beside what one gets for nothing, the costs, the pictures; the folder last.
 
     Args:

@@ -14,7 +14,7 @@ GROUPS = [
     if path.parent != CONF
 ]
 # Shared parts of the files that use them.
-PARTS = {("model", "asysplat"), ("data", "views")}
+PARTS = {("model", "asysplat"), ("model", "blocks"), ("model", "one_branch"), ("data", "views")}
 
 
 @pytest.mark.parametrize("group", sorted(set(GROUPS) - PARTS), ids="/".join)
