@@ -1,6 +1,7 @@
 """Batches of reconstruction tasks, the same for the same seed wherever a run is resumed."""
 
 from collections.abc import Callable, Mapping
+from multiprocessing import get_all_start_methods
 from typing import Any
 
 import lightning
@@ -84,6 +85,8 @@ class SceneDataModule(lightning.LightningDataModule):
             num_workers=self.workers,
             collate_fn=collate,
             prefetch_factor=4 if self.workers else None,
+            # The platform's own: joblib's, the default in its jobs, cannot start these workers.
+            multiprocessing_context=get_all_start_methods()[0] if self.workers else None,
         )
 
     def val_dataloader(self) -> DataLoader:
