@@ -1,0 +1,167 @@
+"""A table of the paper with our numbers in it, and what they say together."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from asysplat.report.paper import Column, Row, Table
+
+Number = int | float
+# Keyed as in metrics.json without "cost/": parameters, geometry_share, gflops (as the paper
+# counts), gflops_true, gaussians, activation_gb.
+Costs = dict[str, Number]
+
+# Columns that need no run: they stand among the costs, at the paper's scale.
+COMPUTED = ("parameters", "gflops", "gaussians")
+
+# How far our costs may be from the paper's, as a fraction of the paper's.
+LIMITS = {"parameters": 0.015, "gflops": 0.03}
+
+
+@dataclass(frozen=True)
+class FilledRow:
+    """One method with what we measured of it.
+
+    Args:
+        row: the paper's.
+        costs: at the paper's scale; None where not asked for, and for quoted rows.
+        reading_costs: one for each of `row.readings`, or empty where not asked for.
+        values: column key -> measured numbers, one a seed; a column without any was not run.
+        seeds: those measured.
+        missing: those still to be run.
+        note: what a reader should know of this row, such as "needs evaluate.py".
+    """
+
+    row: Row
+    costs: Costs | None = None
+    reading_costs: tuple[Costs, ...] = ()
+    values: dict[str, list[Number]] = field(default_factory=dict)
+    seeds: tuple[int, ...] = ()
+    missing: tuple[int, ...] = ()
+    note: str = ""
+
+    @property
+    def name(self) -> str:
+        return self.row.name + (" †" if self.row.unverified else "")
+
+
+@dataclass(frozen=True)
+class FilledTable:
+    """One table of the paper with our rows beside it.
+
+    Args:
+        table: the paper's.
+        rows: in the paper's order.
+        scale: of our runs, such as "laptop: 8 views of 64x64, 240 steps".
+        command: what made our numbers.
+        stand_ins: which of our test sets stands for which of the paper's.
+        baselines: the paper's test set -> what one gets for nothing -> PSNR.
+        machine: that ours were measured on.
+    """
+
+    table: Table
+    rows: tuple[FilledRow, ...]
+    scale: str
+    command: str
+    stand_ins: str = ""
+    baselines: dict[str, dict[str, Number]] = field(default_factory=dict)
+    machine: str = ""
+
+    @property
+    def title(self) -> str:
+        return f"Table {self.table.number}: {self.table.title}"
+
+    @property
+    def networks(self) -> list[FilledRow]:
+        """Rows without post-optimisation, which changes no cost of the network."""
+        return [row for row in self.rows if row.row.post_optimisation == 0]
+
+    @property
+    def measured_columns(self) -> list[Column]:
+        """Those that need a run."""
+        return [column for column in self.table.columns if column.key not in COMPUTED]
+
+
+@dataclass(frozen=True)
+class RankAgreement:
+    """Does our order of the rows follow the paper's?
+
+    Args:
+        rho: Spearman's; None below three rows, and where all rows are equal.
+        rows: how many have both numbers.
+        signal: standard deviation between rows over the one between seeds; None without seeds.
+    """
+
+    rho: float | None
+    rows: int
+    signal: float | None
+
+
+def mean_and_spread(values: Sequence[Number]) -> tuple[float, float | None]:
+    """Mean and sample standard deviation over seeds; None for the latter of a single seed."""
+    spread = float(np.std(values, ddof=1)) if len(values) > 1 else None
+    return float(np.mean(values)), spread
+
+
+def rank_agreement(filled: FilledTable, column: str) -> RankAgreement:
+    """Spearman's rho between the paper's numbers and our means in the column of this key."""
+    both = [row for row in filled.rows if column in row.row.paper and row.values.get(column)]
+    ours = np.array([np.mean(row.values[column]) for row in both])
+    paper = np.array([row.row.paper[column] for row in both])
+    between = float(np.std(ours, ddof=1)) if len(both) > 1 else None
+    within = pooled_spread([row.values[column] for row in both])
+    signal = None
+    if between is not None and within is not None:
+        signal = between / within if within else math.inf
+    return RankAgreement(spearman(paper, ours), len(both), signal)
+
+
+def spearman(first: np.ndarray, second: np.ndarray) -> float | None:
+    """Correlation of the ranks, equal values sharing their mean rank.
+
+    None below three values, and where either side is constant.
+    """
+    if len(first) < 3 or np.ptp(first) == 0 or np.ptp(second) == 0:
+        return None
+    return float(np.corrcoef(_ranks(first), _ranks(second))[0, 1])
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    above = values[:, None] > values
+    at_least = values[:, None] >= values
+    return (above.sum(1) + at_least.sum(1) + 1) / 2
+
+
+def pooled_spread(groups: Sequence[Sequence[Number]]) -> float | None:
+    """Standard deviation within groups, weighted by degrees of freedom; None without any."""
+    freedom = sum(len(group) - 1 for group in groups)
+    if freedom <= 0:
+        return None
+    squares = sum(float(np.var(group)) * len(group) for group in groups)
+    return math.sqrt(squares / freedom)
+
+
+def cost_errors(row: Row, costs: Costs) -> dict[str, float]:
+    """Relative error of each cost that has a limit and that the paper prints."""
+    return {key: costs[key] / row.paper[key] - 1 for key in LIMITS if key in row.paper}
+
+
+def fits(row: Row, costs: Costs) -> bool:
+    """Whether every cost is within its limit of the paper's."""
+    return all(abs(error) <= LIMITS[key] for key, error in cost_errors(row, costs).items())
+
+
+def check(filled: FilledRow) -> str:
+    """One word or two on a row's costs: only a row whose layout is known can be "off"."""
+    if filled.row.quoted:
+        return "quoted"
+    if filled.costs is None:
+        return "not computed"
+    if not cost_errors(filled.row, filled.costs):
+        return "not printed"
+    fit = fits(filled.row, filled.costs)
+    if filled.row.unverified:
+        return "unverified, fits" if fit else "unverified, no fit"
+    return "fits" if fit else "off"

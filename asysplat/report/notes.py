@@ -1,0 +1,87 @@
+"""What stands under a table: how both sides were measured, and how far to trust the order."""
+
+from asysplat.report.filled import FilledTable, RankAgreement, rank_agreement
+from asysplat.report.sheet import Note
+
+BASELINES = {"mean_colour": "mean colour", "nearest_view": "nearest view, copied"}
+
+
+def notes(filled: FilledTable) -> list[Note]:
+    """From what is compared to the command that made it."""
+    lines = [
+        Note("Paper", filled.table.protocol),
+        Note("Ours", filled.scale),
+        Note("Stand-ins", filled.stand_ins),
+        Note("For nothing", _baselines(filled)),
+        Note("Seeds", _seeds(filled)),
+        Note("Order", _order(filled)),
+        *_remarks(filled),
+        Note("Machine", filled.machine),
+        Note("Command", filled.command, code=True),
+    ]
+    return [line for line in lines if line.text]
+
+
+def rho_text(filled: FilledTable) -> str:
+    """Spearman's rho of the column that the table is ranked by, in a word."""
+    if filled.table.rank_by is None:
+        return "-"
+    agreement = rank_agreement(filled, filled.table.rank_by)
+    if agreement.rho is None:
+        return "-"
+    doubt = "?" if agreement.signal is None or agreement.signal < 1 else ""
+    return f"{agreement.rho:.2f}{doubt} ({agreement.rows} rows)"
+
+
+def _baselines(filled: FilledTable) -> str:
+    """What every PSNR is to be read beside."""
+    sets = []
+    for name, entry in filled.baselines.items():
+        numbers = [f"{BASELINES.get(key, key)} {psnr:.2f} dB" for key, psnr in entry.items()]
+        sets.append(f"{name}: {', '.join(numbers)}")
+    return "; ".join(sets)
+
+
+def _seeds(filled: FilledTable) -> str:
+    seeds = sorted({seed for row in filled.rows for seed in row.seeds})
+    if not seeds:
+        return ""
+    if len(seeds) == 1:
+        return f"{seeds[0]} alone, so no spread"
+    return f"{', '.join(map(str, seeds))}: mean ± sample standard deviation over them"
+
+
+def _order(filled: FilledTable) -> str:
+    if filled.table.rank_by is None:
+        return ""
+    agreement = rank_agreement(filled, filled.table.rank_by)
+    title = next(c.title for c in filled.table.columns if c.key == filled.table.rank_by)
+    if agreement.rho is None:
+        return f"cannot be compared by {title}: rows with both numbers: {agreement.rows}"
+    return (
+        f"by {title}, Spearman's rho with the paper's is {agreement.rho:.2f} over {agreement.rows} "
+        f"rows; {_trust(agreement)}"
+    )
+
+
+def _trust(agreement: RankAgreement) -> str:
+    if agreement.signal is None:
+        return "one seed a row does not tell whether the order means anything"
+    if agreement.signal < 1:
+        return f"rows differ less than seeds do ({agreement.signal:.1f} x): the order means little"
+    return f"rows differ {agreement.signal:.1f} x as much as seeds do"
+
+
+def _remarks(filled: FilledTable) -> list[Note]:
+    """What is special of single rows; rows with the same remark share a line."""
+    names: dict[str, list[str]] = {}
+    for row in filled.rows:
+        if row.row.quoted:
+            names.setdefault("quoted", []).append(row.name)
+        elif row.note:
+            names.setdefault(row.note, []).append(row.name)
+    shared = [Note(note[0].upper() + note[1:], "; ".join(rows)) for note, rows in names.items()]
+    open_layouts = [
+        Note(f"† {row.row.name}", row.row.unverified) for row in filled.rows if row.row.unverified
+    ]
+    return shared + open_layouts

@@ -1,0 +1,116 @@
+"""Plots of filled tables: ours on the left, the paper's on the right."""
+
+import re
+from collections.abc import Sequence
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from asysplat.report.filled import FilledRow, FilledTable, Number, mean_and_spread
+from asysplat.report.layout import ARROWS
+from asysplat.report.paper import Column
+from asysplat.report.pareto import pareto_plot
+from asysplat.report.svg import FAINT, OURS, PAPER, STYLE
+
+# Tables in which one quantity varies: what the first number in a row's name is.
+RATIOS = {
+    "geometry_ratio": "parameters in the geometry branch (%)",
+    "mamba_ratio": "Mamba layers among the 8 of a stage",
+}
+
+
+def make_plots(filled: FilledTable) -> list[tuple[str, Figure]]:
+    """Caption and figure of each plot that says more than the table; none below two rows that ran.
+
+    Lines for a table of one ratio; for others a dot for each seed, and quality against cost where
+    the rows' costs differ.
+    """
+    ranked = [column for column in filled.table.columns if column.key == filled.table.rank_by]
+    if not ranked or sum(ranked[0].key in row.values for row in filled.rows) < 2:
+        return []
+    with matplotlib.rc_context(STYLE):
+        if filled.table.key in RATIOS:
+            return [_ratio_plot(filled)]
+        return [_seed_plot(filled, ranked[0]), *pareto_plot(filled, ranked[0])]
+
+
+def _seed_plot(filled: FilledTable, column: Column) -> tuple[str, Figure]:
+    """A line of the plot for each row of the table, a dot for each seed, a bar at the mean."""
+    rows = filled.rows
+    figure = Figure(figsize=(9, 1.1 + 0.32 * len(rows)), layout="constrained")
+    ours, paper = figure.subplots(1, 2, sharey=True)
+    for place, row in enumerate(rows):
+        values = row.values.get(column.key, [])
+        _dots(ours, values, [place] * len(values), OURS)
+        if values:
+            ours.plot(mean_and_spread(values)[0], place, "|", color=OURS, ms=16, mew=2.5)
+        else:
+            _say(ours, place, "quoted" if row.row.quoted else "not run")
+        if column.key in row.row.paper:
+            paper.plot(row.row.paper[column.key], place, "|", color=PAPER, ms=16, mew=2.5)
+    ours.set_yticks(range(len(rows)), [row.name for row in rows])
+    ours.set_ylim(len(rows) - 0.5, -0.5)
+    for axes, title in ((ours, "ours"), (paper, "paper")):
+        axes.set(title=title, xlabel=column.title + ARROWS[column.better])
+        axes.margins(x=0.08)
+        axes.locator_params(axis="x", nbins=5)
+        axes.tick_params(axis="y", length=0)
+    return f"{column.title} of each row: a dot for each seed, a bar at the mean.", figure
+
+
+def _say(axes: Axes, place: int, text: str) -> None:
+    across = axes.get_yaxis_transform()
+    axes.text(0.5, place, text, color=FAINT, ha="center", va="center", transform=across)
+
+
+def _ratio_plot(filled: FilledTable) -> tuple[str, Figure]:
+    """A line for each test set, in its first metric."""
+    columns = _first_metrics(filled)
+    figure = Figure(figsize=(9, 0.6 + 2.2 * len(columns)), layout="constrained")
+    grid = figure.subplots(len(columns), 2, squeeze=False, sharex=True)
+    for (ours, paper), column in zip(grid, columns, strict=True):
+        _our_line(ours, filled.rows, column)
+        points = {
+            _ratio(r): r.row.paper[column.key] for r in filled.rows if column.key in r.row.paper
+        }
+        paper.plot(points.keys(), points.values(), "o-", color=PAPER)
+        ours.set_ylabel(column.title + ARROWS[column.better])
+    grid[0, 0].set_title("ours")
+    grid[0, 1].set_title("paper")
+    for axes in grid[-1]:
+        axes.set_xlabel(RATIOS[filled.table.key])
+        axes.set_xticks([_ratio(row) for row in filled.rows])
+    return (
+        "Against the ratio: pale dots are seeds, the line joins the means ± their spread.",
+        figure,
+    )
+
+
+def _our_line(axes: Axes, rows: Sequence[FilledRow], column: Column) -> None:
+    run = [row for row in rows if row.values.get(column.key)]
+    for row in run:
+        values = row.values[column.key]
+        _dots(axes, [_ratio(row)] * len(values), values, OURS)
+    summaries = [mean_and_spread(row.values[column.key]) for row in run]
+    means = [mean for mean, _ in summaries]
+    spreads = [spread or 0.0 for _, spread in summaries]
+    axes.errorbar([_ratio(row) for row in run], means, spreads, fmt="o-", color=OURS, capsize=3)
+
+
+def _dots(axes: Axes, x: Sequence[Number], y: Sequence[Number], colour: str) -> None:
+    axes.plot(x, y, "o", color=colour, ms=6, alpha=0.45, mew=0)
+
+
+def _first_metrics(filled: FilledTable) -> list[Column]:
+    """The first column of each test set."""
+    first: dict[str, Column] = {}
+    for column in filled.table.columns:
+        test_set, slash, _ = column.key.partition("/")
+        if slash:
+            first.setdefault(test_set, column)
+    return list(first.values())
+
+
+def _ratio(row: FilledRow) -> int:
+    return int(re.search(r"\d+", row.row.name)[0])

@@ -1,0 +1,106 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from asysplat.report.filled import (
+    FilledRow,
+    FilledTable,
+    check,
+    cost_errors,
+    fits,
+    mean_and_spread,
+    pooled_spread,
+    rank_agreement,
+    spearman,
+)
+from asysplat.report.paper import Column, Row, Table
+
+PSNR = Column("dl3dv/psnr", "DL3DV-140 PSNR", "higher", "{:.2f}")
+
+
+def row(name: str = "row", run: tuple[str, ...] | None = ("model=x",), **paper: float) -> Row:
+    paper = {"dl3dv/psnr" if key == "psnr" else key: value for key, value in paper.items()}
+    return Row(name, paper, run, 32, (256, 256))
+
+
+def filled(paper: list[float], ours: list[list[float]]) -> FilledTable:
+    rows = tuple(
+        FilledRow(row(psnr=number), values={"dl3dv/psnr": values} if values else {})
+        for number, values in zip(paper, ours, strict=True)
+    )
+    table = Table("t", "1", "title", "protocol", (PSNR,), tuple(r.row for r in rows), "dl3dv/psnr")
+    return FilledTable(table, rows, "laptop", "python train.py")
+
+
+def test_mean_and_spread():
+    assert mean_and_spread([1.0, 2.0, 6.0]) == (3.0, pytest.approx(math.sqrt(7)))
+    assert mean_and_spread([4.5]) == (4.5, None)
+
+
+def test_pooled_spread_weighs_by_degrees_of_freedom():
+    # Squares within: 2 of 1 degree, 2 of 2 degrees, none of a single seed.
+    assert pooled_spread([[0.0, 2.0], [4.0, 5.0, 6.0], [9.0]]) == pytest.approx(math.sqrt(4 / 3))
+    assert pooled_spread([[1.0], [2.0]]) is None
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "rho"),
+    [
+        ([1, 2, 3, 4], [10, 20, 30, 40], 1.0),
+        ([1, 2, 3, 4], [4, 3, 2, 1], -1.0),
+        ([1, 2, 3, 4], [1, 3, 2, 4], 0.8),  # 1 - 6 * 2 / (4 * 15)
+        ([1, 2, 2, 4], [1, 2, 3, 4], math.sqrt(0.9)),  # ranks 1 2.5 2.5 4: 4.5 / sqrt(4.5 * 5)
+    ],
+)
+def test_spearman(first, second, rho):
+    assert spearman(np.array(first), np.array(second)) == pytest.approx(rho)
+
+
+def test_spearman_says_nothing_of_two_rows_or_of_equal_rows():
+    assert spearman(np.array([1.0, 2.0]), np.array([1.0, 2.0])) is None
+    assert spearman(np.array([1.0, 2.0, 3.0]), np.array([5.0, 5.0, 5.0])) is None
+
+
+def test_rank_agreement_takes_the_rows_that_have_both():
+    table = filled([19.0, 18.0, 17.0, 16.0], [[20.0, 22.0], [18.0, 20.0], [], [16.0, 18.0]])
+    agreement = rank_agreement(table, "dl3dv/psnr")
+    assert (agreement.rho, agreement.rows) == (pytest.approx(1.0), 3)
+    # Means 21, 19, 17: 2 between the rows; sqrt(2) between seeds.
+    assert agreement.signal == pytest.approx(math.sqrt(2))
+
+
+def test_rank_agreement_of_one_seed_has_no_signal():
+    table = filled([3.0, 2.0, 1.0], [[1.0], [2.0], [3.0]])
+    assert rank_agreement(table, "dl3dv/psnr").rho == pytest.approx(-1.0)
+    assert rank_agreement(table, "dl3dv/psnr").signal is None
+    assert rank_agreement(filled([1.0], [[]]), "dl3dv/psnr").rows == 0
+
+
+def test_cost_errors_are_relative_to_the_paper():
+    errors = cost_errors(
+        row(parameters=100e6, gflops=2000.0), {"parameters": 101e6, "gflops": 1900}
+    )
+    assert errors == {"parameters": pytest.approx(0.01), "gflops": pytest.approx(-0.05)}
+    assert cost_errors(row(psnr=19.0), {"parameters": 101e6}) == {}
+
+
+def test_limits_of_a_fit():
+    paper = row(parameters=100e6, gflops=2000.0)
+    assert fits(paper, {"parameters": 101.4e6, "gflops": 2058.0})
+    assert not fits(paper, {"parameters": 101.6e6, "gflops": 2000.0})
+    assert not fits(paper, {"parameters": 100e6, "gflops": 1938.0})
+
+
+def test_check():
+    paper = row(parameters=100e6)
+    good, bad = {"parameters": 101e6}, {"parameters": 110e6}
+    unverified = replace(paper, unverified="no layers are named")
+    assert check(FilledRow(paper, good)) == "fits"
+    assert check(FilledRow(paper, bad)) == "off"
+    assert check(FilledRow(unverified, good)) == "unverified, fits"
+    assert check(FilledRow(unverified, bad)) == "unverified, no fit"
+    assert check(FilledRow(row(run=None, parameters=1e6))) == "quoted"
+    assert check(FilledRow(paper)) == "not computed"
+    assert check(FilledRow(row(psnr=19.0), good)) == "not printed"

@@ -1,0 +1,273 @@
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+from io import StringIO
+
+import pytest
+from rich.console import Console
+
+from asysplat.report.filled import FilledRow, FilledTable
+from asysplat.report.html import render_html
+from asysplat.report.markdown import escape, render_markdown
+from asysplat.report.paper import Column, Reading, Row, Table
+from asysplat.report.pareto import pareto_front
+from asysplat.report.plots import make_plots
+from asysplat.report.terminal import render_terminal
+
+COLUMNS = (
+    Column("parameters", "Param (M)", None, "{:.1f}", 1e6),
+    Column("inference_seconds", "Time (s)", "lower", "{:.2f}"),
+    Column("dl3dv/psnr", "DL3DV-140 PSNR", "higher", "{:.2f}"),
+    Column("dl3dv/lpips", "DL3DV-140 LPIPS", "lower", "{:.3f}"),
+)
+
+
+def make_row(name: str, run: tuple[str, ...] | None = ("model=x",), **numbers) -> Row:
+    keys = {"psnr": "dl3dv/psnr", "lpips": "dl3dv/lpips"}
+    extra = {key: numbers.pop(key) for key in ("bounds", "unverified") if key in numbers}
+    readings = (Reading("without the links", ("model=y",)),) if "unverified" in extra else ()
+    paper = {keys.get(key, key): float(value) for key, value in numbers.items()}
+    return Row(name, paper, run, 32, (256, 256), readings=readings, **extra)
+
+
+def costs(parameters: float) -> dict[str, int | float]:
+    return {
+        "parameters": int(parameters),
+        "geometry_share": 0.905,
+        "gflops": 2041.2,
+        "gflops_true": 2600.4,
+        "gaussians": 524288,
+        "activation_gb": 21.34,
+    }
+
+
+def values(*psnr: float, seconds: float = 0.2) -> dict[str, list[int | float]]:
+    count = len(psnr)
+    return {
+        "dl3dv/psnr": list(psnr),
+        "dl3dv/lpips": [0.5] * count,
+        "inference_seconds": [seconds] * count,
+    }
+
+
+@pytest.fixture
+def table() -> FilledTable:
+    quick = {"inference_seconds": "<1"}
+    rows = (
+        FilledRow(make_row("Quoted|net", None, parameters=125e6, psnr=25.89, lpips=0.142)),
+        FilledRow(
+            make_row("Net*", parameters=98e6, psnr=19.24, lpips=0.49, bounds=quick),
+            costs(98.11e6),
+            values=values(21.0, 22.0, 23.0),
+            seeds=(0, 1, 2),
+        ),
+        FilledRow(
+            make_row("Off", parameters=88e6, psnr=18.74, lpips=0.52, inference_seconds=0.3),
+            costs(91e6),
+            values=values(20.5, 20.7, seconds=0.1),
+            seeds=(0, 1),
+            missing=(2,),
+            note="2 of 3 seeds",
+        ),
+        FilledRow(
+            make_row("Open", parameters=89e6, psnr=19.1, unverified="No layers are named."),
+            costs(93e6),
+            (costs(89.1e6),),
+            values(21.5),
+            (0,),
+        ),
+        FilledRow(make_row("Later", parameters=95e6, psnr=17.78), costs(95e6), note="not run"),
+    )
+    paper = Table(
+        "layers", "6b", "Layers <of> a stage", "32 views", COLUMNS, tuple(r.row for r in rows),
+        "dl3dv/psnr",
+    )  # fmt: skip
+    return FilledTable(
+        paper,
+        rows,
+        "laptop: 8 views of 64x64",
+        "python train.py sweeps=layers",
+        "made-up scenes stand for DL3DV-140",
+        {"DL3DV-140": {"mean_colour": 13.2, "nearest_view": 14.5}},
+        "2 cores",
+    )
+
+
+@pytest.fixture
+def ratios(table) -> FilledTable:
+    """A table of one ratio, all of it run."""
+    rows = tuple(
+        FilledRow(make_row(f"{share}%", psnr=psnr), values=values(*seeds), seeds=(0, 1))
+        for share, psnr, *seeds in [(90, 19.2, 21, 22), (80, 19.1, 21, 20), (70, 19.0, 19, 20)]
+    )
+    paper = Table(
+        "geometry_ratio", "A3", "Share", "32 views", COLUMNS[2:3], tuple(r.row for r in rows),
+        "dl3dv/psnr",
+    )  # fmt: skip
+    return FilledTable(paper, rows, "laptop", "python train.py sweeps=geometry_ratio")
+
+
+class Page(HTMLParser):
+    """Checks that elements close in order; collects texts, ids, links and tags."""
+
+    VOID = ("meta", "link")
+    TEXT = ("td", "th", "dt", "dd", "h2", "figcaption", "p")
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.open, self.ids, self.links, self.tags = [], set(), set(), set()
+        self.cells: list[str] = []
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        self.tags.add(tag)
+        self.ids.add(attrs.get("id"))
+        if tag == "a":
+            self.links.add(attrs["href"])
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag in self.TEXT:
+            self.cells.append("")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if set(self.TEXT) & set(self.open):
+            self.cells[-1] += data
+
+
+def line(markdown: str, start: str, nth: int = 0) -> list[str]:
+    """Cells of the nth line of a Markdown table that begins with `start`."""
+    found = [text for text in markdown.splitlines() if text.startswith(f"| {start} |")]
+    return [cell.strip() for cell in re.split(r"(?<!\\)\|", found[nth])[2:-1]]
+
+
+def test_cells_of_every_kind_of_row(table):
+    text = render_markdown([table])
+    assert line(text, "Net\\*") == [
+        "\\<1", "0.20 ± 0.00", "19.24", "**22.00 ± 1.00**", "0.490", "0.500 ± 0.000",
+    ]  # fmt: skip
+    assert line(text, r"Quoted\|net")[2:4] == ["**25.89**", "quoted"]
+    assert line(text, "Off")[:4] == ["0.30", "**0.10 ± 0.00**", "18.74", "20.60 ± 0.14"]
+    assert line(text, "Open †")[2:5] == ["19.10", "21.50", "-"]
+    assert line(text, "Later") == ["-", "not run", "17.78", "not run", "-", "not run"]
+
+
+def test_costs_beside_the_paper(table):
+    text = render_markdown([table])
+    # Parameters: paper, ours, error; GFLOPs, Gaussians, true GFLOPs, share, activations; check.
+    rest = ["2,041", "0.524", "2,600", "90.5", "21.3"]
+    assert line(text, "Net\\*", 1) == ["98", "98.11", "+0.1%", *rest, "fits"]
+    assert line(text, "Off", 1) == ["88", "91", "**+3.4%**", *rest, "**off**"]
+    assert line(text, "Open †", 1) == ["89", "93", "**+4.5%**", *rest, "unverified, no fit"]
+    assert line(text, "or: without the links") == ["89", "89.1", "+0.1%", *rest, "fits"]
+    assert line(text, "Quoted\\|net", 1) == ["125", *["-"] * 7, "quoted"]
+
+
+def test_notes_under_a_table(table):
+    text = render_markdown([table])
+    for note in (
+        "**Paper**: 32 views",
+        "**Ours**: laptop: 8 views of 64x64",
+        "**Stand-ins**: made-up scenes stand for DL3DV-140",
+        "**For nothing**: DL3DV-140: mean colour 13.20 dB, nearest view, copied 14.50 dB",
+        "**Seeds**: 0, 1, 2: mean ± sample standard deviation over them",
+        # Means 22, 20.6, 21.5: 0.71 between rows; sqrt((2 + 0.02) / 3) = 0.82 between seeds.
+        "Spearman's rho with the paper's is 1.00 over 3 rows; "
+        "rows differ less than seeds do (0.9 x): the order means little",
+        "**Quoted**: Quoted\\|net",
+        "**2 of 3 seeds**: Off",
+        "**Not run**: Later",
+        "**† Open**: No layers are named.",
+        "**Machine**: 2 cores",
+        "**Command**: `python train.py sweeps=layers`",
+    ):
+        assert note in text
+
+
+def test_overview_has_a_line_a_table(table, ratios):
+    text = render_markdown([table, ratios])
+    assert "| [Table 6b: Layers \\<of\\> a stage](#table-6b-layers-of-a-stage) | 3 of 4 |" in text
+    assert line(text, "[Table A3: Share](#table-a3-share)") == [
+        "3 of 3", "2", "1.00 (3 rows)", "-",
+    ]  # fmt: skip
+    assert "1.00? (3 rows) | **2 of 3, 1 †**" in text
+    assert "All tables" not in render_markdown([table])
+
+
+def test_html_says_what_markdown_says(table, ratios):
+    markdown = render_markdown([table, ratios])
+    page = Page(render_html([table, ratios]))
+    plots = [caption for table in (table, ratios) for caption, _ in make_plots(table)]
+    words = [text for text in page.cells if text not in plots]
+    assert len(words) > 150
+    assert [text for text in words if escape(text) not in markdown and text not in markdown] == []
+
+
+def test_html_needs_nothing_else(table, ratios):
+    text = render_html([table, ratios])
+    page = Page(text)
+    assert not re.search(r"https?://|@import|url\((?!#)", text)
+    assert "script" not in page.tags
+    assert page.links == {"#table-6b-layers-of-a-stage", "#table-a3-share"}
+    assert {link[1:] for link in page.links} <= page.ids
+    assert "Layers &lt;of&gt; a stage" in text
+    assert text == render_html([table, ratios])
+
+
+def test_terminal_breaks_a_wide_table_into_blocks(table):
+    wide, narrow = Console(width=200, file=StringIO()), Console(width=80, file=StringIO())
+    render_terminal([table], wide)
+    render_terminal([table], narrow)
+    assert "22.00 ± 1.00" in wide.file.getvalue()
+    assert "unverified, no fit" in narrow.file.getvalue()
+    tables = narrow.file.getvalue().split("Paper: 32")[0]
+    assert max(map(len, tables.splitlines())) <= 80
+    assert "…" not in tables
+    assert tables.count("Later") > wide.file.getvalue().split("Paper: 32")[0].count("Later")
+
+
+def test_pareto_front():
+    points = [("a", 1.0, 5.0), ("b", 2.0, 4.0), ("c", 3.0, 7.0), ("d", 3.0, 6.0), ("e", 4.0, 7.0)]
+    assert [name for name, _, _ in pareto_front(points, "higher")] == ["a", "c"]
+    assert [name for name, _, _ in pareto_front(points, "lower")] == ["a", "b"]
+
+
+def test_plots_show_every_seed_and_the_paper(table, ratios):
+    (_, seeds), *_ = make_plots(table)
+    ours, paper = seeds.axes
+    drawn = sorted(x for dots in ours.lines for x in dots.get_xdata() if dots.get_marker() == "o")
+    assert drawn == [20.5, 20.7, 21.0, 21.5, 22.0, 23.0]
+    assert [text.get_text() for text in ours.texts] == ["quoted", "not run"]
+    assert [bar.get_xdata()[0] for bar in paper.lines] == [25.89, 19.24, 18.74, 19.1, 17.78]
+    [(_, lines)] = make_plots(ratios)
+    ours, paper = lines.axes
+    assert list(paper.lines[0].get_xdata()) == [90, 80, 70]
+    assert list(paper.lines[0].get_ydata()) == [19.2, 19.1, 19.0]
+    [mean] = [
+        line for line in ours.lines if len(line.get_xdata()) == 3 and line.get_marker() == "o"
+    ]
+    assert list(mean.get_ydata()) == [21.5, 20.5, 19.5]
+
+
+def test_no_plot_of_what_was_not_run(table):
+    assert make_plots(replace(table, rows=table.rows[-1:])) == []
+
+
+def test_chromium_opens_the_page_without_an_error(table, ratios, tmp_path):
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium on PATH to open the page in")
+    path = tmp_path / "report.html"
+    path.write_text(render_html([table, ratios]))
+    command = [chromium, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+    command += ["--enable-logging=stderr", "--v=0", f"--user-data-dir={tmp_path / 'profile'}"]
+    done = subprocess.run([*command, path.as_uri()], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0
+    assert "22.00 ± 1.00" in done.stdout and done.stdout.count("<svg") == 3
+    assert "CONSOLE" not in done.stderr
