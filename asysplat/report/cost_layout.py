@@ -7,16 +7,17 @@ from asysplat.report.sheet import Cell, Grid, Heading
 
 # Key in `Costs`: title, what its unit is worth, format.
 PRINTED = {
-    "parameters": ("Parameters (M)", 1e6, "{:.4g}"),
+    "parameters": ("Param (M)", 1e6, "{:.4g}"),
     "gflops": ("GFLOPs", 1, "{:,.0f}"),
     "gaussians": ("Gaussians (M)", 1e6, "{:.3g}"),
     "gflops_true": ("True GFLOPs", 1, "{:,.0f}"),
-    "geometry_share": ("Geometry branch (%)", 0.01, "{:.1f}"),
-    "activation_gb": ("Activations (GB)", 1, "{:.3g}"),
+    "geometry_share": ("Geometry (%)", 0.01, "{:.1f}"),
+    "activation_gb": ("Activation (GB)", 1, "{:.3g}"),
 }
 CAPTION = (
     "Costs at the paper's scale. GFLOPs are those of linear and convolution modules, as the paper "
-    "counts them; true ones have attention and scans too."
+    "counts them; true ones have attention and scans too. Geometry is the share of the parameters "
+    "in that branch."
 )
 NOTHING = Cell("-", "muted")
 

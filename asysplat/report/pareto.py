@@ -29,14 +29,14 @@ def pareto_front(points: Sequence[Point], better: str) -> list[Point]:
 
 
 def pareto_plot(filled: FilledTable, quality: Column) -> list[tuple[str, Figure]]:
-    """The caption and the figure, or nothing where cost does not tell the rows apart."""
+    """The caption and the figure, or nothing below three rows or where they cost the same."""
     costs = {column.key: column for column in filled.table.columns if column.key in COSTS}
     if not costs:
         return []
     cost = costs[next(key for key in COSTS if key in costs)]
     ours = [point for row in filled.rows if (point := _our_point(row, cost, quality))]
     paper = [point for row in filled.rows if (point := _point(row, row.row.paper, cost, quality))]
-    if len(ours) < 2 or _range(ours) < LEAST_RANGE:
+    if len(ours) < 3 or _range(ours) < LEAST_RANGE:
         return []
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -51,7 +51,7 @@ def pareto_plot(filled: FilledTable, quality: Column) -> list[tuple[str, Figure]
 def _our_point(row: FilledRow, cost: Column, quality: Column) -> Point | None:
     """The network's costs are those at the paper's scale; the others were measured."""
     numbers = {key: mean_and_spread(values)[0] for key, values in row.values.items() if values}
-    numbers |= {key: (row.costs or {})[key] for key in COMPUTED if key in (row.costs or {})}
+    numbers |= {key: number for key, number in (row.costs or {}).items() if key in COMPUTED}
     return _point(row, numbers, cost, quality)
 
 
@@ -73,22 +73,25 @@ def _draw(axes: Axes, points: Sequence[Point], better: str, colour: str) -> None
     axes.plot([p[1] for p in front], [p[2] for p in front], "o-", color=colour, ms=7)
     rest = [point for point in points if point not in front]
     axes.plot([p[1] for p in rest], [p[2] for p in rest], "o", color=FAINT, ms=6, alpha=0.7)
-    for point in points:
-        _label(axes, point, point in front)
-    axes.margins(x=0.25, y=0.18)
+    for point in rest:
+        _label(axes, point, FAINT, "center", "top")
+    for point in front:
+        _label(axes, point, INK, "left" if point == front[-1] else "right", "bottom")
+    axes.margins(x=0.2, y=0.18)
     axes.locator_params(nbins=5)
 
 
-def _label(axes: Axes, point: Point, on_front: bool) -> None:
-    """The name: above the front, below the others, so that neighbours stay apart."""
+def _label(axes: Axes, point: Point, colour: str, ha: str, va: str) -> None:
+    """Names on the front stand above it and away from its end, so that neighbours stay apart."""
     name, cost, quality = point
+    offset = (0, 6 if va == "bottom" else -6)
     axes.annotate(
         name,
         (cost, quality),
-        (0, 7 if on_front else -7),
+        offset,
         textcoords="offset points",
-        ha="center",
-        va="bottom" if on_front else "top",
-        color=INK if on_front else FAINT,
+        ha=ha,
+        va=va,
+        color=colour,
         fontsize=9,
     )

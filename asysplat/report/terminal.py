@@ -33,39 +33,39 @@ def render_terminal(tables: Sequence[FilledTable], console: Console) -> None:
 def _print_grid(grid: Grid, console: Console) -> None:
     """A grid wider than the console goes on below, with the names of its rows again."""
     console.print(Text(grid.caption, style="italic"))
-    for columns in _blocks(grid, console.width):
+    # Names wrap; what is measured of a row never does.
+    widths = [_width(grid, number) for number in range(len(grid.headings))]
+    widths[0] = min(widths[0], console.width // 3)
+    for columns in _blocks(grid, widths, console.width):
         table = Table(box=ROUNDED)
+        table.add_column(Text("\n".join(_title(grid.headings[0]))), width=widths[0])
         for number in columns:
-            title = "\n".join(_title(grid.headings[number]))
-            table.add_column(Text(title), justify="right" if number else "left", no_wrap=True)
+            title = Text("\n".join(_title(grid.headings[number])))
+            table.add_column(title, justify="right", no_wrap=True)
         for row in grid.rows:
-            table.add_row(*(_text(row[number]) for number in columns))
+            table.add_row(*(_text(row[number]) for number in (0, *columns)))
         console.print(table)
 
 
-def _blocks(grid: Grid, width: int) -> list[list[int]]:
-    """Column numbers of each block: what stands under one title is kept together."""
-    names, *groups = [columns for _, columns in grid.groups()]
-    blocks = [[*names]]
-    for columns in groups:
-        if len(blocks[-1]) > 1 and _width(grid, blocks[-1] + columns) > width:
-            blocks.append([*names])
+def _blocks(grid: Grid, widths: list[int], total: int) -> list[list[int]]:
+    """Columns of each block, less the names: what stands under one title is kept together."""
+    blocks: list[list[int]] = [[]]
+    for _, columns in grid.groups()[1:]:
+        shown = [0, *blocks[-1], *columns]
+        if blocks[-1] and 1 + sum(BORDER + widths[number] for number in shown) > total:
+            blocks.append([])
         blocks[-1] += columns
     return blocks
 
 
-def _width(grid: Grid, columns: list[int]) -> int:
-    return 1 + sum(BORDER + _column_width(grid, number) for number in columns)
-
-
-def _column_width(grid: Grid, number: int) -> int:
+def _width(grid: Grid, number: int) -> int:
     texts = [*_title(grid.headings[number]), *(row[number].text for row in grid.rows)]
     return max(map(cell_len, texts))
 
 
 def _title(heading: Heading) -> list[str]:
     """A line for each word."""
-    return [*heading.title.split(" "), heading.part]
+    return [word for word in (*heading.title.split(" "), heading.part) if word]
 
 
 def _text(cell: Cell) -> Text:
