@@ -1,15 +1,18 @@
 """Parameters, FLOPs and memory."""
 
 import math
+import re
 import resource
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 GB = 1e9
+STATUS, CLEAR_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")  # Linux alone
 NORMS = (nn.LayerNorm, nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
 
 
@@ -59,22 +62,32 @@ def true_flops(run: Callable[[], object]) -> int:
     """FLOPs of one `run()` with every matrix product, einsum and attention included.
 
     Run it on the meta device, which needs no memory: elsewhere the kernel that torch picks may be
-    unknown to its counter (some releases count attention on a CPU as 0). Scans count where
-    they are matrix products; element-wise work never.
+    unknown to its counter (some releases count attention on a CPU as 0). Scans count with their
+    matrix products and their recurrence; other element-wise work never.
     """
     with FlopCounterMode(display=False) as counter:
         run()
     return counter.get_total_flops()
 
 
-def peak_memory_gb(device: torch.device | str) -> float:
-    """Peak memory in units of 1e9 bytes.
+def reset_peak_memory(device: torch.device | str) -> None:
+    """Let `peak_memory_gb` start anew, where it can: on CUDA and on Linux."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    elif CLEAR_PEAK.exists():
+        CLEAR_PEAK.write_text("5")
 
-    On CUDA what tensors held since the last `torch.cuda.reset_peak_memory_stats`, elsewhere the
-    resident set of the whole process since it began.
+
+def peak_memory_gb(device: torch.device | str) -> float:
+    """Peak memory in units of 1e9 bytes, since the last `reset_peak_memory` or the process began.
+
+    On CUDA what tensors held, elsewhere the resident set of the whole process.
     """
     if torch.device(device).type == "cuda":
         return torch.cuda.max_memory_allocated(device) / GB
+    if STATUS.exists():
+        kilobytes = re.search(r"VmHWM:\s+(\d+) kB", STATUS.read_text())[1]
+        return int(kilobytes) * 1024 / GB
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     bytes_per_unit = 1 if sys.platform == "darwin" else 1024
     return peak * bytes_per_unit / GB

@@ -56,7 +56,9 @@ def test_geometry_ratio(build, ratio, width):
     assert abs(total / expected - 1) < 0.01
 
 
-@pytest.mark.parametrize(("ratio", "complaint"), [(1.2, "between 0 and 1"), (0.01, "closest come stages ")])
+@pytest.mark.parametrize(
+    ("ratio", "complaint"), [(1.2, "between 0 and 1"), (0.01, "closest come stages ")]
+)
 def test_geometry_ratio_that_cannot_be_met(build, ratio, complaint):
     with pytest.raises(InstantiationException) as caught:
         build(f"geometry_ratio={ratio}", device="meta")

@@ -1,71 +1,84 @@
 """What a run costs: parameters, FLOPs, Gaussians, seconds a step, memory."""
 
-import copy
+import statistics
 import time
 from typing import Any
 
 import lightning
 import torch
 
-from asysplat.evaluation.cost import count_parameters, module_flops, peak_memory_gb, true_flops
-from asysplat.scene import Views
+from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
+from asysplat.evaluation.static_cost import static_costs
 
 WARM_UP_STEPS = 5
-GIGA = 1e9
 
 
 class Costs(lightning.Callback):
     """Writes `values`, "cost/..." -> number; what needs no running is known before the first step.
 
-    gflops counts as the paper does (Linear and Conv modules of one scene's forward), gflops_true
-    every product, attention and scans as matrices included; both at the run's views and resolution.
+    Of one scene at the run's views and resolution: see `static_costs`. Measured: the median
+    training step and the peak of memory over all of them (seconds_per_step, peak_gb), the median
+    forward of the network over the test's scenes and the peak of memory in the test
+    (inference_seconds, inference_gb).
     """
 
     def __init__(self):
         self.values: dict[str, float | int] = {}
         self.seconds: list[float] = []
+        self.forwards: list[float] = []
 
     def on_fit_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        if module.device.type == "cuda":
-            # Jobs of a sweep share a process, and the peak would be that of the largest.
-            torch.cuda.reset_peak_memory_stats(module.device)
+        # Jobs of a sweep share a process, and the peak would be that of the largest.
+        reset_peak_memory(module.device)
         scene = trainer.datamodule.evaluation["val"][0]["inputs"]
-        self.values = static_costs(module.net, scene)
+        costs = static_costs(module.net, scene.num_views, *scene.images.shape[-2:])
+        self.values = {f"cost/{name}": value for name, value in costs.items()}
         for logger in trainer.loggers:
             logger.log_metrics(self.values, step=0)
 
-    def on_train_batch_start(self, trainer: lightning.Trainer, *_: Any) -> None:
-        self.started = time.perf_counter()
+    def on_train_batch_start(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule, *_: Any
+    ) -> None:
+        self._start(module)
 
     def on_train_batch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule, *_: Any
     ) -> None:
-        if module.device.type == "cuda":
-            torch.cuda.synchronize(module.device)
-        self.seconds.append(time.perf_counter() - self.started)
+        self.seconds.append(self._elapsed(module))
 
     def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         measured = self.seconds[WARM_UP_STEPS:]
         if measured:
-            self.values["cost/seconds_per_step"] = torch.tensor(measured).median().item()
+            self.values["cost/seconds_per_step"] = statistics.median(measured)
         self.values["cost/peak_gb"] = peak_memory_gb(module.device)
         for logger in trainer.loggers:
             logger.log_metrics(self.values, step=trainer.global_step)
 
+    def on_test_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        reset_peak_memory(module.device)
+        self.hooks = [
+            module.net.register_forward_pre_hook(lambda *_: self._start(module)),
+            module.net.register_forward_hook(
+                lambda *_: self.forwards.append(self._elapsed(module))
+            ),
+        ]
 
-def static_costs(net: torch.nn.Module, scene: Views) -> dict[str, float | int]:
-    """Costs of one scene's forward pass, from a copy of the network on the meta device."""
-    on_meta = copy.deepcopy(net).to("meta").eval()
-    views = scene.to("meta")
+    def on_test_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        for hook in self.hooks:
+            hook.remove()
+        self.values["cost/inference_seconds"] = statistics.median(self.forwards)
+        self.values["cost/inference_gb"] = peak_memory_gb(module.device)
 
-    def run() -> object:
-        return on_meta(views)
+    def _start(self, module: lightning.LightningModule) -> None:
+        wait_for(module.device)
+        self.started = time.perf_counter()
 
-    with torch.no_grad():
-        return {
-            "cost/parameters": count_parameters(net),
-            "cost/geometry_share": net.geometry_share(),
-            "cost/gflops": module_flops(on_meta, run) / GIGA,
-            "cost/gflops_true": true_flops(run) / GIGA,
-            "cost/gaussians": run().num_gaussians,
-        }
+    def _elapsed(self, module: lightning.LightningModule) -> float:
+        wait_for(module.device)
+        return time.perf_counter() - self.started
+
+
+def wait_for(device: torch.device) -> None:
+    """A GPU works on after the call returns; a time is taken when it has finished."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
