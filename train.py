@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError, input_error_behind
 from asysplat.training.checkpoints import check_checkpoint, find_checkpoint, load_weights
-from asysplat.training.runs import find_run, identity
+from asysplat.training.runs import describe_run, find_run
 from asysplat.training.summary import print_summary, write_json
 from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
 
@@ -86,8 +86,7 @@ def train(config: DictConfig) -> float | None:
     trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     trainer.test(module, data, verbose=False)
 
-    results = {"run/identity": identity(config), "run/seed": config.seed}
-    results |= callbacks.costs.values | callbacks.metrics.results
+    results = describe_run(config) | callbacks.costs.values | callbacks.metrics.results
     if trainer.is_global_zero:
         write_json(folder / "metrics.json", results)
         log_outcome(logger, results, data.name)

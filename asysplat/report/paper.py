@@ -151,6 +151,11 @@ def stand_ins(data: str) -> dict[str, str]:
     return known[data]
 
 
+def set_titles() -> dict[str, str]:
+    """The paper's test sets, as it prints them."""
+    return _raw()["test_sets"]
+
+
 @cache
 def _raw() -> dict:
     return OmegaConf.to_container(OmegaConf.load(PAPER))
@@ -176,7 +181,7 @@ def _column(key: str) -> Column:
     """A column's title and direction come from its kind, the last part of its key."""
     *test_set, kind = key.split("/")
     entry = _raw()["columns"][kind]
-    title = " ".join([*(_raw()["test_sets"][name] for name in test_set), entry["title"]])
+    title = " ".join([*(set_titles()[name] for name in test_set), entry["title"]])
     return Column(key, title, entry.get("better"), entry["format"], float(entry.get("unit", 1)))
 
 

@@ -2,18 +2,20 @@
 
 import hashlib
 import json
+import os
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 RESULTS = "metrics.json"
 EVALUATION = "evaluation.json"  # what evaluate.py adds to a run
-# Names, and what other keys have already taken their values from.
-BESIDE_THE_POINT = ("name", "ckpt_path", "stage", "stages", "more_inputs")
+# Names, what watches a run, and what other keys have already taken their values from.
+BESIDE_THE_POINT = ("name", "ckpt_path", "callbacks", "stage", "stages", "more_inputs")
 
 
 @dataclass(frozen=True)
@@ -35,16 +37,27 @@ class Run:
 
 
 def identity(config: DictConfig) -> str:
-    """A hash of all that the configuration resolves to, but for the seed and for what says where
-    things are on disk: runs of one identity and seed give the same numbers."""
+    """A hash of all that the configuration resolves to, but for the seed and for what changes no
+    number: places on disk, callbacks, loader workers. Runs of one identity and seed agree."""
     config = config.copy()
     with open_dict(config):
         config.paths = dict.fromkeys(config.paths, "")
-        config.seed = None
+        config.seed = config.data.workers = None
     resolved = OmegaConf.to_container(config, resolve=True)
     for key in BESIDE_THE_POINT:
         resolved.pop(key, None)
     return hashlib.sha256(json.dumps(resolved, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def describe_run(config: DictConfig) -> dict[str, str | int]:
+    """What metrics.json says of the run itself: run/identity, run/seed, run/machine."""
+    gpus = torch.cuda.device_count()
+    machine = f"{gpus} x {torch.cuda.get_device_name()}" if gpus else f"{os.cpu_count()} CPU cores"
+    return {
+        "run/identity": identity(config),
+        "run/seed": config.seed,
+        "run/machine": f"{machine}, torch {torch.__version__}",
+    }
 
 
 def find_runs(logs: Path) -> Iterator[Run]:

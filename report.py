@@ -1,0 +1,53 @@
+"""Finished sweeps beside the paper's tables: python report.py table=layers costs=true"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.progress import track
+
+from asysplat.errors import InputError
+from asysplat.report.fill import fill_table, finished_runs, with_costs
+from asysplat.report.html import render_html
+from asysplat.report.markdown import render_markdown
+from asysplat.report.paper import find_tables
+from asysplat.report.terminal import render_terminal
+from asysplat.words import check_words
+
+
+@hydra.main(config_path="conf", config_name="report", version_base="1.3")
+def main(options: DictConfig) -> None:
+    try:
+        report(options)
+    except InputError as error:
+        sys.exit(f"error: {error}")
+
+
+def report(options: DictConfig) -> None:
+    """Fill the tables, print them, write report.md and report.html."""
+    tables = find_tables(options.table)
+    words = [*([] if options.scale == "laptop" else [f"scale={options.scale}"]), *options.overrides]
+    check_words(words)
+    runs = finished_runs(Path(options.logs))
+    filled = [fill_table(table, words, compose_train, runs) for table in tables]
+    if options.costs:
+        filled = [with_costs(table, compose_train) for table in track(filled, "counting costs")]
+    console = Console()
+    render_terminal(filled, console)
+    folder = Path(options.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "report.md").write_text(render_markdown(filled))
+    (folder / "report.html").write_text(render_html(filled))
+    console.print(f"page: {folder / 'report.html'}", soft_wrap=True)
+
+
+def compose_train(overrides: Sequence[str]) -> DictConfig:
+    """The configuration that train.py would run."""
+    return hydra.compose("train", list(overrides), return_hydra_config=True)
+
+
+if __name__ == "__main__":
+    main()
