@@ -15,7 +15,7 @@ from asysplat.report.html import render_html
 from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import find_tables
 from asysplat.report.terminal import render_terminal
-from asysplat.words import check_words
+from asysplat.words import check_words, exit_at_unknown_words
 
 
 @hydra.main(config_path="conf", config_name="report", version_base="1.3")
@@ -50,4 +50,5 @@ def compose_train(overrides: Sequence[str]) -> DictConfig:
 
 
 if __name__ == "__main__":
+    exit_at_unknown_words()
     main()

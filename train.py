@@ -19,6 +19,7 @@ from asysplat.training.checkpoints import check_checkpoint, find_checkpoint, loa
 from asysplat.training.runs import describe_run, find_run
 from asysplat.training.summary import print_summary, write_json
 from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
+from asysplat.words import exit_at_unknown_words
 
 
 @hydra.main(config_path="conf", config_name="train", version_base="1.3")
@@ -95,4 +96,5 @@ def train(config: DictConfig) -> float | None:
 
 
 if __name__ == "__main__":
+    exit_at_unknown_words()
     main()

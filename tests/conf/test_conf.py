@@ -1,4 +1,5 @@
-"""Every file under conf/ composes, and says first how to use it."""
+"""Every file under conf/ and sweeps/ composes, builds its model, trains a step, and says first how
+to use it. New files are found by themselves."""
 
 from pathlib import Path
 
@@ -6,8 +7,12 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
-CONF = Path(__file__).parents[2] / "conf"
+from asysplat.data.datamodule import TrainingTasks, collate
+
+ROOT = Path(__file__).parents[2]
+CONF, SWEEPS = ROOT / "conf", ROOT / "sweeps"
 GROUPS = [
     (str(path.parent.relative_to(CONF)), path.stem)
     for path in sorted(CONF.rglob("*.yaml"))
@@ -15,18 +20,82 @@ GROUPS = [
 ]
 # Shared parts of the files that use them.
 PARTS = {("model", "asysplat"), ("model", "blocks"), ("model", "one_branch"), ("data", "views")}
+TRAINED = [(group, name) for group, name in GROUPS if group in ("model", "experiment")]
+TRAINED += [("sweeps", path.stem) for path in sorted(SWEEPS.glob("*.yaml"))]
+TINY = ["width=0.125", "state_size=8", "data.workers=0", "data.num_frames=32"]
+TINY += ["data.inputs=2", "data.targets=1", "data.window=[12,32]"]
+TINY += ["data.val_scenes=1", "data.test_scenes=1", "data.test_sets=null"]
+
+
+def compose_train(*overrides):
+    with initialize_config_dir(str(CONF), version_base=None):
+        return compose("train", list(overrides), return_hydra_config=True)
+
+
+def first_rows(config) -> list[str]:
+    """The first choice of every word that a sweep varies."""
+    return [f"{k}={str(v).split(',')[0]}" for k, v in config.hydra.sweeper.params.items()]
+
+
+@pytest.fixture(autouse=True)
+def in_the_root(monkeypatch):
+    monkeypatch.chdir(ROOT)  # sweeps/ is looked for there
 
 
 @pytest.mark.parametrize("group", sorted(set(GROUPS) - PARTS), ids="/".join)
 def test_composes_and_builds_its_model(group):
-    with initialize_config_dir(str(CONF), version_base=None):
-        config = compose("train", [f"{group[0]}={group[1]}"])
+    config = compose_train("=".join(group))
     with torch.device("meta"):
         net = instantiate(config.model)
     assert sum(p.numel() for p in net.parameters()) > 1e6
 
 
-@pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(SWEEPS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_row_of_a_sweep_builds_its_model(path):
+    config = compose_train(f"sweeps={path.stem}")
+    assert config.hydra.mode.name == "MULTIRUN"
+    assert config.name == path.stem
+    choices = dict(config.hydra.sweeper.params)
+    choices.pop("seed", None)
+    assert choices
+    for word, values in choices.items():
+        for value in values.split(","):
+            row = compose_train(f"sweeps={path.stem}", f"{word}={value}")
+            with torch.device("meta"):
+                instantiate(row.model)
+
+
+@pytest.mark.parametrize("choice", sorted(set(TRAINED) - PARTS), ids="/".join)
+def test_trains_a_step_at_a_tiny_size(choice):
+    overrides = ["=".join(choice), *TINY]
+    if choice[0] == "sweeps":
+        overrides += first_rows(compose_train(overrides[0]))
+    config = compose_train(*overrides, "data.height=32", "data.width=32", "data.batch_size=1")
+    data = instantiate(config.data)
+    module = instantiate(config.training, net=instantiate(config.model))
+    batch = collate([TrainingTasks(data)[0]])
+    optimizer = module.configure_optimizers()["optimizer"]
+    before = [parameter.detach().clone() for parameter in module.net.head.parameters()]
+    rendering = module.reconstruct(batch, depth=module.loss.needs_depth).rendering
+    loss = module.loss(rendering, batch["targets"])["loss"]
+    loss.backward()
+    optimizer.step()
+    assert loss.isfinite()
+    changed = zip(before, module.net.head.parameters(), strict=True)
+    assert all(not torch.equal(old, new) and new.isfinite().all() for old, new in changed)
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted(CONF.rglob("*.yaml")) + sorted(SWEEPS.glob("*.yaml")),
+    ids=lambda path: path.stem,
+)
 def test_first_comment_is_the_command(path):
     comments = [line for line in path.read_text().splitlines()[:2] if line.startswith("# ")]
-    assert any("python train.py" in comment for comment in comments)
+    script = "report.py" if path.stem == "report" else "train.py"
+    assert any(f"python {script}" in comment for comment in comments)
+
+
+def test_every_table_has_its_sweep():
+    tables = OmegaConf.load(ROOT / "asysplat" / "report" / "paper.yaml").tables
+    assert {path.stem for path in SWEEPS.glob("*.yaml")} == set(tables)

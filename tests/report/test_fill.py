@@ -1,0 +1,113 @@
+"""Our numbers in the paper's tables: costs of every row, and runs matched by configuration."""
+
+import json
+from pathlib import Path
+
+import hydra
+import pytest
+from hydra import initialize_config_dir
+
+from asysplat.report.fill import fill_table, finished_runs, with_costs
+from asysplat.report.filled import check
+from asysplat.report.paper import find_tables, load_paper
+from asysplat.training.runs import describe_run, find_run
+
+WORDS = ["steps=7"]
+
+
+@pytest.fixture
+def compose(repository, monkeypatch):
+    monkeypatch.chdir(repository)  # sweeps/ is looked for there
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        yield compose_train
+
+
+def compose_train(overrides):
+    return hydra.compose("train", list(overrides), return_hydra_config=True)
+
+
+def write_run(folder: Path, config, numbers: dict, seed: int) -> None:
+    folder.mkdir(parents=True)
+    del config.hydra
+    config.seed = seed
+    (folder / "metrics.json").write_text(json.dumps(describe_run(config) | numbers))
+
+
+@pytest.mark.parametrize("table", load_paper())
+def test_costs_of_every_row_are_the_papers_or_flagged(compose, table):
+    filled = with_costs(fill_table(load_paper()[table], [], compose, {}), compose)
+    for row in filled.networks:
+        if row.row.quoted:
+            continue
+        if row.row.unverified:
+            # Both readings are there, and one of them has the paper's costs.
+            assert len(row.reading_costs) == len(row.row.readings) > 0
+            assert check(row).startswith("unverified")
+        else:
+            assert check(row) in ("fits", "not printed")
+
+
+@pytest.fixture
+def logs(compose, tmp_path):
+    for seed, psnr in ((0, 20.0), (2, 21.0)):
+        config = compose(["sweeps=layers", "model=asysplat_7m1t", *WORDS])
+        numbers = {"test/procedural/psnr": psnr, "baseline/procedural/mean_colour/psnr": 13.0}
+        numbers["baseline/procedural/nearest_view/psnr"] = 16.0
+        write_run(tmp_path / "a" / str(seed), config, numbers, seed)
+    other = compose(["sweeps=layers", "model=asysplat_7m1t", "steps=8"])
+    write_run(tmp_path / "b" / "0", other, {"test/procedural/psnr": 1.0}, 0)
+    return tmp_path
+
+
+def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
+    (table,) = find_tables("layers")
+    filled = fill_table(table, WORDS, compose, finished_runs(logs))
+    rows = {row.row.run: row for row in filled.rows}
+    row = rows[("model=asysplat_7m1t",)]
+    assert row.values["dl3dv/psnr"] == [20.0, 21.0]
+    assert row.seeds == (0, 2) and row.missing == (1,)
+    assert "1" in row.note
+    assert not rows[("model=asysplat_8t",)].values
+    assert filled.baselines == {"procedural": {"mean_colour": 13.0, "nearest_view": 16.0}}
+    assert filled.command == "python train.py sweeps=layers steps=7"
+
+
+def test_one_run_serves_every_table_that_names_its_configuration(compose, logs, tmp_path):
+    config = compose(["sweeps=layers", "model=asysplat_4m4s"])
+    numbers = {"test/procedural/psnr": 20.0, "test/outdoors/psnr": 19.0}
+    write_run(tmp_path / "c", config, numbers, 0)
+    runs = finished_runs(tmp_path)
+    for key in ("layers", "architecture", "asymmetry", "matched_parameters", "geometry_ratio"):
+        filled = fill_table(load_paper()[key], [], compose, runs)
+        ours = [row for row in filled.rows if row.values]
+        assert [row.values["dl3dv/psnr"] for row in ours] == [[20.0]]
+    assert ours[0].values["mipnerf360/psnr"] == [19.0]
+
+
+def test_post_optimisation_is_not_run_until_evaluation_adds_it(compose, tmp_path):
+    config = compose(["sweeps=state_of_the_art", "model=asysplat_4m4s"])
+    write_run(tmp_path / "run", config, {"test/procedural/psnr": 20.0}, 0)
+    table = load_paper()["state_of_the_art"]
+
+    def ours():
+        filled = fill_table(table, [], compose, finished_runs(tmp_path))
+        return {row.row.post_optimisation: row for row in filled.rows if "AsySplat" in row.name}
+
+    assert ours()[0].values["dl3dv/psnr"] == [20.0]
+    assert not ours()[10].values and "evaluate.py" in ours()[10].note
+    added = {"test/procedural/post10/psnr": 23.0, "cost/post10/seconds": 4.0}
+    (tmp_path / "run" / "evaluation.json").write_text(json.dumps(added))
+    assert ours()[10].values["dl3dv/psnr"] == [23.0]
+    assert ours()[10].values["inference_seconds"] == [4.0]
+    assert not ours()[3].values
+
+
+@pytest.mark.parametrize("text", ["", '{"run/identity": "1', "[]", '{"test/procedural/psnr": 1}'])
+def test_half_written_results_are_no_results(compose, tmp_path, text):
+    config = compose(["sweeps=layers"])
+    write_run(tmp_path / "run", config, {"test/procedural/psnr": 20.0}, 0)
+    config.seed = 0
+    assert find_run(tmp_path, config).folder == tmp_path / "run"
+    (tmp_path / "run" / "metrics.json").write_text(text)
+    with pytest.warns(UserWarning, match="is not the results of a finished run"):
+        assert find_run(tmp_path, config) is None
