@@ -11,6 +11,7 @@ from asysplat.models.shapes import Widths
 
 SHARE_TOLERANCE = 0.015
 TOTAL_TOLERANCE = 0.0095  # so that any two totals are within 2 %
+ATTEMPTS = 10  # widths that are built and counted, for each number of layers
 
 Build = Callable[[Widths, int], nn.Module]
 
@@ -42,23 +43,33 @@ def solve_widths(
     terms = _quadratic_terms(candidates / base.head)
     # Among the widths that fit, those that keep the proportions of the stages.
     shape_error = np.log(candidates[:, :-1] / np.array(base.stages)).std(axis=1)
+
+    def errors(total: np.ndarray | int, geometry: np.ndarray | float) -> np.ndarray | float:
+        """At most 1 where both tolerances are kept."""
+        share = np.abs(geometry / total - ratio) / SHARE_TOLERANCE
+        return np.maximum(share, np.abs(total / wanted - 1) / TOTAL_TOLERANCE)
+
     closest, description = np.inf, ""
     for count in sorted(range(1, 3 * layers + 1), key=lambda n: (abs(n - layers), -n)):
         coefficients = _fit_counts(lambda widths, n=count: build(widths, n), base)
-        total, geometry = (terms @ coefficients).T
-        share_error = np.abs(geometry / total - ratio) / SHARE_TOLERANCE
-        error = np.maximum(share_error, np.abs(total / wanted - 1) / TOTAL_TOLERANCE)
-        best = int(np.argmin(np.where(error < 1, error / 2 + shape_error, 1e3 + error)))
-        *stages, fine = (int(width) for width in candidates[best])
-        if error[best] < 1:
-            return Widths(tuple(stages), fine, base.head), count
-        if error[best] < closest:
-            closest = error[best]
-            description = (
-                f"stages {'/'.join(map(str, stages))} and an appearance branch {fine} wide in "
-                f"{count} layers a stage, with {geometry[best] / total[best]:.3f} of "
-                f"{total[best] / 1e6:.2f}M"
-            )
+        error = errors(*(terms @ coefficients).T)
+        order = np.argsort(np.where(error < 1, error / 2 + shape_error, 1e3 + error))
+        # The polynomial knows neither rounding nor stages of equal width: the model is counted.
+        for row in candidates[order[:ATTEMPTS]]:
+            *stages, fine = (int(width) for width in row)
+            widths = Widths(tuple(stages), fine, base.head)
+            total, geometry = _count(build(widths, count))
+            found = float(errors(total, geometry))
+            if found < 1:
+                return widths, count
+            if found < closest:
+                closest = found
+                description = (
+                    f"stages {'/'.join(map(str, stages))} and an appearance branch {fine} wide in "
+                    f"{count} layers a stage, with {geometry / total:.3f} of {total / 1e6:.2f}M"
+                )
+            if error[order[0]] > 1:
+                break  # nothing fits with this many layers
     raise InputError(
         f"geometry_ratio={ratio} cannot be met within {SHARE_TOLERANCE} at "
         f"{wanted / 1e6:.2f}M parameters with heads {base.head} wide: closest come {description}; "

@@ -19,41 +19,77 @@ def make_views(batch=(2,), views=3, height=32, width=64):
     return Views(cameras, torch.rand(*batch, views, 3, height, width))
 
 
-# Architecture rows of the paper and their parameters in this layout, in units of 1e6.
-PAPER_ROWS = {
-    (): 98.11,
-    ("model.layers=4m4t",): 94.40,
-    ("model.blocks.s.conv_blocks=false",): 94.40,
-    ("model.layers=7m1s",): 86.84,
-    ("model.layers=7m1t",): 85.91,
-    ("model.layers=8t",): 105.72,
-    ("model/source=fine",): 98.11,
-    ("model/source=coarse",): 96.05,
-    ("model/links=only_fine_to_coarse",): 92.96,
-    ("model/links=only_coarse_to_fine",): 90.96,
-    ("model/appearance=none",): 94.10,
+# Every model of architecture.md and its parameters in this layout, in units of 1e6.
+PARAMETERS = {
+    "asysplat_4m4s": 98.11,
+    "asysplat_7m1s": 86.84,
+    "asysplat_7m1t": 85.91,
+    "asysplat_4m4t": 94.40,
+    "asysplat_8t": 105.72,
+    "asysplat_4m4s_noconv": 94.40,
+    "asysplat_pred_fine": 98.11,
+    "asysplat_pred_coarse": 96.05,
+    "asysplat_only_fine_to_coarse": 92.96,
+    "asysplat_only_coarse_to_fine": 90.96,
+    "asysplat_no_mambavision": 94.10,
+    "asysplat_8m0a": 93.58,
+    "asysplat_7m1a": 96.59,
+    "asysplat_6m2a": 99.61,
+    "asysplat_4m4a": 94.40,
+    "asysplat_2m6a": 100.06,
+    "asysplat_0m8a": 105.72,
+    "single_branch": 94.29,
+    "two_branch": 90.26,
+    "longlrm": 141.91,
+    "longlrm_18": 102.98,
+    "longlrm_24": 98.88,
+    "longlrm_24h": 101.84,
 }
 
 
-@pytest.mark.parametrize("overrides", PAPER_ROWS, ids=lambda row: " ".join(row) or "4m4s")
-def test_parameters_at_full_width(build, overrides):
-    net = build("scale=paper", *overrides, device="meta")
+@pytest.mark.parametrize("model", PARAMETERS)
+def test_parameters_at_full_width(build, model):
+    net = build("scale=paper", f"model={model}", device="meta")
     millions = sum(p.numel() for p in net.parameters()) / 1e6
-    assert round(millions, 2) == PAPER_ROWS[overrides]
+    assert round(millions, 2) == PARAMETERS[model]
 
 
 def test_geometry_share_of_the_paper(build):
     assert abs(build("scale=paper", device="meta").geometry_share() - 0.905) < 0.001
 
 
-@pytest.mark.parametrize("ratio", [0.5, 0.7, 0.9])
-@pytest.mark.parametrize("width", [0.25, 1.0])
+@pytest.mark.parametrize("ratio", [0.3, 0.5, 0.7, 0.9, 0.95])
+@pytest.mark.parametrize("width", [0.125, 0.25, 1.0])
 def test_geometry_ratio(build, ratio, width):
     base = build(f"width={width}", device="meta")
     net = build(f"width={width}", f"geometry_ratio={ratio}", device="meta")
     total, expected = (sum(p.numel() for p in n.parameters()) for n in (net, base))
-    assert abs(net.geometry_share() - ratio) < 0.02
+    assert abs(net.geometry_share() - ratio) <= 0.015
     assert abs(total / expected - 1) < 0.01
+    assert all(width % net.widths.head == 0 for width in (*net.widths.stages, net.widths.fine))
+    stages = "/".join(map(str, net.widths.stages))
+    assert f"stages {stages} wide" in net.describe() and f"{net.widths.fine} wide" in net.describe()
+
+
+def test_parameter_budget(build):
+    base = build(device="meta")
+    net = build("geometry_ratio=0.8", "parameter_budget=0.5", device="meta")
+    total, expected = (sum(p.numel() for p in n.parameters()) for n in (net, base))
+    assert abs(total / expected - 0.5) < 0.005
+
+
+@pytest.mark.parametrize(
+    ("overrides", "complaint"),
+    [
+        (["parameter_budget=0.5"], "without a geometry_ratio"),
+        (["model=longlrm", "geometry_ratio=0.5"], "leave them out"),
+        (["model=longlrm", "model.merges=[true]"], "model.merges has 1 entries for 3 stages"),
+    ],
+)
+def test_what_a_model_refuses(build, overrides, complaint):
+    with pytest.raises(InstantiationException) as caught:
+        build(*overrides, device="meta")
+    assert complaint in str(input_error_behind(caught.value))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,62 @@
+"""Sweeps: what is finished is not run again, a failure stops nothing else, launchers work."""
+
+import json
+import signal
+import subprocess
+import time
+
+import pytest
+
+SWEEP = ["sweeps=layers", "model=asysplat_7m1s", "model.layers=1m1s", "steps=1"]
+
+
+def finished_seeds(logs) -> list[int]:
+    return sorted(json.loads(path.read_text())["run/seed"] for path in logs.rglob("metrics.json"))
+
+
+def test_an_interrupted_sweep_runs_only_what_is_missing(train, repository, tmp_path):
+    process = subprocess.Popen(
+        [*train.command, *SWEEP, "seed=0,1,2"],
+        cwd=repository,
+        env=train.environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    deadline = time.monotonic() + 300
+    while not finished_seeds(tmp_path):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("metrics.json")}
+    assert len(before) < 3
+
+    result = train(*SWEEP, "seed=0,1,2")
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count("finished already") == len(before)
+    assert finished_seeds(tmp_path) == [0, 1, 2]
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+    other = train(*SWEEP, "seed=2", "training.learning_rate=1e-4")
+    assert "finished already" not in other.stdout
+    assert finished_seeds(tmp_path) == [0, 1, 2, 2]
+
+
+def test_a_failure_is_named_and_the_others_go_on(train, tmp_path):
+    result = train(*SWEEP, "seed=0", "data.height=40,32", "data.width=32")
+    assert result.returncode != 0
+    assert "failed: job 0" in result.stderr and "set 64x32" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert finished_seeds(tmp_path) == [0]
+
+
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_launchers(train, tmp_path, launcher):
+    plugin = launcher.partition("_")[0]
+    pytest.importorskip(f"hydra_plugins.hydra_{plugin}_launcher")
+    words = [f"hydra/launcher={launcher}", "data.workers=1"]
+    result = train(*SWEEP, "seed=0,1", *words)
+    assert result.returncode == 0, result.stderr
+    assert finished_seeds(tmp_path) == [0, 1]
+    assert train(*SWEEP, "seed=0,1", *words).returncode == 0
+    assert finished_seeds(tmp_path) == [0, 1]
