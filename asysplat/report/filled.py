@@ -16,6 +16,10 @@ Costs = dict[str, Number]
 # Columns that need no run: they stand among the costs, at the paper's scale.
 COMPUTED = ("parameters", "gflops", "gaussians")
 
+# Below this, rows may differ by the luck of their seeds: one table in twenty of six equal rows and
+# three seeds exceeds it (the F distribution's 95 % is 3.1 = 1.76 ** 2).
+CLEAR_SIGNAL = 1.76
+
 # How far our costs may be from the paper's, as a fraction of the paper's.
 LIMITS = {"parameters": 0.015, "gflops": 0.03}
 
@@ -91,7 +95,9 @@ class RankAgreement:
     Args:
         rho: Spearman's; None below three rows, and where all rows are equal.
         rows: how many have both numbers.
-        signal: standard deviation between rows over the one between seeds; None without seeds.
+        signal: standard deviation between rows over the one that the seeds alone would give to
+            means of as many seeds, the root of the F statistic; about 1 where rows are equal. None
+            without seeds.
     """
 
     rho: float | None
@@ -114,7 +120,8 @@ def rank_agreement(filled: FilledTable, column: str) -> RankAgreement:
     within = pooled_spread([row.values[column] for row in both])
     signal = None
     if between is not None and within is not None:
-        signal = between / within if within else math.inf
+        seeds = float(np.mean([len(row.values[column]) for row in both]))
+        signal = between / (within / math.sqrt(seeds)) if within else math.inf
     return RankAgreement(spearman(paper, ours), len(both), signal)
 
 

@@ -16,7 +16,7 @@ INTRODUCTION = (
 )
 OVERVIEW = (
     "All tables. Rank agreement is Spearman's rho with the paper's order; ? where rows differ "
-    "less than seeds do, or one seed does not tell."
+    "hardly more than seeds alone make them, or one seed does not tell."
 )
 # The space does not break.
 ARROWS = {"higher": "\u00a0↑", "lower": "\u00a0↓", None: ""}

@@ -1,6 +1,6 @@
 """What stands under a table: how both sides were measured, and how far to trust the order."""
 
-from asysplat.report.filled import FilledTable, RankAgreement, rank_agreement
+from asysplat.report.filled import CLEAR_SIGNAL, FilledTable, RankAgreement, rank_agreement
 from asysplat.report.sheet import Note
 
 BASELINES = {"mean_colour": "mean colour", "nearest_view": "nearest view, copied"}
@@ -29,7 +29,7 @@ def rho_text(filled: FilledTable) -> str:
     agreement = rank_agreement(filled, filled.table.rank_by)
     if agreement.rho is None:
         return "-"
-    doubt = "?" if agreement.signal is None or agreement.signal < 1 else ""
+    doubt = "?" if agreement.signal is None or agreement.signal < CLEAR_SIGNAL else ""
     return f"{agreement.rho:.2f}{doubt} ({agreement.rows} rows)"
 
 
@@ -67,9 +67,12 @@ def _order(filled: FilledTable) -> str:
 def _trust(agreement: RankAgreement) -> str:
     if agreement.signal is None:
         return "one seed a row does not tell whether the order means anything"
-    if agreement.signal < 1:
-        return f"rows differ less than seeds do ({agreement.signal:.1f} x): the order means little"
-    return f"rows differ {agreement.signal:.1f} x as much as seeds do"
+    if agreement.signal < CLEAR_SIGNAL:
+        return (
+            f"rows differ {agreement.signal:.1f} x as much as seeds alone make them: "
+            "the order means little"
+        )
+    return f"rows differ {agreement.signal:.1f} x as much as seeds alone make them"
 
 
 def _remarks(filled: FilledTable) -> list[Note]:

@@ -67,8 +67,8 @@ def test_rank_agreement_takes_the_rows_that_have_both():
     table = filled([19.0, 18.0, 17.0, 16.0], [[20.0, 22.0], [18.0, 20.0], [], [16.0, 18.0]])
     agreement = rank_agreement(table, "dl3dv/psnr")
     assert (agreement.rho, agreement.rows) == (pytest.approx(1.0), 3)
-    # Means 21, 19, 17: 2 between the rows; sqrt(2) between seeds.
-    assert agreement.signal == pytest.approx(math.sqrt(2))
+    # Means 21, 19, 17: 2 between the rows; sqrt(2) between seeds, 1 between means of two.
+    assert agreement.signal == pytest.approx(2.0)
 
 
 def test_rank_agreement_of_one_seed_has_no_signal():
