@@ -1,0 +1,28 @@
+"""report.py as a user runs it."""
+
+import subprocess
+import sys
+
+
+def run(repository, *words):
+    return subprocess.run(
+        [sys.executable, "report.py", *words], cwd=repository, capture_output=True, text=True
+    )
+
+
+def test_writes_markdown_and_a_page(repository, tmp_path):
+    result = run(repository, "table=layers", f"logs={tmp_path}")
+    assert result.returncode == 0, result.stderr
+    assert "7m+1t" in result.stdout and "not run" in result.stdout
+    page = tmp_path / "report" / "report.html"
+    assert result.stdout.strip().endswith(f"page: {page}")
+    assert "18.78" in page.read_text()
+    assert "18.78" in (tmp_path / "report" / "report.md").read_text()
+
+
+def test_an_unknown_table_lists_the_nearest(repository, tmp_path):
+    result = run(repository, "table=layer", f"logs={tmp_path}")
+    assert result.returncode != 0
+    assert "table=layer is unknown: did you mean layers" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not list(tmp_path.iterdir())
