@@ -53,7 +53,8 @@ def solve_widths(
     for count in sorted(range(1, 3 * layers + 1), key=lambda n: (abs(n - layers), -n)):
         coefficients = _fit_counts(lambda widths, n=count: build(widths, n), base)
         error = errors(*(terms @ coefficients).T)
-        order = np.argsort(np.where(error < 1, error / 2 + shape_error, 1e3 + error))
+        rank = np.where(error < 1, error / 2 + shape_error, 1e3 + error)
+        order = np.argsort(rank, kind="stable")  # the same widths on every machine
         # The polynomial knows neither rounding nor stages of equal width: the model is counted.
         for row in candidates[order[:ATTEMPTS]]:
             *stages, fine = (int(width) for width in row)
@@ -107,10 +108,11 @@ def _fit_counts(build: Callable[[Widths], nn.Module], base: Widths) -> np.ndarra
 
 def _samples(columns: int) -> np.ndarray:
     """As many points as a quadratic has coefficients, in general position: the base, one step and
-    two steps along each axis, and one step along each pair. The steps of different axes differ so
-    that no two stages are ever equally wide, where the projection between them would vanish."""
-    base = 2.0 + 4 * np.arange(columns)
-    axes = np.eye(columns)
+    two steps along each axis, and one step along each pair. Even numbers of heads, so that halves
+    and sixteenths of a width are whole; no two stages are ever equally wide, where the projection
+    between them would vanish."""
+    base = 4.0 + 8 * np.arange(columns)
+    axes = 2 * np.eye(columns)
     single = [base + step * axis for axis in axes for step in (1, 2)]
     pairs = [base + axes[i] + axes[j] for i in range(columns) for j in range(i + 1, columns)]
     return np.stack([base, *single, *pairs])
