@@ -1,5 +1,6 @@
 """Parameters, FLOPs and memory."""
 
+import contextlib
 import math
 import re
 import resource
@@ -71,10 +72,12 @@ def true_flops(run: Callable[[], object]) -> int:
 
 
 def reset_peak_memory(device: torch.device | str) -> None:
-    """Let `peak_memory_gb` start anew, where it can: on CUDA and on Linux."""
+    """Let `peak_memory_gb` start anew, where it can: on CUDA, and on Linux where /proc is
+    writable."""
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    elif CLEAR_PEAK.exists():
+        return
+    with contextlib.suppress(OSError):
         CLEAR_PEAK.write_text("5")
 
 

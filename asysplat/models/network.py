@@ -1,5 +1,7 @@
 """What every network that turns views into Gaussians has in common."""
 
+from abc import ABC, abstractmethod
+
 from torch import nn
 
 from asysplat.errors import InputError
@@ -7,7 +9,7 @@ from asysplat.models.shapes import Widths
 from asysplat.scene import Gaussians, Views
 
 
-class Network(nn.Module):
+class Network(nn.Module, ABC):
     """Views -> Gaussians: checks sizes, takes any leading batch dimensions.
 
     Args:
@@ -26,13 +28,13 @@ class Network(nn.Module):
         gaussians = self.predict(with_one_batch_dimension(views))
         return gaussians.map(lambda field: field.reshape(*batch, *field.shape[1:]))
 
+    @abstractmethod
     def predict(self, views: Views) -> Gaussians:
         """Views [B, V] -> Gaussians [B, N]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def geometry_share(self) -> float:
         """Parameters outside an appearance branch over all parameters."""
-        raise NotImplementedError
 
     def describe(self) -> str:
         """The sizes and what they come to, in a line."""

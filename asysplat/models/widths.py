@@ -56,7 +56,9 @@ def solve_widths(
         rank = np.where(error < 1, error / 2 + shape_error, 1e3 + error)
         order = np.argsort(rank, kind="stable")  # the same widths on every machine
         # The polynomial knows neither rounding nor stages of equal width: the model is counted.
-        for row in candidates[order[:ATTEMPTS]]:
+        # Where nothing fits, the closest alone, so that it can be named.
+        attempts = ATTEMPTS if error[order[0]] < 1 else 1
+        for row in candidates[order[:attempts]]:
             *stages, fine = (int(width) for width in row)
             widths = Widths(tuple(stages), fine, base.head)
             total, geometry = _count(build(widths, count))
@@ -69,8 +71,6 @@ def solve_widths(
                     f"stages {'/'.join(map(str, stages))} and an appearance branch {fine} wide in "
                     f"{count} layers a stage, with {geometry / total:.3f} of {total / 1e6:.2f}M"
                 )
-            if error[order[0]] > 1:
-                break  # nothing fits with this many layers
     raise InputError(
         f"geometry_ratio={ratio} cannot be met within {SHARE_TOLERANCE} at "
         f"{wanted / 1e6:.2f}M parameters with heads {base.head} wide: closest come {description}; "

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.stats import spearmanr
 
 from asysplat.report.paper import Column, Row, Table
 
@@ -132,13 +133,7 @@ def spearman(first: np.ndarray, second: np.ndarray) -> float | None:
     """
     if len(first) < 3 or np.ptp(first) == 0 or np.ptp(second) == 0:
         return None
-    return float(np.corrcoef(_ranks(first), _ranks(second))[0, 1])
-
-
-def _ranks(values: np.ndarray) -> np.ndarray:
-    above = values[:, None] > values
-    at_least = values[:, None] >= values
-    return (above.sum(1) + at_least.sum(1) + 1) / 2
+    return float(spearmanr(first, second).statistic)
 
 
 def pooled_spread(groups: Sequence[Sequence[Number]]) -> float | None:
