@@ -15,6 +15,8 @@ class Convention:
         eps2d: variance added to every projected Gaussian, in pixels squared.
         near: Gaussians whose mean has a depth <= near are culled, in scene units.
         frustum_margin: the Jacobian is taken inside the view widened by this share on each side.
+        compensation_min: least share of a splat's area that antialiasing leaves of its opacity,
+            squared.
     """
 
     alpha_max: float = 0.99
@@ -23,7 +25,11 @@ class Convention:
     eps2d: float = 0.3
     near: float = 0.01
     frustum_margin: float = 0.15
+    compensation_min: float = 2.5e-5
 
 
 # diff-gaussian-rasterization (Kerbl et al. 2023) and gsplat 1.6; their near planes differ.
 INRIA = Convention()
+# gsplat 1.5.3 clamps alpha later.
+GSPLAT_1_5 = Convention(alpha_max=0.999)
+CONVENTIONS = {"inria": INRIA, "gsplat-1.5": GSPLAT_1_5}

@@ -1,7 +1,8 @@
 """The renderer's one public function."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float
@@ -10,12 +11,16 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.ops.dispatch import pick_backend
 from asysplat.ops.precision import without_autocast
-from asysplat.rendering.projection import Splats, project
-from asysplat.rendering.rasterize import reference
-from asysplat.rendering.tiles import assign_tiles
+from asysplat.rendering import cpu, reference
+from asysplat.rendering.chunks import draw_in_chunks
+from asysplat.rendering.convention import INRIA, Convention
+from asysplat.rendering.layers import Layers
+from asysplat.rendering.settings import Settings, Skips
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
-BACKENDS = {"auto": reference, "reference": reference}
+Draw = Callable[[Gaussians, Cameras, Settings], Layers]
+BACKENDS: dict[str, Draw] = {"reference": reference.draw, "cpu": cpu.draw}
+DEPTHS = {True: "expected", False: None}
 ALPHA_TINY = 1e-6  # an alpha below 1/255 is exactly 0, so any value between will do
 
 
@@ -26,9 +31,9 @@ class Rendering(TensorRecord):
     Args:
         image: [..., V, 3, H, W] >= 0; no upper bound.
         alpha: [..., V, H, W] in [0, 1).
-        depth: [..., V, H, W] expected z, in scene units: sum_i w_i z_i / alpha, and 0 where no
-            Gaussian is seen. None unless asked for.
-        stats: visible (pairs of Gaussian and view), intersections (of those with tiles), tile_size.
+        depth: [..., V, H, W] in scene units, 0 where no Gaussian is seen; None unless asked for.
+        stats: visible (pairs of Gaussian and view), pairs (of those with tiles), tile_size, and
+            what the backend skipped.
     """
 
     image: Float[Tensor, "*batch V 3 H W"]
@@ -42,54 +47,77 @@ def render(
     cameras: Cameras,
     background: Tensor | None = None,
     backend: str = "auto",
-    depth: bool = True,
+    depth: bool | str = True,
+    *,
+    antialiased: bool = False,
+    sh_degree: int | None = None,
+    convention: Convention = INRIA,
+    skips: Skips = Skips(),  # noqa: B008
+    views_at_once: int | None = None,
+    validate: bool = False,
 ) -> Rendering:
     """Render every view, by alpha compositing in depth order (Kerbl et al. 2023).
 
     Differentiable in all fields of `gaussians` and `cameras`, and in `background`; a Gaussian that
-    is culled (see `project`) has gradient 0. Half-precision inputs are computed in float32, also
-    under autocast. On a CPU the same inputs give the same bits on any number of threads.
+    is culled (see `reference.projection.project`) has gradient 0. Half-precision inputs are
+    computed in float32, also under autocast. The same inputs give the same bits, on a CPU on any
+    number of threads.
 
     Args:
         gaussians: [..., N].
         cameras: [..., V], with the batch dimensions of `gaussians`. Skew is ignored.
         background: RGB [3], or [..., V, 3] one a view; None is black.
-        backend: "auto" or "reference".
-        depth: whether to render the depth.
+        backend: "reference", "cpu" or "auto", which is the fast one where there is one for the
+            device: the reference for float64.
+        depth: True or "expected": sum_i w_i z_i / alpha. "accumulated": not divided by alpha.
+            "median": z of the Gaussian that takes the transmittance to half or below. False: none.
+        antialiased: lower opacities by what the dilation adds to a splat's area (Yu et al. 2024).
+        sh_degree: leave higher harmonics out.
+        convention: cut-offs of alpha compositing; see `CONVENTIONS`.
+        skips: exact skips, each of which can be switched off.
+        views_at_once: draw so many views of each scene at a time, keep nothing but the inputs, and
+            draw them again in the backward pass (deferred backpropagation, Zhang et al. 2022): the
+            same gradient, in the memory of so many views. None draws all at once.
+        validate: look at every number of both arguments first.
 
     Raises:
-        InputError: an unknown backend, or shapes that do not fit together.
+        InputError: an unknown backend or depth, shapes, devices or types that do not fit together,
+            more pairs of Gaussian and tile than can be numbered; with `validate`, what
+            `Gaussians.validate` and `Cameras.validate` refuse.
     """
-    rasterizer = pick_backend("render", BACKENDS, backend)
-    batch = _check_batch(gaussians, cameras, background)
+    if sh_degree not in (None, 0, 1, 2, 3):
+        raise InputError(f"render's sh_degree is {sh_degree!r}: choose 0, 1, 2, 3 or None.")
+    if validate:
+        gaussians.validate("render's gaussians")
+        cameras.validate("render's cameras")
+    batch = _check(gaussians, cameras, background)
     dtype = torch.promote_types(gaussians.means.dtype, cameras.cam_to_world.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
+    settings = Settings(convention, antialiased, DEPTHS.get(depth, depth), skips)
     with without_autocast(gaussians.means):
         scenes = gaussians.map(lambda t: _one_batch(t.to(dtype), batch))
+        if sh_degree is not None:
+            scenes = replace(scenes, sh=scenes.sh[..., : (sh_degree + 1) ** 2, :])
         views = cameras.map(lambda t: _one_batch(t.to(dtype), batch))
-        splats = project(scenes, views)
-        images = views.intrinsics.shape[0] * views.num_views
-        lists = assign_tiles(splats, images, cameras.height, cameras.width, rasterizer.TILE_SIZE)
-        tiles = rasterizer.rasterize(splats, _values(splats, depth), lists)
-        out = lists.untile(tiles, cameras.height, cameras.width)
-        out = out.unflatten(0, (*batch, cameras.num_views))
-        image, alpha = out[..., :3, :, :], out[..., 3, :, :]
+        auto = BACKENDS[_fast_backend(gaussians.means.device, dtype)]
+        draw = pick_backend("render", {"auto": auto, **BACKENDS}, backend)
+        layers = draw_in_chunks(draw, scenes, views, settings, views_at_once)
+
+        def shaped(images: Tensor) -> Tensor:
+            return images.to(dtype).unflatten(0, (*batch, cameras.num_views))
+
+        image, alpha = shaped(layers.image), shaped(layers.alpha)
+        distance = None if layers.depth is None else shaped(layers.depth)
+        if settings.depth == "expected":
+            distance = distance / alpha.clamp_min(ALPHA_TINY)
         if background is not None:
-            color = background.to(dtype)[..., None, None]
-            image = image + (1 - alpha)[..., None, :, :] * color
-        stats = {
-            "visible": len(splats.images),
-            "intersections": len(lists.splats),
-            "tile_size": lists.size,
-        }
-        expected = out[..., 4, :, :] / alpha.clamp_min(ALPHA_TINY) if depth else None
-        return Rendering(image, alpha, expected, stats)
+            image = image + (1 - alpha)[..., None, :, :] * background.to(dtype)[..., None, None]
+        return Rendering(image, alpha, distance, layers.stats)
 
 
-def _values(splats: Splats, depth: bool) -> Tensor:
-    """[M, 4 or 5]: the colour; 1, which composites to alpha; and the depth."""
-    depths = (splats.depths[:, None],) if depth else ()
-    return torch.cat((splats.colors, torch.ones_like(splats.colors[:, :1]), *depths), -1)
+def _fast_backend(device: torch.device, dtype: torch.dtype) -> str:
+    """The fastest for the device, that keeps what float64 asks for."""
+    return "cpu" if device.type == "cpu" and dtype == torch.float32 else "reference"
 
 
 def _one_batch(tensor: Tensor, batch: tuple[int, ...]) -> Tensor:
@@ -97,10 +125,8 @@ def _one_batch(tensor: Tensor, batch: tuple[int, ...]) -> Tensor:
     return tensor.reshape(math.prod(batch), *tensor.shape[len(batch) :])
 
 
-def _check_batch(
-    gaussians: Gaussians, cameras: Cameras, background: Tensor | None
-) -> tuple[int, ...]:
-    """The shared batch dimensions."""
+def _check(gaussians: Gaussians, cameras: Cameras, background: Tensor | None) -> tuple[int, ...]:
+    """The shared batch dimensions, of tensors that go together."""
     batch, views = tuple(gaussians.opacities.shape[:-1]), tuple(cameras.intrinsics.shape[:-2])
     if batch != views[:-1]:
         raise InputError(
@@ -112,4 +138,18 @@ def _check_batch(
             f"render's background has shape {tuple(background.shape)}: "
             f"expected (3,) or {(*views, 3)}."
         )
+    named = {f"gaussians.{f.name}": getattr(gaussians, f.name) for f in fields(gaussians)}
+    named["cameras.intrinsics"] = cameras.intrinsics
+    named["cameras.cam_to_world"] = cameras.cam_to_world
+    if background is not None:
+        named["background"] = background
+    device = gaussians.means.device
+    for name, tensor in named.items():
+        if tensor.device != device:
+            raise InputError(
+                f"render's {name} is on {tensor.device} and gaussians.means on {device}: "
+                "move both to one device."
+            )
+        if not tensor.is_floating_point():
+            raise InputError(f"render's {name} is {tensor.dtype}: give floating-point numbers.")
     return batch

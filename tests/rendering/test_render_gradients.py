@@ -65,7 +65,7 @@ def test_nothing_to_see_gives_the_background(make_scene, keep):
     out = render(gaussians, cameras, background)
     assert (out.image == background[:, None, None]).all()
     assert (out.alpha == 0).all() and (out.depth == 0).all()
-    assert out.stats["visible"] == 0 and out.stats["intersections"] == 0
+    assert out.stats["visible"] == 0 and out.stats["pairs"] == 0
     out.image.sum().backward()
     assert all((getattr(gaussians, name).grad == 0).all() for name in GAUSSIAN_FIELDS)
     assert (background.grad == 2 * 13 * 17).all()

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.rendering.projection import Splats
+from asysplat.rendering.reference.projection import Splats
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,20 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from asysplat.rendering.convention import INRIA
-from asysplat.rendering.projection import Splats
-from asysplat.rendering.tiles import TileLists
+from asysplat.rendering.convention import Convention
+from asysplat.rendering.reference.projection import Splats
+from asysplat.rendering.reference.tiles import TileLists
 
 TILE_SIZE = 4
 GROUP_ELEMENTS = 1 << 17  # (splat, pixel) pairs of one group: temporaries of 512 KiB
 
 
 def rasterize(
-    splats: Splats, values: Float[Tensor, "M C"], lists: TileLists
+    splats: Splats,
+    values: Float[Tensor, "M C"],
+    lists: TileLists,
+    convention: Convention,
+    median: bool = False,
 ) -> Float[Tensor, "T C P"]:
     """Composite sum_i w_i values_i at every pixel of every tile, front to back.
 
@@ -29,39 +33,44 @@ def rasterize(
         splats: M splats, sorted by depth within their image.
         values: what each splat shows.
         lists: from `assign_tiles`; P = size * size pixels a tile, row by row.
+        convention: the cut-offs.
+        median: of the last value, take that of the splat at which the transmittance falls to half
+            or below; 0 where it never does.
 
-    w_i = alpha_i prod_{j<i} (1 - alpha_j), Kerbl et al. 2023, with the cut-offs of INRIA.
+    w_i = alpha_i prod_{j<i} (1 - alpha_j), Kerbl et al. 2023.
     """
     packed = torch.cat((splats.xy, splats.whitening, splats.opacities[:, None], values), -1)
     # The last row is what padding shows: opacity 0.
     packed = torch.nn.functional.pad(packed, (0, 0, 0, 1))
-    return _Rasterize.apply(packed, lists)
+    return _Rasterize.apply(packed, lists, convention, median)
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, packed: Tensor, lists: TileLists) -> Tensor:
+    def forward(
+        ctx, packed: Tensor, lists: TileLists, convention: Convention, median: bool
+    ) -> Tensor:
         ctx.save_for_backward(packed)
-        ctx.lists = lists
+        ctx.lists, ctx.options = lists, (convention, median)
         pixels = lists.size**2
         out = packed.new_zeros(len(lists.lengths), packed.shape[1] - 6, pixels)
         for tiles, splats in _groups(lists, len(packed) - 1):
-            block = _Block(_rows(packed, splats), lists.origins(tiles), lists.size)
-            out.index_copy_(0, tiles, block.values.mT @ block.weights())
+            block = _Block(_rows(packed, splats), lists.origins(tiles), lists.size, *ctx.options)
+            out.index_copy_(0, tiles, block.forward())
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_out: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx, grad_out: Tensor) -> tuple[Tensor, None, None, None]:
         (packed,) = ctx.saved_tensors
         lists = ctx.lists
         grad = torch.zeros_like(packed)
         for tiles, splats in _groups(lists, len(packed) - 1):
-            block = _Block(_rows(packed, splats), lists.origins(tiles), lists.size)
+            block = _Block(_rows(packed, splats), lists.origins(tiles), lists.size, *ctx.options)
             rows = block.backward(grad_out.index_select(0, tiles))
             # On a CPU this sums in a fixed order: the same bits every time.
             grad.index_add_(0, splats.flatten(), rows.flatten(0, 1))
-        return grad, None
+        return grad, None, None, None
 
 
 def _groups(lists: TileLists, padding: int) -> Iterator[tuple[Tensor, Tensor]]:
@@ -97,8 +106,11 @@ def _keep_at_least(values: Tensor, gate: Tensor, limit: float) -> None:
 class _Block:
     """K depth-ordered splats on each of t tiles: alphas, weights and their gradients."""
 
-    def __init__(self, packed: Tensor, origins: Tensor, size: int):
+    def __init__(
+        self, packed: Tensor, origins: Tensor, size: int, convention: Convention, median: bool
+    ):
         """packed [t, K, 6 + C] and origins [t, 2]; all temporaries are [t, K, P]."""
+        self.convention, self.median = convention, median
         self.x, self.y, self.a, self.b, self.c, self.opacity = packed[..., :6].unbind(-1)
         self.values = packed[..., 6:]
         corner = origins[:, None].to(packed.dtype) + 0.5
@@ -110,12 +122,12 @@ class _Block:
         self.u = torch.stack((self.a * self.dx + self.b * self.dy, self.a, self.b), -1) @ self.basis
         self.v = torch.stack((self.c * self.dy, self.c), -1) @ self.basis[::2]
         exponent = (self.u * self.u).addcmul_(self.v, self.v).mul_(-0.5)
-        self.alpha = exponent.exp_().mul_(self.opacity[..., None]).clamp_max_(INRIA.alpha_max)
-        _keep_at_least(self.alpha, self.alpha, INRIA.alpha_min)
+        self.alpha = exponent.exp_().mul_(self.opacity[..., None]).clamp_max_(convention.alpha_max)
+        _keep_at_least(self.alpha, self.alpha, convention.alpha_min)
         self.passed = 1 - self.alpha
         self.transmittance = self.passed.cumprod(1)  # behind each splat
         # It never grows, so dropping below the limit drops everything behind as well.
-        _keep_at_least(self.alpha, self.transmittance, INRIA.transmittance_min)
+        _keep_at_least(self.alpha, self.transmittance, convention.transmittance_min)
 
     def weights(self) -> Tensor:
         """alpha times the transmittance in front of each splat."""
@@ -123,19 +135,36 @@ class _Block:
         weights[:, 1:] *= self.transmittance[:, :-1]
         return weights
 
+    def halving(self) -> Tensor:
+        """1 for the splat that takes the transmittance to half or below, else 0."""
+        before = torch.nn.functional.pad(self.transmittance[:, :-1], (0, 0, 1, 0), value=1.0)
+        crosses = (before > 0.5) & (self.transmittance <= 0.5) & (self.alpha > 0)
+        return crosses.to(before.dtype)
+
+    def forward(self) -> Tensor:
+        """The composited values [t, C, P]."""
+        if not self.median:
+            return self.values.mT @ self.weights()
+        blended = self.values[..., :-1].mT @ self.weights()
+        return torch.cat((blended, self.values[..., -1:].mT @ self.halving()), 1)
+
     def backward(self, grad_out: Tensor) -> Tensor:
         """Gradient of `packed`, from the gradient [t, C, P] of the composited values."""
         weights = self.weights()
-        share = weights * (self.values @ grad_out)  # of each splat in grad . out
         grad_values = weights @ grad_out.mT
+        values = self.values
+        if self.median:
+            grad_values[..., -1:] = self.halving() @ grad_out[:, -1:].mT
+            values, grad_out = values[..., :-1], grad_out[:, :-1]
+        share = weights * (values @ grad_out)  # of each splat in grad . out
         behind = share.sum(1, keepdim=True) - share.cumsum(1)
         # alpha dL/dalpha; 0 where alpha is clamped.
         grad = share.addcmul_(behind, self.alpha / self.passed, value=-1)
-        if bool((self.opacity >= INRIA.alpha_max).any()):
-            grad.mul_(self.alpha < INRIA.alpha_max)
+        if bool((self.opacity >= self.convention.alpha_max).any()):
+            grad.mul_(self.alpha < self.convention.alpha_max)
         u0, a, b = -(self.u.mul_(grad) @ self.basis.T).movedim(-1, 0)
         v0, c = -(self.v.mul_(grad) @ self.basis[::2].T).movedim(-1, 0)
-        grad_opacity = grad.sum(-1) / self.opacity.clamp_min(INRIA.alpha_min)
+        grad_opacity = grad.sum(-1) / self.opacity.clamp_min(self.convention.alpha_min)
         grads = (
             -self.a * u0,
             -self.b * u0 - self.c * v0,

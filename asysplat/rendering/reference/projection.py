@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.rendering.convention import INRIA
-from asysplat.rendering.sh import sh_colors
+from asysplat.rendering.reference.sh import sh_colors
+from asysplat.rendering.settings import Settings
 from asysplat.scene import Cameras, Gaussians
 
 BOUNDS_MARGIN = 1e-3  # pixels; more than the rounding of an extent
@@ -26,7 +26,7 @@ class Splats:
         opacities: [M].
         colors: [M, 3], >= 0.
         depths: [M] z in the camera's frame, in scene units.
-        first, last: [M, 2] inclusive range (x, y) of the pixels that can have alpha >= 1/255.
+        first, last: [M, 2] inclusive range (x, y) of the pixels that can have alpha >= alpha_min.
     """
 
     images: Int[Tensor, "M"]
@@ -45,22 +45,23 @@ class _Footprint(NamedTuple):
     xy: Tensor  # [..., 2]
     whitening: Tensor  # [..., 3]
     deviations: Tensor  # [..., 2] standard deviations along x and y, in pixels
+    compensation: Tensor  # [...] of the opacity, for antialiasing
 
 
-def project(gaussians: Gaussians, cameras: Cameras) -> Splats:
+def project(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Splats:
     """Splats of every view of every scene.
 
     Args:
         gaussians: with one batch dimension, [B, N].
         cameras: [B, V], zero skew; image b * V + v is view v of scene b.
+        settings: convention and antialiasing.
 
-    Culled, with gradient 0: depth <= near, opacity < 1/255, no pixel centre in reach, and
+    Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel centre in reach, and
     whatever does not project to finite numbers (NaN, infinity, a zero quaternion).
     """
     size = (cameras.width, cameras.height)
-    images, indices = _visible(gaussians, cameras)
+    images, indices = _visible(gaussians, cameras, settings)
     # Only visible pairs enter the graph, so nothing that was culled can send a NaN back.
-    opacities = gaussians.opacities.flatten().index_select(0, indices)
     footprint = _footprint(
         *(
             field.flatten(0, 1).index_select(0, indices)
@@ -69,8 +70,10 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Splats:
         cameras.cam_to_world.flatten(0, 1).index_select(0, images),
         cameras.intrinsics.flatten(0, 1).index_select(0, images),
         size,
+        settings,
     )
-    first, last = _pixel_range(footprint, opacities, size)
+    opacities = gaussians.opacities.flatten().index_select(0, indices) * footprint.compensation
+    first, last = _pixel_range(footprint, opacities, size, settings)
     sh = gaussians.sh.flatten(0, 1).index_select(0, indices)
     return Splats(
         images=images,
@@ -85,7 +88,7 @@ def project(gaussians: Gaussians, cameras: Cameras) -> Splats:
 
 
 @torch.no_grad()
-def _visible(gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
+def _visible(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> tuple[Tensor, Tensor]:
     """Image and flat Gaussian index of every visible pair, in the order of `Splats`."""
     size = (cameras.width, cameras.height)
     footprint = _footprint(
@@ -95,13 +98,14 @@ def _visible(gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
         cameras.cam_to_world[:, :, None],
         cameras.intrinsics[:, :, None],
         size,
+        settings,
     )
-    opacities = gaussians.opacities[:, None]
-    first, last = _pixel_range(footprint, opacities, size)
+    opacities = gaussians.opacities[:, None] * footprint.compensation
+    first, last = _pixel_range(footprint, opacities, size, settings)
     # Written so that NaN compares false.
     visible = (
-        (footprint.depths > INRIA.near)
-        & (opacities >= INRIA.alpha_min)
+        (footprint.depths > settings.convention.near)
+        & (opacities >= settings.convention.alpha_min)
         & (first <= last).all(-1)
         & footprint.whitening.isfinite().all(-1)
         & (footprint.whitening[..., 0] > 0)
@@ -124,6 +128,7 @@ def _footprint(
     cam_to_world: Tensor,
     intrinsics: Tensor,
     size: tuple[int, int],
+    settings: Settings,
 ) -> _Footprint:
     """Project; all arguments broadcast over their leading dimensions."""
     rotation = cam_to_world[..., :3, :3]
@@ -135,7 +140,7 @@ def _footprint(
     principal = intrinsics[..., :2, 2]
 
     size = focal.new_tensor(size)
-    margin = INRIA.frustum_margin * size
+    margin = settings.convention.frustum_margin * size
     clamped = torch.clamp(
         tangents, (-principal - margin) / focal, (size - principal + margin) / focal
     )
@@ -144,24 +149,31 @@ def _footprint(
         rotation.mT[..., :2, :] - clamped[..., None] * rotation.mT[..., 2:, :]
     )
     rows = jacobian @ _rotations(quats) * scales[..., None, :]
-    whitening, deviations = _whiten(*rows.unbind(-2))
-    return _Footprint(offsets, z, tangents * focal + principal, whitening, deviations)
+    ellipse = _whiten(*rows.unbind(-2), settings)
+    return _Footprint(offsets, z, tangents * focal + principal, *ellipse)
 
 
-def _whiten(row_x: Tensor, row_y: Tensor) -> tuple[Tensor, Tensor]:
-    """Whitening (a, b, c) and standard deviations of the covariance M M^T + eps I, M = (x; y).
+def _whiten(row_x: Tensor, row_y: Tensor, settings: Settings) -> tuple[Tensor, Tensor, Tensor]:
+    """Whitening (a, b, c), standard deviations and the opacity's compensation of the covariance
+    M M^T + eps I, M = (x; y).
 
     The Cholesky factor of the inverse. The determinant is a sum of squares (Cauchy-Binet), so no
     needle makes it cancel to zero, and it is divided by Syy early, so no large scale overflows.
     """
-    eps = INRIA.eps2d
+    eps = settings.convention.eps2d
     xx, xy, yy = ((p * q).sum(-1) for p, q in ((row_x, row_x), (row_x, row_y), (row_y, row_y)))
     var_y = yy + eps
     deviation_y = var_y.sqrt()
     minors = torch.linalg.cross(row_x, row_y / deviation_y[..., None]).square().sum(-1)
-    a = (minors + eps * (1 + xx / var_y)).rsqrt()
+    det = minors + eps * (1 + xx / var_y)  # over Syy
+    a = det.rsqrt()
     whitening = torch.stack((a, -a * xy / var_y, 1 / deviation_y), -1)
-    return whitening, torch.stack(((xx + eps).sqrt(), deviation_y), -1)
+    deviations = torch.stack(((xx + eps).sqrt(), deviation_y), -1)
+    if not settings.antialiased:
+        return whitening, deviations, torch.ones_like(a)
+    # sqrt(det(M M^T) / det(M M^T + eps I)), Yu et al. 2024, Eq. 10.
+    share = (minors / det).clamp_min(settings.convention.compensation_min)
+    return whitening, deviations, share.sqrt()
 
 
 def _rotations(quats: Tensor) -> Tensor:
@@ -177,10 +189,10 @@ def _rotations(quats: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _pixel_range(
-    footprint: _Footprint, opacities: Tensor, size: tuple[int, int]
+    footprint: _Footprint, opacities: Tensor, size: tuple[int, int], settings: Settings
 ) -> tuple[Tensor, Tensor]:
-    """First and last pixel (x, y) whose centre the box around alpha >= 1/255 holds."""
-    reach = (2 * (opacities / INRIA.alpha_min).log().clamp_min(0)).sqrt()
+    """First and last pixel (x, y) whose centre the box around alpha >= alpha_min holds."""
+    reach = (2 * (opacities / settings.convention.alpha_min).log().clamp_min(0)).sqrt()
     extent = footprint.deviations * reach[..., None] + BOUNDS_MARGIN
     size = extent.new_tensor(size)
     zero = torch.zeros_like(size)

@@ -1,0 +1,77 @@
+"""Scenes of known make for measuring renderers: nothing to download, the same on every machine."""
+
+import torch
+from torch import Tensor
+
+from asysplat.scene import Cameras, Gaussians
+
+FOCAL = 0.9  # of the image's width
+
+
+def random_scene(count: int, height: int, width: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
+    """Gaussians anywhere: depth uniform in 2 to 10, positions uniform over the image and 10 %
+    beyond, deviations log-normal (median 2 pixels, 0.6) per axis, opacity uniform in .05 to .95.
+
+    Returns:
+        Gaussians [N] of harmonics of degree 0, and one camera; float32.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    depths = 2 + 8 * torch.rand(count, generator=generator, dtype=torch.float64)
+    place = 1.2 * torch.rand(count, 2, generator=generator, dtype=torch.float64) - 0.1
+    pixels = place * torch.tensor([width, height])
+    sigma = 2 * (0.6 * _normal(count, 3, generator=generator)).exp()
+    opacities = 0.05 + 0.9 * torch.rand(count, generator=generator, dtype=torch.float64)
+    return _scene(pixels, depths, sigma, opacities, height, width, generator)
+
+
+def pixel_aligned_scene(
+    side: int, height: int, width: int, seed: int = 0
+) -> tuple[Gaussians, Cameras]:
+    """What networks predict: two jittered grids of side x side Gaussians over the image at a smooth
+    depth near 4, deviations log-normal (median 0.8 width / side pixels, 0.4), opacity
+    sigmoid(2 N(0, 1)), in the order of the pixels.
+
+    Returns:
+        Gaussians [2 side^2] of harmonics of degree 0, and one camera; float32.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    count = 2 * side * side
+    steps = torch.arange(side, dtype=torch.float64)
+    grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).flatten(0, 1).repeat(2, 1)
+    place = (grid + torch.rand(count, 2, generator=generator, dtype=torch.float64)) / side
+    pixels = place * torch.tensor([width, height])
+    waves = (6 * place[:, 0]).sin() * (5 * place[:, 1]).cos()
+    depths = 4 + 0.5 * waves + 0.01 * _normal(count, generator=generator)
+    sigma = 0.8 * width / side * (0.4 * _normal(count, 3, generator=generator)).exp()
+    opacities = (2 * _normal(count, generator=generator)).sigmoid()
+    return _scene(pixels, depths, sigma, opacities, height, width, generator)
+
+
+def _normal(*shape: int, generator: torch.Generator) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def _scene(
+    pixels: Tensor,
+    depths: Tensor,
+    sigma: Tensor,
+    opacities: Tensor,
+    height: int,
+    width: int,
+    generator: torch.Generator,
+) -> tuple[Gaussians, Cameras]:
+    """Gaussians that project to `pixels` with `sigma` pixels, and the camera they do so in."""
+    count = len(depths)
+    focal = FOCAL * width
+    center = torch.tensor([width / 2, height / 2])
+    means = torch.cat(((pixels - center) / focal * depths[:, None], depths[:, None]), -1)
+    gaussians = Gaussians(
+        means=means,
+        quats=_normal(count, 4, generator=generator),
+        scales=sigma * depths[:, None] / focal,
+        opacities=opacities,
+        sh=_normal(count, 1, 3, generator=generator),
+    )
+    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    cameras = Cameras(intrinsics[None], torch.eye(4)[None], height, width)
+    return gaussians.to(torch.float32), cameras.to(torch.float32)

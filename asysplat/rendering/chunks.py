@@ -1,0 +1,131 @@
+"""Rendering a few views at a time, in the memory of so many."""
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from asysplat.errors import InputError
+from asysplat.rendering.layers import Layers
+from asysplat.rendering.settings import Settings
+from asysplat.scene import Cameras, Gaussians
+
+Draw = Callable[[Gaussians, Cameras, Settings], Layers]
+OF_VIEWS = ("cam_to_world", "intrinsics")
+NAMES = (*(field.name for field in dataclasses.fields(Gaussians)), *OF_VIEWS)
+SAME_IN_ALL = ("tile_size",)  # statistics that do not add up
+
+
+def draw_in_chunks(
+    draw: Draw,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    settings: Settings,
+    views_at_once: int | None,
+) -> Layers:
+    """`draw`, with all views at once, or with `views_at_once` of every scene.
+
+    Where the device's memory does not hold all, half as many are tried, and a warning says so.
+
+    Raises:
+        InputError: views_at_once below 1.
+    """
+    if views_at_once is None:
+        try:
+            return draw(gaussians, cameras, settings)
+        except torch.OutOfMemoryError:
+            if cameras.num_views == 1:
+                raise
+        views_at_once = -(-cameras.num_views // 2)
+        warnings.warn(
+            f"render: {cameras.num_views} views at once do not fit into memory; drawing "
+            f"{views_at_once} at a time, and again in the backward pass (views_at_once="
+            f"{views_at_once}).",
+            stacklevel=3,
+        )
+    if views_at_once < 1:
+        raise InputError(f"render's views_at_once is {views_at_once}: give at least 1, or None.")
+    if views_at_once >= cameras.num_views:
+        return draw(gaussians, cameras, settings)
+    stats: dict[str, int] = {}
+    job = _Job(draw, settings, cameras.height, cameras.width, views_at_once, stats)
+    fields = [getattr(gaussians, name) for name in NAMES if name not in OF_VIEWS]
+    layers = _Deferred.apply(job, *fields, cameras.cam_to_world, cameras.intrinsics)
+    return Layers(*layers, stats)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Job:
+    """How to draw some of the views; `stats` is filled in passing."""
+
+    draw: Draw
+    settings: Settings
+    height: int
+    width: int
+    views_at_once: int
+    stats: dict[str, int]
+
+    def chunks(self, num_views: int) -> list[slice]:
+        starts = range(0, num_views, self.views_at_once)
+        return [slice(start, start + self.views_at_once) for start in starts]
+
+    def layers(self, tensors: list[Tensor]) -> tuple[Layers, list[Tensor | None]]:
+        """Of Gaussian fields, poses and intrinsics; the images also as [B, views, ...]."""
+        *fields, poses, intrinsics = tensors
+        cameras = Cameras(intrinsics, poses, self.height, self.width)
+        layers = self.draw(Gaussians(*fields), cameras, self.settings)
+        shape = poses.shape[:2]
+        images = (layers.image, layers.alpha, layers.depth)
+        return layers, [None if image is None else image.unflatten(0, shape) for image in images]
+
+
+class _Deferred(torch.autograd.Function):
+    """Keeps the inputs alone; the backward pass draws each chunk again, with a graph."""
+
+    @staticmethod
+    def forward(ctx, job: _Job, *tensors: Tensor) -> tuple[Tensor | None, ...]:
+        ctx.job = job
+        ctx.save_for_backward(*tensors)
+        ctx.set_materialize_grads(False)
+        *fields, poses, intrinsics = tensors
+        parts = []
+        for views in job.chunks(poses.shape[1]):
+            layers, images = job.layers([*fields, poses[:, views], intrinsics[:, views]])
+            parts.append(images)
+            for name, count in layers.stats.items():
+                job.stats[name] = count + (0 if name in SAME_IN_ALL else job.stats.get(name, 0))
+        return tuple(
+            None if images[0] is None else torch.cat(images, 1).flatten(0, 1)
+            for images in zip(*parts, strict=True)
+        )
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        *fields, poses, intrinsics = ctx.saved_tensors
+        needed = ctx.needs_input_grad[1:]
+        totals = [
+            torch.zeros_like(tensor) if need else None
+            for tensor, need in zip(ctx.saved_tensors, needed, strict=True)
+        ]
+        for views in ctx.job.chunks(poses.shape[1]):
+            part = [*fields, poses[:, views], intrinsics[:, views]]
+            part = [
+                tensor.detach().requires_grad_(need)
+                for tensor, need in zip(part, needed, strict=True)
+            ]
+            with torch.enable_grad():
+                _, images = ctx.job.layers(part)
+            seen = [
+                (image, grad.unflatten(0, poses.shape[:2])[:, views])
+                for image, grad in zip(images, grads, strict=True)
+                if image is not None and grad is not None
+            ]
+            torch.autograd.backward(*map(list, zip(*seen, strict=True)))
+            for name, total, tensor in zip(NAMES, totals, part, strict=True):
+                if total is not None and tensor.grad is not None:
+                    (total[:, views] if name in OF_VIEWS else total).add_(tensor.grad)
+        return (None, *totals)

@@ -1,0 +1,302 @@
+"""The stages of the CPU renderer, one after the other, as one operation to torch."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from asysplat.errors import InputError
+from asysplat.rendering.cpu import layout as col
+from asysplat.rendering.cpu.backward import rasterize_backward
+from asysplat.rendering.cpu.forward import rasterize
+from asysplat.rendering.cpu.project import project
+from asysplat.rendering.cpu.project_backward import project_backward
+from asysplat.rendering.cpu.threads import even_bounds, run_blocks, weighted_bounds
+from asysplat.rendering.cpu.tiles import place, start_positions
+from asysplat.rendering.layers import Layers
+from asysplat.rendering.settings import Settings
+from asysplat.scene import Cameras, Gaussians
+
+MOST_PAIRS = 2**31 - 1  # that a list's int32 can number
+
+
+def draw(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Layers:
+    """Gaussians [B, N] and cameras [B, V] to layers of B V images, float32.
+
+    Raises:
+        InputError: tensors elsewhere than on a CPU; more pairs of splat and tile than a list can
+            number.
+    """
+    if gaussians.means.device.type != "cpu":
+        raise InputError(
+            f"render's backend is 'cpu' and its Gaussians are on {gaussians.means.device}: choose "
+            "'auto', or move them with .to('cpu')."
+        )
+    stats: dict[str, int] = {}
+    image, alpha, depth = _Draw.apply(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        cameras.cam_to_world,
+        cameras.intrinsics,
+        (cameras.height, cameras.width),
+        settings,
+        stats,
+    )
+    return Layers(image, alpha, depth, stats)
+
+
+class _Lists(NamedTuple):
+    """Splats [images * N, 16] and which tiles they touch, sorted by tile, then by Gaussian."""
+
+    splats: np.ndarray
+    first_pair: np.ndarray  # [images * N + 1]
+    first_entry: np.ndarray  # [tiles + 1]
+    entries: np.ndarray  # [pairs, 2]
+
+
+class _Frame(NamedTuple):
+    """What the kernels are told of all images."""
+
+    images: int
+    views: int
+    num: int  # Gaussians of an image
+    blocks: int  # of an image
+    block_size: int
+    height: int
+    width: int
+    columns: int  # of tiles
+    tiles: int  # of an image
+    settings: Settings
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        return self.height, self.width, self.columns
+
+    @property
+    def grid(self) -> tuple[int, int, int, int]:
+        return self.columns, self.tiles, self.height, self.width
+
+    @property
+    def projection(self) -> tuple[float, ...]:
+        c = self.settings.convention
+        log_alpha_min = math.log2(c.alpha_min)
+        return c.alpha_min, log_alpha_min, c.eps2d, c.near, c.frustum_margin, c.compensation_min
+
+    @property
+    def cutoffs(self) -> tuple[np.float32, ...]:
+        c = self.settings.convention
+        return tuple(map(np.float32, (c.alpha_min, c.alpha_max, c.transmittance_min)))
+
+
+class _Draw(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, *args):
+        *tensors, (height, width), settings, stats = args
+        means, _, _, _, _, cam_to_world, intrinsics = tensors
+        batch, num = means.shape[:2]
+        views = intrinsics.shape[1]
+        blocks = max(1, min(-(-num // col.BLOCK), col.MOST_BLOCKS))
+        columns = -(-width // col.TILE)
+        frame = _Frame(
+            images=batch * views,
+            views=views,
+            num=num,
+            blocks=blocks,
+            block_size=-(-num // blocks),
+            height=height,
+            width=width,
+            columns=columns,
+            tiles=-(-height // col.TILE) * columns,
+            settings=settings,
+        )
+        fields = [_array(tensor) for tensor in tensors[:5]]
+        cameras = _camera_rows(cam_to_world, intrinsics)
+        lists = _make_lists(frame, fields, cameras, stats)
+        image = torch.empty(frame.images, 3, height, width)
+        alpha = torch.empty(frame.images, height, width)
+        depth = torch.empty(frame.images, height, width) if settings.depth else None
+        last_entry = np.empty(frame.images * frame.tiles, np.int64)
+        counters = np.empty((frame.images * frame.tiles, col.COUNTERS), np.int64)
+        run_blocks(
+            rasterize,
+            weighted_bounds(lists.first_entry),
+            lists.splats,
+            lists.first_entry,
+            last_entry,
+            lists.entries,
+            frame.grid,
+            frame.cutoffs,
+            (settings.skips.rows, settings.skips.opaque),
+            image.numpy(),
+            alpha.numpy(),
+            *_by_kind(depth, settings),
+            counters,
+        )
+        rows, in_reach = counters.sum(0).tolist()
+        drawn = int((last_entry - lists.first_entry[:-1]).sum())
+        stats["pairs_behind_opaque"] = stats["pairs"] - drawn
+        stats["rows"] = rows
+        stats["rows_out_of_reach"] = drawn * col.TILE - in_reach
+        stats["rows_opaque"] = in_reach - rows
+        ctx.save_for_backward(*tensors, image, alpha, depth)
+        ctx.frame, ctx.lists, ctx.last_entry = frame, lists, last_entry
+        ctx.set_materialize_grads(False)
+        return image, alpha, depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_image, grad_alpha, grad_depth):
+        *tensors, image, alpha, depth = ctx.saved_tensors
+        frame, lists, settings = ctx.frame, ctx.lists, ctx.frame.settings
+        grads = [
+            None if layer is None else _contiguous(grad, layer)
+            for layer, grad in ((image, grad_image), (alpha, grad_alpha), (depth, grad_depth))
+        ]
+        pair_grads = np.empty((len(lists.entries), col.GRADIENT), np.float32)
+        run_blocks(
+            rasterize_backward,
+            weighted_bounds(lists.first_entry),
+            lists.splats,
+            lists.first_entry,
+            ctx.last_entry,
+            lists.entries,
+            frame.grid,
+            frame.cutoffs,
+            (settings.skips.rows, settings.skips.opaque),
+            image.numpy(),
+            alpha.numpy(),
+            _by_kind(depth, settings)[0],
+            grads[0].numpy(),
+            grads[1].numpy(),
+            *_by_kind(grads[2], settings),
+            pair_grads,
+        )
+        fields = [_array(tensor) for tensor in tensors[:5]]
+        cameras = _camera_rows(*tensors[5:])
+        field_grads = [torch.empty(t.shape, dtype=t.dtype) for t in tensors[:5]]
+        camera_grads = np.empty((frame.images, frame.blocks, col.CAMERA))
+        run_blocks(
+            project_backward,
+            even_bounds(frame.images // frame.views * frame.blocks),
+            *fields,
+            cameras,
+            frame.views,
+            frame.block_size,
+            frame.size,
+            frame.projection,
+            settings.antialiased,
+            lists.first_pair,
+            pair_grads,
+            *(_array(grad) for grad in field_grads),
+            camera_grads,
+        )
+        return (
+            *field_grads,
+            *_camera_gradients(camera_grads.sum(1), *tensors[5:]),
+            None,
+            None,
+            None,
+        )
+
+
+def _make_lists(
+    frame: _Frame, fields: list[np.ndarray], cameras: np.ndarray, stats: dict[str, int]
+) -> _Lists:
+    """Project, and sort into tiles."""
+    skips = frame.settings.skips
+    splats = np.empty((frame.images * frame.num, col.SPLAT), np.float32)
+    counts = np.empty(frame.images * frame.num, np.int32)
+    boxes = np.empty((frame.images, frame.blocks), np.int64)
+    histograms = np.empty((frame.images, frame.blocks, frame.tiles), np.int32)
+    pieces = even_bounds(frame.images * frame.blocks)
+    run_blocks(
+        project,
+        pieces,
+        *fields,
+        cameras,
+        frame.views,
+        frame.block_size,
+        frame.size,
+        frame.projection,
+        frame.settings.antialiased,
+        (skips.opacity, skips.extent, skips.ellipse),
+        splats,
+        counts,
+        boxes,
+        histograms,
+    )
+    first_entry = _starts(histograms.sum(1, dtype=np.int64).reshape(-1))
+    first_pair = _starts(counts)
+    pairs = int(first_entry[-1])
+    if pairs > MOST_PAIRS:
+        raise InputError(
+            f"render needs {pairs} pairs of Gaussian and tile, and its lists hold {MOST_PAIRS}: "
+            "set views_at_once, or render smaller Gaussians."
+        )
+    stats["visible"] = int(np.count_nonzero(counts))
+    stats["pairs"] = pairs
+    stats["pairs_off_ellipse"] = int(boxes.sum()) - pairs if skips.ellipse else 0
+    stats["tile_size"] = col.TILE
+    positions = np.empty(histograms.shape, np.int64)
+    run_blocks(start_positions, even_bounds(frame.images), histograms, first_entry, positions)
+    entries = np.empty((pairs, 2), np.int32)
+    run_blocks(
+        place,
+        pieces,
+        splats,
+        first_pair,
+        positions,
+        frame.num,
+        frame.block_size,
+        frame.size,
+        skips.ellipse,
+        entries,
+    )
+    return _Lists(splats, first_pair, first_entry, entries)
+
+
+def _by_kind(depth: Tensor | None, settings: Settings) -> tuple[np.ndarray | None, ...]:
+    """As the accumulated depth and as the median: one of them at most is asked for."""
+    if depth is None:
+        return None, None
+    return (None, depth.numpy()) if settings.depth == "median" else (depth.numpy(), None)
+
+
+def _contiguous(grad: Tensor | None, layer: Tensor) -> Tensor:
+    """A gradient that nobody asks for is 0."""
+    return torch.zeros_like(layer) if grad is None else grad.contiguous()
+
+
+def _starts(counts: np.ndarray) -> np.ndarray:
+    """[0, c_0, c_0 + c_1, ...]"""
+    starts = np.zeros(len(counts) + 1, np.int64)
+    np.cumsum(counts, out=starts[1:])
+    return starts
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    """[B, N, ...] as [B * N, ...], without a copy where memory allows it."""
+    return tensor.detach().contiguous().flatten(0, 1).numpy()
+
+
+def _camera_rows(cam_to_world: Tensor, intrinsics: Tensor) -> np.ndarray:
+    """[images, 16] float64, see `layout`."""
+    poses = cam_to_world.detach().double().flatten(0, 1)
+    pinhole = intrinsics.detach().double().flatten(0, 1)
+    numbers = pinhole[:, [0, 1, 0, 1], [0, 1, 2, 2]]
+    return torch.cat((poses[:, :3].mT.flatten(1), numbers), 1).numpy()
+
+
+def _camera_gradients(rows: np.ndarray, cam_to_world: Tensor, intrinsics: Tensor):
+    """Gradients of poses and intrinsics from those of `_camera_rows`."""
+    grads = torch.from_numpy(rows)
+    poses, pinhole = (torch.zeros(t.shape, dtype=torch.float64) for t in (cam_to_world, intrinsics))
+    poses.flatten(0, 1)[:, :3] = grads[:, :12].unflatten(1, (4, 3)).mT
+    pinhole.flatten(0, 1)[:, [0, 1, 0, 1], [0, 1, 2, 2]] = grads[:, 12:]
+    return poses.to(cam_to_world.dtype), pinhole.to(intrinsics.dtype)

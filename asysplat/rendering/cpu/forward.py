@@ -1,0 +1,125 @@
+"""Splats to pixels, front to back: a task draws a tile, a vector is a row of it."""
+
+import numpy as np
+
+from asysplat.rendering.cpu import layout as col
+from asysplat.rendering.cpu.kernel import kernel
+from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, ONE, ZERO, alpha_at, fma
+from asysplat.rendering.cpu.sort import DIGITS, RADIX, sort_by_depth
+from asysplat.rendering.cpu.tile import (
+    CHECK,
+    PIXELS,
+    aligned,
+    center_offset,
+    corner,
+    is_opaque,
+    rows_in_reach,
+    whitened_start,
+)
+
+# Planes of a tile's state: what passes through, alpha, colour, depths.
+ALPHA, RED, GREEN, BLUE, DEPTH, MEDIAN = (plane * PIXELS for plane in range(1, 7))
+PLANES = 7
+
+
+@kernel
+def rasterize(
+    start,
+    stop,
+    splats,
+    first_entry,
+    last_entry,
+    entries,
+    grid,
+    convention,
+    skips,
+    image,
+    alpha,
+    depth,
+    median,
+    counters,
+):
+    """Sort and draw tiles start to stop.
+
+    Args:
+        splats: [images * N, 16], see `layout`.
+        first_entry: [tiles + 1] where each tile's list begins.
+        last_entry: [tiles] is set to where it was left, all its pixels being opaque.
+        entries: [pairs, 2] splat and pair of each; sorted in place.
+        grid: columns of tiles, tiles of an image, height, width.
+        convention: alpha_min, alpha_max, transmittance_min, float32.
+        skips: whether to skip rows out of reach, and those that are opaque.
+        image: [images, 3, H, W]; alpha, depth, median: [images, H, W], of which the last two may be
+            None: then they cost nothing. Every pixel is written.
+        counters: [tiles, COUNTERS].
+    """
+    alpha_min, alpha_max, transmittance_min = convention
+    skip_rows, skip_opaque = skips
+    bases = splats.view(np.int32)
+    longest = 0
+    for tile in range(start, stop):
+        longest = max(longest, first_entry[tile + 1] - first_entry[tile])
+    keys = np.empty((2, longest), np.uint32)
+    scratch = np.empty((2, longest, 2), entries.dtype)
+    digits = np.empty((DIGITS, RADIX), np.int64)
+    state = aligned(PLANES * PIXELS)
+    for tile in range(start, stop):
+        picture, left, top, rows, columns = corner(tile, grid)
+        position, end = first_entry[tile], first_entry[tile + 1]
+        sort_by_depth(entries, position, end, splats, keys, scratch, digits)
+        state[:PIXELS] = ONE
+        state[PIXELS:] = ZERO
+        live = (1 << rows) - 1
+        in_reach = drawn = 0
+        while position < end and live:
+            d = entries[position, 0]
+            look = skip_opaque and position & CHECK == CHECK
+            position += 1
+            x, y = center_offset(splats, bases, d, left, top)
+            u0, b = whitened_start(splats, d, x, y)
+            first, last = rows_in_reach(splats, d, y, rows) if skip_rows else (0, rows - 1)
+            a, c, log_opacity = splats[d, col.A], splats[d, col.C], splats[d, col.LOG_OPACITY]
+            red, green, blue = splats[d, col.RED], splats[d, col.GREEN], splats[d, col.BLUE]
+            z = splats[d, col.DEPTH]
+            in_reach += last - first + 1
+            for row in range(first, last + 1):
+                if not (live >> row) & 1:
+                    continue
+                drawn += 1
+                base = (row & (col.TILE - 1)) * LANES
+                v = c * np.float32(y + row)
+                exponent = fma(-v, v, log_opacity)
+                middle = np.float32(u0 + b * row)
+                for i in range(LANES):
+                    u = fma(a, np.float32(i) - MIDDLE, middle)
+                    opacity = alpha_at(u, exponent, alpha_min, alpha_max)
+                    before = state[base + i]
+                    behind = fma(-opacity, before, before)
+                    keep = ONE if behind >= transmittance_min else ZERO
+                    weight = opacity * before * keep
+                    state[base + i] = behind * keep
+                    state[ALPHA + base + i] += weight
+                    state[RED + base + i] = fma(weight, red, state[RED + base + i])
+                    state[GREEN + base + i] = fma(weight, green, state[GREEN + base + i])
+                    state[BLUE + base + i] = fma(weight, blue, state[BLUE + base + i])
+                    if depth is not None:
+                        state[DEPTH + base + i] = fma(weight, z, state[DEPTH + base + i])
+                    if median is not None:
+                        halved = before > HALF and weight > ZERO and behind <= HALF
+                        state[MEDIAN + base + i] += z if halved else ZERO
+                if look and is_opaque(state, base):
+                    live &= ~(1 << row)
+        last_entry[tile] = position
+        counters[tile, col.ROWS_IN_REACH] = in_reach
+        counters[tile, col.ROWS] = drawn
+        for row in range(rows):
+            for i in range(columns):
+                pixel = row * LANES + i
+                alpha[picture, top + row, left + i] = state[ALPHA + pixel]
+                image[picture, 0, top + row, left + i] = state[RED + pixel]
+                image[picture, 1, top + row, left + i] = state[GREEN + pixel]
+                image[picture, 2, top + row, left + i] = state[BLUE + pixel]
+                if depth is not None:
+                    depth[picture, top + row, left + i] = state[DEPTH + pixel]
+                if median is not None:
+                    median[picture, top + row, left + i] = state[MEDIAN + pixel]

@@ -1,0 +1,56 @@
+"""Blocks of work on as many threads as torch has; the kernels let go of Python's lock."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+import torch
+
+PER_THREAD = 4  # portions of the work, so that an uneven one is made up for
+
+
+def run_blocks(kernel: Callable[..., None], bounds: np.ndarray, *args: object) -> None:
+    """`kernel(start, stop, *args)` for neighbouring numbers of `bounds`, in any order.
+
+    What a kernel writes must depend on its range alone: then the number of threads changes no bit.
+    """
+    threads = torch.get_num_threads()
+    ranges = [
+        (a, b) for a, b in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True) if a < b
+    ]
+    if threads == 1 or len(ranges) == 1:
+        for start, stop in ranges:
+            kernel(start, stop, *args)
+        return
+    jobs = [_pool(threads).submit(kernel, start, stop, *args) for start, stop in ranges]
+    for job in jobs:
+        job.result()
+
+
+def even_bounds(count: int) -> np.ndarray:
+    """Portions of `count` blocks of equal cost."""
+    return np.linspace(0, count, min(count, _portions()) + 1).astype(np.int64)
+
+
+def weighted_bounds(ends: np.ndarray) -> np.ndarray:
+    """Portions of blocks whose costs sum to `ends`, [0, ..., total]."""
+    targets = np.linspace(ends[0], ends[-1], _portions() + 1)
+    bounds = np.searchsorted(ends, targets)
+    bounds[0], bounds[-1] = 0, len(ends) - 1
+    return np.maximum.accumulate(bounds)
+
+
+def _portions() -> int:
+    threads = torch.get_num_threads()
+    return 1 if threads == 1 else PER_THREAD * threads
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="render")
+
+
+# A forked process has none of its parent's threads.
+os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -1,0 +1,63 @@
+"""How both passes see a splat from a tile."""
+
+import math
+
+import numpy as np
+
+from asysplat.rendering.cpu import layout as col
+from asysplat.rendering.cpu.kernel import inline
+from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, to_bits
+
+PIXELS = col.TILE * LANES
+CHECK = 15  # look after every 16 splats whether a row is opaque
+
+
+@inline
+def aligned(count):
+    """float32 scratch at a cache line's beginning, so that no vector straddles two."""
+    memory = np.empty(count + 16, np.float32)
+    return memory[((-memory.ctypes.data) & 63) // 4 :]
+
+
+@inline
+def corner(tile, grid):
+    """Image, first pixel column and row, and number of rows and columns of a tile."""
+    columns, tiles, height, width = grid
+    left = tile % tiles % columns * col.TILE
+    top = tile % tiles // columns * col.TILE
+    return tile // tiles, left, top, min(col.TILE, height - top), min(col.TILE, width - left)
+
+
+@inline
+def center_offset(splats, bases, d, left, top):
+    """From a splat's centre to the middle of the tile's first row, float64."""
+    x = left + float(MIDDLE + HALF) - float(bases[d, col.BASE_X]) - float(splats[d, col.X])
+    y = top + float(HALF) - float(bases[d, col.BASE_Y]) - float(splats[d, col.Y])
+    return x, y
+
+
+@inline
+def rows_in_reach(splats, d, y, rows):
+    """First and last row of the tile that the splat can show in."""
+    reach = float(splats[d, col.REACH_Y]) + col.PIXEL_MARGIN
+    first = math.ceil(max(-y - reach, 0.0))
+    last = math.floor(min(-y + reach, rows - 1.0))
+    return first, last
+
+
+@inline
+def whitened_start(splats, d, x, y):
+    """u = A dx + B dy in the middle of the first row and what a row adds, float64: far from its
+    centre a needle's two terms nearly cancel."""
+    a = float(splats[d, col.A]) + float(splats[d, col.A_REST])
+    b = float(splats[d, col.B]) + float(splats[d, col.B_REST])
+    return a * x + b * y, b
+
+
+@inline
+def is_opaque(left_over, base):
+    """Whether nothing behind can show in this row."""
+    any_left = np.int32(0)
+    for i in range(LANES):
+        any_left |= to_bits(left_over[base + i])
+    return any_left == 0

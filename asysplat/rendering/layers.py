@@ -1,0 +1,24 @@
+"""What a backend returns."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Images without background, batch and views flattened.
+
+    Args:
+        image: [I, 3, H, W] sum of w_i c_i.
+        alpha: [I, H, W] sum of w_i.
+        depth: [I, H, W] sum of w_i z_i, or the depth of the Gaussian that takes the transmittance
+            to half or below, 0 where none does; None unless asked for.
+        stats: counts of what was done and of what was skipped.
+    """
+
+    image: Float[Tensor, "I 3 H W"]
+    alpha: Float[Tensor, "I H W"]
+    depth: Float[Tensor, "I H W"] | None
+    stats: dict[str, int]
