@@ -8,11 +8,23 @@ own for its gradient: no two threads write to one, and sums have a fixed order.
 import numpy as np
 
 from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.kernel import inline, kernel
-from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, ONE, ZERO, alpha_at, fma
+from asysplat.rendering.cpu.kernel import kernel
+from asysplat.rendering.cpu.lanes import (
+    HALF,
+    LANES,
+    MIDDLE,
+    ONE,
+    ZERO,
+    alpha_at,
+    fma,
+    prefetch,
+    take_sum,
+)
 from asysplat.rendering.cpu.tile import (
+    AHEAD,
     CHECK,
     PIXELS,
+    PLANE,
     aligned,
     center_offset,
     corner,
@@ -23,22 +35,13 @@ from asysplat.rendering.cpu.tile import (
 
 # Planes of a tile's state: what passes through; what lies behind, times its gradient; gradients.
 BEHIND, G_ALPHA, G_RED, G_GREEN, G_BLUE, G_DEPTH, G_MEDIAN = (
-    plane * PIXELS for plane in range(1, 8)
+    plane * PLANE for plane in range(1, 8)
 )
 PLANES = 8
 # Sums over the rows of a splat, for each column: of the exponent's gradient e, e u, e u y, e y,
 # e y^2, and of the values' gradients.
-E, EU, EUY, EY, EYY, RED, GREEN, BLUE, DEPTH = (PLANES * PIXELS + k * LANES for k in range(9))
-SUMS = 9
-
-
-@inline
-def total(state, base):
-    """Sum of a row's columns."""
-    total = ZERO
-    for i in range(LANES):
-        total += state[base + i]
-    return total
+E, EU, EUY, EY, EYY, RED, GREEN, BLUE, DEPTH, EUX = (PLANES * PIXELS + k * LANES for k in range(10))
+SUMS = 10
 
 
 @kernel
@@ -68,11 +71,11 @@ def rasterize_backward(
     alpha_min, alpha_max, transmittance_min = convention
     skip_rows, skip_opaque = skips
     bases = splats.view(np.int32)
-    state = aligned(PLANES * PIXELS + SUMS * LANES)
+    state = aligned(PLANES * PLANE + SUMS * LANES)
     for tile in range(start, stop):
         picture, left, top, rows, columns = corner(tile, grid)
         state[:PIXELS] = ONE
-        state[PIXELS : PLANES * PIXELS] = ZERO
+        state[PIXELS:] = ZERO
         for row in range(rows):
             for i in range(columns):
                 pixel, at_y, at_x = row * LANES + i, top + row, left + i
@@ -95,8 +98,10 @@ def rasterize_backward(
                     behind += depth[picture, at_y, at_x] * grad_depth[picture, at_y, at_x]
                 state[BEHIND + pixel] = behind
         live = (1 << rows) - 1
-        for position in range(first_entry[tile], last_entry[tile]):
+        end = last_entry[tile]
+        for position in range(first_entry[tile], end):
             d, pair = entries[position, 0], entries[position, 1]
+            prefetch(splats, entries[min(position + AHEAD, end - 1), 0])
             look = skip_opaque and position & CHECK == CHECK
             x, y = center_offset(splats, bases, d, left, top)
             u0, b = whitened_start(splats, d, x, y)
@@ -104,7 +109,6 @@ def rasterize_backward(
             a, c, log_opacity = splats[d, col.A], splats[d, col.C], splats[d, col.LOG_OPACITY]
             red, green, blue = splats[d, col.RED], splats[d, col.GREEN], splats[d, col.BLUE]
             z = splats[d, col.DEPTH]
-            state[E : E + SUMS * LANES] = ZERO
             for row in range(first, last + 1):
                 if not (live >> row) & 1:
                     continue
@@ -147,21 +151,19 @@ def rasterize_backward(
                         state[DEPTH + i] += state[G_MEDIAN + base + i] if halved else ZERO
                 if look and is_opaque(state, base):
                     live &= ~(1 << row)
-            # e u x, with x = middle of the tile + (i - MIDDLE)
-            eux = ZERO
             for i in range(LANES):
-                eux += state[EU + i] * np.float32(x + (i - float(MIDDLE)))
-            eu, ey = total(state, EU), total(state, EY)
+                state[EUX + i] = state[EU + i] * (np.float32(x) + (np.float32(i) - MIDDLE))
+            eu, ey = take_sum(state, EU), take_sum(state, EY)
             # The exponent is LOG_OPACITY - u^2 - v^2, u = A x + B y, v = C y, of minus the centre.
             grads[pair, col.G_X] = 2 * a * eu
             grads[pair, col.G_Y] = np.float32(2 * b) * eu + 2 * c * c * ey
-            grads[pair, col.G_A] = -2 * eux
-            grads[pair, col.G_B] = -2 * total(state, EUY)
-            grads[pair, col.G_C] = -2 * c * total(state, EYY)
-            grads[pair, col.G_LOG_OPACITY] = total(state, E)
-            grads[pair, col.G_RED] = total(state, RED)
-            grads[pair, col.G_GREEN] = total(state, GREEN)
-            grads[pair, col.G_BLUE] = total(state, BLUE)
-            grads[pair, col.G_DEPTH] = total(state, DEPTH)
+            grads[pair, col.G_A] = -2 * take_sum(state, EUX)
+            grads[pair, col.G_B] = -2 * take_sum(state, EUY)
+            grads[pair, col.G_C] = -2 * c * take_sum(state, EYY)
+            grads[pair, col.G_LOG_OPACITY] = take_sum(state, E)
+            grads[pair, col.G_RED] = take_sum(state, RED)
+            grads[pair, col.G_GREEN] = take_sum(state, GREEN)
+            grads[pair, col.G_BLUE] = take_sum(state, BLUE)
+            grads[pair, col.G_DEPTH] = take_sum(state, DEPTH)
         for position in range(last_entry[tile], first_entry[tile + 1]):
             grads[entries[position, 1]] = ZERO

@@ -86,7 +86,7 @@ class _Frame(NamedTuple):
     def projection(self) -> tuple[float, ...]:
         c = self.settings.convention
         log_alpha_min = math.log2(c.alpha_min)
-        return c.alpha_min, log_alpha_min, c.eps2d, c.near, c.frustum_margin, c.compensation_min
+        return c.alpha_min, log_alpha_min, c.eps2d, c.near, c.compensation_min
 
     @property
     def cutoffs(self) -> tuple[np.float32, ...]:
@@ -116,7 +116,7 @@ class _Draw(torch.autograd.Function):
             settings=settings,
         )
         fields = [_array(tensor) for tensor in tensors[:5]]
-        cameras = _camera_rows(cam_to_world, intrinsics)
+        cameras = _camera_rows(frame, cam_to_world, intrinsics)
         lists = _make_lists(frame, fields, cameras, stats)
         image = torch.empty(frame.images, 3, height, width)
         alpha = torch.empty(frame.images, height, width)
@@ -178,9 +178,9 @@ class _Draw(torch.autograd.Function):
             pair_grads,
         )
         fields = [_array(tensor) for tensor in tensors[:5]]
-        cameras = _camera_rows(*tensors[5:])
+        cameras = _camera_rows(frame, *tensors[5:])
         field_grads = [torch.empty(t.shape, dtype=t.dtype) for t in tensors[:5]]
-        camera_grads = np.empty((frame.images, frame.blocks, col.CAMERA))
+        camera_grads = np.empty((frame.images, frame.blocks, col.CAMERA_GRADIENT))
         run_blocks(
             project_backward,
             even_bounds(frame.images // frame.views * frame.blocks),
@@ -188,7 +188,6 @@ class _Draw(torch.autograd.Function):
             cameras,
             frame.views,
             frame.block_size,
-            frame.size,
             frame.projection,
             settings.antialiased,
             lists.first_pair,
@@ -212,6 +211,7 @@ def _make_lists(
     skips = frame.settings.skips
     splats = np.empty((frame.images * frame.num, col.SPLAT), np.float32)
     counts = np.empty(frame.images * frame.num, np.int32)
+    first_tiles = np.empty(frame.images * frame.num, np.int32)
     boxes = np.empty((frame.images, frame.blocks), np.int64)
     histograms = np.empty((frame.images, frame.blocks, frame.tiles), np.int32)
     pieces = even_bounds(frame.images * frame.blocks)
@@ -228,6 +228,7 @@ def _make_lists(
         (skips.opacity, skips.extent, skips.ellipse),
         splats,
         counts,
+        first_tiles,
         boxes,
         histograms,
     )
@@ -251,6 +252,7 @@ def _make_lists(
         pieces,
         splats,
         first_pair,
+        first_tiles,
         positions,
         frame.num,
         frame.block_size,
@@ -285,12 +287,16 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().flatten(0, 1).numpy()
 
 
-def _camera_rows(cam_to_world: Tensor, intrinsics: Tensor) -> np.ndarray:
-    """[images, 16] float64, see `layout`."""
+def _camera_rows(frame: _Frame, cam_to_world: Tensor, intrinsics: Tensor) -> np.ndarray:
+    """[images, 20] float64, see `layout`."""
     poses = cam_to_world.detach().double().flatten(0, 1)
     pinhole = intrinsics.detach().double().flatten(0, 1)
-    numbers = pinhole[:, [0, 1, 0, 1], [0, 1, 2, 2]]
-    return torch.cat((poses[:, :3].mT.flatten(1), numbers), 1).numpy()
+    focal, principal = pinhole[:, [0, 1], [0, 1]], pinhole[:, [0, 1], [2, 2]]
+    size = focal.new_tensor([frame.width, frame.height])
+    margin = frame.settings.convention.frustum_margin * size
+    low, high = (-principal - margin) / focal, (size - principal + margin) / focal
+    limits = torch.stack((low, high), -1).flatten(1)
+    return torch.cat((poses[:, :3].mT.flatten(1), focal, principal, limits), 1).numpy()
 
 
 def _camera_gradients(rows: np.ndarray, cam_to_world: Tensor, intrinsics: Tensor):

@@ -4,11 +4,13 @@ import numpy as np
 
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.kernel import kernel
-from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, ONE, ZERO, alpha_at, fma
+from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, ONE, ZERO, alpha_at, fma, prefetch
 from asysplat.rendering.cpu.sort import DIGITS, RADIX, sort_by_depth
 from asysplat.rendering.cpu.tile import (
+    AHEAD,
     CHECK,
     PIXELS,
+    PLANE,
     aligned,
     center_offset,
     corner,
@@ -18,7 +20,7 @@ from asysplat.rendering.cpu.tile import (
 )
 
 # Planes of a tile's state: what passes through, alpha, colour, depths.
-ALPHA, RED, GREEN, BLUE, DEPTH, MEDIAN = (plane * PIXELS for plane in range(1, 7))
+ALPHA, RED, GREEN, BLUE, DEPTH, MEDIAN = (plane * PLANE for plane in range(1, 7))
 PLANES = 7
 
 
@@ -62,7 +64,7 @@ def rasterize(
     keys = np.empty((2, longest), np.uint32)
     scratch = np.empty((2, longest, 2), entries.dtype)
     digits = np.empty((DIGITS, RADIX), np.int64)
-    state = aligned(PLANES * PIXELS)
+    state = aligned(PLANES * PLANE)
     for tile in range(start, stop):
         picture, left, top, rows, columns = corner(tile, grid)
         position, end = first_entry[tile], first_entry[tile + 1]
@@ -73,6 +75,7 @@ def rasterize(
         in_reach = drawn = 0
         while position < end and live:
             d = entries[position, 0]
+            prefetch(splats, entries[min(position + AHEAD, end - 1), 0])
             look = skip_opaque and position & CHECK == CHECK
             position += 1
             x, y = center_offset(splats, bases, d, left, top)

@@ -22,12 +22,6 @@ def clamp(value, low, high):
 
 
 @inline
-def tangent_limits(focal, principal, pixels, margin):
-    """Least and greatest x / z that the Jacobian is taken at."""
-    return (-principal - margin * pixels) / focal, (pixels - principal + margin * pixels) / focal
-
-
-@inline
 def jacobian_row(axis, forward, focal, inverse_z, tangent):
     """How a pixel coordinate moves with the mean, in world axes."""
     return scaled(focal * inverse_z, plus(axis, -tangent, forward))

@@ -8,12 +8,14 @@ import llvmlite.binding
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from asysplat.rendering.cpu.kernel import inline
 
 LANES = 16  # pixels of a tile's row, one vector of AVX-512
-FLOAT32_BITS = ir.IntType(32)
+FLOAT, FLOAT_BITS = ir.FloatType(), ir.IntType(32)
+LANES_TYPE = ir.VectorType(FLOAT, LANES)
 HAS_FMA = bool(llvmlite.binding.get_host_cpu_features().get("fma", True))
 
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
@@ -53,7 +55,7 @@ def to_bits(typing_context, value):
     """The bits of a float32 as int32."""
 
     def generate(context, builder, signature, args):
-        return builder.bitcast(args[0], FLOAT32_BITS)
+        return builder.bitcast(args[0], FLOAT_BITS)
 
     return types.int32(types.float32), generate
 
@@ -63,9 +65,54 @@ def from_bits(typing_context, value):
     """The float32 of these bits."""
 
     def generate(context, builder, signature, args):
-        return builder.bitcast(args[0], ir.FloatType())
+        return builder.bitcast(args[0], FLOAT)
 
     return types.float32(types.int32), generate
+
+
+@intrinsic
+def take_sum(typing_context, state, base):
+    """Sum of the LANES numbers from `base` on, which are left at 0 for the next splat."""
+
+    def generate(context, builder, signature, args):
+        pointer = _element(context, builder, signature, args, LANES_TYPE)
+        vector = builder.load(pointer, align=4)
+        builder.store(ir.Constant(LANES_TYPE, [0.0] * LANES), pointer, align=4)
+        name = f"llvm.vector.reduce.fadd.v{LANES}f32"
+        signature_ = ir.FunctionType(FLOAT, [FLOAT, LANES_TYPE])
+        function = cgutils.get_or_insert_function(builder.module, signature_, name)
+        # Without an order to keep, it is the tree that the processor does best.
+        return builder.call(function, [FLOAT(-0.0), vector], fastmath=("reassoc",))
+
+    return types.float32(state, base), generate
+
+
+@intrinsic
+def prefetch(typing_context, rows, row):
+    """Ask for a row of a 2D array before it is needed."""
+
+    def generate(context, builder, signature, args):
+        array_type, row_type = signature.args
+        array = context.make_array(array_type)(context, builder, args[0])
+        row = context.cast(builder, args[1], row_type, types.intp)
+        stride = builder.extract_value(array.strides, 0)
+        byte = builder.bitcast(array.data, ir.IntType(8).as_pointer())
+        pointer = builder.gep(byte, [builder.mul(row, stride)])
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type, *[ir.IntType(32)] * 3])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        read, keep, data = (ir.IntType(32)(value) for value in (0, 3, 1))
+        builder.call(function, [pointer, read, keep, data])
+        return context.get_dummy_value()
+
+    return types.void(rows, row), generate
+
+
+def _element(context, builder, signature, args, kind):
+    """Pointer to an element of a 1D array, as one to `kind`."""
+    array_type, index_type = signature.args
+    array = context.make_array(array_type)(context, builder, args[0])
+    index = context.cast(builder, args[1], index_type, types.intp)
+    return builder.bitcast(builder.gep(array.data, [index]), kind.as_pointer())
 
 
 @inline

@@ -12,9 +12,11 @@ SPLAT = 16
 G_X, G_Y, G_A, G_B, G_C, G_LOG_OPACITY, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
 GRADIENT = 10
 
-# A camera [16] float64: its axes and centre in the world; intrinsics in pixels.
+# A camera [20] float64: its axes and centre in the world; intrinsics in pixels; the least and the
+# greatest x / z and y / z that the Jacobian is taken at. Its gradient is that of the first 16.
 RIGHT, DOWN, FORWARD, CENTER, FX, FY, CX, CY = 0, 3, 6, 9, 12, 13, 14, 15
-CAMERA = 16
+LOW_X, HIGH_X, LOW_Y, HIGH_Y = range(16, 20)
+CAMERA_GRADIENT = 16
 
 TILE = 16  # pixels a side
 BLOCK = 2048  # Gaussians of one piece of work, unless that made more than

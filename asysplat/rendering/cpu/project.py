@@ -11,7 +11,6 @@ from asysplat.rendering.cpu.geometry import (
     covariance,
     ellipse_rows,
     jacobian_row,
-    tangent_limits,
     whitening,
 )
 from asysplat.rendering.cpu.kernel import inline, kernel
@@ -41,19 +40,21 @@ def project(
     skips,
     splats,
     counts,
+    first_tiles,
     boxes,
     histograms,
 ):
-    """Fill `splats`, `counts` (pairs of each, 0 where culled) and `histograms` of blocks.
+    """Splats of blocks start to stop, and how many tiles they touch.
 
     Args:
         means, quats, scales, opacities, sh: [B * N, ...].
-        cameras: [B * V, 16] float64, views: V.
+        cameras: [B * V, 20] float64, views: V.
         block_size: Gaussians of a block.
         size: height and width in pixels, columns in tiles.
-        convention: alpha_min, log2(alpha_min), eps2d, near, frustum_margin, compensation_min.
+        convention: alpha_min, log2(alpha_min), eps2d, near, compensation_min.
         skips: whether to use the opacity cull, the opacity's extent, the exact ellipse.
-        splats: [B * V * N, 16]. counts: [B * V * N].
+        splats: [B * V * N, 16], written where visible.
+        counts, first_tiles: [B * V * N] pairs of each, 0 where culled, and its first tile.
         boxes: [B * V, blocks] pairs there would be with boxes in the place of ellipses.
         histograms: [B * V, blocks, tiles] pairs of each tile.
     """
@@ -64,7 +65,6 @@ def project(
     images = cameras.shape[0]
     num = splats.shape[0] // images
     functions = np.empty(16)
-    ignored = np.empty(histograms.shape[2], np.int32)
     for index in range(start, stop):
         image, block = index // blocks, index % blocks
         histogram = histograms[image, block]
@@ -93,9 +93,10 @@ def project(
                 splats,
                 bases,
             ):
-                counts[d] = count_tiles(splats, bases, d, size, exact, histogram)
-                if exact:
-                    boxes[image, block] += count_tiles(splats, bases, d, size, False, ignored)
+                counts[d], first_tiles[d], box = count_tiles(
+                    splats, bases, d, size, exact, histogram
+                )
+                boxes[image, block] += box
 
 
 @inline
@@ -104,7 +105,7 @@ def splat(
     functions, splats, bases,
 ):  # fmt: skip
     """Write splat d of Gaussian g in an image; whether it can be seen."""
-    alpha_min, log_alpha_min, eps, near, margin, compensation_min = convention
+    alpha_min, log_alpha_min, eps, near, compensation_min = convention
     _, own_extent, _ = skips
     height, width, _ = size
     right, down = row3(cameras, image, col.RIGHT), row3(cameras, image, col.DOWN)
@@ -118,10 +119,10 @@ def splat(
         return False
     inverse_z = 1 / z
     tangent_x, tangent_y = dot(right, offset) * inverse_z, dot(down, offset) * inverse_z
-    low_x, high_x = tangent_limits(fx, cx, width, margin)
-    low_y, high_y = tangent_limits(fy, cy, height, margin)
-    row_x = jacobian_row(right, forward, fx, inverse_z, clamp(tangent_x, low_x, high_x))
-    row_y = jacobian_row(down, forward, fy, inverse_z, clamp(tangent_y, low_y, high_y))
+    inside_x = clamp(tangent_x, cameras[image, col.LOW_X], cameras[image, col.HIGH_X])
+    inside_y = clamp(tangent_y, cameras[image, col.LOW_Y], cameras[image, col.HIGH_Y])
+    row_x = jacobian_row(right, forward, fx, inverse_z, inside_x)
+    row_y = jacobian_row(down, forward, fy, inverse_z, inside_y)
     mx, my, _, _, _ = ellipse_rows(quats, scales, g, row_x, row_y)
     xx, xy, yy, _, det0, det = covariance(mx, my, eps)
     a, b, c = whitening(xy, yy + eps, det)
@@ -165,9 +166,12 @@ def splat(
 @inline
 def write_color(g, d, offset, sh, functions, splats):
     """The colour seen along `offset`; False, and the splat is culled, where it is not finite."""
-    length = math.sqrt(max(dot(offset, offset), TINY))
     count = sh.shape[1]
-    basis(offset[0] / length, offset[1] / length, offset[2] / length, count, functions)
+    x = y = z = 0.0
+    if count > 1:
+        length = math.sqrt(max(dot(offset, offset), TINY))
+        x, y, z = offset[0] / length, offset[1] / length, offset[2] / length
+    basis(x, y, z, count, functions)
     for channel in range(3):
         color = 0.5
         for k in range(count):

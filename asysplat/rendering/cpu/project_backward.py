@@ -10,7 +10,6 @@ from asysplat.rendering.cpu.geometry import (
     covariance,
     ellipse_rows,
     jacobian_row,
-    tangent_limits,
     whitening,
 )
 from asysplat.rendering.cpu.kernel import inline, kernel
@@ -43,7 +42,6 @@ def project_backward(
     cameras,
     views,
     block_size,
-    size,
     convention,
     antialiased,
     first_pair,
@@ -77,19 +75,23 @@ def project_backward(
             grad_cameras[scene * views + view, block] = 0
         for n in range(block * block_size, min((block + 1) * block_size, num)):
             g = scene * num + n
-            g_mean[:], g_quat[:], g_scale[:], g_sh[:] = 0, 0, 0, 0
+            _clear(g_mean)
+            _clear(g_quat)
+            _clear(g_scale)
+            for k in range(count):
+                _clear(g_sh[k])
             g_opacity = 0.0
             for view in range(views):
                 image = scene * views + view
                 d = image * num + n
                 if first_pair[d] == first_pair[d + 1]:
                     continue
-                pixel[:] = 0
+                _clear(pixel)
                 for pair in range(first_pair[d], first_pair[d + 1]):
                     for k in range(col.GRADIENT):
                         pixel[k] += grads[pair, k]
                 g_opacity += _splat_backward(
-                    g, means, quats, scales, opacities, sh, cameras, image, size, convention,
+                    g, means, quats, scales, opacities, sh, cameras, image, convention,
                     antialiased, functions, g_functions, pixel, g_mean, g_quat, g_scale, g_sh,
                     grad_cameras[image, block],
                 )  # fmt: skip
@@ -104,6 +106,12 @@ def project_backward(
 
 
 @inline
+def _clear(vector):
+    for k in range(len(vector)):
+        vector[k] = 0.0
+
+
+@inline
 def _add3(out, start, factor, values):
     out[start] += factor * values[0]
     out[start + 1] += factor * values[1]
@@ -112,25 +120,22 @@ def _add3(out, start, factor, values):
 
 @inline
 def _splat_backward(
-    g, means, quats, scales, opacities, sh, cameras, image, size, convention, antialiased,
+    g, means, quats, scales, opacities, sh, cameras, image, convention, antialiased,
     functions, g_functions, pixel, g_mean, g_quat, g_scale, g_sh, g_camera,
 ):  # fmt: skip
     """Add one splat's part to the gradients; returns that of the opacity."""
-    _, _, eps, _, margin, compensation_min = convention
-    height, width, _ = size
+    _, _, eps, _, compensation_min = convention
     right, down = row3(cameras, image, col.RIGHT), row3(cameras, image, col.DOWN)
     forward = row3(cameras, image, col.FORWARD)
     fx, fy = cameras[image, col.FX], cameras[image, col.FY]
-    cx, cy = cameras[image, col.CX], cameras[image, col.CY]
 
     # What `project` computed.
     offset = plus(row3(means, g), -1.0, row3(cameras, image, col.CENTER))
     z = dot(forward, offset)
     inverse_z = 1 / z
     tangent_x, tangent_y = dot(right, offset) * inverse_z, dot(down, offset) * inverse_z
-    low_x, high_x = tangent_limits(fx, cx, width, margin)
-    low_y, high_y = tangent_limits(fy, cy, height, margin)
-    inside_x, inside_y = clamp(tangent_x, low_x, high_x), clamp(tangent_y, low_y, high_y)
+    inside_x = clamp(tangent_x, cameras[image, col.LOW_X], cameras[image, col.HIGH_X])
+    inside_y = clamp(tangent_y, cameras[image, col.LOW_Y], cameras[image, col.HIGH_Y])
     row_x = jacobian_row(right, forward, fx, inverse_z, inside_x)
     row_y = jacobian_row(down, forward, fy, inverse_z, inside_y)
     mx, my, turned_x, turned_y, scale = ellipse_rows(quats, scales, g, row_x, row_y)
@@ -214,7 +219,7 @@ def _splat_backward(
     direction = scaled(1 / length, offset)
     count = sh.shape[1]
     basis(direction[0], direction[1], direction[2], count, functions)
-    g_functions[:count] = 0
+    _clear(g_functions)
     for channel in range(3):
         color = 0.5
         for k in range(count):

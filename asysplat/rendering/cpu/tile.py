@@ -9,6 +9,10 @@ from asysplat.rendering.cpu.kernel import inline
 from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, to_bits
 
 PIXELS = col.TILE * LANES
+# From one plane of a tile's state to the next: planes 4096 bytes apart would look like one to the
+# processor's store buffer.
+PLANE = PIXELS + LANES
+AHEAD = 4  # splats that are fetched from memory before they are drawn
 CHECK = 15  # look after every 16 splats whether a row is opaque
 
 

@@ -59,16 +59,24 @@ def tile_columns(splats, bases, d, row, width, exact):
 
 @inline
 def count_tiles(splats, bases, d, size, exact, histogram):
-    """Add a splat's tiles to the histogram [tiles of an image]; how many."""
+    """Add a splat's tiles to the histogram [tiles of an image]; how many, the first of them, and
+    how many its box touches."""
     height, width, columns = size
     first_row, last_row = tile_rows(splats, bases, d, height)
-    count = 0
+    left, right = tile_columns(splats, bases, d, first_row, width, False)
+    box = (last_row - first_row + 1) * (right - left + 1)
+    count, first_tile = 0, -1
     for row in range(first_row, last_row + 1):
-        first, last = tile_columns(splats, bases, d, row, width, exact)
+        first, last = left, right
+        if exact and box > 1:
+            first, last = tile_columns(splats, bases, d, row, width, True)
         for column in range(first, last + 1):
-            histogram[row * columns + column] += 1
+            tile = row * columns + column
+            histogram[tile] += 1
             count += 1
-    return count
+            if first_tile < 0:
+                first_tile = tile
+    return count, first_tile, box
 
 
 @kernel
@@ -77,6 +85,7 @@ def place(
     stop,
     splats,
     first_pair,
+    first_tiles,
     positions,
     num,
     block_size,
@@ -88,6 +97,7 @@ def place(
 
     Args:
         first_pair: [images * N + 1] the number of a splat's first pair, and of all pairs.
+        first_tiles: [images * N] a splat's first tile.
         positions: [images, blocks, tiles] where a block's next pair of a tile goes.
         num, block_size: Gaussians of an image and of a block.
         size: height and width in pixels, columns in tiles.
@@ -101,7 +111,15 @@ def place(
         for n in range(block * block_size, min((block + 1) * block_size, num)):
             d = image * num + n
             pair = first_pair[d]
-            if pair == first_pair[d + 1]:
+            count = first_pair[d + 1] - pair
+            if count == 0:
+                continue
+            if count == 1:  # most of them, and known
+                tile = first_tiles[d]
+                position = positions[image, block, tile]
+                positions[image, block, tile] = position + 1
+                entries[position, 0] = d
+                entries[position, 1] = pair
                 continue
             first_row, last_row = tile_rows(splats, bases, d, height)
             for row in range(first_row, last_row + 1):
