@@ -8,9 +8,9 @@ from asysplat.rendering.cpu.vectors import (
     dot,
     plus,
     rotation_columns,
-    row3,
     scaled,
     times,
+    triple,
     unit_quaternion,
 )
 
@@ -29,12 +29,13 @@ def jacobian_row(axis, forward, focal, inverse_z, tangent):
 
 @inline
 def ellipse_rows(quats, scales, g, row_x, row_y):
-    """Rows of M in the covariance M M^T, in pixels, and what they were made from."""
-    w, x, y, z, _ = unit_quaternion(quats, g)
+    """Rows of M in the covariance M M^T, in pixels, and what they were made from; of Gaussian g in
+    flat arrays."""
+    w, x, y, z, _ = unit_quaternion(quats, 4 * g)
     axis0, axis1, axis2 = rotation_columns(w, x, y, z)
     turned_x = (dot(row_x, axis0), dot(row_x, axis1), dot(row_x, axis2))
     turned_y = (dot(row_y, axis0), dot(row_y, axis1), dot(row_y, axis2))
-    scale = row3(scales, g)
+    scale = triple(scales, 3 * g)
     return times(turned_x, scale), times(turned_y, scale), turned_x, turned_y, scale
 
 

@@ -4,6 +4,8 @@ Products and sums are fused by name and never by the compiler's choice, so that 
 backward pass, which share these functions, take identical decisions.
 """
 
+import math
+
 import llvmlite.binding
 import numpy as np
 from llvmlite import ir
@@ -18,6 +20,7 @@ FLOAT, FLOAT_BITS = ir.FloatType(), ir.IntType(32)
 LANES_TYPE = ir.VectorType(FLOAT, LANES)
 HAS_FMA = bool(llvmlite.binding.get_host_cpu_features().get("fma", True))
 
+SQRT_2, TWO_OVER_LN_2 = math.sqrt(2), 2 / math.log(2)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 MIDDLE = np.float32((LANES - 1) / 2)
 # Added and taken away again, it rounds a float32 to an integer that stands in its lowest bits.
@@ -127,6 +130,21 @@ def exp2(x):
     p = fma(p, f, P1)
     p = fma(p, f, P0)
     return from_bits(to_bits(p) + (to_bits(shifted) << np.int32(23)))
+
+
+@inline
+def log2(x):
+    """log2 of a positive float64, rounded to float32 first, to 1e-9."""
+    bits = to_bits(np.float32(x))
+    exponent = (bits >> np.int32(23)) - np.int32(127)
+    mantissa = float(from_bits((bits & np.int32(0x7FFFFF)) | np.int32(0x3F800000)))
+    # From [1, 2) to around 1.
+    high = mantissa > SQRT_2
+    mantissa = 0.5 * mantissa if high else mantissa
+    t = (mantissa - 1) / (mantissa + 1)
+    square = t * t
+    series = 1 + square * (1 / 3 + square * (1 / 5 + square * (1 / 7 + square / 9)))
+    return float(exponent) + (1.0 if high else 0.0) + TWO_OVER_LN_2 * t * series
 
 
 @inline

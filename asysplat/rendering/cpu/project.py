@@ -1,4 +1,8 @@
-"""Gaussians to splats, in float64 whatever the inputs: a splat is rounded once, at the end."""
+"""Gaussians to splats, in float64 whatever the inputs: a splat is rounded once, at the end.
+
+Where a Gaussian's ellipse lies is computed for a batch at a time, without a branch, so that the
+compiler makes vectors of it; colours and tiles follow for what can be seen.
+"""
 
 import math
 
@@ -14,12 +18,20 @@ from asysplat.rendering.cpu.geometry import (
     whitening,
 )
 from asysplat.rendering.cpu.kernel import inline, kernel
+from asysplat.rendering.cpu.lanes import log2
 from asysplat.rendering.cpu.sh import basis
 from asysplat.rendering.cpu.tiles import count_tiles
-from asysplat.rendering.cpu.vectors import dot, plus, row3
+from asysplat.rendering.cpu.vectors import dot, plus, row3, triple
 
 LARGEST = float(np.finfo(np.float32).max)
 TINY = 1e-20  # below the square of any distance that matters
+
+BATCH = 256
+# Rows [BATCH] of what `_ellipses` finds; SEEN is 1 or 0.
+CENTER_X, CENTER_Y, DEPTH, WHITEN_A, WHITEN_B, WHITEN_C, LOG_OPACITY, REACH_X, REACH_Y, SEEN = (
+    BATCH * row for row in range(10)
+)
+FOUND = 10
 
 
 @kernel
@@ -40,7 +52,7 @@ def project(
     skips,
     splats,
     counts,
-    first_tiles,
+    corners,
     boxes,
     histograms,
 ):
@@ -54,121 +66,152 @@ def project(
         convention: alpha_min, log2(alpha_min), eps2d, near, compensation_min.
         skips: whether to use the opacity cull, the opacity's extent, the exact ellipse.
         splats: [B * V * N, 16], written where visible.
-        counts, first_tiles: [B * V * N] pairs of each, 0 where culled, and its first tile.
+        counts: [B * V * N] pairs of each, 0 where culled.
+        corners: [B * V * N, 2] see `count_tiles`; written where there are pairs.
         boxes: [B * V, blocks] pairs there would be with boxes in the place of ellipses.
         histograms: [B * V, blocks, tiles] pairs of each tile.
     """
     alpha_min = convention[0]
-    skip_opacity, _, exact = skips
+    skip_opacity, own_extent, exact = skips
     bases = splats.view(np.int32)
     blocks = histograms.shape[1]
     images = cameras.shape[0]
     num = splats.shape[0] // images
     functions = np.empty(16)
+    found = np.empty(FOUND * BATCH)
     for index in range(start, stop):
         image, block = index // blocks, index % blocks
         histogram = histograms[image, block]
         histogram[:] = 0
-        boxes[image, block] = 0
-        for n in range(block * block_size, min((block + 1) * block_size, num)):
-            g, d = image // views * num + n, image * num + n
-            counts[d] = 0
-            if skip_opacity and not opacities[g] >= alpha_min:
+        touched = 0
+        last = min((block + 1) * block_size, num)
+        for first in range(block * block_size, last, BATCH):
+            length = min(BATCH, last - first)
+            g, d = image // views * num + first, image * num + first
+            if skip_opacity and not _any_above(opacities[g : g + length], alpha_min):
+                counts[d : d + length] = 0
                 continue
-            if splat(
-                g,
-                d,
-                means,
-                quats,
-                scales,
-                opacities,
-                sh,
-                cameras,
-                image,
+            _ellipses(
+                means[g : g + length].reshape(-1),
+                quats[g : g + length].reshape(-1),
+                scales[g : g + length].reshape(-1),
+                opacities[g : g + length],
+                cameras[image],
                 size,
                 convention,
                 antialiased,
-                skips,
-                functions,
-                splats,
-                bases,
-            ):
-                counts[d], first_tiles[d], box = count_tiles(
-                    splats, bases, d, size, exact, histogram
-                )
-                boxes[image, block] += box
+                own_extent,
+                found,
+            )
+            for i in range(length):
+                counts[d + i] = 0
+                if found[SEEN + i] == 0:
+                    continue
+                _write_ellipse(found, i, splats, bases, d + i)
+                if _write_color(g + i, d + i, means, sh, cameras, image, functions, splats):
+                    counts[d + i], box = count_tiles(
+                        splats,
+                        bases,
+                        d + i,
+                        found[REACH_X + i],
+                        size,
+                        exact,
+                        histogram,
+                        corners[d + i],
+                    )
+                    touched += box
+        boxes[image, block] = touched
 
 
 @inline
-def splat(
-    g, d, means, quats, scales, opacities, sh, cameras, image, size, convention, antialiased, skips,
-    functions, splats, bases,
-):  # fmt: skip
-    """Write splat d of Gaussian g in an image; whether it can be seen."""
+def _any_above(values, limit):
+    above = False
+    for value in values:
+        above |= value >= limit
+    return above
+
+
+@inline
+def _ellipses(
+    means, quats, scales, opacities, camera, size, convention, antialiased, own_extent, found
+):
+    """Fill `found` for a batch of Gaussians; all arrays but `camera` and `size` are flat."""
     alpha_min, log_alpha_min, eps, near, compensation_min = convention
-    _, own_extent, _ = skips
     height, width, _ = size
-    right, down = row3(cameras, image, col.RIGHT), row3(cameras, image, col.DOWN)
-    forward = row3(cameras, image, col.FORWARD)
-    fx, fy = cameras[image, col.FX], cameras[image, col.FY]
-    cx, cy = cameras[image, col.CX], cameras[image, col.CY]
-    # Relative to the camera first: exact for scenes far from the origin.
-    offset = plus(row3(means, g), -1.0, row3(cameras, image, col.CENTER))
-    z = dot(forward, offset)
-    if not near < z < LARGEST:  # written so that NaN is culled
-        return False
-    inverse_z = 1 / z
-    tangent_x, tangent_y = dot(right, offset) * inverse_z, dot(down, offset) * inverse_z
-    inside_x = clamp(tangent_x, cameras[image, col.LOW_X], cameras[image, col.HIGH_X])
-    inside_y = clamp(tangent_y, cameras[image, col.LOW_Y], cameras[image, col.HIGH_Y])
-    row_x = jacobian_row(right, forward, fx, inverse_z, inside_x)
-    row_y = jacobian_row(down, forward, fy, inverse_z, inside_y)
-    mx, my, _, _, _ = ellipse_rows(quats, scales, g, row_x, row_y)
-    xx, xy, yy, _, det0, det = covariance(mx, my, eps)
-    a, b, c = whitening(xy, yy + eps, det)
-    opacity = float(opacities[g])
-    if antialiased:
-        opacity *= compensation(det0, det, compensation_min)
-    x, y = tangent_x * fx + cx, tangent_y * fy + cy
-    # NaN and infinity anywhere make this sum neither larger nor smaller than 0.
-    if not (opacity >= alpha_min and a > 0 and abs(x + y + b + c + opacity) < np.inf):
-        return False
-    log_opacity = math.log2(opacity)
-    room = (log_opacity if own_extent else 0.0) - log_alpha_min + col.EXPONENT_MARGIN
-    reach = math.sqrt(room) / col.WHITEN_TO_LOG2
-    reach_x, reach_y = reach * math.sqrt(xx + eps), reach * math.sqrt(yy + eps)
+    right, down = triple(camera, col.RIGHT), triple(camera, col.DOWN)
+    forward, center = triple(camera, col.FORWARD), triple(camera, col.CENTER)
+    fx, fy, cx, cy = camera[col.FX], camera[col.FY], camera[col.CX], camera[col.CY]
+    low_x, high_x = camera[col.LOW_X], camera[col.HIGH_X]
+    low_y, high_y = camera[col.LOW_Y], camera[col.HIGH_Y]
     edge = 0.5 - col.PIXEL_MARGIN
-    if not (
-        x + reach_x >= edge
-        and x - reach_x <= width - edge
-        and y + reach_y >= edge
-        and y - reach_y <= height - edge
-    ):
-        return False
-    if not write_color(g, d, offset, sh, functions, splats):
-        return False
-    base_x = min(max(math.floor(x), -col.FARTHEST), col.FARTHEST)
-    base_y = min(max(math.floor(y), -col.FARTHEST), col.FARTHEST)
-    bases[d, col.BASE_X], bases[d, col.BASE_Y] = int(base_x), int(base_y)
-    splats[d, col.X], splats[d, col.Y] = x - base_x, y - base_y
-    a, b = a * col.WHITEN_TO_LOG2, b * col.WHITEN_TO_LOG2
-    splats[d, col.A], splats[d, col.B] = a, b
-    splats[d, col.A_REST] = a - float(splats[d, col.A])
-    splats[d, col.B_REST] = b - float(splats[d, col.B])
-    splats[d, col.C] = c * col.WHITEN_TO_LOG2
-    splats[d, col.LOG_OPACITY] = log_opacity
-    splats[d, col.DEPTH] = z
-    splats[d, col.DEPTH_REST] = z - float(splats[d, col.DEPTH])
-    splats[d, col.REACH_Y] = reach_y * (1 + 1e-6)
-    return True
+    for i in range(len(opacities)):
+        # Relative to the camera first: exact for scenes far from the origin.
+        offset = plus(triple(means, 3 * i), -1.0, center)
+        z = dot(forward, offset)
+        inverse_z = 1 / z
+        tangent_x, tangent_y = dot(right, offset) * inverse_z, dot(down, offset) * inverse_z
+        inside_x, inside_y = clamp(tangent_x, low_x, high_x), clamp(tangent_y, low_y, high_y)
+        row_x = jacobian_row(right, forward, fx, inverse_z, inside_x)
+        row_y = jacobian_row(down, forward, fy, inverse_z, inside_y)
+        mx, my, _, _, _ = ellipse_rows(quats, scales, i, row_x, row_y)
+        xx, xy, yy, _, det0, det = covariance(mx, my, eps)
+        a, b, c = whitening(xy, yy + eps, det)
+        opacity = float(opacities[i])
+        if antialiased:
+            opacity *= compensation(det0, det, compensation_min)
+        x, y = tangent_x * fx + cx, tangent_y * fy + cy
+        log_opacity = log2(opacity)
+        room = (log_opacity if own_extent else 0.0) - log_alpha_min + col.EXPONENT_MARGIN
+        reach = math.sqrt(max(room, 0.0)) / col.WHITEN_TO_LOG2
+        reach_x, reach_y = reach * math.sqrt(xx + eps), reach * math.sqrt(yy + eps)
+        # Every comparison with NaN is false. Without a short cut: `and` would be a branch.
+        seen = (
+            (z > near)
+            & (z < LARGEST)
+            & (opacity >= alpha_min)
+            & (opacity <= 1)
+            & (a > 0)
+            & (abs(x + y + b + c) < np.inf)
+            & (x + reach_x >= edge)
+            & (x - reach_x <= width - edge)
+            & (y + reach_y >= edge)
+            & (y - reach_y <= height - edge)
+        )
+        found[CENTER_X + i], found[CENTER_Y + i], found[DEPTH + i] = x, y, z
+        found[WHITEN_A + i] = a * col.WHITEN_TO_LOG2
+        found[WHITEN_B + i] = b * col.WHITEN_TO_LOG2
+        found[WHITEN_C + i] = c * col.WHITEN_TO_LOG2
+        found[LOG_OPACITY + i] = log_opacity
+        found[REACH_X + i], found[REACH_Y + i] = reach_x, reach_y
+        found[SEEN + i] = 1.0 if seen else 0.0
 
 
 @inline
-def write_color(g, d, offset, sh, functions, splats):
-    """The colour seen along `offset`; False, and the splat is culled, where it is not finite."""
+def _write_ellipse(found, i, splats, bases, d):
+    """Round to a splat; all but the colour."""
+    x, y, z = found[CENTER_X + i], found[CENTER_Y + i], found[DEPTH + i]
+    a, b = found[WHITEN_A + i], found[WHITEN_B + i]
+    base_x = min(max(np.floor(x), -col.FARTHEST), col.FARTHEST)
+    base_y = min(max(np.floor(y), -col.FARTHEST), col.FARTHEST)
+    bases[d, col.BASE_X], bases[d, col.BASE_Y] = np.int32(base_x), np.int32(base_y)
+    splats[d, col.X], splats[d, col.Y] = x - base_x, y - base_y
+    splats[d, col.A], splats[d, col.B] = a, b
+    splats[d, col.A_REST] = a - float(np.float32(a))
+    splats[d, col.B_REST] = b - float(np.float32(b))
+    splats[d, col.C] = found[WHITEN_C + i]
+    splats[d, col.LOG_OPACITY] = found[LOG_OPACITY + i]
+    splats[d, col.DEPTH] = z
+    splats[d, col.DEPTH_REST] = z - float(np.float32(z))
+    splats[d, col.REACH_Y] = found[REACH_Y + i] * (1 + 1e-6)
+
+
+@inline
+def _write_color(g, d, means, sh, cameras, image, functions, splats):
+    """The colour seen from the camera; False, and the splat is culled, where it is not finite."""
     count = sh.shape[1]
     x = y = z = 0.0
     if count > 1:
+        offset = plus(row3(means, g), -1.0, row3(cameras, image, col.CENTER))
         length = math.sqrt(max(dot(offset, offset), TINY))
         x, y, z = offset[0] / length, offset[1] / length, offset[2] / length
     basis(x, y, z, count, functions)

@@ -61,7 +61,7 @@ def project_backward(
         grad_means, grad_quats, grad_scales, grad_opacities, grad_sh: [B * N, ...], float32 or
             float64, every element written.
         grad_cameras: [B * V, blocks, 16] float64, each block's part.
-        others: as for `project`.
+        quats, scales: flat. Others: as for `project`.
     """
     blocks = grad_cameras.shape[1]
     num = means.shape[0] * views // cameras.shape[0]
@@ -169,7 +169,7 @@ def _splat_backward(
     # Rows of M to scale, rotation and the Jacobian's rows.
     _add3(g_scale, 0, 1.0, plus(times(g_mx, turned_x), 1.0, times(g_my, turned_y)))
     h_x, h_y = times(g_mx, scale), times(g_my, scale)
-    qw, qx, qy, qz, inverse = unit_quaternion(quats, g)
+    qw, qx, qy, qz, inverse = unit_quaternion(quats, 4 * g)
     axis0, axis1, axis2 = rotation_columns(qw, qx, qy, qz)
     turn = rotation_gradient(
         qw, qx, qy, qz, inverse,

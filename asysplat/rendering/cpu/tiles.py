@@ -9,11 +9,13 @@ from asysplat.rendering.cpu.kernel import inline, kernel
 
 
 @inline
-def clipped_range(low, high, size):
-    """Pixels whose centres lie from `low` to `high`, of 0 to size - 1; empty if last < first."""
-    first = math.ceil(max(low - 0.5 - col.PIXEL_MARGIN, -1.0))
-    last = math.floor(min(high - 0.5 + col.PIXEL_MARGIN, size + 1.0))
-    return max(int(first), 0), min(int(last), size - 1)
+def tile_range(center, below, above, size):
+    """First and last tile that has a pixel centre from center - below to center + above, of an
+    image of `size` pixels; none if last < first."""
+    edge = 0.5 + col.PIXEL_MARGIN
+    first = int(np.ceil(max(center - below - edge, 0.0)))
+    last = int(np.floor(min(center + above - 0.5 + col.PIXEL_MARGIN, size - 1.0)))
+    return first // col.TILE, last // col.TILE if last >= first else -1
 
 
 @inline
@@ -21,18 +23,16 @@ def tile_rows(splats, bases, d, height):
     """First and last row of tiles."""
     center = float(bases[d, col.BASE_Y]) + float(splats[d, col.Y])
     reach = float(splats[d, col.REACH_Y])
-    first, last = clipped_range(center - reach, center + reach, height)
-    return first // col.TILE, last // col.TILE if last >= first else -1
+    return tile_range(center, reach, reach, height)
 
 
 @inline
-def tile_columns(splats, bases, d, row, width, exact):
-    """First and last tile of a row of tiles: those the ellipse touches, or, if not `exact`, those
-    its box does.
+def tile_columns(splats, bases, d, row, width):
+    """First and last tile of a row of tiles that the ellipse touches.
 
-    The ellipse is (A dx + B dy)^2 + (C dy)^2 <= (C REACH_Y)^2. Between the row's outermost pixel
-    centres its right edge is farthest out at its tip, or, where the tip is not among them, at the
-    centre nearest to it; the left edge mirrors it.
+    It is (A dx + B dy)^2 + (C dy)^2 <= (C REACH_Y)^2. Between the row's outermost pixel centres its
+    right edge is farthest out at its tip, or, where the tip is not among them, at the centre
+    nearest to it; the left edge mirrors it.
     """
     a = float(splats[d, col.A])
     b = float(splats[d, col.B])
@@ -42,41 +42,40 @@ def tile_columns(splats, bases, d, row, width, exact):
     square = (c * limit) ** 2
     tilt = b / c
     tip = -tilt / math.sqrt(tilt * tilt + 1) * limit  # dy of the rightmost point
-    if exact:
-        center_y = float(bases[d, col.BASE_Y]) + float(splats[d, col.Y])
-        low = row * col.TILE + 0.5 - col.PIXEL_MARGIN - center_y
-        high = low + col.TILE - 1 + 2 * col.PIXEL_MARGIN
-        low, high = max(low, -limit), min(high, limit)
-    else:
-        low, high = -limit, limit
+    center_y = float(bases[d, col.BASE_Y]) + float(splats[d, col.Y])
+    low = row * col.TILE + 0.5 - col.PIXEL_MARGIN - center_y
+    high = low + col.TILE - 1 + 2 * col.PIXEL_MARGIN
+    low, high = max(low, -limit), min(high, limit)
     right_dy = min(max(tip, low), high)
     left_dy = min(max(-tip, low), high)
     right = (math.sqrt(max(square - (c * right_dy) ** 2, 0.0)) - b * right_dy) / a
     left = (-math.sqrt(max(square - (c * left_dy) ** 2, 0.0)) - b * left_dy) / a
-    first, last = clipped_range(center_x + left, center_x + right, width)
-    return first // col.TILE, last // col.TILE if last >= first else -1
+    return tile_range(center_x, -left, right, width)
 
 
 @inline
-def count_tiles(splats, bases, d, size, exact, histogram):
-    """Add a splat's tiles to the histogram [tiles of an image]; how many, the first of them, and
-    how many its box touches."""
+def count_tiles(splats, bases, d, reach_x, size, exact, histogram, corner):
+    """Add a splat's tiles to the histogram [tiles of an image]; how many, and how many its box
+    touches.
+
+    corner: set to the first tile and, where the tiles are the whole box, its width, else to 0.
+    """
     height, width, columns = size
     first_row, last_row = tile_rows(splats, bases, d, height)
-    left, right = tile_columns(splats, bases, d, first_row, width, False)
-    box = (last_row - first_row + 1) * (right - left + 1)
-    count, first_tile = 0, -1
+    center = float(bases[d, col.BASE_X]) + float(splats[d, col.X])
+    left, right = tile_range(center, reach_x, reach_x, width)
+    across = max(right - left + 1, 0)
+    box = max(last_row - first_row + 1, 0) * across
+    count = 0
     for row in range(first_row, last_row + 1):
         first, last = left, right
         if exact and box > 1:
-            first, last = tile_columns(splats, bases, d, row, width, True)
+            first, last = tile_columns(splats, bases, d, row, width)
         for column in range(first, last + 1):
-            tile = row * columns + column
-            histogram[tile] += 1
+            histogram[row * columns + column] += 1
             count += 1
-            if first_tile < 0:
-                first_tile = tile
-    return count, first_tile, box
+    corner[0], corner[1] = first_row * columns + left, across if count == box else 0
+    return count, box
 
 
 @kernel
@@ -85,19 +84,18 @@ def place(
     stop,
     splats,
     first_pair,
-    first_tiles,
+    corners,
     positions,
     num,
     block_size,
     size,
-    exact,
     entries,
 ):
     """Write every pair (splat, its number among all pairs) of blocks start to stop into the lists.
 
     Args:
         first_pair: [images * N + 1] the number of a splat's first pair, and of all pairs.
-        first_tiles: [images * N] a splat's first tile.
+        corners: [images * N, 2] see `count_tiles`.
         positions: [images, blocks, tiles] where a block's next pair of a tile goes.
         num, block_size: Gaussians of an image and of a block.
         size: height and width in pixels, columns in tiles.
@@ -112,25 +110,26 @@ def place(
             d = image * num + n
             pair = first_pair[d]
             count = first_pair[d + 1] - pair
-            if count == 0:
-                continue
-            if count == 1:  # most of them, and known
-                tile = first_tiles[d]
-                position = positions[image, block, tile]
-                positions[image, block, tile] = position + 1
-                entries[position, 0] = d
-                entries[position, 1] = pair
-                continue
-            first_row, last_row = tile_rows(splats, bases, d, height)
-            for row in range(first_row, last_row + 1):
-                first, last = tile_columns(splats, bases, d, row, width, exact)
-                for column in range(first, last + 1):
-                    tile = row * columns + column
-                    position = positions[image, block, tile]
-                    positions[image, block, tile] = position + 1
-                    entries[position, 0] = d
-                    entries[position, 1] = pair
-                    pair += 1
+            across = corners[d, 1]
+            if across > 0:
+                for k in range(count):
+                    tile = corners[d, 0] + k // across * columns + k % across
+                    _put(entries, positions[image, block], tile, d, pair + k)
+            elif count > 0:
+                first_row, last_row = tile_rows(splats, bases, d, height)
+                for row in range(first_row, last_row + 1):
+                    first, last = tile_columns(splats, bases, d, row, width)
+                    for column in range(first, last + 1):
+                        _put(entries, positions[image, block], row * columns + column, d, pair)
+                        pair += 1
+
+
+@inline
+def _put(entries, positions, tile, d, pair):
+    position = positions[tile]
+    positions[tile] = position + 1
+    entries[position, 0] = d
+    entries[position, 1] = pair
 
 
 @kernel

@@ -12,6 +12,12 @@ def row3(array, row, column=0):
 
 
 @inline
+def triple(array, start):
+    """Three float64 from a flat array."""
+    return (float(array[start]), float(array[start + 1]), float(array[start + 2]))
+
+
+@inline
 def dot(p, q):
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
@@ -42,13 +48,13 @@ def times(p, q):
 
 
 @inline
-def unit_quaternion(quats, row):
-    """Its four numbers and 1 / its length."""
+def unit_quaternion(quats, start):
+    """Its four numbers, from a flat array, and 1 / its length."""
     w, x, y, z = (
-        float(quats[row, 0]),
-        float(quats[row, 1]),
-        float(quats[row, 2]),
-        float(quats[row, 3]),
+        float(quats[start]),
+        float(quats[start + 1]),
+        float(quats[start + 2]),
+        float(quats[start + 3]),
     )
     inverse = 1 / math.sqrt(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
