@@ -1,4 +1,5 @@
-"""What every test gets: a seed, the shared data if it is there, and no GPU test without a GPU."""
+"""What every test gets: a seed, small scenes, the shared data if it is there, and no GPU test
+without a GPU."""
 
 import os
 from pathlib import Path
@@ -7,6 +8,8 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+
+from asysplat.scene import Cameras, Gaussians
 
 REPO = Path(__file__).resolve().parents[1]
 
@@ -36,6 +39,39 @@ def build(repository):
             return instantiate(config.model)
 
     return network
+
+
+@pytest.fixture(scope="session")
+def make_scene():
+    """The function below: as many Gaussians and cameras as a test asks for."""
+    return _make_scene
+
+
+def _make_scene(count=12, views=1, height=13, width=17, degree=1, dtype=torch.float64, seed=0):
+    """Gaussians of about 2 pixels in front of cameras that are a little turned and moved."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    depths = torch.linspace(2, 5, count, dtype=torch.float64)[:, None]
+    means = torch.cat((0.3 * normal(count, 2) * depths, depths), -1)
+    gaussians = Gaussians(
+        means=means,
+        quats=normal(count, 4),
+        scales=0.12 * depths * (0.4 * normal(count, 3)).exp(),
+        opacities=torch.rand(count, generator=generator, dtype=torch.float64) * 0.4 + 0.3,
+        sh=0.3 * normal(count, (degree + 1) ** 2, 3),
+    )
+    rotations = torch.linalg.matrix_exp(0.05 * (lambda m: m - m.mT)(normal(views, 3, 3)))
+    cam_to_world = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
+    cam_to_world[:, :3, :3] = rotations
+    cam_to_world[:, :3, 3] = 0.1 * normal(views, 3)
+    intrinsics = torch.tensor(
+        [[width, 0, 0.45 * width], [0, 0.9 * width, 0.55 * height], [0, 0, 1]], dtype=torch.float64
+    ).repeat(views, 1, 1)
+    cameras = Cameras(intrinsics, cam_to_world, height, width)
+    return gaussians.to(dtype), cameras.to(dtype)
 
 
 @pytest.fixture(autouse=True)

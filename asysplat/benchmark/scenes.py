@@ -6,6 +6,8 @@ from torch import Tensor
 from asysplat.scene import Cameras, Gaussians
 
 FOCAL = 0.9  # of the image's width
+DISTANCE = 4.0  # of what networks predict
+ARC = 0.5  # radians
 
 
 def random_scene(count: int, height: int, width: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
@@ -45,6 +47,24 @@ def pixel_aligned_scene(
     sigma = 0.8 * width / side * (0.4 * _normal(count, 3, generator=generator)).exp()
     opacities = (2 * _normal(count, generator=generator)).sigmoid()
     return _scene(pixels, depths, sigma, opacities, height, width, generator)
+
+
+def on_an_arc(camera: Cameras, views: int) -> Cameras:
+    """`views` cameras like the one given, on an arc of ARC radians about what stands DISTANCE in
+    front of it."""
+    angles = torch.linspace(-ARC / 2, ARC / 2, views)
+    turns = torch.zeros(views, 4, 4)
+    turns[:, 0, 0] = turns[:, 2, 2] = angles.cos()
+    turns[:, 0, 2], turns[:, 2, 0] = angles.sin(), -angles.sin()
+    turns[:, 1, 1] = turns[:, 3, 3] = 1
+    turns[:, 2, 3] = DISTANCE
+    turns[:, :3, 3] -= DISTANCE * turns[:, :3, 2]
+    return Cameras(
+        camera.intrinsics.expand(views, 3, 3),
+        camera.cam_to_world @ turns,
+        camera.height,
+        camera.width,
+    )
 
 
 def _normal(*shape: int, generator: torch.Generator) -> Tensor:

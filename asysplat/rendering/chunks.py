@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from asysplat.rendering.layers import Layers
 from asysplat.rendering.settings import Settings
 from asysplat.scene import Cameras, Gaussians
 
-Draw = Callable[[Gaussians, Cameras, Settings], Layers]
+Draw = Callable[[Gaussians, Cameras, Settings, Tensor | None], Layers]
 OF_VIEWS = ("cam_to_world", "intrinsics")
 NAMES = (*(field.name for field in dataclasses.fields(Gaussians)), *OF_VIEWS)
 SAME_IN_ALL = ("tile_size",)  # statistics that do not add up
@@ -24,6 +24,7 @@ def draw_in_chunks(
     gaussians: Gaussians,
     cameras: Cameras,
     settings: Settings,
+    masks: Tensor | None,
     views_at_once: int | None,
 ) -> Layers:
     """`draw`, with all views at once, or with `views_at_once` of every scene.
@@ -35,7 +36,7 @@ def draw_in_chunks(
     """
     if views_at_once is None:
         try:
-            return draw(gaussians, cameras, settings)
+            return draw(gaussians, cameras, settings, masks)
         except torch.OutOfMemoryError:
             if cameras.num_views == 1:
                 raise
@@ -49,9 +50,9 @@ def draw_in_chunks(
     if views_at_once < 1:
         raise InputError(f"render's views_at_once is {views_at_once}: give at least 1, or None.")
     if views_at_once >= cameras.num_views:
-        return draw(gaussians, cameras, settings)
+        return draw(gaussians, cameras, settings, masks)
     stats: dict[str, int] = {}
-    job = _Job(draw, settings, cameras.height, cameras.width, views_at_once, stats)
+    job = _Job(draw, settings, masks, cameras.height, cameras.width, views_at_once, stats)
     fields = [getattr(gaussians, name) for name in NAMES if name not in OF_VIEWS]
     layers = _Deferred.apply(job, *fields, cameras.cam_to_world, cameras.intrinsics)
     return Layers(*layers, stats)
@@ -63,6 +64,7 @@ class _Job:
 
     draw: Draw
     settings: Settings
+    masks: Tensor | None
     height: int
     width: int
     views_at_once: int
@@ -72,11 +74,17 @@ class _Job:
         starts = range(0, num_views, self.views_at_once)
         return [slice(start, start + self.views_at_once) for start in starts]
 
-    def layers(self, tensors: list[Tensor]) -> tuple[Layers, list[Tensor | None]]:
-        """Of Gaussian fields, poses and intrinsics; the images also as [B, views, ...]."""
+    def part(self, tensors: Sequence[Tensor], views: slice) -> list[Tensor]:
+        """Those of some views."""
         *fields, poses, intrinsics = tensors
+        return [*fields, poses[:, views], intrinsics[:, views]]
+
+    def layers(self, part: Sequence[Tensor], views: slice) -> tuple[Layers, list[Tensor | None]]:
+        """Of Gaussian fields, and poses and intrinsics of `views`; also as [B, views, ...]."""
+        *fields, poses, intrinsics = part
         cameras = Cameras(intrinsics, poses, self.height, self.width)
-        layers = self.draw(Gaussians(*fields), cameras, self.settings)
+        masks = None if self.masks is None else self.masks[:, views]
+        layers = self.draw(Gaussians(*fields), cameras, self.settings, masks)
         shape = poses.shape[:2]
         images = (layers.image, layers.alpha, layers.depth)
         return layers, [None if image is None else image.unflatten(0, shape) for image in images]
@@ -90,10 +98,9 @@ class _Deferred(torch.autograd.Function):
         ctx.job = job
         ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
-        *fields, poses, intrinsics = tensors
         parts = []
-        for views in job.chunks(poses.shape[1]):
-            layers, images = job.layers([*fields, poses[:, views], intrinsics[:, views]])
+        for views in job.chunks(tensors[-1].shape[1]):
+            layers, images = job.layers(job.part(tensors, views), views)
             parts.append(images)
             for name, count in layers.stats.items():
                 job.stats[name] = count + (0 if name in SAME_IN_ALL else job.stats.get(name, 0))
@@ -105,22 +112,21 @@ class _Deferred(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        *fields, poses, intrinsics = ctx.saved_tensors
+        job, shape = ctx.job, ctx.saved_tensors[-1].shape[:2]
         needed = ctx.needs_input_grad[1:]
         totals = [
             torch.zeros_like(tensor) if need else None
             for tensor, need in zip(ctx.saved_tensors, needed, strict=True)
         ]
-        for views in ctx.job.chunks(poses.shape[1]):
-            part = [*fields, poses[:, views], intrinsics[:, views]]
+        for views in job.chunks(shape[1]):
             part = [
                 tensor.detach().requires_grad_(need)
-                for tensor, need in zip(part, needed, strict=True)
+                for tensor, need in zip(job.part(ctx.saved_tensors, views), needed, strict=True)
             ]
             with torch.enable_grad():
-                _, images = ctx.job.layers(part)
+                _, images = job.layers(part, views)
             seen = [
-                (image, grad.unflatten(0, poses.shape[:2])[:, views])
+                (image, grad.unflatten(0, shape)[:, views])
                 for image, grad in zip(images, grads, strict=True)
                 if image is not None and grad is not None
             ]

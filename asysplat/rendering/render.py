@@ -1,25 +1,22 @@
 """The renderer's one public function."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.ops.dispatch import pick_backend
 from asysplat.ops.precision import without_autocast
-from asysplat.rendering import cpu, reference
+from asysplat.rendering import cpu, cuda, reference
 from asysplat.rendering.chunks import draw_in_chunks
 from asysplat.rendering.convention import INRIA, Convention
-from asysplat.rendering.layers import Layers
 from asysplat.rendering.settings import Settings, Skips
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
-Draw = Callable[[Gaussians, Cameras, Settings], Layers]
-BACKENDS: dict[str, Draw] = {"reference": reference.draw, "cpu": cpu.draw}
+BACKENDS = {"reference": reference.draw, "cpu": cpu.draw, "cuda": cuda.draw}
 DEPTHS = {True: "expected", False: None}
 ALPHA_TINY = 1e-6  # an alpha below 1/255 is exactly 0, so any value between will do
 
@@ -53,6 +50,7 @@ def render(
     sh_degree: int | None = None,
     convention: Convention = INRIA,
     skips: Skips = Skips(),  # noqa: B008
+    masks: Bool[Tensor, "*batch V H W"] | None = None,
     views_at_once: int | None = None,
     validate: bool = False,
 ) -> Rendering:
@@ -60,21 +58,23 @@ def render(
 
     Differentiable in all fields of `gaussians` and `cameras`, and in `background`; a Gaussian that
     is culled (see `reference.projection.project`) has gradient 0. Half-precision inputs are
-    computed in float32, also under autocast. The same inputs give the same bits, on a CPU on any
-    number of threads.
+    computed in float32, also under autocast. The same inputs give the same bits on one device, on a
+    CPU on any number of threads.
 
     Args:
         gaussians: [..., N].
         cameras: [..., V], with the batch dimensions of `gaussians`. Skew is ignored.
         background: RGB [3], or [..., V, 3] one a view; None is black.
-        backend: "reference", "cpu" or "auto", which is the fast one where there is one for the
-            device: the reference for float64.
+        backend: "reference", "cpu", "cuda" or "auto", which is the fast one for the device, and the
+            reference for float64.
         depth: True or "expected": sum_i w_i z_i / alpha. "accumulated": not divided by alpha.
             "median": z of the Gaussian that takes the transmittance to half or below. False: none.
         antialiased: lower opacities by what the dilation adds to a splat's area (Yu et al. 2024).
         sh_degree: leave higher harmonics out.
         convention: cut-offs of alpha compositing; see `CONVENTIONS`.
         skips: exact skips, each of which can be switched off.
+        masks: True where a pixel counts; the others show the background, and tiles of them cost
+            nothing.
         views_at_once: draw so many views of each scene at a time, keep nothing but the inputs, and
             draw them again in the backward pass (deferred backpropagation, Zhang et al. 2022): the
             same gradient, in the memory of so many views. None draws all at once.
@@ -90,7 +90,7 @@ def render(
     if validate:
         gaussians.validate("render's gaussians")
         cameras.validate("render's cameras")
-    batch = _check(gaussians, cameras, background)
+    batch = _check(gaussians, cameras, background, masks)
     dtype = torch.promote_types(gaussians.means.dtype, cameras.cam_to_world.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
     settings = Settings(convention, antialiased, DEPTHS.get(depth, depth), skips)
@@ -101,13 +101,17 @@ def render(
         views = cameras.map(lambda t: _one_batch(t.to(dtype), batch))
         auto = BACKENDS[_fast_backend(gaussians.means.device, dtype)]
         draw = pick_backend("render", {"auto": auto, **BACKENDS}, backend)
-        layers = draw_in_chunks(draw, scenes, views, settings, views_at_once)
+        counts = None if masks is None else _one_batch(masks, batch)
+        layers = draw_in_chunks(draw, scenes, views, settings, counts, views_at_once)
 
         def shaped(images: Tensor) -> Tensor:
             return images.to(dtype).unflatten(0, (*batch, cameras.num_views))
 
         image, alpha = shaped(layers.image), shaped(layers.alpha)
         distance = None if layers.depth is None else shaped(layers.depth)
+        if masks is not None:
+            image, alpha = image.where(masks[..., None, :, :], 0), alpha.where(masks, 0)
+            distance = None if distance is None else distance.where(masks, 0)
         if settings.depth == "expected":
             distance = distance / alpha.clamp_min(ALPHA_TINY)
         if background is not None:
@@ -117,7 +121,8 @@ def render(
 
 def _fast_backend(device: torch.device, dtype: torch.dtype) -> str:
     """The fastest for the device, that keeps what float64 asks for."""
-    return "cpu" if device.type == "cpu" and dtype == torch.float32 else "reference"
+    fast = {"cpu": "cpu", "cuda": "cuda"}
+    return fast.get(device.type, "reference") if dtype == torch.float32 else "reference"
 
 
 def _one_batch(tensor: Tensor, batch: tuple[int, ...]) -> Tensor:
@@ -125,7 +130,9 @@ def _one_batch(tensor: Tensor, batch: tuple[int, ...]) -> Tensor:
     return tensor.reshape(math.prod(batch), *tensor.shape[len(batch) :])
 
 
-def _check(gaussians: Gaussians, cameras: Cameras, background: Tensor | None) -> tuple[int, ...]:
+def _check(
+    gaussians: Gaussians, cameras: Cameras, background: Tensor | None, masks: Tensor | None
+) -> tuple[int, ...]:
     """The shared batch dimensions, of tensors that go together."""
     batch, views = tuple(gaussians.opacities.shape[:-1]), tuple(cameras.intrinsics.shape[:-2])
     if batch != views[:-1]:
@@ -137,6 +144,12 @@ def _check(gaussians: Gaussians, cameras: Cameras, background: Tensor | None) ->
         raise InputError(
             f"render's background has shape {tuple(background.shape)}: "
             f"expected (3,) or {(*views, 3)}."
+        )
+    pixels = (*views, cameras.height, cameras.width)
+    if masks is not None and (tuple(masks.shape) != pixels or masks.dtype != torch.bool):
+        raise InputError(
+            f"render's masks are {masks.dtype} of shape {tuple(masks.shape)}: expected torch.bool "
+            f"of shape {pixels}, one number a pixel."
         )
     named = {f"gaussians.{f.name}": getattr(gaussians, f.name) for f in fields(gaussians)}
     named["cameras.intrinsics"] = cameras.intrinsics

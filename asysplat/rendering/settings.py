@@ -15,16 +15,20 @@ class Skips:
 
     Args:
         opacity: Gaussians below alpha_min are culled before they are projected.
+        frustum: what does not reach into the image is culled before its colour is computed.
         extent: a splat reaches to where its own alpha falls below alpha_min, not that of an
             opaque one.
         ellipse: tiles that its ellipse does not touch are left out, not only those its box misses.
+        masks: tiles in which no pixel counts.
         rows: in a tile, pixel rows out of its reach.
         opaque: what lies behind rows and tiles that are opaque.
     """
 
     opacity: bool = True
+    frustum: bool = True
     extent: bool = True
     ellipse: bool = True
+    masks: bool = True
     rows: bool = True
     opaque: bool = True
 

@@ -56,9 +56,11 @@ class Reconstruction(lightning.LightningModule):
     def reconstruct(self, batch: dict[str, Any], depth: bool) -> Outcome:
         """Gaussians of the inputs and their rendering at the target cameras."""
         gaussians = self.net(batch["inputs"])
-        return Outcome(
-            gaussians, render(gaussians, batch["targets"].cameras, self.background, depth=depth)
+        targets = batch["targets"]
+        rendering = render(
+            gaussians, targets.cameras, self.background, depth=depth, masks=targets.masks
         )
+        return Outcome(gaussians, rendering)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         rendering = self.reconstruct(batch, depth=self.loss.needs_depth).rendering

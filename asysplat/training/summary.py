@@ -74,7 +74,8 @@ def print_summary(results: dict[str, float | int | str], data: str, folder: Path
         f"{results['cost/gaussians']:.0f} Gaussians a scene",
     ]
     if "cost/seconds_per_step" in results:
-        costs.append(f"{results['cost/seconds_per_step']:.2f} s a step")
+        step, rendering = results["cost/seconds_per_step"], results["cost/render_seconds"]
+        costs.append(f"{step:.2f} s a step, {rendering / step:.1%} of it for rendering")
     console.print(", ".join(costs), soft_wrap=True)
     for picture in sorted((folder / "pictures").glob("test-*.png")):
         console.print(f"picture: {picture}", soft_wrap=True)

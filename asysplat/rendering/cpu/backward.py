@@ -8,7 +8,7 @@ own for its gradient: no two threads write to one, and sums have a fixed order.
 import numpy as np
 
 from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.kernel import kernel
+from asysplat.rendering.cpu.kernel import inline, kernel
 from asysplat.rendering.cpu.lanes import (
     HALF,
     LANES,
@@ -40,8 +40,50 @@ BEHIND, G_ALPHA, G_RED, G_GREEN, G_BLUE, G_DEPTH, G_MEDIAN = (
 PLANES = 8
 # Sums over the rows of a splat, for each column: of the exponent's gradient e, e u, e u y, e y,
 # e y^2, and of the values' gradients.
-E, EU, EUY, EY, EYY, RED, GREEN, BLUE, DEPTH, EUX = (PLANES * PIXELS + k * LANES for k in range(10))
+E, EU, EUY, EY, EYY, RED, GREEN, BLUE, DEPTH, EUX = (PLANES * PLANE + k * LANES for k in range(10))
 SUMS = 10
+
+
+@inline
+def draw_row_backward(
+    state, base, dy, a, middle, exponent, color, z, convention, depth, grad_median
+):
+    """Add the row that begins at `base`, `dy` below the splat's centre, to the sums; see
+    `draw_row`."""
+    alpha_min, alpha_max, transmittance_min = convention
+    red, green, blue = color
+    for i in range(LANES):
+        u = fma(a, np.float32(i) - MIDDLE, middle)
+        opacity = alpha_at(u, exponent, alpha_min, alpha_max)
+        before = state[base + i]
+        after = fma(-opacity, before, before)
+        keep = ONE if after >= transmittance_min else ZERO
+        weight = opacity * before * keep
+        state[base + i] = after * keep
+        value = fma(red, state[G_RED + base + i], state[G_ALPHA + base + i])
+        value = fma(green, state[G_GREEN + base + i], value)
+        value = fma(blue, state[G_BLUE + base + i], value)
+        if depth is not None:
+            value = fma(z, state[G_DEPTH + base + i], value)
+        behind = fma(-weight, value, state[BEHIND + base + i])
+        state[BEHIND + base + i] = behind
+        # Clamped alphas do not answer.
+        moves = keep if opacity < alpha_max else ZERO
+        e = moves * fma(weight, value, -opacity * behind / (ONE - opacity))
+        eu, ey = e * u, e * dy
+        state[E + i] += e
+        state[EU + i] += eu
+        state[EUY + i] = fma(eu, dy, state[EUY + i])
+        state[EY + i] += ey
+        state[EYY + i] = fma(ey, dy, state[EYY + i])
+        state[RED + i] = fma(weight, state[G_RED + base + i], state[RED + i])
+        state[GREEN + i] = fma(weight, state[G_GREEN + base + i], state[GREEN + i])
+        state[BLUE + i] = fma(weight, state[G_BLUE + base + i], state[BLUE + i])
+        if depth is not None:
+            state[DEPTH + i] = fma(weight, state[G_DEPTH + base + i], state[DEPTH + i])
+        if grad_median is not None:
+            halved = before > HALF and weight > ZERO and after <= HALF
+            state[DEPTH + i] += state[G_MEDIAN + base + i] if halved else ZERO
 
 
 @kernel
@@ -68,7 +110,6 @@ def rasterize_backward(
 
     The other arguments are those of `rasterize`, its results, and their gradients.
     """
-    alpha_min, alpha_max, transmittance_min = convention
     skip_rows, skip_opaque = skips
     bases = splats.view(np.int32)
     state = aligned(PLANES * PLANE + SUMS * LANES)
@@ -107,7 +148,7 @@ def rasterize_backward(
             u0, b = whitened_start(splats, d, x, y)
             first, last = rows_in_reach(splats, d, y, rows) if skip_rows else (0, rows - 1)
             a, c, log_opacity = splats[d, col.A], splats[d, col.C], splats[d, col.LOG_OPACITY]
-            red, green, blue = splats[d, col.RED], splats[d, col.GREEN], splats[d, col.BLUE]
+            color = (splats[d, col.RED], splats[d, col.GREEN], splats[d, col.BLUE])
             z = splats[d, col.DEPTH]
             for row in range(first, last + 1):
                 if not (live >> row) & 1:
@@ -117,38 +158,9 @@ def rasterize_backward(
                 v = c * dy
                 exponent = fma(-v, v, log_opacity)
                 middle = np.float32(u0 + b * row)
-                for i in range(LANES):
-                    u = fma(a, np.float32(i) - MIDDLE, middle)
-                    opacity = alpha_at(u, exponent, alpha_min, alpha_max)
-                    before = state[base + i]
-                    after = fma(-opacity, before, before)
-                    keep = ONE if after >= transmittance_min else ZERO
-                    weight = opacity * before * keep
-                    state[base + i] = after * keep
-                    value = fma(red, state[G_RED + base + i], state[G_ALPHA + base + i])
-                    value = fma(green, state[G_GREEN + base + i], value)
-                    value = fma(blue, state[G_BLUE + base + i], value)
-                    if depth is not None:
-                        value = fma(z, state[G_DEPTH + base + i], value)
-                    behind = fma(-weight, value, state[BEHIND + base + i])
-                    state[BEHIND + base + i] = behind
-                    # Clamped alphas do not answer.
-                    moves = keep if opacity < alpha_max else ZERO
-                    e = moves * fma(weight, value, -opacity * behind / (ONE - opacity))
-                    eu, ey = e * u, e * dy
-                    state[E + i] += e
-                    state[EU + i] += eu
-                    state[EUY + i] = fma(eu, dy, state[EUY + i])
-                    state[EY + i] += ey
-                    state[EYY + i] = fma(ey, dy, state[EYY + i])
-                    state[RED + i] = fma(weight, state[G_RED + base + i], state[RED + i])
-                    state[GREEN + i] = fma(weight, state[G_GREEN + base + i], state[GREEN + i])
-                    state[BLUE + i] = fma(weight, state[G_BLUE + base + i], state[BLUE + i])
-                    if depth is not None:
-                        state[DEPTH + i] = fma(weight, state[G_DEPTH + base + i], state[DEPTH + i])
-                    if grad_median is not None:
-                        halved = before > HALF and weight > ZERO and after <= HALF
-                        state[DEPTH + i] += state[G_MEDIAN + base + i] if halved else ZERO
+                draw_row_backward(
+                    state, base, dy, a, middle, exponent, color, z, convention, depth, grad_median
+                )
                 if look and is_opaque(state, base):
                     live &= ~(1 << row)
             for i in range(LANES):

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -23,8 +24,15 @@ from asysplat.scene import Cameras, Gaussians
 MOST_PAIRS = 2**31 - 1  # that a list's int32 can number
 
 
-def draw(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Layers:
+def draw(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    settings: Settings,
+    masks: Bool[Tensor, "B V H W"] | None = None,
+) -> Layers:
     """Gaussians [B, N] and cameras [B, V] to layers of B V images, float32.
+
+    What it draws where `masks` is False has no meaning.
 
     Raises:
         InputError: tensors elsewhere than on a CPU; more pairs of splat and tile than a list can
@@ -46,6 +54,7 @@ def draw(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Layers:
         cameras.intrinsics,
         (cameras.height, cameras.width),
         settings,
+        masks if settings.skips.masks else None,
         stats,
     )
     return Layers(image, alpha, depth, stats)
@@ -97,7 +106,7 @@ class _Frame(NamedTuple):
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(ctx, *args):
-        *tensors, (height, width), settings, stats = args
+        *tensors, (height, width), settings, masks, stats = args
         means, _, _, _, _, cam_to_world, intrinsics = tensors
         batch, num = means.shape[:2]
         views = intrinsics.shape[1]
@@ -122,6 +131,7 @@ class _Draw(torch.autograd.Function):
         alpha = torch.empty(frame.images, height, width)
         depth = torch.empty(frame.images, height, width) if settings.depth else None
         last_entry = np.empty(frame.images * frame.tiles, np.int64)
+        wanted = _wanted_tiles(frame, masks)
         counters = np.empty((frame.images * frame.tiles, col.COUNTERS), np.int64)
         run_blocks(
             rasterize,
@@ -130,6 +140,7 @@ class _Draw(torch.autograd.Function):
             lists.first_entry,
             last_entry,
             lists.entries,
+            wanted,
             frame.grid,
             frame.cutoffs,
             (settings.skips.rows, settings.skips.opaque),
@@ -140,7 +151,9 @@ class _Draw(torch.autograd.Function):
         )
         rows, in_reach = counters.sum(0).tolist()
         drawn = int((last_entry - lists.first_entry[:-1]).sum())
-        stats["pairs_behind_opaque"] = stats["pairs"] - drawn
+        masked = int(np.diff(lists.first_entry)[~wanted].sum())
+        stats["pairs_masked"] = masked
+        stats["pairs_behind_opaque"] = stats["pairs"] - masked - drawn
         stats["rows"] = rows
         stats["rows_out_of_reach"] = drawn * col.TILE - in_reach
         stats["rows_opaque"] = in_reach - rows
@@ -179,7 +192,9 @@ class _Draw(torch.autograd.Function):
         )
         fields = [_array(tensor) for tensor in tensors[:5]]
         cameras = _camera_rows(frame, *tensors[5:])
-        field_grads = [_empty_like(tensor) for tensor in tensors[:5]]
+        sh_needed, cameras_needed = ctx.needs_input_grad[4], any(ctx.needs_input_grad[5:7])
+        field_grads = [_empty_like(tensor) for tensor in tensors[:4]]
+        field_grads.append(_empty_like(tensors[4] if sh_needed else tensors[4][:0]))
         camera_grads = np.empty((frame.images, frame.blocks, col.CAMERA_GRADIENT))
         run_blocks(
             project_backward,
@@ -193,18 +208,18 @@ class _Draw(torch.autograd.Function):
             frame.block_size,
             frame.projection,
             settings.antialiased,
+            (sh_needed, cameras_needed),
             lists.first_pair,
             pair_grads,
             *(_array(grad) for grad in field_grads),
             camera_grads,
         )
-        return (
-            *field_grads,
-            *_camera_gradients(camera_grads.sum(1), *tensors[5:]),
-            None,
-            None,
-            None,
+        if not sh_needed:
+            field_grads[-1] = None
+        poses = (
+            _camera_gradients(camera_grads.sum(1), *tensors[5:]) if cameras_needed else (None,) * 2
         )
+        return (*field_grads, *poses, *(None,) * 4)
 
 
 def _make_lists(
@@ -228,7 +243,7 @@ def _make_lists(
         frame.size,
         frame.projection,
         frame.settings.antialiased,
-        (skips.opacity, skips.extent, skips.ellipse),
+        (skips.opacity, skips.frustum, skips.extent, skips.ellipse),
         splats,
         counts,
         corners,
@@ -244,6 +259,7 @@ def _make_lists(
             "set views_at_once, or render smaller Gaussians."
         )
     stats["visible"] = int(np.count_nonzero(counts))
+    stats["culled"] = len(counts) - stats["visible"]
     stats["pairs"] = pairs
     stats["pairs_off_ellipse"] = int(boxes.sum()) - pairs if skips.ellipse else 0
     stats["tile_size"] = col.TILE
@@ -263,6 +279,14 @@ def _make_lists(
         entries,
     )
     return _Lists(splats, first_pair, first_entry, entries)
+
+
+def _wanted_tiles(frame: _Frame, masks: Tensor | None) -> np.ndarray:
+    """[images * tiles] whether any pixel counts."""
+    if masks is None:
+        return np.ones(frame.images * frame.tiles, np.bool_)
+    counts = masks.flatten(0, 1).to(torch.float32)
+    return torch.nn.functional.max_pool2d(counts, col.TILE, ceil_mode=True).flatten().numpy() > 0
 
 
 def _by_kind(depth: Tensor | None, settings: Settings) -> tuple[np.ndarray | None, ...]:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.kernel import kernel
+from asysplat.rendering.cpu.kernel import inline, kernel
 from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, ONE, ZERO, alpha_at, fma, prefetch
 from asysplat.rendering.cpu.sort import DIGITS, RADIX, sort_by_depth
 from asysplat.rendering.cpu.tile import (
@@ -24,6 +24,31 @@ ALPHA, RED, GREEN, BLUE, DEPTH, MEDIAN = (plane * PLANE for plane in range(1, 7)
 PLANES = 7
 
 
+@inline
+def draw_row(state, base, a, middle, exponent, color, z, convention, depth, median):
+    """Blend a splat into the row that begins at `base`: alpha = 2^(exponent - u^2), where u grows
+    by `a` a pixel and is `middle` in the middle."""
+    alpha_min, alpha_max, transmittance_min = convention
+    red, green, blue = color
+    for i in range(LANES):
+        u = fma(a, np.float32(i) - MIDDLE, middle)
+        opacity = alpha_at(u, exponent, alpha_min, alpha_max)
+        before = state[base + i]
+        behind = fma(-opacity, before, before)
+        keep = ONE if behind >= transmittance_min else ZERO
+        weight = opacity * before * keep
+        state[base + i] = behind * keep
+        state[ALPHA + base + i] += weight
+        state[RED + base + i] = fma(weight, red, state[RED + base + i])
+        state[GREEN + base + i] = fma(weight, green, state[GREEN + base + i])
+        state[BLUE + base + i] = fma(weight, blue, state[BLUE + base + i])
+        if depth is not None:
+            state[DEPTH + base + i] = fma(weight, z, state[DEPTH + base + i])
+        if median is not None:
+            halved = before > HALF and weight > ZERO and behind <= HALF
+            state[MEDIAN + base + i] += z if halved else ZERO
+
+
 @kernel
 def rasterize(
     start,
@@ -32,6 +57,7 @@ def rasterize(
     first_entry,
     last_entry,
     entries,
+    wanted,
     grid,
     convention,
     skips,
@@ -48,6 +74,7 @@ def rasterize(
         first_entry: [tiles + 1] where each tile's list begins.
         last_entry: [tiles] is set to where it was left, all its pixels being opaque.
         entries: [pairs, 2] splat and pair of each; sorted in place.
+        wanted: [tiles] whether to draw it.
         grid: columns of tiles, tiles of an image, height, width.
         convention: alpha_min, alpha_max, transmittance_min, float32.
         skips: whether to skip rows out of reach, and those that are opaque.
@@ -55,7 +82,6 @@ def rasterize(
             None: then they cost nothing. Every pixel is written.
         counters: [tiles, COUNTERS].
     """
-    alpha_min, alpha_max, transmittance_min = convention
     skip_rows, skip_opaque = skips
     bases = splats.view(np.int32)
     longest = 0
@@ -68,6 +94,8 @@ def rasterize(
     for tile in range(start, stop):
         picture, left, top, rows, columns = corner(tile, grid)
         position, end = first_entry[tile], first_entry[tile + 1]
+        if not wanted[tile]:
+            end = position
         sort_by_depth(entries, position, end, splats, keys, scratch, digits)
         state[:PIXELS] = ONE
         state[PIXELS:] = ZERO
@@ -82,7 +110,7 @@ def rasterize(
             u0, b = whitened_start(splats, d, x, y)
             first, last = rows_in_reach(splats, d, y, rows) if skip_rows else (0, rows - 1)
             a, c, log_opacity = splats[d, col.A], splats[d, col.C], splats[d, col.LOG_OPACITY]
-            red, green, blue = splats[d, col.RED], splats[d, col.GREEN], splats[d, col.BLUE]
+            color = (splats[d, col.RED], splats[d, col.GREEN], splats[d, col.BLUE])
             z = splats[d, col.DEPTH]
             in_reach += last - first + 1
             for row in range(first, last + 1):
@@ -93,23 +121,7 @@ def rasterize(
                 v = c * np.float32(y + row)
                 exponent = fma(-v, v, log_opacity)
                 middle = np.float32(u0 + b * row)
-                for i in range(LANES):
-                    u = fma(a, np.float32(i) - MIDDLE, middle)
-                    opacity = alpha_at(u, exponent, alpha_min, alpha_max)
-                    before = state[base + i]
-                    behind = fma(-opacity, before, before)
-                    keep = ONE if behind >= transmittance_min else ZERO
-                    weight = opacity * before * keep
-                    state[base + i] = behind * keep
-                    state[ALPHA + base + i] += weight
-                    state[RED + base + i] = fma(weight, red, state[RED + base + i])
-                    state[GREEN + base + i] = fma(weight, green, state[GREEN + base + i])
-                    state[BLUE + base + i] = fma(weight, blue, state[BLUE + base + i])
-                    if depth is not None:
-                        state[DEPTH + base + i] = fma(weight, z, state[DEPTH + base + i])
-                    if median is not None:
-                        halved = before > HALF and weight > ZERO and behind <= HALF
-                        state[MEDIAN + base + i] += z if halved else ZERO
+                draw_row(state, base, a, middle, exponent, color, z, convention, depth, median)
                 if look and is_opaque(state, base):
                     live &= ~(1 << row)
         last_entry[tile] = position

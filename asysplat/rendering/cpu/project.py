@@ -64,7 +64,7 @@ def project(
         block_size: Gaussians of a block.
         size: height and width in pixels, columns in tiles.
         convention: alpha_min, log2(alpha_min), eps2d, near, compensation_min.
-        skips: whether to use the opacity cull, the opacity's extent, the exact ellipse.
+        skips: whether to use the culls by opacity and frustum, the opacity's extent, the ellipse.
         splats: [B * V * N, 16], written where visible.
         counts: [B * V * N] pairs of each, 0 where culled.
         corners: [B * V * N, 2] see `count_tiles`; written where there are pairs.
@@ -72,7 +72,7 @@ def project(
         histograms: [B * V, blocks, tiles] pairs of each tile.
     """
     alpha_min = convention[0]
-    skip_opacity, own_extent, exact = skips
+    skip_opacity, skip_frustum, own_extent, exact = skips
     bases = splats.view(np.int32)
     blocks = histograms.shape[1]
     images = cameras.shape[0]
@@ -100,6 +100,7 @@ def project(
                 size,
                 convention,
                 antialiased,
+                skip_frustum,
                 own_extent,
                 found,
             )
@@ -133,7 +134,17 @@ def _any_above(values, limit):
 
 @inline
 def _ellipses(
-    means, quats, scales, opacities, camera, size, convention, antialiased, own_extent, found
+    means,
+    quats,
+    scales,
+    opacities,
+    camera,
+    size,
+    convention,
+    antialiased,
+    skip_frustum,
+    own_extent,
+    found,
 ):
     """Fill `found` for a batch of Gaussians; all arrays but `camera` and `size` are flat."""
     alpha_min, log_alpha_min, eps, near, compensation_min = convention
@@ -172,7 +183,9 @@ def _ellipses(
             & (opacity <= 1)
             & (a > 0)
             & (abs(x + y + b + c) < np.inf)
-            & (x + reach_x >= edge)
+        )
+        inside = (
+            (x + reach_x >= edge)
             & (x - reach_x <= width - edge)
             & (y + reach_y >= edge)
             & (y - reach_y <= height - edge)
@@ -183,7 +196,7 @@ def _ellipses(
         found[WHITEN_C + i] = c * col.WHITEN_TO_LOG2
         found[LOG_OPACITY + i] = log_opacity
         found[REACH_X + i], found[REACH_Y + i] = reach_x, reach_y
-        found[SEEN + i] = 1.0 if seen else 0.0
+        found[SEEN + i] = 1.0 if seen & (inside | (not skip_frustum)) else 0.0
 
 
 @inline

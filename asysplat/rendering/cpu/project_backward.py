@@ -44,6 +44,7 @@ def project_backward(
     block_size,
     convention,
     antialiased,
+    needs,
     first_pair,
     grads,
     grad_means,
@@ -56,6 +57,7 @@ def project_backward(
     """Gradients of blocks start to stop of the scenes' Gaussians.
 
     Args:
+        needs: whether the harmonics' and the cameras' gradients are asked for.
         first_pair: [images * N + 1].
         grads: [pairs, 10].
         grad_means, grad_quats, grad_scales, grad_opacities, grad_sh: [B * N, ...], float32 or
@@ -69,6 +71,7 @@ def project_backward(
     functions, g_functions, pixel = np.empty(16), np.zeros(16), np.empty(col.GRADIENT)
     g_mean, g_quat, g_scale = np.empty(3), np.empty(4), np.empty(3)
     g_sh = np.empty((count, 3))
+    sh_needed, _ = needs
     for index in range(start, stop):
         scene, block = index // blocks, index % blocks
         for view in range(views):
@@ -78,8 +81,9 @@ def project_backward(
             _clear(g_mean)
             _clear(g_quat)
             _clear(g_scale)
-            for k in range(count):
-                _clear(g_sh[k])
+            if sh_needed:
+                for k in range(count):
+                    _clear(g_sh[k])
             g_opacity = 0.0
             for view in range(views):
                 image = scene * views + view
@@ -92,17 +96,18 @@ def project_backward(
                         pixel[k] += grads[pair, k]
                 g_opacity += _splat_backward(
                     g, means, quats, scales, opacities, sh, cameras, image, convention,
-                    antialiased, functions, g_functions, pixel, g_mean, g_quat, g_scale, g_sh,
-                    grad_cameras[image, block],
+                    antialiased, needs, functions, g_functions, pixel, g_mean, g_quat, g_scale,
+                    g_sh, grad_cameras[image, block],
                 )  # fmt: skip
             grad_opacities[g] = g_opacity
             for k in range(3):
                 grad_means[g, k], grad_scales[g, k] = g_mean[k], g_scale[k]
             for k in range(4):
                 grad_quats[g, k] = g_quat[k]
-            for k in range(count):
-                for channel in range(3):
-                    grad_sh[g, k, channel] = g_sh[k, channel]
+            if sh_needed:
+                for k in range(count):
+                    for channel in range(3):
+                        grad_sh[g, k, channel] = g_sh[k, channel]
 
 
 @inline
@@ -121,10 +126,11 @@ def _add3(out, start, factor, values):
 @inline
 def _splat_backward(
     g, means, quats, scales, opacities, sh, cameras, image, convention, antialiased,
-    functions, g_functions, pixel, g_mean, g_quat, g_scale, g_sh, g_camera,
+    needs, functions, g_functions, pixel, g_mean, g_quat, g_scale, g_sh, g_camera,
 ):  # fmt: skip
     """Add one splat's part to the gradients; returns that of the opacity."""
     _, _, eps, _, compensation_min = convention
+    sh_needed, cameras_needed = needs
     right, down = row3(cameras, image, col.RIGHT), row3(cameras, image, col.DOWN)
     forward = row3(cameras, image, col.FORWARD)
     fx, fy = cameras[image, col.FX], cameras[image, col.FY]
@@ -189,10 +195,6 @@ def _splat_backward(
     g_fx = g_x * tangent_x + dot(row_x, g_row_x) / fx
     g_fy = g_y * tangent_y + dot(row_y, g_row_y) / fy
     g_cx, g_cy = g_x, g_y
-    _add3(g_camera, col.RIGHT, fx * inverse_z, g_row_x)
-    _add3(g_camera, col.DOWN, fy * inverse_z, g_row_y)
-    _add3(g_camera, col.FORWARD, -fx * inverse_z * inside_x, g_row_x)
-    _add3(g_camera, col.FORWARD, -fy * inverse_z * inside_y, g_row_y)
     g_inside_x = -fx * inverse_z * dot(forward, g_row_x)
     g_inside_y = -fy * inverse_z * dot(forward, g_row_y)
     g_tangent_x, g_tangent_y = g_x * fx, g_y * fy
@@ -208,9 +210,6 @@ def _splat_backward(
         g_fy -= g_inside_y * inside_y / fy
     g_z -= inverse_z * (g_tangent_x * tangent_x + g_tangent_y * tangent_y)
     g_u, g_v = g_tangent_x * inverse_z, g_tangent_y * inverse_z
-    _add3(g_camera, col.RIGHT, g_u, offset)
-    _add3(g_camera, col.DOWN, g_v, offset)
-    _add3(g_camera, col.FORWARD, g_z, offset)
     g_offset = plus(plus(scaled(g_u, right), g_v, down), g_z, forward)
 
     # Colour.
@@ -227,7 +226,8 @@ def _splat_backward(
         if color > 0:
             g_color = pixel[col.G_RED + channel]
             for k in range(count):
-                g_sh[k, channel] += functions[k] * g_color
+                if sh_needed:
+                    g_sh[k, channel] += functions[k] * g_color
                 g_functions[k] += float(sh[g, k, channel]) * g_color
     g_direction = basis_gradient(direction[0], direction[1], direction[2], count, g_functions)
     g_offset = plus(g_offset, 1 / length, g_direction)
@@ -235,9 +235,14 @@ def _splat_backward(
         g_offset = plus(g_offset, -dot(direction, g_direction) / length, direction)
 
     _add3(g_mean, 0, 1.0, g_offset)
-    _add3(g_camera, col.CENTER, -1.0, g_offset)
-    g_camera[col.FX] += g_fx
-    g_camera[col.FY] += g_fy
-    g_camera[col.CX] += g_cx
-    g_camera[col.CY] += g_cy
+    if cameras_needed:
+        _add3(g_camera, col.RIGHT, 1.0, plus(scaled(g_u, offset), fx * inverse_z, g_row_x))
+        _add3(g_camera, col.DOWN, 1.0, plus(scaled(g_v, offset), fy * inverse_z, g_row_y))
+        through_x = plus(scaled(g_z, offset), -fx * inverse_z * inside_x, g_row_x)
+        _add3(g_camera, col.FORWARD, 1.0, plus(through_x, -fy * inverse_z * inside_y, g_row_y))
+        _add3(g_camera, col.CENTER, -1.0, g_offset)
+        g_camera[col.FX] += g_fx
+        g_camera[col.FY] += g_fy
+        g_camera[col.CX] += g_cx
+        g_camera[col.CY] += g_cy
     return g_opacity

@@ -69,7 +69,7 @@ def count_tiles(splats, bases, d, reach_x, size, exact, histogram, corner):
     count = 0
     for row in range(first_row, last_row + 1):
         first, last = left, right
-        if exact and box > 1:
+        if exact and across > 1 and last_row > first_row:  # else it has no corners to miss
             first, last = tile_columns(splats, bases, d, row, width)
         for column in range(first, last + 1):
             histogram[row * columns + column] += 1

@@ -11,10 +11,12 @@ from asysplat.rendering.settings import Settings
 from asysplat.scene import Cameras, Gaussians
 
 
-def draw(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Layers:
+def draw(
+    gaussians: Gaussians, cameras: Cameras, settings: Settings, masks: Tensor | None = None
+) -> Layers:
     """Gaussians [B, N] and cameras [B, V], of one float type, to layers of B V images.
 
-    It takes none of `settings.skips`.
+    It takes none of `settings.skips`, and so draws masked pixels too.
     """
     splats = project(gaussians, cameras, settings)
     images = cameras.intrinsics.shape[0] * cameras.num_views

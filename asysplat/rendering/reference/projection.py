@@ -39,7 +39,7 @@ class Splats:
     last: Int[Tensor, "M 2"]
 
 
-class _Footprint(NamedTuple):
+class Footprint(NamedTuple):
     offsets: Tensor  # [..., 3] mean - camera centre, world axes
     depths: Tensor  # [...]
     xy: Tensor  # [..., 2]
@@ -60,9 +60,9 @@ def project(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Splat
     whatever does not project to finite numbers (NaN, infinity, a zero quaternion).
     """
     size = (cameras.width, cameras.height)
-    images, indices = _visible(gaussians, cameras, settings)
+    images, indices = find_visible(gaussians, cameras, settings)
     # Only visible pairs enter the graph, so nothing that was culled can send a NaN back.
-    footprint = _footprint(
+    footprint = find_footprint(
         *(
             field.flatten(0, 1).index_select(0, indices)
             for field in (gaussians.means, gaussians.quats, gaussians.scales)
@@ -88,10 +88,12 @@ def project(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Splat
 
 
 @torch.no_grad()
-def _visible(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> tuple[Tensor, Tensor]:
+def find_visible(
+    gaussians: Gaussians, cameras: Cameras, settings: Settings
+) -> tuple[Tensor, Tensor]:
     """Image and flat Gaussian index of every visible pair, in the order of `Splats`."""
     size = (cameras.width, cameras.height)
-    footprint = _footprint(
+    footprint = find_footprint(
         gaussians.means[:, None],
         gaussians.quats[:, None],
         gaussians.scales[:, None],
@@ -121,7 +123,7 @@ def _visible(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> tupl
     return images, order[images, ranks] + scenes * gaussians.num_gaussians
 
 
-def _footprint(
+def find_footprint(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -129,7 +131,7 @@ def _footprint(
     intrinsics: Tensor,
     size: tuple[int, int],
     settings: Settings,
-) -> _Footprint:
+) -> Footprint:
     """Project; all arguments broadcast over their leading dimensions."""
     rotation = cam_to_world[..., :3, :3]
     # Relative to the camera first: exact for scenes far from the origin.
@@ -150,7 +152,7 @@ def _footprint(
     )
     rows = jacobian @ _rotations(quats) * scales[..., None, :]
     ellipse = _whiten(*rows.unbind(-2), settings)
-    return _Footprint(offsets, z, tangents * focal + principal, *ellipse)
+    return Footprint(offsets, z, tangents * focal + principal, *ellipse)
 
 
 def _whiten(row_x: Tensor, row_y: Tensor, settings: Settings) -> tuple[Tensor, Tensor, Tensor]:
@@ -189,7 +191,7 @@ def _rotations(quats: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _pixel_range(
-    footprint: _Footprint, opacities: Tensor, size: tuple[int, int], settings: Settings
+    footprint: Footprint, opacities: Tensor, size: tuple[int, int], settings: Settings
 ) -> tuple[Tensor, Tensor]:
     """First and last pixel (x, y) whose centre the box around alpha >= alpha_min holds."""
     reach = (2 * (opacities / settings.convention.alpha_min).log().clamp_min(0)).sqrt()

@@ -7,7 +7,9 @@ from typing import Any
 import lightning
 import torch
 
+from asysplat.data.datamodule import collate
 from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
+from asysplat.evaluation.render_time import render_seconds, wait_for
 from asysplat.evaluation.static_cost import static_costs
 
 WARM_UP_STEPS = 5
@@ -17,9 +19,9 @@ class Costs(lightning.Callback):
     """Writes `values`, "cost/..." -> number; what needs no running is known before the first step.
 
     Of one scene at the run's views and resolution: see `static_costs`. Measured: the median
-    training step and the peak of memory over all of them (seconds_per_step, peak_gb), the median
-    forward of the network over the test's scenes and the peak of memory in the test
-    (inference_seconds, inference_gb).
+    training step and the peak of memory over all of them (seconds_per_step, peak_gb); what a step
+    renders, with its gradients (render_seconds); the median forward of the network over the test's
+    scenes and the peak of memory in the test (inference_seconds, inference_gb).
     """
 
     def __init__(self):
@@ -50,9 +52,25 @@ class Costs(lightning.Callback):
         measured = self.seconds[WARM_UP_STEPS:]
         if measured:
             self.values["cost/seconds_per_step"] = statistics.median(measured)
+            self.values["cost/render_seconds"] = self._render_seconds(trainer, module)
         self.values["cost/peak_gb"] = peak_memory_gb(module.device)
         for logger in trainer.loggers:
             logger.log_metrics(self.values, step=trainer.global_step)
+
+    @staticmethod
+    def _render_seconds(trainer: lightning.Trainer, module: lightning.LightningModule) -> float:
+        """Of a batch of training, taken to be as many scenes of validation."""
+        data = trainer.datamodule
+        scene = collate([data.evaluation["val"][0]] * data.batch_size)
+        inputs, targets = scene["inputs"].to(module.device), scene["targets"].to(module.device)
+        was_training = module.net.training
+        module.net.eval()  # or the running means of the batch norms would move
+        with torch.no_grad():
+            gaussians = module.net(inputs)
+        module.net.train(was_training)
+        return render_seconds(
+            gaussians, targets.cameras, module.background, module.loss.needs_depth
+        )
 
     def on_test_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         reset_peak_memory(module.device)
@@ -76,9 +94,3 @@ class Costs(lightning.Callback):
     def _elapsed(self, module: lightning.LightningModule) -> float:
         wait_for(module.device)
         return time.perf_counter() - self.started
-
-
-def wait_for(device: torch.device) -> None:
-    """A GPU works on after the call returns; a time is taken when it has finished."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

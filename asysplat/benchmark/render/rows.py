@@ -1,0 +1,66 @@
+"""One 16-pixel row of a tile, over and over: what `rasterize` and `rasterize_backward` do with
+nothing around it, which no renderer of this kind can be faster than."""
+
+import numpy as np
+
+from asysplat.rendering.cpu import backward, forward
+from asysplat.rendering.cpu import layout as col
+from asysplat.rendering.cpu.backward import draw_row_backward
+from asysplat.rendering.cpu.forward import draw_row
+from asysplat.rendering.cpu.kernel import inline, kernel
+from asysplat.rendering.cpu.lanes import LANES, fma
+from asysplat.rendering.cpu.tile import PLANE, aligned
+
+FORWARD_STATE = forward.PLANES * PLANE
+BACKWARD_STATE = backward.PLANES * PLANE + backward.SUMS * LANES
+
+
+@inline
+def row_of(splat, offset, drawn):
+    """Where the state's row begins, how far below the centre it is, the exponent and u."""
+    row = drawn & (col.TILE - 1)
+    x, y = offset
+    dy = np.float32(y + row)
+    v = splat[col.C] * dy
+    middle = float(splat[col.A]) * x + float(splat[col.B]) * (y + row)
+    return row * LANES, dy, fma(-v, v, splat[col.LOG_OPACITY]), np.float32(middle)
+
+
+@kernel
+def forward_rows(start, stop, splat, offset, times, convention, states):
+    """Draw a splat `times` times into each of the tiles start to stop.
+
+    Args:
+        splat: [16], see `layout`.
+        offset: from its centre to the middle of the tile's first row, in pixels.
+        convention: alpha_min, alpha_max, transmittance_min, float32.
+        states: [tiles, FORWARD_STATE], what the tile begins with and ends with.
+    """
+    a, color = splat[col.A], (splat[col.RED], splat[col.GREEN], splat[col.BLUE])
+    z = splat[col.DEPTH]
+    state = aligned(FORWARD_STATE)
+    for tile in range(start, stop):
+        state[:FORWARD_STATE] = states[tile]
+        for drawn in range(times * col.TILE):
+            base, _, exponent, middle = row_of(splat, offset, drawn)
+            draw_row(state, base, a, middle, exponent, color, z, convention, None, None)
+        states[tile] = state[:FORWARD_STATE]
+
+
+@kernel
+def backward_rows(start, stop, splat, offset, times, convention, states):
+    """Take the gradients of a splat `times` times in each of the tiles start to stop.
+
+    Arguments as for `forward_rows`, but that states are [tiles, BACKWARD_STATE].
+    """
+    a, color = splat[col.A], (splat[col.RED], splat[col.GREEN], splat[col.BLUE])
+    z = splat[col.DEPTH]
+    state = aligned(BACKWARD_STATE)
+    for tile in range(start, stop):
+        state[:BACKWARD_STATE] = states[tile]
+        for drawn in range(times * col.TILE):
+            base, dy, exponent, middle = row_of(splat, offset, drawn)
+            draw_row_backward(
+                state, base, dy, a, middle, exponent, color, z, convention, None, None
+            )
+        states[tile] = state[:BACKWARD_STATE]

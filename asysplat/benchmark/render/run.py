@@ -1,0 +1,127 @@
+"""One forward and one backward pass: how long, how much memory, how wrong."""
+
+import ctypes
+import gc
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from asysplat.benchmark.render.backends import Backend
+from asysplat.benchmark.render.cases import Scene
+from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
+from asysplat.rendering import Convention, Skips, render
+from asysplat.scene import Cameras, Gaussians
+
+FIELDS = tuple(field.name for field in fields(Gaussians))
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """
+    Args:
+        gaussians: whose gradients are asked for.
+        cameras: on the same device.
+        weights: [V, 3, H, W] the gradient of the image, from a normal distribution.
+    """
+
+    gaussians: Gaussians
+    cameras: Cameras
+    weights: Tensor
+
+
+@dataclass(frozen=True)
+class Pass:
+    """
+    Args:
+        image: [V, 3, H, W].
+        gradients: of each of FIELDS.
+        forward, backward: seconds.
+        stats: counts of what was done.
+    """
+
+    image: Tensor
+    gradients: tuple[Tensor, ...]
+    forward: float
+    backward: float
+    stats: dict[str, int]
+
+
+def prepare(scene: Scene, device: str) -> Inputs:
+    """The same weights at every call."""
+    gaussians, cameras = (part.to(device) for part in scene)
+    size = (cameras.num_views, 3, cameras.height, cameras.width)
+    weights = torch.randn(size, generator=torch.Generator().manual_seed(1))
+    leaves = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
+    return Inputs(leaves, cameras, weights.to(gaussians.means))
+
+
+def run(backend: Backend, skips: Skips, inputs: Inputs) -> Pass:
+    """Draw, and take the gradients."""
+    fields = [getattr(inputs.gaussians, name) for name in FIELDS]
+    start = _now(backend.device)
+    image, stats = backend.draw(inputs.gaussians, inputs.cameras, skips)
+    middle = _now(backend.device)
+    gradients = torch.autograd.grad(image, fields, inputs.weights)
+    end = _now(backend.device)
+    return Pass(image.detach(), gradients, middle - start, end - middle, stats)
+
+
+def summary(seconds: Sequence[float]) -> dict[str, float]:
+    """Median and interquartile range."""
+    low, median, high = np.percentile(seconds, [25, 50, 75]).tolist()
+    return {"median": median, "iqr": high - low}
+
+
+def peak_gb(backend: Backend, skips: Skips, inputs: Inputs) -> float:
+    """What a pass takes beyond what there was before it, in 1e9 bytes.
+
+    Too small where a process cannot start its peak anew: on a CPU without Linux.
+    """
+    _give_back_memory()
+    reset_peak_memory(backend.device)
+    before = peak_memory_gb(backend.device)
+    run(backend, skips, inputs)
+    return peak_memory_gb(backend.device) - before
+
+
+def truth(scene: Scene, convention: Convention) -> Pass:
+    """The scene in float64."""
+
+    def draw(gaussians, cameras, skips):
+        out = render(gaussians, cameras, backend="reference", depth=False, convention=convention)
+        return out.image, out.stats
+
+    exact = tuple(part.to(torch.float64) for part in scene)
+    return run(Backend("truth", "cpu", draw), Skips(), prepare(exact, "cpu"))
+
+
+def errors(found: Pass, exact: Pass) -> dict[str, float | dict[str, float]]:
+    """Of the image, the largest and the 99th percentile; of each gradient, relative in L2."""
+    wrong = (found.image.cpu().double() - exact.image).abs()
+    pairs = zip(FIELDS, found.gradients, exact.gradients, strict=True)
+    return {
+        "image_max": wrong.max().item(),
+        "image_p99": float(np.percentile(wrong.numpy(), 99)),
+        "gradients": {
+            name: ((grad.cpu().double() - true).norm() / true.norm()).item()
+            for name, grad, true in pairs
+        },
+    }
+
+
+def _now(device: str) -> float:
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def _give_back_memory() -> None:
+    """To the system what was freed: a pass that is given it again would not show as a rise."""
+    gc.collect()
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -1,0 +1,42 @@
+"""Time against error, in one process: python benchmark.py suite=render scenes=[A,C]"""
+
+import json
+import sys
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+from rich.console import Console
+
+from asysplat.benchmark.machine import describe_machine
+from asysplat.benchmark.suites import find_suite
+from asysplat.errors import InputError
+from asysplat.words import exit_at_unknown_words
+
+
+@hydra.main(config_path="conf", config_name="benchmark", version_base="1.3")
+def main(options: DictConfig) -> None:
+    try:
+        benchmark(options)
+    except InputError as error:
+        sys.exit(f"error: {error}")
+
+
+def benchmark(options: DictConfig) -> None:
+    """Measure, print the tables, write <suite>.json and <suite>.png."""
+    suite = find_suite(options.suite)
+    console = Console()
+    results = {"machine": describe_machine(), **suite.measure(options, console)}
+    for table in suite.tables(results):
+        console.print(table)
+    folder = Path(options.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers, picture = (folder / f"{options.suite}{end}" for end in (".json", ".png"))
+    numbers.write_text(json.dumps(results, indent=2) + "\n")
+    suite.plot(results).savefig(picture, dpi=150)
+    console.print(f"numbers: {numbers}\npicture: {picture}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    exit_at_unknown_words()
+    main()

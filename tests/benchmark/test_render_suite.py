@@ -1,0 +1,138 @@
+"""The suite on a tiny scene, and what benchmark.py says to a user."""
+
+import json
+import math
+import os
+import runpy
+import subprocess
+import sys
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from asysplat.benchmark.render.backends import SKIPS, Backend, find_backends
+from asysplat.benchmark.render.cases import CASES, Case, find_cases
+from asysplat.benchmark.render.run import FIELDS, errors, peak_gb, prepare, run, truth
+from asysplat.benchmark.render.stages import STAGES
+from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
+from asysplat.benchmark.suites import find_suite
+from asysplat.errors import InputError
+from asysplat.evaluation.cost import CLEAR_PEAK
+from asysplat.rendering import INRIA, Skips
+
+
+@pytest.fixture(scope="module")
+def measured(repository, tmp_path_factory):
+    """benchmark.py on two scenes of a moment; the numbers, and the folder they are in."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    script = runpy.run_path(str(repository / "benchmark.py"))
+    options = {"suite": "render", "scenes": ["tiny", "twin"], "repeats": 2, "output": folder}
+    twin = partial(pixel_aligned_scene, 8, 16, 16)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(CASES, "tiny", Case(partial(random_scene, 500, 24, 40)))
+        patch.setitem(CASES, "twin", Case(partial(pixel_aligned_scene, 16, 32, 32), twin))
+        script["benchmark"](OmegaConf.create(options))
+    return json.loads((folder / "render.json").read_text()), folder
+
+
+def numbers(value):
+    """All numbers of nested dictionaries and lists."""
+    if isinstance(value, dict | list):
+        inner = value.values() if isinstance(value, dict) else value
+        return [number for part in inner for number in numbers(part)]
+    return [value] if isinstance(value, int | float) else []
+
+
+def test_json_has_every_backend_and_skip(measured):
+    results, folder = measured
+    assert {"cpu", "cores", "threads", "torch", "numba"} <= results["machine"].keys()
+    assert all(math.isfinite(number) for number in numbers(results))
+    rows = {(row["scene"], row["backend"], row["without"]): row for row in results["rows"]}
+    assert len(rows) == len(results["rows"])
+    for scene in ("tiny", "twin"):
+        assert (scene, "reference", None) in rows
+        assert all((scene, "cpu", off) in rows for off in (None, *SKIPS))
+    for (scene, backend, _), row in rows.items():
+        size = {"tiny": (500, 24, 40), "twin": (512, 32, 32)}[scene]
+        assert (row["gaussians"], row["height"], row["width"]) == size and row["views"] == 1
+        assert row["threads"] == torch.get_num_threads() and row["peak_gb"] >= 0
+        assert row["error"]["measured_on"]["gaussians"] == {"tiny": 500, "twin": 128}[scene]
+        assert row["error"]["gradients"].keys() == set(FIELDS)
+        assert 0 <= row["error"]["image_p99"] <= row["error"]["image_max"]
+        assert {"visible", "pairs", "tile_size"} <= row["stats"].keys() or backend == "gsplat"
+        assert row["forward"].keys() == row["backward"].keys() == {"median", "iqr"}
+        assert row["faster_than_reference"].keys() == {"forward", "backward"}
+        if backend == "cpu":
+            assert row["stages"].keys() == set(STAGES)
+            for direction in ("forward", "backward"):
+                raster = row["raster"][direction]
+                floor = row["stats"]["rows"] * raster["hot_row"] / row["threads"]
+                assert raster["floor"] == pytest.approx(floor)
+                assert raster["whole_over_raster"] > 1 and raster["over_floor"] > 0
+    assert (folder / "render.png").stat().st_size > 0
+
+
+def test_a_skip_leaves_the_error_as_it_is(measured):
+    results, _ = measured
+    for scene in ("tiny", "twin"):
+        rows = [r for r in results["rows"] if (r["scene"], r["backend"]) == (scene, "cpu")]
+        assert all(row["error"] == rows[0]["error"] for row in rows)
+        by_skip = {row["without"]: row["stats"]["rows"] for row in rows}
+        assert by_skip["rows"] > by_skip[None]
+
+
+def test_errors_are_those_of_image_and_gradients():
+    scene = random_scene(200, 20, 20)
+    exact = truth(scene, INRIA)
+    found = run(find_backends()[0], Skips(), prepare(scene, "cpu"))
+    close = errors(found, exact)
+    assert 0 < close["image_max"] < 1e-3 and max(close["gradients"].values()) < 1e-2
+
+    image = exact.image.clone()
+    image[0, 0, 0, 0] += 1
+    gradients = (exact.gradients[0] * 1.5, *exact.gradients[1:])
+    wrong = errors(replace(exact, image=image, gradients=gradients), exact)
+    assert wrong["image_max"] == pytest.approx(1) and wrong["image_p99"] == 0
+    assert wrong["gradients"] == pytest.approx({name: 0.5 * (name == "means") for name in FIELDS})
+
+
+@pytest.mark.skipif(not os.access(CLEAR_PEAK, os.W_OK), reason="peaks cannot be started anew")
+def test_peak_memory_is_the_rise():
+    def draw(gaussians, cameras, skips):
+        torch.ones(25_000_000)
+        total = sum(getattr(gaussians, name).sum() for name in FIELDS)
+        return total.expand(1, 3, cameras.height, cameras.width), {}
+
+    kept = torch.ones(50_000_000)
+    inputs = prepare(random_scene(10, 8, 8), "cpu")
+    assert peak_gb(Backend("", "cpu", draw), Skips(), inputs) == pytest.approx(0.1, abs=0.02)
+    del kept
+
+
+def test_unknown_words_are_named():
+    with pytest.raises(InputError, match=r"^suite=rendr is unknown: choose one of render\.$"):
+        find_suite("rendr")
+    with pytest.raises(InputError, match=r"^scenes=D is unknown: .*A, B, C, 524k, 4M"):
+        find_cases(["A", "D"])
+    with pytest.raises(InputError, match=r"^scenes=.* unknown"):
+        find_cases([])
+    assert find_cases("all").keys() == CASES.keys()
+    assert list(find_cases(["C", "A"])) == ["C", "A"] and list(find_cases("4M")) == ["4M"]
+
+
+@pytest.mark.parametrize(
+    "word, says", [("scenes=[A,D]", "scenes=D is unknown"), ("repeats=0", "repeats=0 cannot be")]
+)
+def test_a_mistake_is_one_sentence(repository, tmp_path, word, says):
+    result = subprocess.run(
+        [sys.executable, "benchmark.py", word, f"output={tmp_path}"],
+        cwd=repository,
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode != 0
+    assert result.stderr.startswith(f"error: {says}") and result.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())

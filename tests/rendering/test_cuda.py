@@ -1,0 +1,226 @@
+"""The Triton renderer against the reference in float64: on a GPU, or in Triton's interpreter.
+
+Triton reads TRITON_INTERPRET when it is first imported, so one test runs this file a second time,
+in a process that has it set: there, what is marked `kernel` runs on a CPU.
+"""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from asysplat.errors import InputError
+from asysplat.rendering import GSPLAT_1_5, Skips, cpu, cuda, reference
+from asysplat.rendering.cuda.projection import project
+from asysplat.rendering.cuda.sums import Gather
+from asysplat.rendering.cuda.tiles import TILE, assign_tiles
+from asysplat.rendering.settings import Settings
+from asysplat.scene import Cameras, Gaussians
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+DEVICE = "cpu" if INTERPRETED else "cuda"
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def kernel(test):
+    """Runs where there is a device for kernels."""
+    return test if INTERPRETED else pytest.mark.gpu(test)
+
+
+def weighted_sum(image):
+    generator = torch.Generator().manual_seed(1)
+    weights = torch.randn(image.shape, generator=generator, dtype=torch.float64)
+    return (image * weights.to(image)).sum()
+
+
+def run(draw, gaussians, cameras, settings):
+    """Layers, and the gradients of every input."""
+    leaves = [getattr(gaussians, name) for name in FIELDS]
+    leaves = [
+        t.detach().requires_grad_() for t in (*leaves, cameras.cam_to_world, cameras.intrinsics)
+    ]
+    *fields, cam_to_world, intrinsics = leaves
+    views = Cameras(intrinsics, cam_to_world, cameras.height, cameras.width)
+    layers = draw(Gaussians(*fields), views, settings)
+    images = [i for i in (layers.image, layers.alpha, layers.depth) if i is not None]
+    grads = torch.autograd.grad(sum(map(weighted_sum, images)), leaves)
+    return [image.detach() for image in images], grads, layers.stats
+
+
+def make_batch(make_scene, scenes=1, opaque=False, device="cpu", **options):
+    """[scenes, N] and [scenes, V], float32."""
+    pairs = [make_scene(dtype=torch.float32, seed=seed, **options) for seed in range(scenes)]
+    gaussians = Gaussians.stack([scene for scene, _ in pairs])
+    if opaque:  # so that clamping and the stop are met
+        gaussians.opacities.fill_(0.9999)
+        gaussians.scales.mul_(3)
+    return gaussians.to(device), Cameras.stack([views for _, views in pairs]).to(device)
+
+
+def errors(got, exact):
+    """Largest error of each image, and the relative L2 errors of the gradients."""
+    images = [float((a.double() - b).abs().max()) for a, b in zip(got[0], exact[0], strict=True)]
+    grads = zip(got[1], exact[1], strict=True)
+    return images, [float((a.double() - b).norm() / b.norm()) for a, b in grads]
+
+
+CASES = {
+    "batch": ({"scenes": 2, "views": 2, "count": 4}, Settings(depth=None)),
+    "antialiased": ({"height": 17, "width": 31}, Settings(antialiased=True)),
+    "opaque": ({"opaque": True}, Settings(depth="accumulated")),
+    "median": ({"opaque": True, "degree": 0}, Settings(depth="median", convention=GSPLAT_1_5)),
+    "a pixel": ({"height": 1, "width": 1, "degree": 3}, Settings(depth="median")),
+}
+
+
+@kernel
+@pytest.mark.parametrize("name", CASES)
+def test_images_and_gradients_are_those_of_the_reference(make_scene, name):
+    options, settings = CASES[name]
+    scene = make_batch(make_scene, device=DEVICE, **options)
+    exact = run(reference.draw, *(part.to(torch.float64) for part in scene), settings)
+    got = run(cuda.draw, *scene, settings)
+    assert exact[0][1].max() > (0.999 if "opaque" in options else 0.3)
+    assert len(exact[0]) == (2 if settings.depth is None else 3)
+    images, grads = errors(got, exact)
+    assert max(images) <= 1e-6
+    # Behind opaque splats float32 leaves less than that, to the reference as well.
+    _, singles = errors(run(reference.draw, *scene, settings), exact)
+    assert all(error <= max(5e-6, 3 * single) for error, single in zip(grads, singles, strict=True))
+
+
+@kernel
+def test_skips_leave_the_bits(make_scene):
+    scene = make_batch(make_scene, count=20, device=DEVICE)
+    scene[0].scales.mul_(torch.tensor([9.0, 0.3, 0.3], device=DEVICE))
+    scene[0].opacities[:, ::2] = 0.02
+    scene[0].scales[:, 6:8] = 20  # a wall
+    scene[0].opacities[:, 6:8] = 0.9999
+    images, grads, stats = run(cuda.draw, *scene, Settings())
+    assert stats["pairs_off_ellipse"] > 0 and stats["pairs_behind_opaque"] > 0
+    for name in ("extent", "ellipse", "opaque"):
+        other = run(cuda.draw, *scene, Settings(skips=Skips().without(name)))
+        assert all(map(torch.equal, [*images, *grads], [*other[0], *other[1]]))
+        more = "pairs_behind_opaque" if name == "opaque" else "pairs"
+        assert other[2][more] != stats[more]
+
+
+@kernel
+@pytest.mark.parametrize("count", [0, 3])
+def test_nothing_to_see(make_scene, count):
+    gaussians, cameras = make_batch(make_scene, scenes=2, views=2, count=count, device=DEVICE)
+    gaussians.means[..., 2] -= 20
+    images, grads, stats = run(cuda.draw, gaussians, cameras, Settings())
+    assert all((tensor == 0).all() for tensor in (*images, *grads))
+    assert stats["visible"] == 0 and stats["pairs"] == 0
+
+
+@kernel
+def test_float64_is_projected_as_it_is_and_drawn_in_float32(make_scene):
+    scene = make_batch(make_scene, count=3, height=8, width=8, device=DEVICE)
+    scene = [part.to(torch.float64) for part in scene]
+    images, grads, _ = run(cuda.draw, *scene, Settings())
+    assert {image.dtype for image in images} == {torch.float32}
+    assert {grad.dtype for grad in grads} == {torch.float64}
+    exact = run(reference.draw, *scene, Settings())
+    assert max(errors((images, grads), exact)[0]) <= 1e-6
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(INTERPRETED, reason="too large")
+def test_a_large_scene_is_the_same_every_time_and_that_of_the_cpu(make_scene):
+    scene = make_batch(make_scene, views=3, count=20_000, height=256, width=240, device=DEVICE)
+    scene[0].scales.mul_(0.1)
+    first = run(cuda.draw, *scene, Settings())
+    again = run(cuda.draw, *scene, Settings())
+    assert all(map(torch.equal, [*first[0], *first[1]], [*again[0], *again[1]]))
+    images, grads, _ = run(cpu.draw, *(part.to("cpu") for part in scene), Settings())
+    for got, image in zip(first[0], images, strict=True):
+        off = (got.cpu() - image).abs() > 1e-4 * (1 + image.abs())
+        assert off.float().mean() < 1e-3  # at the cut-offs
+    for got, grad in zip(first[1], grads, strict=True):
+        assert (got.cpu() - grad).norm() < 1e-2 * grad.norm()
+
+
+def needles(scene):
+    """Thin and long, the centres of most far outside the image."""
+    gaussians, cameras = scene
+    gaussians.scales.mul_(torch.tensor([100, 0.05, 0.05]))
+    gaussians.means[..., :2].mul_(20)
+    return gaussians, cameras
+
+
+@pytest.mark.parametrize("change", [lambda scene: scene, needles], ids=["blobs", "needles"])
+def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, change):
+    scene = change(make_batch(make_scene, views=2, count=200, height=45, width=50))
+    image_of, splats = project(*scene, Settings())
+    lists = assign_tiles(image_of, splats, 2, (45, 50), Settings())
+    tiles = lists.rows * lists.columns
+    assert (lists.first_entry.diff() >= 0).all() and lists.first_entry[-1] == len(lists.entries)
+    tile = torch.repeat_interleave(lists.first_entry.diff())
+    assert torch.equal(tile // tiles, image_of[lists.entries])
+    # Splats are numbered by depth, and each tile's list is in that order.
+    assert (lists.entries.diff()[tile.diff() == 0] > 0).all()
+    splat_of_pair = torch.repeat_interleave(lists.first_pair.diff())
+    assert torch.equal(splat_of_pair[lists.pairs], lists.entries.long())
+
+    # On a grid eight times as fine as pixels, between the outermost pixel centres of each tile.
+    offsets = torch.arange(0, TILE - 0.9, 1 / 8, dtype=torch.float64) + 0.5
+    fine_x, fine_y = (
+        (torch.arange(0, n * TILE, TILE)[:, None] + offsets).clamp_max(pixels - 0.5).flatten()
+        for n, pixels in ((lists.columns, 50), (lists.rows, 45))
+    )
+    x, y, a, b, c, opacity = splats.double()[:, :6, None, None].unbind(1)
+    dx, dy = fine_x - x, fine_y[:, None] - y
+    alpha = opacity * torch.exp2(-((a * dx + b * dy).square() + (c * dy).square()))
+    alpha = alpha.unflatten(2, (lists.columns, -1)).unflatten(1, (lists.rows, -1))
+    touched = (alpha.amax((2, 4)) >= 1 / 255).flatten(1)
+    listed = torch.zeros_like(touched)
+    listed[lists.entries, tile % tiles] = True
+    assert touched.any() and listed[touched].all()
+    assert listed.sum() <= 1.05 * touched.sum()
+
+
+def test_gather_has_the_gradient_of_index_select():
+    rows = torch.randn(7, 3, 2, dtype=torch.float64, requires_grad=True)
+    index = torch.tensor([5, 0, 0, 3, 5, 5, 1])
+    expected = torch.autograd.grad(weighted_sum(rows.index_select(0, index)), rows)
+    got = torch.autograd.grad(weighted_sum(Gather(index, 7)(rows)), rows)
+    torch.testing.assert_close(got, expected)
+
+
+def test_too_many_pairs_are_an_error(make_scene, monkeypatch):
+    image_of, splats = project(*make_batch(make_scene), Settings())
+    monkeypatch.setattr("asysplat.rendering.cuda.tiles.MOST_PAIRS", 3)
+    with pytest.raises(InputError, match=r"\d+ pairs.* 3: set views_at_once"):
+        assign_tiles(image_of, splats, 1, (13, 17), Settings())
+
+
+@pytest.mark.skipif(INTERPRETED, reason="a CPU will do there")
+def test_tensors_on_a_cpu_are_an_error(make_scene):
+    pytest.importorskip("triton")
+    with pytest.raises(InputError, match=r"'cuda'.* cpu: choose 'auto'.*to\('cuda'\)"):
+        cuda.draw(*make_batch(make_scene), Settings())
+
+
+def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
+    monkeypatch.delitem(sys.modules, "asysplat.rendering.cuda.rasterize", raising=False)
+    monkeypatch.setitem(sys.modules, "triton", None)
+    for name in ("kernel", "forward", "backward"):
+        monkeypatch.delitem(sys.modules, f"asysplat.rendering.cuda.{name}", raising=False)
+    with pytest.raises(InputError, match="'cuda' needs triton: pip install triton"):
+        cuda.draw(*make_batch(make_scene), Settings())
+
+
+@pytest.mark.skipif(INTERPRETED, reason="this is that process")
+def test_kernels_in_the_interpreter():
+    pytest.importorskip("triton")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", __file__],
+        env={**os.environ, "TRITON_INTERPRET": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
