@@ -1,0 +1,156 @@
+"""The backends under test, and what one makes of a scene: images, and gradients of every input."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from asysplat.rendering import render
+from asysplat.scene import Cameras, Gaussians
+
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+INPUTS = (*FIELDS, "cam_to_world", "intrinsics", "background")
+BACKGROUND = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Backend:
+    """Args:
+    name: as `render` calls it.
+    dtype: what its inputs are given in.
+    image_error: largest difference to the float64 reference, of values near 1.
+    gradient_error: the same of a gradient, relative, L2.
+    many: Gaussians of a scene of moderate size.
+    """
+
+    name: str
+    dtype: torch.dtype
+    image_error: float
+    gradient_error: float
+    many: int
+
+    def __str__(self) -> str:
+        return f"{self.name}-{str(self.dtype).removeprefix('torch.')}"
+
+
+EXACT = Backend("reference", torch.float64, 1e-12, 1e-10, 400)
+BACKENDS = (
+    EXACT,
+    Backend("reference", torch.float32, 2e-5, 2e-4, 400),
+    Backend("cpu", torch.float32, 1e-6, 5e-6, 3000),
+)
+FAST = tuple(backend for backend in BACKENDS if backend.name != "reference")
+
+
+@dataclass(frozen=True)
+class Result:
+    """A rendering, and the gradients of INPUTS that one pull on its layers gives."""
+
+    layers: dict[str, Tensor]
+    grads: dict[str, Tensor]
+    stats: dict[str, int]
+
+    @property
+    def image(self) -> Tensor:
+        return self.layers["image"]
+
+    @property
+    def alpha(self) -> Tensor:
+        return self.layers["alpha"]
+
+    @property
+    def depth(self) -> Tensor:
+        return self.layers["depth"]
+
+    def is_finite(self) -> bool:
+        return all(t.isfinite().all() for t in (*self.layers.values(), *self.grads.values()))
+
+
+def both_ways(
+    backend: Backend,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: Tensor = BACKGROUND,
+    pull: Callable[[str, Tensor], Tensor] | None = None,
+    **options,
+) -> Result:
+    """Render in the backend's float type, forward and backward.
+
+    `pull` gives the gradient of a layer from its name and value; a random one of its shape, the
+    same every time, unless told.
+    """
+    leaves = {name: getattr(gaussians, name) for name in FIELDS}
+    leaves |= {"cam_to_world": cameras.cam_to_world, "intrinsics": cameras.intrinsics}
+    leaves["background"] = background
+    leaves = {k: t.detach().to(backend.dtype).clone().requires_grad_() for k, t in leaves.items()}
+    out = render(
+        Gaussians(*(leaves[name] for name in FIELDS)),
+        replace(cameras, intrinsics=leaves["intrinsics"], cam_to_world=leaves["cam_to_world"]),
+        leaves["background"],
+        backend=backend.name,
+        **options,
+    )
+    layers = {"image": out.image, "alpha": out.alpha, "depth": out.depth}
+    layers = {name: layer for name, layer in layers.items() if layer is not None}
+    pulls = [(pull or random_pull)(name, layer.detach()) for name, layer in layers.items()]
+    pulls = [grad.to(backend.dtype) for grad in pulls]
+    grads = torch.autograd.grad(list(layers.values()), list(leaves.values()), pulls)
+    detached = {name: layer.detach() for name, layer in layers.items()}
+    return Result(detached, dict(zip(INPUTS, grads, strict=True)), out.stats)
+
+
+def random_pull(name: str, layer: Tensor) -> Tensor:
+    generator = torch.Generator().manual_seed(len(name))
+    return torch.randn(layer.shape, generator=generator, dtype=torch.float64)
+
+
+def assert_same_bits(one: Result, other: Result) -> None:
+    for name, layer in one.layers.items():
+        assert torch.equal(layer, other.layers[name]), name
+    for name, grad in one.grads.items():
+        assert torch.equal(grad, other.grads[name]), name
+
+
+def assert_close(
+    backend: Backend, result: Result, exact: Result, slack: float = 1, names: tuple = INPUTS
+) -> None:
+    """Layers to the backend's image_error, the named gradients to its gradient_error."""
+    for name, layer in exact.layers.items():
+        bound = slack * backend.image_error * max(1, float(layer.abs().amax()))
+        assert max_error(result.layers[name], layer) <= bound, name
+    for name in names:
+        error = relative_error(result.grads[name], exact.grads[name])
+        assert error <= slack * backend.gradient_error, name
+
+
+def max_error(value: Tensor, exact: Tensor) -> float:
+    return float((value.double() - exact.double()).abs().amax())
+
+
+def relative_error(value: Tensor, exact: Tensor) -> float:
+    """L2; 0 where both are 0."""
+    difference = (value.double() - exact.double()).norm()
+    return float(difference / exact.double().norm()) if difference > 0 else 0.0
+
+
+def assert_as_without(result: Result, clean: Result, gone: int) -> None:
+    """Gaussian `gone` left no trace: the others have the bits that they have without it."""
+    for name, layer in clean.layers.items():
+        assert torch.equal(result.layers[name], layer), name
+    for name, grad in clean.grads.items():
+        if name in FIELDS:
+            # Gaussians first, whether there is a batch or not.
+            lead = result.layers["alpha"].ndim - 3
+            per_gaussian = result.grads[name].movedim(lead, 0)
+            others = torch.arange(len(per_gaussian)) != gone
+            assert (per_gaussian[gone] == 0).all(), name
+            assert torch.equal(per_gaussian[others], grad.movedim(lead, 0)), name
+        else:
+            assert torch.equal(result.grads[name], grad), name
+
+
+def facing(cameras: Cameras) -> Cameras:
+    """The cameras at the origin, looking along z, so that means are in their frame."""
+    poses = torch.eye(4, dtype=cameras.cam_to_world.dtype).expand_as(cameras.cam_to_world)
+    return replace(cameras, cam_to_world=poses.clone())

@@ -1,0 +1,49 @@
+"""Where rounding may decide: pixels at which an alpha or a transmittance is at a cut-off."""
+
+import torch
+from torch import Tensor
+
+from asysplat.rendering.reference.projection import project
+from asysplat.rendering.settings import Settings
+from asysplat.scene import Cameras, Gaussians
+
+ALPHA_ROUNDING = 1e-5  # of itself; float32 leaves a tenth of it
+# The transmittance collects the rounding of 1 - alpha, which is up to 100 times that of alpha.
+TRANSMITTANCE_ROUNDING = 1e-3
+ROWS = 8  # of pixels at a time
+
+
+@torch.no_grad()
+def boundary_band(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Tensor:
+    """[V, H, W] True where some alpha is within rounding of alpha_min or alpha_max, or some
+    transmittance of transmittance_min or, for the median depth, of a half; in float64."""
+    convention = settings.convention
+    scene = gaussians.map(lambda t: t[None].double())
+    splats = project(scene, cameras.map(lambda t: t[None].double()), settings)
+    band = torch.zeros(cameras.num_views, cameras.height, cameras.width, dtype=torch.bool)
+    for view in range(cameras.num_views):
+        own = splats.images == view
+        xy, (a, b, c) = splats.xy[own], splats.whitening[own].unbind(-1)
+        dx = torch.arange(cameras.width) + 0.5 - xy[:, :1]
+        for top in range(0, cameras.height, ROWS):
+            rows = torch.arange(top, min(top + ROWS, cameras.height))
+            dy = (rows + 0.5 - xy[:, 1:])[..., None]  # [M, rows, 1]
+            u = a[:, None, None] * dx[:, None] + b[:, None, None] * dy
+            alpha = (u.square() + (c[:, None, None] * dy).square()).mul_(-0.5).exp_()
+            alpha *= splats.opacities[own, None, None]
+
+            def near(value, limit, rounding):
+                return (value / limit - 1).abs_() < rounding
+
+            jump = near(alpha, convention.alpha_min, ALPHA_ROUNDING)
+            jump |= near(alpha, convention.alpha_max, ALPHA_ROUNDING)
+            alpha.clamp_max_(convention.alpha_max).mul_(alpha >= convention.alpha_min)
+            left = (1 - alpha).cumprod(0)
+            jump |= near(left, convention.transmittance_min, TRANSMITTANCE_ROUNDING)
+            if settings.depth == "median":
+                jump |= near(left, 0.5, ALPHA_ROUNDING)
+            # What lies behind the stop shows nowhere.
+            before = torch.cat((torch.ones_like(left[:1]), left[:-1]))
+            reached = before > convention.transmittance_min * (1 - TRANSMITTANCE_ROUNDING)
+            band[view, rows] = (jump & reached).any(0)
+    return band

@@ -1,0 +1,94 @@
+"""Images and gradients against the float64 reference: tight outside the boundary band, and flips
+within it are counted."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import pytest
+import torch
+from backends import EXACT, FIELDS, INPUTS, Backend, both_ways, random_pull, relative_error
+from band import boundary_band
+from torch import Tensor
+
+from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
+from asysplat.rendering.settings import Settings
+
+OTHERS = tuple(name for name in INPUTS if name not in FIELDS)
+SCENES = {
+    "random": lambda count: random_scene(count, 96, 128),
+    "pixel-aligned": lambda count: pixel_aligned_scene(int((count / 2) ** 0.5), 96, 128),
+}
+# Layers that are pulled at, and options of `render`.
+MODES = {
+    "image": (("image",), {"depth": False}),
+    "image, antialiased": (("image",), {"depth": False, "antialiased": True}),
+    "alpha and depth": (("alpha", "depth"), {"depth": "expected"}),
+}
+UNMENDED = {
+    ("pixel-aligned", "alpha and depth", FIELDS): "what is behind is left of large sums",
+    ("pixel-aligned", "alpha and depth", OTHERS): "what is behind is left of large sums",
+    ("pixel-aligned", "image", OTHERS): "the background is seen through 1 - alpha, which cancels",
+    ("pixel-aligned", "image, antialiased", OTHERS): "as for image",
+}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Of a backend with the reference: band and difference [V, H, W], relative gradient errors."""
+
+    band: Tensor
+    difference: Tensor
+    grads: dict[str, float]
+
+
+@cache
+def compare(backend: Backend, scene: str, mode: str) -> Comparison:
+    gaussians, cameras = SCENES[scene](backend.many)
+    layers, options = MODES[mode]
+    settings = Settings(antialiased=options.get("antialiased", False))
+    band = boundary_band(gaussians, cameras, settings)
+
+    def pull(name, layer):
+        at_band = band[:, None] if name == "image" else band
+        return random_pull(name, layer) * ~at_band * float(name in layers)
+
+    result = both_ways(backend, gaussians, cameras, pull=pull, **options)
+    exact = both_ways(EXACT, gaussians, cameras, pull=pull, **options)
+    difference = [(result.image.double() - exact.image).abs().amax(1)]
+    difference += [
+        (result.layers[name].double() - exact.layers[name]).abs() / exact.layers[name].max()
+        for name in exact.layers
+        if name != "image"
+    ]
+    return Comparison(
+        band,
+        torch.stack(difference).amax(0),
+        {name: relative_error(result.grads[name], exact.grads[name]) for name in INPUTS},
+    )
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("scene", SCENES)
+def test_images_are_those_of_the_reference_outside_the_band(fast_backend, scene, mode):
+    found = compare(fast_backend, scene, mode)
+    flips = int((found.difference > 1e-6).sum())
+    tight = float(found.difference[~found.band].max())
+    print(
+        f"\n{fast_backend}: band {int(found.band.sum())} of {found.band.numel()} pixels, ", end=""
+    )
+    print(f"{flips} flips, largest error outside {tight:.1e}")
+    assert found.band.float().mean() < 0.02
+    assert tight <= 1e-6
+    assert flips < 1e-4 * found.band.numel()
+
+
+@pytest.mark.parametrize("inputs", [FIELDS, OTHERS], ids=["Gaussians", "cameras, background"])
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("scene", SCENES)
+def test_gradients_are_those_of_the_reference(fast_backend, request, scene, mode, inputs):
+    if reason := UNMENDED.get((scene, mode, inputs)):
+        request.applymarker(pytest.mark.xfail(reason=reason, strict=True))
+    found = compare(fast_backend, scene, mode)
+    errors = {name: found.grads[name] for name in inputs}
+    print(f"\n{fast_backend}:", ", ".join(f"{name} {error:.1e}" for name, error in errors.items()))
+    assert max(errors.values()) <= 5e-6

@@ -1,0 +1,84 @@
+"""Gradients against finite differences, and every backend against the reference, in every mode:
+cases 4 and 25."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from backends import BACKGROUND, EXACT, FIELDS, assert_close, both_ways, random_pull
+from soft import FLOOR, MODES, soft_scene
+
+from asysplat.rendering import INRIA, render
+from asysplat.rendering.reference.projection import project
+from asysplat.rendering.settings import Settings
+from asysplat.scene import Gaussians
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_soft_scene_has_no_jump(make_scene, mode):
+    mode = MODES[mode]
+    gaussians, cameras = soft_scene(make_scene, mode)
+    left = torch.ones(2, 5, 6, dtype=torch.float64)
+    for i in range(3):
+        out = render(gaussians.keep(torch.arange(3) == i), cameras, **mode.options)
+        assert out.alpha.min() > 1.1 / 255 and out.alpha.max() < 0.9
+        assert (out.image / out.alpha[:, None]).min() > 0.05  # colours
+        left = left * (1 - out.alpha)
+        if mode.options.get("depth") == "median":
+            assert (left - 0.5).abs().min() > 1e-4  # where it jumps
+    assert left.min() > 1e-3
+    if mode.options.get("convention") is FLOOR:
+        one = project(
+            gaussians.map(lambda t: t[None]),
+            cameras.map(lambda t: t[None]),
+            Settings(FLOOR, antialiased=True),
+        )
+        lowered = one.opacities.sort().values / gaussians.opacities.repeat(2).sort().values
+        at_floor = (lowered - 0.5).abs() < 1e-9
+        assert at_floor.all() if mode.scale < 1 else not at_floor.any()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_case_25_every_gradient_equals_finite_differences(make_scene, mode):
+    mode = MODES[mode]
+    gaussians, cameras = soft_scene(make_scene, mode)
+    leaves = [getattr(gaussians, name) for name in FIELDS]
+    leaves += [cameras.cam_to_world, cameras.intrinsics, BACKGROUND]
+    leaves = [leaf.clone().requires_grad_() for leaf in leaves]
+
+    def outputs(*leaves):
+        *fields, poses, intrinsics, background = leaves
+        views = replace(cameras, cam_to_world=poses, intrinsics=intrinsics)
+        out = render(Gaussians(*fields), views, background, **mode.options)
+        layers = {"image": out.image, "alpha": out.alpha, "depth": out.depth}
+        return tuple((t * random_pull(name, t)).sum((-1, -2)) for name, t in layers.items())
+
+    assert torch.autograd.gradcheck(outputs, leaves, atol=1e-7, fast_mode=True)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_case_25_every_gradient_equals_that_of_the_reference(fast_backend, make_scene, mode):
+    mode = MODES[mode]
+    gaussians, cameras = soft_scene(make_scene, mode, torch.float32)
+    result = both_ways(fast_backend, gaussians, cameras, **mode.options)
+    assert_close(fast_backend, result, both_ways(EXACT, gaussians, cameras, **mode.options))
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e-3, 1e-2, 0.1], ids="{:g} pixels".format)
+def test_case_04_the_floor_of_the_compensation(backend, make_scene, scale):
+    """Under it the opacity stays at the floor, and scales move nothing but the ellipse."""
+    gaussians, cameras = make_scene(count=1, dtype=torch.float32)
+    gaussians.means[:] = torch.tensor([0.0, 0, 2])
+    gaussians.scales.fill_(scale * 2 / 17)
+    gaussians.opacities.fill_(1.0)
+    cameras.cam_to_world[:] = torch.eye(4)
+    cameras.intrinsics[:] = torch.tensor([[17.0, 0, 8.5], [0, 17, 6.5], [0, 0, 1]])
+
+    def pull(name, layer):  # all gradients of one sign, so that none cancel
+        return torch.full_like(layer, float(name == "alpha"))
+
+    result = both_ways(backend, gaussians, cameras, pull=pull, antialiased=True)
+    share = max(scale**4 / (scale**2 + INRIA.eps2d) ** 2, INRIA.compensation_min)
+    assert float(result.alpha[0, 6, 8]) == pytest.approx(share**0.5, rel=1e-5)
+    exact = both_ways(EXACT, gaussians, cameras, pull=pull, antialiased=True)
+    assert_close(backend, result, exact, names=("scales", "opacities"))

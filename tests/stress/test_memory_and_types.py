@@ -1,0 +1,150 @@
+"""Poisoned buffers, types, strides, and what is not asked for: cases 24, 28 and 30."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from backends import BACKGROUND, FIELDS, INPUTS, assert_same_bits, both_ways
+
+from asysplat.rendering import render
+from asysplat.scene import Gaussians
+
+
+@pytest.fixture
+def poisoned_memory(monkeypatch):
+    """Memory that nobody has written holds NaN, or 99 in integers."""
+
+    def poisoned(shape, dtype=float, **options):
+        array = allocate(shape, dtype, **options)
+        array.fill(np.nan if array.dtype.kind == "f" else 99)
+        return array
+
+    allocate = np.empty
+    monkeypatch.setattr(np, "empty", poisoned)
+    torch.use_deterministic_algorithms(True)  # fills torch's
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.parametrize("depth", [False, "expected", "median"])
+def test_case_24_every_element_is_written(backend, make_scene, request, depth):
+    gaussians, cameras = make_scene(count=60, views=3, height=33, width=35, dtype=torch.float32)
+    gaussians.means[::2, 2] -= 10  # culled
+    gaussians.opacities[1::4] = 1.0  # and opaque: some are behind the stop
+    clean = both_ways(backend, gaussians, cameras, depth=depth)
+    request.getfixturevalue("poisoned_memory")
+    assert_same_bits(both_ways(backend, gaussians, cameras, depth=depth), clean)
+
+
+@pytest.mark.parametrize("autocast", [None, torch.bfloat16, torch.float16], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64], ids=str)
+def test_case_28_types(backend, make_scene, dtype, autocast):
+    """Computed in float32 at least; gradients in the inputs' type."""
+    gaussians, cameras = make_scene(views=2, dtype=dtype)
+    background = BACKGROUND.to(dtype, copy=True)
+    leaves = [getattr(gaussians, name) for name in FIELDS]
+    leaves += [cameras.cam_to_world, cameras.intrinsics, background]
+    for leaf in leaves:
+        leaf.requires_grad_()
+    with torch.autocast("cpu", dtype=autocast or torch.bfloat16, enabled=autocast is not None):
+        out = render(gaussians, cameras, background, backend=backend.name)
+    at_least = torch.promote_types(dtype, torch.float32)
+    assert out.image.dtype == out.alpha.dtype == out.depth.dtype == at_least
+    plain = replace(backend, dtype=at_least)
+    result = both_ways(plain, gaussians, cameras, background, pull=lambda _, t: torch.ones_like(t))
+    assert torch.equal(out.image, result.image)
+    (out.image.sum() + out.alpha.sum() + out.depth.sum()).backward()
+    for name, leaf in zip(INPUTS, leaves, strict=True):
+        assert leaf.grad.dtype == dtype
+        torch.testing.assert_close(leaf.grad, result.grads[name].to(dtype), msg=name)
+
+
+def test_case_30_strided_and_expanded_inputs_and_gradients(backend, make_scene):
+    gaussians, cameras = make_scene(count=12, views=3, dtype=torch.float32)
+    gaussians.sh[:] = gaussians.sh[:1]
+    gaussians.opacities[:] = 0.5
+    cameras.intrinsics[:] = cameras.intrinsics[:1]
+    plain = both_ways(backend, gaussians, cameras, pull=lambda _, t: torch.ones_like(t))
+
+    def strided(tensor):
+        return torch.stack((tensor, tensor), -1)[..., 0]
+
+    leaves = {
+        "means": strided(gaussians.means),
+        "quats": gaussians.quats.flip(0),
+        "scales": gaussians.scales.mT.contiguous(),
+        "opacities": gaussians.opacities[0].clone(),
+        "sh": gaussians.sh[:1],
+        "cam_to_world": strided(cameras.cam_to_world),
+        "intrinsics": cameras.intrinsics[0].clone(),
+        "background": torch.tensor([[0.2, 0.5, 0.9]]),
+    }
+    leaves = {k: t.detach().to(backend.dtype).requires_grad_() for k, t in leaves.items()}
+    scene = Gaussians(
+        means=leaves["means"],
+        quats=leaves["quats"].flip(0),
+        scales=leaves["scales"].mT,
+        opacities=leaves["opacities"].expand(12),
+        sh=leaves["sh"].expand(12, -1, -1),
+    )
+    views = replace(
+        cameras,
+        cam_to_world=leaves["cam_to_world"],
+        intrinsics=leaves["intrinsics"].expand(3, 3, 3),
+    )
+    out = render(scene, views, leaves["background"].to(backend.dtype).expand(3, 3), backend.name)
+    torch.testing.assert_close(out.image, plain.image, rtol=0, atol=1e-6)
+    # Strides of an image that lies [W, H, 3] in memory, and of numbers that are all the same.
+    pulls = [torch.ones_like(out.image.mT.contiguous()).mT]
+    pulls += [torch.ones(()).to(backend.dtype).expand_as(layer) for layer in (out.alpha, out.depth)]
+    grads = torch.autograd.grad([out.image, out.alpha, out.depth], list(leaves.values()), pulls)
+    expected = dict(plain.grads)
+    expected["quats"] = expected["quats"].flip(0)
+    expected["scales"] = expected["scales"].mT
+    expected["opacities"] = expected["opacities"].sum()
+    expected["sh"] = expected["sh"].sum(0, keepdim=True)
+    expected["intrinsics"] = expected["intrinsics"].sum(0)
+    for name, grad in zip(INPUTS, grads, strict=True):
+        torch.testing.assert_close(
+            grad, expected[name].reshape(grad.shape), rtol=1e-4, atol=1e-4, msg=name
+        )
+
+
+@pytest.mark.parametrize("depth", ["expected", "median", "accumulated"])
+@pytest.mark.parametrize("used", ["image", "alpha", "depth"])
+def test_case_30_unused_outputs(backend, make_scene, used, depth):
+    """The gradient of one layer is that of all with zeros for the others."""
+    gaussians, cameras = make_scene(views=2, dtype=torch.float32)
+
+    def pull(name, layer):
+        return torch.full_like(layer, float(name == used))
+
+    expected = both_ways(backend, gaussians, cameras, pull=pull, depth=depth)
+    gaussians = gaussians.map(lambda t: t.to(backend.dtype).requires_grad_())
+    background = BACKGROUND.to(backend.dtype)
+    out = render(gaussians, cameras.to(backend.dtype), background, backend.name, depth)
+    grads = torch.autograd.grad(
+        getattr(out, used).sum(), [getattr(gaussians, name) for name in FIELDS], allow_unused=True
+    )
+    for name, grad in zip(FIELDS, grads, strict=True):
+        value = torch.zeros_like(expected.grads[name]) if grad is None else grad
+        torch.testing.assert_close(value, expected.grads[name], rtol=1e-5, atol=1e-5, msg=name)
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_case_30_one_input_alone_needs_a_gradient(backend, make_scene, name):
+    gaussians, cameras = make_scene(views=2, dtype=torch.float32)
+    expected = both_ways(backend, gaussians, cameras, pull=lambda _, t: torch.ones_like(t))
+    gaussians, cameras = gaussians.to(backend.dtype), cameras.to(backend.dtype)
+    background = BACKGROUND.to(backend.dtype, copy=True)
+    record = next((r for r in (gaussians, cameras) if hasattr(r, name)), None)
+    leaf = (background if record is None else getattr(record, name)).requires_grad_()
+    out = render(gaussians, cameras, background, backend=backend.name)
+    (out.image.sum() + out.alpha.sum() + out.depth.sum()).backward()
+    assert torch.equal(leaf.grad, expected.grads[name])
+
+
+def test_case_30_no_input_needs_a_gradient(backend, make_scene):
+    gaussians, cameras = make_scene(dtype=backend.dtype)
+    assert not render(gaussians, cameras, backend=backend.name).image.requires_grad

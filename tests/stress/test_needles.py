@@ -1,0 +1,112 @@
+"""Needles, and scenes far from the origin: the alpha against that of the textbook's formula in
+float32."""
+
+import pytest
+import torch
+from backends import EXACT
+from torch import Tensor
+
+from asysplat.rendering import INRIA, render
+from asysplat.scene import Cameras, Gaussians
+
+COUNT, SIZE = 150, 32
+
+
+def naive_alphas(gaussians: Gaussians, cameras: Cameras) -> Tensor:
+    """[M, H, W] of M scenes of one Gaussian: world to camera by a matrix, the covariance inverted
+    by its determinant xx yy - xy^2, the exponent -(A dx^2 + C dy^2) / 2 - B dx dy; all float32."""
+    to_camera = torch.linalg.inv(cameras.cam_to_world[:, 0])
+    means = gaussians.means[:, 0]
+    homogeneous = torch.cat((means, torch.ones_like(means[:, :1])), -1)
+    x, y, z = (to_camera @ homogeneous[..., None]).squeeze(-1)[:, :3].unbind(-1)
+    fx, fy = cameras.intrinsics[:, 0, 0, 0], cameras.intrinsics[:, 0, 1, 1]
+    cx, cy = cameras.intrinsics[:, 0, 0, 2], cameras.intrinsics[:, 0, 1, 2]
+    w, i, j, k = torch.nn.functional.normalize(gaussians.quats[:, 0], dim=-1).unbind(-1)
+    rotation = torch.stack(
+        (
+            *(1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)),
+            *(2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i)),
+            *(2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j)),
+        ),
+        -1,
+    ).unflatten(-1, (3, 3))
+    spread = rotation * gaussians.scales
+    covariance = spread @ spread.mT
+    margin = INRIA.frustum_margin * SIZE
+    tx = torch.clamp(x / z, (-cx - margin) / fx, (SIZE - cx + margin) / fx)
+    ty = torch.clamp(y / z, (-cy - margin) / fy, (SIZE - cy + margin) / fy)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack((fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z), -1)
+    jacobian = jacobian.unflatten(-1, (2, 3)) @ to_camera[:, :3, :3]
+    projected = jacobian @ covariance @ jacobian.mT
+    xx, xy = projected[:, 0, 0] + INRIA.eps2d, projected[:, 0, 1]
+    yy = projected[:, 1, 1] + INRIA.eps2d
+    det = xx * yy - xy * xy
+    a, b, c = (t[:, None, None] for t in (yy / det, -xy / det, xx / det))
+    pixel = torch.arange(SIZE) + 0.5
+    dx = (pixel - (fx * x / z + cx)[:, None])[:, None, :]
+    dy = (pixel - (fy * y / z + cy)[:, None])[:, :, None]
+    power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
+    alpha = (gaussians.opacities[:, :, None] * power.exp()).clamp(max=INRIA.alpha_max)
+    return torch.where((power <= 0) & (alpha >= INRIA.alpha_min), alpha, 0)
+
+
+def one_each(longest: float, offset: float) -> tuple[Gaussians, Cameras]:
+    """Gaussians of any rotation, each alone before a camera of its own, `offset` from the origin.
+
+    Their axes are log-uniform, the long one from 1 to `longest`, the others from 1e-3 to
+    1 / (10 longest); without `longest` they are 0.1 to 0.3."""
+    generator = torch.Generator().manual_seed(5)
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    if longest:
+        thinness = uniform(COUNT, 1)
+        long, thin = longest**thinness, 1e-3 * (100 / longest) ** -thinness
+        scales = torch.cat((long, thin, thin), -1)
+    else:
+        scales = 0.1 * 3 ** uniform(COUNT, 3)
+    place = uniform(COUNT, 3) * torch.tensor([1, 1, 2]) + torch.tensor([-0.5, -0.5, 2])
+    turn = torch.randn(COUNT, 3, 3, generator=generator, dtype=torch.float64)
+    rotation = torch.linalg.matrix_exp(turn - turn.mT)
+    center = offset * (2 * uniform(COUNT, 3) - 1)
+    poses = torch.eye(4, dtype=torch.float64).repeat(COUNT, 1, 1)
+    poses[:, :3, :3], poses[:, :3, 3] = rotation, center
+    means = center + (rotation @ place[..., None]).squeeze(-1)
+    gaussians = Gaussians(
+        means=means[:, None],
+        quats=torch.randn(COUNT, 1, 4, generator=generator, dtype=torch.float64),
+        scales=scales[:, None],
+        opacities=0.3 + 0.6 * uniform(COUNT, 1),
+        sh=torch.zeros(COUNT, 1, 1, 3),
+    )
+    pinhole = torch.tensor([[SIZE, 0, SIZE / 2], [0, SIZE, SIZE / 2], [0, 0, 1]])
+    cameras = Cameras(pinhole.repeat(COUNT, 1, 1, 1), poses[:, None], SIZE, SIZE)
+    return gaussians.to(torch.float32), cameras.to(torch.float32)
+
+
+@pytest.mark.parametrize(
+    "longest, offset",
+    [
+        pytest.param(1e3, 0.0, id="needles"),
+        pytest.param(0.0, 1e4, id="offset 1e4"),
+        pytest.param(0.0, 1e6, id="offset 1e6"),
+        pytest.param(1e3, 1e6, id="needles at 1e6"),
+    ],
+)
+def test_alpha_is_40_times_nearer_than_by_the_textbook(fast_backend, longest, offset):
+    gaussians, cameras = one_each(longest, offset)
+    exact = render(gaussians.to(EXACT.dtype), cameras.to(EXACT.dtype)).alpha[:, 0]
+    alpha = render(gaussians, cameras, backend=fast_backend.name).alpha[:, 0]
+    naive = naive_alphas(gaussians, cameras)
+    # Where one of them shows, and not within rounding of the cut-off.
+    seen = (exact > 1.001 * INRIA.alpha_min) | (naive > 1.001 * INRIA.alpha_min)
+    seen &= (exact == 0) | (exact > 1.001 * INRIA.alpha_min)
+    assert seen.sum() > 1000
+    ours, theirs = (
+        float(torch.quantile((value.double() - exact).abs()[seen], 0.99))
+        for value in (alpha, naive)
+    )
+    print(f"\n{fast_backend}: alpha error at p99 {ours:.1e}, textbook {theirs:.1e}")
+    assert ours * 40 <= theirs

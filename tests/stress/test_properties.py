@@ -1,0 +1,174 @@
+"""What holds for any scene: the same image and gradients for the same scene said otherwise."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from backends import (
+    BACKENDS,
+    FIELDS,
+    assert_close,
+    both_ways,
+    max_error,
+    random_pull,
+    relative_error,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from asysplat.rendering import INRIA
+from asysplat.scene import Cameras, Gaussians
+
+few = settings(max_examples=4, derandomize=True, deadline=None)
+seeds = st.integers(0, 10**6)
+per_backend = pytest.mark.parametrize("backend", BACKENDS, ids=str)
+
+
+def loosely(backend):
+    """A scene said otherwise is rounded otherwise: its errors are those of float32 inputs."""
+    return max(backend.image_error, 1e-5 if backend.dtype == torch.float32 else 1e-11)
+
+
+@per_backend
+@few
+@given(seed=seeds, permutation=st.permutations(range(12)))
+def test_permutation_of_the_gaussians(make_scene, backend, seed, permutation):
+    gaussians, cameras = make_scene(seed=seed)
+    order = torch.tensor(permutation)
+    before = both_ways(backend, gaussians, cameras)
+    after = both_ways(backend, gaussians.map(lambda t: t[order]), cameras)
+    for name in FIELDS:
+        before.grads[name] = before.grads[name][order]
+    assert_close(backend, after, before)
+
+
+@per_backend
+@few
+@given(seed=seeds, turn=st.tuples(*(st.floats(-3, 3),) * 3))
+def test_rotation_of_world_and_cameras_together(make_scene, backend, seed, turn):
+    gaussians, cameras = make_scene(views=2, degree=0, seed=seed)
+    x, y, z = turn
+    spin = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    rotation = torch.linalg.matrix_exp(spin)
+    half = torch.tensor([0.0, x, y, z], dtype=torch.float64) / 2
+    angle = half.norm()
+    q = torch.sinc(angle / torch.pi) * half
+    q[0] = angle.cos()
+    w, (a, b, c) = q[0], q[1:]
+    product = torch.tensor([[w, -a, -b, -c], [a, w, -c, b], [b, c, w, -a], [c, -b, a, w]])
+    turned = replace(
+        gaussians, means=gaussians.means @ rotation.T, quats=gaussians.quats @ product.double().T
+    )
+    poses = cameras.cam_to_world.clone()
+    poses[:, :3] = rotation @ poses[:, :3]
+    before = both_ways(backend, gaussians, cameras)
+    after = both_ways(backend, turned, replace(cameras, cam_to_world=poses))
+    assert max_error(after.image, before.image) <= loosely(backend)
+    for name in ("scales", "opacities", "sh", "intrinsics", "background"):
+        assert relative_error(after.grads[name], before.grads[name]) <= 10 * loosely(backend), name
+    turned_back = after.grads["means"].double() @ rotation
+    assert relative_error(turned_back, before.grads["means"]) <= 10 * loosely(backend)
+
+
+@per_backend
+@few
+@given(seed=seeds, power=st.floats(-4, 4))
+def test_scaling_of_scene_and_cameras(make_scene, backend, seed, power):
+    gaussians, cameras = make_scene(views=2, seed=seed)
+    factor = 10.0**power
+    poses = cameras.cam_to_world.clone()
+    poses[:, :3, 3] *= factor
+    before = both_ways(backend, gaussians, cameras, depth=False)
+    after = both_ways(
+        backend,
+        gaussians.scale_by(factor),
+        replace(cameras, cam_to_world=poses),
+        depth=False,
+        convention=replace(INRIA, near=INRIA.near * factor),
+    )
+    assert max_error(after.image, before.image) <= loosely(backend)
+    for name in ("means", "scales"):
+        after.grads[name] *= factor
+    after.grads["cam_to_world"][:, :3, 3] *= factor
+    for name, grad in before.grads.items():
+        assert relative_error(after.grads[name], grad) <= 10 * loosely(backend), name
+
+
+@per_backend
+@few
+@given(seed=seeds, batch=st.integers(1, 3), views=st.integers(1, 3))
+def test_splitting_batch_and_views(make_scene, backend, seed, batch, views):
+    scenes = [make_scene(views=views, seed=seed + b) for b in range(batch)]
+    gaussians = Gaussians.stack([scene for scene, _ in scenes])
+    cameras = Cameras.stack([cameras for _, cameras in scenes])
+    together = both_ways(backend, gaussians, cameras)
+    pulls = {name: random_pull(name, layer) for name, layer in together.layers.items()}
+    for b, (scene, poses) in enumerate(scenes):
+        total = dict.fromkeys(FIELDS, 0)
+        for v in range(views):
+
+            def pull(name, _, b=b, v=v):
+                return pulls[name][b, v : v + 1]
+
+            one = both_ways(backend, scene, poses.select([v]), pull=pull)
+            for name, layer in one.layers.items():
+                error = max_error(layer[0], together.layers[name][b, v])
+                assert error <= backend.image_error * max(1, layer.max()), name
+            for name in FIELDS:
+                total[name] = total[name] + one.grads[name]
+            for name in ("cam_to_world", "intrinsics"):
+                error = relative_error(one.grads[name][0], together.grads[name][b, v])
+                assert error <= backend.gradient_error, name
+        for name in FIELDS:
+            error = relative_error(total[name], together.grads[name][b])
+            assert error <= backend.gradient_error, name
+
+
+@per_backend
+@few
+@given(seed=seeds, left=st.integers(0, 20), top=st.integers(0, 20))
+def test_cropping_an_image(make_scene, backend, seed, left, top):
+    """A window of the image is the image of a window whose principal point is shifted; all means
+    are inside both, where the Jacobian is not clamped."""
+    gaussians, cameras = make_scene(height=45, width=45, seed=seed)
+    means = gaussians.means.clone()
+    means[:, :2] = means[:, 2:] * means[:, :2].tanh() * 0.1
+    gaussians = replace(gaussians, means=means, scales=gaussians.scales * 0.3)
+    poses = torch.eye(4, dtype=torch.float64)[None]
+    cameras = replace(cameras, cam_to_world=poses)
+    cameras.intrinsics[:, 0, 2] = cameras.intrinsics[:, 1, 2] = 22.3
+    window = replace(cameras, intrinsics=cameras.intrinsics.clone(), height=25, width=25)
+    window.intrinsics[:, 0, 2] -= left
+    window.intrinsics[:, 1, 2] -= top
+
+    def cut(layer):
+        return layer[..., top : top + 25, left : left + 25]
+
+    def pull_window(name, layer):
+        grad = torch.zeros(layer.shape, dtype=torch.float64)
+        cut(grad)[:] = random_pull(name, cut(layer))
+        return grad
+
+    whole = both_ways(backend, gaussians, cameras, pull=pull_window)
+    part = both_ways(backend, gaussians, window)
+    for name, layer in part.layers.items():
+        error = max_error(layer, cut(whole.layers[name]))
+        assert error <= loosely(backend) * max(1, layer.max()), name
+    for name, grad in part.grads.items():
+        assert relative_error(grad, whole.grads[name]) <= 10 * loosely(backend), name
+
+
+@per_backend
+@few
+@given(
+    seed=seeds,
+    views=st.integers(2, 4),
+    depth=st.sampled_from([False, "expected", "accumulated", "median"]),
+    antialiased=st.booleans(),
+)
+def test_deferred_backpropagation(make_scene, backend, seed, views, depth, antialiased):
+    """One view at a time, drawn twice: the gradient of all at once."""
+    gaussians, cameras = make_scene(views=views, seed=seed)
+    options = {"depth": depth, "antialiased": antialiased}
+    plain = both_ways(backend, gaussians, cameras, **options)
+    assert_close(backend, both_ways(backend, gaussians, cameras, views_at_once=1, **options), plain)

@@ -1,0 +1,85 @@
+"""Images of odd sizes, many tiles, many pairs, many views: cases 15 to 18."""
+
+import numpy as np
+import pytest
+import torch
+from backends import EXACT, assert_close, both_ways, facing
+
+from asysplat.errors import InputError
+from asysplat.rendering import Skips, render
+from asysplat.rendering.cpu.draw import _starts
+from asysplat.rendering.render import BACKENDS
+from asysplat.scene import Cameras, Gaussians
+
+
+@pytest.mark.parametrize("height, width", [(1, 1), (1, 4096), (17, 31), (33, 1)])
+def test_case_15_odd_sizes(backend, make_scene, height, width):
+    gaussians, cameras = make_scene(count=6, height=height, width=width, dtype=torch.float32)
+    result = both_ways(backend, gaussians, cameras)
+    assert result.image.shape == (1, 3, height, width)
+    exact = both_ways(EXACT, gaussians, cameras)
+    assert (exact.alpha > 0.1).any()
+    assert_close(backend, result, exact, slack=5)
+
+
+def test_case_16_more_tiles_than_16_bits_count(backend, make_scene):
+    """Columns of 16384 pixels in 65 views, of which the last alone sees anything."""
+    gaussians, cameras = make_scene(count=3, views=65, height=16384, width=1, dtype=torch.float32)
+    cameras = facing(cameras)
+    cameras.intrinsics[:] = torch.tensor([[20.0, 0, 0.5], [0, 20, 16380], [0, 0, 1]])
+    gaussians.means[:, :2] = 0
+    cameras.cam_to_world[:-1, 2, 3] = 100  # behind all of it
+    result = both_ways(backend, gaussians, cameras)
+    last = both_ways(backend, gaussians, cameras.select([64]))
+    assert result.stats["pairs"] == last.stats["pairs"]
+    assert (result.alpha[:-1] == 0).all()
+    assert (last.alpha[0, 16360:] > 0.1).any()
+    for name, layer in last.layers.items():
+        assert torch.equal(result.layers[name][64:], layer), name
+
+
+def test_case_17_pairs_that_no_list_can_number_are_refused():
+    """2^31 and more of them, on the CPU: 33000 giants over 65536 tiles."""
+    count = 33000
+    giants = Gaussians(
+        means=torch.tensor([0.0, 0, 1]).expand(count, 3),
+        quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4),
+        scales=torch.full((count, 3), 1e10),
+        opacities=torch.full((count,), 0.5),
+        sh=torch.zeros(count, 1, 3),
+    )
+    intrinsics = torch.tensor([[[100.0, 0, 2**19], [0, 100, 0.5], [0, 0, 1]]])
+    cameras = Cameras(intrinsics, torch.eye(4)[None], 1, 2**20)
+    with pytest.raises(InputError, match=rf"{count * 2**16} pairs.*2147483647.*views_at_once"):
+        render(giants, cameras, backend="cpu", skips=Skips().without("ellipse"))
+
+
+def test_case_17_too_little_memory_is_met_by_fewer_views(backend, make_scene, monkeypatch):
+    gaussians, cameras = make_scene(views=5)
+    plain = both_ways(backend, gaussians, cameras)
+    draw = BACKENDS[backend.name]
+
+    def poor(gaussians, cameras, *rest):
+        if cameras.num_views > 3:
+            raise torch.OutOfMemoryError("no memory for more than 3 views")
+        return draw(gaussians, cameras, *rest)
+
+    monkeypatch.setitem(BACKENDS, backend.name, poor)
+    with pytest.warns(UserWarning, match="5 views at once do not fit.*drawing 3 at a time"):
+        result = both_ways(backend, gaussians, cameras)
+    assert_close(backend, result, plain)
+
+
+@pytest.mark.parametrize("views_at_once", [1, 7])
+def test_case_18_many_views_a_few_at_a_time(backend, make_scene, views_at_once):
+    gaussians, cameras = make_scene(views=20, height=5, width=6, dtype=torch.float32)
+    plain = both_ways(backend, gaussians, cameras)
+    chunked = both_ways(backend, gaussians, cameras, views_at_once=views_at_once)
+    for name in ("visible", "pairs", "tile_size"):
+        assert chunked.stats[name] == plain.stats[name]
+    assert_close(backend, chunked, plain)
+
+
+def test_case_18_offsets_are_counted_in_64_bits():
+    most = np.full(3, 2**31 - 1, np.int32)
+    assert _starts(most).tolist() == [0, 2**31 - 1, 2 * (2**31 - 1), 3 * (2**31 - 1)]

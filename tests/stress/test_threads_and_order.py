@@ -1,0 +1,75 @@
+"""The same bits on any number of threads and in every run, and for equal depths an order: cases 26
+and 27."""
+
+import pytest
+import torch
+from backends import EXACT, FIELDS, assert_same_bits, both_ways, max_error
+
+from asysplat.benchmark.scenes import random_scene
+from asysplat.scene import Cameras, Gaussians
+
+
+@pytest.fixture
+def threads():
+    """Sets their number, until the test's end."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("depth", ["expected", "median"])
+def test_case_26_any_number_of_threads_gives_the_same_bits(backend, threads, depth):
+    scenes = [random_scene(backend.many, 48, 64, seed) for seed in range(2)]
+    gaussians = Gaussians.stack([scene for scene, _ in scenes])
+    cameras = Cameras.stack([views for _, views in scenes])
+    cameras = cameras.map(lambda t: t.repeat(1, 2, 1, 1))
+    cameras.cam_to_world[:, 1, 0, 3] = 0.5
+
+    def run(count):
+        threads(count)
+        return both_ways(backend, gaussians, cameras, depth=depth)
+
+    one = run(1)
+    for again in (run(1), run(2), run(2)):
+        assert_same_bits(again, one)
+
+
+def test_case_27_equal_depths_are_drawn_by_index(backend, make_scene):
+    """Copies at one place: over one another as two images are, the first in front."""
+    gaussians, cameras = make_scene(count=1, dtype=torch.float32)
+    gaussians = gaussians.map(lambda t: t.repeat(3, *(1,) * (t.ndim - 1)))
+    gaussians.sh[:] = torch.randn(3, 4, 3)
+    black = torch.zeros(3)
+    single = [
+        both_ways(backend, gaussians.keep(torch.arange(3) == i), cameras, black) for i in range(3)
+    ]
+    left, expected = 1, 0
+    for one in single:
+        expected = expected + left * one.image
+        left = left * (1 - one.alpha)
+    for order in ([0, 1, 2], [2, 0, 1]):
+        shuffled = gaussians.map(lambda t, order=order: t[order])
+        result = both_ways(backend, shuffled, cameras, black)
+        same = max_error(result.image, expected) <= 2 * backend.image_error
+        assert same == (order == [0, 1, 2])
+
+
+@pytest.mark.parametrize("ties", [False, True])
+def test_case_27_the_order_of_the_input_changes_nothing_else(backend, make_scene, ties):
+    """Pairs at one depth keep their order; their gradients move with them."""
+    gaussians, cameras = make_scene(count=40, views=2, dtype=torch.float32)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(3))
+    if ties:
+        gaussians = gaussians.map(lambda t: t.repeat_interleave(2, 0))
+        gaussians.sh[1::2] *= -1
+        order = (2 * order[:, None] + torch.arange(2)).flatten()
+    result = both_ways(backend, gaussians.map(lambda t: t[order]), cameras)
+    plain = both_ways(backend, gaussians, cameras)
+    for name, layer in plain.layers.items():
+        assert max_error(result.layers[name], layer) <= backend.image_error, name
+    for name in FIELDS:
+        torch.testing.assert_close(
+            result.grads[name], plain.grads[name][order], rtol=1e-4, atol=1e-4, msg=name
+        )
+    exact = both_ways(EXACT, gaussians, cameras)
+    assert max_error(result.image, exact.image) <= backend.image_error
