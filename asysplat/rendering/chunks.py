@@ -29,26 +29,36 @@ def draw_in_chunks(
 ) -> Layers:
     """`draw`, with all views at once, or with `views_at_once` of every scene.
 
-    Where the device's memory does not hold all, half as many are tried, and a warning says so.
+    Where memory does not hold them, half as many are tried, and a warning says so.
 
     Raises:
         InputError: views_at_once below 1.
     """
-    if views_at_once is None:
-        try:
-            return draw(gaussians, cameras, settings, masks)
-        except torch.OutOfMemoryError:
-            if cameras.num_views == 1:
-                raise
-        views_at_once = -(-cameras.num_views // 2)
-        warnings.warn(
-            f"render: {cameras.num_views} views at once do not fit into memory; drawing "
-            f"{views_at_once} at a time, and again in the backward pass (views_at_once="
-            f"{views_at_once}).",
-            stacklevel=3,
-        )
-    if views_at_once < 1:
+    if views_at_once is not None and views_at_once < 1:
         raise InputError(f"render's views_at_once is {views_at_once}: give at least 1, or None.")
+    together = min(views_at_once or cameras.num_views, cameras.num_views)
+    while True:
+        try:
+            return _draw(draw, gaussians, cameras, settings, masks, together)
+        except (torch.OutOfMemoryError, MemoryError) as error:
+            if together <= 1:
+                raise
+            together = -(-together // 2)
+            warnings.warn(
+                f"render: memory does not hold so many views at once ({error}); drawing {together} "
+                f"at a time, and again in the backward pass (views_at_once={together}).",
+                stacklevel=3,
+            )
+
+
+def _draw(
+    draw: Draw,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    settings: Settings,
+    masks: Tensor | None,
+    views_at_once: int,
+) -> Layers:
     if views_at_once >= cameras.num_views:
         return draw(gaussians, cameras, settings, masks)
     stats: dict[str, int] = {}
@@ -86,7 +96,7 @@ class _Job:
         masks = None if self.masks is None else self.masks[:, views]
         layers = self.draw(Gaussians(*fields), cameras, self.settings, masks)
         shape = poses.shape[:2]
-        images = (layers.image, layers.alpha, layers.depth)
+        images = (layers.image, layers.alpha, layers.transmittance, layers.depth)
         return layers, [None if image is None else image.unflatten(0, shape) for image in images]
 
 

@@ -2,6 +2,16 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
+LARGEST = 1e18  # depths and harmonics beyond it are culled: their squares overflow float32
+
+
+def single(value: float) -> float:
+    """The float32 nearest to `value`: the renderers that set these constants compute in float32,
+    where two clamped alphas reach the stop, and float64 has to decide as they do."""
+    return float(np.float32(value))
+
 
 @dataclass(frozen=True)
 class Convention:
@@ -19,9 +29,9 @@ class Convention:
             squared.
     """
 
-    alpha_max: float = 0.99
-    alpha_min: float = 1 / 255
-    transmittance_min: float = 1e-4
+    alpha_max: float = single(0.99)
+    alpha_min: float = single(1 / 255)
+    transmittance_min: float = single(1e-4)
     eps2d: float = 0.3
     near: float = 0.01
     frustum_margin: float = 0.15
@@ -31,5 +41,5 @@ class Convention:
 # diff-gaussian-rasterization (Kerbl et al. 2023) and gsplat 1.6; their near planes differ.
 INRIA = Convention()
 # gsplat 1.5.3 clamps alpha later.
-GSPLAT_1_5 = Convention(alpha_max=0.999)
+GSPLAT_1_5 = Convention(alpha_max=single(0.999))
 CONVENTIONS = {"inria": INRIA, "gsplat-1.5": GSPLAT_1_5}

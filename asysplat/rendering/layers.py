@@ -13,6 +13,8 @@ class Layers:
     Args:
         image: [I, 3, H, W] sum of w_i c_i.
         alpha: [I, H, W] sum of w_i.
+        transmittance: [I, H, W] 1 - alpha, but to float32's relative precision also where it is
+            nearly 0.
         depth: [I, H, W] sum of w_i z_i, or the depth of the Gaussian that takes the transmittance
             to half or below, 0 where none does; None unless asked for.
         stats: counts of what was done and of what was skipped.
@@ -20,5 +22,6 @@ class Layers:
 
     image: Float[Tensor, "I 3 H W"]
     alpha: Float[Tensor, "I H W"]
+    transmittance: Float[Tensor, "I H W"]
     depth: Float[Tensor, "I H W"] | None
     stats: dict[str, int]

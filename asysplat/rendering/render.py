@@ -108,14 +108,16 @@ def render(
             return images.to(dtype).unflatten(0, (*batch, cameras.num_views))
 
         image, alpha = shaped(layers.image), shaped(layers.alpha)
+        transmittance = shaped(layers.transmittance)
         distance = None if layers.depth is None else shaped(layers.depth)
         if masks is not None:
-            image, alpha = image.where(masks[..., None, :, :], 0), alpha.where(masks, 0)
+            image = image.where(masks[..., None, :, :], 0)
+            alpha, transmittance = alpha.where(masks, 0), transmittance.where(masks, 1)
             distance = None if distance is None else distance.where(masks, 0)
         if settings.depth == "expected":
             distance = distance / alpha.clamp_min(ALPHA_TINY)
         if background is not None:
-            image = image + (1 - alpha)[..., None, :, :] * background.to(dtype)[..., None, None]
+            image = image + transmittance[..., None, :, :] * background.to(dtype)[..., None, None]
         return Rendering(image, alpha, distance, layers.stats)
 
 

@@ -34,12 +34,27 @@ def tile():
     lists = splats, first_entry, last_entry, entries
     image = np.empty((1, 3, col.TILE, col.TILE), np.float32)
     alpha = np.empty((1, col.TILE, col.TILE), np.float32)
+    transmittance = np.empty((1, col.TILE, col.TILE), np.float32)
     counters = np.empty((1, col.COUNTERS), np.int64)
     skips = (False, False)
     wanted = np.ones(1, np.bool_)
-    rasterize(0, 1, *lists, wanted, GRID, CUTOFFS, skips, image, alpha, None, None, counters)
+    rasterize(
+        0,
+        1,
+        *lists,
+        wanted,
+        GRID,
+        CUTOFFS,
+        skips,
+        image,
+        alpha,
+        transmittance,
+        None,
+        None,
+        counters,
+    )
     assert counters[0, col.ROWS] == TIMES * col.TILE
-    return splat, offset, lists, image, alpha
+    return splat, offset, lists, image, transmittance
 
 
 def planes(state, *starts):
@@ -47,28 +62,28 @@ def planes(state, *starts):
 
 
 def test_forward_rows_draw_what_rasterize_draws(tile):
-    splat, offset, _, image, alpha = tile
+    splat, offset, _, image, transmittance = tile
     state = np.zeros((1, rows.FORWARD_STATE), np.float32)
     state[:, :PIXELS] = 1
     rows.forward_rows(0, 1, splat, offset, TIMES, CUTOFFS, state)
-    assert 0.9 < alpha.max() < 1
-    np.testing.assert_array_equal(planes(state, forward.ALPHA), alpha)
+    assert 0 < transmittance.min() < 0.1
+    np.testing.assert_array_equal(planes(state, 0) + planes(state, forward.REST), transmittance)
     np.testing.assert_array_equal(planes(state, forward.RED, forward.GREEN, forward.BLUE), image[0])
 
 
 def test_backward_rows_sum_what_rasterize_backward_sums(tile):
-    splat, offset, lists, image, alpha = tile
+    splat, offset, lists, image, transmittance = tile
     grads = np.empty((TIMES, col.GRADIENT), np.float32)
     grad_image = np.random.default_rng(0).normal(size=image.shape).astype(np.float32)
-    grad_alpha = np.random.default_rng(1).normal(size=alpha.shape).astype(np.float32)
-    given = image, alpha, None, grad_image, grad_alpha, None, None
+    grad_left = np.random.default_rng(1).normal(size=transmittance.shape).astype(np.float32)
+    given = image, transmittance, None, grad_image, grad_left, None, None
     rasterize_backward(0, 1, *lists, GRID, CUTOFFS, (False, False), *given, grads)
 
     state = np.zeros((1, rows.BACKWARD_STATE), np.float32)
     state[:, :PIXELS] = 1
-    behind = alpha[0] * grad_alpha[0] + (image * grad_image)[0].sum(0)
-    values = (behind, grad_alpha[0], *grad_image[0])
-    starts = (backward.BEHIND, backward.G_ALPHA, backward.G_RED, backward.G_GREEN, backward.G_BLUE)
+    behind = transmittance[0] * grad_left[0] + (image * grad_image)[0].sum(0)
+    values = (behind, *grad_image[0])
+    starts = (backward.BEHIND, backward.G_RED, backward.G_GREEN, backward.G_BLUE)
     for start, plane in zip(starts, values, strict=True):
         state[0, start : start + PIXELS] = plane.reshape(-1)
     rows.backward_rows(0, 1, splat, offset, TIMES, CUTOFFS, state)

@@ -193,7 +193,7 @@ def test_gather_has_the_gradient_of_index_select():
 
 def test_too_many_pairs_are_an_error(make_scene, monkeypatch):
     image_of, splats = project(*make_batch(make_scene), Settings())
-    monkeypatch.setattr("asysplat.rendering.cuda.tiles.MOST_PAIRS", 3)
+    monkeypatch.setattr("asysplat.rendering.limits.MOST_PAIRS", 3)
     with pytest.raises(InputError, match=r"\d+ pairs.* 3: set views_at_once"):
         assign_tiles(image_of, splats, 1, (13, 17), Settings())
 

@@ -65,7 +65,7 @@ def test_case_17_too_little_memory_is_met_by_fewer_views(backend, make_scene, mo
         return draw(gaussians, cameras, *rest)
 
     monkeypatch.setitem(BACKENDS, backend.name, poor)
-    with pytest.warns(UserWarning, match="5 views at once do not fit.*drawing 3 at a time"):
+    with pytest.warns(UserWarning, match="memory does not hold.*drawing 3 at a time"):
         result = both_ways(backend, gaussians, cameras)
     assert_close(backend, result, plain)
 

@@ -33,11 +33,10 @@ from asysplat.rendering.cpu.tile import (
     whitened_start,
 )
 
-# Planes of a tile's state: what passes through; what lies behind, times its gradient; gradients.
-BEHIND, G_ALPHA, G_RED, G_GREEN, G_BLUE, G_DEPTH, G_MEDIAN = (
-    plane * PLANE for plane in range(1, 8)
-)
-PLANES = 8
+# Planes of a tile's state: what passes through; what lies behind, the background included, times
+# its gradient; gradients.
+BEHIND, G_RED, G_GREEN, G_BLUE, G_DEPTH, G_MEDIAN = (plane * PLANE for plane in range(1, 7))
+PLANES = 7
 # Sums over the rows of a splat, for each column: of the exponent's gradient e, e u, e u y, e y,
 # e y^2, and of the values' gradients.
 E, EU, EUY, EY, EYY, RED, GREEN, BLUE, DEPTH, EUX = (PLANES * PLANE + k * LANES for k in range(10))
@@ -60,7 +59,7 @@ def draw_row_backward(
         keep = ONE if after >= transmittance_min else ZERO
         weight = opacity * before * keep
         state[base + i] = after * keep
-        value = fma(red, state[G_RED + base + i], state[G_ALPHA + base + i])
+        value = red * state[G_RED + base + i]
         value = fma(green, state[G_GREEN + base + i], value)
         value = fma(blue, state[G_BLUE + base + i], value)
         if depth is not None:
@@ -98,10 +97,10 @@ def rasterize_backward(
     convention,
     skips,
     image,
-    alpha,
+    transmittance,
     depth,
     grad_image,
-    grad_alpha,
+    grad_transmittance,
     grad_depth,
     grad_median,
     grads,
@@ -120,15 +119,15 @@ def rasterize_backward(
         for row in range(rows):
             for i in range(columns):
                 pixel, at_y, at_x = row * LANES + i, top + row, left + i
-                g_alpha = grad_alpha[picture, at_y, at_x]
                 g_red = grad_image[picture, 0, at_y, at_x]
                 g_green = grad_image[picture, 1, at_y, at_x]
                 g_blue = grad_image[picture, 2, at_y, at_x]
-                behind = alpha[picture, at_y, at_x] * g_alpha
+                behind = (
+                    transmittance[picture, at_y, at_x] * grad_transmittance[picture, at_y, at_x]
+                )
                 behind += image[picture, 0, at_y, at_x] * g_red
                 behind += image[picture, 1, at_y, at_x] * g_green
                 behind += image[picture, 2, at_y, at_x] * g_blue
-                state[G_ALPHA + pixel] = g_alpha
                 state[G_RED + pixel] = g_red
                 state[G_GREEN + pixel] = g_green
                 state[G_BLUE + pixel] = g_blue

@@ -18,10 +18,11 @@ from asysplat.rendering.cpu.project_backward import project_backward
 from asysplat.rendering.cpu.threads import even_bounds, run_blocks, weighted_bounds
 from asysplat.rendering.cpu.tiles import place, start_positions
 from asysplat.rendering.layers import Layers
+from asysplat.rendering.limits import check_pairs
 from asysplat.rendering.settings import Settings
 from asysplat.scene import Cameras, Gaussians
 
-MOST_PAIRS = 2**31 - 1  # that a list's int32 can number
+MOST_SPLATS = 2**25  # in memory at a time: 2 GiB
 
 
 def draw(
@@ -35,6 +36,7 @@ def draw(
     What it draws where `masks` is False has no meaning.
 
     Raises:
+        MemoryError: too many splats at once.
         InputError: tensors elsewhere than on a CPU; more pairs of splat and tile than a list can
             number.
     """
@@ -43,8 +45,11 @@ def draw(
             f"render's backend is 'cpu' and its Gaussians are on {gaussians.means.device}: choose "
             "'auto', or move them with .to('cpu')."
         )
+    images = cameras.intrinsics.shape[:2].numel()
+    if images * gaussians.num_gaussians > MOST_SPLATS and cameras.num_views > 1:
+        raise MemoryError(f"{images} images of {gaussians.num_gaussians} Gaussians")
     stats: dict[str, int] = {}
-    image, alpha, depth = _Draw.apply(
+    layers = _Draw.apply(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
@@ -57,7 +62,7 @@ def draw(
         masks if settings.skips.masks else None,
         stats,
     )
-    return Layers(image, alpha, depth, stats)
+    return Layers(*layers, stats)
 
 
 class _Lists(NamedTuple):
@@ -129,6 +134,7 @@ class _Draw(torch.autograd.Function):
         lists = _make_lists(frame, fields, cameras, stats)
         image = torch.empty(frame.images, 3, height, width)
         alpha = torch.empty(frame.images, height, width)
+        transmittance = torch.empty_like(alpha)
         depth = torch.empty(frame.images, height, width) if settings.depth else None
         last_entry = np.empty(frame.images * frame.tiles, np.int64)
         wanted = _wanted_tiles(frame, masks)
@@ -146,6 +152,7 @@ class _Draw(torch.autograd.Function):
             (settings.skips.rows, settings.skips.opaque),
             image.numpy(),
             alpha.numpy(),
+            transmittance.numpy(),
             *_by_kind(depth, settings),
             counters,
         )
@@ -157,20 +164,21 @@ class _Draw(torch.autograd.Function):
         stats["rows"] = rows
         stats["rows_out_of_reach"] = drawn * col.TILE - in_reach
         stats["rows_opaque"] = in_reach - rows
-        ctx.save_for_backward(*tensors, image, alpha, depth)
+        ctx.save_for_backward(*tensors, image, transmittance, depth)
         ctx.frame, ctx.lists, ctx.last_entry = frame, lists, last_entry
         ctx.set_materialize_grads(False)
-        return image, alpha, depth
+        return image, alpha, transmittance, depth
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_image, grad_alpha, grad_depth):
-        *tensors, image, alpha, depth = ctx.saved_tensors
+    def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth):
+        *tensors, image, transmittance, depth = ctx.saved_tensors
         frame, lists, settings = ctx.frame, ctx.lists, ctx.frame.settings
-        grads = [
-            None if layer is None else _contiguous(grad, layer)
-            for layer, grad in ((image, grad_image), (alpha, grad_alpha), (depth, grad_depth))
-        ]
+        grad_image = _or_zeros(grad_image, image)
+        grad_transmittance = _or_zeros(grad_transmittance, transmittance)
+        if grad_alpha is not None:
+            grad_transmittance = grad_transmittance - grad_alpha
+        grad_depth = None if depth is None else _or_zeros(grad_depth, depth)
         pair_grads = np.empty((len(lists.entries), col.GRADIENT), np.float32)
         run_blocks(
             rasterize_backward,
@@ -183,11 +191,11 @@ class _Draw(torch.autograd.Function):
             frame.cutoffs,
             (settings.skips.rows, settings.skips.opaque),
             image.numpy(),
-            alpha.numpy(),
+            transmittance.numpy(),
             _by_kind(depth, settings)[0],
-            grads[0].numpy(),
-            grads[1].numpy(),
-            *_by_kind(grads[2], settings),
+            grad_image.numpy(),
+            grad_transmittance.numpy(),
+            *_by_kind(grad_depth, settings),
             pair_grads,
         )
         fields = [_array(tensor) for tensor in tensors[:5]]
@@ -230,7 +238,7 @@ def _make_lists(
     splats = np.empty((frame.images * frame.num, col.SPLAT), np.float32)
     counts = np.empty(frame.images * frame.num, np.int32)
     corners = np.empty((frame.images * frame.num, 2), np.int32)
-    boxes = np.empty((frame.images, frame.blocks), np.int64)
+    counters = np.empty((frame.images, frame.blocks, col.PROJECT_COUNTERS), np.int64)
     histograms = np.empty((frame.images, frame.blocks, frame.tiles), np.int32)
     pieces = even_bounds(frame.images * frame.blocks)
     run_blocks(
@@ -247,21 +255,17 @@ def _make_lists(
         splats,
         counts,
         corners,
-        boxes,
+        counters,
         histograms,
     )
     first_entry = _starts(histograms.sum(1, dtype=np.int64).reshape(-1))
     first_pair = _starts(counts)
     pairs = int(first_entry[-1])
-    if pairs > MOST_PAIRS:
-        raise InputError(
-            f"render needs {pairs} pairs of Gaussian and tile, and its lists hold {MOST_PAIRS}: "
-            "set views_at_once, or render smaller Gaussians."
-        )
+    check_pairs(pairs)
     stats["visible"] = int(np.count_nonzero(counts))
-    stats["culled"] = len(counts) - stats["visible"]
+    boxes, stats["culled_by_opacity"], stats["culled_by_frustum"] = counters.sum((0, 1)).tolist()
     stats["pairs"] = pairs
-    stats["pairs_off_ellipse"] = int(boxes.sum()) - pairs if skips.ellipse else 0
+    stats["pairs_off_ellipse"] = boxes - pairs if skips.ellipse else 0
     stats["tile_size"] = col.TILE
     positions = np.empty(histograms.shape, np.int64)
     run_blocks(start_positions, even_bounds(frame.images), histograms, first_entry, positions)
@@ -296,8 +300,8 @@ def _by_kind(depth: Tensor | None, settings: Settings) -> tuple[np.ndarray | Non
     return (None, depth.numpy()) if settings.depth == "median" else (depth.numpy(), None)
 
 
-def _contiguous(grad: Tensor | None, layer: Tensor) -> Tensor:
-    """A gradient that nobody asks for is 0."""
+def _or_zeros(grad: Tensor | None, layer: Tensor) -> Tensor:
+    """A contiguous gradient; that of a layer that was not used is 0."""
     return torch.zeros_like(layer) if grad is None else grad.contiguous()
 
 

@@ -19,9 +19,10 @@ from asysplat.rendering.cpu.tile import (
     whitened_start,
 )
 
-# Planes of a tile's state: what passes through, alpha, colour, depths.
-ALPHA, RED, GREEN, BLUE, DEPTH, MEDIAN = (plane * PLANE for plane in range(1, 7))
-PLANES = 7
+# Planes of a tile's state: what passes through; what passed where nothing may any more; alpha;
+# colour; depths.
+REST, ALPHA, RED, GREEN, BLUE, DEPTH, MEDIAN = (plane * PLANE for plane in range(1, 8))
+PLANES = 8
 
 
 @inline
@@ -38,6 +39,7 @@ def draw_row(state, base, a, middle, exponent, color, z, convention, depth, medi
         keep = ONE if behind >= transmittance_min else ZERO
         weight = opacity * before * keep
         state[base + i] = behind * keep
+        state[REST + base + i] = fma(ONE - keep, before, state[REST + base + i])
         state[ALPHA + base + i] += weight
         state[RED + base + i] = fma(weight, red, state[RED + base + i])
         state[GREEN + base + i] = fma(weight, green, state[GREEN + base + i])
@@ -63,6 +65,7 @@ def rasterize(
     skips,
     image,
     alpha,
+    transmittance,
     depth,
     median,
     counters,
@@ -78,8 +81,8 @@ def rasterize(
         grid: columns of tiles, tiles of an image, height, width.
         convention: alpha_min, alpha_max, transmittance_min, float32.
         skips: whether to skip rows out of reach, and those that are opaque.
-        image: [images, 3, H, W]; alpha, depth, median: [images, H, W], of which the last two may be
-            None: then they cost nothing. Every pixel is written.
+        image: [images, 3, H, W]; alpha, transmittance, depth, median: [images, H, W], of which the
+            last two may be None: then they cost nothing. Every pixel is written.
         counters: [tiles, COUNTERS].
     """
     skip_rows, skip_opaque = skips
@@ -131,6 +134,7 @@ def rasterize(
             for i in range(columns):
                 pixel = row * LANES + i
                 alpha[picture, top + row, left + i] = state[ALPHA + pixel]
+                transmittance[picture, top + row, left + i] = state[pixel] + state[REST + pixel]
                 image[picture, 0, top + row, left + i] = state[RED + pixel]
                 image[picture, 1, top + row, left + i] = state[GREEN + pixel]
                 image[picture, 2, top + row, left + i] = state[BLUE + pixel]

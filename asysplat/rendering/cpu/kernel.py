@@ -1,14 +1,26 @@
 """How every function here is compiled: once, kept on disk, and without Python's lock."""
 
+import hashlib
 import inspect
+import os
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 
+import numba
 from numba import njit
+
+HERE = Path(__file__).parent
 
 
 def kernel(function: Callable) -> Callable:
     """A function that a thread is sent into."""
-    return njit(cache=True, nogil=True, error_model="numpy")(_bare(function))
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = _cache_folder(before)
+    try:
+        return njit(cache=True, nogil=True, error_model="numpy")(_bare(function))
+    finally:
+        numba.config.CACHE_DIR = before
 
 
 def inline(function: Callable) -> Callable:
@@ -19,3 +31,14 @@ def inline(function: Callable) -> Callable:
 def _bare(function: Callable) -> Callable:
     """Without what a type checker has put around it, which cannot be compiled."""
     return inspect.unwrap(function)
+
+
+@cache
+def _cache_folder(asked: str) -> str:
+    """Another one for every version of these sources: Numba looks at a kernel's own file alone, and
+    would keep one whose parts, in other files, have changed."""
+    sources = b"".join(path.read_bytes() for path in sorted(HERE.glob("*.py")))
+    beside = HERE / "__pycache__"
+    home = Path.home() / ".cache" / "asysplat"
+    root = asked or (beside if os.access(HERE, os.W_OK) else home)
+    return str(Path(root) / f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}")

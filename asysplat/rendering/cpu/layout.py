@@ -29,6 +29,11 @@ PIXEL_MARGIN = 1e-3
 
 FARTHEST = 2.0**30  # pixels; of a centre far outside the image, the rest stands in X and Y
 
+# Counters of the projection: tiles that boxes would touch in the place of ellipses; Gaussians that
+# were culled by their opacity; those that were culled outside the image.
+BOXES, FAINT, OUTSIDE = range(3)
+PROJECT_COUNTERS = 3
+
 # Counters of a tile: rows of splats that were drawn; that were in reach before rows got opaque.
 ROWS, ROWS_IN_REACH = range(2)
 COUNTERS = 2

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from asysplat.rendering.convention import LARGEST
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.geometry import (
     clamp,
@@ -23,15 +24,15 @@ from asysplat.rendering.cpu.sh import basis
 from asysplat.rendering.cpu.tiles import count_tiles
 from asysplat.rendering.cpu.vectors import dot, plus, row3, triple
 
-LARGEST = float(np.finfo(np.float32).max)
 TINY = 1e-20  # below the square of any distance that matters
 
 BATCH = 256
-# Rows [BATCH] of what `_ellipses` finds; SEEN is 1 or 0.
+# Rows [BATCH] of what `_ellipses` finds; SEEN is 1, OUTSIDE the image, or 0.
 CENTER_X, CENTER_Y, DEPTH, WHITEN_A, WHITEN_B, WHITEN_C, LOG_OPACITY, REACH_X, REACH_Y, SEEN = (
     BATCH * row for row in range(10)
 )
 FOUND = 10
+OUTSIDE = -1.0
 
 
 @kernel
@@ -53,7 +54,7 @@ def project(
     splats,
     counts,
     corners,
-    boxes,
+    counters,
     histograms,
 ):
     """Splats of blocks start to stop, and how many tiles they touch.
@@ -68,7 +69,7 @@ def project(
         splats: [B * V * N, 16], written where visible.
         counts: [B * V * N] pairs of each, 0 where culled.
         corners: [B * V * N, 2] see `count_tiles`; written where there are pairs.
-        boxes: [B * V, blocks] pairs there would be with boxes in the place of ellipses.
+        counters: [B * V, blocks, PROJECT_COUNTERS], see `layout`.
         histograms: [B * V, blocks, tiles] pairs of each tile.
     """
     alpha_min = convention[0]
@@ -79,74 +80,72 @@ def project(
     num = splats.shape[0] // images
     functions = np.empty(16)
     found = np.empty(FOUND * BATCH)
+    chosen = np.empty(BATCH, np.int32)
+    some_means, some_scales = np.empty(3 * BATCH, means.dtype), np.empty(3 * BATCH, scales.dtype)
+    some_quats, some_opacities = np.empty(4 * BATCH, quats.dtype), np.empty(BATCH, opacities.dtype)
     for index in range(start, stop):
         image, block = index // blocks, index % blocks
         histogram = histograms[image, block]
         histogram[:] = 0
-        touched = 0
         last = min((block + 1) * block_size, num)
+        faint = outside = touched = 0
         for first in range(block * block_size, last, BATCH):
             length = min(BATCH, last - first)
             g, d = image // views * num + first, image * num + first
-            if skip_opacity and not _any_above(opacities[g : g + length], alpha_min):
-                counts[d : d + length] = 0
-                continue
+            counts[d : d + length] = 0
+            kept = _gather(
+                g, length, alpha_min if skip_opacity else -np.inf, means, quats, scales, opacities,
+                chosen, some_means, some_quats, some_scales, some_opacities,
+            )  # fmt: skip
+            faint += length - kept
             _ellipses(
-                means[g : g + length].reshape(-1),
-                quats[g : g + length].reshape(-1),
-                scales[g : g + length].reshape(-1),
-                opacities[g : g + length],
-                cameras[image],
-                size,
-                convention,
-                antialiased,
-                skip_frustum,
-                own_extent,
-                found,
-            )
-            for i in range(length):
-                counts[d + i] = 0
-                if found[SEEN + i] == 0:
+                kept, some_means, some_quats, some_scales, some_opacities, cameras[image], size,
+                convention, antialiased, skip_frustum, own_extent, found,
+            )  # fmt: skip
+            for k in range(kept):
+                if found[SEEN + k] != 1:
+                    outside += found[SEEN + k] == OUTSIDE
                     continue
-                _write_ellipse(found, i, splats, bases, d + i)
+                i = chosen[k]
+                _write_ellipse(found, k, splats, bases, d + i)
                 if _write_color(g + i, d + i, means, sh, cameras, image, functions, splats):
                     counts[d + i], box = count_tiles(
-                        splats,
-                        bases,
-                        d + i,
-                        found[REACH_X + i],
-                        size,
-                        exact,
-                        histogram,
+                        splats, bases, d + i, found[REACH_X + k], size, exact, histogram,
                         corners[d + i],
-                    )
+                    )  # fmt: skip
                     touched += box
-        boxes[image, block] = touched
+        counters[image, block, col.BOXES] = touched
+        counters[image, block, col.FAINT] = faint
+        counters[image, block, col.OUTSIDE] = outside
 
 
 @inline
-def _any_above(values, limit):
-    above = False
-    for value in values:
-        above |= value >= limit
-    return above
+def _gather(
+    g, length, least, means, quats, scales, opacities,
+    chosen, some_means, some_quats, some_scales, some_opacities,
+):  # fmt: skip
+    """Put the Gaussians whose opacity is not below `least` side by side; how many they are."""
+    kept = 0
+    for i in range(length):
+        if opacities[g + i] < least:
+            continue
+        chosen[kept] = i
+        some_opacities[kept] = opacities[g + i]
+        for k in range(3):
+            some_means[3 * kept + k] = means[g + i, k]
+            some_scales[3 * kept + k] = scales[g + i, k]
+        for k in range(4):
+            some_quats[4 * kept + k] = quats[g + i, k]
+        kept += 1
+    return kept
 
 
 @inline
 def _ellipses(
-    means,
-    quats,
-    scales,
-    opacities,
-    camera,
-    size,
-    convention,
-    antialiased,
-    skip_frustum,
-    own_extent,
-    found,
-):
-    """Fill `found` for a batch of Gaussians; all arrays but `camera` and `size` are flat."""
+    count, means, quats, scales, opacities, camera, size,
+    convention, antialiased, skip_frustum, own_extent, found,
+):  # fmt: skip
+    """Fill `found` for the first `count` Gaussians of flat arrays."""
     alpha_min, log_alpha_min, eps, near, compensation_min = convention
     height, width, _ = size
     right, down = triple(camera, col.RIGHT), triple(camera, col.DOWN)
@@ -155,7 +154,7 @@ def _ellipses(
     low_x, high_x = camera[col.LOW_X], camera[col.HIGH_X]
     low_y, high_y = camera[col.LOW_Y], camera[col.HIGH_Y]
     edge = 0.5 - col.PIXEL_MARGIN
-    for i in range(len(opacities)):
+    for i in range(count):
         # Relative to the camera first: exact for scenes far from the origin.
         offset = plus(triple(means, 3 * i), -1.0, center)
         z = dot(forward, offset)
@@ -180,7 +179,7 @@ def _ellipses(
             (z > near)
             & (z < LARGEST)
             & (opacity >= alpha_min)
-            & (opacity <= 1)
+            & (float(opacities[i]) <= 1)
             & (a > 0)
             & (abs(x + y + b + c) < np.inf)
         )
@@ -196,7 +195,8 @@ def _ellipses(
         found[WHITEN_C + i] = c * col.WHITEN_TO_LOG2
         found[LOG_OPACITY + i] = log_opacity
         found[REACH_X + i], found[REACH_Y + i] = reach_x, reach_y
-        found[SEEN + i] = 1.0 if seen & (inside | (not skip_frustum)) else 0.0
+        shown = 1.0 if inside | (not skip_frustum) else OUTSIDE
+        found[SEEN + i] = shown if seen else 0.0
 
 
 @inline
@@ -215,12 +215,12 @@ def _write_ellipse(found, i, splats, bases, d):
     splats[d, col.LOG_OPACITY] = found[LOG_OPACITY + i]
     splats[d, col.DEPTH] = z
     splats[d, col.DEPTH_REST] = z - float(np.float32(z))
-    splats[d, col.REACH_Y] = found[REACH_Y + i] * (1 + 1e-6)
+    splats[d, col.REACH_Y] = min(found[REACH_Y + i] * (1 + 1e-6), col.FARTHEST)
 
 
 @inline
 def _write_color(g, d, means, sh, cameras, image, functions, splats):
-    """The colour seen from the camera; False, and the splat is culled, where it is not finite."""
+    """The colour seen from the camera; False, and the splat is culled, where it is not usable."""
     count = sh.shape[1]
     x = y = z = 0.0
     if count > 1:
@@ -228,11 +228,12 @@ def _write_color(g, d, means, sh, cameras, image, functions, splats):
         length = math.sqrt(max(dot(offset, offset), TINY))
         x, y, z = offset[0] / length, offset[1] / length, offset[2] / length
     basis(x, y, z, count, functions)
+    usable = True
     for channel in range(3):
         color = 0.5
         for k in range(count):
-            color += functions[k] * float(sh[g, k, channel])
+            coefficient = float(sh[g, k, channel])
+            usable &= abs(coefficient) < LARGEST
+            color += functions[k] * coefficient
         splats[d, col.RED + channel] = max(color, 0.0)
-        if not abs(color) < LARGEST:
-            return False
-    return True
+    return usable

@@ -48,4 +48,4 @@ def draw(
         "pairs_behind_opaque": len(lists.entries) - drawn,
         "tile_size": lists.size,
     }
-    return Layers(image, alpha, depth, stats)
+    return Layers(image, alpha, 1 - alpha, depth, stats)

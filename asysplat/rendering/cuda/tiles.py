@@ -7,11 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.errors import InputError
+from asysplat.rendering.limits import check_pairs
 from asysplat.rendering.settings import Settings
 
 TILE = 8  # pixels a side
-MOST_PAIRS = 2**31 - 1  # that torch can sort on a GPU
 
 # What a skip leaves standing, so that rounding never drops what a pixel would have shown.
 EXPONENT_MARGIN = 1e-3  # of log2 alpha
@@ -77,11 +76,7 @@ def assign_tiles(
     counts = _lengths(first, last)
     boxes = (spans * _lengths(*box_columns)).sum()
     total, total_of_boxes = torch.stack((counts.sum(), boxes)).tolist()
-    if total > MOST_PAIRS:
-        raise InputError(
-            f"render needs {total} pairs of Gaussian and tile, and its lists hold {MOST_PAIRS}: "
-            "set views_at_once, or render smaller Gaussians."
-        )
+    check_pairs(total)
     strip, step = _expand(counts, total)
     tile = ((image_of[owner] * rows + row) * columns + first)[strip] + step
     tiles = images * rows * columns

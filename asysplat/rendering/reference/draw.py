@@ -30,6 +30,7 @@ def draw(
     return Layers(
         image=out[:, :3],
         alpha=out[:, 3],
+        transmittance=1 - out[:, 3],
         depth=out[:, 4] if settings.depth else None,
         stats={
             "visible": len(splats.images),

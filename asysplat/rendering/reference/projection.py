@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asysplat.rendering.convention import LARGEST
 from asysplat.rendering.reference.sh import sh_colors
 from asysplat.rendering.settings import Settings
 from asysplat.scene import Cameras, Gaussians
@@ -107,11 +108,13 @@ def find_visible(
     # Written so that NaN compares false.
     visible = (
         (footprint.depths > settings.convention.near)
+        & (footprint.depths < LARGEST)
         & (opacities >= settings.convention.alpha_min)
+        & (gaussians.opacities[:, None] <= 1)
         & (first <= last).all(-1)
         & footprint.whitening.isfinite().all(-1)
         & (footprint.whitening[..., 0] > 0)
-        & gaussians.sh.isfinite().flatten(2).all(-1)[:, None]
+        & (gaussians.sh.abs() < LARGEST).flatten(2).all(-1)[:, None]
     ).flatten(0, 1)
     depths = footprint.depths.flatten(0, 1).where(visible, torch.inf)
     order = torch.argsort(depths, dim=-1, stable=True)

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asysplat.rendering.limits import check_pairs
 from asysplat.rendering.reference.projection import Splats
 
 
@@ -49,6 +50,7 @@ def assign_tiles(splats: Splats, images: int, height: int, width: int, size: int
     # A range that rounding emptied since the visibility test gives no intersection.
     spans = (last - first + 1).clamp_min(0)
     counts = spans.prod(-1)
+    check_pairs(int(counts.sum()))
     splat = torch.repeat_interleave(counts)
     step = torch.arange(len(splat), device=splat.device) - (counts.cumsum(0) - counts)[splat]
     corner = (splats.images * rows + first[:, 1]) * columns + first[:, 0]
