@@ -64,8 +64,8 @@ def _draw(
     stats: dict[str, int] = {}
     job = _Job(draw, settings, masks, cameras.height, cameras.width, views_at_once, stats)
     fields = [getattr(gaussians, name) for name in NAMES if name not in OF_VIEWS]
-    layers = _Deferred.apply(job, *fields, cameras.cam_to_world, cameras.intrinsics)
-    return Layers(*layers, stats)
+    *layers, origin = _Deferred.apply(job, *fields, cameras.cam_to_world, cameras.intrinsics)
+    return Layers(*layers, stats, origin)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +96,8 @@ class _Job:
         masks = None if self.masks is None else self.masks[:, views]
         layers = self.draw(Gaussians(*fields), cameras, self.settings, masks)
         shape = poses.shape[:2]
-        images = (layers.image, layers.alpha, layers.transmittance, layers.depth)
+        images = [layers.image, layers.alpha, layers.transmittance, layers.depth]
+        images.append(layers.depth_origin)
         return layers, [None if image is None else image.unflatten(0, shape) for image in images]
 
 
@@ -138,7 +139,7 @@ class _Deferred(torch.autograd.Function):
             seen = [
                 (image, grad.unflatten(0, shape)[:, views])
                 for image, grad in zip(images, grads, strict=True)
-                if image is not None and grad is not None
+                if grad is not None and image is not None and image.requires_grad
             ]
             torch.autograd.backward(*map(list, zip(*seen, strict=True)))
             for name, total, tensor in zip(NAMES, totals, part, strict=True):

@@ -13,6 +13,7 @@ from asysplat.ops.precision import without_autocast
 from asysplat.rendering import cpu, cuda, reference
 from asysplat.rendering.chunks import draw_in_chunks
 from asysplat.rendering.convention import INRIA, Convention
+from asysplat.rendering.layers import Layers
 from asysplat.rendering.settings import Settings, Skips
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
@@ -109,16 +110,25 @@ def render(
 
         image, alpha = shaped(layers.image), shaped(layers.alpha)
         transmittance = shaped(layers.transmittance)
-        distance = None if layers.depth is None else shaped(layers.depth)
+        distance = None if layers.depth is None else _depth(layers, settings).to(dtype)
+        distance = None if distance is None else distance.unflatten(0, alpha.shape[:-2])
         if masks is not None:
             image = image.where(masks[..., None, :, :], 0)
             alpha, transmittance = alpha.where(masks, 0), transmittance.where(masks, 1)
             distance = None if distance is None else distance.where(masks, 0)
-        if settings.depth == "expected":
-            distance = distance / alpha.clamp_min(ALPHA_TINY)
         if background is not None:
             image = image + transmittance[..., None, :, :] * background.to(dtype)[..., None, None]
         return Rendering(image, alpha, distance, layers.stats)
+
+
+def _depth(layers: Layers, settings: Settings) -> Tensor:
+    """[I, H, W] of the kind that was asked for."""
+    if settings.depth == "median":
+        return layers.depth
+    origin = 0 if layers.depth_origin is None else layers.depth_origin
+    if settings.depth == "accumulated":
+        return layers.depth + origin * layers.alpha
+    return layers.depth / layers.alpha.clamp_min(ALPHA_TINY) + origin * (layers.alpha > 0)
 
 
 def _fast_backend(device: torch.device, dtype: torch.dtype) -> str:

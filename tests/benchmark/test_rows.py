@@ -33,28 +33,13 @@ def tile():
     splats = np.tile(splat, (TIMES, 1))
     lists = splats, first_entry, last_entry, entries
     image = np.empty((1, 3, col.TILE, col.TILE), np.float32)
-    alpha = np.empty((1, col.TILE, col.TILE), np.float32)
-    transmittance = np.empty((1, col.TILE, col.TILE), np.float32)
+    alpha, transmittance, stops = np.empty((3, 1, col.TILE, col.TILE), np.float32)
     counters = np.empty((1, col.COUNTERS), np.int64)
-    skips = (False, False)
-    wanted = np.ones(1, np.bool_)
-    rasterize(
-        0,
-        1,
-        *lists,
-        wanted,
-        GRID,
-        CUTOFFS,
-        skips,
-        image,
-        alpha,
-        transmittance,
-        None,
-        None,
-        counters,
-    )
+    options = np.ones(1, np.bool_), GRID, CUTOFFS, (False, False)
+    layers = image, alpha, transmittance, None, None, stops, None, None
+    rasterize(0, 1, *lists, *options, *layers, counters)
     assert counters[0, col.ROWS] == TIMES * col.TILE
-    return splat, offset, lists, image, transmittance
+    return splat, offset, lists, image, transmittance, stops
 
 
 def planes(state, *starts):
@@ -62,7 +47,7 @@ def planes(state, *starts):
 
 
 def test_forward_rows_draw_what_rasterize_draws(tile):
-    splat, offset, _, image, transmittance = tile
+    splat, offset, _, image, transmittance, _ = tile
     state = np.zeros((1, rows.FORWARD_STATE), np.float32)
     state[:, :PIXELS] = 1
     rows.forward_rows(0, 1, splat, offset, TIMES, CUTOFFS, state)
@@ -72,18 +57,17 @@ def test_forward_rows_draw_what_rasterize_draws(tile):
 
 
 def test_backward_rows_sum_what_rasterize_backward_sums(tile):
-    splat, offset, lists, image, transmittance = tile
+    splat, offset, lists, image, transmittance, stops = tile
     grads = np.empty((TIMES, col.GRADIENT), np.float32)
     grad_image = np.random.default_rng(0).normal(size=image.shape).astype(np.float32)
     grad_left = np.random.default_rng(1).normal(size=transmittance.shape).astype(np.float32)
-    given = image, transmittance, None, grad_image, grad_left, None, None
+    given = transmittance, stops, None, None, grad_image, grad_left, None, None
     rasterize_backward(0, 1, *lists, GRID, CUTOFFS, (False, False), *given, grads)
 
     state = np.zeros((1, rows.BACKWARD_STATE), np.float32)
-    state[:, :PIXELS] = 1
-    behind = transmittance[0] * grad_left[0] + (image * grad_image)[0].sum(0)
-    values = (behind, *grad_image[0])
-    starts = (backward.BEHIND, backward.G_RED, backward.G_GREEN, backward.G_BLUE)
+    behind = transmittance[0] * grad_left[0]
+    values = (transmittance[0], behind, stops[0], *grad_image[0])
+    starts = (0, backward.BEHIND, backward.STOP, backward.G_RED, backward.G_GREEN, backward.G_BLUE)
     for start, plane in zip(starts, values, strict=True):
         state[0, start : start + PIXELS] = plane.reshape(-1)
     rows.backward_rows(0, 1, splat, offset, TIMES, CUTOFFS, state)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from asysplat.errors import InputError
-from asysplat.rendering import render
+from asysplat.rendering import INRIA, render
 from asysplat.rendering.reference import compositing
 from asysplat.scene import Cameras, Gaussians
 
@@ -49,10 +49,10 @@ def pixel_loop(gaussians, cameras, background):
             left, depth = 1.0, 0.0
             for z, u, v, conic, opacity, color in splats:
                 d = torch.tensor([column + 0.5 - u, row + 0.5 - v], dtype=torch.float64)
-                alpha = min(0.99, float(opacity * torch.exp(-0.5 * d @ conic @ d)))
-                if alpha < 1 / 255:
+                alpha = min(INRIA.alpha_max, float(opacity * torch.exp(-0.5 * d @ conic @ d)))
+                if alpha < INRIA.alpha_min:
                     continue
-                if left * (1 - alpha) < 1e-4:
+                if left * (1 - alpha) < INRIA.transmittance_min:
                     break
                 image[:, row, column] += left * alpha * color
                 depth += left * alpha * z

@@ -24,12 +24,6 @@ MODES = {
     "image, antialiased": (("image",), {"depth": False, "antialiased": True}),
     "alpha and depth": (("alpha", "depth"), {"depth": "expected"}),
 }
-UNMENDED = {
-    ("pixel-aligned", "alpha and depth", FIELDS): "what is behind is left of large sums",
-    ("pixel-aligned", "alpha and depth", OTHERS): "what is behind is left of large sums",
-    ("pixel-aligned", "image", OTHERS): "the background is seen through 1 - alpha, which cancels",
-    ("pixel-aligned", "image, antialiased", OTHERS): "as for image",
-}
 
 
 @dataclass(frozen=True)
@@ -85,9 +79,7 @@ def test_images_are_those_of_the_reference_outside_the_band(fast_backend, scene,
 @pytest.mark.parametrize("inputs", [FIELDS, OTHERS], ids=["Gaussians", "cameras, background"])
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("scene", SCENES)
-def test_gradients_are_those_of_the_reference(fast_backend, request, scene, mode, inputs):
-    if reason := UNMENDED.get((scene, mode, inputs)):
-        request.applymarker(pytest.mark.xfail(reason=reason, strict=True))
+def test_gradients_are_those_of_the_reference(fast_backend, scene, mode, inputs):
     found = compare(fast_backend, scene, mode)
     errors = {name: found.grads[name] for name in inputs}
     print(f"\n{fast_backend}:", ", ".join(f"{name} {error:.1e}" for name, error in errors.items()))

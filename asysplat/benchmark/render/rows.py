@@ -43,7 +43,8 @@ def forward_rows(start, stop, splat, offset, times, convention, states):
         state[:FORWARD_STATE] = states[tile]
         for drawn in range(times * col.TILE):
             base, _, exponent, middle = row_of(splat, offset, drawn)
-            draw_row(state, base, a, middle, exponent, color, z, convention, None, None)
+            rank = np.float32(drawn // col.TILE)
+            draw_row(state, base, rank, a, middle, exponent, color, z, z, convention, None, None)
         states[tile] = state[:FORWARD_STATE]
 
 
@@ -60,7 +61,8 @@ def backward_rows(start, stop, splat, offset, times, convention, states):
         state[:BACKWARD_STATE] = states[tile]
         for drawn in range(times * col.TILE):
             base, dy, exponent, middle = row_of(splat, offset, drawn)
+            rank = np.float32(times - 1 - drawn // col.TILE)
             draw_row_backward(
-                state, base, dy, a, middle, exponent, color, z, convention, None, None
+                state, base, rank, dy, a, middle, exponent, color, z, z, convention, None, None
             )
         states[tile] = state[:BACKWARD_STATE]

@@ -1,8 +1,9 @@
-"""Gradients of the splats from those of the pixels, front to back and without stored states.
+"""Gradients of the splats from those of the pixels, back to front.
 
-What lies behind a splat is what is left of the finished pixel once the splats up to it are taken
-away, so the transmittance is never divided back up. Each pair of splat and tile has a place of its
-own for its gradient: no two threads write to one, and sums have a fixed order.
+What lies behind a splat is summed up on the way, from little to much, so that nothing cancels; the
+transmittance before it is that behind it over 1 - alpha, which keeps its relative precision. Which
+splats a pixel saw is what the forward pass left: where it stopped. Each pair of splat and tile has
+a place of its own for its gradient: no two threads write to one, and sums have a fixed order.
 """
 
 import numpy as np
@@ -10,7 +11,6 @@ import numpy as np
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.kernel import inline, kernel
 from asysplat.rendering.cpu.lanes import (
-    HALF,
     LANES,
     MIDDLE,
     ONE,
@@ -22,21 +22,22 @@ from asysplat.rendering.cpu.lanes import (
 )
 from asysplat.rendering.cpu.tile import (
     AHEAD,
-    CHECK,
     PIXELS,
     PLANE,
     aligned,
     center_offset,
     corner,
-    is_opaque,
     rows_in_reach,
     whitened_start,
 )
 
 # Planes of a tile's state: what passes through; what lies behind, the background included, times
-# its gradient; gradients.
-BEHIND, G_RED, G_GREEN, G_BLUE, G_DEPTH, G_MEDIAN = (plane * PLANE for plane in range(1, 7))
-PLANES = 7
+# its gradient; the rank that the pixel stopped at; the origin of its depth; the rank of its median
+# depth; gradients.
+BEHIND, STOP, ORIGIN, HALVED, G_RED, G_GREEN, G_BLUE, G_DEPTH, G_MEDIAN = (
+    plane * PLANE for plane in range(1, 10)
+)
+PLANES = 10
 # Sums over the rows of a splat, for each column: of the exponent's gradient e, e u, e u y, e y,
 # e y^2, and of the values' gradients.
 E, EU, EUY, EY, EYY, RED, GREEN, BLUE, DEPTH, EUX = (PLANES * PLANE + k * LANES for k in range(10))
@@ -45,30 +46,46 @@ SUMS = 10
 
 @inline
 def draw_row_backward(
-    state, base, dy, a, middle, exponent, color, z, convention, depth, grad_median
+    state,
+    base,
+    rank,
+    dy,
+    a,
+    middle,
+    exponent,
+    color,
+    z,
+    z_rest,
+    convention,
+    grad_depth,
+    grad_median,
 ):
     """Add the row that begins at `base`, `dy` below the splat's centre, to the sums; see
     `draw_row`."""
-    alpha_min, alpha_max, transmittance_min = convention
+    alpha_min, alpha_max, _ = convention
     red, green, blue = color
     for i in range(LANES):
         u = fma(a, np.float32(i) - MIDDLE, middle)
         opacity = alpha_at(u, exponent, alpha_min, alpha_max)
-        before = state[base + i]
-        after = fma(-opacity, before, before)
-        keep = ONE if after >= transmittance_min else ZERO
-        weight = opacity * before * keep
-        state[base + i] = after * keep
+        opacity = opacity if rank < state[STOP + base + i] else ZERO
+        passed = ONE - opacity
+        inverse = ONE / passed
+        after = state[base + i]
+        before = after * inverse
+        before = fma(fma(-before, passed, after), inverse, before)  # to the last bit
+        weight = opacity * before
+        state[base + i] = before
         value = red * state[G_RED + base + i]
         value = fma(green, state[G_GREEN + base + i], value)
         value = fma(blue, state[G_BLUE + base + i], value)
-        if depth is not None:
-            value = fma(z, state[G_DEPTH + base + i], value)
-        behind = fma(-weight, value, state[BEHIND + base + i])
-        state[BEHIND + base + i] = behind
+        if grad_depth is not None:
+            dz = (z - state[ORIGIN + base + i]) + z_rest
+            value = fma(dz, state[G_DEPTH + base + i], value)
+        behind = state[BEHIND + base + i]
+        state[BEHIND + base + i] = fma(weight, value, behind)
         # Clamped alphas do not answer.
-        moves = keep if opacity < alpha_max else ZERO
-        e = moves * fma(weight, value, -opacity * behind / (ONE - opacity))
+        moves = ONE if opacity < alpha_max else ZERO
+        e = moves * fma(weight, value, -opacity * inverse * behind)
         eu, ey = e * u, e * dy
         state[E + i] += e
         state[EU + i] += eu
@@ -78,11 +95,11 @@ def draw_row_backward(
         state[RED + i] = fma(weight, state[G_RED + base + i], state[RED + i])
         state[GREEN + i] = fma(weight, state[G_GREEN + base + i], state[GREEN + i])
         state[BLUE + i] = fma(weight, state[G_BLUE + base + i], state[BLUE + i])
-        if depth is not None:
+        if grad_depth is not None:
             state[DEPTH + i] = fma(weight, state[G_DEPTH + base + i], state[DEPTH + i])
         if grad_median is not None:
-            halved = before > HALF and weight > ZERO and after <= HALF
-            state[DEPTH + i] += state[G_MEDIAN + base + i] if halved else ZERO
+            chosen = rank == state[HALVED + base + i]
+            state[DEPTH + i] += state[G_MEDIAN + base + i] if chosen else ZERO
 
 
 @kernel
@@ -96,9 +113,10 @@ def rasterize_backward(
     grid,
     convention,
     skips,
-    image,
     transmittance,
-    depth,
+    stops,
+    halved,
+    origins,
     grad_image,
     grad_transmittance,
     grad_depth,
@@ -112,45 +130,42 @@ def rasterize_backward(
     skip_rows, skip_opaque = skips
     bases = splats.view(np.int32)
     state = aligned(PLANES * PLANE + SUMS * LANES)
+    row_stops = np.empty(col.TILE, np.float32)
     for tile in range(start, stop):
         picture, left, top, rows, columns = corner(tile, grid)
         state[:PIXELS] = ONE
         state[PIXELS:] = ZERO
         for row in range(rows):
+            row_stops[row] = 0
             for i in range(columns):
                 pixel, at_y, at_x = row * LANES + i, top + row, left + i
-                g_red = grad_image[picture, 0, at_y, at_x]
-                g_green = grad_image[picture, 1, at_y, at_x]
-                g_blue = grad_image[picture, 2, at_y, at_x]
-                behind = (
-                    transmittance[picture, at_y, at_x] * grad_transmittance[picture, at_y, at_x]
-                )
-                behind += image[picture, 0, at_y, at_x] * g_red
-                behind += image[picture, 1, at_y, at_x] * g_green
-                behind += image[picture, 2, at_y, at_x] * g_blue
-                state[G_RED + pixel] = g_red
-                state[G_GREEN + pixel] = g_green
-                state[G_BLUE + pixel] = g_blue
-                if grad_median is not None:
-                    state[G_MEDIAN + pixel] = grad_median[picture, at_y, at_x]
-                if depth is not None:
+                left_over = transmittance[picture, at_y, at_x]
+                state[pixel] = left_over
+                state[BEHIND + pixel] = left_over * grad_transmittance[picture, at_y, at_x]
+                state[STOP + pixel] = stops[picture, at_y, at_x]
+                row_stops[row] = max(row_stops[row], stops[picture, at_y, at_x])
+                state[G_RED + pixel] = grad_image[picture, 0, at_y, at_x]
+                state[G_GREEN + pixel] = grad_image[picture, 1, at_y, at_x]
+                state[G_BLUE + pixel] = grad_image[picture, 2, at_y, at_x]
+                if grad_depth is not None:
                     state[G_DEPTH + pixel] = grad_depth[picture, at_y, at_x]
-                    behind += depth[picture, at_y, at_x] * grad_depth[picture, at_y, at_x]
-                state[BEHIND + pixel] = behind
-        live = (1 << rows) - 1
-        end = last_entry[tile]
-        for position in range(first_entry[tile], end):
+                    state[ORIGIN + pixel] = origins[picture, at_y, at_x]
+                if grad_median is not None:
+                    state[HALVED + pixel] = halved[picture, at_y, at_x]
+                    state[G_MEDIAN + pixel] = grad_median[picture, at_y, at_x]
+        begin = first_entry[tile]
+        for position in range(last_entry[tile] - 1, begin - 1, -1):
             d, pair = entries[position, 0], entries[position, 1]
-            prefetch(splats, entries[min(position + AHEAD, end - 1), 0])
-            look = skip_opaque and position & CHECK == CHECK
+            prefetch(splats, entries[max(position - AHEAD, begin), 0])
+            rank = np.float32(position - begin)
             x, y = center_offset(splats, bases, d, left, top)
             u0, b = whitened_start(splats, d, x, y)
             first, last = rows_in_reach(splats, d, y, rows) if skip_rows else (0, rows - 1)
             a, c, log_opacity = splats[d, col.A], splats[d, col.C], splats[d, col.LOG_OPACITY]
             color = (splats[d, col.RED], splats[d, col.GREEN], splats[d, col.BLUE])
-            z = splats[d, col.DEPTH]
+            z, z_rest = splats[d, col.DEPTH], splats[d, col.DEPTH_REST]
             for row in range(first, last + 1):
-                if not (live >> row) & 1:
+                if skip_opaque and rank >= row_stops[row]:
                     continue
                 base = (row & (col.TILE - 1)) * LANES
                 dy = np.float32(y + row)
@@ -158,10 +173,20 @@ def rasterize_backward(
                 exponent = fma(-v, v, log_opacity)
                 middle = np.float32(u0 + b * row)
                 draw_row_backward(
-                    state, base, dy, a, middle, exponent, color, z, convention, depth, grad_median
+                    state,
+                    base,
+                    rank,
+                    dy,
+                    a,
+                    middle,
+                    exponent,
+                    color,
+                    z,
+                    z_rest,
+                    convention,
+                    grad_depth,
+                    grad_median,
                 )
-                if look and is_opaque(state, base):
-                    live &= ~(1 << row)
             for i in range(LANES):
                 state[EUX + i] = state[EU + i] * (np.float32(x) + (np.float32(i) - MIDDLE))
             eu, ey = take_sum(state, EU), take_sum(state, EY)

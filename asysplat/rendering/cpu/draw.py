@@ -62,7 +62,8 @@ def draw(
         masks if settings.skips.masks else None,
         stats,
     )
-    return Layers(*layers, stats)
+    *layers, origin = layers
+    return Layers(*layers, stats, origin)
 
 
 class _Lists(NamedTuple):
@@ -138,6 +139,9 @@ class _Draw(torch.autograd.Function):
         depth = torch.empty(frame.images, height, width) if settings.depth else None
         last_entry = np.empty(frame.images * frame.tiles, np.int64)
         wanted = _wanted_tiles(frame, masks)
+        stops = np.empty(alpha.shape, np.float32)
+        halved = np.empty(alpha.shape, np.float32) if settings.depth == "median" else None
+        origins = torch.empty_like(alpha) if settings.depth not in (None, "median") else None
         counters = np.empty((frame.images * frame.tiles, col.COUNTERS), np.int64)
         run_blocks(
             rasterize,
@@ -154,6 +158,9 @@ class _Draw(torch.autograd.Function):
             alpha.numpy(),
             transmittance.numpy(),
             *_by_kind(depth, settings),
+            stops,
+            halved,
+            None if origins is None else origins.numpy(),
             counters,
         )
         rows, in_reach = counters.sum(0).tolist()
@@ -164,21 +171,25 @@ class _Draw(torch.autograd.Function):
         stats["rows"] = rows
         stats["rows_out_of_reach"] = drawn * col.TILE - in_reach
         stats["rows_opaque"] = in_reach - rows
-        ctx.save_for_backward(*tensors, image, transmittance, depth)
+        ctx.save_for_backward(*tensors, transmittance)
         ctx.frame, ctx.lists, ctx.last_entry = frame, lists, last_entry
+        ctx.seen = stops, halved, None if origins is None else origins.numpy()
         ctx.set_materialize_grads(False)
-        return image, alpha, transmittance, depth
+        if origins is not None:
+            ctx.mark_non_differentiable(origins)
+        return image, alpha, transmittance, depth, origins
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth):
-        *tensors, image, transmittance, depth = ctx.saved_tensors
+    def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth, _):
+        *tensors, transmittance = ctx.saved_tensors
         frame, lists, settings = ctx.frame, ctx.lists, ctx.frame.settings
-        grad_image = _or_zeros(grad_image, image)
-        grad_transmittance = _or_zeros(grad_transmittance, transmittance)
+        if grad_image is None:
+            grad_image = torch.zeros(frame.images, 3, frame.height, frame.width)
+        if grad_transmittance is None:
+            grad_transmittance = torch.zeros_like(transmittance)
         if grad_alpha is not None:
             grad_transmittance = grad_transmittance - grad_alpha
-        grad_depth = None if depth is None else _or_zeros(grad_depth, depth)
         pair_grads = np.empty((len(lists.entries), col.GRADIENT), np.float32)
         run_blocks(
             rasterize_backward,
@@ -190,11 +201,10 @@ class _Draw(torch.autograd.Function):
             frame.grid,
             frame.cutoffs,
             (settings.skips.rows, settings.skips.opaque),
-            image.numpy(),
             transmittance.numpy(),
-            _by_kind(depth, settings)[0],
-            grad_image.numpy(),
-            grad_transmittance.numpy(),
+            *ctx.seen,
+            grad_image.contiguous().numpy(),
+            grad_transmittance.contiguous().numpy(),
             *_by_kind(grad_depth, settings),
             pair_grads,
         )
@@ -261,7 +271,7 @@ def _make_lists(
     first_entry = _starts(histograms.sum(1, dtype=np.int64).reshape(-1))
     first_pair = _starts(counts)
     pairs = int(first_entry[-1])
-    check_pairs(pairs)
+    check_pairs(pairs, int(np.diff(first_entry).max()))
     stats["visible"] = int(np.count_nonzero(counts))
     boxes, stats["culled_by_opacity"], stats["culled_by_frustum"] = counters.sum((0, 1)).tolist()
     stats["pairs"] = pairs
@@ -297,12 +307,8 @@ def _by_kind(depth: Tensor | None, settings: Settings) -> tuple[np.ndarray | Non
     """As the accumulated depth and as the median: one of them at most is asked for."""
     if depth is None:
         return None, None
-    return (None, depth.numpy()) if settings.depth == "median" else (depth.numpy(), None)
-
-
-def _or_zeros(grad: Tensor | None, layer: Tensor) -> Tensor:
-    """A contiguous gradient; that of a layer that was not used is 0."""
-    return torch.zeros_like(layer) if grad is None else grad.contiguous()
+    array = depth.contiguous().numpy()
+    return (None, array) if settings.depth == "median" else (array, None)
 
 
 def _empty_like(tensor: Tensor) -> Tensor:

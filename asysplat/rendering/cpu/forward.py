@@ -19,14 +19,18 @@ from asysplat.rendering.cpu.tile import (
     whitened_start,
 )
 
-# Planes of a tile's state: what passes through; what passed where nothing may any more; alpha;
-# colour; depths.
-REST, ALPHA, RED, GREEN, BLUE, DEPTH, MEDIAN = (plane * PLANE for plane in range(1, 8))
-PLANES = 8
+# Planes of a tile's state: what passes through; what passed where nothing may any more, and 1 + the
+# rank in the list at which that was; alpha; colour; depths, and 1 + the rank of the median's.
+REST, STOP, ALPHA, RED, GREEN, BLUE, DEPTH, ORIGIN, MEDIAN, HALVED = (
+    plane * PLANE for plane in range(1, 11)
+)
+PLANES = 11
+
+NEVER = np.float32(2.0**30)  # more than any rank
 
 
 @inline
-def draw_row(state, base, a, middle, exponent, color, z, convention, depth, median):
+def draw_row(state, base, rank, a, middle, exponent, color, z, z_rest, convention, depth, median):
     """Blend a splat into the row that begins at `base`: alpha = 2^(exponent - u^2), where u grows
     by `a` a pixel and is `middle` in the middle."""
     alpha_min, alpha_max, transmittance_min = convention
@@ -39,16 +43,23 @@ def draw_row(state, base, a, middle, exponent, color, z, convention, depth, medi
         keep = ONE if behind >= transmittance_min else ZERO
         weight = opacity * before * keep
         state[base + i] = behind * keep
-        state[REST + base + i] = fma(ONE - keep, before, state[REST + base + i])
+        stops = (ONE - keep) if before > ZERO else ZERO
+        state[STOP + base + i] = fma(stops, rank + ONE, state[STOP + base + i])
+        state[REST + base + i] = fma(stops, before, state[REST + base + i])
         state[ALPHA + base + i] += weight
         state[RED + base + i] = fma(weight, red, state[RED + base + i])
         state[GREEN + base + i] = fma(weight, green, state[GREEN + base + i])
         state[BLUE + base + i] = fma(weight, blue, state[BLUE + base + i])
         if depth is not None:
-            state[DEPTH + base + i] = fma(weight, z, state[DEPTH + base + i])
+            # From the depth of the first that shows: what is blended are small differences.
+            first = ONE if before == ONE and weight > ZERO else ZERO
+            origin = fma(first, z, state[ORIGIN + base + i])
+            state[ORIGIN + base + i] = origin
+            state[DEPTH + base + i] = fma(weight, (z - origin) + z_rest, state[DEPTH + base + i])
         if median is not None:
-            halved = before > HALF and weight > ZERO and behind <= HALF
-            state[MEDIAN + base + i] += z if halved else ZERO
+            halved = ONE if before > HALF and weight > ZERO and behind <= HALF else ZERO
+            state[MEDIAN + base + i] = fma(halved, z, state[MEDIAN + base + i])
+            state[HALVED + base + i] = fma(halved, rank + ONE, state[HALVED + base + i])
 
 
 @kernel
@@ -68,6 +79,9 @@ def rasterize(
     transmittance,
     depth,
     median,
+    stops,
+    halved,
+    origins,
     counters,
 ):
     """Sort and draw tiles start to stop.
@@ -83,6 +97,11 @@ def rasterize(
         skips: whether to skip rows out of reach, and those that are opaque.
         image: [images, 3, H, W]; alpha, transmittance, depth, median: [images, H, W], of which the
             last two may be None: then they cost nothing. Every pixel is written.
+        stops: [images, H, W] the rank in its list of the splat that a pixel dropped, and all behind
+            it; NEVER where it dropped none.
+        halved: [images, H, W] the rank of the splat of the median depth, -1 without one; None
+            where `median` is.
+        origins: [images, H, W] the depth that those in `depth` are taken from; None where it is.
         counters: [tiles, COUNTERS].
     """
     skip_rows, skip_opaque = skips
@@ -108,13 +127,14 @@ def rasterize(
             d = entries[position, 0]
             prefetch(splats, entries[min(position + AHEAD, end - 1), 0])
             look = skip_opaque and position & CHECK == CHECK
+            rank = np.float32(position - first_entry[tile])
             position += 1
             x, y = center_offset(splats, bases, d, left, top)
             u0, b = whitened_start(splats, d, x, y)
             first, last = rows_in_reach(splats, d, y, rows) if skip_rows else (0, rows - 1)
             a, c, log_opacity = splats[d, col.A], splats[d, col.C], splats[d, col.LOG_OPACITY]
             color = (splats[d, col.RED], splats[d, col.GREEN], splats[d, col.BLUE])
-            z = splats[d, col.DEPTH]
+            z, z_rest = splats[d, col.DEPTH], splats[d, col.DEPTH_REST]
             in_reach += last - first + 1
             for row in range(first, last + 1):
                 if not (live >> row) & 1:
@@ -124,7 +144,20 @@ def rasterize(
                 v = c * np.float32(y + row)
                 exponent = fma(-v, v, log_opacity)
                 middle = np.float32(u0 + b * row)
-                draw_row(state, base, a, middle, exponent, color, z, convention, depth, median)
+                draw_row(
+                    state,
+                    base,
+                    rank,
+                    a,
+                    middle,
+                    exponent,
+                    color,
+                    z,
+                    z_rest,
+                    convention,
+                    depth,
+                    median,
+                )
                 if look and is_opaque(state, base):
                     live &= ~(1 << row)
         last_entry[tile] = position
@@ -140,5 +173,9 @@ def rasterize(
                 image[picture, 2, top + row, left + i] = state[BLUE + pixel]
                 if depth is not None:
                     depth[picture, top + row, left + i] = state[DEPTH + pixel]
+                    origins[picture, top + row, left + i] = state[ORIGIN + pixel]
                 if median is not None:
                     median[picture, top + row, left + i] = state[MEDIAN + pixel]
+                    halved[picture, top + row, left + i] = state[HALVED + pixel] - ONE
+                stop_rank = state[STOP + pixel] - ONE
+                stops[picture, top + row, left + i] = stop_rank if stop_rank >= ZERO else NEVER
