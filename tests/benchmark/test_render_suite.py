@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from asysplat.benchmark.render.backends import SKIPS, Backend, find_backends
 from asysplat.benchmark.render.cases import CASES, Case, find_cases
-from asysplat.benchmark.render.run import FIELDS, errors, peak_gb, prepare, run, truth
+from asysplat.benchmark.render.run import FIELDS, errors, flips, peak_gb, prepare, run, truth
 from asysplat.benchmark.render.stages import STAGES
 from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
 from asysplat.benchmark.suites import find_suite
@@ -88,15 +88,22 @@ def test_errors_are_those_of_image_and_gradients():
     scene = random_scene(200, 20, 20)
     exact = truth(scene, INRIA)
     found = run(find_backends()[0], Skips(), prepare(scene, "cpu"))
-    close = errors(found, exact)
-    assert 0 < close["image_max"] < 1e-3 and max(close["gradients"].values()) < 1e-2
+    none = flips(exact, exact)
+    close = errors(found, exact, none)
+    assert (
+        not none.any() and 0 < close["image_max"] < 1e-3 and max(close["gradients"].values()) < 1e-2
+    )
 
     image = exact.image.clone()
     image[0, 0, 0, 0] += 1
     gradients = (exact.gradients[0] * 1.5, *exact.gradients[1:])
-    wrong = errors(replace(exact, image=image, gradients=gradients), exact)
+    other = replace(exact, image=image, gradients=gradients)
+    wrong = errors(other, exact, none)
     assert wrong["image_max"] == pytest.approx(1) and wrong["image_p99"] == 0
     assert wrong["gradients"] == pytest.approx({name: 0.5 * (name == "means") for name in FIELDS})
+    flipped = flips(other, exact)
+    assert flipped.sum() == 1 and flipped[0, 0, 0]
+    assert errors(other, exact, flipped)["image_max"] == 0
 
 
 @pytest.mark.skipif(not os.access(CLEAR_PEAK, os.W_OK), reason="peaks cannot be started anew")

@@ -17,6 +17,7 @@ from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
 from asysplat.rendering import Convention, Skips, render
 from asysplat.scene import Cameras, Gaussians
 
+FLIP = 1e-4  # a difference that rounding alone does not make; a flip makes up to 1/255
 FIELDS = tuple(field.name for field in fields(Gaussians))
 
 
@@ -51,11 +52,13 @@ class Pass:
     stats: dict[str, int]
 
 
-def prepare(scene: Scene, device: str) -> Inputs:
-    """The same weights at every call."""
+def prepare(scene: Scene, device: str, ignored: Tensor | None = None) -> Inputs:
+    """The same weights at every call, but for 0 at the pixels `ignored`, [V, H, W]."""
     gaussians, cameras = (part.to(device) for part in scene)
     size = (cameras.num_views, 3, cameras.height, cameras.width)
     weights = torch.randn(size, generator=torch.Generator().manual_seed(1))
+    if ignored is not None:
+        weights = weights * ~ignored[:, None]
     leaves = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     return Inputs(leaves, cameras, weights.to(gaussians.means))
 
@@ -89,7 +92,7 @@ def peak_gb(backend: Backend, skips: Skips, inputs: Inputs) -> float:
     return peak_memory_gb(backend.device) - before
 
 
-def truth(scene: Scene, convention: Convention) -> Pass:
+def truth(scene: Scene, convention: Convention, ignored: Tensor | None = None) -> Pass:
     """The scene in float64."""
 
     def draw(gaussians, cameras, skips):
@@ -97,14 +100,21 @@ def truth(scene: Scene, convention: Convention) -> Pass:
         return out.image, out.stats
 
     exact = tuple(part.to(torch.float64) for part in scene)
-    return run(Backend("truth", "cpu", draw), Skips(), prepare(exact, "cpu"))
+    return run(Backend("truth", "cpu", draw), Skips(), prepare(exact, "cpu", ignored))
 
 
-def errors(found: Pass, exact: Pass) -> dict[str, float | dict[str, float]]:
-    """Of the image, the largest and the 99th percentile; of each gradient, relative in L2."""
-    wrong = (found.image.cpu().double() - exact.image).abs()
+def flips(found: Pass, exact: Pass) -> Tensor:
+    """[V, H, W] pixels at which rounding decided otherwise at a cut-off."""
+    return ((found.image.cpu().double() - exact.image).abs() > FLIP).any(1)
+
+
+def errors(found: Pass, exact: Pass, ignored: Tensor) -> dict[str, float | dict[str, float]]:
+    """Of the image, the largest and the 99th percentile; of each gradient, relative in L2; outside
+    the pixels `ignored`, whose share is given."""
+    wrong = (found.image.cpu().double() - exact.image).abs() * ~ignored[:, None]
     pairs = zip(FIELDS, found.gradients, exact.gradients, strict=True)
     return {
+        "flipped": ignored.double().mean().item(),
         "image_max": wrong.max().item(),
         "image_p99": float(np.percentile(wrong.numpy(), 99)),
         "gradients": {

@@ -24,7 +24,8 @@ def tables(results: Result) -> list[Table]:
     ours = [row for row in rows if row["backend"] == "cpu" and row["without"] is None]
     machine = ", ".join(f"{key} {value}" for key, value in results["machine"].items())
     notes = (
-        f"{machine}\nmedian ± interquartile range; *: errors of a smaller scene of the same make"
+        f"{machine}\nmedian ± interquartile range; *: errors of a smaller scene of the same make;\n"
+        "errors outside the pixels where some backend's rounding decides otherwise at a cut-off"
     )
     return [
         _table("Every backend, and without one of its skips", COLUMNS, rows, notes),
@@ -80,6 +81,7 @@ COLUMNS = {
     "memory\nMB": lambda row: f"{1000 * row['peak_gb']:.0f}",
     "image\np99": lambda row: _error(row, row["error"]["image_p99"]),
     "image\nmax": lambda row: _error(row, row["error"]["image_max"]),
+    "flips\n1e-6": lambda row: f"{1e6 * row['error']['flipped']:.0f}",
     "gradients\nworst": lambda row: _error(row, max(row["error"]["gradients"].values())),
 }
 STAGE_COLUMNS = {

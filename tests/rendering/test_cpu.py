@@ -1,0 +1,58 @@
+"""The CPU back end on other machines than this one, and beside other processes."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from asysplat.rendering import render
+
+PLAIN = """
+import torch
+from asysplat.benchmark.scenes import random_scene
+from asysplat.rendering import render
+from asysplat.rendering.cpu.forward import rasterize
+
+gaussians, cameras = random_scene(300, 40, 50)
+leaves = gaussians.map(lambda t: t.requires_grad_())
+out = render(leaves, cameras, backend="cpu", depth=False)
+exact = render(leaves.to(torch.float64), cameras.to(torch.float64), depth=False)
+assert (out.image - exact.image).abs().max() < 1e-6
+grads = [torch.autograd.grad(x.image.square().sum(), leaves.means)[0] for x in (out, exact)]
+assert (grads[0] - grads[1]).norm() < 5e-6 * grads[1].norm()
+assert "zmm" not in next(iter(rasterize.inspect_asm().values()))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names the instructions of an x86 processor")
+def test_without_avx512_it_is_as_exact(tmp_path):
+    if "x86_64" not in os.uname().machine:
+        pytest.skip("names the instructions of an x86 processor")
+    environment = {
+        **os.environ,
+        "NUMBA_CPU_NAME": "haswell",
+        "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma,+bmi,+bmi2,+lzcnt,+popcnt,+sse4.2",
+        "NUMBA_CACHE_DIR": str(tmp_path),
+    }
+    done = subprocess.run([sys.executable, "-c", PLAIN], env=environment, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_draws_too(make_scene):
+    """It has none of its parent's threads."""
+    gaussians, cameras = make_scene(dtype=torch.float32, views=4)
+    expected = render(gaussians, cameras).image  # the pool of threads is there now
+
+    def draw(queue):
+        queue.put(torch.equal(render(gaussians, cameras).image, expected))
+
+    context = multiprocessing.get_context("fork")
+    queue = context.SimpleQueue()
+    process = context.Process(target=draw, args=(queue,))
+    process.start()
+    process.join(60)
+    assert process.exitcode == 0 and queue.get()
