@@ -1,5 +1,6 @@
 """The backends under test, and what one makes of a scene: images, and gradients of every input."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -41,6 +42,11 @@ BACKENDS = (
     Backend("cpu", torch.float32, 1e-6, 5e-6, 3000),
 )
 FAST = tuple(backend for backend in BACKENDS if backend.name != "reference")
+# A process in which Triton interprets its kernels, see test_in_triton.py, tests them alone.
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+if INTERPRETED:
+    BACKENDS = (Backend("cuda", torch.float32, 2e-5, 2e-4, 60),)
+    FAST = ()
 
 
 @dataclass(frozen=True)
