@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields, replace
+from importlib.util import find_spec
 
 import torch
 from jaxtyping import Bool, Float
@@ -67,7 +68,7 @@ def render(
         cameras: [..., V], with the batch dimensions of `gaussians`. Skew is ignored.
         background: RGB [3], or [..., V, 3] one a view; None is black.
         backend: "reference", "cpu", "cuda" or "auto", which is the fast one for the device, and the
-            reference for float64.
+            reference for float64 and where that needs a package which is not there.
         depth: True or "expected": sum_i w_i z_i / alpha. "accumulated": not divided by alpha.
             "median": z of the Gaussian that takes the transmittance to half or below. False: none.
         antialiased: lower opacities by what the dilation adds to a splat's area (Yu et al. 2024).
@@ -133,8 +134,11 @@ def _depth(layers: Layers, settings: Settings) -> Tensor:
 
 def _fast_backend(device: torch.device, dtype: torch.dtype) -> str:
     """The fastest for the device, that keeps what float64 asks for."""
-    fast = {"cpu": "cpu", "cuda": "cuda"}
-    return fast.get(device.type, "reference") if dtype == torch.float32 else "reference"
+    if dtype == torch.float32 and device.type == "cpu":
+        return "cpu"
+    if dtype == torch.float32 and device.type == "cuda" and find_spec("triton"):
+        return "cuda"
+    return "reference"
 
 
 def _one_batch(tensor: Tensor, batch: tuple[int, ...]) -> Tensor:

@@ -19,8 +19,8 @@ LOW_X, HIGH_X, LOW_Y, HIGH_Y = range(16, 20)
 CAMERA_GRADIENT = 16
 
 TILE = 16  # pixels a side
-BLOCK = 2048  # Gaussians of one piece of work, unless that made more than
-MOST_BLOCKS = 64  # pieces of an image
+BLOCK = 2048  # Gaussians of a piece of work; more, where an image would have over MOST_BLOCKS
+MOST_BLOCKS = 64
 WHITEN_TO_LOG2 = math.sqrt(0.5 / math.log(2))  # exp(-x^2 / 2) = 2^-(WHITEN_TO_LOG2 x)^2
 
 # What a skip leaves standing, so that rounding never drops what a pixel would have shown.
