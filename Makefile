@@ -8,7 +8,7 @@ demo: $(ENV) ## train a small model on made-up scenes, measure it, draw what it 
 test: $(ENV) ## style and tests
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
-	.venv/bin/python -m pytest
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 # two tests at a time, a thread each
 
 format: $(ENV)
 	.venv/bin/ruff check --fix .
