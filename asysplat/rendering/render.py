@@ -19,7 +19,7 @@ from asysplat.rendering.settings import Settings, Skips
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
 BACKENDS = {"reference": reference.draw, "cpu": cpu.draw, "cuda": cuda.draw}
-DEPTHS = {True: "expected", False: None}
+DEPTH_SWITCH = {True: "expected", False: None}  # what depth=True and depth=False stand for
 ALPHA_TINY = 1e-6  # an alpha below 1/255 is exactly 0, so any value between will do
 
 
@@ -95,7 +95,7 @@ def render(
     batch = _check(gaussians, cameras, background, masks)
     dtype = torch.promote_types(gaussians.means.dtype, cameras.cam_to_world.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    settings = Settings(convention, antialiased, DEPTHS.get(depth, depth), skips)
+    settings = Settings(convention, antialiased, DEPTH_SWITCH.get(depth, depth), skips)
     with without_autocast(gaussians.means):
         scenes = gaussians.map(lambda t: _one_batch(t.to(dtype), batch))
         if sh_degree is not None:

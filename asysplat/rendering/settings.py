@@ -39,11 +39,16 @@ class Skips:
 
 @dataclass(frozen=True)
 class Settings:
-    """Args:
-    convention: cut-offs of alpha compositing.
-    antialiased: opacity is lowered by what eps2d adds to a splat's area (Yu et al. 2024).
-    depth: one of DEPTHS, or None.
-    skips: work to leave out.
+    """How to draw.
+
+    Args:
+        convention: cut-offs of alpha compositing.
+        antialiased: opacity is lowered by what eps2d adds to a splat's area (Yu et al. 2024).
+        depth: one of DEPTHS, or None.
+        skips: work to leave out.
+
+    Raises:
+        InputError: an unknown depth.
     """
 
     convention: Convention = INRIA

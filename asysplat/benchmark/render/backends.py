@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from asysplat.rendering import GSPLAT_1_5, INRIA, Convention, Skips, render
-from asysplat.rendering.render import BACKENDS
 from asysplat.scene import Cameras, Gaussians
 
 SKIPS = tuple(field.name for field in fields(Skips))
@@ -40,8 +39,7 @@ def find_backends() -> list[Backend]:
     found = [Backend("reference", "cpu", partial(_ours, "reference"))]
     found.append(Backend("cpu", "cpu", partial(_ours, "cpu"), SKIPS))
     if torch.cuda.is_available():
-        if "cuda" in BACKENDS:
-            found.append(Backend("cuda", "cuda", partial(_ours, "cuda"), SKIPS))
+        found.append(Backend("cuda", "cuda", partial(_ours, "cuda"), SKIPS))
         if importlib.util.find_spec("gsplat"):
             found.append(Backend("gsplat", "cuda", _gsplat, convention=GSPLAT_1_5))
     return found
