@@ -8,22 +8,20 @@ from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.backward import draw_row_backward
 from asysplat.rendering.cpu.forward import draw_row
 from asysplat.rendering.cpu.kernel import inline, kernel
-from asysplat.rendering.cpu.lanes import LANES, fma
-from asysplat.rendering.cpu.tile import PLANE, aligned
+from asysplat.rendering.cpu.lanes import LANES
+from asysplat.rendering.cpu.tile import PLANE, aligned, row_of
 
 FORWARD_STATE = forward.PLANES * PLANE
 BACKWARD_STATE = backward.PLANES * PLANE + backward.SUMS * LANES
 
 
 @inline
-def row_of(splat, offset, drawn):
-    """Where the state's row begins, how far below the centre it is, the exponent and u."""
-    row = drawn & (col.TILE - 1)
+def row_again(splat, offset, drawn):
+    """`row_of` of the rows of a tile in turn."""
     x, y = offset
-    dy = np.float32(y + row)
-    v = splat[col.C] * dy
-    middle = float(splat[col.A]) * x + float(splat[col.B]) * (y + row)
-    return row * LANES, dy, fma(-v, v, splat[col.LOG_OPACITY]), np.float32(middle)
+    b = float(splat[col.B])
+    u0 = float(splat[col.A]) * x + b * y
+    return row_of(drawn & (col.TILE - 1), y, u0, b, splat[col.C], splat[col.LOG_OPACITY])
 
 
 @kernel
@@ -42,7 +40,7 @@ def forward_rows(start, stop, splat, offset, times, convention, states):
     for tile in range(start, stop):
         state[:FORWARD_STATE] = states[tile]
         for drawn in range(times * col.TILE):
-            base, _, exponent, middle = row_of(splat, offset, drawn)
+            base, _, exponent, middle = row_again(splat, offset, drawn)
             rank = np.float32(drawn // col.TILE)
             draw_row(state, base, rank, a, middle, exponent, color, z, z, convention, None, None)
         states[tile] = state[:FORWARD_STATE]
@@ -60,7 +58,7 @@ def backward_rows(start, stop, splat, offset, times, convention, states):
     for tile in range(start, stop):
         state[:BACKWARD_STATE] = states[tile]
         for drawn in range(times * col.TILE):
-            base, dy, exponent, middle = row_of(splat, offset, drawn)
+            base, dy, exponent, middle = row_again(splat, offset, drawn)
             rank = np.float32(times - 1 - drawn // col.TILE)
             draw_row_backward(
                 state, base, rank, dy, a, middle, exponent, color, z, z, convention, None, None

@@ -27,6 +27,7 @@ from asysplat.rendering.cpu.tile import (
     aligned,
     center_offset,
     corner,
+    row_of,
     rows_in_reach,
     whitened_start,
 )
@@ -167,11 +168,7 @@ def rasterize_backward(
             for row in range(first, last + 1):
                 if skip_opaque and rank >= row_stops[row]:
                     continue
-                base = (row & (col.TILE - 1)) * LANES
-                dy = np.float32(y + row)
-                v = c * dy
-                exponent = fma(-v, v, log_opacity)
-                middle = np.float32(u0 + b * row)
+                base, dy, exponent, middle = row_of(row, y, u0, b, c, log_opacity)
                 draw_row_backward(
                     state,
                     base,

@@ -15,6 +15,7 @@ from asysplat.rendering.cpu.tile import (
     center_offset,
     corner,
     is_opaque,
+    row_of,
     rows_in_reach,
     whitened_start,
 )
@@ -140,10 +141,7 @@ def rasterize(
                 if not (live >> row) & 1:
                     continue
                 drawn += 1
-                base = (row & (col.TILE - 1)) * LANES
-                v = c * np.float32(y + row)
-                exponent = fma(-v, v, log_opacity)
-                middle = np.float32(u0 + b * row)
+                base, _, exponent, middle = row_of(row, y, u0, b, c, log_opacity)
                 draw_row(
                     state,
                     base,

@@ -6,7 +6,7 @@ import numpy as np
 
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.kernel import inline
-from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, to_bits
+from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, fma, to_bits
 
 PIXELS = col.TILE * LANES
 # From one plane of a tile's state to the next: planes 4096 bytes apart would look like one to the
@@ -56,6 +56,16 @@ def whitened_start(splats, d, x, y):
     a = float(splats[d, col.A]) + float(splats[d, col.A_REST])
     b = float(splats[d, col.B]) + float(splats[d, col.B_REST])
     return a * x + b * y, b
+
+
+@inline
+def row_of(row, y, u0, b, c, log_opacity):
+    """Where the tile's row begins in a plane, how far below the splat's centre it is, the exponent
+    where u is 0, and u in the middle."""
+    dy = np.float32(y + row)
+    v = c * dy
+    base = (row & (col.TILE - 1)) * LANES
+    return base, dy, fma(-v, v, log_opacity), np.float32(u0 + b * row)
 
 
 @inline
