@@ -13,6 +13,7 @@ from asysplat.rendering import GSPLAT_1_5, INRIA, Convention, Skips, render
 from asysplat.scene import Cameras, Gaussians
 
 SKIPS = tuple(field.name for field in fields(Skips))
+SKIPS_OF_CUDA = tuple(name for name in SKIPS if name != "rows")
 Draw = Callable[[Gaussians, Cameras, Skips], tuple[Tensor, dict[str, int]]]
 
 
@@ -39,7 +40,7 @@ def find_backends() -> list[Backend]:
     found = [Backend("reference", "cpu", partial(_ours, "reference"))]
     found.append(Backend("cpu", "cpu", partial(_ours, "cpu"), SKIPS))
     if torch.cuda.is_available():
-        found.append(Backend("cuda", "cuda", partial(_ours, "cuda"), SKIPS))
+        found.append(Backend("cuda", "cuda", partial(_ours, "cuda"), SKIPS_OF_CUDA))
         if importlib.util.find_spec("gsplat"):
             found.append(Backend("gsplat", "cuda", _gsplat, convention=GSPLAT_1_5))
     return found

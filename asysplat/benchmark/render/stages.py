@@ -18,6 +18,7 @@ from asysplat.benchmark.render.rows import (
 from asysplat.rendering import INRIA
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.threads import even_bounds, run_blocks
+from asysplat.rendering.formulas import WHITEN_TO_LOG2
 
 STAGES = ("project", "start_positions", "place", "rasterize")
 STAGES += ("rasterize_backward", "project_backward")
@@ -68,7 +69,7 @@ def row_seconds() -> dict[str, float]:
 def middle_splat(opacity: float) -> np.ndarray:
     """A round one in the middle of a tile."""
     splat = np.zeros(col.SPLAT, np.float32)
-    splat[[col.A, col.C]] = col.WHITEN_TO_LOG2 / DEVIATION
+    splat[[col.A, col.C]] = WHITEN_TO_LOG2 / DEVIATION
     splat[col.LOG_OPACITY] = np.log2(opacity)
     splat[[col.RED, col.GREEN, col.BLUE]] = 0.5
     return splat

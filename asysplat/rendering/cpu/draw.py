@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
+from asysplat.rendering.camera_rows import CAMERA_GRADIENT, camera_gradients, camera_rows
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.backward import rasterize_backward
 from asysplat.rendering.cpu.forward import rasterize
@@ -213,7 +214,7 @@ class _Draw(torch.autograd.Function):
         sh_needed, cameras_needed = ctx.needs_input_grad[4], any(ctx.needs_input_grad[5:7])
         field_grads = [_empty_like(tensor) for tensor in tensors[:4]]
         field_grads.append(_empty_like(tensors[4] if sh_needed else tensors[4][:0]))
-        camera_grads = np.empty((frame.images, frame.blocks, col.CAMERA_GRADIENT))
+        camera_grads = np.empty((frame.images, frame.blocks, CAMERA_GRADIENT))
         run_blocks(
             project_backward,
             even_bounds(frame.images // frame.views * frame.blocks),
@@ -235,7 +236,9 @@ class _Draw(torch.autograd.Function):
         if not sh_needed:
             field_grads[-1] = None
         poses = (
-            _camera_gradients(camera_grads.sum(1), *tensors[5:]) if cameras_needed else (None,) * 2
+            camera_gradients(torch.from_numpy(camera_grads.sum(1)), *tensors[5:])
+            if cameras_needed
+            else (None,) * 2
         )
         return (*field_grads, *poses, *(None,) * 4)
 
@@ -329,21 +332,6 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _camera_rows(frame: _Frame, cam_to_world: Tensor, intrinsics: Tensor) -> np.ndarray:
-    """[images, 20] float64, see `layout`."""
-    poses = cam_to_world.detach().double().flatten(0, 1)
-    pinhole = intrinsics.detach().double().flatten(0, 1)
-    focal, principal = pinhole[:, [0, 1], [0, 1]], pinhole[:, [0, 1], [2, 2]]
-    size = focal.new_tensor([frame.width, frame.height])
-    margin = frame.settings.convention.frustum_margin * size
-    low, high = (-principal - margin) / focal, (size - principal + margin) / focal
-    limits = torch.stack((low, high), -1).flatten(1)
-    return torch.cat((poses[:, :3].mT.flatten(1), focal, principal, limits), 1).numpy()
-
-
-def _camera_gradients(rows: np.ndarray, cam_to_world: Tensor, intrinsics: Tensor):
-    """Gradients of poses and intrinsics from those of `_camera_rows`."""
-    grads = torch.from_numpy(rows)
-    poses, pinhole = (torch.zeros(t.shape, dtype=torch.float64) for t in (cam_to_world, intrinsics))
-    poses.flatten(0, 1)[:, :3] = grads[:, :12].unflatten(1, (4, 3)).mT
-    pinhole.flatten(0, 1)[:, [0, 1, 0, 1], [0, 1, 2, 2]] = grads[:, 12:]
-    return poses.to(cam_to_world.dtype), pinhole.to(intrinsics.dtype)
+    """[images, 20] float64, see `camera_rows`."""
+    size = (frame.height, frame.width)
+    return camera_rows(cam_to_world, intrinsics, size, frame.settings.convention).numpy()

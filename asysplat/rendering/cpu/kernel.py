@@ -37,7 +37,8 @@ def _bare(function: Callable) -> Callable:
 def _cache_folder(asked: str) -> str:
     """Another one for every version of these sources: Numba looks at a kernel's own file alone, and
     would keep one whose parts, in other files, have changed."""
-    sources = b"".join(path.read_bytes() for path in sorted(HERE.glob("*.py")))
+    paths = (*HERE.glob("*.py"), *HERE.parent.glob("*.py"))
+    sources = b"".join(path.read_bytes() for path in sorted(paths))
     beside = HERE / "__pycache__"
     home = Path.home() / ".cache" / "asysplat"
     root = asked or (beside if os.access(HERE, os.W_OK) else home)

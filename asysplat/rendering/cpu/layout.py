@@ -1,7 +1,5 @@
 """The columns of the arrays that pass between the stages, and the sizes they agree on."""
 
-import math
-
 # A splat [16] float32, one cache line; BASE_* hold int32, the REST what float32 leaves over.
 # alpha = 2^(LOG_OPACITY - (A dx + B dy)^2 - (C dy)^2), the centre at (BASE_X + X, BASE_Y + Y).
 X, Y, A, B, C, LOG_OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
@@ -12,16 +10,9 @@ SPLAT = 16
 G_X, G_Y, G_A, G_B, G_C, G_LOG_OPACITY, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
 GRADIENT = 10
 
-# A camera [20] float64: its axes and centre in the world; intrinsics in pixels; the least and the
-# greatest x / z and y / z that the Jacobian is taken at. Its gradient is that of the first 16.
-RIGHT, DOWN, FORWARD, CENTER, FX, FY, CX, CY = 0, 3, 6, 9, 12, 13, 14, 15
-LOW_X, HIGH_X, LOW_Y, HIGH_Y = range(16, 20)
-CAMERA_GRADIENT = 16
-
 TILE = 16  # pixels a side
 BLOCK = 2048  # Gaussians of a piece of work; more, where an image would have over MOST_BLOCKS
 MOST_BLOCKS = 64
-WHITEN_TO_LOG2 = math.sqrt(0.5 / math.log(2))  # exp(-x^2 / 2) = 2^-(WHITEN_TO_LOG2 x)^2
 
 # What a skip leaves standing, so that rounding never drops what a pixel would have shown.
 EXPONENT_MARGIN = 1e-3  # of log2 alpha

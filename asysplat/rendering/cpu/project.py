@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from asysplat.rendering import camera_rows as cam
 from asysplat.rendering.convention import LARGEST
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.geometry import (
@@ -23,6 +24,7 @@ from asysplat.rendering.cpu.lanes import log2
 from asysplat.rendering.cpu.sh import basis
 from asysplat.rendering.cpu.tiles import count_tiles
 from asysplat.rendering.cpu.vectors import dot, plus, row3, triple
+from asysplat.rendering.formulas import WHITEN_TO_LOG2
 
 TINY = 1e-20  # below the square of any distance that matters
 
@@ -148,11 +150,11 @@ def _ellipses(
     """Fill `found` for the first `count` Gaussians of flat arrays."""
     alpha_min, log_alpha_min, eps, near, compensation_min = convention
     height, width, _ = size
-    right, down = triple(camera, col.RIGHT), triple(camera, col.DOWN)
-    forward, center = triple(camera, col.FORWARD), triple(camera, col.CENTER)
-    fx, fy, cx, cy = camera[col.FX], camera[col.FY], camera[col.CX], camera[col.CY]
-    low_x, high_x = camera[col.LOW_X], camera[col.HIGH_X]
-    low_y, high_y = camera[col.LOW_Y], camera[col.HIGH_Y]
+    right, down = triple(camera, cam.RIGHT), triple(camera, cam.DOWN)
+    forward, center = triple(camera, cam.FORWARD), triple(camera, cam.CENTER)
+    fx, fy, cx, cy = camera[cam.FX], camera[cam.FY], camera[cam.CX], camera[cam.CY]
+    low_x, high_x = camera[cam.LOW_X], camera[cam.HIGH_X]
+    low_y, high_y = camera[cam.LOW_Y], camera[cam.HIGH_Y]
     edge = 0.5 - col.PIXEL_MARGIN
     for i in range(count):
         # Relative to the camera first: exact for scenes far from the origin.
@@ -172,7 +174,7 @@ def _ellipses(
         x, y = tangent_x * fx + cx, tangent_y * fy + cy
         log_opacity = log2(opacity)
         room = (log_opacity if own_extent else 0.0) - log_alpha_min + col.EXPONENT_MARGIN
-        reach = math.sqrt(max(room, 0.0)) / col.WHITEN_TO_LOG2
+        reach = math.sqrt(max(room, 0.0)) / WHITEN_TO_LOG2
         reach_x, reach_y = reach * math.sqrt(xx + eps), reach * math.sqrt(yy + eps)
         # Every comparison with NaN is false. Without a short cut: `and` would be a branch.
         seen = (
@@ -190,9 +192,9 @@ def _ellipses(
             & (y - reach_y <= height - edge)
         )
         found[CENTER_X + i], found[CENTER_Y + i], found[DEPTH + i] = x, y, z
-        found[WHITEN_A + i] = a * col.WHITEN_TO_LOG2
-        found[WHITEN_B + i] = b * col.WHITEN_TO_LOG2
-        found[WHITEN_C + i] = c * col.WHITEN_TO_LOG2
+        found[WHITEN_A + i] = a * WHITEN_TO_LOG2
+        found[WHITEN_B + i] = b * WHITEN_TO_LOG2
+        found[WHITEN_C + i] = c * WHITEN_TO_LOG2
         found[LOG_OPACITY + i] = log_opacity
         found[REACH_X + i], found[REACH_Y + i] = reach_x, reach_y
         shown = 1.0 if inside | (not skip_frustum) else OUTSIDE
@@ -224,7 +226,7 @@ def _write_color(g, d, means, sh, cameras, image, functions, splats):
     count = sh.shape[1]
     x = y = z = 0.0
     if count > 1:
-        offset = plus(row3(means, g), -1.0, row3(cameras, image, col.CENTER))
+        offset = plus(row3(means, g), -1.0, row3(cameras, image, cam.CENTER))
         length = math.sqrt(max(dot(offset, offset), TINY))
         x, y, z = offset[0] / length, offset[1] / length, offset[2] / length
     basis(x, y, z, count, functions)

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from asysplat.rendering import camera_rows as cam
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.geometry import (
     clamp,
@@ -26,6 +27,7 @@ from asysplat.rendering.cpu.vectors import (
     times,
     unit_quaternion,
 )
+from asysplat.rendering.formulas import WHITEN_TO_LOG2
 
 LOG_2 = math.log(2)
 
@@ -131,17 +133,17 @@ def _splat_backward(
     """Add one splat's part to the gradients; returns that of the opacity."""
     _, _, eps, _, compensation_min = convention
     sh_needed, cameras_needed = needs
-    right, down = row3(cameras, image, col.RIGHT), row3(cameras, image, col.DOWN)
-    forward = row3(cameras, image, col.FORWARD)
-    fx, fy = cameras[image, col.FX], cameras[image, col.FY]
+    right, down = row3(cameras, image, cam.RIGHT), row3(cameras, image, cam.DOWN)
+    forward = row3(cameras, image, cam.FORWARD)
+    fx, fy = cameras[image, cam.FX], cameras[image, cam.FY]
 
     # What `project` computed.
-    offset = plus(row3(means, g), -1.0, row3(cameras, image, col.CENTER))
+    offset = plus(row3(means, g), -1.0, row3(cameras, image, cam.CENTER))
     z = dot(forward, offset)
     inverse_z = 1 / z
     tangent_x, tangent_y = dot(right, offset) * inverse_z, dot(down, offset) * inverse_z
-    inside_x = clamp(tangent_x, cameras[image, col.LOW_X], cameras[image, col.HIGH_X])
-    inside_y = clamp(tangent_y, cameras[image, col.LOW_Y], cameras[image, col.HIGH_Y])
+    inside_x = clamp(tangent_x, cameras[image, cam.LOW_X], cameras[image, cam.HIGH_X])
+    inside_y = clamp(tangent_y, cameras[image, cam.LOW_Y], cameras[image, cam.HIGH_Y])
     row_x = jacobian_row(right, forward, fx, inverse_z, inside_x)
     row_y = jacobian_row(down, forward, fy, inverse_z, inside_y)
     mx, my, turned_x, turned_y, scale = ellipse_rows(quats, scales, g, row_x, row_y)
@@ -158,7 +160,7 @@ def _splat_backward(
         g_det0, g_det = half / det0, -half / det
 
     # Whitening to rows of M.
-    factor = LOG_2 * col.WHITEN_TO_LOG2
+    factor = LOG_2 * WHITEN_TO_LOG2
     g_a, g_b, g_c = (
         factor * pixel[col.G_A],
         factor * pixel[col.G_B],
@@ -236,13 +238,13 @@ def _splat_backward(
 
     _add3(g_mean, 0, 1.0, g_offset)
     if cameras_needed:
-        _add3(g_camera, col.RIGHT, 1.0, plus(scaled(g_u, offset), fx * inverse_z, g_row_x))
-        _add3(g_camera, col.DOWN, 1.0, plus(scaled(g_v, offset), fy * inverse_z, g_row_y))
+        _add3(g_camera, cam.RIGHT, 1.0, plus(scaled(g_u, offset), fx * inverse_z, g_row_x))
+        _add3(g_camera, cam.DOWN, 1.0, plus(scaled(g_v, offset), fy * inverse_z, g_row_y))
         through_x = plus(scaled(g_z, offset), -fx * inverse_z * inside_x, g_row_x)
-        _add3(g_camera, col.FORWARD, 1.0, plus(through_x, -fy * inverse_z * inside_y, g_row_y))
-        _add3(g_camera, col.CENTER, -1.0, g_offset)
-        g_camera[col.FX] += g_fx
-        g_camera[col.FY] += g_fy
-        g_camera[col.CX] += g_cx
-        g_camera[col.CY] += g_cy
+        _add3(g_camera, cam.FORWARD, 1.0, plus(through_x, -fy * inverse_z * inside_y, g_row_y))
+        _add3(g_camera, cam.CENTER, -1.0, g_offset)
+        g_camera[cam.FX] += g_fx
+        g_camera[cam.FY] += g_fy
+        g_camera[cam.CX] += g_cx
+        g_camera[cam.CY] += g_cy
     return g_opacity

@@ -1,17 +1,7 @@
 """Spherical harmonics of one direction, degree 0 to 3, with the signs of INRIA's code."""
 
-import math
-
 from asysplat.rendering.cpu.kernel import inline
-
-Y0 = 0.5 / math.sqrt(math.pi)
-Y1 = math.sqrt(3 / (4 * math.pi))
-Y2 = 0.5 * math.sqrt(15 / math.pi)
-Y2_0 = 0.25 * math.sqrt(5 / math.pi)
-Y3_3 = 0.25 * math.sqrt(35 / (2 * math.pi))
-Y3_2 = 0.5 * math.sqrt(105 / math.pi)
-Y3_1 = 0.25 * math.sqrt(21 / (2 * math.pi))
-Y3_0 = 0.25 * math.sqrt(7 / math.pi)
+from asysplat.rendering.formulas import Y0, Y1, Y2, Y2_0, Y3_0, Y3_1, Y3_2, Y3_3
 
 
 @inline

@@ -1,24 +1,16 @@
-"""Gradients of the splats from those of the pixels, front to back and without stored states.
+"""Gradients of the splats from those of the pixels, back to front.
 
-What lies behind a splat is what is left of the finished pixel once the splats up to it are taken
-away, so the transmittance is never divided back up. Each pair of splat and tile has a place of its
-own for its gradient.
+What lies behind a splat is summed up on the way, from little to much, so that nothing cancels; the
+transmittance before it is that behind it over 1 - alpha, which keeps its relative precision. Which
+splats a pixel saw is what the forward pass left: where it stopped. Each pair of splat and tile has
+a place of its own for its gradient.
 """
-
-import math
 
 import triton.language as tl
 
-from asysplat.rendering.cuda.kernel import (
-    alpha_at,
-    kernel,
-    load_color,
-    load_shape,
-    offset,
-    tile_pixels,
-)
-
-TWO_LN2 = tl.constexpr(2 * math.log(2))
+from asysplat.rendering.cuda.kernel import kernel
+from asysplat.rendering.cuda.splat import GRADIENT, load_color, load_depth, load_shape
+from asysplat.rendering.cuda.tile import HALF_TILE, TILE, alpha_at, color_pixels, tile_pixels
 
 
 @kernel
@@ -28,11 +20,12 @@ def draw_tile_backward(
     pairs,
     first_entry,
     last_entry,
-    image,
-    alpha,
-    depth,
+    transmittance,
+    origins,
+    stops,
+    halved,
     grad_image,
-    grad_alpha,
+    grad_transmittance,
     grad_depth,
     grads,
     columns,
@@ -41,86 +34,88 @@ def draw_tile_backward(
     width,
     alpha_min,
     alpha_max,
-    transmittance_min,
-    HAS_DEPTH: tl.constexpr,
+    DEPTH: tl.constexpr,
     MEDIAN: tl.constexpr,
-    CHANNELS: tl.constexpr,
-    TILE: tl.constexpr,
     STEP: tl.constexpr,
 ):
-    """Write `grads` [P, CHANNELS] of every pair that `draw_tile` drew.
+    """Write `grads` [pairs, 10], see `splat`, of every pair in the tile.
 
-    The other arguments are those of `draw_tile`, its results, and their gradients.
+    The other arguments are those of `draw_tile`, its results, and their gradients; and the place
+    [pairs] of each pair's gradient.
     """
     tile = tl.program_id(0).to(tl.int64)
-    picture, column, row, inside = tile_pixels(tile, columns, tiles, height, width, TILE)
-    center_x, center_y = column.to(tl.float32) + 0.5, row.to(tl.float32) + 0.5
-    pixel = offset(picture, row, column, height, width)
-    red_pixel = offset(3 * picture, row, column, height, width)
-    green_pixel = offset(3 * picture + 1, row, column, height, width)
-    blue_pixel = offset(3 * picture + 2, row, column, height, width)
-    g_alpha = tl.load(grad_alpha + pixel, mask=inside, other=0.0)
+    picture, left, top, lane_x, lane_y, pixel, inside = tile_pixels(
+        tile, columns, tiles, height, width
+    )
+    red_pixel, green_pixel, blue_pixel = color_pixels(pixel, picture, height, width)
     g_red = tl.load(grad_image + red_pixel, mask=inside, other=0.0)
     g_green = tl.load(grad_image + green_pixel, mask=inside, other=0.0)
     g_blue = tl.load(grad_image + blue_pixel, mask=inside, other=0.0)
-    behind = g_alpha * tl.load(alpha + pixel, mask=inside, other=0.0)
-    behind += g_red * tl.load(image + red_pixel, mask=inside, other=0.0)
-    behind += g_green * tl.load(image + green_pixel, mask=inside, other=0.0)
-    behind += g_blue * tl.load(image + blue_pixel, mask=inside, other=0.0)
-    if HAS_DEPTH:
+    passed = tl.load(transmittance + pixel, mask=inside, other=1.0)
+    # What lies behind, the background included, times its gradient.
+    behind = passed * tl.load(grad_transmittance + pixel, mask=inside, other=0.0)
+    stop = tl.load(stops + pixel, mask=inside, other=0)
+    if DEPTH or MEDIAN:
         g_depth = tl.load(grad_depth + pixel, mask=inside, other=0.0)
-        if not MEDIAN:
-            behind += g_depth * tl.load(depth + pixel, mask=inside, other=0.0)
-    left_over = inside.to(tl.float32)
-    position = tl.load(first_entry + tile)
+    if DEPTH:
+        origin = tl.load(origins + pixel, mask=inside, other=0.0)
+    if MEDIAN:
+        half = tl.load(halved + pixel, mask=inside, other=-1)
+    first = tl.load(first_entry + tile)
     end = tl.load(last_entry + tile)
-    while position < end:
+    position = end - 1
+    while position >= first:
         for k in tl.static_range(STEP):
-            there = position + k < end
-            index = tl.load(entries + position + k, mask=there, other=0)
-            splat = splats + index.to(tl.int64) * CHANNELS
-            grad = grads + tl.load(pairs + position + k, mask=there, other=0) * CHANNELS
-            x, y, a, b, c, opacity = load_shape(splat, there)
-            red, green, blue = load_color(splat, there)
-            before = left_over
-            dx, dy = center_x - x, center_y - y
-            hit, left_over, u, v = alpha_at(
-                dx,
-                dy,
-                a,
-                b,
-                c,
-                opacity,
-                before,
-                alpha_min,
-                alpha_max,
-                transmittance_min,
+            there = position - k >= first
+            rank = (position - k - first).to(tl.int32)
+            d = tl.load(entries + position - k, mask=there, other=0).to(tl.int64)
+            grad = grads + GRADIENT * tl.load(pairs + position - k, mask=there, other=0)
+            x, rest_x, y, rest_y, u, a, b, c, log_opacity = load_shape(
+                splats, d, left, top, HALF_TILE, there
             )
-            weight = hit * before
-            shown = g_alpha + g_red * red + g_green * green + g_blue * blue
-            if HAS_DEPTH:
-                if MEDIAN:
-                    halves = (before > 0.5) & (left_over <= 0.5) & (hit > 0)
-                    g_z = tl.where(halves, g_depth, 0.0)
-                else:
-                    z = tl.load(splat + 9, mask=there, other=0.0)
-                    shown += g_depth * z
-                    g_z = g_depth * weight
-                tl.store(grad + 9, tl.sum(g_z, 0), mask=there)
-            behind -= weight * shown
-            # alpha dL/dalpha, 0 where alpha is clamped.
-            e = hit * (before * shown - behind / (1 - hit))
-            e = tl.where(hit < alpha_max, e, 0.0)
-            g_u = -TWO_LN2 * e * u
-            g_v = -TWO_LN2 * e * v
-            sum_u = tl.sum(g_u, 0)
-            tl.store(grad, -a * sum_u, mask=there)
-            tl.store(grad + 1, -b * sum_u - c * tl.sum(g_v, 0), mask=there)
-            tl.store(grad + 2, tl.sum(g_u * dx, 0), mask=there)
-            tl.store(grad + 3, tl.sum(g_u * dy, 0), mask=there)
-            tl.store(grad + 4, tl.sum(g_v * dy, 0), mask=there)
-            tl.store(grad + 5, tl.sum(e, 0) / tl.maximum(opacity, alpha_min), mask=there)
-            tl.store(grad + 6, tl.sum(g_red * weight, 0), mask=there)
-            tl.store(grad + 7, tl.sum(g_green * weight, 0), mask=there)
-            tl.store(grad + 8, tl.sum(g_blue * weight, 0), mask=there)
-        position += STEP
+            red, green, blue = load_color(splats, d, there)
+            dx = (x + lane_x) + rest_x
+            dy = (y + lane_y) + rest_y
+            v = c * dy
+            u = tl.fma(a, lane_x, tl.fma(b, lane_y, u))
+            shows = alpha_at(u, v, log_opacity, alpha_min, alpha_max)
+            shows = tl.where(rank < stop, shows, 0.0)
+            rest = 1 - shows
+            inverse = 1 / rest
+            before = passed * inverse
+            before = tl.fma(tl.fma(-before, rest, passed), inverse, before)  # to the last bit
+            weight = shows * before
+            passed = before
+            value = tl.fma(blue, g_blue, tl.fma(green, g_green, red * g_red))
+            if DEPTH:
+                z, rest_z = load_depth(splats, d, there)
+                value = tl.fma((z - origin) + rest_z, g_depth, value)
+                tl.store(grad + 9, tl.sum(weight * g_depth, 0), mask=there)
+            if MEDIAN:
+                tl.store(grad + 9, tl.sum(tl.where(rank == half, g_depth, 0.0), 0), mask=there)
+            # alpha dL/dalpha; clamped alphas do not answer.
+            e = tl.fma(weight, value, -shows * inverse * behind)
+            e = tl.where(shows < alpha_max, e, 0.0)
+            behind = tl.fma(weight, value, behind)
+            # The exponent is log_opacity - u^2 - v^2, u = a x + b y, v = c y, of minus the centre.
+            eu, ey = e * u, e * dy
+            sum_eu = tl.sum(eu, 0)
+            tl.store(grad, 2 * a * sum_eu, mask=there)
+            tl.store(grad + 1, 2 * b * sum_eu + 2 * c * c * tl.sum(ey, 0), mask=there)
+            tl.store(grad + 2, -2 * tl.sum(eu * dx, 0), mask=there)
+            tl.store(grad + 3, -2 * tl.sum(eu * dy, 0), mask=there)
+            tl.store(grad + 4, -2 * c * tl.sum(ey * dy, 0), mask=there)
+            tl.store(grad + 5, tl.sum(e, 0), mask=there)
+            tl.store(grad + 6, tl.sum(weight * g_red, 0), mask=there)
+            tl.store(grad + 7, tl.sum(weight * g_green, 0), mask=there)
+            tl.store(grad + 8, tl.sum(weight * g_blue, 0), mask=there)
+        position -= STEP
+    # Nothing shows of those behind.
+    lane = tl.arange(0, TILE * TILE)
+    last = tl.load(first_entry + tile + 1)
+    while end < last:
+        there = end + lane < last
+        grad = grads + GRADIENT * tl.load(pairs + end + lane, mask=there, other=0)
+        for k in tl.static_range(GRADIENT):
+            tl.store(grad + k, tl.zeros(lane.shape, tl.float32), mask=there)
+        end += TILE * TILE

@@ -1,48 +1,34 @@
-"""Sums of rows in a fixed order: what atomic additions on a GPU are not."""
+"""The gradient of a splat from those of its tiles."""
 
-from functools import cached_property
+import triton.language as tl
 
-import torch
-from jaxtyping import Float, Int
-from torch import Tensor
-from torch.autograd.function import once_differentiable
+from asysplat.rendering.cuda.kernel import kernel
+from asysplat.rendering.cuda.splat import GRADIENT
 
-
-def sum_runs(
-    rows: Float[Tensor, "R *shape"], starts: Int[Tensor, "ends"]
-) -> Float[Tensor, "ends-1 *shape"]:
-    """Sum of rows starts[s] to starts[s + 1], one after the other; 0 where there are none."""
-    if rows.numel() == 0 or len(starts) == 1:
-        return rows.new_zeros(len(starts) - 1, *rows.shape[1:])
-    flat = rows.flatten(1) if rows.ndim > 1 else rows[:, None]
-    sums = torch.segment_reduce(flat, "sum", offsets=starts, axis=0, unsafe=True)
-    return sums.unflatten(1, rows.shape[1:]) if rows.ndim > 1 else sums[:, 0]
+PAIRS = tl.constexpr(8)  # of a splat that are summed at a time
 
 
-class Gather:
-    """rows -> rows[index], of `count` rows; the gradient of each is summed in index's order."""
+@kernel
+def sum_pairs(counts, first_pair, grads, num_splats, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
+    """Leave the sum over each of BLOCK splats' tiles, in a fixed order, in the place of its first
+    pair.
 
-    def __init__(self, index: Int[Tensor, "R"], count: int):
-        self.index, self.count = index, count
-
-    def __call__(self, rows: Tensor) -> Tensor:
-        return _Gather.apply(rows, self)
-
-    @cached_property
-    def runs(self) -> tuple[Tensor, Tensor]:
-        """What sorts the index, and [count + 1] where each row's run starts."""
-        rows, order = torch.sort(self.index, stable=True)
-        return order, torch.searchsorted(rows, torch.arange(self.count + 1, device=rows.device))
-
-
-class _Gather(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, rows: Tensor, gather: Gather) -> Tensor:
-        ctx.gather = gather
-        return rows.index_select(0, gather.index)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
-        order, starts = ctx.gather.runs
-        return sum_runs(grad.index_select(0, order), starts), None
+    Args:
+        counts, first_pair: [num_splats].
+        grads: [pairs, 10], of which the first CHANNELS are summed.
+    """
+    d = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    count = tl.load(counts + d, mask=d < num_splats, other=0)
+    several = count > 1
+    most = tl.max(tl.where(several, count, 0), 0)
+    if most > 0:
+        row = grads + GRADIENT * tl.load(first_pair + d, mask=several, other=0).to(tl.int64)
+        step = tl.arange(0, PAIRS)
+        for channel in tl.static_range(CHANNELS):
+            total = tl.zeros((BLOCK,), tl.float64)
+            for start in range(0, most, PAIRS):
+                pair = start + step[None, :]
+                here = several[:, None] & (pair < count[:, None])
+                values = tl.load(row[:, None] + GRADIENT * pair + channel, mask=here, other=0.0)
+                total += tl.sum(values.to(tl.float64), 1)
+            tl.store(row + channel, total.to(tl.float32), mask=several)

@@ -1,21 +1,20 @@
-"""Which splats touch which tile of the image."""
+"""Which splats touch which tile: counted, then placed, the same answer both times."""
 
-import math
 from dataclasses import dataclass
 
 import torch
+import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asysplat.rendering.cuda.geometry import clamp
+from asysplat.rendering.cuda.kernel import kernel
+from asysplat.rendering.cuda.splat import load_ellipse
+from asysplat.rendering.cuda.tile import TILE
 from asysplat.rendering.limits import check_pairs
-from asysplat.rendering.settings import Settings
 
-TILE = 8  # pixels a side
-
-# What a skip leaves standing, so that rounding never drops what a pixel would have shown.
-EXPONENT_MARGIN = 1e-3  # of log2 alpha
-PIXEL_MARGIN = 1e-3
-ROUNDING = 1e-6  # of lengths in float32
+PIXEL_MARGIN = tl.constexpr(1e-3)  # so that rounding never drops what a pixel would have shown
+BLOCK = 128
 
 
 @dataclass(frozen=True)
@@ -23,144 +22,183 @@ class TileLists:
     """Depth-ordered splats of every tile; tiles are numbered image by image, row by row.
 
     Args:
-        images, height, width: of what is drawn, in pixels.
-        rows, columns: of tiles of size x size pixels.
         entries: [P] splat of each pair of splat and tile, sorted by tile, then by depth.
-        pairs: [P] number of each among all pairs, sorted by splat.
+        pairs: [P] the number of each among all pairs.
         first_entry: [T + 1] where each tile's list begins.
-        first_pair: [M + 1] where each splat's pairs begin.
-        off_ellipse: how many more pairs there would be with boxes in the place of ellipses.
+        first_pair: [images * N] the number of a splat's first pair, where it has any.
     """
 
-    images: int
-    height: int
-    width: int
-    size: int
-    rows: int
-    columns: int
     entries: Int[Tensor, "P"]
     pairs: Int[Tensor, "P"]
     first_entry: Int[Tensor, "tile_ends"]
-    first_pair: Int[Tensor, "splat_ends"]
-    off_ellipse: int
+    first_pair: Int[Tensor, "splats"]
 
 
-@torch.no_grad()
-def assign_tiles(
-    image_of: Int[Tensor, "M"],
-    splats: Float[Tensor, "M C"],
+def sort_into_tiles(
+    splats: Float[Tensor, "splats 16"],
+    depths: Float[Tensor, "splats"],
+    counts: Int[Tensor, "splats"],
     images: int,
     size: tuple[int, int],
-    settings: Settings,
+    exact: bool,
 ) -> TileLists:
-    """Sort splats, which come in depth order within their image, into tiles.
+    """Sort the splats [images * N] of all images into tiles.
 
     Args:
-        image_of, splats: from `project`.
-        images: how many there are.
+        depths: read where there are pairs.
+        counts: of pairs.
         size: height and width in pixels.
+        exact: see `tile_columns`.
+
+    Raises:
+        InputError: more pairs than a list can number.
     """
     height, width = size
-    rows, columns = -(-height // TILE), -(-width // TILE)
-    ellipses = _Ellipses(splats, settings)
-    box_rows = _tiles(*ellipses.vertical(), height)
-    box_columns = _tiles(*ellipses.horizontal(), width)
-    # First into rows of tiles, then each row into tiles.
-    spans = _lengths(*box_rows)
-    owner, step = _expand(spans)
-    row = box_rows[0][owner] + step
-    if settings.skips.ellipse:
-        first, last = _tiles(*ellipses.horizontal_within(owner, row), width)
-    else:
-        first, last = box_columns[0][owner], box_columns[1][owner]
-    counts = _lengths(first, last)
-    boxes = (spans * _lengths(*box_columns)).sum()
-    total, total_of_boxes = torch.stack((counts.sum(), boxes)).tolist()
-    check_pairs(total)
-    strip, step = _expand(counts, total)
-    tile = ((image_of[owner] * rows + row) * columns + first)[strip] + step
+    rows, columns = -(-height // TILE.value), -(-width // TILE.value)
     tiles = images * rows * columns
-    # A GPU sorts short keys in fewer passes; a stable sort keeps the order of depths.
-    key = torch.int16 if tiles < 2**15 else torch.int32
-    tile, pairs = torch.sort(tile.to(key), stable=True)
-    return TileLists(
-        images=images,
-        height=height,
-        width=width,
-        size=TILE,
-        rows=rows,
-        columns=columns,
-        entries=owner[strip[pairs]].int(),
-        pairs=pairs,
-        first_entry=torch.searchsorted(
-            tile, torch.arange(tiles + 1, dtype=key, device=tile.device)
-        ),
-        first_pair=_starts(counts)[_starts(spans)],
-        off_ellipse=total_of_boxes - total if settings.skips.ellipse else 0,
-    )
-
-
-class _Ellipses:
-    """Where splats have alpha >= alpha_min: (a dx + b dy)^2 + (c dy)^2 <= reach^2."""
-
-    def __init__(self, splats: Tensor, settings: Settings):
-        self.x, self.y, self.a, b, self.c, opacity = splats[:, :6].unbind(-1)
-        self.tilt = b / self.c
-        room = opacity.log2() if settings.skips.extent else torch.zeros_like(opacity)
-        room = room - math.log2(settings.convention.alpha_min) + EXPONENT_MARGIN
-        self.reach = room.clamp_min(0).sqrt()
-        self.half_width = self.reach * (1 + self.tilt.square()).sqrt() / self.a
-        # Far from a needle's centre the two terms of the first square nearly cancel.
-        self.margin = PIXEL_MARGIN + ROUNDING * (self.x.abs() + self.half_width)
-
-    def vertical(self) -> tuple[Tensor, Tensor]:
-        """Least and greatest y."""
-        half = self.reach / self.c + PIXEL_MARGIN + ROUNDING * self.y.abs()
-        return self.y - half, self.y + half
-
-    def horizontal(self) -> tuple[Tensor, Tensor]:
-        """Least and greatest x."""
-        half = self.half_width + self.margin
-        return self.x - half, self.x + half
-
-    def horizontal_within(self, index: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
-        """Least and greatest x of the splats `index` between the outermost pixel centres of the
-        given rows of tiles.
-
-        There the right edge is farthest out at its tip, or, where the tip is not between them, at
-        the centre nearest to it; the left edge mirrors it.
-        """
-        x, y, a, c, tilt, reach, margin = (
-            t[index] for t in (self.x, self.y, self.a, self.c, self.tilt, self.reach, self.margin)
+    visible = torch.nonzero(counts)[:, 0]
+    # By depth across all images: the order of tiles, which comes second, parts these again.
+    order = visible[torch.argsort(depths[visible], stable=True)]
+    ends = counts[order].cumsum(0)
+    pairs = int(ends[-1]) if len(order) else 0
+    check_pairs(pairs)
+    # A GPU sorts short keys in fewer passes.
+    key = next(t for t in (torch.int16, torch.int32, torch.int64) if tiles <= torch.iinfo(t).max)
+    tile_of = torch.empty(pairs, dtype=key, device=splats.device)
+    owners = torch.empty(pairs, dtype=torch.int32, device=splats.device)
+    first_pair = torch.empty_like(counts)
+    if pairs:
+        place[(-(-len(order) // BLOCK),)](
+            splats,
+            order,
+            counts,
+            ends,
+            tile_of,
+            owners,
+            first_pair,
+            len(order),
+            len(counts) // images,
+            height,
+            width,
+            columns,
+            rows * columns,
+            EXACT=exact,
+            BLOCK=BLOCK,
+            enable_fp_fusion=False,
         )
-        low = row * TILE + 0.5 - PIXEL_MARGIN - y
-        high = low + (TILE - 1 + 2 * PIXEL_MARGIN)
-        low, high = (c * low).clamp(-reach, reach), (c * high).clamp(-reach, reach)
-        tip = -reach * tilt / (1 + tilt.square()).sqrt()  # c dy of the rightmost point
-        right, left = tip.clamp(low, high), (-tip).clamp(low, high)
-        right_edge = ((reach.square() - right.square()).clamp_min(0).sqrt() - tilt * right) / a
-        left_edge = (-(reach.square() - left.square()).clamp_min(0).sqrt() - tilt * left) / a
-        return x + left_edge - margin, x + right_edge + margin
+    tile_of, numbers = torch.sort(tile_of, stable=True)
+    starts = torch.arange(tiles + 1, dtype=key, device=splats.device)
+    return TileLists(owners[numbers], numbers, torch.searchsorted(tile_of, starts), first_pair)
 
 
-def _tiles(low: Tensor, high: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
-    """First and last tile, along one axis, with a pixel centre from `low` to `high`; the last is
-    before the first where there is none."""
-    first = (low - 0.5).ceil().clamp(0, pixels).long()
-    last = (high - 0.5).floor().clamp(-1, pixels - 1).long()
-    return first // TILE, torch.where(first <= last, last // TILE, -1)
+@kernel
+def place(
+    splats,
+    order,
+    counts,
+    ends,
+    tile_of,
+    owners,
+    first_pair,
+    num_visible,
+    num,
+    height,
+    width,
+    columns,
+    tiles,
+    EXACT: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Write the tile and the splat of every pair of BLOCK splats, of those that have any, by depth.
+
+    Args:
+        splats: [images * N, 16], N is `num`.
+        order: [num_visible].
+        counts, first_pair: [images * N].
+        ends: [num_visible] the number behind a splat's last pair.
+        tile_of, owners: [pairs].
+    """
+    rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    there = rank < num_visible
+    d = tl.load(order + rank, mask=there, other=0)
+    pair = tl.load(ends + rank, mask=there, other=0) - tl.load(counts + d, mask=there, other=0)
+    tl.store(first_pair + d, pair.to(tl.int32), mask=there)
+    ellipse = load_ellipse(splats, d, there)
+    first_row, last_row = tile_rows(ellipse, height)
+    last_row = tl.where(there, last_row, first_row - 1)
+    first_tile = d // num * tiles
+    for step in range(tl.max(last_row - first_row, 0) + 1):
+        row = first_row + step
+        first, last = tile_columns(ellipse, row, width, EXACT)
+        last = tl.where(row <= last_row, last, first - 1)
+        for column_step in range(tl.max(last - first, 0) + 1):
+            column = first + column_step
+            here = column <= last
+            tl.store(tile_of + pair, first_tile + row * columns + column, mask=here)
+            tl.store(owners + pair, d.to(tl.int32), mask=here)
+            pair += here.to(tl.int64)
 
 
-def _lengths(first: Tensor, last: Tensor) -> Tensor:
-    return (last - first + 1).clamp_min(0)
+@kernel
+def count_tiles(ellipse, shown, height, width, EXACT: tl.constexpr):
+    """Tiles of each splat that is shown; of the boxes of all, together."""
+    first_row, last_row = tile_rows(ellipse, height)
+    last_row = tl.where(shown, last_row, first_row - 1)
+    left, right = box_columns(ellipse, width)
+    boxes = (last_row - first_row + 1) * tl.maximum(right - left + 1, 0)
+    count = tl.zeros_like(first_row)
+    for step in range(tl.max(last_row - first_row, 0) + 1):
+        row = first_row + step
+        first, last = tile_columns(ellipse, row, width, EXACT)
+        count += tl.where(row <= last_row, tl.maximum(last - first + 1, 0), 0)
+    return count, tl.sum(boxes, 0)
 
 
-def _starts(counts: Tensor) -> Tensor:
-    """[0, c_0, c_0 + c_1, ...]"""
-    return torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+@kernel
+def tile_range(center, below, above, size):
+    """First and last tile that has a pixel centre from center - below to center + above, of an
+    image of `size` pixels; the last is before the first where there is none."""
+    first = tl.ceil(clamp(center - below - 0.5 - PIXEL_MARGIN, 0.0, size * 1.0)).to(tl.int32)
+    last = tl.floor(clamp(center + above - 0.5 + PIXEL_MARGIN, -1.0, size - 1.0)).to(tl.int32)
+    return first // TILE, tl.where(first <= last, last // TILE, first // TILE - 1)
 
 
-def _expand(counts: Tensor, total: int | None = None) -> tuple[Tensor, Tensor]:
-    """Index i counts[i] times, and 0, 1, ... to each."""
-    owner = torch.repeat_interleave(counts, output_size=total)
-    return owner, torch.arange(len(owner), device=owner.device) - _starts(counts)[owner]
+@kernel
+def tile_rows(ellipse, height):
+    """First and last row of tiles."""
+    _, y, _, _, _, reach = ellipse
+    return tile_range(y, reach, reach, height)
+
+
+@kernel
+def box_columns(ellipse, width):
+    """First and last tile of a row of tiles that its box touches."""
+    x, _, a, b, c, reach = ellipse
+    tilt = b / c
+    half_width = c * reach * tl.sqrt(1 + tilt * tilt) / a
+    return tile_range(x, half_width, half_width, width)
+
+
+@kernel
+def tile_columns(ellipse, row, width, EXACT: tl.constexpr):
+    """First and last tile of a row of tiles that the ellipse touches, or, if not EXACT, its box.
+
+    It is (a dx + b dy)^2 + (c dy)^2 <= (c reach)^2. Between the row's outermost pixel centres its
+    right edge is farthest out at its tip, or, where the tip is not among them, at the centre
+    nearest to it; the left edge mirrors it.
+    """
+    if not EXACT:
+        return box_columns(ellipse, width)
+    x, y, a, b, c, reach = ellipse
+    square = (c * reach) * (c * reach)
+    tilt = b / c
+    tip = -tilt / tl.sqrt(tilt * tilt + 1) * reach  # dy of the rightmost point
+    low = (row * TILE).to(tl.float64) + (0.5 - PIXEL_MARGIN) - y
+    high = low + (TILE - 1 + 2 * PIXEL_MARGIN)
+    low, high = tl.maximum(low, -reach), tl.minimum(high, reach)
+    right_dy = tl.minimum(tl.maximum(tip, low), high)
+    left_dy = tl.minimum(tl.maximum(-tip, low), high)
+    right_v, left_v = c * right_dy, c * left_dy
+    right = (tl.sqrt(tl.maximum(square - right_v * right_v, 0.0)) - b * right_dy) / a
+    left = (-tl.sqrt(tl.maximum(square - left_v * left_v, 0.0)) - b * left_dy) / a
+    return tile_range(x, -left, right, width)

@@ -1,0 +1,134 @@
+"""Gaussians to splats, in float64 whatever the inputs: a splat is rounded once, at the end."""
+
+import triton.language as tl
+
+from asysplat.rendering import convention, formulas
+from asysplat.rendering.cuda.geometry import (
+    CAMERA,
+    CX,
+    CY,
+    FX,
+    FY,
+    covariance,
+    direction_of,
+    ellipse_rows,
+    in_camera,
+    whitening,
+)
+from asysplat.rendering.cuda.kernel import kernel
+from asysplat.rendering.cuda.sh import basis, sum_harmonics
+from asysplat.rendering.cuda.splat import as_stored, store_splat
+from asysplat.rendering.cuda.tiles import PIXEL_MARGIN, count_tiles
+from asysplat.rendering.cuda.vectors import load3, load_unit_quaternion
+
+LARGEST = tl.constexpr(convention.LARGEST)
+WHITEN_TO_LOG2 = tl.constexpr(formulas.WHITEN_TO_LOG2)
+EXPONENT_MARGIN = tl.constexpr(1e-3)  # of log2 alpha, so that rounding never drops what shows
+
+
+@kernel
+def project(
+    means,
+    quats,
+    scales,
+    opacities,
+    sh,
+    cameras,
+    splats,
+    depths,
+    counts,
+    counters,
+    num,
+    views,
+    height,
+    width,
+    alpha_min,
+    log_alpha_min,
+    eps,
+    near,
+    compensation_min,
+    ANTIALIASED: tl.constexpr,
+    SKIP_OPACITY: tl.constexpr,
+    SKIP_FRUSTUM: tl.constexpr,
+    OWN_EXTENT: tl.constexpr,
+    EXACT: tl.constexpr,
+    COUNT: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Splats of BLOCK Gaussians in one image, and how many tiles they touch.
+
+    Args:
+        means, quats, scales, opacities, sh: [B * num, ...], COUNT harmonics.
+        cameras: [B * views, 20] float64, see `camera_rows`.
+        splats: [B * views * num, 16] and depths: [B * views * num], written where visible.
+        counts: [B * views * num] pairs of each, 0 where culled.
+        counters: [programs, 3]: tiles that boxes would touch in the place of ellipses; Gaussians
+            that were culled by their opacity, and outside the image.
+    """
+    image = tl.program_id(1).to(tl.int64)
+    n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    g = image // views * num + n
+    opacity = tl.load(opacities + g, mask=n < num, other=0.0).to(tl.float64)
+    there = n < num
+    if SKIP_OPACITY:
+        # Written so that NaN stays, and is culled below.
+        there = there & ((opacity >= alpha_min) | (opacity != opacity))
+    faint = tl.sum(((n < num) & (there == 0)).to(tl.int32), 0)
+    mean, scale = load3(means, g, there), load3(scales, g, there)
+    qw, qx, qy, qz, _ = load_unit_quaternion(quats, g, there)
+    camera = cameras + CAMERA * image
+    offset, tangent_x, tangent_y, z, _, _, _, row_x, row_y = in_camera(camera, mean)
+    mx, my, _, _ = ellipse_rows((qw, qx, qy, qz), scale, row_x, row_y)
+    xx, xy, yy, _, det0, det = covariance(mx, my, eps)
+    a, b, c = whitening(xy, yy + eps, det)
+    shown = (opacity <= 1) & there
+    if ANTIALIASED:
+        opacity *= tl.sqrt(tl.maximum(det0 / det, compensation_min))
+    x = tangent_x * tl.load(camera + FX) + tl.load(camera + CX)
+    y = tangent_y * tl.load(camera + FY) + tl.load(camera + CY)
+    log_opacity = tl.log2(opacity)
+    room = EXPONENT_MARGIN - log_alpha_min
+    if OWN_EXTENT:
+        room += log_opacity
+    reach = tl.sqrt(tl.maximum(room, 0.0)) / WHITEN_TO_LOG2
+    reach_x, reach_y = reach * tl.sqrt(xx + eps), reach * tl.sqrt(yy + eps)
+    # Every comparison with NaN is false.
+    shown = shown & (z > near) & (z < LARGEST) & (opacity >= alpha_min) & (a > 0)
+    shown = shown & (tl.abs(x + y + b + c) < float("inf"))
+    edge = 0.5 - PIXEL_MARGIN
+    inside = (x + reach_x >= edge) & (x - reach_x <= width - edge)
+    inside = inside & (y + reach_y >= edge) & (y - reach_y <= height - edge)
+    outside = 0
+    if SKIP_FRUSTUM:
+        outside += tl.sum((shown & (inside == 0)).to(tl.int32), 0)
+        shown = shown & inside
+    count = tl.zeros(n.shape, tl.int32)
+    boxes = tl.sum(count, 0)
+    d = image * num + n
+    if tl.max(shown.to(tl.int32), 0) > 0:
+        red, green, blue, shown = colors(sh, g, offset, shown, COUNT)
+        a, b, c = a * WHITEN_TO_LOG2, b * WHITEN_TO_LOG2, c * WHITEN_TO_LOG2
+        reach_y *= 1 + 1e-6
+        store_splat(splats, d, x, y, a, b, c, log_opacity, reach_y, red, green, blue, z, shown)
+        tl.store(depths + d, z.to(tl.float32), mask=shown)
+        ellipse = as_stored(x, y, a, b, c, reach_y)
+        count, boxes = count_tiles(ellipse, shown, height, width, EXACT)
+    tl.store(counts + d, count, mask=n < num)
+    counter = counters + 3 * (image * tl.num_programs(0) + tl.program_id(0))
+    tl.store(counter, boxes)
+    tl.store(counter + 1, faint)
+    tl.store(counter + 2, outside)
+
+
+@kernel
+def colors(sh, g, offset, shown, COUNT: tl.constexpr):
+    """The three channels seen along `offset`; and `shown` less what has unusable harmonics."""
+    _, _, x, y, z = direction_of(offset)
+    functions = basis(x, y, z, COUNT)
+    red = tl.maximum(sum_harmonics(sh, g, 0, functions, shown, COUNT), 0.0)
+    green = tl.maximum(sum_harmonics(sh, g, 1, functions, shown, COUNT), 0.0)
+    blue = tl.maximum(sum_harmonics(sh, g, 2, functions, shown, COUNT), 0.0)
+    for k in tl.static_range(3 * COUNT):
+        coefficient = tl.load(sh + 3 * COUNT * g + k, mask=shown, other=0.0)
+        shown = shown & (tl.abs(coefficient) < LARGEST)
+    return red, green, blue, shown

@@ -1,0 +1,66 @@
+"""The kernels of "cuda" compile for GPUs that are not at hand: what the interpreter takes, the
+compiler may not."""
+
+import pytest
+import torch
+
+from asysplat.rendering import render
+
+triton = pytest.importorskip("triton")
+
+TYPES = {torch.float32: "fp32", torch.float64: "fp64", torch.int16: "i16", torch.int32: "i32"}
+TYPES |= {torch.int64: "i64", torch.bool: "i1"}
+KERNELS = {"project", "place", "draw_tile", "draw_tile_backward", "sum_pairs", "project_backward"}
+
+
+def compiled(kernel, arguments, constants, architecture):
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    names = kernel.arg_names
+    options = {name: constants.pop(name) for name in list(constants) if name not in names}
+    signature = {}
+    for name, value in zip(names, arguments, strict=False):
+        if value is None:
+            constants[name] = None
+        elif isinstance(value, torch.Tensor):
+            signature[name] = "*" + TYPES[value.dtype]
+        else:
+            signature[name] = "fp32" if isinstance(value, float) else "i32"
+    signature |= dict.fromkeys(constants, "constexpr")
+    source = ASTSource(kernel, {name: signature[name] for name in names}, constants)
+    return triton.compile(source, GPUTarget("cuda", architecture, 32), options)
+
+
+@pytest.fixture(params=[80, 90], ids="sm_{}".format)
+def launched(request, monkeypatch):
+    """Kernels are compiled in the place of being run; every Gaussian is left with one pair."""
+    from triton.runtime.jit import JITFunction
+
+    kernels = {}
+
+    def run(kernel, *arguments, grid, warmup, **constants):
+        name = kernel.fn.__name__
+        kernels[name] = compiled(kernel, arguments, constants, request.param)
+        for argument, tensor in zip(kernel.arg_names, arguments, strict=False):
+            if isinstance(tensor, torch.Tensor) and not tensor.is_floating_point():
+                tensor.fill_(argument == "counts")
+
+    monkeypatch.setattr(JITFunction, "run", run)
+    monkeypatch.setattr("asysplat.rendering.cuda.stages.INTERPRETED", True)
+    return kernels
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"depth": "median", "antialiased": True, "sh_degree": 0}], ids=str
+)
+def test_all_kernels_compile(make_scene, launched, options):
+    gaussians, cameras = make_scene(dtype=torch.float32, degree=3)
+    cameras.cam_to_world.requires_grad_()
+    gaussians.sh.requires_grad_()
+    masks = torch.ones(1, cameras.height, cameras.width, dtype=torch.bool)
+    out = render(gaussians, cameras, backend="cuda", masks=masks, **options)
+    out.image.sum().backward()
+    assert set(launched) == KERNELS
+    for name, kernel in launched.items():
+        assert kernel.asm["cubin"], name
