@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from asysplat.benchmark.render import rows, stages
+from asysplat.ops.cpu.lanes import LANES
 from asysplat.rendering import INRIA
 from asysplat.rendering.cpu import backward, forward
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.backward import rasterize_backward
 from asysplat.rendering.cpu.forward import rasterize
-from asysplat.rendering.cpu.lanes import LANES
 from asysplat.rendering.cpu.tile import PIXELS
 
 LIMITS = (INRIA.alpha_min, INRIA.alpha_max, INRIA.transmittance_min)

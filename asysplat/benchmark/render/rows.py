@@ -3,12 +3,12 @@ nothing around it, which no renderer of this kind can be faster than."""
 
 import numpy as np
 
+from asysplat.ops.cpu.kernel import inline, kernel
+from asysplat.ops.cpu.lanes import LANES
 from asysplat.rendering.cpu import backward, forward
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.backward import draw_row_backward
 from asysplat.rendering.cpu.forward import draw_row
-from asysplat.rendering.cpu.kernel import inline, kernel
-from asysplat.rendering.cpu.lanes import LANES
 from asysplat.rendering.cpu.tile import PLANE, aligned, row_of
 
 FORWARD_STATE = forward.PLANES * PLANE

@@ -15,9 +15,9 @@ from asysplat.benchmark.render.rows import (
     backward_rows,
     forward_rows,
 )
+from asysplat.ops.cpu.threads import even_bounds, run_blocks
 from asysplat.rendering import INRIA
 from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.threads import even_bounds, run_blocks
 from asysplat.rendering.formulas import WHITEN_TO_LOG2
 
 STAGES = ("project", "start_positions", "place", "rasterize")

@@ -8,9 +8,8 @@ a place of its own for its gradient: no two threads write to one, and sums have 
 
 import numpy as np
 
-from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.kernel import inline, kernel
-from asysplat.rendering.cpu.lanes import (
+from asysplat.ops.cpu.kernel import inline, kernel
+from asysplat.ops.cpu.lanes import (
     LANES,
     MIDDLE,
     ONE,
@@ -20,6 +19,7 @@ from asysplat.rendering.cpu.lanes import (
     prefetch,
     take_sum,
 )
+from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.tile import (
     AHEAD,
     PIXELS,

@@ -10,13 +10,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
+from asysplat.ops.cpu.threads import even_bounds, run_blocks, weighted_bounds
 from asysplat.rendering.camera_rows import CAMERA_GRADIENT, camera_gradients, camera_rows
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.backward import rasterize_backward
 from asysplat.rendering.cpu.forward import rasterize
 from asysplat.rendering.cpu.project import project
 from asysplat.rendering.cpu.project_backward import project_backward
-from asysplat.rendering.cpu.threads import even_bounds, run_blocks, weighted_bounds
 from asysplat.rendering.cpu.tiles import place, start_positions
 from asysplat.rendering.layers import Layers
 from asysplat.rendering.limits import check_pairs

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from asysplat.ops.cpu.kernel import inline, kernel
+from asysplat.ops.cpu.lanes import HALF, LANES, MIDDLE, ONE, ZERO, alpha_at, fma, prefetch
 from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.kernel import inline, kernel
-from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, ONE, ZERO, alpha_at, fma, prefetch
 from asysplat.rendering.cpu.sort import DIGITS, RADIX, sort_by_depth
 from asysplat.rendering.cpu.tile import (
     AHEAD,

@@ -2,7 +2,7 @@
 
 import math
 
-from asysplat.rendering.cpu.kernel import inline
+from asysplat.ops.cpu.kernel import inline
 from asysplat.rendering.cpu.vectors import (
     cross,
     dot,

@@ -8,6 +8,8 @@ import math
 
 import numpy as np
 
+from asysplat.ops.cpu.kernel import inline, kernel
+from asysplat.ops.cpu.lanes import log2
 from asysplat.rendering import camera_rows as cam
 from asysplat.rendering.convention import LARGEST
 from asysplat.rendering.cpu import layout as col
@@ -19,8 +21,6 @@ from asysplat.rendering.cpu.geometry import (
     jacobian_row,
     whitening,
 )
-from asysplat.rendering.cpu.kernel import inline, kernel
-from asysplat.rendering.cpu.lanes import log2
 from asysplat.rendering.cpu.sh import basis
 from asysplat.rendering.cpu.tiles import count_tiles
 from asysplat.rendering.cpu.vectors import dot, plus, row3, triple

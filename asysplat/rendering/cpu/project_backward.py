@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from asysplat.ops.cpu.kernel import inline, kernel
 from asysplat.rendering import camera_rows as cam
 from asysplat.rendering.cpu import layout as col
 from asysplat.rendering.cpu.geometry import (
@@ -13,7 +14,6 @@ from asysplat.rendering.cpu.geometry import (
     jacobian_row,
     whitening,
 )
-from asysplat.rendering.cpu.kernel import inline, kernel
 from asysplat.rendering.cpu.project import TINY
 from asysplat.rendering.cpu.sh import basis, basis_gradient
 from asysplat.rendering.cpu.vectors import (

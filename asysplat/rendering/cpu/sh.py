@@ -1,6 +1,6 @@
 """Spherical harmonics of one direction, degree 0 to 3, with the signs of INRIA's code."""
 
-from asysplat.rendering.cpu.kernel import inline
+from asysplat.ops.cpu.kernel import inline
 from asysplat.rendering.formulas import Y0, Y1, Y2, Y2_0, Y3_0, Y3_1, Y3_2, Y3_3
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from asysplat.ops.cpu.kernel import inline
 from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.kernel import inline
 
 SHORT = 32  # lists up to this are sorted by insertion
 RADIX = 256

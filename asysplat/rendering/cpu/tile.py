@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
+from asysplat.ops.cpu.kernel import inline
+from asysplat.ops.cpu.lanes import HALF, LANES, MIDDLE, fma, to_bits
 from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.kernel import inline
-from asysplat.rendering.cpu.lanes import HALF, LANES, MIDDLE, fma, to_bits
 
 PIXELS = col.TILE * LANES
 # From one plane of a tile's state to the next: planes 4096 bytes apart would look like one to the

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from asysplat.ops.cpu.kernel import inline, kernel
 from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.kernel import inline, kernel
 
 
 @inline

@@ -2,8 +2,8 @@
 
 import math
 
+from asysplat.ops.cpu.kernel import inline
 from asysplat.rendering import formulas
-from asysplat.rendering.cpu.kernel import inline
 
 dot = inline(formulas.dot)
 cross = inline(formulas.cross)

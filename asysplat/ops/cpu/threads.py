@@ -49,7 +49,7 @@ def _portions() -> int:
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="render")
+    return ThreadPoolExecutor(threads, thread_name_prefix="asysplat")
 
 
 # A forked process has none of its parent's threads.

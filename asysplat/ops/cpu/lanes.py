@@ -13,7 +13,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from asysplat.rendering.cpu.kernel import inline
+from asysplat.ops.cpu.kernel import inline
 
 LANES = 16  # pixels of a tile's row, one vector of AVX-512
 FLOAT, FLOAT_BITS = ir.FloatType(), ir.IntType(32)

@@ -11,6 +11,7 @@ import numba
 from numba import njit
 
 HERE = Path(__file__).parent
+PACKAGE = HERE.parent.parent
 
 
 def kernel(function: Callable) -> Callable:
@@ -35,9 +36,9 @@ def _bare(function: Callable) -> Callable:
 
 @cache
 def _cache_folder(asked: str) -> str:
-    """Another one for every version of these sources: Numba looks at a kernel's own file alone, and
+    """Another one for every version of the sources: Numba looks at a kernel's own file alone, and
     would keep one whose parts, in other files, have changed."""
-    paths = (*HERE.glob("*.py"), *HERE.parent.glob("*.py"))
+    paths = [path for folder in ("ops", "rendering") for path in (PACKAGE / folder).rglob("*.py")]
     sources = b"".join(path.read_bytes() for path in sorted(paths))
     beside = HERE / "__pycache__"
     home = Path.home() / ".cache" / "asysplat"
