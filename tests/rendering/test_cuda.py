@@ -233,7 +233,8 @@ def test_tensors_on_a_cpu_are_an_error(make_scene):
 
 
 def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
-    for name in [name for name in sys.modules if name.startswith("asysplat.rendering.cuda.")]:
+    names = ("asysplat.rendering.cuda.", "asysplat.ops.cuda.")
+    for name in [name for name in sys.modules if name.startswith(names)]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "triton", None)
     with pytest.raises(InputError, match="'cuda' needs triton: pip install triton"):

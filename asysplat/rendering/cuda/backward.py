@@ -8,7 +8,7 @@ a place of its own for its gradient.
 
 import triton.language as tl
 
-from asysplat.rendering.cuda.kernel import kernel
+from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering.cuda.splat import GRADIENT, load_color, load_depth, load_shape
 from asysplat.rendering.cuda.tile import HALF_TILE, TILE, alpha_at, color_pixels, tile_pixels
 

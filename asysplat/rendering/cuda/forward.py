@@ -2,7 +2,7 @@
 
 import triton.language as tl
 
-from asysplat.rendering.cuda.kernel import kernel
+from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering.cuda.splat import load_color, load_depth, load_shape
 from asysplat.rendering.cuda.tile import HALF_TILE, alpha_at, color_pixels, tile_pixels
 

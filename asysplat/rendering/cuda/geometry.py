@@ -2,8 +2,8 @@
 
 import triton.language as tl
 
+from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering import camera_rows as cam
-from asysplat.rendering.cuda.kernel import kernel
 from asysplat.rendering.cuda.vectors import (
     cross,
     dot,

@@ -2,6 +2,7 @@
 
 import triton.language as tl
 
+from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering import convention, formulas
 from asysplat.rendering.cuda.geometry import (
     CAMERA,
@@ -15,7 +16,6 @@ from asysplat.rendering.cuda.geometry import (
     in_camera,
     whitening,
 )
-from asysplat.rendering.cuda.kernel import kernel
 from asysplat.rendering.cuda.sh import basis, sum_harmonics
 from asysplat.rendering.cuda.splat import as_stored, store_splat
 from asysplat.rendering.cuda.tiles import PIXEL_MARGIN, count_tiles

@@ -4,6 +4,7 @@ import math
 
 import triton.language as tl
 
+from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering import formulas
 from asysplat.rendering.cuda.geometry import (
     CAMERA,
@@ -23,7 +24,6 @@ from asysplat.rendering.cuda.geometry import (
     in_camera,
     whitening,
 )
-from asysplat.rendering.cuda.kernel import kernel
 from asysplat.rendering.cuda.sh import basis, basis_gradient, sum_harmonics
 from asysplat.rendering.cuda.splat import GRADIENT
 from asysplat.rendering.cuda.vectors import (

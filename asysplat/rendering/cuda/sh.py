@@ -2,8 +2,8 @@
 
 import triton.language as tl
 
+from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering import formulas
-from asysplat.rendering.cuda.kernel import kernel
 
 Y0, Y1 = tl.constexpr(formulas.Y0), tl.constexpr(formulas.Y1)
 Y2, Y2_0 = tl.constexpr(formulas.Y2), tl.constexpr(formulas.Y2_0)

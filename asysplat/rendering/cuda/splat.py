@@ -2,7 +2,7 @@
 
 import triton.language as tl
 
-from asysplat.rendering.cuda.kernel import kernel
+from asysplat.ops.cuda.kernel import kernel
 
 # A splat [16] float32: alpha = 2^(log_opacity - (a dx + b dy)^2 - (c dy)^2), its centre, rounded
 # down, in columns 0 and 1 as int32, and what that leaves of it in 2 and 3; a, b, c in 4 to 6, and

@@ -2,7 +2,7 @@
 
 import triton.language as tl
 
-from asysplat.rendering.cuda.kernel import kernel
+from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering.cuda.splat import GRADIENT
 
 PAIRS = tl.constexpr(8)  # of a splat that are summed at a time

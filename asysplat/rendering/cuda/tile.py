@@ -2,7 +2,7 @@
 
 import triton.language as tl
 
-from asysplat.rendering.cuda.kernel import kernel
+from asysplat.ops.cuda.kernel import kernel
 
 TILE = tl.constexpr(8)  # pixels a side
 HALF_TILE = tl.constexpr(4)

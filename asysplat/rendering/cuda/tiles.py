@@ -7,8 +7,8 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering.cuda.geometry import clamp
-from asysplat.rendering.cuda.kernel import kernel
 from asysplat.rendering.cuda.splat import load_ellipse
 from asysplat.rendering.cuda.tile import TILE
 from asysplat.rendering.limits import check_pairs

@@ -6,8 +6,8 @@ from types import FunctionType
 
 import triton.language as tl
 
+from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering import formulas
-from asysplat.rendering.cuda.kernel import kernel
 
 
 def shared(formula: Callable) -> Callable:

@@ -1,0 +1,1 @@
+"""What all kernels for GPUs have in common: how they are compiled (Triton)."""
