@@ -31,7 +31,7 @@ def selective_arguments(batch=2, length=7, channels=3, state=5, dtype=torch.floa
 
 SCANS = {
     "ssd": (ssd, ssd_arguments, "chunked"),
-    "selective_scan": (selective_scan, selective_arguments, "recurrent"),
+    "selective_scan": (selective_scan, selective_arguments, "chunked"),
 }
 
 

@@ -45,8 +45,7 @@ FAST = tuple(backend for backend in BACKENDS if backend.name != "reference")
 # A process in which Triton interprets its kernels, see test_in_triton.py, tests them alone.
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 if INTERPRETED:
-    BACKENDS = (Backend("cuda", torch.float32, 1e-6, 5e-6, 60),)
-    FAST = ()
+    FAST = BACKENDS = (Backend("cuda", torch.float32, 1e-6, 5e-6, 60),)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import torch
 from backends import (
     BACKENDS,
     FIELDS,
+    INTERPRETED,
     assert_close,
     both_ways,
     max_error,
@@ -19,7 +20,7 @@ from hypothesis import strategies as st
 from asysplat.rendering import INRIA
 from asysplat.scene import Cameras, Gaussians
 
-few = settings(max_examples=4, derandomize=True, deadline=None)
+few = settings(max_examples=1 if INTERPRETED else 4, derandomize=True, deadline=None)
 seeds = st.integers(0, 10**6)
 per_backend = pytest.mark.parametrize("backend", BACKENDS, ids=str)
 

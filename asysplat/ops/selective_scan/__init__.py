@@ -3,15 +3,21 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.dispatch import pick_backend, run_scan
-from asysplat.ops.selective_scan.recurrent import selective_scan_recurrent
+from asysplat.ops.dispatch import run_scan
+from asysplat.ops.scan_operator import scan_operator
+from asysplat.ops.selective_scan.chunked import selective_scan_chunked
 from asysplat.ops.selective_scan.reference import selective_scan_reference
 
-_BACKENDS = {
-    "auto": selective_scan_recurrent,
-    "recurrent": selective_scan_recurrent,
-    "reference": selective_scan_reference,
-}
+
+def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int, int]:
+    """A multiplication and an addition for each new state, and for each that is read; then the
+    states again, and four gradients."""
+    states = x_shape[0] * x_shape[1] * x_shape[2] * B_shape[-1]
+    return 4 * states, 10 * states
+
+
+_FORMS = {"chunked": selective_scan_chunked, "reference": selective_scan_reference}
+_OPERATOR = scan_operator("selective_scan", count_flops)
 
 
 def selective_scan(
@@ -32,10 +38,12 @@ def selective_scan(
         A: < 0, so that no exponent is positive.
         B, C: input and output vectors, shared by the channels.
         D: skip weight of each channel.
+        backend: "cpu" or "cuda", "chunked" (torch, any device and float type), "reference", or
+            "auto", which is the fast one for the device, and "chunked" for float64.
         reverse: scan from the last token to the first.
 
     Raises:
-        InputError: an unknown backend.
+        InputError: an unknown backend, or one that cannot take these tensors; shapes or devices
+            that do not go together; integers; no token.
     """
-    form = pick_backend("selective_scan", _BACKENDS, backend)
-    return run_scan(form, x, dt, A, B, C, D, reverse)
+    return run_scan("selective_scan", _FORMS, _OPERATOR, backend, (x, dt, A, B, C, D), reverse)

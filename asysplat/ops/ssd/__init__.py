@@ -3,11 +3,26 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.dispatch import pick_backend, run_scan
-from asysplat.ops.ssd.chunked import ssd_chunked
+from asysplat.ops.dispatch import run_scan
+from asysplat.ops.scan_operator import scan_operator
+from asysplat.ops.ssd.chunked import CHUNK, ssd_chunked
 from asysplat.ops.ssd.reference import ssd_reference
 
-_BACKENDS = {"auto": ssd_chunked, "chunked": ssd_chunked, "reference": ssd_reference}
+
+def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int, int]:
+    """Of the products of the chunked form, forward and backward."""
+    tokens, heads, head_width = x_shape[0] * x_shape[1], x_shape[2], x_shape[3]
+    state = heads * head_width * B_shape[-1]
+    scores = 2 * tokens * CHUNK * B_shape[-1]
+    within = 2 * tokens * CHUNK * heads * head_width
+    forward = scores + within + 4 * tokens * state
+    # Scores and states again; then every product has two gradients, and the decays need what was
+    # read of the state.
+    return forward, 3 * scores + 2 * within + 12 * tokens * state
+
+
+_FORMS = {"chunked": ssd_chunked, "reference": ssd_reference}
+_OPERATOR = scan_operator("ssd", count_flops)
 
 
 def ssd(
@@ -28,10 +43,12 @@ def ssd(
         A: < 0, so that no exponent is positive.
         B, C: input and output vectors, shared by the heads.
         D: skip weight of each head.
+        backend: "cpu" or "cuda", "chunked" (torch, any device and float type), "reference", or
+            "auto", which is the fast one for the device, and "chunked" for float64.
         reverse: scan from the last token to the first.
 
     Raises:
-        InputError: an unknown backend.
+        InputError: an unknown backend, or one that cannot take these tensors; shapes or devices
+            that do not go together; integers; no token.
     """
-    form = pick_backend("ssd", _BACKENDS, backend)
-    return run_scan(form, x, dt, A, B, C, D, reverse)
+    return run_scan("ssd", _FORMS, _OPERATOR, backend, (x, dt, A, B, C, D), reverse)

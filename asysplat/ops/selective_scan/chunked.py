@@ -1,0 +1,45 @@
+"""The selective scan in torch, a chunk of tokens at a time: any device, any float type.
+
+Within a chunk everything but the recurrence itself is done for all tokens at once. The backward
+pass computes a chunk again, so that the states of one chunk alone are in memory.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from asysplat.ops.recurrence import linear_recurrence
+
+CHUNK = 256
+
+
+def selective_scan_chunked(
+    x: Float[Tensor, "B L D"],
+    dt: Float[Tensor, "B L D"],
+    A: Float[Tensor, "D N"],
+    B: Float[Tensor, "B L N"],
+    C: Float[Tensor, "B L N"],
+    D: Float[Tensor, "D"],
+) -> Float[Tensor, "B L D"]:
+    """See `asysplat.ops.selective_scan`."""
+    state = x.new_zeros(x.shape[0], *A.shape)
+    outputs = []
+    for chunk in zip(*(tensor.split(CHUNK, dim=1) for tensor in (x, dt, B, C)), strict=True):
+        y, state = checkpoint(_chunk, *chunk, A, D, state, use_reentrant=False)
+        outputs.append(y)
+    return torch.cat(outputs, 1)
+
+
+def _chunk(
+    x: Tensor, dt: Tensor, B: Tensor, C: Tensor, A: Tensor, D: Tensor, state: Tensor
+) -> tuple[Tensor, Tensor]:
+    """y of the chunk, and the state behind it."""
+    # Time comes first, so that each step of the recurrence reads contiguous memory.
+    xs, dts, Bs, Cs = (tensor.transpose(0, 1) for tensor in (x, dt, B, C))
+    decay = torch.exp(dts[..., None] * A)
+    inputs = (dts * xs)[..., None] * Bs[..., None, :]
+    first = torch.addcmul(inputs[0], decay[0], state)
+    states = linear_recurrence(decay, torch.cat((first[None], inputs[1:])))
+    y = (states @ Cs[..., None]).squeeze(-1)
+    return torch.addcmul(y, xs, D).transpose(0, 1), states[-1]

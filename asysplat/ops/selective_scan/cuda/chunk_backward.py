@@ -1,0 +1,89 @@
+"""One chunk: its gradients from the state before it and the gradient of the state after it."""
+
+import triton.language as tl
+
+from asysplat.ops.cuda.kernel import kernel
+from asysplat.ops.selective_scan.cuda.tile import load_channels, load_vector, place, row_at
+
+
+@kernel
+def scan_chunk_backward(
+    grad_y,
+    x,
+    dt,
+    A,
+    B,
+    C,
+    D,
+    states,
+    grad_states,
+    grad_x,
+    grad_dt,
+    grad_A,
+    grad_B,
+    grad_C,
+    grad_D,
+    length,
+    channels,
+    REVERSE: tl.constexpr,
+    STATE: tl.constexpr,
+    BLOCK: tl.constexpr,
+    CHUNK: tl.constexpr,
+):
+    """Sums that leave the program are left as parts.
+
+    Args:
+        grad_y, x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
+        states, grad_states: [B, chunks, D, N] before, and of what is after, each chunk.
+        grad_x, grad_dt: [B, L, D].
+        grad_A, grad_D: [B, chunks, D, N] and [B, chunks, D].
+        grad_B, grad_C: [B, L, blocks, N].
+    """
+    batch, chunk, channel, there, entry = place(channels, STATE, BLOCK)
+    rate = tl.load(A + entry, mask=there[:, None], other=0.0)
+    skip = tl.load(D + channel, mask=there, other=0.0)
+    row = (batch * tl.num_programs(0) + chunk) * channels
+    state = tl.load(states + row * STATE + entry, mask=there[:, None], other=0.0)
+    before = (state,)
+    for k in tl.static_range(CHUNK - 1):
+        position = chunk * CHUNK + k
+        token, limit = row_at(batch, position, length, channels, REVERSE)
+        step = load_channels(dt, token, limit, channel)
+        value = load_channels(x, token, limit, channel)
+        vector = load_vector(B, batch, position, length, STATE, REVERSE)
+        state = tl.exp(step[:, None] * rate) * state + (step * value)[:, None] * vector
+        before = before + (state,)
+
+    grad_state = tl.load(grad_states + row * STATE + entry, mask=there[:, None], other=0.0)
+    total_A = tl.zeros_like(rate)
+    total_D = tl.zeros_like(skip)
+    for k in tl.static_range(CHUNK):
+        position = chunk * CHUNK + (CHUNK - 1 - k)
+        token, limit = row_at(batch, position, length, channels, REVERSE)
+        step = load_channels(dt, token, limit, channel)
+        value = load_channels(x, token, limit, channel)
+        out = load_channels(grad_y, token, limit, channel)
+        vector = load_vector(B, batch, position, length, STATE, REVERSE)
+        decay = tl.exp(step[:, None] * rate)
+        decayed = decay * before[CHUNK - 1 - k]
+        state = decayed + (step * value)[:, None] * vector
+        grad_state += out[:, None] * load_vector(C, batch, position, length, STATE, REVERSE)
+        grad_exponent = grad_state * decayed
+        grad_input = tl.sum(grad_state * vector, 1)
+        total_A += step[:, None] * grad_exponent
+        total_D += value * out
+
+        result = (step * grad_input + skip * out).to(grad_x.dtype.element_ty)
+        tl.store(grad_x + token + channel, result, mask=channel < limit)
+        grad_step = tl.sum(grad_exponent * rate, 1) + value * grad_input
+        tl.store(grad_dt + token + channel, grad_step, mask=channel < limit)
+        parts = tl.num_programs(1) * STATE
+        part, limit = row_at(batch, position, length, parts, REVERSE)
+        entries = tl.program_id(1) * STATE + tl.arange(0, STATE)
+        vector = tl.sum(grad_state * (step * value)[:, None], 0)
+        tl.store(grad_B + part + entries, vector, mask=entries < limit)
+        vector = tl.sum(state * out[:, None], 0)
+        tl.store(grad_C + part + entries, vector, mask=entries < limit)
+        grad_state *= decay
+    tl.store(grad_A + row * STATE + entry, total_A, mask=there[:, None])
+    tl.store(grad_D + row + channel, total_D, mask=there)

@@ -1,0 +1,36 @@
+"""What a program works on: a chunk of a sequence, and a block of its channels."""
+
+import triton.language as tl
+
+from asysplat.ops.cuda.kernel import kernel
+from asysplat.ops.cuda.scans import tokens_at
+
+
+@kernel
+def place(channels, STATE: tl.constexpr, BLOCK: tl.constexpr):
+    """Batch entry, chunk, the channels, whether they are there, and where in an array [D, N]."""
+    chunk = tl.program_id(0)
+    channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
+    batch = tl.program_id(2).to(tl.int64)
+    entry = channel[:, None] * STATE + tl.arange(0, STATE)[None, :]
+    return batch, chunk, channel, channel < channels, entry
+
+
+@kernel
+def row_at(batch, position, length, size, REVERSE: tl.constexpr):
+    """Where an array [B, L, size] has a token's row, and its length, 0 where there is no token."""
+    token, there = tokens_at(position, length, REVERSE)
+    return (batch * length + token) * size, tl.where(there, size, 0)
+
+
+@kernel
+def load_channels(array, row, limit, channel):
+    """fp32 [BLOCK] of a row, 0 from `limit` on."""
+    return tl.load(array + row + channel, mask=channel < limit, other=0.0).to(tl.float32)
+
+
+@kernel
+def load_vector(array, batch, position, length, STATE: tl.constexpr, REVERSE: tl.constexpr):
+    """fp32 [1, STATE] of an array [B, L, N], 0 where there is no token."""
+    row, limit = row_at(batch, position, length, STATE, REVERSE)
+    return load_channels(array, row, limit, tl.arange(0, STATE))[None, :]

@@ -1,0 +1,9 @@
+"""SSD for GPUs (Triton): matrix products within chunks, the state passed on between them.
+
+Dao and Gu 2024, Section 6. Decays are fp32 differences of sums that start with the chunk and are
+kept to 48 bits; every exponent is <= 0. The backward pass is handed nothing but the inputs.
+"""
+
+from asysplat.ops.ssd.cuda.stages import backward, carried_shape, forward
+
+__all__ = ["backward", "carried_shape", "forward"]

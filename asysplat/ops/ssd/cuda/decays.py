@@ -1,0 +1,70 @@
+"""The log decays of every chunk, once for all kernels that need them."""
+
+import triton.language as tl
+
+from asysplat.ops.cuda.kernel import kernel
+from asysplat.ops.cuda.scans import tokens_at
+
+# What a token needs, rows of [B, H, ROWS, positions], fp32: log decay since the chunk's start,
+# with the token's own (<= 0), and what float32 leaves of it; log decay to the chunk's end; dt.
+SINCE, REST, TO_END, STEP = (tl.constexpr(row) for row in range(4))
+ROWS = tl.constexpr(4)
+# exp of it is 0 in float32: a token that forgets more does not make the sums after it coarser.
+LEAST = tl.constexpr(-128.0)
+
+
+@kernel
+def sum_decays(
+    dt,
+    A,
+    decays,
+    length,
+    heads,
+    REVERSE: tl.constexpr,
+    CHUNK: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Write `decays` for a chunk and BLOCK heads; a position without a token has dt = 0.
+
+    Args:
+        dt, A: [B, L, H] and [H].
+    """
+    chunk = tl.program_id(0)
+    head = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
+    batch = tl.program_id(2).to(tl.int64)
+    position = chunk * CHUNK + tl.arange(0, CHUNK)
+    token, inside = tokens_at(position, length, REVERSE)
+    there = (head < heads)[:, None]
+    mask = there & inside[None, :]
+    step = tl.load(
+        dt + (batch * length + token)[None, :] * heads + head[:, None], mask=mask, other=0.0
+    )
+    rate = tl.load(A + head, mask=head < heads, other=0.0)
+    exponent = tl.maximum(step.to(tl.float64) * rate.to(tl.float64)[:, None], LEAST)
+    total = tl.cumsum(exponent, 1)
+    since = total.to(tl.float32)
+    positions = tl.num_programs(0) * CHUNK
+    to = decays + (batch * heads + head)[:, None] * ROWS * positions + position[None, :]
+    tl.store(to + SINCE * positions, since, mask=there)
+    tl.store(to + REST * positions, (total - since.to(tl.float64)).to(tl.float32), mask=there)
+    to_end = tl.sum(exponent, 1)[:, None] - total
+    tl.store(to + TO_END * positions, tl.minimum(to_end, 0.0).to(tl.float32), mask=there)
+    tl.store(to + STEP * positions, step, mask=there)
+
+
+@kernel
+def decays_of(decays, batch, head, heads, chunk, chunks, CHUNK: tl.constexpr):
+    """Where a head's rows have their first position of a chunk, and the length of a row."""
+    positions = tl.cast(chunks, tl.int64) * CHUNK
+    return decays + (batch * heads + head) * ROWS * positions + chunk * CHUNK, positions
+
+
+@kernel
+def decay_between(row, positions, CHUNK: tl.constexpr):
+    """exp of the decay from position s to position t >= s, [t, s]; 0 where s is later than t."""
+    lane = tl.arange(0, CHUNK)
+    since = tl.load(row + SINCE * positions + lane)
+    rest = tl.load(row + REST * positions + lane)
+    exponent = (since[:, None] - since[None, :]) + (rest[:, None] - rest[None, :])
+    decay = tl.exp(tl.minimum(exponent, 0.0))
+    return tl.where(lane[:, None] >= lane[None, :], decay, 0.0)
