@@ -10,7 +10,7 @@ from types import ModuleType
 
 from asysplat.errors import InputError
 
-SUITES = ("render",)
+SUITES = ("render", "ops", "model")
 
 
 def find_suite(name: str) -> ModuleType:

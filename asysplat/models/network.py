@@ -47,8 +47,8 @@ class Network(nn.Module, ABC):
 
     @property
     def size_multiple(self) -> int:
-        """Image sides must be multiples of this: the largest patch times the largest grid."""
-        return self.patch * max(getattr(m, "grid", 1) for m in self.modules())
+        """Image sides must be multiples of this: the largest patch."""
+        return self.patch
 
     def check_size(self, height: int, width: int) -> None:
         """Raise InputError unless both sides are multiples of `size_multiple`."""
@@ -56,7 +56,7 @@ class Network(nn.Module, ABC):
         if height % multiple or width % multiple:
             raise InputError(
                 f"data.height x data.width is {height}x{width}, but this model takes multiples of "
-                f"{multiple} (patch times grid): set {-(-height // multiple) * multiple}x"
+                f"{multiple}, its patch: set {-(-height // multiple) * multiple}x"
                 f"{-(-width // multiple) * multiple}, as the paper takes 540 to 544."
             )
 

@@ -81,6 +81,9 @@ def _fast_backend(x: Tensor, single: bool) -> str:
 
 def _check(scan: str, arguments: tuple[Tensor, ...]) -> None:
     x, dt, A, B, C, D = arguments
+    axes = "[B, L, H, P]" if scan == "ssd" else "[B, L, D]"
+    if x.ndim != axes.count(",") + 1:
+        raise InputError(f"{scan}'s x has shape {tuple(x.shape)}: expected {axes}.")
     batch, length, *channels = x.shape
     state_size = B.shape[-1]
     rows = (channels[0],) if scan == "ssd" else (channels[0], state_size)

@@ -120,7 +120,9 @@ def test_peak_memory_is_the_rise():
 
 
 def test_unknown_words_are_named():
-    with pytest.raises(InputError, match=r"^suite=rendr is unknown: choose one of render\.$"):
+    with pytest.raises(
+        InputError, match=r"^suite=rendr is unknown: choose one of render, ops, model\.$"
+    ):
         find_suite("rendr")
     with pytest.raises(InputError, match=r"^scenes=D is unknown: .*A, B, C, 524k, 4M"):
         find_cases(["A", "D"])

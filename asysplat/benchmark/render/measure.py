@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 
+from asysplat.benchmark.choices import check_repeats
 from asysplat.benchmark.render.backends import Backend, find_backends
 from asysplat.benchmark.render.cases import Case, Scene, describe, find_cases
 from asysplat.benchmark.render.run import (
@@ -18,11 +19,10 @@ from asysplat.benchmark.render.run import (
     peak_gb,
     prepare,
     run,
-    summary,
     truth,
 )
 from asysplat.benchmark.render.stages import row_seconds, stage_seconds
-from asysplat.errors import InputError
+from asysplat.benchmark.timing import summary
 from asysplat.rendering import Skips
 
 RASTER_STAGES = {"forward": "rasterize", "backward": "rasterize_backward"}
@@ -56,8 +56,7 @@ def measure(options: DictConfig, console: Console) -> Result:
         InputError: an unknown scene; repeats below 1.
     """
     cases = find_cases(options.scenes)
-    if not isinstance(options.repeats, int) or options.repeats < 1:
-        raise InputError(f"repeats={options.repeats} cannot be: give a whole number from 1.")
+    check_repeats(options.repeats)
     results: list[Result] = []
     with Progress(console=console) as progress:
         for name, case in cases.items():

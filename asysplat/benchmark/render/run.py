@@ -1,10 +1,6 @@
 """One forward and one backward pass: how long, how much memory, how wrong."""
 
-import ctypes
-import gc
 import time
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -13,7 +9,8 @@ from torch import Tensor
 
 from asysplat.benchmark.render.backends import Backend
 from asysplat.benchmark.render.cases import Scene
-from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
+from asysplat.benchmark.timing import rise_gb
+from asysplat.evaluation.render_time import wait_for
 from asysplat.rendering import Convention, Skips, render
 from asysplat.scene import Cameras, Gaussians
 
@@ -66,30 +63,18 @@ def prepare(scene: Scene, device: str, ignored: Tensor | None = None) -> Inputs:
 def run(backend: Backend, skips: Skips, inputs: Inputs) -> Pass:
     """Draw, and take the gradients."""
     fields = [getattr(inputs.gaussians, name) for name in FIELDS]
-    start = _now(backend.device)
+    device = torch.device(backend.device)
+    start = _now(device)
     image, stats = backend.draw(inputs.gaussians, inputs.cameras, skips)
-    middle = _now(backend.device)
+    middle = _now(device)
     gradients = torch.autograd.grad(image, fields, inputs.weights)
-    end = _now(backend.device)
+    end = _now(device)
     return Pass(image.detach(), gradients, middle - start, end - middle, stats)
 
 
-def summary(seconds: Sequence[float]) -> dict[str, float]:
-    """Median and interquartile range."""
-    low, median, high = np.percentile(seconds, [25, 50, 75]).tolist()
-    return {"median": median, "iqr": high - low}
-
-
 def peak_gb(backend: Backend, skips: Skips, inputs: Inputs) -> float:
-    """What a pass takes beyond what there was before it, in 1e9 bytes.
-
-    Too small where a process cannot start its peak anew: on a CPU without Linux.
-    """
-    _give_back_memory()
-    reset_peak_memory(backend.device)
-    before = peak_memory_gb(backend.device)
-    run(backend, skips, inputs)
-    return peak_memory_gb(backend.device) - before
+    """What a pass takes beyond what there was before it, in 1e9 bytes; see `rise_gb`."""
+    return rise_gb(lambda: run(backend, skips, inputs), torch.device(backend.device))
 
 
 def truth(scene: Scene, convention: Convention, ignored: Tensor | None = None) -> Pass:
@@ -124,14 +109,6 @@ def errors(found: Pass, exact: Pass, ignored: Tensor) -> dict[str, float | dict[
     }
 
 
-def _now(device: str) -> float:
-    if device == "cuda":
-        torch.cuda.synchronize()
+def _now(device: torch.device) -> float:
+    wait_for(device)
     return time.perf_counter()
-
-
-def _give_back_memory() -> None:
-    """To the system what was freed: a pass that is given it again would not show as a rise."""
-    gc.collect()
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)

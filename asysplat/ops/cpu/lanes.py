@@ -134,6 +134,12 @@ def exp2(x):
 
 
 @inline
+def decay2(x):
+    """2^x for x <= 0; 0 where a normal float32 cannot hold it."""
+    return exp2(max(x, SMALLEST)) if x > SMALLEST else ZERO
+
+
+@inline
 def log2(x):
     """log2 of a positive float64, rounded to float32 first, to 1e-9."""
     bits = to_bits(np.float32(x))

@@ -1,7 +1,8 @@
 """How every function here is compiled.
 
 Products and sums that decide what a pixel shows are fused by name and never by the compiler's
-choice (enable_fp_fusion=False at every launch), so that both passes take identical decisions.
+choice (enable_fp_fusion=False at every launch of the renderer), so that both passes take identical
+decisions.
 """
 
 import inspect

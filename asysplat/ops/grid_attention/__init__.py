@@ -29,13 +29,29 @@ def grid_attention(
         grid: p_g; 1 is full attention.
 
     Raises:
-        InputError: a token map whose sides are not multiples of `grid`, or an unknown backend.
+        InputError: shapes, devices or types that do not go together, grid < 1, or an unknown
+            backend.
     """
     form = pick_backend("grid_attention", _BACKENDS, backend)
-    height, width = q.shape[2:4]
-    if height % grid or width % grid:
-        raise InputError(
-            f"grid_attention got a token map of {height}x{width}: both sides must be multiples "
-            f"of the grid, {grid}; change the resolution or the patch size."
-        )
+    _check(q, k, v, grid)
     return form(q, k, v, grid)
+
+
+def _check(q: Tensor, k: Tensor, v: Tensor, grid: int) -> None:
+    if grid < 1:
+        raise InputError(f"grid_attention got grid={grid}: give 1, full attention, or more.")
+    for name, tensor in {"q": q, "k": k, "v": v}.items():
+        if tensor.ndim != 6 or tensor.shape != q.shape:
+            expected = "[B, V, h, w, H, P]" if tensor is q else tuple(q.shape)
+            raise InputError(
+                f"grid_attention's {name} has shape {tuple(tensor.shape)}: expected {expected}."
+            )
+        if not tensor.is_floating_point():
+            raise InputError(
+                f"grid_attention's {name} is {tensor.dtype}: give floating-point numbers."
+            )
+        if tensor.device != q.device:
+            raise InputError(
+                f"grid_attention's {name} is on {tensor.device} and q on {q.device}: move both to "
+                "one device."
+            )

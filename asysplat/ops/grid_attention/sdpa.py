@@ -1,8 +1,9 @@
 """Grid attention with each grid place as a batch entry of torch's fused attention."""
 
+import torch
 import torch.nn.functional as F
-from einops import rearrange
-from jaxtyping import Float
+from einops import rearrange, repeat
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
@@ -13,10 +14,30 @@ def grid_attention_sdpa(
     grid: int,
 ) -> Float[Tensor, "B V h w H P"]:
     """See `asysplat.ops.grid_attention`."""
-    sizes = {"gh": grid, "gw": grid, "v": q.shape[1], "h": q.shape[2] // grid}
+    views, height, width = q.shape[1:4]
+    below, right = -height % grid, -width % grid
+    mask = None
+    if below or right:
+        q, k, v = (F.pad(t, (0, 0, 0, 0, 0, right, 0, below)) for t in (q, k, v))
+        mask = _real_tokens(height, width, grid, q)
+    sizes = {"gh": grid, "gw": grid, "v": views, "h": q.shape[2] // grid}
     q, k, v = (
         rearrange(tensor, "b v (h gh) (w gw) H p -> (b gh gw) H (v h w) p", gh=grid, gw=grid)
         for tensor in (q, k, v)
     )
-    output = F.scaled_dot_product_attention(q, k, v)
-    return rearrange(output, "(b gh gw) H (v h w) p -> b v (h gh) (w gw) H p", **sizes)
+    output = F.scaled_dot_product_attention(q, k, v, mask)
+    output = rearrange(output, "(b gh gw) H (v h w) p -> b v (h gh) (w gw) H p", **sizes)
+    return output[:, :, :height, :width]
+
+
+def _real_tokens(
+    height: int, width: int, grid: int, padded: Float[Tensor, "B V h w H P"]
+) -> Bool[Tensor, "place 1 1 key"]:
+    """Which keys of a grid place are no padding; all where there is nothing else to see."""
+    batch, views, rows, columns = padded.shape[:4]
+    real = torch.zeros(rows, columns, dtype=torch.bool, device=padded.device)
+    real[:height, :width] = True
+    real = repeat(
+        real, "(h gh) (w gw) -> (b gh gw) 1 1 (v h w)", gh=grid, gw=grid, b=batch, v=views
+    )
+    return real | ~real.any(-1, keepdim=True)

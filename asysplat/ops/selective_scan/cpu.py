@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.lanes import LANES, SMALLEST, ZERO, exp2, fma, take_sum
+from asysplat.ops.cpu.lanes import LANES, ZERO, decay2, fma, take_sum
 from asysplat.ops.cpu.threads import even_bounds, run_blocks
 
 CHUNK = 32  # tokens: their states, CHUNK x N x LANES, fit a core's cache
@@ -125,7 +125,7 @@ def _forward(start, stop, x, dt, B, C, D, A, reverse, y, carried):
             for n in range(state_size):
                 b, c = B[batch, t, n], C[batch, t, n]
                 for i in range(LANES):
-                    decay = exp2(max(step[i] * A[block, n, i], SMALLEST))
+                    decay = decay2(step[i] * A[block, n, i])
                     state[n, i] = fma(decay, state[n, i], added[i] * b)
                     out[i] = fma(c, state[n, i], out[i])
             for i in range(width):
@@ -147,6 +147,7 @@ def _backward(
     pull, behind = np.zeros(LANES, np.float32), np.empty((state_size, LANES), np.float32)
     g_step, g_added = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     g_b, g_c = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
+    chunk_A, chunk_D = np.empty((state_size, LANES), np.float32), np.empty(LANES, np.float32)
     for index in range(start, stop):
         batch, block = index // blocks, index % blocks
         first = block * LANES
@@ -158,6 +159,8 @@ def _backward(
         added[:] = ZERO
         pull[:] = ZERO
         for chunk in range(chunks - 1, -1, -1):
+            chunk_A[:] = ZERO
+            chunk_D[:] = ZERO
             begin = chunk * CHUNK
             count = min(CHUNK, length - begin)
             states[0] = carried[batch, block, chunk]
@@ -169,7 +172,7 @@ def _backward(
                 for n in range(state_size):
                     b = B[batch, t, n]
                     for i in range(LANES):
-                        decay = exp2(max(steps[k, i] * A[block, n, i], SMALLEST))
+                        decay = decay2(steps[k, i] * A[block, n, i])
                         decays[k, n, i] = decay
                         states[k + 1, n, i] = fma(decay, states[k, n, i], added[k, i] * b)
             for k in range(count - 1, -1, -1):
@@ -188,12 +191,16 @@ def _backward(
                         # Of the exponent, a factor log2(e) is in A.
                         g_log = g_state * decays[k, n, i] * states[k, n, i]
                         g_step[i] = fma(g_log, A[block, n, i], g_step[i])
-                        grad_A[batch, block, n, i] += g_log * steps[k, i]
+                        chunk_A[n, i] += g_log * steps[k, i]
                         behind[n, i] = g_state * decays[k, n, i]
                     grad_B[block, batch, t, n] = take_sum(g_b, 0)
                     grad_C[block, batch, t, n] = take_sum(g_c, 0)
                 for i in range(width):
                     value = x[batch, t, first + i]
                     grad_dt[batch, t, first + i] = fma(g_added[i], value, g_step[i] * LN_2)
-                    grad_x[batch, t, first + i] = fma(D[first + i], pull[i], g_added[i] * steps[k, i])
-                    grad_D[batch, block, i] = fma(pull[i], value, grad_D[batch, block, i])
+                    grad_x[batch, t, first + i] = fma(
+                        D[first + i], pull[i], g_added[i] * steps[k, i]
+                    )
+                    chunk_D[i] = fma(pull[i], value, chunk_D[i])
+            grad_A[batch, block] += chunk_A
+            grad_D[batch, block] += chunk_D

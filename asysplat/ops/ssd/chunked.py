@@ -27,14 +27,15 @@ def ssd_chunked(
     skip = D[:, None] * x
     # Padded tokens have dt = 0: they neither decay the state nor add to it.
     x, dt, B, C = (_into_chunks(tensor) for tensor in (x, dt, B, C))
-    log_decay = torch.cumsum(dt * A, dim=2)  # [b c q h], since the chunk's start
+    exponents = dt * A
+    log_decay = torch.cumsum(exponents, dim=2)  # [b c q h], since the chunk's start
     inputs = x * dt[..., None]
 
-    scores = (C @ B.mT)[..., None] * _decay_between(log_decay)  # [b c t s h]
+    scores = (C @ B.mT)[..., None] * _decay_between(exponents)  # [b c t s h]
     y = torch.einsum("bctsh,bcshp->bcthp", scores, inputs)
 
     if x.shape[1] > 1:
-        to_end = torch.exp(log_decay[:, :, -1:] - log_decay)
+        to_end = torch.exp(F.pad(exponents[:, :, 1:], (0, 0, 0, 1)).flip(2).cumsum(2).flip(2))
         added = torch.einsum("bcsn,bcsh,bcshp->cbhpn", B, to_end, inputs)
         decay = rearrange(torch.exp(log_decay[:, :, -1]), "b c h -> c b h 1 1")
         states = linear_recurrence(decay.expand_as(added), added)
@@ -52,8 +53,14 @@ def _into_chunks(tensor: Tensor) -> Tensor:
     return tensor.unflatten(1, (-1, CHUNK))
 
 
-def _decay_between(log_decay: Float[Tensor, "b c q h"]) -> Float[Tensor, "b c q q h"]:
-    """exp of the decay from token s to token t >= s; 0 where s is later than t."""
-    difference = log_decay[:, :, :, None] - log_decay[:, :, None]
-    later = torch.ones(difference.shape[2:4], dtype=torch.bool, device=log_decay.device).triu(1)
-    return torch.exp(difference.masked_fill(later[..., None], -torch.inf))
+def _decay_between(exponents: Float[Tensor, "b c q h"]) -> Float[Tensor, "b c q q h"]:
+    """exp of the sum of exponents from token s (without) to token t >= s; 0 where s is later.
+
+    Sums, not differences of sums from the chunk's start: a token that forgets everything would
+    leave its rounding in all decays behind it.
+    """
+    q = exponents.shape[2]
+    ones = torch.ones(q, q, dtype=torch.bool, device=exponents.device)
+    steps = exponents[:, :, :, None].expand(-1, -1, -1, q, -1)  # [b c t s h]
+    sums = steps.masked_fill(ones.triu()[..., None], 0).cumsum(2)
+    return torch.exp(sums.masked_fill(ones.triu(1)[..., None], -torch.inf))

@@ -154,11 +154,13 @@ class _Segment:
         grad_inputs.addcmul_(written, self.to_end)
         read_share = (read_pull * read).sum(-1, dtype=torch.float64)  # [c q h]
         write_share = (self.weighted * written).sum(-1, dtype=torch.float64)
+
         # A token's decay acts on what was written before it and is read at it or behind it.
-        behind = grad_logs + read_share
-        before = write_share.cumsum(1) if not self.reverse else write_share.flip(1).cumsum(1).flip(1)
-        behind = behind.cumsum(1) if self.reverse else behind.flip(1).cumsum(1).flip(1)
-        grad_decay = self.tokens(behind + before - write_share + left.mT).float()
+        # Sums of the tokens behind and before, none taken away again: a difference would keep the
+        # rounding of the largest.
+        behind = _sum_behind(read_share, self.reverse)
+        before = _sum_behind(_previous(write_share, self.reverse), not self.reverse)
+        grad_decay = self.tokens(grad_logs + behind + before + left.mT).float()
         grad_inputs = self.tokens(grad_inputs)
         return (
             torch.addcmul(grad_inputs * self.dt[..., None], pull, self.D),
@@ -208,3 +210,15 @@ def _heads_first(tensor: Tensor) -> Tensor:
 def _tokens_first(tensor: Tensor) -> Tensor:
     """[c h q p] -> [c q h p]"""
     return tensor.transpose(1, 2).contiguous()
+
+
+def _sum_behind(shares: Tensor, reverse: bool) -> Tensor:
+    """[c q h]: of each token and those of its chunk that the scan comes to later."""
+    return shares.cumsum(1) if reverse else shares.flip(1).cumsum(1).flip(1)
+
+
+def _previous(shares: Tensor, reverse: bool) -> Tensor:
+    """[c q h]: of the token of the chunk that the scan came to just before, 0 at the first."""
+    if reverse:
+        return F.pad(shares[:, 1:], (0, 0, 0, 1))
+    return F.pad(shares[:, :-1], (0, 0, 1, 0))

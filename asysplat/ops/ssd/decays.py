@@ -3,7 +3,7 @@
 import numpy as np
 
 from asysplat.ops.cpu.kernel import inline, kernel
-from asysplat.ops.cpu.lanes import LANES, ONE, SMALLEST, ZERO, exp2
+from asysplat.ops.cpu.lanes import LANES, ONE, ZERO, decay2
 
 
 @inline
@@ -14,7 +14,7 @@ def decay_between(high, low, chunk, head, t, s, reverse):
     # the decays behind it.
     whole = high[chunk, head, t] - high[chunk, head, s]
     exponent = whole + (low[chunk, head, t] - low[chunk, head, s])
-    return exp2(min(max(exponent, SMALLEST), ZERO)) * (ONE if before else ZERO)
+    return decay2(min(exponent, ZERO)) * (ONE if before else ZERO)
 
 
 @inline
@@ -48,9 +48,9 @@ def mix(start, stop, scores, high, low, reverse, weights):
 
 
 @kernel
-def unmix(start, stop, grad_weights, scores, high, low, reverse, grad_scores, grad_logs):
-    """Write the gradients of scores [c, q, q] and of the logarithms (natural ones) [c, h, q],
-    float64, of chunks start to stop, from that of `mix`'s weights."""
+def unmix(start, stop, grad_weights, scores, high, low, reverse, grad_scores, grad_exponents):
+    """Write the gradients of scores [c, q, q] and of each token's dt A [c, h, q], float64, of
+    chunks start to stop, from that of `mix`'s weights."""
     heads, size = grad_weights.shape[1:3]
     pull = np.empty(LANES, np.float32)
     column = np.empty(size)
@@ -58,18 +58,18 @@ def unmix(start, stop, grad_weights, scores, high, low, reverse, grad_scores, gr
         grad_scores[chunk] = ZERO
         for head in range(heads):
             column[:] = 0
-            for t in range(size):
+            for k in range(size):
+                t = k if reverse else size - 1 - k  # from the last that the scan comes to
                 first, last = reach(t, size, reverse)
-                row = 0.0
                 for base in range(first, last, LANES):
                     for i in range(LANES):
                         decay = decay_between(high, low, chunk, head, t, base + i, reverse)
                         pull[i] = decay * grad_weights[chunk, head, t, base + i]
                         grad_scores[chunk, t, base + i] += pull[i]
                     for i in range(LANES):
-                        share = float(pull[i] * scores[chunk, t, base + i])
-                        column[base + i] += share
-                        row += share
-                grad_logs[chunk, head, t] = row
-            for t in range(size):
-                grad_logs[chunk, head, t] -= column[t]
+                        column[base + i] += float(pull[i] * scores[chunk, t, base + i])
+                # The decay of t lies between all tokens before it and itself or those behind it.
+                total = 0.0
+                for s in range(t + 1 if reverse else 0, size if reverse else t):
+                    total += column[s]
+                grad_exponents[chunk, head, t] = total

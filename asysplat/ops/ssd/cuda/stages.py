@@ -17,7 +17,7 @@ from asysplat.ops.ssd.cuda.vector_gradients import score_gradients, vector_gradi
 CHUNK = 16 if INTERPRETED else 64  # tokens
 BLOCK = 64  # columns of a state in a program
 HEADS = 8  # in a program that sums decays
-WIDE = {"num_warps": 8, "num_stages": 2}  # where registers would spill
+LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}  # with fewer warps, fp32 products spill
 MOST_WIDTH, MOST_STATE = 128, 256
 # As what a product's factors are rounded: fp16 has not the range of a state, TF32 has all its bits.
 PRODUCTS = {
@@ -58,7 +58,6 @@ def forward(
             *(x, C, D, decays, _scores(sizes, B, C), states, y),
             *sizes.counts,
             **sizes.tile,
-            **WIDE,
         )
     return y, dt.new_empty(carried_shape(x, B))
 
@@ -91,7 +90,6 @@ def backward(
             *(grad_x, grad_dt, grad_A, grad_D),
             *sizes.counts,
             **sizes.tile,
-            **WIDE,
         )
         grad_scores = dt.new_empty(sizes.squares)
         tile = {name: size for name, size in sizes.tile.items() if name not in ("STATE", "BLOCK")}
@@ -151,7 +149,7 @@ class _Sizes(NamedTuple):
             "BLOCK": self.block,
             "CHUNK": CHUNK,
             **PRODUCTS[self.dtype],
-            **FUSED,
+            **LAUNCH,
         }
 
 

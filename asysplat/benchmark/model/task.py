@@ -1,0 +1,105 @@
+"""A network of conf/model and an input for it: the passes that are measured."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import hydra
+import torch
+from hydra.utils import instantiate
+
+from asysplat.benchmark.scenes import on_an_arc, random_scene
+from asysplat.evaluation.cost import GB, count_parameters
+from asysplat.evaluation.static_cost import activation_gb
+from asysplat.models.network import Network
+from asysplat.scene import Gaussians, Views
+from asysplat.words import check_words
+
+
+@dataclass(frozen=True)
+class Task:
+    """
+    Args:
+        name: of the model.
+        net: with random weights.
+        precision: fp32 or bf16.
+        dtype: of autocast; fp32 means none.
+        views: one scene's.
+    """
+
+    name: str
+    net: Network
+    precision: str
+    dtype: torch.dtype
+    views: Views
+
+    @property
+    def device(self) -> torch.device:
+        return self.views.images.device
+
+    @property
+    def tokens(self) -> int:
+        """Of the network's largest patch, those that most layers work on."""
+        cameras = self.views.cameras
+        return cameras.num_views * cameras.height * cameras.width // self.net.patch**2
+
+    def forward(self) -> Gaussians:
+        """As when it reconstructs."""
+        self.net.eval()
+        with torch.no_grad(), self._autocast(self.device.type):
+            return self.net(self.views)
+
+    def step(self) -> None:
+        """A training step without its renderer and optimiser: a mean of the outputs is the loss."""
+        self.net.train()
+        with self._autocast(self.device.type):
+            gaussians = self.net(self.views)
+            means = [getattr(gaussians, field.name).float().mean() for field in fields(gaussians)]
+        sum(means).backward()
+        self.net.zero_grad(set_to_none=True)
+
+    @cached_property
+    def step_gb(self) -> float:
+        """What a step keeps, about: activations, parameters and their gradients."""
+        cameras = self.views.cameras
+        with self._autocast("cpu"):
+            kept = activation_gb(self.net, cameras.num_views, cameras.height, cameras.width)
+        return kept + 2 * 4 * count_parameters(self.net) / GB
+
+    @property
+    def step_fits(self) -> bool:
+        return self.step_gb < _memory_gb(self.device)
+
+    def _autocast(self, device: str) -> torch.autocast:
+        return torch.autocast(device, self.dtype, enabled=self.dtype != torch.float32)
+
+
+def make_net(name: str, words: Mapping[str, object], device: torch.device) -> tuple[Network, dict]:
+    """The network that train.py would build, and its inputs' sizes: views, height, width.
+
+    Raises:
+        InputError: an unknown model, or an unknown choice among the words.
+    """
+    overrides = [f"model={name}", *(f"{key}={value}" for key, value in words.items())]
+    check_words(overrides)
+    config = hydra.compose("train", overrides)
+    torch.manual_seed(0)
+    with device:
+        net = instantiate(config.model)
+    data = config.data
+    return net, {"views": data.inputs, "height": data.height, "width": data.width}
+
+
+def make_views(views: int, height: int, width: int, device: torch.device) -> Views:
+    """Noise, seen from an arc."""
+    _, camera = random_scene(1, height, width)
+    images = torch.rand(views, 3, height, width, generator=torch.Generator().manual_seed(0))
+    return Views(on_an_arc(camera, views), images).to(device)
+
+
+def _memory_gb(device: torch.device) -> float:
+    """Of the device."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_properties(device).total_memory / GB
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GB

@@ -1,0 +1,136 @@
+"""The suite on networks of a moment: what it finds is complete and agrees with itself."""
+
+import json
+import math
+import runpy
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from asysplat.benchmark.model import task as tasks
+from asysplat.benchmark.model.components import COMPONENTS, OPERATORS, OTHERS, record_products
+from asysplat.benchmark.model.tables import NETWORKS, tables
+from asysplat.benchmark.model.task import Task, make_net, make_views
+from asysplat.errors import InputError
+from asysplat.evaluation.cost import true_flops
+from asysplat.evaluation.static_cost import blank_views
+
+CPU = torch.device("cpu")
+WORDS = {"scale": "laptop", "width": 0.125, "state_size": 8}
+NAMES, VIEWS = ["asysplat_4m4t", "asysplat_4m4s"], [4, 8]
+ATTENTION = dict(zip(NAMES, ("full attention", "sparse attention"), strict=True))
+
+
+@pytest.fixture(scope="module")
+def conf(repository):
+    """Where models are composed from, as in benchmark.py."""
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        yield
+
+
+@pytest.fixture(scope="module")
+def measured(conf, repository, tmp_path_factory):
+    """The numbers by model, views and precision, all of them, and the folder they are in."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    script = runpy.run_path(str(repository / "benchmark.py"))
+    options = compose("benchmark", ["suite=model", "repeats=2", "device=cpu"])
+    OmegaConf.set_struct(options, False)  # the words are the user's
+    tiny = {"names": NAMES, "views": VIEWS, "words": WORDS, "precisions": ["fp32"]}
+    script["benchmark"](OmegaConf.merge(options, {"model": tiny, "output": str(folder)}))
+    results = json.loads((folder / "model.json").read_text())
+    rows = {(row["model"], row["views"], row["precision"]): row for row in results["rows"]}
+    return rows, results, folder
+
+
+@pytest.fixture
+def task(conf):
+    """A network and two views."""
+    net, _ = make_net("asysplat_4m4s", WORDS, CPU)
+    return Task("asysplat_4m4s", net, "bf16", torch.bfloat16, make_views(2, 32, 64, CPU))
+
+
+def test_rows_are_complete_and_consistent(measured):
+    rows, results, folder = measured
+    assert set(rows) == {(name, views, "fp32") for name in NAMES for views in VIEWS}
+    for (name, views, precision), row in rows.items():
+        assert (row["height"], row["width"], row["tokens"]) == (64, 64, 16 * views)
+        assert row["parameters"] > 1e5
+        passes = {"forward": row["forward"], "step": row["step"]}
+        floors = {"forward": row["floor"]["median"], "step": 3 * row["floor"]["median"]}
+        for key, seconds in passes.items():
+            assert seconds["iqr"] >= 0
+            assert row["over_floor"][key] == pytest.approx(seconds["median"] / floors[key])
+            assert row["bytes_per_token"][key] * row["tokens"] == pytest.approx(
+                1e9 * row["peak_gb"][key]
+            )
+        assert row["step"]["median"] > row["forward"]["median"]
+        first = rows[NAMES[0], views, precision]["step"]["median"]
+        assert row["step_over_first"] == pytest.approx(row["step"]["median"] / first)
+        assert row["step_over_first"] == 1 or name != NAMES[0]
+        kilobytes = f"{1e6 * row['peak_gb']['step'] / row['tokens']:,.0f}"
+        assert NETWORKS["step\nkB / token"](row) == kilobytes
+    assert len(tables(results)) == 3
+    assert (folder / "model.png").stat().st_size > 0
+
+
+def test_the_floor_is_below_the_total(measured):
+    for row in measured[0].values():
+        assert 0 < row["floor"]["median"] < row["forward"]["median"]
+        assert all(part["floor"] >= 0 for part in row["components"].values())
+
+
+def test_components_are_those_of_the_model(measured):
+    for (name, _, _), row in measured[0].items():
+        missing = set(ATTENTION.values()) - {ATTENTION[name]}
+        assert set(row["components"]) == {*COMPONENTS, OTHERS} - missing
+        assert set(row["operators"]) == set(OPERATORS)
+        assert all(part["seconds"]["median"] > 0 for part in row["components"].values())
+        scans = {"ssd": "Mamba2", "selective_scan": "MambaVision"}
+        for operator, component in scans.items():
+            within = row["components"][component]["seconds"]["median"]
+            assert row["operators"][operator]["median"] < within
+
+
+def test_products_add_up_to_what_torch_counts(measured, conf):
+    for (name, views, _), row in measured[0].items():
+        listed = sum(entry["count"] * entry["gflops"] for entry in row["products"])
+        assert listed == pytest.approx(row["gflops"])
+        assert all(math.isfinite(entry["seconds"]) for entry in row["products"])
+        net, size = make_net(name, WORDS, torch.device("meta"))
+        with torch.device("meta"), torch.no_grad():
+            inputs = blank_views(views, size["height"], size["width"])
+            counted = true_flops(lambda net=net, inputs=inputs: net(inputs))
+        assert row["gflops"] == pytest.approx(counted / 1e9, rel=0.01)
+
+
+def test_products_have_the_precision_and_the_component_they_run_in(task):
+    counts = record_products(task)
+    assert counts.keys() == {*COMPONENTS, OTHERS} - {"full attention"}
+    layers = [p for name, part in counts.items() if name != OTHERS for p in part]
+    linears = [p for p in layers if p.function is torch.ops.aten.mm.default]
+    assert linears and all(p.arguments[0].dtype == torch.bfloat16 for p in linears)
+    convolutions = {n for n, part in counts.items() if any("convolution" in str(p) for p in part)}
+    assert convolutions == {"Mamba2", "MambaVision", "sparse attention", OTHERS}
+
+
+def test_hooks_and_gradients_are_taken_away_again(task):
+    record_products(task)
+    task.step()
+    assert not any(m._forward_hooks or m._forward_pre_hooks for m in task.net.modules())
+    assert all(parameter.grad is None for parameter in task.net.parameters())
+    assert not task.forward().means.requires_grad
+
+
+def test_a_step_that_does_not_fit_is_left_out(task, monkeypatch):
+    assert task.step_fits and task.step_gb > 0
+    monkeypatch.setattr(tasks, "_memory_gb", lambda device: task.step_gb / 2)
+    assert not task.step_fits
+
+
+def test_unknown_words_are_named(conf):
+    with pytest.raises(InputError, match=r"^model=asysplat_4m4x is unknown: .*asysplat_4m4"):
+        make_net("asysplat_4m4x", WORDS, CPU)
+    with pytest.raises(InputError, match=r"^scale=desk is unknown"):
+        make_net("asysplat_4m4s", {"scale": "desk"}, CPU)

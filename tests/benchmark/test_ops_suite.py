@@ -1,0 +1,201 @@
+"""The suite on operators of a moment, and the products that they are compared with."""
+
+import json
+import math
+import runpy
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from asysplat.benchmark.choices import PRECISIONS, check_repeats, find_device, find_precisions
+from asysplat.benchmark.ops.cases import SSD, GridAttention, SelectiveScan
+from asysplat.benchmark.ops.measure import PASSES
+from asysplat.benchmark.ops.rows import make_rows
+from asysplat.benchmark.ops.run import Path
+from asysplat.benchmark.products import (
+    LARGEST,
+    Operand,
+    RecordProducts,
+    products,
+    with_gradients,
+)
+from asysplat.errors import InputError
+from asysplat.evaluation.cost import true_flops
+
+CPU = torch.device("cpu")
+BOUNDS = {"fp32": 2e-6, "bf16": 1e-2}
+LENGTH, LOOP_TOKENS = 150, 50
+TINY = {
+    "ssd": {"batch": 1, "length": LENGTH, "heads": 8, "head_width": 16, "state": 8},
+    "selective_scan": {"batch": 2, "length": LENGTH, "channels": 16, "state": 4},
+    "grid_attention": {
+        "batch": 1,
+        "views": 2,
+        "height": 4,
+        "width": 6,
+        "heads": 2,
+        "head_width": 8,
+        "grids": [1, 2],
+    },
+    "loop_tokens": LOOP_TOKENS,
+    "exact": {
+        "ssd": {"length": 140},  # all heads: few numbers would make an error of A's gradient chance
+        "selective_scan": {"batch": 1},
+        "grid_attention": {"views": 1},
+    },
+}
+SCANS = ("ssd", "selective_scan")
+ATTENTION = ("grid_attention/1", "grid_attention/2")
+
+
+@pytest.fixture(scope="module")
+def options(repository):
+    """conf/benchmark.yaml, its operators of a moment."""
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        config = compose("benchmark", ["suite=ops", "repeats=2", "device=cpu"])
+    return OmegaConf.merge(config, {"ops": TINY})
+
+
+@pytest.fixture(scope="module")
+def measured(options, repository, tmp_path_factory):
+    """The numbers, and the folder they are in."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    script = runpy.run_path(str(repository / "benchmark.py"))
+    script["benchmark"](OmegaConf.merge(options, {"output": str(folder)}))
+    results = json.loads((folder / "ops.json").read_text())
+    return {(r["operator"], r["precision"], r["path"]): r for r in results["rows"]}, folder
+
+
+def test_every_operator_has_a_path_and_what_it_is_compared_with(measured):
+    rows, folder = measured
+    for operator in (*SCANS, *ATTENTION):
+        for precision in BOUNDS:
+            paths = {path for name, p, path in rows if (name, p) == (operator, precision)}
+            assert paths - {"loop", "matmuls"}
+            assert ("matmuls" in paths) == (operator != "selective_scan")
+            assert ("loop" in paths) == (operator in SCANS and precision == "fp32")
+    assert (folder / "ops.png").stat().st_size > 0
+
+
+def test_errors_are_below_their_bounds(measured):
+    rows, _ = measured
+    for (operator, precision, path), row in rows.items():
+        if path == "matmuls":
+            assert row["error"] is None
+            continue
+        error = row["error"]
+        names = {"q", "k", "v"} if operator in ATTENTION else {"x", "dt", "A", "B", "C", "D"}
+        assert error["gradients"].keys() == names
+        assert error["measured_on"] != row["sizes"]
+        worst = max(error["forward"], *error["gradients"].values())
+        assert 0 < worst < BOUNDS[precision], (operator, precision, path)
+
+
+def test_ratios_are_those_of_the_times(measured):
+    rows, _ = measured
+    for (operator, precision, _), row in rows.items():
+        loop = rows.get((operator, "fp32", "loop"))
+        matmuls = rows.get((operator, precision, "matmuls"))
+        for name in PASSES:
+            seconds = row[name]["median"]
+            assert seconds > 0 and math.isfinite(row[name]["iqr"])
+            if loop:
+                expected = loop[name]["median"] / seconds
+                assert row["faster_than_loop"][name] == pytest.approx(expected)
+            if matmuls:
+                expected = seconds / matmuls[name]["median"]
+                assert row["over_matmuls"][name] == pytest.approx(expected)
+        assert bool(loop) == bool(row["faster_than_loop"])
+        assert bool(matmuls) == bool(row["over_matmuls"])
+        if row["path"] == "loop":
+            assert row["loop_tokens"] == LOOP_TOKENS
+        if row["path"] != "matmuls":
+            assert all(value >= 0 for value in row["bytes_per_token"].values())
+
+
+def test_an_error_is_seen():
+    case = SelectiveScan(batch=1, length=5, channels=3, state=2)
+    path = Path(case, "reference", torch.float32, CPU)
+    output, gradients = path.truth()
+    wrong = 2 * output, {name: 4 * grad for name, grad in gradients.items()}
+    found = path.errors(wrong)
+    assert found["forward"] == pytest.approx(1 / 2, abs=1e-5)
+    assert found["gradients"] == pytest.approx(
+        dict.fromkeys(["x", "dt", "A", "B", "C", "D"], 3 / 4), abs=1e-5
+    )
+
+
+def flops_of(counts):
+    return sum(count * product.flops() for product, count in counts.items())
+
+
+CASES = [
+    (SSD(batch=2, length=256, heads=4, head_width=16, state=32), "chunked"),
+    (GridAttention(batch=1, views=3, height=4, width=8, heads=2, head_width=16, grid=2), "sdpa"),
+]
+
+
+@pytest.mark.parametrize("case, path", CASES, ids=lambda value: getattr(value, "name", None))
+def test_products_are_those_of_the_operator(case, path):
+    def forward():
+        case.run({name: tensor.to("meta") for name, tensor in case.tensors().items()}, path)
+
+    counts = products(case.sizes(), torch.float32, CPU)
+    # The rest is the recurrence between the chunks.
+    assert flops_of(counts) == pytest.approx(true_flops(forward), rel=0.01)
+    both = products(with_gradients(case.sizes()), torch.float32, CPU)
+    assert flops_of(both) == 3 * flops_of(counts)
+    assert counts <= both
+
+
+def test_large_products_are_done_in_parts_that_add_up():
+    batch, m, k, n = 6, 1000, 64, 30_000
+    counts = products([(batch, m, k, n)], torch.bfloat16, CPU)
+    assert flops_of(counts) == 2 * batch * m * k * n
+    for product in counts:
+        a, b = (operand.shape for operand in product.arguments)
+        assert max(math.prod(a), math.prod(b), a[-2] * b[-1]) <= LARGEST["cpu"]
+
+
+def test_calls_are_recorded_under_their_label():
+    a, weight = torch.randn(2, 5, 8), torch.randn(6, 8)
+    maps, kernel = torch.randn(1, 4, 7, 7), torch.randn(6, 2, 3, 3)
+    bias = torch.randn(6)
+
+    def forward():
+        torch.nn.functional.linear(a, weight)
+        torch.nn.functional.linear(a, weight, bias)
+        torch.nn.functional.conv2d(maps, kernel, bias, stride=2, padding=1, groups=2)
+        torch.nn.functional.scaled_dot_product_attention(a, a, a)
+
+    with torch.no_grad(), RecordProducts("first") as recorder:
+        forward()
+        recorder.label = "second"
+        a @ a.mT
+    assert flops_of(recorder.counts["first"]) == true_flops(forward)
+    (product,) = recorder.counts["second"]
+    assert [operand.shape for operand in product.arguments] == [(2, 5, 8), (2, 8, 5)]
+    assert product.arguments[0] == Operand((2, 5, 8), torch.float32)
+    assert str(product) == "bmm 2x5x8 2x8x5 float32"
+    assert product.seconds(3, CPU) > 0
+
+
+def test_unknown_words_are_named():
+    with pytest.raises(InputError, match=r"^ops\.precisions=fp8 is unknown: .*fp32, bf16"):
+        find_precisions("ops.precisions", ["fp32", "fp8"])
+    with pytest.raises(InputError, match=r"^ops\.precisions=None is unknown"):
+        find_precisions("ops.precisions", [])
+    with pytest.raises(InputError, match=r"^device=tpu is unknown: .*auto, cpu, cuda"):
+        find_device("tpu")
+    for repeats in (0, 1.5):
+        with pytest.raises(InputError, match=f"^repeats={repeats} cannot be"):
+            check_repeats(repeats)
+    assert find_device("cpu") == CPU
+
+
+def test_a_wrong_size_is_not_taken_for_a_path_that_is_not_there():
+    case = GridAttention(batch=1, views=1, height=4, width=6, heads=1, head_width=8, grid=5)
+    with pytest.raises(InputError, match="4x6"):
+        make_rows(case, case, PRECISIONS, LOOP_TOKENS, CPU)

@@ -1,0 +1,48 @@
+"""The same bits in every run and on any number of threads, and every element is written."""
+
+import numpy as np
+import pytest
+import torch
+from scans import Result, both_ways, make_arguments
+
+
+def assert_same_bits(one: Result, other: Result) -> None:
+    for name, value in one.named().items():
+        assert torch.equal(value, other.named()[name]), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+def test_any_number_of_threads_gives_the_same_bits(path, threads, dtype, reverse):
+    arguments = make_arguments(path[0], 131, channels=4, width=16, state=16, dtype=dtype)
+
+    def run(count):
+        threads(count)
+        return both_ways(path, arguments, reverse=reverse)
+
+    one = run(1)
+    for again in (run(1), run(2)):
+        assert_same_bits(again, one)
+
+
+@pytest.fixture
+def poisoned_memory(monkeypatch):
+    """Memory that nobody has written holds NaN."""
+
+    def poisoned(shape, dtype=float, **options):
+        array = allocate(shape, dtype, **options)
+        array.fill(np.nan)
+        return array
+
+    allocate = np.empty
+    monkeypatch.setattr(np, "empty", poisoned)
+    torch.use_deterministic_algorithms(True)  # fills torch's
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.parametrize("length", [1, 67])
+def test_every_element_is_written(path, request, length, reverse):
+    arguments = make_arguments(path[0], length)
+    clean = both_ways(path, arguments, reverse=reverse)
+    request.getfixturevalue("poisoned_memory")
+    assert_same_bits(both_ways(path, arguments, reverse=reverse), clean)

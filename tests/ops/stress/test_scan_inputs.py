@@ -1,0 +1,94 @@
+"""Inputs as they come: strided, expanded, of other types, and those that need no gradient."""
+
+import pytest
+import torch
+from scans import (
+    ERROR,
+    NAMES,
+    SCANS,
+    both_ways,
+    by_loop,
+    make_arguments,
+    random_pull,
+    relative_error,
+    sum_error,
+)
+
+
+def run(path, arguments, reverse=False):
+    return SCANS[path[0]](*arguments, backend=path[1], reverse=reverse)
+
+
+def test_strided_inputs_and_gradient(path, reverse):
+    arguments = make_arguments(path[0], 67)
+    exact = by_loop(path, arguments, reverse=reverse)
+
+    def spread_out(tensor):
+        """Its dimensions in the opposite order, and a second number beside each."""
+        return torch.stack((tensor.permute(*range(tensor.ndim)[::-1]),) * 2, -1)
+
+    def back(tensor):
+        return tensor[..., 0].permute(*range(tensor.ndim - 1)[::-1])
+
+    leaves = [spread_out(argument).requires_grad_() for argument in arguments]
+    y = run(path, [back(leaf) for leaf in leaves], reverse)
+    assert relative_error(y, exact.y) <= ERROR[torch.float32]
+    grads = torch.autograd.grad(y, leaves, back(spread_out(random_pull(y))))
+    for name, grad, right in zip(NAMES, grads, exact.grads, strict=True):
+        assert relative_error(back(grad), right) <= ERROR[torch.float32], name
+
+
+def test_expanded_inputs_and_gradient(path, reverse):
+    """One token for all, one batch entry for all, one rate for all; y.sum() pulls all alike."""
+    x, dt, A, B, C, D = make_arguments(path[0], 67)
+    leaves = [x[:, :1], dt[..., :1], A[:1], B[:1], C[:, :, :1], D[:1]]
+    leaves = [leaf.clone().requires_grad_() for leaf in leaves]
+    shapes = [argument.shape for argument in (x, dt, A, B, C, D)]
+    expanded = [leaf.expand(shape) for leaf, shape in zip(leaves, shapes, strict=True)]
+    y = run(path, expanded, reverse)
+    exact = by_loop(path, expanded, torch.ones_like(y), reverse)
+    assert relative_error(y, exact.y) <= ERROR[torch.float32]
+    grads = torch.autograd.grad(y.sum(), leaves)
+    for name, grad, whole in zip(NAMES, grads, exact.grads, strict=True):
+        assert sum_error(grad, whole) <= ERROR[torch.float32], name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_input_alone_needs_a_gradient(path, name):
+    arguments = make_arguments(path[0], 67)
+    all_of_them = both_ways(path, arguments, torch.ones_like(arguments[0])).named()
+    leaf = arguments[NAMES.index(name)].requires_grad_()
+    run(path, arguments).sum().backward()
+    assert torch.equal(leaf.grad, all_of_them[name])
+
+
+def test_no_input_needs_a_gradient(path):
+    assert not run(path, make_arguments(path[0], 67)).requires_grad
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16], ids=str)
+def test_results_have_the_types_of_the_inputs(path, dtype):
+    arguments = make_arguments(path[0], 67, dtype=dtype)
+    result = both_ways(path, arguments)
+    assert result.y.dtype == dtype
+    assert [grad.dtype for grad in result.grads] == [a.dtype for a in arguments]
+
+
+def test_the_inputs_are_left_alone(path):
+    arguments = make_arguments(path[0], 67)
+    copies = [argument.clone() for argument in arguments]
+    leaves = [argument.requires_grad_() for argument in arguments]
+    run(path, leaves).sum().backward()
+    for name, leaf, copy in zip(NAMES, leaves, copies, strict=True):
+        assert torch.equal(leaf, copy), name
+
+
+def test_autocast_changes_nothing(path):
+    leaves = [argument.requires_grad_() for argument in make_arguments(path[0], 67)]
+    plain = both_ways(path, leaves)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        y = run(path, leaves)
+    assert torch.equal(y, plain.y)
+    grads = torch.autograd.grad(y, leaves, random_pull(y))
+    for name, grad, right in zip(NAMES, grads, plain.grads, strict=True):
+        assert torch.equal(grad, right), name

@@ -1,0 +1,33 @@
+"""Sequences as long as those of 32 images at 540x960, and of four times as many; few channels."""
+
+import pytest
+import torch
+from scans import assert_exact, make_arguments
+
+# Where a state is the sum of 10,000 tokens and more, each addition is rounded, and a float32 decay
+# next to 1 holds only the first digits of what is lost: no form reaches 2e-6.
+SLACK = 3
+
+
+def long_arguments(path, length, steps, rates="1"):
+    return make_arguments(path[0], length, steps, rates, batch=1, channels=2, width=1, state=2)
+
+
+def test_long_sequences(path, reverse):
+    assert_exact(path, long_arguments(path, 65_280, "mixed"), reverse=reverse)
+
+
+def test_longer_sequences(path):
+    assert_exact(path, long_arguments(path, 262_144, "1e-2"))
+
+
+@pytest.mark.parametrize("steps", ["1e-8", "1e-2"])
+def test_long_memory(path, steps):
+    assert_exact(path, long_arguments(path, 65_280, steps, "1e-4"), slack=SLACK)
+
+
+@pytest.mark.parametrize("length, step, rate", [(65_280, 1e-2, 1.0), (262_144, 1.0, 1e-4)])
+def test_long_constants(path, length, step, rate):
+    x, dt, A, B, C, D = (torch.ones_like(a) for a in long_arguments(path, length, "1"))
+    constants = (x, step * dt, -rate * A, B, C, D)
+    assert_exact(path, constants, torch.ones_like(x), slack=SLACK)

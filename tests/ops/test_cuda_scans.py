@@ -1,0 +1,174 @@
+"""The Triton scans against the reference in float64: on a GPU, or in Triton's interpreter.
+
+Triton reads TRITON_INTERPRET when it is first imported, so one test runs this file a second time,
+in a process that has it set: there, what is marked `kernel` runs on a CPU.
+"""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from asysplat.errors import InputError
+from asysplat.ops import selective_scan, ssd
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+DEVICE = "cpu" if INTERPRETED else "cuda"
+SCANS = {"ssd": ssd, "selective_scan": selective_scan}
+CHUNKS = {"ssd": 16, "selective_scan": 4} if INTERPRETED else {"ssd": 64, "selective_scan": 16}
+NAMES = ("y", "x", "dt", "A", "B", "C", "D")
+
+
+def kernel(test):
+    """Runs where there is a device for kernels."""
+    return test if INTERPRETED else pytest.mark.gpu(test)
+
+
+def arguments(name, length, batch=2, channels=3, width=16, state=16, dtype=torch.float32):
+    """x, dt, A, B, C, D; `channels` heads of `width`, or channels."""
+    heads = (channels, width) if name == "ssd" else (channels,)
+    rates = (channels,) if name == "ssd" else (channels, state)
+    return [
+        torch.randn(batch, length, *heads).to(dtype),
+        torch.rand(batch, length, channels),
+        -torch.rand(rates) - 0.1,
+        torch.randn(batch, length, state).to(dtype),
+        torch.randn(batch, length, state).to(dtype),
+        torch.randn(channels),
+    ]
+
+
+def run(name, tensors, backend, reverse):
+    """y, and the gradients of x, dt, A, B, C and D."""
+    leaves = [tensor.detach().to(DEVICE).requires_grad_() for tensor in tensors]
+    y = SCANS[name](*leaves, backend=backend, reverse=reverse)
+    generator = torch.Generator().manual_seed(1)
+    weights = torch.randn(y.shape, generator=generator).to(tensors[0].dtype)
+    return [y.detach(), *torch.autograd.grad(y, leaves, weights.to(y))]
+
+
+def check(name, tensors, reverse=False, tolerance=2e-6, backend="reference", dims=None):
+    """Relative L2 errors; over all, or of each channel or head, along its place in `dims`."""
+    exact = run(name, [tensor.double() for tensor in tensors], backend, reverse)
+    got = run(name, tensors, "cuda", reverse)
+    for part, a, b, like in zip(NAMES, got, exact, (tensors[0], *tensors), strict=True):
+        assert a.dtype == like.dtype and a.isfinite().all(), part
+        dim = None if dims is None else dims[part]
+        if dim is not None:
+            a, b = (t.movedim(dim, 0).flatten(1) if t.ndim > 1 else t[:, None] for t in (a, b))
+        error = torch.linalg.vector_norm(a.double() - b, dim=-1 if dim is not None else None)
+        scale = torch.linalg.vector_norm(b, dim=-1 if dim is not None else None)
+        assert (error <= tolerance * scale).all(), (part, error / scale)
+
+
+# Where each result has its heads or channels.
+OWN = {"y": 2, "x": 2, "dt": 2, "A": 0, "B": None, "C": None, "D": 0}
+
+
+@kernel
+@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("chunks, more", [(0, 1), (1, -1), (1, 0), (1, 1), (3, 5)])
+def test_output_and_gradients_are_those_of_the_reference(name, chunks, more, reverse):
+    check(name, arguments(name, chunks * CHUNKS[name] + more), reverse)
+
+
+@kernel
+@pytest.mark.parametrize("name", SCANS)
+def test_wide_heads_and_states(name):
+    channels = 2 if name == "ssd" else 18  # more than a program has
+    check(name, arguments(name, 17, batch=1, channels=channels, width=64, state=64))
+    if name == "ssd":  # of more than a program's columns
+        check(name, arguments(name, 17, batch=1, channels=1, state=128))
+
+
+@kernel
+@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("dtype, tolerance", [(torch.bfloat16, 1e-2), (torch.float16, 1e-3)])
+def test_half_precision(name, dtype, tolerance):
+    check(name, arguments(name, 17, dtype=dtype), tolerance=tolerance)
+
+
+@kernel
+@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("reverse", [False, True])
+def test_all_small_and_all_large_steps_and_rates(name, reverse):
+    tensors = arguments(name, CHUNKS[name] + 3, batch=1, channels=4)
+    tensors[1] = torch.tensor([1e-8, 1e-8, 1e3, 1e3]).expand_as(tensors[1])
+    rates = torch.tensor([-1e-4, -1e4, -1e-4, -1e4])
+    tensors[2] = (rates if name == "ssd" else rates[:, None]).expand_as(tensors[2])
+    check(name, tensors, reverse, dims=OWN)
+
+
+@kernel
+@pytest.mark.parametrize("name", SCANS)
+def test_mixed_steps_and_rates(name):
+    tensors = arguments(name, CHUNKS[name] + 3, channels=4)
+    tensors[1] = 10 ** (torch.rand_like(tensors[1]) * 11 - 8)
+    tensors[2] = -(10 ** (torch.rand_like(tensors[2]) * 8 - 4))
+    check(name, tensors)
+
+
+@kernel
+@pytest.mark.parametrize("name", SCANS)
+def test_a_token_that_forgets_everything_leaves_small_decays_exact(name):
+    tensors = arguments(name, CHUNKS[name] + 3, channels=2)
+    tensors[1] *= 1e-3
+    tensors[1][:, 1] = 1e12
+    check(name, tensors)
+
+
+@kernel
+@pytest.mark.parametrize("name", SCANS)
+def test_a_state_may_be_larger_than_half_precision_holds(name):
+    x, dt, A, B, C, D = arguments(name, 17, batch=1, dtype=torch.float16)
+    tensors = (x.abs(), dt, A, torch.full_like(B, 6e4), C * 1e-5, D)
+    got = SCANS[name](*(tensor.to(DEVICE) for tensor in tensors), backend="cuda")
+    exact = SCANS[name](*(tensor.double() for tensor in tensors), backend="reference")
+    assert (got.cpu() - exact).norm() <= 1e-3 * exact.norm()
+
+
+@kernel
+@pytest.mark.parametrize(
+    "name, sizes, message",
+    [
+        ("ssd", {"state": 24}, "state size of 24: expected a power of two from 16 to 256"),
+        ("ssd", {"width": 8}, "head width of 8: expected a power of two from 16 to 128"),
+        ("selective_scan", {"state": 8}, "state size of 8: expected a power of two from 16 to 256"),
+    ],
+)
+def test_sizes_that_kernels_cannot_take(name, sizes, message):
+    with pytest.raises(InputError, match=message):
+        run(name, arguments(name, 3, **sizes), "cuda", False)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(INTERPRETED, reason="too large")
+@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("reverse", [False, True])
+def test_long_sequences_are_those_of_the_chunked_form_and_the_same_every_time(name, reverse):
+    tensors = arguments(name, 10_007, channels=28, width=64, state=256 if name == "ssd" else 16)
+    check(name, tensors, reverse, backend="chunked")
+    check(
+        name,
+        [t.bfloat16() if i in (0, 3, 4) else t for i, t in enumerate(tensors)],
+        reverse,
+        tolerance=1e-2,
+        backend="chunked",
+    )
+    first, again = (run(name, tensors, "cuda", reverse) for _ in range(2))
+    assert all(map(torch.equal, first, again))
+
+
+@pytest.mark.skipif(INTERPRETED, reason="this is that process")
+def test_kernels_in_the_interpreter():
+    pytest.importorskip("triton")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", __file__],
+        env={**os.environ, "TRITON_INTERPRET": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
