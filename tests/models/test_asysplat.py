@@ -196,8 +196,14 @@ def test_double_precision_agrees(build):
 
 
 def test_resolution_that_the_patches_do_not_take(build):
-    with pytest.raises(InputError, match="set 64x64"):
+    with pytest.raises(InputError, match="set 48x48"):
         build(*TINY)(make_views(height=48, width=40))
+
+
+@pytest.mark.parametrize("model", ["asysplat_4m4s", "asysplat_7m1s"])
+def test_token_maps_that_the_grid_does_not_divide(build, model):
+    gaussians = build(*TINY, f"model={model}")(make_views(height=48, width=80))
+    assert all(field.isfinite().all() for field in (gaussians.means, gaussians.sh))
 
 
 @pytest.mark.parametrize(

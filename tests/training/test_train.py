@@ -139,7 +139,7 @@ REFUSED = {
     "an unknown model": (["model=asysplat_4m4z"], "did you mean asysplat_4m4"),
     "an unknown table": (["sweeps=layer"], "did you mean layers"),
     "no weights to start from": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
-    "a size that the patches do not take": (["data.height=40"], "set 64x32"),
+    "a size that the patches do not take": (["data.height=40"], "set 48x32"),
     "an unusable layer mix": (["model.layers=4q"], "such as 4m4s"),
     "a ratio out of reach": (["geometry_ratio=1.5"], "geometry_ratio=1.5: give a share"),
     "a missing folder": (["data=transforms", "data.root=nowhere"], "data.root=nowhere"),
