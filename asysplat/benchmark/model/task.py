@@ -17,6 +17,9 @@ from asysplat.scene import Gaussians, Views
 from asysplat.words import check_words
 
 
+FILLED = 0.75  # of the memory, at most: a step also needs what it does not keep
+
+
 @dataclass(frozen=True)
 class Task:
     """
@@ -69,7 +72,7 @@ class Task:
 
     @property
     def step_fits(self) -> bool:
-        return self.step_gb < _memory_gb(self.device)
+        return self.step_gb < FILLED * _memory_gb(self.device)
 
     def _autocast(self, device: str) -> torch.autocast:
         return torch.autocast(device, self.dtype, enabled=self.dtype != torch.float32)
