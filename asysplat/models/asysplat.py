@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from asysplat.errors import InputError
+from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.stage import Component, Stage
@@ -83,7 +84,7 @@ class AsySplat(Network):
             {
                 "tokenizer": Tokenizer(patch_fine, widths.fine),
                 "stages": nn.ModuleList(
-                    nn.Sequential(*(appearance_block(fine) for _ in range(appearance_layers)))
+                    Layers(*(appearance_block(fine) for _ in range(appearance_layers)))
                     for _ in shapes
                 ),
                 "links": nn.ModuleList(fine_reads_coarse(shape, fine) for shape in shapes),

@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from torch import nn
 
 from asysplat.errors import InputError
+from asysplat.models.layers import Layers
 from asysplat.models.shapes import Widths
 from asysplat.scene import Gaussians, Views
 
@@ -44,6 +45,12 @@ class Network(nn.Module, ABC):
             f"{total / 1e6:.2f}M parameters, {self.geometry_share():.1%} of them for geometry; "
             f"stages {stages} wide, heads {self.widths.head}"
         )
+
+    def checkpoint_layers(self, checkpointing: bool) -> None:
+        """Whether the backward pass computes each layer again, to save memory; see `Layers`."""
+        for module in self.modules():
+            if isinstance(module, Layers):
+                module.checkpointing = checkpointing
 
     @property
     def size_multiple(self) -> int:

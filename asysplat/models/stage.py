@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.models.layer_mix import parse_layer_mix
+from asysplat.models.layers import Layers
 from asysplat.models.shapes import StageShape
 
 Component = Callable[..., nn.Module]
@@ -39,7 +40,7 @@ class Stage(nn.Module):
         same = previous_width == shape.width
         self.project = nn.Identity() if same else nn.Linear(previous_width, shape.width)
         mix = parse_layer_mix(layers, set(blocks))
-        self.layers = nn.Sequential(*(blocks[letter](shape) for letter in mix))
+        self.layers = Layers(*(blocks[letter](shape) for letter in mix))
 
     def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h2 w2 e"]:
         return self.layers(self.project(self.merge(tokens)))

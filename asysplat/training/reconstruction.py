@@ -7,9 +7,10 @@ from typing import Any
 
 import lightning
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from asysplat.evaluation.metrics import psnr
+from asysplat.models.network import Network
 from asysplat.rendering import Rendering, render
 from asysplat.scene import Gaussians
 from asysplat.training.losses import ReconstructionLoss
@@ -34,11 +35,12 @@ class Reconstruction(lightning.LightningModule):
         betas: of AdamW.
         warmup_steps, total_steps: in optimizer steps.
         background: RGB behind the Gaussians.
+        checkpoint_layers: compute each layer again in the backward pass, to save memory.
     """
 
     def __init__(
         self,
-        net: nn.Module,
+        net: Network,
         loss: ReconstructionLoss,
         learning_rate: float,
         weight_decay: float,
@@ -46,8 +48,10 @@ class Reconstruction(lightning.LightningModule):
         warmup_steps: int,
         total_steps: int,
         background: Sequence[float],
+        checkpoint_layers: bool = False,
     ):
         super().__init__()
+        net.checkpoint_layers(checkpoint_layers)
         self.net, self.loss = net, loss
         self.learning_rate, self.weight_decay, self.betas = learning_rate, weight_decay, betas
         self.warmup_steps, self.total_steps = warmup_steps, total_steps

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from asysplat.errors import InputError
 from asysplat.ops import selective_scan, ssd
@@ -99,3 +100,35 @@ def test_unknown_backend(name):
     scan, make, _ = SCANS[name]
     with pytest.raises(InputError, match="backend='fast'"):
         scan(*make(), backend="fast")
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_torch_sees_one_operator(name):
+    """opcheck: schema, autograd, the meta device and AOT dispatch; and torch.compile in one graph."""
+    scan, make, _ = SCANS[name]
+    arguments = [a.requires_grad_() for a in make(length=70, dtype=torch.float32)]
+    operator = getattr(torch.ops.asysplat, name).default
+    torch.library.opcheck(operator, ("cpu", *arguments, True))
+
+    # The public function less what checks its shapes in tests, which cannot be compiled.
+    @torch.compile(backend="aot_eager", fullgraph=True)
+    def compiled(*arguments):
+        return operator("cpu", *arguments, False)[0]
+
+    expected, got = scan(*arguments), compiled(*arguments)
+    assert torch.equal(got, expected)
+    grads = [torch.autograd.grad(y.square().sum(), arguments) for y in (expected, got)]
+    assert all(map(torch.equal, *grads))
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_flops_are_counted_on_the_meta_device(name):
+    scan, make, _ = SCANS[name]
+    arguments = [a.to("meta").requires_grad_() for a in make(length=128, dtype=torch.float32)]
+    with FlopCounterMode(display=False) as counter:
+        y = scan(*arguments)
+        forward = counter.get_total_flops()
+        y.sum().backward()
+    # One product or more for each, of all states.
+    assert forward > 2 * arguments[0].numel() * 5
+    assert counter.get_total_flops() > 3 * forward

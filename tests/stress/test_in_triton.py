@@ -1,6 +1,6 @@
 """Cases once more, in a process in which Triton interprets the kernels of "cuda".
 
-The interpreter is slow: here are some of each kind. TRITON_INTERPRET=1 pytest tests/stress runs all.
+The interpreter is slow: here are some of each kind. All: TRITON_INTERPRET=1 pytest tests/stress
 """
 
 import os

@@ -16,7 +16,6 @@ from asysplat.models.network import Network
 from asysplat.scene import Gaussians, Views
 from asysplat.words import check_words
 
-
 FILLED = 0.75  # of the memory, at most: a step also needs what it does not keep
 
 

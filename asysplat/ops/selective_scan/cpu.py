@@ -19,7 +19,7 @@ CHUNK = 32  # tokens: their states, CHUNK x N x LANES, fit a core's cache
 LOG2_E, LN_2 = 1 / math.log(2), np.float32(math.log(2))
 
 
-def carried_shape(x: Tensor, B: Tensor) -> tuple[int, ...]:
+def carried_shape(x: Tensor, B: Tensor) -> tuple:
     """States at the beginning of chunks: [B, blocks of channels, chunks, N, LANES]."""
     batch, length, channels = x.shape
     return batch, -(-channels // LANES), -(-length // CHUNK), B.shape[-1], LANES

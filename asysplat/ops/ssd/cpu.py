@@ -19,7 +19,7 @@ CHUNK = 64  # tokens
 SEGMENT = 16 * CHUNK
 
 
-def carried_shape(x: Tensor, B: Tensor) -> tuple[int, ...]:
+def carried_shape(x: Tensor, B: Tensor) -> tuple:
     """States before each segment: [B, segments, N, H P]."""
     batch, length, heads, head_width = x.shape
     return batch, -(-length // SEGMENT), B.shape[-1], heads * head_width

@@ -1,0 +1,42 @@
+"""Layers one after the other, kept in memory or computed again."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+
+class Layers(nn.Sequential):
+    """With `checkpointing`, the backward pass computes each layer again, so that only what passes
+    between them is kept (Chen et al. 2016)."""
+
+    checkpointing = False
+
+    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
+        for layer in self:
+            if self.checkpointing and torch.is_grad_enabled():
+                contexts = (nullcontext(), _without_running_means(layer))
+                tokens = checkpoint(
+                    layer, tokens, use_reentrant=False, context_fn=lambda c=contexts: c
+                )
+            else:
+                tokens = layer(tokens)
+        return tokens
+
+
+@contextmanager
+def _without_running_means(layer: nn.Module) -> Iterator[None]:
+    """A layer that is computed twice has seen its batch once."""
+    norms = [m for m in layer.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)]
+    momenta = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.momentum = 0.0
+        norm.num_batches_tracked -= int(norm.training)
+    try:
+        yield
+    finally:
+        for norm, momentum in zip(norms, momenta, strict=True):
+            norm.momentum = momentum

@@ -1,0 +1,56 @@
+"""Checkpointing: the same step in less memory; and float32 against float64, a network whole."""
+
+import pytest
+import torch
+
+from asysplat.evaluation.static_cost import activation_gb
+from asysplat.scene import Cameras, Views
+
+SMALL = ["width=0.125", "model.blocks.m.state_size=16", "model.layers=2m2s"]
+
+
+def make_views(views=3, height=32, width=48):
+    generator = torch.Generator().manual_seed(0)
+    poses = torch.eye(4).repeat(1, views, 1, 1)
+    poses[0, :, 0, 3] = torch.linspace(-0.5, 0.5, views)
+    intrinsics = torch.tensor([[50.0, 0, width / 2], [0, 50, height / 2], [0, 0, 1]])
+    images = torch.rand(1, views, 3, height, width, generator=generator)
+    return Views(Cameras(intrinsics.repeat(1, views, 1, 1), poses, height, width), images)
+
+
+def step(net, views):
+    """Gaussians, gradients and running means."""
+    net.train().zero_grad()
+    gaussians = net(views)
+    (gaussians.means.square().mean() + gaussians.sh.mean() + gaussians.opacities.mean()).backward()
+    grads = [p.grad.clone() for p in net.parameters() if p.grad is not None]
+    return [gaussians.means.detach(), gaussians.sh.detach(), *grads, *net.buffers()]
+
+
+def test_checkpointing_changes_nothing_but_memory(build):
+    torch.manual_seed(0)
+    net = build(*SMALL)
+    start = {name: value.clone() for name, value in net.state_dict().items()}
+    plain = [tensor.clone() for tensor in step(net, make_views())]
+    kept = activation_gb(net.to("meta"), 3, 32, 48)
+    again = build(*SMALL)
+    again.load_state_dict(start)
+    again.checkpoint_layers(True)
+    assert all(map(torch.equal, step(again, make_views()), plain))
+    less = activation_gb(again.to("meta"), 3, 32, 48)
+    print(f"\nkept for the backward pass: {1e3 * kept:.1f} MB, with checkpointing {1e3 * less:.1f}")
+    assert less < 0.5 * kept
+
+
+@pytest.mark.parametrize("model", ["asysplat_4m4s", "asysplat_7m1t"])
+def test_float32_gives_the_gaussians_of_float64(build, model):
+    torch.manual_seed(0)
+    net = build("width=0.125", f"model={model}").eval()
+    with torch.no_grad():
+        single = net(make_views(views=4, height=64, width=64))
+        exact = net.double()(make_views(views=4, height=64, width=64).to(torch.float64))
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        value, truth = getattr(single, name).double(), getattr(exact, name)
+        assert truth.dtype == torch.float64
+        assert (value - truth).norm() <= 1e-4 * truth.norm(), name
+        assert (value - truth).abs().max() <= 1e-4 * truth.abs().max(), name
