@@ -14,17 +14,17 @@ from backends import INTERPRETED
 # What is left of each file, as pytest's -k says it.
 SOME = {
     "bad_input": "",
-    "boundary_band": "random",
+    "boundary_band": "random and depth",
     "culled": "case_01 or case_02 and nan or case_06 and inf and True or case_09 and quaternion"
     " or case_14 and median or case_32 and (opacities and near or means and 1e38)",
-    "extents": "not case_08 or 1e+00",
+    "extents": "not case_08",
     "gradchecks": "",
     "memory_and_types": "strided or bfloat16-None",
     "needles": "1e6",
-    "opacities": "",
-    "places": "not 1e+05 and not 1e+07",
+    "opacities": "not gsplat",
+    "places": "not case_12 and not case_13 or 1e+06 or 0.01",
     "properties": "permutation or cropping",
-    "sizes": "case_15 and not 4096 or case_17",
+    "sizes": "case_15 and not 4096",
     "threads_and_order": "equal_depths",
 }
 
