@@ -145,15 +145,15 @@ class _Segment:
             torch.mm(self.B[chunk], grad_state, out=written[chunk].view(CHUNK, -1))
             grad_B[chunk].addmm_(self.weighted[chunk].flatten(1), grad_state.mT)
             # What was left of the state before it, and what was read of that.
-            kept = (state * grad_state).view(-1, heads, width).sum((0, 2), dtype=torch.float64)
+            kept = (state * grad_state).view(-1, heads, width).sum((0, 2))
             left[chunk] = kept[:, None] * self.across[chunk]
             torch.mm(self.C[chunk], state, out=read[chunk].view(CHUNK, -1))
             grad_C[chunk].addmm_(read_pull[chunk].flatten(1), state.mT)
             grad_state.view(-1, heads, width).mul_(self.across[chunk])
             grad_state.addmm_(self.C[chunk].mT, read_pull[chunk].flatten(1))
         grad_inputs.addcmul_(written, self.to_end)
-        read_share = (read_pull * read).sum(-1, dtype=torch.float64)  # [c q h]
-        write_share = (self.weighted * written).sum(-1, dtype=torch.float64)
+        read_share = read.mul_(read_pull).sum(-1).double()  # [c q h]
+        write_share = written.mul_(self.weighted).sum(-1).double()
 
         # A token's decay acts on what was written before it and is read at it or behind it.
         # Sums of the tokens behind and before, none taken away again: a difference would keep the
