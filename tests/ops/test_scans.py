@@ -104,7 +104,7 @@ def test_unknown_backend(name):
 
 @pytest.mark.parametrize("name", SCANS)
 def test_torch_sees_one_operator(name):
-    """opcheck: schema, autograd, the meta device and AOT dispatch; and torch.compile in one graph."""
+    """opcheck (schema, autograd, meta device, AOT dispatch), and torch.compile in one graph."""
     scan, make, _ = SCANS[name]
     arguments = [a.requires_grad_() for a in make(length=70, dtype=torch.float32)]
     operator = getattr(torch.ops.asysplat, name).default
