@@ -136,8 +136,8 @@ def attention_sizes(heads: int, queries: int, keys: int, head_width: int) -> lis
 def grid_attention_sizes(
     batch: int, views: int, height: int, width: int, heads: int, head_width: int, grid: int
 ) -> list[Size]:
-    """Each grid place by itself."""
-    tokens = views * height * width // grid**2
+    """Each grid place by itself, maps padded to multiples of the grid."""
+    tokens = views * -(-height // grid) * -(-width // grid)
     return attention_sizes(batch * grid**2 * heads, tokens, tokens, head_width)
 
 

@@ -196,6 +196,6 @@ def test_unknown_words_are_named():
 
 
 def test_a_wrong_size_is_not_taken_for_a_path_that_is_not_there():
-    case = GridAttention(batch=1, views=1, height=4, width=6, heads=1, head_width=8, grid=5)
-    with pytest.raises(InputError, match="4x6"):
+    case = GridAttention(batch=1, views=1, height=4, width=6, heads=1, head_width=8, grid=0)
+    with pytest.raises(InputError, match="grid=0"):
         make_rows(case, case, PRECISIONS, LOOP_TOKENS, CPU)
