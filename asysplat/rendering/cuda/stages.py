@@ -108,12 +108,13 @@ class _Draw(torch.autograd.Function):
             )
             pixels = _rasterize(frame, splats, lists, masks)
         image, alpha, transmittance, depth, origins, stops, halved, last_entry, wanted = pixels
-        boxes, faint, outside = counters.sum(0).tolist()
         lengths = lists.first_entry.diff()
-        masked = 0 if wanted is None else int(lengths[~wanted].sum())
-        drawn = int((last_entry - lists.first_entry[:-1]).sum())
+        masked = lengths.new_zeros(()) if wanted is None else (lengths * ~wanted).sum()
+        drawn = (last_entry - lists.first_entry[:-1]).sum()
+        # One wait for the GPU.
+        counted = torch.stack((*counters.sum(0), masked, drawn, counts.count_nonzero()))
+        boxes, faint, outside, masked, drawn, stats["visible"] = counted.tolist()
         pairs = len(lists.entries)
-        stats["visible"] = int(counts.count_nonzero())
         stats["culled_by_opacity"], stats["culled_by_frustum"] = faint, outside
         stats["pairs"] = pairs
         stats["pairs_off_ellipse"] = boxes - pairs if settings.skips.ellipse else 0
