@@ -43,9 +43,8 @@ def run_scan(
     """
     x, dt, A, B, C, D = arguments
     _check(scan, arguments)
-    single = x.dtype != torch.float64
     if backend == "auto":
-        backend = _fast_backend(x, single)
+        backend = _fast_backend(x)
     if backend in FAST:
         _check_fast(scan, backend, x)
         with without_autocast(x):
@@ -70,11 +69,13 @@ def run_scan(
     return (y.flip(1) if reverse else y).to(x.dtype)
 
 
-def _fast_backend(x: Tensor, single: bool) -> str:
+def _fast_backend(x: Tensor) -> str:
     """The fastest for the device, that keeps what float64 asks for; the meta device has any."""
-    if single and x.device.type in ("cpu", "meta"):
+    if x.dtype == torch.float64:
+        return "chunked"
+    if x.device.type in ("cpu", "meta"):
         return "cpu"
-    if single and x.device.type == "cuda" and find_spec("triton"):
+    if x.device.type == "cuda" and find_spec("triton"):
         return "cuda"
     return "chunked"
 

@@ -16,7 +16,7 @@ from asysplat.rendering.cuda.project_backward import project_backward
 from asysplat.rendering.cuda.splat import GRADIENT, SPLAT
 from asysplat.rendering.cuda.sums import sum_pairs
 from asysplat.rendering.cuda.tile import TILE
-from asysplat.rendering.cuda.tiles import sort_into_tiles
+from asysplat.rendering.cuda.tiles import TileLists, sort_into_tiles
 from asysplat.rendering.layers import Layers
 from asysplat.rendering.settings import Settings
 from asysplat.scene import Cameras, Gaussians
@@ -251,7 +251,9 @@ def _project(
     return splats, depths, counts, counters
 
 
-def _rasterize(frame: _Frame, splats: Tensor, lists, masks: Tensor | None):
+def _rasterize(
+    frame: _Frame, splats: Tensor, lists: TileLists, masks: Tensor | None
+) -> tuple[Tensor | None, ...]:
     """Layers, what the backward pass needs, and which tiles are wanted; see `draw_tile`."""
     shape = (frame.images, frame.height, frame.width)
     settings, convention = frame.settings, frame.settings.convention
