@@ -1,17 +1,20 @@
 """Posed photographs from made-up places and from files, as batches of reconstruction tasks."""
 
+from asysplat.data.cache import ImageCache
 from asysplat.data.datamodule import SceneDataModule
-from asysplat.data.modules import procedural_data, transforms_data
+from asysplat.data.modules import files_data, procedural_data
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.sources import ProceduralSource, TransformsSource
-from asysplat.data.transforms import TransformsCapture
+from asysplat.data.readers import find_scenes, open_scene
+from asysplat.data.sources import FilesSource, ProceduralSource
 
 __all__ = [
+    "FilesSource",
+    "ImageCache",
     "ProceduralScene",
     "ProceduralSource",
     "SceneDataModule",
-    "TransformsCapture",
-    "TransformsSource",
+    "files_data",
+    "find_scenes",
+    "open_scene",
     "procedural_data",
-    "transforms_data",
 ]

@@ -4,9 +4,11 @@ Pixel positions count from the image's corner: the first pixel's centre is at +0
 written, and the exif orientation is not applied: calibrations speak of the pixels as stored.
 """
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,25 @@ from asysplat.errors import InputError
 
 END_MARKERS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
 TAIL_BYTES = 4096  # room for what some cameras append
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedImage:
+    """An image file's bytes inside another file.
+
+    Args:
+        name: where they stand, for error messages.
+        data: as the file on its own would hold them.
+    """
+
+    name: str
+    data: UInt8[ndarray, "bytes"]
+
+    def __str__(self) -> str:
+        return self.name
+
+
+ImageFile = Path | EncodedImage
 
 
 @dataclass(frozen=True)
@@ -48,7 +69,7 @@ class Lens:
         return self.fisheye or any(self.distortion)
 
 
-def image_size(path: Path) -> tuple[int, int]:
+def image_size(path: ImageFile) -> tuple[int, int]:
     """(width, height), from the header; only a file whose end is missing is decoded as well.
 
     Raises:
@@ -57,7 +78,7 @@ def image_size(path: Path) -> tuple[int, int]:
     return _read(path, _size_if_whole)
 
 
-def load_photograph(path: Path) -> UInt8[ndarray, "h w 3"]:
+def load_photograph(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
     """RGB in 0..255; transparent pixels are laid on white.
 
     Raises:
@@ -66,7 +87,7 @@ def load_photograph(path: Path) -> UInt8[ndarray, "h w 3"]:
     return _read(path, _to_rgb)
 
 
-def load_depth(path: Path) -> Float32[ndarray, "h w"]:
+def load_depth(path: ImageFile) -> Float32[ndarray, "h w"]:
     """The stored integers of a one-channel (16-bit) image; 0 where unknown.
 
     Raises:
@@ -80,7 +101,7 @@ def load_depth(path: Path) -> Float32[ndarray, "h w"]:
     return stored.astype(np.float32)
 
 
-def load_mask(path: Path) -> Bool[ndarray, "h w"]:
+def load_mask(path: ImageFile) -> Bool[ndarray, "h w"]:
     """True where the stored value is not 0.
 
     Raises:
@@ -169,29 +190,55 @@ def _to_rgb(image: Image.Image) -> UInt8[ndarray, "h w 3"]:
     return np.asarray(image.convert("RGB"))
 
 
+def content_hash(file: ImageFile) -> str:
+    """Of the stored bytes, read once while the file does not change.
+
+    Raises:
+        InputError: the file is missing or empty.
+    """
+    if isinstance(file, EncodedImage):
+        return hashlib.blake2b(file.data.tobytes(), digest_size=16).hexdigest()
+    _check_there(file)
+    stat = file.stat()
+    return _hash_of(file, stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache(maxsize=65536)
+def _hash_of(path: Path, size: int, modified: int) -> str:
+    return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+
+
 def _size_if_whole(image: Image.Image) -> tuple[int, int]:
     """A file that does not end as its format ends is decoded, which fails if it was cut short."""
     marker = END_MARKERS.get(image.format or "")
     if marker:
-        with open(image.filename, "rb") as file:
-            file.seek(0, 2)
-            file.seek(max(0, file.tell() - TAIL_BYTES))
-            if marker not in file.read():
-                image.load()
+        position = image.fp.tell()
+        image.fp.seek(0, 2)
+        image.fp.seek(max(0, image.fp.tell() - TAIL_BYTES))
+        whole = marker in image.fp.read()
+        image.fp.seek(position)
+        if not whole:
+            image.load()
     return image.size
 
 
-def _read(path: Path, extract: Callable[[Image.Image], Any]) -> Any:
+def _read(file: ImageFile, extract: Callable[[Image.Image], Any]) -> Any:
     """What `extract` makes of the opened image, with every failure as one InputError."""
-    if not path.is_file():
-        raise InputError(f"{path} does not exist: put the image there, or drop its frame.")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path} is empty (0 bytes): copy it again, or drop its frame.")
+    if isinstance(file, Path):
+        _check_there(file)
+    stored = file if isinstance(file, Path) else BytesIO(file.data.tobytes())
     try:
-        with Image.open(path) as image:
+        with Image.open(stored) as image:
             return extract(image)
     # Damaged files make Pillow raise anything from OSError to SyntaxError.
     except Exception as error:
         raise InputError(
-            f"{path} cannot be read as an image ({error}): copy it again, or drop its frame."
+            f"{file} cannot be read as an image ({error}): copy it again, or drop its frame."
         ) from error
+
+
+def _check_there(path: Path) -> None:
+    if not path.is_file():
+        raise InputError(f"{path} does not exist: put the image there, or drop its frame.")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path} is empty (0 bytes): copy it again, or drop its frame.")

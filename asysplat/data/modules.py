@@ -4,8 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from asysplat.data.bad_frames import Policy
+from asysplat.data.cache import ImageCache
 from asysplat.data.datamodule import SceneDataModule
-from asysplat.data.sources import ProceduralSource, Source, Task, TransformsSource
+from asysplat.data.sources import FilesSource, ProceduralSource, Source, Task
 from asysplat.errors import InputError
 
 
@@ -28,15 +30,23 @@ def procedural_data(
     return scene_data(source, own, height=height, width=width, **options)
 
 
-def transforms_data(
-    root: str, height: int, width: int, window: Sequence[int], **options
+def files_data(
+    root: str,
+    height: int,
+    width: int,
+    window: Sequence[int],
+    layout: str = "auto",
+    on_bad_frame: Policy = "fail",
+    cache: ImageCache | None = None,
+    **options,
 ) -> SceneDataModule:
-    """Scenes with a `transforms.json`; arguments are those of TransformsSource and `scene_data`."""
+    """Scenes on disk; arguments are those of FilesSource and `scene_data`."""
 
-    def source(root: str) -> TransformsSource:
-        return TransformsSource(root, height, width, window)
+    def source(root: str, layout: str) -> FilesSource:
+        return FilesSource(root, height, width, window, layout, on_bad_frame, cache)
 
-    return scene_data(source, {"root": root}, height=height, width=width, **options)
+    own = {"root": root, "layout": layout}
+    return scene_data(source, own, height=height, width=width, **options)
 
 
 def scene_data(

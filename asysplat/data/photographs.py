@@ -1,8 +1,8 @@
 """Photographs on disk with known cameras: what the readers of file formats have in common."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,8 +10,12 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from torch import Tensor
 
+from asysplat.data.bad_frames import BadFrames
+from asysplat.data.cache import ImageCache
 from asysplat.data.images import (
+    ImageFile,
     Lens,
+    content_hash,
     load_depth,
     load_mask,
     load_photograph,
@@ -32,12 +36,27 @@ class Photograph:
         mask: image that is not 0 where the pixel counts.
     """
 
-    image: Path
+    image: ImageFile
     lens: Lens
     cam_to_world: Float[ndarray, "4 4"]
-    depth: Path | None = None
+    depth: ImageFile | None = None
     depth_unit: float = 1.0
-    mask: Path | None = None
+    mask: ImageFile | None = None
+
+
+@dataclass(frozen=True)
+class PosedScene:
+    """What a reader finds in a scene's files.
+
+    Args:
+        name: unique within the data set.
+        photographs: in the order they were taken.
+        points: sparse points of the scene's surfaces, where the files have any.
+    """
+
+    name: str
+    photographs: list[Photograph]
+    points: Float[ndarray, "P 3"] | None = None
 
 
 class PhotographCapture:
@@ -49,28 +68,27 @@ class PhotographCapture:
 
     Args:
         height, width: the size of every view, in pixels.
+        cache: of pixels that were read.
     """
 
-    def __init__(self, name: str, photographs: Sequence[Photograph], height: int, width: int):
-        self.name = name
-        self._photographs = photographs
-        lenses = [photograph.lens for photograph in photographs]
-        intrinsics = np.stack([resized_intrinsics(lens, height, width) for lens in lenses])
-        poses = np.stack([photograph.cam_to_world for photograph in photographs])
+    def __init__(self, scene: PosedScene, height: int, width: int, cache: ImageCache | None = None):
+        self.scene, self.name, self._cache = scene, scene.name, cache
+        photographs = scene.photographs
+        shape = (len(photographs), -1, -1)
+        intrinsics = [resized_intrinsics(p.lens, height, width) for p in photographs]
+        poses = [photograph.cam_to_world for photograph in photographs]
         self.cameras = Cameras(
-            intrinsics=torch.from_numpy(intrinsics).float(),
-            cam_to_world=torch.from_numpy(poses).float(),
+            intrinsics=torch.tensor(np.array(intrinsics), dtype=torch.float32).view(shape[0], 3, 3),
+            cam_to_world=torch.tensor(np.array(poses), dtype=torch.float32).view(shape[0], 4, 4),
             height=height,
             width=width,
         )
         self._has_depths = any(photograph.depth for photograph in photographs)
-        self._has_masks = any(photograph.mask for photograph in photographs) or any(
-            lens.is_distorted for lens in lenses
-        )
+        self._has_masks = any(p.mask or p.lens.is_distorted for p in photographs)
 
     @property
     def num_frames(self) -> int:
-        return len(self._photographs)
+        return len(self.scene.photographs)
 
     def views(self, frames: Sequence[int]) -> Views:
         """The named frames, in the given order.
@@ -78,7 +96,7 @@ class PhotographCapture:
         Raises:
             InputError: a file whose pixels are damaged.
         """
-        chosen = [self._photographs[frame] for frame in frames]
+        chosen = [self.scene.photographs[frame] for frame in frames]
         return Views(
             cameras=self.cameras.select(frames),
             images=torch.stack([self._image(p) for p in chosen]),
@@ -86,26 +104,62 @@ class PhotographCapture:
             masks=torch.stack([self._mask(p) for p in chosen]) if self._has_masks else None,
         )
 
+    def without_damaged(self, bad: BadFrames) -> "PhotographCapture":
+        """The frames whose pixels can be read; the others are noted in `bad`."""
+        whole = []
+        for frame, photograph in enumerate(self.scene.photographs):
+            with bad.caught():
+                self.views([frame])
+                whole.append(photograph)
+        scene = replace(self.scene, photographs=whole)
+        return PhotographCapture(scene, self.cameras.height, self.cameras.width, self._cache)
+
     def _image(self, photograph: Photograph) -> Float[Tensor, "3 H W"]:
-        pixels = self._fit(load_photograph(photograph.image), photograph.lens)
+        pixels = self._pixels(photograph.image, load_photograph, photograph.lens)
         return pixels.permute(2, 0, 1).float() / 255
 
     def _depth(self, photograph: Photograph) -> Float[Tensor, "H W"]:
         if photograph.depth is None:
             return torch.zeros(self.cameras.height, self.cameras.width)
-        stored = self._fit(load_depth(photograph.depth), photograph.lens, nearest=True)
+        stored = self._pixels(photograph.depth, load_depth, photograph.lens, nearest=True)
         return stored * photograph.depth_unit
 
     def _mask(self, photograph: Photograph) -> Bool[Tensor, "H W"]:
         lens = photograph.lens
         if photograph.mask is None:
-            mask = np.ones((lens.height, lens.width), dtype=bool)
-        else:
-            mask = load_mask(photograph.mask)
-        return self._fit(mask.astype(np.uint8), lens, nearest=True) > 0
+            everywhere = np.ones((lens.height, lens.width), dtype=np.uint8)
+            return torch.tensor(self._fit(everywhere, lens, nearest=True)) > 0
+        return self._pixels(photograph.mask, load_mask, lens, nearest=True) > 0
 
-    def _fit(self, pixels: ndarray, lens: Lens, nearest: bool = False) -> Tensor:
+    def _pixels(
+        self,
+        file: ImageFile,
+        load: Callable[[ImageFile], ndarray],
+        lens: Lens,
+        nearest: bool = False,
+    ) -> Tensor:
+        """A file's pixels as this capture's views have them."""
+
+        def make() -> ndarray:
+            return self._fit(load(file), lens, nearest)
+
+        if self._cache is None:
+            pixels = make()
+        else:
+            size = (self.cameras.height, self.cameras.width)
+            key = "-".join((content_hash(file), _hash(lens, *size, load.__name__)))
+            # What needs neither is as quickly decoded again.
+            changed = lens.is_distorted or (lens.height, lens.width) != size
+            pixels = self._cache.get(key, make, to_disk=changed)
+        # A copy, since what the cache and Pillow lend is read-only.
+        return torch.tensor(pixels)
+
+    def _fit(self, pixels: ndarray, lens: Lens, nearest: bool = False) -> ndarray:
+        if pixels.dtype == bool:
+            pixels = pixels.astype(np.uint8)
         pixels = undistort(pixels, lens, nearest)
-        pixels = resize_and_crop(pixels, self.cameras.height, self.cameras.width, nearest)
-        # A copy, since Pillow lends its memory read-only.
-        return torch.from_numpy(pixels.copy())
+        return resize_and_crop(pixels, self.cameras.height, self.cameras.width, nearest)
+
+
+def _hash(*values) -> str:
+    return hashlib.blake2b(repr(values).encode(), digest_size=8).hexdigest()

@@ -2,13 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
+from asysplat.data.bad_frames import Policy
+from asysplat.data.cache import ImageCache
 from asysplat.data.capture import Capture
 from asysplat.data.procedural import ProceduralScene, split_seed
+from asysplat.data.readers import find_scenes, open_scene
 from asysplat.data.selection import (
     Split,
     evaluation_split,
@@ -16,7 +18,6 @@ from asysplat.data.selection import (
     trained,
     training_split,
 )
-from asysplat.data.transforms import TransformsCapture
 from asysplat.errors import InputError
 
 
@@ -80,30 +81,38 @@ class ProceduralSource:
         return ProceduralScene(seed, self.height, self.width, self.num_frames, places=self.places)
 
 
-class TransformsSource:
-    """Scenes on disk with a `transforms.json` each. Of every 8 frames the first is tested and the
-    fifth validates; the others are given as inputs and trained on.
+class FilesSource:
+    """Scenes on disk. Of every 8 frames the first is tested and the fifth validates; the others are
+    given as inputs and trained on.
 
     Args:
         root: one scene, or a folder of scenes.
         height, width: of every view, in pixels.
         window: as for ProceduralSource.
+        layout, on_bad_frame, cache: as `open_scene` takes them.
 
     Raises:
         InputError: no scene, or one that cannot be used.
     """
 
-    def __init__(self, root: str, height: int, width: int, window: Sequence[int]):
-        folder = Path(root)
-        single = folder.suffix == ".json" or (folder / "transforms.json").exists()
-        scenes = [folder] if single else sorted(p.parent for p in folder.glob("*/transforms.json"))
-        if not scenes:
-            raise InputError(
-                f"data.root={root} has no transforms.json, nor has any folder in it: "
-                "name a scene's folder or a folder of scenes."
-            )
+    def __init__(
+        self,
+        root: str,
+        height: int,
+        width: int,
+        window: Sequence[int],
+        layout: str = "auto",
+        on_bad_frame: Policy = "fail",
+        cache: ImageCache | None = None,
+    ):
         self.window = (window[0], window[1])
-        self.captures = [TransformsCapture(scene, height, width) for scene in scenes]
+        try:
+            layout, scenes = find_scenes(root, layout)
+        except InputError as error:
+            raise InputError(f"data.root={root}: {error}") from error
+        self.captures = [
+            open_scene(scene, height, width, layout, on_bad_frame, cache) for scene in scenes
+        ]
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         capture = self.captures[rng.integers(len(self.captures))]

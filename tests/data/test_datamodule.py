@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from asysplat.data import (
+    FilesSource,
     ProceduralSource,
     SceneDataModule,
-    TransformsSource,
+    files_data,
     procedural_data,
-    transforms_data,
 )
 from asysplat.data.datamodule import TrainingTasks, collate
 from asysplat.data.procedural import ProceduralScene
@@ -99,7 +99,7 @@ def test_too_short_a_folder():
 def test_a_written_scene_trains_like_the_scene_itself(tmp_path):
     scene = ProceduralScene(3, 16, 16, num_frames=24)
     write_transforms(scene.views(range(24)), tmp_path / "scene")
-    source = TransformsSource(str(tmp_path), 16, 16, (12, 24))
+    source = FilesSource(str(tmp_path), 16, 16, (12, 24))
     (task,) = source.evaluation("test", 4, 2)
     read = task.capture.views(task.split.targets)
     made = scene.views(task.split.targets)
@@ -113,7 +113,7 @@ def test_a_written_scene_trains_like_the_scene_itself(tmp_path):
 
 def test_a_folder_without_scenes(tmp_path):
     with pytest.raises(InputError, match=r"data\.root"):
-        TransformsSource(str(tmp_path), 16, 16, (12, 24))
+        FilesSource(str(tmp_path), 16, 16, (12, 24))
 
 
 def test_a_test_set_differs_in_its_options_alone():
@@ -162,11 +162,11 @@ def test_a_test_set_in_another_folder(tmp_path):
         scene = ProceduralScene(seed, 16, 16, num_frames=24)
         write_transforms(scene.views(range(24)), tmp_path / str(seed))
     options = {"name": "transforms", "root": str(tmp_path / "3"), **READ_WITH}
-    data = transforms_data(test_sets={"other": {"root": str(tmp_path / "4")}}, **options)
+    data = files_data(test_sets={"other": {"root": str(tmp_path / "4")}}, **options)
     data.setup()
-    alone = transforms_data(**(options | {"root": str(tmp_path / "4")}))
+    alone = files_data(**(options | {"root": str(tmp_path / "4")}))
     alone.setup()
     (scene,), (expected,) = data.tests["other"], alone.evaluation["test"]
     assert torch.equal(scene["targets"].images, expected["targets"].images)
     with pytest.raises(InputError, match=r"data\.test_sets\.lost: data\.root=.*nowhere"):
-        transforms_data(test_sets={"lost": {"root": f"{tmp_path}/nowhere"}}, **options).setup()
+        files_data(test_sets={"lost": {"root": f"{tmp_path}/nowhere"}}, **options).setup()

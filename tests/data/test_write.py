@@ -5,8 +5,8 @@ import pytest
 import torch
 from PIL import Image
 
+from asysplat.data import open_scene
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.transforms import TransformsCapture
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
@@ -44,7 +44,7 @@ def test_images_and_depths_round_trip(views, tmp_path):
 
 def test_the_reader_reads_it_back(views, tmp_path):
     write_transforms(views, tmp_path)
-    read = TransformsCapture(tmp_path, 12, 16).views([0, 1, 2])
+    read = open_scene(tmp_path, 12, 16).views([0, 1, 2])
     torch.testing.assert_close(read.cameras.cam_to_world, views.cameras.cam_to_world)
     torch.testing.assert_close(read.cameras.intrinsics, views.cameras.intrinsics)
     torch.testing.assert_close(read.images, views.images, atol=0.51 / 255, rtol=0)

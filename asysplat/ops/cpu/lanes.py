@@ -26,7 +26,7 @@ MIDDLE = np.float32((LANES - 1) / 2)
 # Added and taken away again, it rounds a float32 to an integer that stands in its lowest bits.
 ROUND = np.float32(1.5 * 2**23)
 LOWEST = np.float32(-64)  # 2 ** LOWEST is below every threshold and still a normal number
-SMALLEST = np.float32(-126)  # of normal float32
+UNDERFLOW = np.float32(-127)  # its exponent's bits, and with them all bits of `exp2`, are 0
 # 2^f on [-1/2, 1/2]: the Chebyshev interpolation, relative error 2e-9.
 P0, P1, P2, P3, P4, P5, P6 = (
     np.float32(c)
@@ -121,7 +121,7 @@ def _element(context, builder, signature, args, kind):
 
 @inline
 def exp2(x):
-    """2^x for x from SMALLEST to 126, to 8e-8 of itself."""
+    """2^x for x from -126 to 126, to 8e-8 of itself."""
     shifted = x + ROUND
     f = x - (shifted - ROUND)
     p = fma(P6, f, P5)
@@ -135,8 +135,8 @@ def exp2(x):
 
 @inline
 def decay2(x):
-    """2^x for x <= 0; 0 where a normal float32 cannot hold it."""
-    return exp2(max(x, SMALLEST)) if x > SMALLEST else ZERO
+    """2^x for x <= 0, to 8e-8 of itself or 1e-38; 0 from UNDERFLOW on."""
+    return exp2(max(x, UNDERFLOW))
 
 
 @inline

@@ -10,59 +10,50 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
-
+from asysplat.data.bad_frames import BadFrames
 from asysplat.data.images import Lens, image_size
-from asysplat.data.photographs import Photograph, PhotographCapture
+from asysplat.data.photographs import Photograph, PosedScene
+from asysplat.data.readers.folders import folders_with, natural_order
+from asysplat.data.readers.poses import opencv_from_opengl, rigid
 from asysplat.errors import InputError
-from asysplat.scene import ORTHONORMAL_TOLERANCE
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 MILLIMETRES = 0.001  # nerfstudio's default unit of stored depths
 
 
-class TransformsCapture(PhotographCapture):
-    """A folder with a `transforms.json`.
+def find_scenes(root: Path) -> list[Path]:
+    """Folders with a `transforms.json`, or the json file itself."""
+    return [root] if root.suffix == ".json" else folders_with(root, "transforms.json")
 
-    Opening it reads the file and the images' headers, so whatever is wrong shows before training
-    starts. Frames are ordered by the numbers in their file names (2 before 10), or, where a name
-    has no number, as in the file.
 
-    Args:
-        root: the folder, or the json file itself. Paths in the file are relative to its folder.
-        height, width: the size of every view, in pixels.
+def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
+    """A folder with a `transforms.json`, or the json file itself.
+
+    Reads the file and the images' headers. Frames are ordered by the numbers in their file names (2
+    before 10), or, where a name has no number, as in the file. Paths in the file are relative to
+    its folder.
 
     Raises:
-        InputError: anything in the file or beside it that cannot be used, or fewer than two frames.
+        InputError: anything in the file that cannot be used.
     """
-
-    def __init__(self, root: Path | str, height: int, width: int):
-        file = Path(root).absolute()
-        if file.suffix != ".json":
-            file = file / "transforms.json"
-        super().__init__(file.parent.name, read_photographs(file), height, width)
-
-
-def read_photographs(file: Path) -> list[Photograph]:
-    """All entries of one `transforms.json`, checked against the headers of their images."""
-    scene = _read_json(file)
+    file = scene if scene.suffix == ".json" else scene / "transforms.json"
+    content = _read_json(file)
     photographs = []
     shared = None  # the first image that does not state its own size: the others must match it
-    for index, entry in enumerate(scene["frames"]):
-        if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-            raise InputError(f"{file}, frame {index} has no file_path: name its image.")
-        where = f"{file}, frame {index} ({entry['file_path']})"
-        image = _find_image(file.parent / entry["file_path"])
-        size = image_size(image)
-        if not ("w" in entry and "h" in entry):
-            shared = shared or (image, size)
-            _check_equal_size(image, size, *shared)
-        photographs.append(_photograph({**scene, **entry}, image, size, file.parent, where))
+    for index, entry in enumerate(content["frames"]):
+        with bad.caught():
+            if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+                raise InputError(f"{file}, frame {index} has no file_path: name its image.")
+            where = f"{file}, frame {index} ({entry['file_path']})"
+            image = _find_image(file.parent / entry["file_path"])
+            size = image_size(image)
+            if not ("w" in entry and "h" in entry):
+                shared = shared or (image, size)
+                _check_equal_size(image, size, *shared)
+            photographs.append(_photograph({**content, **entry}, image, size, file.parent, where))
     if all(re.search(r"\d", photograph.image.stem) for photograph in photographs):
-        photographs.sort(key=lambda photograph: _natural_order(photograph.image))
-    return photographs
+        photographs.sort(key=lambda photograph: natural_order(photograph.image))
+    return PosedScene(file.parent.name, photographs)
 
 
 def _read_json(file: Path) -> dict[str, Any]:
@@ -79,10 +70,6 @@ def _read_json(file: Path) -> dict[str, Any]:
         raise InputError(f"{file} is not JSON ({error}): repair or write it again.") from error
     if not isinstance(scene, dict) or not isinstance(scene.get("frames"), list):
         raise InputError(f'{file} has no list "frames": give one entry an image.')
-    if len(scene["frames"]) < 2:
-        raise InputError(
-            f"{file} has {len(scene['frames'])} frame(s): a scene needs at least two views."
-        )
     return scene
 
 
@@ -98,7 +85,9 @@ def _photograph(
     return Photograph(
         image=image,
         lens=_lens(settings, *size, where),
-        cam_to_world=_opencv_pose(settings.get("transform_matrix"), where),
+        cam_to_world=opencv_from_opengl(
+            rigid(settings.get("transform_matrix"), f"{where}: transform_matrix")
+        ),
         depth=_beside(folder, settings, "depth_file_path", size, where),
         depth_unit=_number(settings, "depth_unit_scale_factor", where, default=MILLIMETRES),
         mask=_beside(folder, settings, "mask_path", size, where),
@@ -151,33 +140,6 @@ def _focal(settings: dict[str, Any], width: int, height: int, where: str) -> tup
     return fx, fy
 
 
-def _opencv_pose(stored: Any, where: str) -> Float[ndarray, "4 4"]:
-    """Camera-to-world with OpenCV axes, its rotation made exactly orthonormal."""
-    where = f"{where}: transform_matrix"
-    try:
-        matrix = np.array(stored, dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape != (4, 4):
-        raise InputError(f"{where} is not 4x4: give camera-to-world as four rows of four numbers.")
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{where} holds NaN or infinity: drop this frame or repair its pose.")
-    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > ORTHONORMAL_TOLERANCE:
-        raise InputError(f"{where} has last row {matrix[3].tolist()}: it must be 0 0 0 1.")
-    rotation = matrix[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise InputError(
-            f"{where} is not a rotation (R Rᵀ is {error:.2g} from the identity, the determinant is "
-            f"{np.linalg.det(rotation):.3g}): remove scale, shear and mirroring from it."
-        )
-    left, _, right = np.linalg.svd(rotation)
-    # OpenGL's y points up and its z backward.
-    matrix[:3, :3] = left @ right * (1, -1, -1)
-    matrix[3] = (0, 0, 0, 1)
-    return matrix
-
-
 def _number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     value = settings.get(key, default)
     if not isinstance(value, int | float) or not math.isfinite(value):
@@ -220,8 +182,3 @@ def _check_equal_size(
             f"{first} is {first_size[0]} x {first_size[1]} and {image} is {size[0]} x {size[1]}: "
             "give images of one size, or w, h and intrinsics in every frame."
         )
-
-
-def _natural_order(path: Path) -> list[str | int]:
-    parts = re.split(r"(\d+)", path.as_posix())
-    return [int(part) if part.isdecimal() else part for part in parts]

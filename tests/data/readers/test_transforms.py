@@ -7,8 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
+from asysplat.data import open_scene as open_at
 from asysplat.data.capture import Capture
-from asysplat.data.transforms import TransformsCapture
 from asysplat.errors import InputError
 
 WIDTH, HEIGHT = 24, 16
@@ -22,6 +22,10 @@ def pose(index: int) -> np.ndarray:
     matrix[:3, :3] = cv2.Rodrigues(np.array([0.3, angle, -0.2]))[0]
     matrix[:3, 3] = (index, 0.5, -2)
     return matrix
+
+
+def open_scene(folder, height=HEIGHT, width=WIDTH):
+    return open_at(folder, height, width)
 
 
 @pytest.fixture
@@ -44,10 +48,6 @@ def scene(tmp_path):
         return tmp_path
 
     return write
-
-
-def open_scene(folder, height=HEIGHT, width=WIDTH) -> TransformsCapture:
-    return TransformsCapture(folder, height, width)
 
 
 def test_cameras_and_images_are_the_file_s(scene):
@@ -197,8 +197,11 @@ def drop(*keys):
 
 BROKEN = {
     "no frames": (drop("frames"), r'transforms\.json has no list "frames"'),
-    "empty frames": (set_scene(frames=[]), r"transforms\.json has 0 frame"),
-    "one frame": (lambda content: content["frames"].__delitem__(slice(1, None)), r"has 1 frame"),
+    "empty frames": (set_scene(frames=[]), r"has 0 usable frame"),
+    "one frame": (
+        lambda content: content["frames"].__delitem__(slice(1, None)),
+        r"has 1 usable frame",
+    ),
     "no path": (set_frame(file_path=None), r"frame 2 has no file_path"),
     "missing image": (set_frame(file_path="images/7.png"), r"7\.png does not exist"),
     "no pose": (set_frame(transform_matrix=None), r"frame 2 \(images/2\.png\).*not 4x4"),
@@ -245,7 +248,7 @@ def test_an_unreadable_file_is_refused(tmp_path, text, message):
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"transforms\.json does not exist"):
+    with pytest.raises(InputError, match="holds no scene"):
         open_scene(tmp_path)
 
 
@@ -308,15 +311,15 @@ def test_real_photographs_meet_their_cameras(shared, tmp_path):
     if not folder.is_dir():
         pytest.skip(f"{folder} is absent")
     frames = [0, 6]
-    capture = TransformsCapture(folder, height=720, width=405)
+    capture = open_scene(folder, height=720, width=405)
     assert capture.num_frames == 50
     assert epipolar_error(capture.views(frames).validate()) < 0.5
     # Smaller, with another shape: intrinsics and pixels must still agree.
-    assert epipolar_error(TransformsCapture(folder, 480, 360).views(frames)) < 0.5
+    assert epipolar_error(open_scene(folder, 480, 360).views(frames)) < 0.5
 
     unflipped = json.loads((folder / "transforms.json").read_text())
     for frame in unflipped["frames"]:
         frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ FLIP).tolist()
         frame["file_path"] = str(folder / frame["file_path"])
     (tmp_path / "transforms.json").write_text(json.dumps(unflipped))
-    assert epipolar_error(TransformsCapture(tmp_path, 720, 405).views(frames)) > 5
+    assert epipolar_error(open_scene(tmp_path, 720, 405).views(frames)) > 5
