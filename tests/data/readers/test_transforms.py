@@ -198,7 +198,7 @@ def drop(*keys):
 BROKEN = {
     "no frames": (drop("frames"), r'transforms\.json has no list "frames"'),
     "empty frames": (set_scene(frames=[]), r"has 0 usable frame"),
-    "one frame": (
+    "one frame": (lambda content: content["frames"].__delitem__(slice(1, None)), "has 1 usable"),
         lambda content: content["frames"].__delitem__(slice(1, None)),
         r"has 1 usable frame",
     ),
