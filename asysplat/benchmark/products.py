@@ -1,6 +1,7 @@
 """Matrix products and convolutions by themselves: the least that a computation made of them takes.
 
-Operands are contiguous, whatever the layout was in the computation they stand for.
+Matrices are contiguous, whatever the layout was in the computation they stand for; images keep
+their channels innermost where they had them so.
 """
 
 from collections import Counter
@@ -32,9 +33,13 @@ class Operand:
 
     shape: tuple[int, ...]
     dtype: torch.dtype
+    channels_last: bool = False
 
     def make(self, device: torch.device | str) -> Tensor:
-        return torch.randn(self.shape, dtype=self.dtype, device=device)
+        values = torch.randn(self.shape, dtype=self.dtype, device=device)
+        if self.channels_last:
+            return values.contiguous(memory_format=torch.channels_last)
+        return values
 
 
 @dataclass(frozen=True)
@@ -112,7 +117,8 @@ def _products_of_call(func: OpOverload, args: tuple) -> Mapping[Product, int]:
 
 def _without_values(value: Any) -> Operand | Any:
     if isinstance(value, Tensor):
-        return Operand(tuple(value.shape), value.dtype)
+        innermost = value.ndim == 4 and value.is_contiguous(memory_format=torch.channels_last)
+        return Operand(tuple(value.shape), value.dtype, innermost and not value.is_contiguous())
     return tuple(value) if isinstance(value, list) else value
 
 

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from asysplat.models.depthwise import depthwise_conv
 from asysplat.models.shapes import StageShape
 from asysplat.ops import ssd
 
@@ -63,10 +64,9 @@ class Mamba2Direction(nn.Module):
 
     def _causal_conv(self, x: Tensor) -> Tensor:
         """Each token sees the CONV_KERNEL - 1 before it in the direction of the scan."""
-        padding = (0, CONV_KERNEL - 1) if self.reverse else (CONV_KERNEL - 1, 0)
-        weight = self.conv.weight.flip(-1) if self.reverse else self.conv.weight
-        padded = F.pad(x.mT, padding)
-        return F.conv1d(padded, weight, self.conv.bias, groups=self.conv.groups).mT
+        if self.reverse:
+            return depthwise_conv(x, self.conv.weight.flip(-1), self.conv.bias, before=0)
+        return depthwise_conv(x, self.conv.weight, self.conv.bias, before=CONV_KERNEL - 1)
 
 
 def log_uniform(count: int, low: float, high: float) -> Float[Tensor, " count"]:

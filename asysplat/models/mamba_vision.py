@@ -6,6 +6,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.models.attention import MLP
+from asysplat.models.depthwise import depthwise_conv
 from asysplat.models.mamba2 import inverse_softplus, log_uniform
 from asysplat.models.shapes import StageShape
 from asysplat.ops import selective_scan
@@ -57,14 +58,12 @@ class MambaVisionMixer(nn.Module):
 
     @staticmethod
     def _conv(channels: int) -> nn.Conv1d:
-        return nn.Conv1d(
-            channels, channels, CONV_KERNEL, padding="same", groups=channels, bias=False
-        )
+        return nn.Conv1d(channels, channels, CONV_KERNEL, groups=channels, bias=False)
 
     def forward(self, frames: Float[Tensor, "F L d"]) -> Float[Tensor, "F L d"]:
         x, gate = self.project(frames).chunk(2, dim=-1)
-        x = F.silu(self.conv_scan(x.mT)).mT
-        gate = F.silu(self.conv_gate(gate.mT)).mT
+        x = F.silu(depthwise_conv(x, self.conv_scan.weight, None, before=CONV_KERNEL // 2))
+        gate = F.silu(depthwise_conv(gate, self.conv_gate.weight, None, before=CONV_KERNEL // 2))
         dt, B, C = self.x_proj(x).split(self.splits, dim=-1)
         dt = F.softplus(self.dt_proj(dt).float())
         y = selective_scan(x, dt, -self.A_log.exp(), B, C, self.D)
