@@ -14,4 +14,7 @@ def input_error_behind(error: BaseException) -> InputError | None:
     seen: BaseException | None = error
     while seen is not None and not isinstance(seen, InputError):
         seen = seen.__cause__ or seen.__context__
-    return seen
+    if seen is None:
+        return None
+    # A loader's worker puts its traceback before the sentence.
+    return InputError(str(seen).rpartition(f"{InputError.__module__}.InputError: ")[2])

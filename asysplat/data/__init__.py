@@ -1,5 +1,6 @@
 """Posed photographs from made-up places and from files, as batches of reconstruction tasks."""
 
+from asysplat.data.augment import Augmentation
 from asysplat.data.cache import ImageCache
 from asysplat.data.datamodule import SceneDataModule
 from asysplat.data.modules import files_data, procedural_data
@@ -8,6 +9,7 @@ from asysplat.data.readers import find_scenes, open_scene
 from asysplat.data.sources import FilesSource, ProceduralSource
 
 __all__ = [
+    "Augmentation",
     "FilesSource",
     "ImageCache",
     "ProceduralScene",

@@ -1,6 +1,6 @@
 """Batches of reconstruction tasks, the same for the same seed wherever a run is resumed."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from multiprocessing import get_all_start_methods
 from typing import Any
 
@@ -8,11 +8,14 @@ import lightning
 import numpy as np
 from torch.utils.data import DataLoader, Dataset, Subset
 
+from asysplat.data.augment import Augmentation, cropped
 from asysplat.data.normalise import normalise
+from asysplat.data.selection import Split
 from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
+KEPT_BYTES = 2**30  # of a set of fixed tasks
 Sample = dict[str, Any]  # scene: name, inputs: Views, targets: Views; a batch has lists of names
 
 
@@ -32,9 +35,11 @@ class SceneDataModule(lightning.LightningDataModule):
         seed: of the training tasks.
         steps_per_epoch: steps between two validations.
         test_sets: further test sets by name, each a function that makes its tasks.
+        augmentation: of the training tasks; none where it is left out.
 
     Raises:
-        InputError: a task that cannot be loaded; the fixed ones are tried in `setup`.
+        InputError: a task that cannot be loaded; the fixed ones are tried in `setup`, as many as
+            fit into memory.
     """
 
     def __init__(
@@ -50,6 +55,7 @@ class SceneDataModule(lightning.LightningDataModule):
         seed: int,
         steps_per_epoch: int,
         test_sets: Mapping[str, Callable[[], list[Task]]] | None = None,
+        augmentation: Augmentation | None = None,
     ):
         super().__init__()
         self.name, self.source = name, source
@@ -58,20 +64,21 @@ class SceneDataModule(lightning.LightningDataModule):
         self.batch_size, self.workers, self.seed = batch_size, workers, seed
         self.steps_per_epoch = steps_per_epoch
         self.test_sets = test_sets or {}
-        self.evaluation: dict[str, list[Sample]] = {}  # val and test of this data set
-        self.tests: dict[str, list[Sample]] = {}  # by test set, this data set first
+        self.augmentation = augmentation or Augmentation()
+        self.evaluation: dict[str, FixedTasks] = {}  # val and test of this data set
+        self.tests: dict[str, FixedTasks] = {}  # by test set, this data set first
 
     def setup(self, stage: str | None = None) -> None:
-        """Load the validation and test tasks once, and try one training task."""
+        """Make the validation and test tasks, and try one training task."""
         if not self.evaluation:
             TrainingTasks(self)[0]
             for name in ("val", "test"):
                 tasks = self.source.evaluation(name, self.inputs, self.targets)
-                self.evaluation[name] = [load(task) for task in tasks]
+                self.evaluation[name] = FixedTasks(tasks)
             self.tests[self.name] = self.evaluation["test"]
             for name, make_tasks in self.test_sets.items():
                 try:
-                    self.tests[name] = [load(task) for task in make_tasks()]
+                    self.tests[name] = FixedTasks(make_tasks())
                 except InputError as error:
                     raise InputError(f"data.test_sets.{name}: {error}") from error
 
@@ -101,20 +108,47 @@ class TrainingTasks(Dataset):
     """Task i, drawn with a generator of its own; there is no last one."""
 
     def __init__(self, data: SceneDataModule):
-        self.source, self.seed = data.source, data.seed
+        self.source, self.seed, self.augmentation = data.source, data.seed, data.augmentation
         self.inputs, self.targets = data.inputs, data.targets
 
     def __getitem__(self, index: int) -> Sample:
         rng = np.random.default_rng((self.seed, index))
-        return load(self.source.training(self.inputs, self.targets, rng))
+        task = self.source.training(self.inputs, self.targets, rng)
+        inputs = self.augmentation.order(task.split.inputs, rng)
+        share = self.augmentation.share(rng)
+        return load(Task(task.capture, Split(inputs, task.split.targets)), share)
 
 
-def load(task: Task) -> Sample:
-    """The task's views, validated and normalised."""
-    frames = task.split.inputs + task.split.targets
-    views = task.capture.views(frames).validate(task.capture.name)
-    count = len(task.split.inputs)
-    inputs, targets = views.select(range(count)), views.select(range(count, len(frames)))
+class FixedTasks(Dataset):
+    """Tasks that come again; the first of them stay loaded, up to KEPT_BYTES."""
+
+    def __init__(self, tasks: Sequence[Task]):
+        self.tasks = tasks
+        self._kept: list[Sample] = []
+        size = 0
+        for task in tasks:
+            self._kept.append(load(task))
+            size += sum(self._kept[-1][views].images.nbytes for views in ("inputs", "targets"))
+            if size > KEPT_BYTES:
+                break
+
+    def __len__(self) -> int:
+        return len(self.tasks)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self._kept[index] if index < len(self._kept) else load(self.tasks[index])
+
+
+def load(task: Task, share: float = 1.0) -> Sample:
+    """The task's views, validated, cropped to that share of their sides, and normalised."""
+    split = task.split
+    # An input that is a target as well is decoded once.
+    frames = list(dict.fromkeys(split.inputs + split.targets))
+    views = cropped(task.capture.views(frames).validate(task.capture.name), share)
+    inputs, targets = (
+        views.select([frames.index(frame) for frame in chosen])
+        for chosen in (split.inputs, split.targets)
+    )
     inputs, targets, _ = normalise(inputs, targets)
     return {"scene": task.capture.name, "inputs": inputs, "targets": targets}
 

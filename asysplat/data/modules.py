@@ -27,7 +27,7 @@ def procedural_data(
         return ProceduralSource(height, width, num_frames, window, val_scenes, test_scenes, places)
 
     own = {"num_frames": num_frames, "test_scenes": test_scenes, "places": places}
-    return scene_data(source, own, height=height, width=width, **options)
+    return scene_data(source(**own), source, own, height=height, width=width, **options)
 
 
 def files_data(
@@ -38,18 +38,36 @@ def files_data(
     layout: str = "auto",
     on_bad_frame: Policy = "fail",
     cache: ImageCache | None = None,
+    test_root: str | None = None,
+    selection: str = "every_8th",
+    index: str | None = None,
+    val_scenes: int = 8,
+    targets_may_be_inputs: bool = False,
     **options,
 ) -> SceneDataModule:
-    """Scenes on disk; arguments are those of FilesSource and `scene_data`."""
+    """Scenes on disk; arguments are those of FilesSource and `scene_data`.
 
-    def source(root: str, layout: str) -> FilesSource:
-        return FilesSource(root, height, width, window, layout, on_bad_frame, cache)
+    A further test set may differ in the root of what it tests, layout, selection and index.
+    """
 
-    own = {"root": root, "layout": layout}
-    return scene_data(source, own, height=height, width=width, **options)
+    def source(root: str, **others) -> FilesSource:
+        reading = {"on_bad_frame": on_bad_frame, "cache": cache, **others}
+        return FilesSource(root, height, width, window, **reading)
+
+    own = {"layout": layout, "selection": selection, "index": index}
+    main = source(
+        root,
+        test_root=test_root,
+        val_scenes=val_scenes,
+        targets_may_be_inputs=targets_may_be_inputs,
+        **own,
+    )
+    own["root"] = test_root or root
+    return scene_data(main, source, own, height=height, width=width, **options)
 
 
 def scene_data(
+    source: Source,
     make_source: Callable[..., Source],
     own: dict[str, Any],
     name: str,
@@ -61,7 +79,8 @@ def scene_data(
     """A data module that is tested on further sets as well.
 
     Args:
-        make_source: of the options `own`, in which test sets may differ.
+        source: of the data set itself.
+        make_source: of a test set, from the options `own`, in which test sets may differ.
         test_sets: name -> the options that differ: any of `own`, inputs and targets.
         name, inputs, targets, options: those of SceneDataModule.
 
@@ -75,7 +94,7 @@ def scene_data(
         sets[other] = partial(_test_tasks, make_source, **{**main, **changes})
     return SceneDataModule(
         name=name,
-        source=make_source(**own),
+        source=source,
         inputs=inputs,
         targets=targets,
         test_sets=sets,

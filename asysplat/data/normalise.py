@@ -1,23 +1,49 @@
 """One world frame and scale for every scene, so that networks meet like with like."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.scene import Views
+from asysplat.motion import moved
+from asysplat.scene import Gaussians, TensorRecord, Views
 
 
-def normalise(inputs: Views, targets: Views) -> tuple[Views, Views, float]:
+@dataclass(frozen=True)
+class Normalisation(TensorRecord):
+    """How a scene was brought into the frame of networks, and how to come back.
+
+    Args:
+        world_to_mean: rigid, float64, from the data set's world to the mean input camera.
+        scale: what lengths were multiplied by after that.
+    """
+
+    world_to_mean: Float[Tensor, "4 4"]
+    scale: float
+
+    def apply(self, views: Views) -> Views:
+        """The data set's views in the frame of networks, depths included."""
+        poses = self.world_to_mean @ views.cameras.cam_to_world.double()
+        poses[:, :3, 3] *= self.scale
+        cameras = replace(views.cameras, cam_to_world=poses.to(views.cameras.cam_to_world))
+        depths = None if views.depths is None else views.depths * self.scale
+        return replace(views, cameras=cameras, depths=depths)
+
+    def undo(self, gaussians: Gaussians) -> Gaussians:
+        """What a network made, in the data set's world: its own cameras see the same of it."""
+        return moved(gaussians.scale_by(1 / self.scale), torch.linalg.inv(self.world_to_mean))
+
+
+def normalise(inputs: Views, targets: Views) -> tuple[Views, Views, Normalisation]:
     """Put the world's origin at the mean input camera and the farthest input at distance 1.
 
     The mean pose has the mean of the centres and the mean of the forward and down axes, made
     orthonormal by Gram-Schmidt (as Long-LRM, arXiv 2410.12781). One scene, without batch dimension.
 
     Returns:
-        inputs and targets in the new frame, depths included, and the factor that lengths were
-        multiplied by; 1 where all inputs stand in one place.
+        inputs and targets in the new frame, and how to undo it; the scale is 1 where all inputs
+        stand in one place.
     """
     poses = inputs.cameras.cam_to_world.double()
     centers = poses[:, :3, 3]
@@ -27,9 +53,8 @@ def normalise(inputs: Views, targets: Views) -> tuple[Views, Views, float]:
     radius = (centers - centers.mean(0)).norm(dim=-1).max()
     # Below this, what differs between the centres is rounding.
     apart = radius > 1e-6 * centers.abs().max()
-    scale = 1 / radius.item() if apart else 1.0
-    world_to_mean = torch.linalg.inv(mean_pose)
-    return _moved(inputs, world_to_mean, scale), _moved(targets, world_to_mean, scale), scale
+    frame = Normalisation(torch.linalg.inv(mean_pose), 1 / radius.item() if apart else 1.0)
+    return frame.apply(inputs), frame.apply(targets), frame
 
 
 def _mean_rotation(rotations: Float[Tensor, "V 3 3"]) -> Float[Tensor, "3 3"]:
@@ -40,11 +65,3 @@ def _mean_rotation(rotations: Float[Tensor, "V 3 3"]) -> Float[Tensor, "3 3"]:
         return rotations[0]
     forward, right = forward / forward.norm(), right / right.norm()
     return torch.stack((right, torch.linalg.cross(forward, right), forward), dim=-1)
-
-
-def _moved(views: Views, world_to_mean: Float[Tensor, "4 4"], scale: float) -> Views:
-    poses = world_to_mean @ views.cameras.cam_to_world.double()
-    poses[:, :3, 3] *= scale
-    cameras = replace(views.cameras, cam_to_world=poses.to(views.cameras.cam_to_world))
-    depths = None if views.depths is None else views.depths * scale
-    return replace(views, cameras=cameras, depths=depths)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -9,15 +10,19 @@ import numpy as np
 from asysplat.data.bad_frames import Policy
 from asysplat.data.cache import ImageCache
 from asysplat.data.capture import Capture
+from asysplat.data.photographs import PhotographCapture
 from asysplat.data.procedural import ProceduralScene, split_seed
-from asysplat.data.readers import find_scenes, open_scene
+from asysplat.data.scenes import Scenes
 from asysplat.data.selection import (
     Split,
+    Stage,
     evaluation_split,
-    held_out_split,
+    selected_split,
+    spread,
     trained,
     training_split,
 )
+from asysplat.data.selection.index import read_index
 from asysplat.errors import InputError
 
 
@@ -37,7 +42,7 @@ class Source(Protocol):
         """A random training task; the same generator gives the same task."""
         ...
 
-    def evaluation(self, stage: Literal["val", "test"], inputs: int, targets: int) -> list[Task]:
+    def evaluation(self, stage: Stage, inputs: int, targets: int) -> list[Task]:
         """The fixed tasks of a stage, none of whose target frames was ever trained on."""
         ...
 
@@ -72,7 +77,7 @@ class ProceduralSource:
         scene = self._scene("train", int(rng.integers(2**31)))
         return Task(scene, training_split(self.num_frames, inputs, targets, self.window, rng))
 
-    def evaluation(self, stage: Literal["val", "test"], inputs: int, targets: int) -> list[Task]:
+    def evaluation(self, stage: Stage, inputs: int, targets: int) -> list[Task]:
         split = evaluation_split(self.num_frames, inputs, targets)
         return [Task(self._scene(stage, index), split) for index in range(self.counts[stage])]
 
@@ -82,17 +87,29 @@ class ProceduralSource:
 
 
 class FilesSource:
-    """Scenes on disk. Of every 8 frames the first is tested and the fifth validates; the others are
-    given as inputs and trained on.
+    """Scenes on disk.
+
+    With a `test_root`, its scenes are tested, some scenes of `root` validate, and the others train
+    with all their frames; a scene that is tested is not trained on though `root` holds it as well.
+    Without one, every scene of `root` is tested on frames that it is not trained on: of every 8 the
+    first is tested and the fifth validates.
 
     Args:
         root: one scene, or a folder of scenes.
         height, width: of every view, in pixels.
         window: as for ProceduralSource.
         layout, on_bad_frame, cache: as `open_scene` takes them.
+        test_root: one scene, or a folder of scenes.
+        selection: how the frames of an evaluation are chosen: every_8th, kmeans (the paper's
+            tests), first_96 (its ablations), uniform, or index.
+        index: with selection=index, the file that names the frames of the test; scenes that it does
+            not name are not tested, and validation takes every_8th.
+        val_scenes: at most so many scenes validate.
+        targets_may_be_inputs: of training tasks.
 
     Raises:
-        InputError: no scene, or one that cannot be used.
+        InputError: no scene, an index that does not fit, or options that do not go together; when a
+            scene is first used, one that cannot be.
     """
 
     def __init__(
@@ -104,26 +121,102 @@ class FilesSource:
         layout: str = "auto",
         on_bad_frame: Policy = "fail",
         cache: ImageCache | None = None,
+        test_root: str | None = None,
+        selection: str = "every_8th",
+        index: str | None = None,
+        val_scenes: int = 8,
+        targets_may_be_inputs: bool = False,
     ):
+        def scenes(option: str, folder: str) -> Scenes:
+            try:
+                return Scenes(folder, height, width, layout, on_bad_frame, cache)
+            except InputError as error:
+                raise InputError(f"data.{option}={folder}: {error}") from error
+
         self.window = (window[0], window[1])
-        try:
-            layout, scenes = find_scenes(root, layout)
-        except InputError as error:
-            raise InputError(f"data.root={root}: {error}") from error
-        self.captures = [
-            open_scene(scene, height, width, layout, on_bad_frame, cache) for scene in scenes
-        ]
+        self.selection, self.index = selection, index
+        self.targets_may_be_inputs = targets_may_be_inputs
+        self.scenes = scenes("root", root)
+        self.split_by_scenes = test_root is not None
+        self.tested = scenes("test_root", test_root) if self.split_by_scenes else self.scenes
+        self.val_scenes = val_scenes
+        if (selection == "index") != (index is not None):
+            raise InputError(
+                f"data.selection is {selection} and data.index is {index}: give both "
+                "data.selection=index and data.index=path, or neither."
+            )
+        if selection == "index" and on_bad_frame == "skip":
+            raise InputError(
+                "data.on_bad_frame=skip changes the numbers of the frames that data.index names: "
+                "set it to fail, and mend the frames."
+            )
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
-        capture = self.captures[rng.integers(len(self.captures))]
-        frames = trained(capture.num_frames)
-        split = training_split(len(frames), inputs, targets, self.window, rng)
+        capture = self.scenes[self._trained[rng.integers(len(self._trained))]]
+        frames = range(capture.num_frames) if self.split_by_scenes else trained(capture.num_frames)
+        split = training_split(
+            len(frames), inputs, targets, self.window, rng, self.targets_may_be_inputs
+        )
         return Task(
             capture, Split([frames[i] for i in split.inputs], [frames[i] for i in split.targets])
         )
 
-    def evaluation(self, stage: Literal["val", "test"], inputs: int, targets: int) -> list[Task]:
+    def evaluation(self, stage: Stage, inputs: int, targets: int) -> list[Task]:
+        if stage == "test" and self.selection == "index":
+            return self._indexed(inputs)
+        selection = "every_8th" if self.selection == "index" else self.selection
+        validated = (self.scenes[scene] for scene in self._validated)
         return [
-            Task(capture, held_out_split(capture.num_frames, inputs, targets, stage))
-            for capture in self.captures
+            Task(capture, selected_split(selection, capture.cameras, inputs, targets, stage))
+            for capture in (self._tested if stage == "test" else validated)
         ]
+
+    @cached_property
+    def _tested(self) -> list[PhotographCapture]:
+        return list(self.tested)
+
+    @cached_property
+    def _untested(self) -> list[int]:
+        """The scenes of `root` that may train and validate."""
+        scenes = range(len(self.scenes))
+        if not self.split_by_scenes:
+            return list(scenes)
+        names = {capture.name for capture in self._tested}
+        return [scene for scene in scenes if names.isdisjoint(self.scenes.folders(scene))]
+
+    @cached_property
+    def _validated(self) -> list[int]:
+        return spread(self._untested, min(self.val_scenes, len(self._untested)))
+
+    @cached_property
+    def _trained(self) -> list[int]:
+        if not self.split_by_scenes and self.selection in ("uniform", "index"):
+            raise InputError(
+                f"data.selection={self.selection} would test frames that are trained on: name the "
+                "scenes to test with data.test_root, or use every_8th, kmeans or first_96."
+            )
+        if not self.split_by_scenes:
+            return self._untested
+        left = sorted(set(self._untested) - set(self._validated))
+        if not left:
+            raise InputError(
+                f"data.root has {len(self._untested)} scenes that data.test_root does not test, "
+                f"and data.val_scenes is {self.val_scenes}: give more scenes, or validate fewer."
+            )
+        return left
+
+    def _indexed(self, inputs: int) -> list[Task]:
+        index = read_index(self.index, inputs)
+        tasks = [
+            Task(capture, index.split(capture.name, capture.cameras, inputs))
+            for capture in self._tested
+            if capture.name in index.entries
+        ]
+        lacking = set(index.entries) - {task.capture.name for task in tasks}
+        if lacking:
+            raise InputError(
+                f"data.index={self.index} names {len(lacking)} scenes that are not there, such as "
+                f"{min(lacking)}: add them, or write an index of the scenes that you have with "
+                "python -m asysplat.data.selection."
+            )
+        return tasks

@@ -5,15 +5,17 @@ import pytest
 import torch
 
 from asysplat.data import (
-    FilesSource,
+    Augmentation,
     ProceduralSource,
     SceneDataModule,
+    datamodule,
     files_data,
     procedural_data,
 )
-from asysplat.data.datamodule import TrainingTasks, collate
+from asysplat.data.datamodule import FixedTasks, TrainingTasks, collate, load
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection import held_out, held_out_split, trained
+from asysplat.data.selection import Split, held_out_split
+from asysplat.data.sources import Task
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 
@@ -65,6 +67,60 @@ def test_another_seed_gives_other_tasks():
     assert torch.equal(first["targets"].images, again["targets"].images)
 
 
+def test_augmented_tasks_are_repeated_by_their_seed():
+    plain, varied = (
+        TrainingTasks(procedural(augmentation=augmentation))
+        for augmentation in (Augmentation(), Augmentation(reverse=0.5, shuffle=0.5, crop=0.5))
+    )
+    orders = set()
+    for index in range(6):
+        straight, first, again = plain[index], varied[index], varied[index]
+        assert first["scene"] == straight["scene"]
+        assert torch.equal(first["inputs"].images, again["inputs"].images)
+        focal = [task["inputs"].cameras.intrinsics[0, 0, 0] for task in (straight, first)]
+        assert 1 <= focal[1] / focal[0] <= 2
+        centers = [task["inputs"].cameras.centers for task in (straight, first)]
+        order = torch.cdist(*centers).argmin(1).tolist()
+        assert sorted(order) == [0, 1, 2]
+        torch.testing.assert_close(centers[1][order], centers[0])
+        orders.add(tuple(order))
+        targets = [task["targets"].cameras.centers for task in (straight, first)]
+        torch.testing.assert_close(*targets)
+    assert len(orders) > 1
+
+
+class Counting:
+    """A capture that remembers which frames were decoded."""
+
+    def __init__(self, scene):
+        self.scene, self.name, self.num_frames = scene, scene.name, scene.num_frames
+        self.cameras, self.decoded = scene.cameras, []
+
+    def views(self, frames):
+        self.decoded += frames
+        return self.scene.views(frames)
+
+
+def test_an_input_that_is_a_target_is_decoded_once():
+    capture = Counting(ProceduralScene(3, 16, 16, num_frames=24))
+    sample = load(Task(capture, Split([9, 2, 5], [5, 7, 9])))
+    assert sorted(capture.decoded) == [2, 5, 7, 9]
+    images = capture.scene.views([9, 2, 5, 7]).images
+    assert torch.equal(sample["inputs"].images, images[:3])
+    assert torch.equal(sample["targets"].images, images[[2, 3, 0]])
+
+
+def test_fixed_tasks_stay_loaded_as_long_as_there_is_room(monkeypatch):
+    captures = [Counting(ProceduralScene(seed, 16, 16, num_frames=24)) for seed in range(3)]
+    tasks = [Task(capture, Split([0, 1], [2])) for capture in captures]
+    monkeypatch.setattr(datamodule, "KEPT_BYTES", 1.5 * 3 * 3 * 16 * 16 * 4)
+    fixed = FixedTasks(tasks)
+    assert [len(capture.decoded) for capture in captures] == [3, 3, 0]
+    for _ in range(2):
+        assert [sample["scene"] for sample in fixed] == [capture.name for capture in captures]
+    assert [len(capture.decoded) for capture in captures] == [3, 3, 6]
+
+
 def test_evaluation_scenes_are_never_trained_on():
     data = procedural()
     data.setup()
@@ -82,38 +138,9 @@ def test_inputs_are_normalised_and_batches_stack():
     torch.testing.assert_close(centers.mean(1), torch.zeros(2, 3), atol=1e-5, rtol=0)
 
 
-def test_frames_of_a_folder_are_tested_or_validated_or_trained():
-    sets = [set(held_out(50, "test")), set(held_out(50, "val")), set(trained(50))]
-    assert set.union(*sets) == set(range(50))
-    assert sum(map(len, sets)) == 50
-    split = held_out_split(50, 8, 4, "test")
-    assert set(split.inputs) <= sets[2] and set(split.targets) <= sets[0]
-    assert len(split.inputs) == 8 and len(split.targets) == 4
-
-
 def test_too_short_a_folder():
     with pytest.raises(InputError, match=r"data\.inputs"):
         held_out_split(6, 8, 4, "test")
-
-
-def test_a_written_scene_trains_like_the_scene_itself(tmp_path):
-    scene = ProceduralScene(3, 16, 16, num_frames=24)
-    write_transforms(scene.views(range(24)), tmp_path / "scene")
-    source = FilesSource(str(tmp_path), 16, 16, (12, 24))
-    (task,) = source.evaluation("test", 4, 2)
-    read = task.capture.views(task.split.targets)
-    made = scene.views(task.split.targets)
-    assert (read.images - made.images).abs().max() < 1 / 255
-    assert (read.depths - made.depths).abs().max() < 1e-3
-    torch.testing.assert_close(read.cameras.cam_to_world, made.cameras.cam_to_world)
-    torch.testing.assert_close(read.cameras.intrinsics, made.cameras.intrinsics)
-    drawn = source.training(4, 2, np.random.default_rng(0)).split
-    assert not set(drawn.inputs + drawn.targets) & set(held_out(24, "test") + held_out(24, "val"))
-
-
-def test_a_folder_without_scenes(tmp_path):
-    with pytest.raises(InputError, match=r"data\.root"):
-        FilesSource(str(tmp_path), 16, 16, (12, 24))
 
 
 def test_a_test_set_differs_in_its_options_alone():
@@ -155,6 +182,28 @@ def test_an_unusable_test_set_is_named(case):
     test_sets, words = REFUSED[case]
     with pytest.raises(InputError, match=words):
         with_test_sets(test_sets).setup()
+
+
+def test_a_test_set_beside_scenes_that_are_tested(tmp_path):
+    """Its root is what it tests, as test_root is of the data set; options are its own."""
+    for name, seeds in {"train": (3, 4, 5), "test": (6,), "other": (7,)}.items():
+        for seed in seeds:
+            scene = ProceduralScene(seed, 16, 16, num_frames=24)
+            write_transforms(scene.views(range(24)), tmp_path / name / str(seed))
+    data = files_data(
+        **{"name": "files", "root": f"{tmp_path}/train", "test_root": f"{tmp_path}/test"},
+        **{"test_sets": {"far": {"root": f"{tmp_path}/other", "selection": "kmeans"}, "more": {}}},
+        **{"val_scenes": 1, **READ_WITH},
+    )
+    data.setup()
+    scenes = {name: [sample["scene"] for sample in tasks] for name, tasks in data.tests.items()}
+    assert scenes == {"files": ["6"], "far": ["7"], "more": ["6"]}
+    # Every 8th of 24 frames, where the data set itself takes two of them.
+    targets = {name: tasks[0]["targets"].num_views for name, tasks in data.tests.items()}
+    assert targets == {"files": 2, "far": 3, "more": 2}
+    drawn = {TrainingTasks(data)[index]["scene"] for index in range(20)}
+    (validated,) = (sample["scene"] for sample in data.evaluation["val"])
+    assert drawn | {validated} == {"3", "4", "5"} and validated not in drawn
 
 
 def test_a_test_set_in_another_folder(tmp_path):

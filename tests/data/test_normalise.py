@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from asysplat import render
 from asysplat.data.normalise import normalise
 from asysplat.scene import Cameras, Views
 
@@ -57,13 +58,13 @@ def project_depth(source: Views, target: Views) -> torch.Tensor:
 
 
 def test_mean_pose_becomes_the_world_and_the_farthest_input_is_at_one(pair):
-    inputs, _, scale = normalise(*pair)
+    inputs, _, frame = normalise(*pair)
     centers = inputs.cameras.centers
     torch.testing.assert_close(centers.mean(0), torch.zeros(3), atol=1e-5, rtol=0)
     assert centers.norm(dim=-1).max().item() == pytest.approx(1, abs=1e-5)
     original = pair[0].cameras.centers
     radius = (original - original.mean(0)).norm(dim=-1).max()
-    assert scale == pytest.approx(1 / radius.item(), rel=1e-5)
+    assert frame.scale == pytest.approx(1 / radius.item(), rel=1e-5)
     forward = inputs.cameras.cam_to_world[:, :3, 2].mean(0)
     torch.testing.assert_close(forward[:2], torch.zeros(2), atol=1e-5, rtol=0)
     # The mean down axis lies in the plane of y and z, on y's side.
@@ -72,26 +73,26 @@ def test_mean_pose_becomes_the_world_and_the_farthest_input_is_at_one(pair):
 
 
 def test_relative_poses_change_in_scale_alone(pair):
-    inputs, targets, scale = normalise(*pair)
+    inputs, targets, frame = normalise(*pair)
     for before, after in ((pair[0], inputs), (pair[1], targets)):
         expected = relative(before, pair[0])
-        expected[:, :3, 3] *= scale
+        expected[:, :3, 3] *= frame.scale
         torch.testing.assert_close(relative(after, inputs), expected, atol=1e-5, rtol=0)
 
 
 def test_depth_reprojection_is_unchanged(pair):
-    inputs, targets, scale = normalise(*pair)
+    inputs, targets, frame = normalise(*pair)
     torch.testing.assert_close(
         project_depth(inputs, targets), project_depth(*pair), atol=2e-3, rtol=1e-3
     )
-    torch.testing.assert_close(targets.depths, pair[1].depths * scale)
+    torch.testing.assert_close(targets.depths, pair[1].depths * frame.scale)
     assert torch.equal(inputs.images, pair[0].images)
 
 
 def test_pure_rotation_keeps_its_scale():
     views = make_views(random_rotations(4), torch.tensor([7.0, -3, 2]).expand(4, 3))
-    inputs, _, scale = normalise(views, views)
-    assert scale == 1
+    inputs, _, frame = normalise(views, views)
+    assert frame.scale == 1
     torch.testing.assert_close(inputs.cameras.centers, torch.zeros(4, 3), atol=1e-6, rtol=0)
 
 
@@ -102,12 +103,38 @@ def test_a_full_circle_of_cameras_has_a_frame():
     right = torch.stack((angle.cos(), zero, -angle.sin()), -1)
     rotations = torch.stack((right, torch.stack((zero, one, zero), -1), forward), -1)
     ring = make_views(rotations, -3 * forward)
-    inputs, _, scale = normalise(ring, ring)
+    inputs, _, frame = normalise(ring, ring)
     inputs.validate()
-    assert scale == pytest.approx(1 / 3)
+    assert frame.scale == pytest.approx(1 / 3)
     torch.testing.assert_close(inputs.cameras.cam_to_world[0, :3, :3], torch.eye(3))
 
 
 def test_views_without_depths_stay_without(pair):
     inputs, targets, _ = normalise(*(replace(views, depths=None) for views in pair))
     assert inputs.depths is None and targets.depths is None
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_is_undone_looks_the_same_from_the_data_set_s_cameras(make_scene, degree):
+    """The data set's world lies far from the frame of networks, turned and in other units."""
+    gaussians, _ = make_scene(count=40, degree=degree)
+    _, cameras = make_scene(views=3, height=16, width=16)
+    world = make_views(random_rotations(1), torch.randn(1, 3) * 20).cameras.cam_to_world.double()
+    poses = cameras.cam_to_world.clone()
+    poses[:, :3, 3] *= 7
+    given = replace(cameras, cam_to_world=world @ poses)
+    views = Views(given, torch.zeros(3, 3, 16, 16, dtype=torch.float64))
+    inputs, _, frame = normalise(views, views)
+    before = render(gaussians, inputs.cameras, backend="reference", depth=True)
+    after = render(frame.undo(gaussians), given, backend="reference", depth=True)
+    assert before.alpha.max() > 0.5 and before.image.std() > 0.05
+    torch.testing.assert_close(after.image, before.image, atol=1e-9, rtol=0)
+    torch.testing.assert_close(after.alpha, before.alpha, atol=1e-9, rtol=0)
+    torch.testing.assert_close(after.depth * frame.scale, before.depth, atol=1e-8, rtol=1e-8)
+
+
+def test_undone_gaussians_keep_their_type(make_scene, pair):
+    gaussians, _ = make_scene(dtype=torch.float32)
+    undone = normalise(*pair)[2].undo(gaussians).validate()
+    assert undone.means.dtype == undone.sh.dtype == undone.quats.dtype == torch.float32
+    assert torch.equal(undone.opacities, gaussians.opacities)

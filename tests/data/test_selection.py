@@ -1,8 +1,48 @@
+import json
+
 import numpy as np
 import pytest
+import torch
 
-from asysplat.data.selection import evaluation_split, training_split
+from asysplat.data import ProceduralScene
+from asysplat.data.selection import (
+    Split,
+    evaluation_split,
+    first_96_split,
+    held_out,
+    held_out_split,
+    kmeans_split,
+    selected_split,
+    trained,
+    training_split,
+)
+from asysplat.data.selection.__main__ import main as index_command
+from asysplat.data.selection.index import Entry, camera_hash, read_index, write_index
+from asysplat.data.selection.kmeans import nearest_to_centres, pose_features
+from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
+from asysplat.scene import Cameras
+
+# Inputs that k-means finds, on every machine.
+CIRCLE = [1, 15, 33, 47, 62, 75, 89, 103]
+LINE = [6, 19, 34, 49, 62, 74, 85, 95]
+MYDESK = [
+    *(14, 39, 55, 73, 100, 126, 147, 170, 189, 207, 228, 257, 282, 303, 329, 350, 370, 399, 426),
+    *(437, 444, 449, 455, 460, 462, 465, 469, 474, 477, 483, 493, 495),
+]
+
+
+def cameras_at(centers, forwards=None) -> Cameras:
+    """Cameras that look along `forwards`, all along z where it is left out."""
+    centers = torch.as_tensor(centers, dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(centers), 1, 1)
+    poses[:, :3, 3] = centers
+    if forwards is not None:
+        z = torch.nn.functional.normalize(torch.as_tensor(forwards, dtype=torch.float64), dim=-1)
+        x = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]).double().expand_as(z), z)
+        x = torch.nn.functional.normalize(x, dim=-1)
+        poses[:, :3, :3] = torch.stack((x, torch.linalg.cross(z, x), z), -1)
+    return Cameras(torch.eye(3, dtype=torch.float64).repeat(len(centers), 1, 1), poses, 4, 4)
 
 
 def test_evaluation_inputs_are_even_and_targets_midway():
@@ -32,19 +72,17 @@ def test_evaluation_never_shares_or_repeats_a_frame(num_frames):
 
 def test_training_stays_in_its_window_and_never_shares_a_frame():
     rng = np.random.default_rng(0)
-    starts, backwards = set(), 0
+    starts = set()
     for _ in range(200):
         split = training_split(50, num_inputs=4, num_targets=3, window=(10, 20), rng=rng)
-        ordered = sorted(split.inputs)
+        ordered = split.inputs
         assert len(set(split.inputs + split.targets)) == 7
         assert 10 <= ordered[-1] - ordered[0] + 1 <= 20
         assert ordered[0] < min(split.targets) and max(split.targets) < ordered[-1]
         assert np.ptp(np.diff(ordered)) <= 1
-        assert (split.inputs == ordered) == (split.targets == sorted(split.targets))
+        assert split.targets == sorted(split.targets)
         starts.add(ordered[0])
-        backwards += split.inputs != ordered
     assert min(starts) <= 1 and max(starts) >= 36 and len(starts) > 30
-    assert 70 < backwards < 130
 
 
 def test_training_is_repeated_by_its_seed():
@@ -54,7 +92,7 @@ def test_training_is_repeated_by_its_seed():
 
 def test_window_is_clipped_to_a_short_sequence():
     split = training_split(9, 4, 3, (64, 128), np.random.default_rng(0))
-    assert sorted(split.inputs) == [0, 3, 5, 8]
+    assert split.inputs == [0, 3, 5, 8]
 
 
 def test_too_short_a_sequence_says_what_to_set():
@@ -73,3 +111,245 @@ def test_unusable_window_is_named(window):
 def test_zero_inputs_are_refused():
     with pytest.raises(InputError, match=r"data\.inputs is 0"):
         evaluation_split(9, num_inputs=0, num_targets=3)
+
+
+def test_targets_of_training_may_be_inputs():
+    rng = np.random.default_rng(0)
+    shared = []
+    for _ in range(100):
+        split = training_split(50, 4, 3, (8, 8), rng, targets_may_be_inputs=True)
+        assert len(set(split.targets)) == 3 and min(split.inputs) <= min(split.targets)
+        shared.append(len(set(split.inputs) & set(split.targets)))
+    # 3 of 8 frames, of which 4 are inputs.
+    assert 1.2 < np.mean(shared) < 1.8
+
+
+def test_frames_of_a_folder_are_tested_or_validated_or_trained():
+    sets = [set(held_out(50, "test")), set(held_out(50, "val")), set(trained(50))]
+    assert set.union(*sets) == set(range(50))
+    assert sum(map(len, sets)) == 50
+    split = held_out_split(50, 8, 4, "test")
+    assert set(split.inputs) <= sets[2] and set(split.targets) <= sets[0]
+    assert len(split.inputs) == 8 and len(split.targets) == 4
+
+
+def test_first_96_frames():
+    split = first_96_split(300, 32, 8, "test")
+    assert split.targets == [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88]
+    # Every 2.68th of the 84 others, which begin with 1 and end with 95.
+    assert split.inputs[:8] == [1, 4, 6, 10, 13, 15, 19, 22]
+    assert split.inputs[-3:] == [90, 92, 95] and len(set(split.inputs)) == 32
+    assert split == first_96_split(96, 32, 8, "test") == first_96_split(1000, 32, 8, "test")
+    assert not set(split.inputs) & set(split.targets)
+
+
+@pytest.mark.parametrize("selection", ["every_8th", "kmeans", "first_96"])
+def test_validation_sees_no_frame_of_the_test(selection):
+    cameras = cameras_at(np.random.default_rng(0).normal(size=(70, 3)))
+    split = selected_split(selection, cameras, 8, 4, "val")
+    assert len(split.inputs) == 8 and len(split.targets) == 4
+    assert not set(split.inputs + split.targets) & set(held_out(70, "test"))
+    assert set(split.targets) <= set(held_out(70, "val"))
+    tested = selected_split(selection, cameras, 8, 4, "test")
+    assert not set(tested.targets) & set(trained(70))
+
+
+def test_uniform_is_the_evaluation_of_made_up_scenes():
+    found = selected_split("uniform", cameras_at(torch.rand(17, 3)), 5, 4, "test")
+    assert found == evaluation_split(17, 5, 4)
+
+
+def test_unknown_selections_and_short_sequences_are_named():
+    cameras = cameras_at(torch.rand(20, 3))
+    with pytest.raises(InputError, match=r"data\.selection is 'k_means': expected one of every_8"):
+        selected_split("k_means", cameras, 4, 4, "test")
+    for selection in ("every_8th", "kmeans", "first_96"):
+        with pytest.raises(InputError, match=r"20 frames, of which 1\d are not .*data\.inputs"):
+            selected_split(selection, cameras, 19, 4, "test")
+
+
+MIDDLES = [5, 14, 23, 33]
+
+
+def planted():
+    """Four clusters of nine cameras; of those that are no target, MIDDLES stand at their means."""
+    rng = np.random.default_rng(1)
+    centers = np.repeat([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10.0]], 9, axis=0)
+    for first in range(0, 36, 9):
+        rows = [i for i in range(first, first + 9) if i % 8 and i not in MIDDLES]
+        offsets = rng.normal(size=(len(rows), 3))
+        centers[rows] += offsets - offsets.mean(0)
+    return cameras_at(centers)
+
+
+def test_kmeans_finds_the_middle_of_planted_clusters():
+    split = kmeans_split(planted(), 4, 2, "test")
+    assert split == Split(MIDDLES, [0, 8, 16, 24, 32])
+
+
+def test_kmeans_tells_directions_apart_as_well():
+    """Two places, and at each cameras that look left and right, whatever the unit of length."""
+    place = np.arange(40) % 10 // 5
+    look = np.arange(40) // 20
+    rng = np.random.default_rng(0)
+    centers = place[:, None] * np.array([2.0, 0, 0]) + 0.05 * rng.normal(size=(40, 3))
+    forwards = np.stack((2 * look - 1.0, 0 * look, 0 * look + 0.3), -1)
+    for unit in (1e-3, 1.0, 1e3):
+        split = kmeans_split(cameras_at(unit * centers + unit, forwards), 4, 4, "test")
+        assert {(place[i], look[i]) for i in split.inputs} == {(0, 0), (0, 1), (1, 0), (1, 1)}
+
+
+def circle(count=120):
+    angle = np.arange(count) * 2 * np.pi / count
+    centers = np.stack((np.sin(angle), 0 * angle, np.cos(angle)), -1)
+    return cameras_at(3 * centers, -centers)
+
+
+def line(count=100):
+    return cameras_at(np.arange(count)[:, None] * [0.1, 0, 0])
+
+
+SCENES = {
+    **{"planted": planted, "circle": circle, "line": line},
+    "procedural": lambda: ProceduralScene(3, 4, 4, 96).cameras.to(torch.float64),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_float_noise_changes_nothing(scene):
+    cameras = SCENES[scene]()
+    split = kmeans_split(cameras, 4 if scene == "planted" else 16, 4, "test")
+    for seed in range(5):
+        noise = np.random.default_rng(seed).normal(size=cameras.cam_to_world[:, :3].shape)
+        moved = cameras.cam_to_world.clone()
+        moved[:, :3] += 1e-7 * torch.tensor(noise)
+        again = Cameras(cameras.intrinsics, moved, 4, 4)
+        assert kmeans_split(again, len(split.inputs), 4, "test") == split
+
+
+def test_kmeans_of_a_circle_and_of_a_walk():
+    assert kmeans_split(circle(), 8, 4, "test").inputs == CIRCLE
+    assert kmeans_split(line(), 8, 4, "test").inputs == LINE
+    assert np.ptp(np.diff(CIRCLE)) <= 5 and np.ptp(np.diff(LINE)) <= 5
+
+
+@pytest.mark.parametrize("count", [1, 7, 30, 31])
+def test_no_frame_is_chosen_twice(count):
+    """Four places, at each of which eight cameras stand and look alike."""
+    features = np.repeat(np.eye(4, 6), 8, axis=0)
+    rows = nearest_to_centres(features, count)
+    assert len(set(rows)) == len(rows) == count
+    if count >= 4:
+        assert {row // 8 for row in rows} == set(range(4))
+
+
+def test_positions_and_directions_weigh_alike():
+    features = pose_features(planted())
+    lengths = np.linalg.norm(features.reshape(36, 2, 3), axis=-1)
+    assert abs((lengths[:, 0] ** 2).mean() - 1) < 1e-3 and np.allclose(lengths[:, 1], 1)
+    assert np.array_equal(features, features.round(4))
+    still = pose_features(cameras_at(np.full((5, 3), 7.1)))
+    assert np.array_equal(still[:, :3], np.zeros((5, 3)))
+
+
+def test_kmeans_of_a_real_walk(shared):
+    file = shared / "data/mydesk/opencv_cameras.json"
+    if not file.is_file():
+        pytest.skip(f"{file} is absent")
+    frames = json.loads(file.read_text())["frames"]
+    poses = np.linalg.inv([frame["w2c"] for frame in frames])
+    cameras = Cameras(torch.eye(3).double().repeat(498, 1, 1), torch.tensor(poses), 4, 4)
+    split = kmeans_split(cameras, 32, 8, "test")
+    assert split.inputs == MYDESK
+    assert split.targets == list(range(0, 498, 8))
+    published = read_index(file, 32).split("mydesk", cameras, 32)
+    assert published.targets == split.targets and len(published.inputs) == 32
+    # They cover the walk about as well: the farthest frame from an input is about as far.
+    features = pose_features(cameras)
+    reach = [
+        np.linalg.norm(features[:, None] - features[inputs], axis=-1).min(1).max()
+        for inputs in (split.inputs, published.inputs)
+    ]
+    assert reach[0] < 1.2 * reach[1]
+
+
+def test_pixelsplat_s_index(tmp_path):
+    file = tmp_path / "index.json"
+    file.write_text('{"5aca": {"context": [2, 9], "target": [2, 4, 9]}, "322": null}')
+    index = read_index(file, 2)
+    assert list(index.entries) == ["5aca"]
+    assert index.split("5aca", line(10), 2) == Split([2, 9], [2, 4, 9])
+    with pytest.raises(InputError, match=r"index\.json, scene 5aca has 2 inputs and data\.inputs"):
+        index.split("5aca", line(10), 3)
+    with pytest.raises(InputError, match="names frame 9, and the scene has 9 frames"):
+        index.split("5aca", line(9), 2)
+
+
+def test_long_lrm_s_lists(tmp_path):
+    for scene in "ab":
+        content = {"scene_name": scene, "frames": [{}] * 20, "fold_8_kmeans_2_input": [3, 12]}
+        (tmp_path / scene).mkdir()
+        (tmp_path / scene / "opencv_cameras.json").write_text(json.dumps(content))
+    expected = Split([3, 12], [0, 8, 16])
+    one = read_index(tmp_path / "a/opencv_cameras.json", 2)
+    assert one.entries == {"a": Entry(expected)}
+    assert read_index(tmp_path, 2).entries == {"a": Entry(expected), "b": Entry(expected)}
+    with pytest.raises(InputError, match=r"no list fold_8_kmeans_4_input .*fold_8_kmeans_2_input"):
+        read_index(tmp_path, 4)
+
+
+def test_our_index_is_of_these_cameras_and_unchanged(tmp_path):
+    file = tmp_path / "index.json"
+    split = kmeans_split(line(), 4, 4, "test")
+    write_index(file, "kmeans", {"walk": Entry(split, camera_hash(line()))})
+    assert read_index(file, 4).split("walk", line(), 4) == split
+    with pytest.raises(InputError, match="made for other cameras"):
+        read_index(file, 4).split("walk", circle(), 4)
+    with pytest.raises(InputError, match=r"index\.json exists"):
+        write_index(file, "kmeans", {})
+    file.write_text(file.read_text().replace("kmeans", "uniform"))
+    with pytest.raises(InputError, match=r"index\.json was changed"):
+        read_index(file, 4)
+
+
+def test_the_hash_is_of_the_cameras_alone():
+    walk = line(10)
+    far = Cameras(walk.intrinsics, walk.cam_to_world.clone(), 4, 4)
+    far.cam_to_world[:, :3, 3] = 7 * far.cam_to_world[:, :3, 3] + 3
+    assert camera_hash(walk) == camera_hash(far.to(torch.float32))
+    backwards = walk.select(list(range(9, -1, -1)))
+    assert len({camera_hash(cameras) for cameras in (walk, backwards, line(11), circle(10))}) == 4
+
+
+UNUSABLE = {
+    "a list": ("[]", "is no index"),
+    "a word": ('{"a": "b"}', "scene a, context is None"),
+    "no target": ('{"a": {"context": [1]}}', "scene a, target is None"),
+    "a negative number": ('{"a": {"context": [-1], "target": [2]}}', "different frame numbers"),
+    "twice the same": ('{"a": {"context": [1, 1], "target": [2]}}', "different frame numbers"),
+    "not JSON": ("{", "is not JSON"),
+}
+
+
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_an_unusable_index_is_named(case, tmp_path):
+    text, words = UNUSABLE[case]
+    (tmp_path / "index.json").write_text(text)
+    with pytest.raises(InputError, match=rf"index\.json.*{words}"):
+        read_index(tmp_path / "index.json", 2)
+
+
+def test_the_command_writes_an_index_outside_of_the_data_set(tmp_path, capsys):
+    for seed in (3, 4):
+        scene = ProceduralScene(seed, 8, 8, num_frames=24)
+        write_transforms(scene.views(range(24)), tmp_path / "scenes" / str(seed))
+    file = tmp_path / "index.json"
+    index_command([str(tmp_path / "scenes"), str(file), "--inputs", "4"])
+    assert "2 scenes" in capsys.readouterr().out
+    index = read_index(file, 4)
+    cameras = ProceduralScene(4, 8, 8, num_frames=24).cameras
+    assert index.split("4", cameras, 4) == kmeans_split(cameras, 4, 8, "test")
+    inside = tmp_path / "scenes/index.json"
+    with pytest.raises(SystemExit, match="lies in the data set"):
+        index_command([str(tmp_path / "scenes"), str(inside), "--inputs", "4"])
+    assert not inside.exists()

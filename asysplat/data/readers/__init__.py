@@ -12,12 +12,30 @@ from types import ModuleType
 from asysplat.data.bad_frames import BadFrames, Policy
 from asysplat.data.cache import ImageCache
 from asysplat.data.photographs import PhotographCapture
-from asysplat.data.readers import transforms
+from asysplat.data.readers import (
+    colmap,
+    dl3dv,
+    llff,
+    long_lrm,
+    posed,
+    realestate10k,
+    replica,
+    scannetpp,
+    transforms,
+)
 from asysplat.errors import InputError
 
 # Where a folder has several, the first counts.
 LAYOUTS: dict[str, ModuleType] = {
+    "long_lrm": long_lrm,
+    "realestate10k": realestate10k,
+    "replica": replica,
+    "scannetpp": scannetpp,
+    "dl3dv": dl3dv,
     "transforms": transforms,
+    "llff": llff,
+    "posed": posed,
+    "colmap": colmap,
 }
 
 
@@ -30,12 +48,12 @@ def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]
     if layout not in ("auto", *LAYOUTS):
         raise InputError(f"data.layout={layout}: expected auto or one of {', '.join(LAYOUTS)}.")
     root = Path(root).absolute()
-    if not root.exists():
-        raise InputError(f"{root} does not exist: name a scene, or a folder of scenes.")
     for name in LAYOUTS if layout == "auto" else (layout,):
         scenes = LAYOUTS[name].find_scenes(root)
         if scenes:
             return name, scenes
+    if not root.exists():
+        raise InputError(f"{root} does not exist: name a scene, or a folder of scenes.")
     raise InputError(
         f"{root} holds no scene of layout {layout}: data/README.md shows which files "
         f"make one; the layouts are {', '.join(LAYOUTS)}."

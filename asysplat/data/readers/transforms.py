@@ -4,7 +4,6 @@ https://github.com/NVlabs/instant-ngp/blob/master/docs/nerf_dataset_tips.md
 https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
-import json
 import math
 import re
 from pathlib import Path
@@ -13,7 +12,11 @@ from typing import Any
 from asysplat.data.bad_frames import BadFrames
 from asysplat.data.images import Lens, image_size
 from asysplat.data.photographs import Photograph, PosedScene
+from asysplat.data.readers.beside import beside
+from asysplat.data.readers.colmap import points_beside
 from asysplat.data.readers.folders import folders_with, natural_order
+from asysplat.data.readers.json_file import read_json
+from asysplat.data.readers.pictures import scaled
 from asysplat.data.readers.poses import opencv_from_opengl, rigid
 from asysplat.errors import InputError
 
@@ -37,7 +40,38 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
         InputError: anything in the file that cannot be used.
     """
     file = scene if scene.suffix == ".json" else scene / "transforms.json"
-    content = _read_json(file)
+    photographs = read_photographs(read_frames(file), file, bad)
+    return PosedScene(file.parent.name, photographs, points_beside(file.parent, photographs))
+
+
+def read_frames(file: Path) -> dict[str, Any]:
+    """The file's content, with a list "frames".
+
+    Raises:
+        InputError: it has none.
+    """
+    content = read_json(file)
+    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
+        raise InputError(f'{file} has no list "frames": give one entry an image.')
+    return content
+
+
+def read_photographs(
+    content: dict[str, Any],
+    file: Path,
+    bad: BadFrames,
+    folder: Path | None = None,
+    resized: bool = False,
+) -> list[Photograph]:
+    """The frames of a `transforms.json`, or of what another layout says in its words.
+
+    Args:
+        content: with a list "frames".
+        file: where it stands, for messages.
+        folder: that its paths are relative to; without it, the file's own.
+        resized: the images may be smaller or larger than w x h, for which the intrinsics hold.
+    """
+    folder = folder or file.parent
     photographs = []
     shared = None  # the first image that does not state its own size: the others must match it
     for index, entry in enumerate(content["frames"]):
@@ -45,56 +79,53 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
             if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
                 raise InputError(f"{file}, frame {index} has no file_path: name its image.")
             where = f"{file}, frame {index} ({entry['file_path']})"
-            image = _find_image(file.parent / entry["file_path"])
+            image = _find_image(folder / entry["file_path"])
             size = image_size(image)
             if not ("w" in entry and "h" in entry):
                 shared = shared or (image, size)
                 _check_equal_size(image, size, *shared)
-            photographs.append(_photograph({**content, **entry}, image, size, file.parent, where))
+            settings = {**content, **entry}
+            photographs.append(_photograph(settings, image, size, folder, resized, where))
     if all(re.search(r"\d", photograph.image.stem) for photograph in photographs):
         photographs.sort(key=lambda photograph: natural_order(photograph.image))
-    return PosedScene(file.parent.name, photographs)
-
-
-def _read_json(file: Path) -> dict[str, Any]:
-    if not file.is_file():
-        raise InputError(
-            f"{file} does not exist: give a folder with a transforms.json, or the json file."
-        )
-    text = file.read_text(encoding="utf-8-sig", errors="replace")
-    if not text.strip():
-        raise InputError(f"{file} is empty: write it again.")
-    try:
-        scene = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{file} is not JSON ({error}): repair or write it again.") from error
-    if not isinstance(scene, dict) or not isinstance(scene.get("frames"), list):
-        raise InputError(f'{file} has no list "frames": give one entry an image.')
-    return scene
+    return photographs
 
 
 def _photograph(
-    settings: dict[str, Any], image: Path, size: tuple[int, int], folder: Path, where: str
+    settings: dict[str, Any],
+    image: Path,
+    size: tuple[int, int],
+    folder: Path,
+    resized: bool,
+    where: str,
 ) -> Photograph:
-    stated = (settings.get("w", size[0]), settings.get("h", size[1]))
-    if stated != size:
-        raise InputError(
-            f"{where}: w x h is {stated[0]} x {stated[1]}, but the image is {size[0]} x {size[1]}: "
-            "give intrinsics for the images' own resolution."
-        )
     return Photograph(
         image=image,
-        lens=_lens(settings, *size, where),
+        lens=_lens(settings, size, resized, where),
         cam_to_world=opencv_from_opengl(
             rigid(settings.get("transform_matrix"), f"{where}: transform_matrix")
         ),
         depth=_beside(folder, settings, "depth_file_path", size, where),
-        depth_unit=_number(settings, "depth_unit_scale_factor", where, default=MILLIMETRES),
+        depth_unit=number(settings, "depth_unit_scale_factor", where, default=MILLIMETRES),
         mask=_beside(folder, settings, "mask_path", size, where),
     )
 
 
-def _lens(settings: dict[str, Any], width: int, height: int, where: str) -> Lens:
+def _lens(settings: dict[str, Any], size: tuple[int, int], resized: bool, where: str) -> Lens:
+    """For an image of (width, height) `size`."""
+    stated = (settings.get("w", size[0]), settings.get("h", size[1]))
+    if stated == size:
+        return _stated_lens(settings, *size, where)
+    if not resized:
+        raise InputError(
+            f"{where}: w x h is {stated[0]} x {stated[1]}, but the image is {size[0]} x {size[1]}: "
+            "give intrinsics for the images' own resolution."
+        )
+    width, height = (round(number(settings, key, where)) for key in ("w", "h"))
+    return scaled(_stated_lens(settings, width, height, where), size, where)
+
+
+def _stated_lens(settings: dict[str, Any], width: int, height: int, where: str) -> Lens:
     model = settings.get("camera_model", "OPENCV")
     fisheye = model == "OPENCV_FISHEYE" or bool(settings.get("is_fisheye", False))
     if not fisheye and model not in PERSPECTIVE_MODELS:
@@ -103,7 +134,7 @@ def _lens(settings: dict[str, Any], width: int, height: int, where: str) -> Lens
             f"{', '.join(PERSPECTIVE_MODELS)}, OPENCV_FISHEYE."
         )
     # The formats disagree on what a perspective k4 means.
-    if not fisheye and _number(settings, "k4", where, default=0.0) != 0:
+    if not fisheye and number(settings, "k4", where, default=0.0) != 0:
         raise InputError(f"{where}: k4 is only known for OPENCV_FISHEYE: undistort the images.")
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     fx, fy = _focal(settings, width, height, where)
@@ -112,9 +143,9 @@ def _lens(settings: dict[str, Any], width: int, height: int, where: str) -> Lens
         height=height,
         fx=fx,
         fy=fy,
-        cx=_number(settings, "cx", where, default=width / 2),
-        cy=_number(settings, "cy", where, default=height / 2),
-        distortion=tuple(_number(settings, name, where, default=0.0) for name in names),
+        cx=number(settings, "cx", where, default=width / 2),
+        cy=number(settings, "cy", where, default=height / 2),
+        distortion=tuple(number(settings, name, where, default=0.0) for name in names),
         fisheye=fisheye,
     )
 
@@ -124,9 +155,9 @@ def _focal(settings: dict[str, Any], width: int, height: int, where: str) -> tup
     found = {}
     for axis, pixels in (("x", width), ("y", height)):
         if f"fl_{axis}" in settings:
-            found[axis] = _number(settings, f"fl_{axis}", where)
+            found[axis] = number(settings, f"fl_{axis}", where)
         elif f"camera_angle_{axis}" in settings:
-            angle = _number(settings, f"camera_angle_{axis}", where)
+            angle = number(settings, f"camera_angle_{axis}", where)
             found[axis] = 0.5 * pixels / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
     if not found:
         raise InputError(f"{where} has no intrinsics: give fl_x in pixels, or camera_angle_x.")
@@ -140,7 +171,12 @@ def _focal(settings: dict[str, Any], width: int, height: int, where: str) -> tup
     return fx, fy
 
 
-def _number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
+def number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
+    """A setting, or `default` where there is none.
+
+    Raises:
+        InputError: it is not a finite number.
+    """
     value = settings.get(key, default)
     if not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{where}: {key} is {value!r}: give a finite number.")
@@ -164,14 +200,7 @@ def _beside(
         return None
     if not isinstance(name, str):
         raise InputError(f"{where}: {key} is {name!r}: give a file name, or leave it out.")
-    path = folder / name
-    width, height = image_size(path)
-    if abs(width * size[1] / size[0] - height) > 1:
-        raise InputError(
-            f"{where}: {path} is {width} x {height} and the image {size[0]} x {size[1]}: "
-            f"give a {key} with the image's proportions."
-        )
-    return path
+    return beside(folder / name, size, f"{where}: {key}")
 
 
 def _check_equal_size(

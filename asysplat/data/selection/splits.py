@@ -1,4 +1,4 @@
-"""Which frames of a sequence the network sees, and which it must predict."""
+"""Splits that follow from the number of frames alone."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,11 +11,14 @@ from asysplat.errors import InputError
 
 HELD_OUT_STEP = 8
 HELD_OUT_START = {"test": 0, "val": 4}
+ABLATION_FRAMES = 96
+
+Stage = Literal["val", "test"]
 
 
 @dataclass(frozen=True)
 class Split:
-    """Frame numbers; no frame is both an input and a target."""
+    """Frame numbers; where it is not said otherwise, no frame is both an input and a target."""
 
     inputs: list[int]
     targets: list[int]
@@ -31,7 +34,7 @@ def evaluation_split(num_frames: int, num_inputs: int, num_targets: int) -> Spli
         InputError: the sequence is too short.
     """
     _check_length(num_frames, num_inputs, num_targets)
-    inputs = _spread(range(num_frames), num_inputs)
+    inputs = spread(range(num_frames), num_inputs)
     gaps = pairwise(inputs)
     candidates = [(before + after) // 2 for before, after in gaps if after - before > 1]
     if len(candidates) < num_targets:
@@ -47,12 +50,14 @@ def training_split(
     num_targets: int,
     window: tuple[int, int],
     rng: np.random.Generator,
+    targets_may_be_inputs: bool = False,
 ) -> Split:
-    """Inputs evenly over a random window, random targets within it, half of the time backwards.
+    """Inputs evenly over a random window, random targets within it.
 
     Args:
         window: the least and the greatest number of frames to draw from, both included; clipped
             to the sequence.
+        targets_may_be_inputs: draw the targets from all frames of the window.
 
     Raises:
         InputError: the sequence or the window is too short.
@@ -67,15 +72,12 @@ def training_split(
     length = int(rng.integers(min(shortest, num_frames), min(longest, num_frames) + 1))
     start = int(rng.integers(num_frames - length + 1))
     frames = range(start, start + length)
-    inputs = _spread(frames, num_inputs)
-    others = sorted(set(frames) - set(inputs))
-    targets = sorted(rng.choice(others, num_targets, replace=False).tolist())
-    if rng.random() < 0.5:
-        return Split(inputs[::-1], targets[::-1])
-    return Split(inputs, targets)
+    inputs = spread(frames, num_inputs)
+    candidates = frames if targets_may_be_inputs else sorted(set(frames) - set(inputs))
+    return Split(inputs, sorted(rng.choice(candidates, num_targets, replace=False).tolist()))
 
 
-def held_out(num_frames: int, stage: Literal["val", "test"]) -> list[int]:
+def held_out(num_frames: int, stage: Stage) -> list[int]:
     """Every 8th frame: from the first on for the test (paper, Suppl. A), from the fifth for
     validation."""
     return list(range(HELD_OUT_START[stage], num_frames, HELD_OUT_STEP))
@@ -87,9 +89,7 @@ def trained(num_frames: int) -> list[int]:
     return sorted(set(range(num_frames)) - set(out))
 
 
-def held_out_split(
-    num_frames: int, num_inputs: int, num_targets: int, stage: Literal["val", "test"]
-) -> Split:
+def held_out_split(num_frames: int, num_inputs: int, num_targets: int, stage: Stage) -> Split:
     """Inputs evenly over the trained frames, at most `num_targets` targets evenly over those held
     out. Deterministic.
 
@@ -97,19 +97,48 @@ def held_out_split(
         InputError: the sequence is too short.
     """
     inputs, targets = trained(num_frames), held_out(num_frames, stage)
-    num_targets = min(num_targets, len(targets))
-    if len(inputs) < num_inputs or not targets:
-        raise InputError(
-            f"The sequence has {num_frames} frames, of which {len(inputs)} are not held out for "
-            f"{stage}: set data.inputs to at most that, or give a longer sequence."
-        )
-    return Split(_spread(inputs, num_inputs), _spread(targets, num_targets))
+    check_held_out(num_frames, len(inputs), num_inputs, stage)
+    return Split(spread(inputs, num_inputs), spread(targets, min(num_targets, len(targets))))
 
 
-def _spread(frames: Sequence[int], count: int) -> list[int]:
+def first_96_split(num_frames: int, num_inputs: int, num_targets: int, stage: Stage) -> Split:
+    """The paper's ablations (Suppl. A): of the first 96 frames every 8th is a target, and inputs
+    lie evenly over the others. Deterministic.
+
+    Raises:
+        InputError: the sequence is too short.
+    """
+    inputs, targets = paper_frames(min(num_frames, ABLATION_FRAMES), num_targets, stage)
+    check_held_out(num_frames, len(inputs), num_inputs, stage)
+    return Split(spread(inputs, num_inputs), targets)
+
+
+def paper_frames(num_frames: int, num_targets: int, stage: Stage) -> tuple[list[int], list[int]]:
+    """The frames that inputs are chosen from, and the targets.
+
+    The test has every 8th frame as a target, and all others to choose from. Validation looks at no
+    frame of the test: it has at most `num_targets` targets, and the trained frames to choose from.
+    """
+    targets = held_out(num_frames, stage)
+    if stage == "val":
+        return trained(num_frames), spread(targets, min(num_targets, len(targets)))
+    return sorted(set(range(num_frames)) - set(targets)), targets
+
+
+def spread(frames: Sequence[int], count: int) -> list[int]:
     """`count` different frames at even distances, the first and the last among them."""
     positions = np.linspace(0, len(frames) - 1, count)
     return [frames[int(position + 0.5)] for position in positions]
+
+
+def check_held_out(num_frames: int, left: int, num_inputs: int, stage: Stage) -> None:
+    """Raise InputError if fewer frames are `left` to choose from than inputs, or none is held
+    out."""
+    if left < num_inputs or not held_out(num_frames, stage):
+        raise InputError(
+            f"The sequence has {num_frames} frames, of which {left} are not held out for "
+            f"{stage}: set data.inputs to at most that, or give a longer sequence."
+        )
 
 
 def _check_length(num_frames: int, num_inputs: int, num_targets: int) -> None:

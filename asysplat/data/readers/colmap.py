@@ -1,0 +1,249 @@
+"""Reader of COLMAP's sparse models, text and binary, also of MipNeRF-360, Tanks&Temples and Deep
+Blending as they are published.
+
+https://colmap.github.io/format.html
+"""
+
+import re
+import struct
+import warnings
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float
+from numpy import ndarray
+
+from asysplat.data.bad_frames import BadFrames
+from asysplat.data.images import Lens, image_size
+from asysplat.data.photographs import Photograph, PosedScene
+from asysplat.data.readers.folders import folders_with, natural_order
+from asysplat.data.readers.pictures import images_in, scaled
+from asysplat.data.readers.poses import inverted, rigid
+from asysplat.errors import InputError
+
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+FOLDERS = ("images", "images_undistort", "images_2", "images_4", "images_8", ".")
+PARAMETERS = {  # of the camera models, in COLMAP's order
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+}
+SHOWN = 5  # names in a warning
+SAME_WORLD = 1e-3  # of the cameras' spread, and between rotations
+
+
+def find_scenes(root: Path) -> list[Path]:
+    """Folders with a model in `sparse/0`, `sparse`, `colmap/sparse/0` or their own files."""
+    return folders_with(
+        root, *(f"{model}/cameras.{kind}" for model in MODELS for kind in ("bin", "txt"))
+    )
+
+
+def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
+    """A folder with a model and the images it names, relative to `images`, `images_undistort`,
+    `images_2`, `images_4`, `images_8` or the folder itself: the first of those that holds the most.
+
+    Frames are the registered images, ordered by the numbers in their names (2 before 10); images
+    that are not registered are told in a warning. Where images are smaller than their cameras say,
+    the intrinsics are scaled.
+
+    Raises:
+        InputError: a model that is cut short, a camera model that is not in PARAMETERS, or no
+            image that the model names.
+    """
+    model = _model_of(scene)
+    if model is None:
+        raise InputError(f"{scene} has no COLMAP model: expected one in {', '.join(MODELS)}.")
+    reconstruction = _read(model)
+    images = sorted(_registered(reconstruction), key=lambda image: natural_order(Path(image.name)))
+    folder = _images_folder(scene, model, [image.name for image in images])
+    _tell_unregistered(model, [folder / image.name for image in images])
+    lenses = {
+        camera: _lens(reconstruction.cameras[camera], f"{model}, camera {camera}")
+        for camera in {image.camera_id for image in images}
+    }
+    photographs = []
+    for image in images:
+        with bad.caught():
+            path = folder / image.name
+            lens = scaled(lenses[image.camera_id], image_size(path), str(path))
+            photographs.append(Photograph(path, lens, _cam_to_world(image, model)))
+    return PosedScene(scene.name, photographs, _points(reconstruction))
+
+
+def points_beside(scene: Path, photographs: Sequence[Photograph]) -> Float[ndarray, "P 3"] | None:
+    """Sparse points of a model beside photographs whose poses were read elsewhere.
+
+    None if there is no model, or if its cameras, known by the images' names, stand elsewhere: then
+    its world is another one.
+
+    Raises:
+        InputError: a model that is cut short.
+    """
+    model = _model_of(scene)
+    if model is None:
+        return None
+    reconstruction = _read(model)
+    images = {Path(image.name).name: image for image in _registered(reconstruction)}
+    pairs = [
+        (photograph.cam_to_world, _cam_to_world(images[photograph.image.name], model))
+        for photograph in photographs
+        if photograph.image.name in images
+    ]
+    return _points(reconstruction) if pairs and _same_world(np.array(pairs)) else None
+
+
+def _same_world(pairs: Float[ndarray, "N 2 4 4"]) -> bool:
+    difference = np.abs(pairs[:, 0] - pairs[:, 1])
+    spread = np.ptp(pairs[:, 0, :3, 3], axis=0).max()
+    turned, moved = difference[:, :3, :3].max(), difference[:, :3, 3].max()
+    return bool(turned < SAME_WORLD and moved < SAME_WORLD * spread)
+
+
+def _model_of(scene: Path) -> Path | None:
+    models = (scene / name for name in MODELS)
+    return next((model for model in models if _is_binary(model) or _is_text(model)), None)
+
+
+def _is_binary(model: Path) -> bool:
+    return (model / "cameras.bin").is_file()
+
+
+def _is_text(model: Path) -> bool:
+    return (model / "cameras.txt").is_file()
+
+
+def _read(model: Path) -> pycolmap.Reconstruction:
+    reconstruction = pycolmap.Reconstruction()
+    for file in model.glob("*.bin"):
+        _check_lengths(file)
+    try:
+        if _is_binary(model):
+            reconstruction.read_binary(model)
+        else:
+            reconstruction.read_text(model)
+    # Damaged files make COLMAP raise anything from IndexError to MemoryError, with a C++ trace.
+    except Exception as error:
+        reason = str(error).split("\n")[0]
+        raise InputError(
+            f"{model} is not a whole COLMAP model ({reason}): copy its cameras, images and "
+            "points3D files again."
+        ) from error
+    if _is_binary(model):
+        _check_cameras(model / "cameras.bin", reconstruction.cameras.values())
+    else:
+        _check_count(model / "images.txt", reconstruction.num_images())
+        _check_count(model / "points3D.txt", reconstruction.num_points3D())
+    return reconstruction
+
+
+def _check_lengths(file: Path) -> None:
+    """COLMAP loops for ever where it is told of more than the file holds."""
+    stored = file.read_bytes()
+    try:
+        (count,) = struct.unpack_from("<Q", stored)
+        end = 8
+        if 8 * count > len(stored):
+            raise ValueError(f"it says that it has {count} entries")
+        for _ in range(count if file.name == "images.bin" else 0):
+            end = stored.index(b"\0", end + 64) + 1  # after numbers and the name
+            end += 8 + 24 * struct.unpack_from("<Q", stored, end)[0]
+        for _ in range(count if file.name == "points3D.bin" else 0):
+            end += 51 + 8 * struct.unpack_from("<Q", stored, end + 43)[0]
+        if end > len(stored):
+            raise ValueError(f"its entries take {end} bytes")
+    except (struct.error, ValueError) as error:
+        raise InputError(
+            f"{file} has {len(stored)} bytes, but {error}: it is cut short or damaged, so copy it "
+            "again."
+        ) from error
+
+
+def _check_cameras(file: Path, cameras: Iterable[pycolmap.Camera]) -> None:
+    """COLMAP makes cameras up beyond the file's end."""
+    expected = 8 + sum(24 + 8 * len(camera.params) for camera in cameras)
+    if file.stat().st_size != expected:
+        raise InputError(
+            f"{file} has {file.stat().st_size} bytes and its cameras take {expected}: it is cut "
+            "short or damaged, so copy it again."
+        )
+
+
+def _check_count(file: Path, found: int) -> None:
+    """COLMAP takes what lines there are; its own files say in a comment how many were written."""
+    with file.open(encoding="utf-8", errors="replace") as lines:
+        header = "".join(line for _, line in zip(range(4), lines, strict=False))
+    stated = re.search(r"^# Number of \w+: (\d+)", header, re.MULTILINE)
+    if stated and int(stated[1]) != found:
+        raise InputError(
+            f"{file} holds {found} entries and its header says {stated[1]}: it is cut short, so "
+            "copy it again, or correct the header."
+        )
+
+
+def _registered(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [image for image in reconstruction.images.values() if image.has_pose]
+
+
+def _cam_to_world(image: pycolmap.Image, model: Path) -> Float[ndarray, "4 4"]:
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().matrix()
+    return inverted(rigid(pose, f"{model}, pose of {image.name}"))
+
+
+def _points(reconstruction: pycolmap.Reconstruction) -> Float[ndarray, "P 3"] | None:
+    points = sorted(reconstruction.points3D.items())
+    return np.array([point.xyz for _, point in points]) if points else None
+
+
+def _lens(camera: pycolmap.Camera, where: str) -> Lens:
+    if camera.model_name not in PARAMETERS:
+        raise InputError(
+            f"{where} has model {camera.model_name}: undistort with colmap image_undistorter, or "
+            f"use one of {', '.join(PARAMETERS)}."
+        )
+    values = dict(zip(PARAMETERS[camera.model_name].split(), camera.params.tolist(), strict=True))
+    fisheye = camera.model_name == "OPENCV_FISHEYE"
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    return Lens(
+        width=camera.width,
+        height=camera.height,
+        fx=values.get("fx", values.get("f")),
+        fy=values.get("fy", values.get("f")),
+        cx=values["cx"],
+        cy=values["cy"],
+        distortion=tuple(values.get(name, 0.0) for name in names),
+        fisheye=fisheye,
+    )
+
+
+def _images_folder(scene: Path, model: Path, names: Sequence[str]) -> Path:
+    counts = {
+        folder: sum((scene / folder / name).is_file() for name in names) for folder in FOLDERS
+    }
+    best = max(counts, key=counts.get)
+    if counts[best] == 0:
+        named = f"names {len(names)} images, such as {names[0]}" if names else "registers no image"
+        raise InputError(
+            f"{model} {named}, and {scene} has none of them: give the folder that holds the model "
+            f"and one of {', '.join(FOLDERS[:-1])}."
+        )
+    return scene / best
+
+
+def _tell_unregistered(model: Path, registered: Sequence[Path]) -> None:
+    known = set(registered)
+    folders = sorted({path.parent for path in registered})
+    left = [path for folder in folders for path in images_in(folder) if path not in known]
+    if left:
+        names = ", ".join(path.name for path in left[:SHOWN]) + (", ..." * (len(left) > SHOWN))
+        warnings.warn(
+            f"{model} has not registered {len(left)} of {len(left) + len(known)} images, which are "
+            f"left out: {names}",
+            stacklevel=2,
+        )

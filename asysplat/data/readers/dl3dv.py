@@ -1,0 +1,79 @@
+"""Reader of DL3DV-10K: nerfstudio's transforms.json beside images of a smaller size than it names.
+
+root/<1K..11K>/<hash>/{transforms.json, images_4/}   DL3DV-ALL-960P (480P has images_8, 2K images_2)
+root/<hash>/nerfstudio/{transforms.json, images_4/}  DL3DV-Benchmark
+
+https://github.com/DL3DV-10K/Dataset
+https://huggingface.co/datasets/DL3DV/DL3DV-Benchmark
+"""
+
+from pathlib import Path
+
+from asysplat.data.bad_frames import BadFrames
+from asysplat.data.photographs import PosedScene
+from asysplat.data.readers.folders import folders_with
+from asysplat.data.readers.transforms import read_frames, read_photographs
+from asysplat.errors import InputError
+
+TRANSFORMS = "transforms.json"
+BENCHMARK = "nerfstudio"  # the folder in a benchmark scene
+IMAGES = ("images_4", "images_8", "images_2")  # 960P first: the paper's
+HASH_LENGTH = 64
+
+
+def find_scenes(root: Path) -> list[Path]:
+    """Folders of scenes, named by their hash.
+
+    Of another name they are known by having downsized images but no `images`, which nerfstudio
+    writes for everyone else.
+    """
+    folders = folders_with(root, TRANSFORMS, f"{BENCHMARK}/{TRANSFORMS}")
+    return [folder for folder in folders if _is_scene(folder)]
+
+
+def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
+    """A scene's folder, or the `nerfstudio` in it: at 960P, or else at the size that is there.
+
+    The intrinsics are for the video's size (w x h in the file) and are scaled to the images'.
+
+    Raises:
+        InputError: no images, or anything in `transforms.json` that cannot be used.
+    """
+    folder = _content(scene)
+    images = _images(folder)
+    if images is None:
+        raise InputError(
+            f"{folder} has no folder {', '.join(IMAGES)}: unpack the scene's archive there."
+        )
+    file = folder / TRANSFORMS
+    content = read_frames(file)
+    frames = [_in_folder(entry, images) for entry in content["frames"]]
+    photographs = read_photographs({**content, "frames": frames}, file, bad, resized=True)
+    return PosedScene(scene.parent.name if scene.name == BENCHMARK else scene.name, photographs)
+
+
+def _content(scene: Path) -> Path:
+    """Where a scene's files lie."""
+    inner = scene / BENCHMARK
+    return inner if (inner / TRANSFORMS).is_file() else scene
+
+
+def _images(folder: Path) -> str | None:
+    return next((name for name in IMAGES if (folder / name).is_dir()), None)
+
+
+def _is_scene(folder: Path) -> bool:
+    content = _content(folder)
+    own = _is_hash(folder.name) or _is_hash(folder.parent.name) or not (content / "images").is_dir()
+    return own and _images(content) is not None
+
+
+def _is_hash(name: str) -> bool:
+    return len(name) == HASH_LENGTH and not set(name) - set("0123456789abcdef")
+
+
+def _in_folder(entry: object, images: str) -> object:
+    """A frame whose image lies in the folder `images`, whatever folder the file names."""
+    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+        return entry
+    return {**entry, "file_path": f"{images}/{Path(entry['file_path']).name}"}

@@ -1,0 +1,92 @@
+"""Reader of `poses_bounds.npy`, the format of LLFF.
+
+https://github.com/Fyusion/LLFF#using-your-own-poses-without-running-colmap
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from asysplat.data.bad_frames import BadFrames
+from asysplat.data.images import Lens, image_size
+from asysplat.data.photographs import Photograph, PosedScene
+from asysplat.data.readers.colmap import points_beside
+from asysplat.data.readers.folders import folders_with
+from asysplat.data.readers.pictures import images_in, scaled
+from asysplat.data.readers.poses import rigid
+from asysplat.errors import InputError
+
+POSES = "poses_bounds.npy"
+FOLDERS = ("images", "images_2", "images_4", "images_8")  # the largest images first
+COLUMNS = 17  # 3x5 matrix, and the nearest and farthest depth
+
+
+def find_scenes(root: Path) -> list[Path]:
+    """Folders with a `poses_bounds.npy`."""
+    return folders_with(root, POSES)
+
+
+def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
+    """A folder with a `poses_bounds.npy` and images.
+
+    Row i of the array belongs to the i-th image in sorted order: a row-major 3x5 matrix, whose
+    first four columns are camera-to-world with axes down, right, backward and whose fifth is
+    height, width and focal length of the full-size image, then the nearest and farthest depth. The
+    principal point is the centre. Images are those of the first of `images`, `images_2`, `images_4`
+    and `images_8` that holds as many as there are rows: the largest that are all there.
+
+    Raises:
+        InputError: an array that cannot be used, or no folder with an image a row.
+    """
+    file = scene / POSES
+    rows = _read_rows(file)
+    photographs = []
+    for index, (image, row) in enumerate(zip(_images(file, len(rows)), rows, strict=True)):
+        with bad.caught():
+            photographs.append(_photograph(image, row, f"{file}, row {index} ({image.name})"))
+    return PosedScene(scene.name, photographs, points_beside(scene, photographs))
+
+
+def _read_rows(file: Path) -> Float[ndarray, "N 17"]:
+    try:
+        rows = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(
+            f"{file} cannot be read as a NumPy array ({error}): copy or write it again."
+        ) from error
+    if not isinstance(rows, ndarray) or rows.ndim != 2 or rows.shape[1] != COLUMNS:
+        found = rows.shape if isinstance(rows, ndarray) else "no array"
+        raise InputError(f"{file} holds {found}: expected a row of {COLUMNS} numbers an image.")
+    if rows.dtype.kind not in "fiu":
+        raise InputError(f"{file} holds values of type {rows.dtype}: expected numbers.")
+    return rows.astype(np.float64)
+
+
+def _images(file: Path, count: int) -> list[Path]:
+    found = {name: images_in(file.parent / name) for name in FOLDERS}
+    for images in found.values():
+        if len(images) == count:
+            return images
+    counts = ", ".join(f"{len(images)} in {name}/" for name, images in found.items() if images)
+    raise InputError(
+        f"{file} has {count} rows, but of images there are {counts or 'none'}: "
+        f"give one image a row, in one of {', '.join(FOLDERS)}."
+    )
+
+
+def _photograph(image: Path, row: Float[ndarray, "17"], where: str) -> Photograph:
+    size = image_size(image)
+    matrix = row[:15].reshape(3, 5)
+    height, width, focal = matrix[:, 4]
+    if not (np.isfinite(matrix[:, 4]).all() and (matrix[:, 4] > 0).all()):
+        raise InputError(
+            f"{where} has height, width, focal length {height:g}, {width:g}, {focal:g}: "
+            "give three numbers > 0 in pixels."
+        )
+    lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
+    down, right, backward, center = matrix.T[:4]
+    pose = np.eye(4)
+    pose[:3] = np.stack((right, down, -backward, center), axis=-1)
+    return Photograph(image, scaled(lens, size, where), rigid(pose, where))

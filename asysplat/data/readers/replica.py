@@ -1,0 +1,99 @@
+"""Reader of Replica as NICE-SLAM rendered it: colours, depths and a trajectory for each room.
+
+root/cam_params.json           intrinsics, image size, and depth steps a metre (6553.5)
+root/<scene>/traj.txt          row i: 16 numbers, camera-to-world of frame i, row-major, OpenCV axes
+root/<scene>/results/          frame000000.jpg, depth000000.png (16 bits, along z)
+
+https://github.com/cvg/nice-slam (scripts/download_replica.sh, src/utils/datasets.py)
+"""
+
+from pathlib import Path
+
+from asysplat.data.bad_frames import BadFrames
+from asysplat.data.images import Lens, image_size
+from asysplat.data.photographs import Photograph, PosedScene
+from asysplat.data.readers.beside import beside
+from asysplat.data.readers.folders import folders_with
+from asysplat.data.readers.json_file import read_json
+from asysplat.data.readers.poses import rigid
+from asysplat.data.readers.transforms import number
+from asysplat.errors import InputError
+
+TRAJECTORY = "traj.txt"
+PARAMETERS = "cam_params.json"
+HALF_A_PIXEL = 0.5  # cx is 599.5 of 1200: these files put the first pixel's centre at 0
+
+
+def find_scenes(root: Path) -> list[Path]:
+    """Folders with a `traj.txt` and `results`."""
+    return [folder for folder in folders_with(root, TRAJECTORY) if (folder / "results").is_dir()]
+
+
+def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
+    """A room's folder. `cam_params.json` lies above it, or in it where a room stands alone.
+
+    Every row of `traj.txt` must have its frame, and, if there is any depth map, its depth.
+
+    Raises:
+        InputError: unusable parameters, or frames without a row.
+    """
+    parameters = next(
+        (file for file in (scene / PARAMETERS, scene.parent / PARAMETERS) if file.is_file()), None
+    )
+    if parameters is None:
+        raise InputError(
+            f"{scene.parent / PARAMETERS} does not exist: copy it there from Replica.zip."
+        )
+    lens, depth_unit = _camera(parameters)
+    trajectory = scene / TRAJECTORY
+    if not trajectory.is_file():
+        raise InputError(f"{trajectory} does not exist: name a room's folder.")
+    rows = trajectory.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    results = scene / "results"
+    frames = len(list(results.glob("frame*.jpg")))
+    if frames > len(rows):
+        raise InputError(
+            f"{trajectory} has {len(rows)} rows for {frames} frames: give a row of 16 numbers "
+            "for each, or copy the file again."
+        )
+    has_depths = next(results.glob("depth*.png"), None) is not None
+    photographs = []
+    for index, row in enumerate(rows):
+        with bad.caught():
+            image = results / f"frame{index:06d}.jpg"
+            size = image_size(image)
+            if size != (lens.width, lens.height):
+                raise InputError(
+                    f"{image} is {size[0]} x {size[1]}, but {parameters} says {lens.width} x "
+                    f"{lens.height}: give intrinsics for the images' own resolution."
+                )
+            depth = results / f"depth{index:06d}.png"
+            photographs.append(
+                Photograph(
+                    image=image,
+                    lens=lens,
+                    cam_to_world=rigid(_four_by_four(row), f"{trajectory}, row {index + 1}"),
+                    depth=beside(depth, size, str(image)) if has_depths else None,
+                    depth_unit=depth_unit,
+                )
+            )
+    return PosedScene(scene.name, photographs)
+
+
+def _camera(file: Path) -> tuple[Lens, float]:
+    """The lens of all frames, and metres a depth step."""
+    content = read_json(file)
+    camera = content.get("camera") if isinstance(content, dict) else None
+    if not isinstance(camera, dict):
+        raise InputError(f'{file} has no "camera": copy it again from Replica.zip.')
+    names = ("w", "h", "fx", "fy", "cx", "cy", "scale")
+    width, height, fx, fy, cx, cy, scale = (number(camera, name, str(file)) for name in names)
+    if min(width, height, fx, fy, scale) <= 0:
+        raise InputError(f"{file}: w, h, fx, fy and scale of its camera must be above 0.")
+    lens = Lens(round(width), round(height), fx, fy, cx + HALF_A_PIXEL, cy + HALF_A_PIXEL)
+    return lens, 1 / scale
+
+
+def _four_by_four(row: str) -> list[list[str]]:
+    numbers = row.split()
+    return [numbers[start : start + 4] for start in range(0, len(numbers), 4)]

@@ -1,0 +1,229 @@
+"""Reader of ScanNet++: photographs of a reflex camera (DSLR), or of an iPhone with its LiDAR.
+
+Each of these files of poses is a scene's address, first the one that its folder stands for:
+
+<scene>/dslr/nerfstudio/transforms_undistorted.json  resized_undistorted_images, .._masks
+<scene>/dslr/nerfstudio/transforms.json              fisheye: resized_images, resized_anon_masks,
+                                                     and render_depth, from the toolkit
+<scene>/iphone/nerfstudio/transforms.json            COLMAP's, some frames: rgb, rgb_masks, depth
+<scene>/iphone/pose_intrinsic_imu.json               ARKit's, every frame: the same folders
+
+Depths are 16-bit PNG, millimetres along z (256 x 192 for the iPhone's 1920 x 1440). Masks are 0
+where a pixel was made anonymous. The world is the laser scan's, in metres: the transforms files
+turn its axes, which is undone, so that both cameras, the sparse points and the mesh agree.
+
+https://kaldir.vc.in.tum.de/scannetpp/documentation
+https://github.com/scannetpp/scannetpp (common/scene_release.py, common/utils/nerfstudio.py)
+"""
+
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from asysplat.data.bad_frames import BadFrames
+from asysplat.data.images import Lens, image_size
+from asysplat.data.photographs import Photograph, PosedScene
+from asysplat.data.readers.beside import beside
+from asysplat.data.readers.folders import folders_with
+from asysplat.data.readers.json_file import read_json
+from asysplat.data.readers.poses import rigid
+from asysplat.data.readers.transforms import MILLIMETRES, read_frames, read_photographs
+from asysplat.errors import InputError
+
+
+@dataclass(frozen=True)
+class Part:
+    """The folders that belong to a file of poses, within its camera's folder.
+
+    Args:
+        get: what to do where the images are not there.
+    """
+
+    images: str
+    masks: str
+    depths: str | None
+    get: str
+
+
+EXTRACT = (
+    "extract rgb.mkv (or rgb.mp4) with the toolkit's iphone.prepare_iphone_data, or with "
+    "ffmpeg -i rgb.mkv -start_number 0 -q:v 1 rgb/frame_%06d.jpg"
+)
+ARKIT = "iphone/pose_intrinsic_imu.json"
+PARTS = {
+    "dslr/nerfstudio/transforms_undistorted.json": Part(
+        images="resized_undistorted_images",
+        masks="resized_undistorted_masks",
+        depths=None,
+        get="download it, or run the toolkit's dslr.undistort",
+    ),
+    "dslr/nerfstudio/transforms.json": Part(
+        images="resized_images",
+        masks="resized_anon_masks",
+        depths="render_depth",
+        get="download it",
+    ),
+    "iphone/nerfstudio/transforms.json": Part("rgb", "rgb_masks", "depth", EXTRACT),
+    ARKIT: Part("rgb", "rgb_masks", "depth", EXTRACT),
+}
+CAMERAS = ("dslr", "iphone")
+# The transforms files' world from the scan's, and back.
+TURN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+
+
+def find_scenes(root: Path) -> list[Path]:
+    """The file of poses that each scene's folder stands for, or the named one.
+
+    Of a scene that is the first in the list above whose images are there; of <scene>/dslr or
+    <scene>/iphone the first of this camera.
+    """
+    if root.is_file():
+        return [root] if _key(root) else []
+    if root.name in CAMERAS:
+        return _first(root.parent, root.name)
+    return [file for scene in folders_with(root, *PARTS) for file in _first(scene)]
+
+
+def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
+    """One camera's photographs, named <scene>-dslr or <scene>-iphone, and COLMAP's sparse points.
+
+    The benchmark's test frames are among them where their images were published. Frames that the
+    file marks `is_bad` are left out, with a warning.
+
+    Args:
+        scene: a file of poses, or a folder that stands for one.
+
+    Raises:
+        InputError: images or masks that were not downloaded or extracted, or an unusable file.
+    """
+    files = find_scenes(scene)
+    if len(files) != 1:
+        raise InputError(
+            f"{scene} holds {len(files)} scenes of ScanNet++: name one, or one of its files "
+            f"{', '.join(PARTS)}."
+        )
+    key = _key(files[0])
+    part, folder = PARTS[key], files[0].parents[key.count("/") - 1]
+    if not (folder / part.images).is_dir():
+        raise InputError(f"{folder / part.images} does not exist: {part.get}.")
+    read = _arkit if key == ARKIT else _transforms
+    return PosedScene(
+        name=f"{folder.parent.name}-{folder.name}",
+        photographs=read(files[0], folder, part, bad),
+        points=_points(folder / "colmap/points3D.txt"),
+    )
+
+
+def _key(file: Path) -> str:
+    """`file` from its scene's folder on; nothing for other files."""
+    return next((key for key in PARTS if file.as_posix().endswith(f"/{key}")), "")
+
+
+def _first(scene: Path, camera: str = "") -> list[Path]:
+    """The file of poses that counts, one with images before one without."""
+    keys = [key for key in PARTS if key.startswith(camera) and (scene / key).is_file()]
+    keys.sort(key=lambda key: not (scene / key.split("/")[0] / PARTS[key].images).is_dir())
+    return [scene / key for key in keys[:1]]
+
+
+def _transforms(file: Path, folder: Path, part: Part, bad: BadFrames) -> list[Photograph]:
+    content = read_frames(file)
+    has_masks = content.get("has_mask", (folder / part.masks).is_dir())
+    if has_masks and not (folder / part.masks).is_dir():
+        raise InputError(
+            f"{folder / part.masks} does not exist, but {file} has masks: download it."
+        )
+    masks = part.masks if has_masks else None
+    depths = part.depths if part.depths and (folder / part.depths).is_dir() else None
+    frames = [
+        _with_paths(entry, part.images, masks, depths)
+        for entry in _good_frames(content, file, folder / part.images)
+    ]
+    found = read_photographs({**content, "frames": frames}, file, bad, folder)
+    return [replace(one, cam_to_world=TURN @ one.cam_to_world) for one in found]
+
+
+def _good_frames(content: dict[str, Any], file: Path, images: Path) -> list[Any]:
+    """Training and published test frames that are not marked as bad."""
+    test = [entry for entry in content.get("test_frames", []) if isinstance(entry, dict)]
+    if not any((images / str(entry.get("file_path"))).is_file() for entry in test):
+        test = []  # hidden ones, and the DSLR's in the iPhone's file
+    frames = content["frames"] + test
+    good = [entry for entry in frames if not (isinstance(entry, dict) and entry.get("is_bad"))]
+    if len(good) < len(frames):
+        warnings.warn(
+            f"{file}: left out {len(frames) - len(good)} of {len(frames)} frames that the data set "
+            "marks is_bad.",
+            stacklevel=2,
+        )
+    return good
+
+
+def _with_paths(entry: Any, images: str, masks: str | None, depths: str | None) -> Any:
+    """A frame that names its image, mask and depth from the camera's folder on."""
+    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+        return entry
+    name = f"{Path(entry['file_path']).stem}.png"
+    return {
+        **entry,
+        "file_path": f"{images}/{entry['file_path']}",
+        "mask_path": masks and f"{masks}/{name}",
+        "depth_file_path": depths and f"{depths}/{name}",
+    }
+
+
+def _arkit(file: Path, folder: Path, part: Part, bad: BadFrames) -> list[Photograph]:
+    """By name: camera-to-world with OpenCV axes, in the scan's world, and intrinsics in pixels."""
+    content = read_json(file)
+    if not isinstance(content, dict):
+        raise InputError(f"{file} is no object of frames by name: download it again.")
+    masks, depths = (
+        folder / name if (folder / name).is_dir() else None for name in (part.masks, part.depths)
+    )
+    photographs = []
+    for name, entry in sorted(content.items()):
+        with bad.caught():
+            where = f"{file}, {name}"
+            if not isinstance(entry, dict):
+                raise InputError(f"{where} is {entry!r}: give its intrinsic and aligned_pose.")
+            image = folder / part.images / f"{name}.jpg"
+            size = image_size(image)
+            photographs.append(
+                Photograph(
+                    image=image,
+                    lens=_pinhole(entry.get("intrinsic"), size, f"{where}: intrinsic"),
+                    cam_to_world=rigid(entry.get("aligned_pose"), f"{where}: aligned_pose"),
+                    depth=depths and beside(depths / f"{name}.png", size, where),
+                    depth_unit=MILLIMETRES,
+                    mask=masks and beside(masks / f"{name}.png", size, where),
+                )
+            )
+    return photographs
+
+
+def _pinhole(stored: Any, size: tuple[int, int], where: str) -> Lens:
+    try:
+        matrix = np.array(stored, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or (np.diag(matrix) <= 0).any():
+        raise InputError(f"{where} is {stored}: give 3x3 numbers, fx and fy above 0, in pixels.")
+    width, height = size
+    return Lens(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+
+
+def _points(file: Path) -> Float[ndarray, "P 3"] | None:
+    """Columns 2 to 4 of COLMAP's text: https://colmap.github.io/format.html#points3d-txt"""
+    if not file.is_file():
+        return None
+    with file.open(encoding="utf-8", errors="replace") as lines:
+        rows = [line.split(maxsplit=4)[1:4] for line in lines if line[:1] not in ("#", "\n")]
+    try:
+        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+    except ValueError as error:
+        raise InputError(f"{file} cannot be read ({error}): download it again.") from error

@@ -1,0 +1,187 @@
+"""Files that name the frames of each scene: pixelSplat's, Long-LRM's, and our own.
+
+https://github.com/dcharatan/pixelsplat/blob/main/assets/evaluation_index_re10k.json
+https://github.com/arthurhero/Long-LRM/tree/main/data/example_data
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from asysplat.data.readers.folders import folders_with
+from asysplat.data.readers.json_file import read_json
+from asysplat.data.selection.kmeans import DECIMALS, pose_features
+from asysplat.data.selection.splits import Split
+from asysplat.errors import InputError
+from asysplat.scene import Cameras
+
+LONG_LRM_FILE = "opencv_cameras.json"
+LONG_LRM_LIST = re.compile(r"fold_(\d+)_kmeans_(\d+)_input")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What an index says of one scene.
+
+    Args:
+        cameras: the hash of the scene's cameras, where the index has one.
+    """
+
+    split: Split
+    cameras: str | None = None
+
+
+@dataclass(frozen=True)
+class ViewIndex:
+    """The splits of the scenes that an index file names.
+
+    Args:
+        path: the file, for messages.
+        entries: by the name of the scene.
+    """
+
+    path: Path
+    entries: Mapping[str, Entry]
+
+    def split(self, scene: str, cameras: Cameras, num_inputs: int) -> Split:
+        """Of a scene that the index names.
+
+        Raises:
+            InputError: it was made for other cameras or another number of inputs, or names a frame
+                that the scene lacks.
+        """
+        entry = self.entries[scene]
+        where = f"{self.path}, scene {scene}"
+        if entry.cameras not in (None, camera_hash(cameras)):
+            raise InputError(
+                f"{where}: the index was made for other cameras: write it again for these files."
+            )
+        if len(entry.split.inputs) != num_inputs:
+            raise InputError(
+                f"{where} has {len(entry.split.inputs)} inputs and data.inputs is {num_inputs}: "
+                "set one to the other."
+            )
+        last = max(entry.split.inputs + entry.split.targets)
+        if last >= cameras.num_views:
+            raise InputError(
+                f"{where} names frame {last}, and the scene has {cameras.num_views} frames: it "
+                "belongs to another version of the scene; write the index again for this one."
+            )
+        return entry.split
+
+
+def read_index(path: Path | str, num_inputs: int) -> ViewIndex:
+    """An index of any of the three forms.
+
+    pixelSplat's: {scene: {"context": [...], "target": [...]} or null}; what is null is left out,
+    and a target may be an input. Long-LRM's: a scene's own opencv_cameras.json with a list
+    `fold_8_kmeans_32_input`, every 8th frame being a target; for many scenes, their folder. Ours:
+    as `write_index` writes it.
+
+    Raises:
+        InputError: none of these, a list for another number of inputs, or an index of ours that
+            was changed.
+    """
+    path = Path(path)
+    if path.is_dir():
+        files = [folder / LONG_LRM_FILE for folder in folders_with(path, LONG_LRM_FILE)]
+        if not files:
+            raise InputError(
+                f"data.index={path} is a folder without {LONG_LRM_FILE}: name an index file, or "
+                "scenes in the layout of Long-LRM."
+            )
+        found = [_long_lrm_entry(file, read_json(file), num_inputs) for file in files]
+        return ViewIndex(path, dict(found))
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise InputError(f'{path} is no index: give {{"scene": {{"context": [], "target": []}}}}.')
+    if isinstance(content.get("frames"), list):
+        return ViewIndex(path, dict([_long_lrm_entry(path, content, num_inputs)]))
+    scenes = _checked_scenes(path, content) if "hash" in content else content
+    entries = {
+        name: _entry(f"{path}, scene {name}", entry)
+        for name, entry in scenes.items()
+        if entry is not None
+    }
+    return ViewIndex(path, entries)
+
+
+def write_index(path: Path, selection: str, entries: Mapping[str, Entry]) -> None:
+    """Write an index of our own; a hash over all of it shows later changes.
+
+    Raises:
+        InputError: the file exists.
+    """
+    if path.exists():
+        raise InputError(f"{path} exists: name a new file, nothing is overwritten.")
+    scenes = {
+        name: {
+            "context": entry.split.inputs,
+            "target": entry.split.targets,
+            "cameras": entry.cameras,
+        }
+        for name, entry in entries.items()
+    }
+    content = {"selection": selection, "scenes": scenes}
+    path.write_text(json.dumps(content | {"hash": _hash_of(content)}, indent=1))
+
+
+def camera_hash(cameras: Cameras) -> str:
+    """Of where a scene's cameras stand and look, whatever its frame's origin and unit."""
+    steps = (pose_features(cameras) * 10**DECIMALS).round().astype("<i8")
+    return _digest(np.ascontiguousarray(steps).tobytes())
+
+
+def _checked_scenes(path: Path, content: dict[str, Any]) -> dict[str, Any]:
+    stored = {name: value for name, value in content.items() if name != "hash"}
+    if content["hash"] != _hash_of(stored) or not isinstance(content.get("scenes"), dict):
+        raise InputError(f"{path} was changed after it was written: write it again.")
+    return content["scenes"]
+
+
+def _hash_of(content: dict[str, Any]) -> str:
+    return _digest(json.dumps(content, sort_keys=True).encode())
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def _entry(where: str, stored: Any) -> Entry:
+    entry = stored if isinstance(stored, dict) else {}
+    split = Split(
+        _frames(f"{where}, context", entry.get("context")),
+        _frames(f"{where}, target", entry.get("target")),
+    )
+    return Entry(split, entry.get("cameras"))
+
+
+def _long_lrm_entry(file: Path, content: Any, num_inputs: int) -> tuple[str, Entry]:
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list):
+        raise InputError(f'{file} has no list "frames": give a file of Long-LRM\'s layout.')
+    lists = {name: match for name in content if (match := LONG_LRM_LIST.fullmatch(name))}
+    for name, match in lists.items():
+        fold, count = map(int, match.groups())
+        if count == num_inputs and fold > 0:
+            inputs = _frames(f"{file}, {name}", content[name])
+            split = Split(inputs, list(range(0, len(frames), fold)))
+            return str(content.get("scene_name", file.parent.name)), Entry(split)
+    there = ", ".join(lists) or "none"
+    raise InputError(
+        f"{file} has no list fold_8_kmeans_{num_inputs}_input (there: {there}): set data.inputs to "
+        "the number of a list, or use data.selection=kmeans."
+    )
+
+
+def _frames(where: str, stored: Any) -> list[int]:
+    usable = isinstance(stored, list) and stored and all(type(n) is int and n >= 0 for n in stored)
+    if not usable or len(set(stored)) != len(stored):
+        raise InputError(f"{where} is {stored!r}: give a list of different frame numbers from 0.")
+    return stored

@@ -1,0 +1,150 @@
+"""`python -m asysplat.data.check`: what it prints, writes and ends with."""
+
+import json
+import shutil
+
+import pytest
+from PIL import Image
+
+from asysplat.data import ProceduralScene
+from asysplat.data.check.__main__ import main
+from asysplat.data.write import write_transforms
+
+HEIGHT, WIDTH, FRAMES = 160, 240, 12
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made") / "walk"
+    scene = ProceduralScene(4, HEIGHT, WIDTH, FRAMES)
+    write_transforms(scene.views(range(FRAMES)), folder)
+    return folder
+
+
+@pytest.fixture
+def scene(written, tmp_path):
+    """A scene that a test may spoil."""
+    return shutil.copytree(written, tmp_path / "data/walk")
+
+
+@pytest.fixture
+def check(tmp_path, monkeypatch, capsys):
+    """Runs the command; gives how it ended and what it said."""
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words) -> tuple[int, str, str]:
+        code = main([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def edit(scene, change) -> None:
+    file = scene / "transforms.json"
+    content = json.loads(file.read_text())
+    change(content)
+    file.write_text(json.dumps(content))
+
+
+def spoil(image) -> None:
+    """Whole at both ends, and so with a size, but not to be decoded."""
+    data = bytearray(image.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 200] = bytes(200)
+    image.write_bytes(data)
+
+
+def test_a_good_scene_is_told_on_one_screen(check, scene, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
+    code, out, err = check(scene)
+    assert code == 0 and not err
+    assert len(out.splitlines()) < 24
+    for text in (
+        *("walk, layout transforms", f"{FRAMES} of {WIDTH} x {HEIGHT}", "known at 100.0%"),
+        *("The cameras fit the images.", "masks           none", "points          none"),
+    ):
+        assert text in out
+    assert {path: path.stat().st_mtime_ns for path in scene.rglob("*")} == before
+    with Image.open(tmp_path / "check/walk/check.png") as picture:
+        assert min(picture.size) > 500 and len(picture.getcolors(2**20)) > 1000
+
+
+def test_nothing_is_overwritten(check, scene, tmp_path):
+    folder = tmp_path / "elsewhere/walk"
+    folder.mkdir(parents=True)
+    (folder / "check.png").write_text("mine")
+    code, out, _ = check(scene, "--out", tmp_path / "elsewhere")
+    assert code == 0 and "elsewhere/walk/check-2.png" in out
+    assert (folder / "check.png").read_text() == "mine"
+    assert sorted(path.name for path in folder.iterdir()) == ["check-2.png", "check.png"]
+
+
+def test_a_mistake_ends_with_1_and_its_mend(check, scene):
+    def unflip(content):
+        for frame in content["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[1], row[2] = -row[1], -row[2]
+
+    edit(scene, unflip)
+    code, out, _ = check(scene)
+    assert code == 1
+    assert "OpenGL axes were taken for OpenCV's" in out and "right, up, backward" in out
+
+
+def test_all_damaged_files_are_listed(check, scene):
+    spoil(scene / "images/00003.png")
+    spoil(scene / "images/00007.png")
+    (scene / "images/00009.png").unlink()
+    code, out, err = check(scene)
+    assert code == 2 and "Traceback" not in err
+    assert err.startswith("error: walk: 3 of 12 frames cannot be used")
+    assert all(name in err for name in ("00003.png", "00007.png", "00009.png"))
+    code, out, err = check(scene, "--on-bad-frame", "skip")
+    assert code == 0 and out.count("left out") == 3
+    assert all(name in out for name in ("00003.png", "00007.png", "00009.png"))
+    assert "frames          9 " in out
+
+
+def test_depths_of_another_unit_are_told(check, scene):
+    edit(scene, lambda content: content.update(depth_unit_scale_factor=0.01))
+    code, out, _ = check(scene)
+    assert code == 0 and "divide the unit of depth by 9.9" in out
+
+
+def blank(scene) -> None:
+    for image in (scene / "images").iterdir():
+        Image.new("RGB", (WIDTH, HEIGHT), (90, 90, 90)).save(image)
+
+
+def test_images_without_a_point_to_match(check, scene):
+    blank(scene)
+    code, out, _ = check(scene)
+    assert code == 1 and "Only 0 points were found again" in out
+    assert "12, 11 with the same file as another" in out
+
+
+def test_one_of_many_scenes(check, scene):
+    blank(scene)
+    for name in "bcde":
+        shutil.copytree(scene, scene.parent / name)
+    _, out, _ = check(scene.parent, "--scene", "d")
+    assert "checking 1 of 5 scenes" in out and "d, layout transforms" in out
+    _, out, _ = check(scene.parent)
+    assert "checking 3 of 5 scenes; --scene NAME checks another" in out
+    assert [name for name in "bcde" if f"{name}, layout" in out] == ["b", "c", "d"]
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (("nowhere",), "nowhere does not exist"),
+        (("data/walk", "--out", "data/walk/check"), "lies in the data set"),
+        (("data", "--scene", "other"), "--scene other is none of the 1 scenes"),
+        (("data", "--layout", "transforms", "--out", "data"), "lies in the data set"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(check, scene, words, message):
+    code, _, err = check(*words)
+    assert code == 2 and message in err
+    assert err.startswith("error: ") and err.count("\n") == 1

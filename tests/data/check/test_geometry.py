@@ -1,0 +1,104 @@
+"""Epipolar distances, triangulation, paths and points on known answers."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from asysplat.data.check.epipolar import epipolar_distances, epipolar_lines, triangulate
+from asysplat.data.check.matching import Matches
+from asysplat.data.check.path import count_points, measure_path
+from asysplat.scene import Cameras
+
+HEIGHT, WIDTH = 120, 160
+
+
+@pytest.fixture
+def cameras() -> Cameras:
+    skew = 0.1 * torch.randn(4, 3, 3).double()
+    poses = torch.eye(4).double().repeat(4, 1, 1)
+    poses[:, :3, :3] = torch.linalg.matrix_exp(skew - skew.mT)
+    poses[:, :3, 3] = torch.randn(4, 3)
+    intrinsics = torch.tensor([[150.0, 0, 82], [0, 140, 57], [0, 0, 1]]).double()
+    return Cameras(intrinsics.repeat(4, 1, 1), poses, HEIGHT, WIDTH)
+
+
+def project(cameras, view, points):
+    """Pixels and depths."""
+    pose, lens = cameras.cam_to_world[view], cameras.intrinsics[view]
+    in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
+    pixels = in_camera @ lens.T
+    return pixels[:, :2] / pixels[:, 2:], in_camera[:, 2]
+
+
+def seen(cameras, first, second, points):
+    pixels, depths = zip(*(project(cameras, view, points) for view in (first, second)), strict=True)
+    frames = torch.tensor([[first, second]]).repeat(len(points), 1)
+    return Matches(frames, torch.stack(pixels, 1)), torch.stack(depths, 1)
+
+
+@pytest.fixture
+def points():
+    return torch.randn(30, 3).double() + torch.tensor([0, 0, 9])
+
+
+def test_true_matches_lie_on_their_lines(cameras, points):
+    matches, depths = seen(cameras, 3, 1, points)
+    assert epipolar_distances(cameras, matches).max() < 1e-9
+    found, angles = triangulate(cameras, matches)
+    torch.testing.assert_close(found, depths)
+    rays = points[:, None] - cameras.centers[[3, 1]]
+    cosine = torch.nn.functional.cosine_similarity(rays[:, 0], rays[:, 1], dim=-1)
+    torch.testing.assert_close(angles, torch.rad2deg(torch.arccos(cosine)))
+
+
+def test_the_distance_is_in_pixels(cameras, points):
+    matches, _ = seen(cameras, 0, 2, points)
+    lines = epipolar_lines(cameras, matches)
+    moved = matches.points.clone()
+    # Across the line in the second view, which leaves that line where it is.
+    moved[:, 1] += 3 * lines[:, 1, :2]
+    moved = replace(matches, points=moved)
+    second = epipolar_lines(cameras, moved)[:, 1]
+    distance = (second[:, :2] * moved.points[:, 1]).sum(-1) + second[:, 2]
+    torch.testing.assert_close(distance.abs(), torch.full_like(distance, 3))
+    first = epipolar_lines(cameras, moved)[:, 0]
+    other = ((first[:, :2] * moved.points[:, 0]).sum(-1) + first[:, 2]).abs()
+    torch.testing.assert_close(epipolar_distances(cameras, moved), (3 + other) / 2)
+
+
+def test_one_place_has_no_epipolar_lines(cameras, points):
+    poses = cameras.cam_to_world.clone()
+    poses[:, :3, 3] = 5
+    cameras = replace(cameras, cam_to_world=poses)
+    matches, _ = seen(cameras, 0, 1, points)
+    assert bool(epipolar_distances(cameras, matches).isinf().all())
+
+
+def test_points_behind_have_negative_depth(cameras, points):
+    matches, depths = seen(cameras, 0, 1, -points)
+    assert depths.max() < 0
+    torch.testing.assert_close(triangulate(cameras, matches)[0], depths)
+
+
+def test_a_path_is_measured():
+    poses = torch.eye(4).repeat(5, 1, 1)
+    poses[:, 0, 3] = torch.tensor([0.0, 1, 3, 3, 3])
+    turn = torch.deg2rad(torch.tensor([0.0, 0, 0.5, 30, 0.5]))
+    poses[:, 0, 0], poses[:, 2, 2] = turn.cos(), turn.cos()
+    poses[:, 0, 2], poses[:, 2, 0] = turn.sin(), -turn.sin()
+    path = measure_path(Cameras(torch.eye(3).repeat(5, 1, 1), poses, HEIGHT, WIDTH))
+    assert (path.length, path.extent, path.step, path.longest_step) == (3, 3, 0, 2)
+    assert path.turn == pytest.approx(0.5, rel=1e-4)
+    assert path.widest_turn == pytest.approx(29.5, rel=1e-4)
+    assert path.repeated == 1
+
+
+def test_points_are_counted_where_they_are_seen():
+    poses = torch.eye(4).repeat(3, 1, 1)
+    poses[2, 2, 3] = 5  # its camera stands behind the points
+    lens = torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
+    cameras = Cameras(lens.repeat(3, 1, 1), poses, HEIGHT, WIDTH)
+    points = torch.tensor([[0, 0, 4], [3.1, 0, 4], [3.3, 0, 4], [0, 0, 6]]).double()
+    seen = count_points(cameras, points)
+    assert (seen.count, seen.seen, seen.views) == (4, 0.75, 2)

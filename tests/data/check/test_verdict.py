@@ -1,0 +1,170 @@
+"""The real scenes, as they are and with cameras that are wrong in known ways."""
+
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+
+from asysplat.data.bad_frames import BadFrames
+from asysplat.data.check.matching import find_matches
+from asysplat.data.check.verdict import LIMIT, judge, measure_fit
+from asysplat.data.photographs import PhotographCapture
+from asysplat.data.readers import llff, long_lrm, posed, transforms
+
+LAYOUTS = {"fern": llff, "fox": transforms, "mydesk": long_lrm, "hololens-000": posed}
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+@pytest.fixture(scope="module", params=LAYOUTS)
+def real(request, shared):
+    """Cameras, matches and image names of a real scene."""
+    folder = shared / "data" / request.param
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent")
+    scene = LAYOUTS[request.param].read_scene(folder, BadFrames())
+    lens = scene.photographs[0].lens
+    capture = PhotographCapture(scene, lens.height, lens.width)
+    names = [str(photograph.image) for photograph in scene.photographs]
+    return capture.cameras.to(torch.float64), find_matches(capture), names
+
+
+def posed_by(change):
+    return lambda cameras: replace(cameras, cam_to_world=change(cameras.cam_to_world))
+
+
+def axes(*columns):
+    """Cameras whose axes are read in another order: each column is the (signed) 1, 2 or 3 of right,
+    down and forward."""
+    turn = torch.zeros(4, 4, dtype=torch.float64)
+    turn[3, 3] = 1
+    for place, column in enumerate(columns):
+        turn[abs(column) - 1, place] = 1 if column > 0 else -1
+    return posed_by(lambda poses: poses @ turn)
+
+
+def scaled(*factors):
+    return lambda cameras: replace(
+        cameras, intrinsics=cameras.intrinsics * torch.tensor([*factors, 1]).double()[:, None]
+    )
+
+
+def parts(rotation, position):
+    def change(poses):
+        poses = poses.clone()
+        inverse = torch.linalg.inv(poses)
+        poses[:, :3, :3], poses[:, :3, 3] = rotation(poses, inverse), position(poses, inverse)
+        return poses
+
+    return posed_by(change)
+
+
+# How cameras are broken, and what must be said of it.
+SEVERE = {
+    "OpenGL": (axes(1, -2, -3), "OpenGL axes were taken for OpenCV's"),
+    "world-to-camera": (
+        posed_by(torch.linalg.inv),
+        "world-to-camera matrices were taken for camera-to-world (",
+    ),
+    "world-to-camera of OpenGL": (
+        posed_by(lambda poses: FLIP @ torch.linalg.inv(poses)),
+        "world-to-camera matrices were taken for camera-to-world, and OpenGL",
+    ),
+    "double": (scaled(2, 2), "images 2 times the size"),
+    "half": (scaled(0.5, 0.5), "images 1/2 the size"),
+    "quarter": (scaled(0.25, 0.25), "images 1/4 the size"),
+    "LLFF": (axes(2, 1, -3), "LLFF axes were taken for OpenCV's"),
+    "y and z": (axes(1, 3, -2), "axes y and z are exchanged"),
+    "x and y": (axes(2, -1, 3), "axes x and y are exchanged"),
+}
+OTHERS = {
+    "transposed": (
+        parts(lambda pose, inverse: inverse[:, :3, :3], lambda pose, inverse: pose[:, :3, 3]),
+        "rotations are transposed",
+    ),
+    "translations": (
+        parts(lambda pose, inverse: pose[:, :3, :3], lambda pose, inverse: inverse[:, :3, 3]),
+        "translations of world-to-camera were taken for positions",
+    ),
+    "negated": (
+        parts(lambda pose, inverse: pose[:, :3, :3], lambda pose, inverse: -pose[:, :3, 3]),
+        "positions are negated",
+    ),
+    "a frame late": (
+        posed_by(lambda poses: poses.roll(1, 0)),
+        "every pose belongs to the image 1 frame earlier",
+    ),
+    "backwards": (posed_by(lambda poses: poses.flip(0)), "the poses run backwards"),
+    "y and z of the world too": (
+        posed_by(lambda poses: (m := torch.eye(4).double()[[0, 2, 1, 3]]) @ poses @ m),
+        "axes y and z are exchanged",
+    ),
+}
+
+
+def test_cameras_as_published_fit(real):
+    verdict = judge(*real)
+    assert verdict.fits and verdict.sentence == "the cameras fit the images"
+    assert verdict.read.error < 0.6 < LIMIT
+    assert verdict.read.under_1px > 0.8 and verdict.read.behind < 0.01
+    assert len(real[1].pairs) >= 8
+
+
+@pytest.mark.parametrize("how", SEVERE)
+def test_a_mistake_that_shows_by_many_pixels_is_named(real, how):
+    cameras, matches, names = real
+    broken, name = SEVERE[how]
+    verdict = judge(broken(cameras), matches, names)
+    assert not verdict.fits and verdict.read.error > 5
+    assert name in verdict.sentence
+    assert verdict.undone.error < LIMIT
+
+
+@pytest.mark.parametrize("how", OTHERS)
+def test_other_mistakes_are_named(real, how):
+    cameras, matches, names = real
+    broken, name = OTHERS[how]
+    verdict = judge(broken(cameras), matches, names)
+    assert not verdict.fits and name in verdict.sentence
+
+
+def test_any_other_resolution_is_fitted(real):
+    cameras, matches, names = real
+    verdict = judge(scaled(1.4, 1.4)(cameras), matches, names)
+    factor = re.search(r"those of images (.+) times the size", verdict.sentence)[1]
+    assert not verdict.fits and float(factor) == pytest.approx(1.4, rel=0.01)
+
+
+def test_the_world_s_axes_and_scale_are_no_mistake(real):
+    cameras, matches, _ = real
+    world = torch.linalg.matrix_exp(torch.tensor([[0, -1.0, 2], [1, 0, 0.5], [-2, -0.5, 0]]))
+    moved = cameras.cam_to_world.clone()
+    moved[:, :3] = world.double() @ moved[:, :3]
+    moved[:, :3, 3] = 7 * moved[:, :3, 3] + 3
+    moved = replace(cameras, cam_to_world=moved)
+    assert measure_fit(moved, matches).error == pytest.approx(
+        measure_fit(cameras, matches).error, rel=1e-3
+    )
+
+
+def test_poses_in_no_order_are_explained_by_nothing(real):
+    cameras, matches, names = real
+    order = torch.randperm(cameras.num_views)
+    shuffled = replace(cameras, cam_to_world=cameras.cam_to_world[order])
+    verdict = judge(shuffled, matches, names)
+    assert not verdict.fits and "no usual mistake explains it" in verdict.sentence
+
+
+def test_poses_sorted_as_strings_are_named(real):
+    cameras, matches, names = real
+    # As if the files had no leading zeros.
+    names = [f"images/{frame}.jpg" for frame in range(len(names))]
+    order = torch.tensor(sorted(range(len(names)), key=lambda frame: names[frame]))
+    verdict = judge(replace(cameras, cam_to_world=cameras.cam_to_world[order]), matches, names)
+    assert "sorted by their numbers, the poses as strings" in verdict.sentence
+
+
+def test_too_few_matches_tell_nothing(real):
+    cameras, matches, names = real
+    verdict = judge(cameras, matches.select(slice(0, 50)), names)
+    assert not verdict.fits and "only 50 points" in verdict.sentence

@@ -1,0 +1,288 @@
+import shutil
+import warnings
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from layouts import colmap as layout
+from layouts import save_image
+
+from asysplat.data import open_scene
+from asysplat.data.bad_frames import BadFrames
+from asysplat.data.images import Lens
+from asysplat.data.readers import colmap
+from asysplat.errors import InputError
+
+HEIGHT, WIDTH = 24, 32
+
+
+@pytest.fixture
+def scene(views, tmp_path):
+    """A folder with the text model of COLMAP until 3.11."""
+    return layout.write(views, tmp_path / "scene")
+
+
+def read(folder):
+    bad = BadFrames()
+    found = colmap.read_scene(folder, bad)
+    bad.settle(str(folder), len(found.photographs))
+    return found
+
+
+def cameras_of(found):
+    return np.array([photograph.cam_to_world for photograph in found.photographs])
+
+
+def names_of(found):
+    return [photograph.image.name for photograph in found.photographs]
+
+
+def edit(file, change):
+    file.write_text(change(file.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+def with_camera(folder, line):
+    """Gives every image the camera `line`: model, width, height and parameters."""
+    (folder / "sparse/0/cameras.txt").write_text(
+        "".join(f"{index + 1} {line}\n" for index in range(12))
+    )
+    return folder
+
+
+def as_binary(folder, old=False):
+    """The same model as COLMAP writes it today, or as it did until 3.11."""
+    model = folder / "sparse/0"
+    pycolmap.Reconstruction(model).write_binary(model)
+    for file in model.glob("*.txt"):
+        file.unlink()
+    if old:
+        (model / "rigs.bin").unlink()
+        (model / "frames.bin").unlink()
+    return folder
+
+
+def test_points_are_the_model_s(scene, views):
+    np.testing.assert_allclose(read(scene).points, layout.points_of(views), atol=1e-9)
+
+
+def test_frames_follow_their_numbers(scene):
+    assert names_of(read(scene)) == [f"{index}.png" for index in range(12)]
+
+
+@pytest.mark.parametrize("old", [True, False])
+def test_text_and_binary_are_the_same(scene, old):
+    text, binary = read(scene), read(as_binary(scene, old))
+    assert names_of(text) == names_of(binary)
+    assert [p.lens for p in text.photographs] == [p.lens for p in binary.photographs]
+    np.testing.assert_allclose(cameras_of(text), cameras_of(binary), atol=1e-12)
+    np.testing.assert_allclose(text.points, binary.points, atol=1e-12)
+
+
+@pytest.mark.parametrize("place", ["sparse", "colmap/sparse/0", "."])
+def test_the_model_may_lie_elsewhere(scene, place):
+    shutil.copytree(scene / "sparse/0", scene / "model")
+    shutil.rmtree(scene / "sparse")
+    (scene / place).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copytree(scene / "model", scene / place, dirs_exist_ok=True)
+    shutil.rmtree(scene / "model")
+    assert colmap.find_scenes(scene.parent) == [scene]
+    assert len(read(scene).photographs) == 12
+
+
+NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
+LENSES = {
+    "SIMPLE_PINHOLE 32 24 30 15 11": (30.0, 30.0, NONE),
+    "PINHOLE 32 24 30 31 15 11": (30.0, 31.0, NONE),
+    "SIMPLE_RADIAL 32 24 30 15 11 0.1": (30.0, 30.0, (0.1, 0.0, 0.0, 0.0, 0.0)),
+    "RADIAL 32 24 30 15 11 0.1 -0.02": (30.0, 30.0, (0.1, -0.02, 0.0, 0.0, 0.0)),
+    "OPENCV 32 24 30 31 15 11 0.1 -0.02 0.003 0.004": (30.0, 31.0, (0.1, -0.02, 0.003, 0.004, 0.0)),
+    "OPENCV_FISHEYE 32 24 30 31 15 11 0.1 -0.02 0.03 0.04": (30.0, 31.0, (0.1, -0.02, 0.03, 0.04)),
+}
+
+
+@pytest.mark.parametrize("line", LENSES, ids=lambda line: line.split()[0])
+def test_camera_models(scene, line):
+    fx, fy, distortion = LENSES[line]
+    found = read(with_camera(scene, line)).photographs[0].lens
+    assert found == Lens(32, 24, fx, fy, 15.0, 11.0, distortion, line.startswith("OPENCV_FISHEYE"))
+    # The same pixels as COLMAP itself would find.
+    in_camera = np.random.default_rng(0).uniform((-0.5, -0.4, 1), (0.5, 0.4, 1), (20, 3))
+    camera = pycolmap.Reconstruction(scene / "sparse/0").cameras[1]
+    matrix = np.array([[found.fx, 0, found.cx], [0, found.fy, found.cy], [0, 0, 1.0]])
+    still, project = np.zeros(3), cv2.fisheye if found.fisheye else cv2
+    pixels, _ = project.projectPoints(
+        in_camera[:, None], still, still, matrix, np.array(found.distortion)
+    )
+    np.testing.assert_allclose(pixels[:, 0], camera.img_from_cam(in_camera), atol=1e-9)
+    open_scene(scene, HEIGHT, WIDTH, layout="colmap").views([0]).validate()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "FULL_OPENCV 32 24 30 31 15 11 0.1 0 0 0 0 0 0 0",
+        "FOV 32 24 30 31 15 11 0.5",
+        "SIMPLE_RADIAL_FISHEYE 32 24 30 15 11 0.1",
+        "THIN_PRISM_FISHEYE 32 24 30 31 15 11 0.1 0 0 0 0 0 0 0",
+    ],
+)
+def test_other_camera_models_are_refused_by_name(scene, line):
+    with pytest.raises(InputError, match=f"model {line.split()[0]}: undistort with colmap image_"):
+        read(with_camera(scene, line))
+
+
+def test_every_image_has_its_own_camera(scene, views):
+    edit(
+        scene / "sparse/0/cameras.txt",
+        lambda text: text.replace("\n3 PINHOLE", "\n3 SIMPLE_PINHOLE 32 24 50 16 12 #"),
+    )
+    focals = [photograph.lens.fx for photograph in read(scene).photographs]
+    assert focals[2] == 50 and focals[1] == pytest.approx(views.cameras.intrinsics[1, 0, 0].item())
+
+
+def test_intrinsics_are_scaled_to_smaller_images(scene):
+    (scene / "images").rename(scene / "images_4")
+    with_camera(scene, "OPENCV 130 97 120 124 60 44 0.1 0 0 0")
+    lens = read(scene).photographs[0].lens
+    x, y = 32 / 130, 24 / 97
+    assert lens == Lens(32, 24, 120 * x, 124 * y, 60 * x, 44 * y, (0.1, 0.0, 0.0, 0.0, 0.0))
+
+
+def test_the_full_size_wins(scene, views):
+    shutil.copytree(scene / "images", scene / "images_2")
+    assert read(scene).photographs[0].image == scene / "images/0.png"
+    for name in ("0.png", "1.png"):
+        (scene / "images" / name).unlink()
+    assert read(scene).photographs[0].image == scene / "images_2/0.png"
+
+
+def test_images_of_other_proportions_are_bad_frames(scene):
+    with_camera(scene, "PINHOLE 64 40 60 60 32 20")
+    with pytest.raises(InputError, match=r"12 of 12 .*\n.*0\.png is 32 x 24 and .* for 64 x 40"):
+        read(scene)
+
+
+def test_names_may_have_folders_and_any_letters(scene, views):
+    (scene / "images/左cam").mkdir()
+    (scene / "images/3.png").rename(scene / "images/左cam/ä3.png")
+    edit(scene / "sparse/0/images.txt", lambda text: text.replace("3.png", "左cam/ä3.png", 1))
+    found = read(scene)
+    expected = views.cameras.cam_to_world[3].double().numpy()
+    (photograph,) = (p for p in found.photographs if p.image.name == "ä3.png")
+    np.testing.assert_allclose(photograph.cam_to_world, expected, atol=1e-6)
+    binary = read(as_binary(scene))
+    assert names_of(binary) == names_of(found)
+
+
+def test_images_that_are_not_registered_are_told(scene, views):
+    for index in range(50, 57):
+        save_image(scene / f"images/{index}.png", views.images[0])
+    with pytest.warns(UserWarning) as caught:
+        found = read(scene)
+    message = str(caught.list[0].message)
+    assert len(caught) == 1 and "not registered 7 of 19" in message
+    assert message.endswith("50.png, 51.png, 52.png, 53.png, 54.png, ...")
+    assert len(found.photographs) == 12
+
+
+def test_bad_images_are_listed_together_or_skipped(scene):
+    (scene / "images/4.png").unlink()
+    cut = scene / "images/7.png"
+    cut.write_bytes(cut.read_bytes()[:200])
+    edit(scene / "sparse/0/images.txt", lambda text: text.replace(" 10.png", " gone/10.png"))
+    (scene / "images/10.png").unlink()
+    with pytest.raises(InputError) as error:
+        open_scene(scene, HEIGHT, WIDTH, layout="colmap")
+    message = str(error.value)
+    assert "3 of 12" in message and "4.png does not exist" in message
+    assert "7.png cannot be read" in message and "gone/10.png does not exist" in message
+    with pytest.warns(UserWarning, match="left out 3 of 12"):
+        capture = open_scene(scene, HEIGHT, WIDTH, layout="colmap", on_bad_frame="skip")
+    assert capture.num_frames == 9
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("part", [0.35, 0.7, 0.95])
+def test_a_model_cut_short_is_refused(scene, binary, name, part):
+    if binary:
+        as_binary(scene, old=True)
+    file = scene / "sparse/0" / f"{name}.{'bin' if binary else 'txt'}"
+    stored = file.read_bytes()
+    file.write_bytes(stored[: int(part * len(stored))])
+    with pytest.raises(InputError, match=r"sparse/0.*copy (it|its .* files) again"):
+        read(scene)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("content", [b"", b"\xff" * 500, b"not a model\n" * 40])
+def test_damaged_files_are_refused(scene, name, content):
+    (as_binary(scene) / f"sparse/0/{name}.bin").write_bytes(content)
+    with pytest.raises(InputError, match=r"sparse/0"):
+        read(scene)
+
+
+def test_a_missing_file_is_refused(scene):
+    (scene / "sparse/0/points3D.txt").unlink()
+    with pytest.raises(InputError, match=r"not a whole COLMAP model.*points3D"):
+        read(scene)
+
+
+def test_a_pose_of_nan_is_a_bad_frame(scene):
+    file = as_binary(scene, old=True) / "sparse/0/images.bin"
+    stored = bytearray(file.read_bytes())
+    stored[8 + 36 : 8 + 44] = np.array(np.nan).tobytes()  # the first image's translation
+    file.write_bytes(stored)
+    with pytest.raises(InputError, match=r"1 of 12 .*\n.*pose of 0\.png holds NaN"):
+        read(scene)
+
+
+def test_a_model_without_its_images_is_refused(scene):
+    with pytest.raises(InputError, match=r"names 12 images, such as 0\.png, and .* none"):
+        read(scene / "sparse/0")
+    shutil.rmtree(scene / "images")
+    with pytest.raises(InputError, match=r"give the folder that holds the model and one of images"):
+        read(scene)
+
+
+def test_a_model_of_no_image_is_refused(scene):
+    (scene / "sparse/0/images.txt").write_text("")
+    (scene / "sparse/0/points3D.txt").write_text("")
+    with pytest.raises(InputError, match="registers no image"):
+        read(scene)
+
+
+def test_a_model_without_points_has_none(scene):
+    (scene / "sparse/0/points3D.txt").write_text("")
+    found = read(scene)
+    assert found.points is None and len(found.photographs) == 12
+
+
+def test_points_beside_photographs_of_the_same_world(scene, views):
+    photographs = read(scene).photographs
+    points = colmap.points_beside(scene, photographs[3:8])
+    np.testing.assert_allclose(points, layout.points_of(views), atol=1e-9)
+    assert colmap.points_beside(scene / "images", photographs) is None
+
+
+@pytest.mark.parametrize("change", ["moved", "scaled", "turned", "other images"])
+def test_points_of_another_world_are_not_taken(scene, change):
+    found = read(scene)
+    transform = np.eye(4)
+    if change == "turned":
+        transform[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    if change == "moved":
+        transform[0, 3] = 0.05
+    poses = transform @ cameras_of(found)
+    if change == "scaled":
+        poses[:, :3, 3] *= 1.05
+    photographs = [
+        type(photograph)(photograph.image, photograph.lens, pose)
+        for photograph, pose in zip(found.photographs, poses, strict=True)
+    ]
+    if change == "other images":
+        edit(scene / "sparse/0/images.txt", lambda text: text.replace(".png", ".jpg"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert colmap.points_beside(scene, photographs) is None

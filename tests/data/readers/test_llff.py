@@ -1,0 +1,117 @@
+import shutil
+
+import numpy as np
+import pytest
+from layouts import colmap as colmap_layout
+from layouts import llff as layout
+
+from asysplat.data import open_scene
+from asysplat.errors import InputError
+
+HEIGHT, WIDTH = 24, 32
+
+
+@pytest.fixture
+def scene(centred_views, tmp_path):
+    return layout.write(centred_views, tmp_path)
+
+
+def open_llff(scene, **options):
+    return open_scene(scene, HEIGHT, WIDTH, layout="llff", **options)
+
+
+def change(scene, edit):
+    rows = np.load(scene / "poses_bounds.npy")
+    np.save(scene / "poses_bounds.npy", edit(rows))
+    return scene
+
+
+def set_at(row, column, value):
+    def edit(rows):
+        rows[row, column] = value
+        return rows
+
+    return edit
+
+
+def test_the_largest_folder_that_is_whole_counts(scene):
+    shutil.copytree(scene / "images_8", scene / "images")
+    shutil.copytree(scene / "images_8", scene / "images_4")
+    (scene / "images/.DS_Store").write_text("")
+    assert open_llff(scene).scene.photographs[0].image.parent.name == "images"
+    (scene / "images/image003.png").unlink()
+    assert open_llff(scene).scene.photographs[0].image.parent.name == "images_4"
+
+
+def test_images_and_rows_that_differ_in_number_are_refused(scene):
+    (scene / "images_8/image003.png").unlink()
+    with pytest.raises(InputError, match=r"npy has 12 rows, but .* 11 in images_8/"):
+        open_llff(scene)
+    shutil.rmtree(scene / "images_8")
+    with pytest.raises(InputError, match="of images there are none"):
+        open_llff(scene)
+
+
+def test_all_bad_frames_are_listed_or_skipped(scene):
+    cut = scene / "images_8/image001.png"
+    cut.write_bytes(cut.read_bytes()[:200])
+    change(scene, set_at(3, 3, np.nan))
+    change(scene, set_at(5, 14, 0.0))  # focal length
+    change(scene, set_at(6, 9, 100.0))  # width
+    with pytest.raises(InputError) as error:
+        open_llff(scene)
+    summary, *sentences = str(error.value).splitlines()
+    assert "4 of 12 frames" in summary
+    expected = [
+        "image001.png cannot be read",
+        "row 3 (image003.png) holds NaN",
+        "row 5 (image005.png) has height, width, focal length 192, 256, 0:",
+        "row 6 (image006.png) is 32 x 24 and its intrinsics are for 100 x 192",
+    ]
+    for sentence, part in zip(sentences, expected, strict=True):
+        assert part in sentence
+    with pytest.warns(UserWarning, match="left out 4 of 12"):
+        assert open_llff(scene, on_bad_frame="skip").num_frames == 8
+
+
+ARRAYS = {
+    "3x5 alone": (lambda rows: rows[:, :15], r"holds \(12, 15\): expected a row of 17"),
+    "flat": (lambda rows: rows[0], r"holds \(17,\): expected a row of 17"),
+    "complex": (lambda rows: rows * 1j, "of type complex128"),
+    "text": (lambda rows: rows.astype(str), "of type <U"),
+    "pickled": (lambda rows: rows.astype(object), "cannot be read as a NumPy array"),
+}
+
+
+@pytest.mark.parametrize("edit, message", ARRAYS.values(), ids=ARRAYS.keys())
+def test_another_array_is_refused(scene, edit, message):
+    with pytest.raises(InputError, match=rf"poses_bounds\.npy .*{message}"):
+        open_llff(change(scene, edit))
+
+
+@pytest.mark.parametrize("size", [0, 5, 60, 500])
+def test_a_cut_file_is_refused(scene, size):
+    file = scene / "poses_bounds.npy"
+    file.write_bytes(file.read_bytes()[:size])
+    with pytest.raises(InputError, match=r"poses_bounds\.npy cannot be read"):
+        open_llff(scene)
+
+
+def test_an_archive_of_arrays_is_refused(scene):
+    with (scene / "poses_bounds.npy").open("wb") as file:
+        np.savez(file, poses=np.zeros((12, 17)))
+    with pytest.raises(InputError, match="holds no array"):
+        open_llff(scene)
+
+
+def test_points_of_a_model_beside_are_taken(scene, centred_views, tmp_path):
+    model = colmap_layout.write(centred_views, tmp_path / "model")
+    for index in range(12):
+        (scene / f"images_8/image{index:03d}.png").rename(scene / f"images_8/{index:02d}.png")
+    text = model / "sparse/0/images.txt"
+    text.write_text(text.read_text().replace(" 0.png", " 00.png"))
+    assert open_llff(scene).scene.points is None
+    shutil.copytree(model / "sparse", scene / "sparse")
+    np.testing.assert_allclose(
+        open_llff(scene).scene.points, colmap_layout.points_of(centred_views), atol=1e-9
+    )

@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+from layouts import posed as layout
+from PIL import Image
+
+from asysplat.data import open_scene
+from asysplat.errors import InputError
+
+HEIGHT, WIDTH = 24, 32
+
+
+@pytest.fixture
+def scene(views, tmp_path):
+    return layout.write(views, tmp_path)
+
+
+def open_posed(scene, **options):
+    return open_scene(scene, HEIGHT, WIDTH, layout="posed", **options)
+
+
+def test_refined_poses_are_preferred(scene):
+    poses = np.loadtxt(scene / "poses.txt")
+    poses[:, 3] += 1
+    np.savetxt(scene / "poses_refined.txt", poses)
+    centers = open_posed(scene).cameras.centers
+    np.testing.assert_allclose(centers[:, 0], poses[:, 3], atol=1e-6)
+
+
+def test_depth_may_be_smaller_or_absent(scene, views):
+    for file in (scene / "depth").iterdir():
+        small = np.asarray(Image.open(file))[::2, ::2]
+        Image.fromarray(np.ascontiguousarray(small)).save(file)
+    depths = open_posed(scene).views([1]).depths
+    expected = views.depths[1, ::2, ::2].repeat_interleave(2, 0).repeat_interleave(2, 1)
+    np.testing.assert_allclose(depths[0], expected, atol=1e-5)
+    (scene / "depth").rename(scene / "sensor")
+    assert open_posed(scene).views([1]).depths is None
+
+
+def test_all_bad_frames_are_listed_or_skipped(scene):
+    cut = scene / "images/00001.png"
+    cut.write_bytes(cut.read_bytes()[:200])
+    (scene / "depth/00002.png").unlink()
+    Image.new("I;16", (24, 24)).save(scene / "depth/00003.png")
+    poses = np.loadtxt(scene / "poses.txt")
+    poses[4, 0] = np.nan
+    poses[5] *= 2
+    np.savetxt(scene / "poses.txt", poses)
+    with pytest.raises(InputError) as error:
+        open_posed(scene)
+    summary, *sentences = str(error.value).splitlines()
+    assert "5 of 12 frames" in summary
+    expected = [
+        "00001.png cannot be read",
+        "depth/00002.png does not exist",
+        "depth/00003.png is 24 x 24 and the image 32 x 24",
+        "pose 4 (00004.png) holds NaN",
+        "pose 5 (00005.png) has last row",
+    ]
+    for sentence, part in zip(sentences, expected, strict=True):
+        assert part in sentence
+    with pytest.warns(UserWarning, match="left out 5 of 12"):
+        assert open_posed(scene, on_bad_frame="skip").num_frames == 7
+
+
+def test_poses_and_images_that_differ_in_number_are_refused(scene):
+    (scene / "images/00003.png").unlink()
+    with pytest.raises(InputError, match=r"poses\.txt has 12 poses and .*images 11 images"):
+        open_posed(scene)
+
+
+TEXTS = {
+    "cut": ("poses.txt", lambda text: text[:-200], r"poses\.txt, row 11 holds \d+ numbers"),
+    "words": ("poses.txt", lambda text: text.replace("e", "x", 1), "cannot be read as numbers"),
+    "bytes": ("poses.txt", lambda text: text + "\0", "cannot be read as numbers"),
+    "nothing": ("poses.txt", lambda text: "", "has 0 poses"),
+    "two rows": ("K.txt", lambda text: text[: len(text) * 2 // 3], r"K\.txt holds \[\["),
+    "transposed": ("K.txt", lambda text: text.replace("0.0000", "1.0000", 1), r"K\.txt holds \[\["),
+    "four columns": ("K.txt", lambda text: text.replace("\n", " 0\n"), r"K\.txt, row 0 holds 4"),
+    "negative": ("K.txt", lambda text: "-" + text, "has intrinsics -"),
+    "nan": ("K.txt", lambda text: f"nan {text.split(' ', 1)[1]}", "has intrinsics nan"),
+}
+
+
+@pytest.mark.parametrize("name, edit, message", TEXTS.values(), ids=TEXTS.keys())
+def test_text_that_cannot_be_used_is_refused(scene, name, edit, message):
+    (scene / name).write_text(edit((scene / name).read_text()))
+    with pytest.raises(InputError, match=message):
+        open_posed(scene)
+
+
+def test_a_missing_file_of_poses_is_refused(scene):
+    (scene / "poses.txt").unlink()
+    with pytest.raises(InputError, match=r"poses\.txt cannot be read"):
+        open_posed(scene)

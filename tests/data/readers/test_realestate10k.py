@@ -1,0 +1,207 @@
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from layouts.realestate10k import KEY, cameras, encoded, scene, write
+
+from asysplat.data import open_scene
+from asysplat.data.readers import realestate10k
+from asysplat.errors import InputError
+
+MAPS = Path("/proc/self/maps")
+
+
+@pytest.fixture
+def few(views):
+    return views.select(range(4))
+
+
+@pytest.fixture
+def chunk(few, tmp_path):
+    """Writes a chunk of one scene after `change(scene)`; gives its path."""
+
+    def save(change=lambda scene: None):
+        content = scene(few)
+        change(content)
+        file = tmp_path / "höfe/000000.torch"
+        file.parent.mkdir()
+        torch.save([content], file)
+        return file
+
+    return save
+
+
+def opened(path, height=24, width=32, **options):
+    return open_scene(path, height, width, layout="realestate10k", **options)
+
+
+def test_scenes_are_found_by_the_index_by_chunk_and_by_address(few, tmp_path):
+    root = write(few, tmp_path)
+    address = tmp_path / "test/000000.torch" / KEY
+    for named in (root, root / "test", root / "test/000000.torch", address):
+        assert realestate10k.find_scenes(named) == [address]
+    assert opened(address).name == KEY
+
+
+def test_chunks_without_an_index_are_opened(few, tmp_path):
+    torch.save([scene(few, "b"), scene(few, "a")], tmp_path / "000001.torch")
+    torch.save([scene(few, "c")], tmp_path / "000000.torch")
+    found = realestate10k.find_scenes(tmp_path)
+    assert [(path.parent.name, path.name) for path in found] == [
+        ("000000.torch", "c"),
+        ("000001.torch", "b"),
+        ("000001.torch", "a"),
+    ]
+
+
+def test_other_folders_hold_no_scene(tmp_path):
+    (tmp_path / "images").mkdir()
+    assert realestate10k.find_scenes(tmp_path) == []
+
+
+def test_an_index_that_names_an_absent_chunk_is_refused(few, tmp_path):
+    root = write(few, tmp_path)
+    index = root / "test/index.json"
+    index.write_text(json.dumps({KEY: "000000.torch", "other": "000001.torch"}))
+    with pytest.raises(InputError, match=r"index.json: scene other is in '000001.torch'"):
+        realestate10k.find_scenes(root)
+
+
+def test_intrinsics_hold_for_any_size_of_image(few, chunk):
+    def half(content):
+        content["images"] = [encoded(image[:, ::2, ::2]) for image in few.images]
+
+    intrinsics = opened(chunk(half) / KEY).cameras.intrinsics
+    torch.testing.assert_close(intrinsics, few.cameras.intrinsics, rtol=0, atol=1e-5)
+
+
+def test_the_form_before_zips_is_read(few, tmp_path):
+    file = tmp_path / "000000.torch"
+    torch.save([scene(few)], file, _use_new_zipfile_serialization=False)
+    read = opened(file / KEY).views(range(4))
+    torch.testing.assert_close(read.images, few.images, rtol=0, atol=1e-5)
+
+
+def test_a_chunk_that_was_written_anew_is_read_anew(few, chunk):
+    file = chunk()
+    assert opened(file / KEY).num_frames == 4
+    torch.save([scene(few.select([0, 1]))], file)
+    assert opened(file / KEY).num_frames == 2
+
+
+def set_camera(index, column, value):
+    def change(content):
+        content["cameras"][index, column] = value
+
+    return change
+
+
+def set_image(index, value):
+    def change(content):
+        content["images"][index] = value
+
+    return change
+
+
+def cut(content):
+    content["images"][2] = content["images"][2][:300].clone()
+
+
+FRAMES = {
+    "nan": (set_camera(2, 9, float("nan")), "frame 2: its world-to-camera holds NaN"),
+    "no rotation": (set_camera(2, 6, 2.0), "frame 2: its world-to-camera is not a rotation"),
+    "focal length": (set_camera(2, 0, 0.0), "frame 2: its intrinsics are"),
+    "infinite": (set_camera(2, 3, float("inf")), "frame 2: its intrinsics are"),
+    "distortion": (set_camera(2, 4, 0.1), "frame 2: numbers 5 and 6"),
+    "cut short": (cut, "frame 2 cannot be read as an image"),
+    "empty": (set_image(2, torch.zeros(0, dtype=torch.uint8)), "frame 2 cannot be read"),
+    "no bytes": (set_image(2, torch.zeros(4)), r"frame 2: its image is no uint8 tensor"),
+    "no tensor": (set_image(2, "frame.jpg"), r"frame 2: its image is no uint8 tensor"),
+}
+
+
+@pytest.mark.parametrize("change, message", FRAMES.values(), ids=FRAMES.keys())
+def test_a_bad_frame_is_named_or_left_out(chunk, change, message):
+    address = chunk(change) / KEY
+    with pytest.raises(InputError, match=f"1 of 4 frames cannot be used(.|\n)*{message}"):
+        opened(address)
+    with pytest.warns(UserWarning, match=f"left out 1 of 4 frames(.|\n)*{message}"):
+        assert opened(address, on_bad_frame="skip").num_frames == 3
+
+
+SCENES = {
+    "17 numbers": (
+        lambda content: content.update(cameras=content["cameras"][:, :17]),
+        r"cameras is \(4, 17\): give a tensor \[V, 18\]",
+    ),
+    "no cameras": (lambda content: content.pop("cameras"), "cameras is NoneType"),
+    "fewer images": (lambda content: content["images"].pop(), "has 4 cameras and images is 3"),
+    "images": (lambda content: content.update(images=None), "images is NoneType"),
+    "no key": (lambda content: content.pop("key"), "000000.torch is no list of scenes"),
+    "another key": (lambda content: content.update(key="a"), f"has no scene {KEY}"),
+}
+
+
+@pytest.mark.parametrize("change, message", SCENES.values(), ids=SCENES.keys())
+def test_a_broken_scene_is_refused(chunk, change, message):
+    with pytest.raises(InputError, match=message):
+        opened(chunk(change) / KEY, on_bad_frame="skip")
+
+
+@pytest.mark.parametrize("left", [0, 10, 5000, -100])
+def test_a_chunk_that_is_cut_short_is_named(chunk, left):
+    file = chunk()
+    file.write_bytes(file.read_bytes()[:left])
+    with pytest.raises(InputError, match=r"000000.torch cannot be read as tensors alone"):
+        opened(file / KEY)
+
+
+def test_an_absent_chunk_and_an_address_without_one_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"000000.torch does not exist"):
+        opened(tmp_path / "000000.torch" / KEY)
+    with pytest.raises(InputError, match="is no scene in a chunk"):
+        opened(tmp_path)
+
+
+class Code:
+    """Pickled, it asks whoever loads it to make a folder."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.folder),)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_code_in_a_chunk_is_not_run(few, tmp_path, zipped):
+    file, made = tmp_path / "000000.torch", tmp_path / "made"
+    content = {**scene(few), "url": Code(made)}
+    torch.save([content], file, _use_new_zipfile_serialization=zipped)
+    with pytest.raises(InputError, match=r"000000.torch cannot be read as tensors alone"):
+        opened(file / KEY)
+    assert not made.exists()
+    torch.load(file, weights_only=False)
+    assert made.exists()  # so it would have run
+
+
+@pytest.mark.skipif(not MAPS.exists(), reason="needs Linux's list of mapped files")
+def test_bytes_stay_in_the_file(few, chunk):
+    file = chunk()
+    image = opened(file / KEY).scene.photographs[1].image
+    assert bytes(image.data) == bytes(encoded(few.images[1]).numpy())
+    mapped = [line.split()[0].split("-") for line in MAPS.open() if str(file) in line]
+    address = image.data.ctypes.data
+    assert any(int(start, 16) <= address < int(end, 16) for start, end in mapped)
+
+
+def test_cameras_are_pixelsplat_s(few):
+    """The writer above against the columns as pixelSplat documents them."""
+    row = cameras(few)[1]
+    matrix = few.cameras.intrinsics[1]
+    assert row[0] == matrix[0, 0] / 32 and row[3] == matrix[1, 2] / 24
+    world_to_cam = row[6:].reshape(3, 4)
+    center = few.cameras.cam_to_world[1, :3, 3]
+    assert (world_to_cam[:, :3] @ center + world_to_cam[:, 3]).abs().max() < 1e-5

@@ -1,0 +1,101 @@
+"""Crops move content and cameras together; orders hold the same frames."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from asysplat.data.augment import Augmentation, cropped
+from asysplat.errors import InputError
+from asysplat.scene import Cameras, Views
+
+HEIGHT, WIDTH = 45, 80
+
+
+def make_views(count=3) -> Views:
+    """Images whose red and green are the pixel's own position, depths and masks of noise."""
+    intrinsics = torch.tensor([[70.0, 0, 43], [0, 66, 20], [0, 0, 1]], dtype=torch.float64)
+    intrinsics = intrinsics.repeat(count, 1, 1)
+    intrinsics[:, 0, 2] += torch.arange(count)
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    image = torch.stack((x / WIDTH, y / HEIGHT, 0 * x)).double()
+    poses = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    return Views(
+        cameras=Cameras(intrinsics, poses, HEIGHT, WIDTH),
+        images=image.repeat(count, 1, 1, 1),
+        depths=torch.rand(count, HEIGHT, WIDTH, dtype=torch.float64) + 1,
+        masks=torch.rand(count, HEIGHT, WIDTH) > 0.3,
+    )
+
+
+@pytest.mark.parametrize("share", [0.77, 0.8, 0.93, 0.995])
+def test_the_same_point_meets_the_same_content(share):
+    """The direction through each pixel of the crop is that of the position it shows."""
+    views = make_views()
+    crop = cropped(views, share)
+    assert crop.images.shape == views.images.shape
+    old = views.cameras.intrinsics[:, None, None]
+    x, y = crop.images[:, 0] * WIDTH, crop.images[:, 1] * HEIGHT
+    seen = torch.stack(
+        ((x - old[..., 0, 2]) / old[..., 0, 0], (y - old[..., 1, 2]) / old[..., 1, 1]), -1
+    )
+    directions = crop.cameras.pixel_directions()[..., :2]
+    # The outermost pixels repeat what lies at the edge of the cut.
+    assert (seen - directions)[:, 1:-1, 1:-1].abs().max() < 1e-6
+    assert (seen - directions).abs().max() < 0.5 / 66
+
+
+@pytest.mark.parametrize("share", [0.6, 0.77])  # no centre on a border between pixels
+def test_depths_and_masks_are_those_under_each_pixel(share):
+    views = make_views()
+    crop = cropped(views, share)
+    x = (crop.images[0, 0, 20] * WIDTH).floor().long()
+    y = (crop.images[0, 1, :, 40] * HEIGHT).floor().long()
+    inner = (slice(None), slice(1, -1), slice(1, -1))
+    for maps, found in ((views.depths, crop.depths), (views.masks, crop.masks)):
+        assert torch.equal(found[inner], maps[:, y[:, None], x][inner])
+    bare = cropped(replace(views, depths=None, masks=None), share)
+    assert bare.depths is None and bare.masks is None
+    assert torch.equal(bare.images, crop.images)
+
+
+def test_a_crop_keeps_the_middle_and_the_poses():
+    views = make_views()
+    crop = cropped(views, 0.6)
+    middle = (slice(None), slice(None), HEIGHT // 2, slice(WIDTH // 2 - 1, WIDTH // 2 + 1))
+    torch.testing.assert_close(crop.images[middle].mean(-1), views.images[middle].mean(-1))
+    assert torch.equal(crop.cameras.cam_to_world, views.cameras.cam_to_world)
+    focal = crop.cameras.intrinsics[:, 0, 0] / views.cameras.intrinsics[:, 0, 0]
+    torch.testing.assert_close(focal, torch.full_like(focal, 1 / 0.6))
+    assert cropped(views, 1.0) is views
+
+
+def test_orders_are_backwards_and_shuffled_as_often_as_asked():
+    inputs = [3, 5, 8, 13, 21, 34]
+    rng = np.random.default_rng(0)
+    both = Augmentation(reverse=0.5, shuffle=0.5)
+    orders = [both.order(inputs, rng) for _ in range(400)]
+    assert all(sorted(order) == inputs for order in orders)
+    kinds = [order == inputs for order in orders], [order == inputs[::-1] for order in orders]
+    assert all(70 < sum(kind) < 130 for kind in kinds)  # a quarter each
+    assert len({tuple(order) for order in orders}) > 100
+    assert Augmentation().order(inputs, rng) == inputs
+    assert Augmentation(reverse=1.0).order(inputs, rng) == inputs[::-1]
+
+
+def test_shares_fill_their_range_and_the_seed_repeats_them():
+    crops = Augmentation(crop=0.77)
+    rng = np.random.default_rng(0)
+    shares = [crops.share(rng) for _ in range(200)]
+    assert 0.77 <= min(shares) < 0.78 and 0.99 < max(shares) <= 1
+    again = np.random.default_rng(0)
+    assert [crops.share(again) for _ in range(200)] == shares
+    assert Augmentation().share(rng) == 1
+
+
+@pytest.mark.parametrize("option", [{"reverse": 1.5}, {"shuffle": -0.1}, {"crop": 0.0}])
+def test_unusable_options_are_named(option):
+    (name,) = option
+    with pytest.raises(InputError, match=rf"data\.augmentation\.{name} is"):
+        Augmentation(**option)

@@ -1,0 +1,210 @@
+"""Scenes on disk: what trains and what is tested, opened when needed."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from asysplat.data import FilesSource, scenes
+from asysplat.data.procedural import ProceduralScene
+from asysplat.data.selection import Split, held_out, kmeans_split
+from asysplat.data.write import write_transforms
+from asysplat.errors import InputError
+
+FRAMES = 24
+SIZE = (8, 8)
+
+
+def made(seed: int) -> ProceduralScene:
+    return ProceduralScene(seed, *SIZE, num_frames=FRAMES)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A folder with the scenes s0 to s7."""
+    root = tmp_path_factory.mktemp("scenes")
+    for seed in range(8):
+        write_transforms(made(seed).views(range(FRAMES)), root / f"s{seed}")
+    return root
+
+
+@pytest.fixture
+def folder(written, tmp_path):
+    """Makes a folder with copies of some of the scenes."""
+
+    def copy(name, *seeds):
+        for seed in seeds:
+            shutil.copytree(written / f"s{seed}", tmp_path / name / f"s{seed}")
+        return str(tmp_path / name)
+
+    return copy
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """The names of the scenes that were opened, in order."""
+    names = []
+
+    def open_scene(path, *arguments, **options):
+        names.append(path.name)
+        return real(path, *arguments, **options)
+
+    real = scenes.open_scene
+    monkeypatch.setattr(scenes, "open_scene", open_scene)
+    return names
+
+
+def drawn(source, count=60, inputs=4, targets=2):
+    rng = np.random.default_rng(0)
+    return [source.training(inputs, targets, rng) for _ in range(count)]
+
+
+def names(tasks):
+    return {task.capture.name for task in tasks}
+
+
+def frames(tasks):
+    return {frame for task in tasks for frame in task.split.inputs + task.split.targets}
+
+
+def test_a_written_scene_trains_like_the_scene_itself(folder):
+    source = FilesSource(folder("one", 3), *SIZE, (12, 24))
+    (task,) = source.evaluation("test", 4, 2)
+    read = task.capture.views(task.split.targets)
+    views = made(3).views(task.split.targets)
+    assert (read.images - views.images).abs().max() < 1 / 255
+    assert (read.depths - views.depths).abs().max() < 1e-3
+    assert (read.cameras.cam_to_world - views.cameras.cam_to_world).abs().max() < 1e-5
+    assert (read.cameras.intrinsics - views.cameras.intrinsics).abs().max() < 1e-5
+    held = set(held_out(FRAMES, "test") + held_out(FRAMES, "val"))
+    assert frames(drawn(source)) == set(range(FRAMES)) - held
+
+
+def test_a_folder_without_scenes(tmp_path, written):
+    with pytest.raises(InputError, match=r"data\.root"):
+        FilesSource(str(tmp_path), *SIZE, (12, 24))
+    with pytest.raises(InputError, match=r"data\.test_root=.*nowhere"):
+        FilesSource(str(written), *SIZE, (12, 24), test_root=f"{tmp_path}/nowhere")
+
+
+def test_scenes_are_opened_when_they_are_drawn(folder, opened):
+    source = FilesSource(folder("many", *range(6)), *SIZE, (12, 24), val_scenes=2)
+    assert opened == []
+    (task,) = drawn(source, 1)
+    assert opened == [task.capture.name]
+    drawn(source)
+    assert sorted(opened) == [f"s{seed}" for seed in range(6)]
+
+
+def test_scenes_that_were_long_unused_are_closed(folder, opened, monkeypatch):
+    monkeypatch.setattr(scenes, "MOST_OPEN", 2)
+    folder = scenes.Scenes(folder("many", 0, 1, 2), *SIZE)
+    assert len(folder) == 3
+    first = folder[0]
+    assert folder[0] is first and folder[1].name == "s1" and folder[0] is first
+    assert folder[2].name == "s2"  # closes s1
+    assert folder[0] is first and folder[1].name == "s1"
+    assert opened == ["s0", "s1", "s2", "s1"]
+
+
+def test_tested_scenes_are_not_trained_on(folder):
+    """Though the root holds them, deeper down, too."""
+    root, tested = folder("all/1K", *range(8)), folder("tested", 2, 5)
+    source = FilesSource(root, *SIZE, (12, 24), test_root=tested, val_scenes=2)
+    validated = names(source.evaluation("val", 4, 2))
+    assert names(source.evaluation("test", 4, 2)) == {"s2", "s5"}
+    trained = names(drawn(source))
+    assert len(validated) == 2 and len(trained) == 4
+    assert trained | validated == {f"s{seed}" for seed in range(8)} - {"s2", "s5"}
+    assert frames(drawn(source)) == set(range(FRAMES))
+
+
+def test_a_test_root_leaves_scenes_to_train_on(folder):
+    root, tested = folder("all", 0, 1), folder("tested", 1)
+    source = FilesSource(root, *SIZE, (12, 24), test_root=tested, val_scenes=1)
+    with pytest.raises(InputError, match=r"data\.root has 1 scenes .*data\.val_scenes is 1"):
+        drawn(source)
+
+
+def test_a_damaged_scene_is_never_another_scene(folder):
+    root = folder("broken", 0, 1, 2)
+    source = FilesSource(root, *SIZE, (12, 24))
+    image = source.scenes.paths[1] / "images/00003.png"
+    image.write_bytes(image.read_bytes()[:50])
+    whole = FilesSource(folder("whole", 0, 1, 2), *SIZE, (12, 24))
+    found = set()
+    for seed in range(20):
+        rngs = [np.random.default_rng(seed) for _ in range(2)]
+        expected = whole.training(4, 2, rngs[0])
+        found.add(expected.capture.name)
+        if expected.capture.name == "s1":
+            with pytest.raises(InputError, match=r"s1/images/00003\.png cannot be read"):
+                source.training(4, 2, rngs[1])
+        else:
+            assert source.training(4, 2, rngs[1]).capture.name == expected.capture.name
+    assert found == {"s0", "s1", "s2"}
+
+
+def test_targets_may_be_inputs_where_asked(folder):
+    root = folder("one", 3)
+    shared = [
+        any(
+            set(task.split.inputs) & set(task.split.targets)
+            for task in drawn(FilesSource(root, *SIZE, (12, 24), targets_may_be_inputs=asked))
+        )
+        for asked in (False, True)
+    ]
+    assert shared == [False, True]
+
+
+def test_the_selection_is_that_of_the_test(folder):
+    root = folder("two", 3, 4)
+    source = FilesSource(root, *SIZE, (12, 24), selection="kmeans")
+    for task in source.evaluation("test", 4, 2):
+        cameras = made(int(task.capture.name[1:])).cameras
+        assert task.split == kmeans_split(cameras, 4, 2, "test")
+        assert task.split.targets == [0, 8, 16]
+    assert not frames(drawn(source)) & {0, 8, 16}
+    with pytest.raises(InputError, match=r"data\.selection is 'k-means'"):
+        FilesSource(root, *SIZE, (12, 24), selection="k-means").evaluation("test", 4, 2)
+
+
+@pytest.fixture
+def index(tmp_path):
+    """Writes an index of pixelSplat's form and gives its path."""
+
+    def write(**scenes):
+        file = tmp_path / "index.json"
+        file.write_text(json.dumps(scenes))
+        return str(file)
+
+    return write
+
+
+def test_an_index_names_the_scenes_and_frames_of_the_test(folder, index):
+    file = index(s2={"context": [3, 20], "target": [3, 9]}, s5=None)
+    source = FilesSource(
+        *(folder("all", *range(8)), *SIZE, (12, 24)),
+        **{"test_root": folder("tested", 2, 5), "selection": "index", "index": file},
+        val_scenes=2,
+    )
+    (task,) = source.evaluation("test", 2, 7)
+    assert task.capture.name == "s2" and task.split == Split([3, 20], [3, 9])
+    assert len(source.evaluation("val", 2, 2)) == 2
+    assert not names(drawn(source)) & {"s2", "s5"}
+
+
+def test_an_index_that_does_not_fit(folder, index):
+    root = folder("one", 2)
+    entry = {"context": [3, 20], "target": [9]}
+    options = {"selection": "index", "index": index(s2=entry, s7=entry, s9=entry)}
+    source = FilesSource(root, *SIZE, (12, 24), **options)
+    with pytest.raises(InputError, match=r"names 2 scenes that are not there, such as s7"):
+        source.evaluation("test", 2, 2)
+    with pytest.raises(InputError, match=r"data\.selection=index would test frames that are"):
+        drawn(source)
+    with pytest.raises(InputError, match=r"data\.selection is kmeans and data\.index is"):
+        FilesSource(root, *SIZE, (12, 24), **(options | {"selection": "kmeans"}))
+    with pytest.raises(InputError, match=r"data\.on_bad_frame=skip changes the numbers"):
+        FilesSource(root, *SIZE, (12, 24), on_bad_frame="skip", **options)

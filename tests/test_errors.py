@@ -1,0 +1,23 @@
+from asysplat.errors import InputError, input_error_behind
+
+
+def raised_from(cause, error):
+    error.__cause__ = cause
+    return error
+
+
+def test_the_sentence_behind_other_errors_is_found():
+    mistake = InputError("scene.json is empty: write it again.")
+    wrapped = raised_from(raised_from(mistake, KeyError("x")), RuntimeError("y"))
+    assert str(input_error_behind(wrapped)) == str(mistake)
+    assert input_error_behind(RuntimeError("y")) is None
+
+
+def test_a_worker_s_traceback_is_left_out():
+    """As torch's loader raises what a worker process raised."""
+    told = (
+        "Caught InputError in DataLoader worker process 0.\nOriginal Traceback:\n  File x, line 1\n"
+        "asysplat.errors.InputError: a.png is empty (0 bytes): copy it again, or drop its frame."
+    )
+    sentence = str(input_error_behind(InputError(told)))
+    assert sentence == "a.png is empty (0 bytes): copy it again, or drop its frame."

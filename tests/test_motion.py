@@ -1,0 +1,73 @@
+"""Gaussians that move keep their shapes, and their colours as seen from cameras that move along."""
+
+import math
+
+import pytest
+import torch
+
+from asysplat.motion import moved, sh_rotation
+from asysplat.rendering.reference.sh import sh_basis
+
+
+def motion(seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    skew = torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = torch.linalg.matrix_exp(skew - skew.mT)
+    matrix[:3, 3] = torch.randn(3, generator=generator, dtype=torch.float64)
+    return matrix
+
+
+@pytest.mark.parametrize("count", [1, 4, 9, 16])
+@pytest.mark.parametrize("seed", range(3))
+def test_harmonics_turn_with_their_directions(count, seed):
+    rotation = motion(seed)[:3, :3]
+    directions = torch.nn.functional.normalize(torch.randn(200, 3, dtype=torch.float64), dim=-1)
+    sh = torch.randn(count, dtype=torch.float64)
+    turned = sh_rotation(rotation, count) @ sh
+    before, after = (
+        sh_basis(directions, count) @ sh,
+        sh_basis(directions @ rotation.mT, count) @ turned,
+    )
+    torch.testing.assert_close(after, before, atol=1e-12, rtol=0)
+
+
+def test_a_rotation_of_harmonics_is_orthogonal_and_keeps_degrees_apart():
+    matrix = sh_rotation(motion(0)[:3, :3], 16)
+    torch.testing.assert_close(matrix @ matrix.mT, torch.eye(16).double(), atol=1e-12, rtol=0)
+    apart = torch.block_diag(*(torch.ones(2 * d + 1, 2 * d + 1) for d in range(4))) == 0
+    assert matrix[apart].abs().max() < 1e-12
+
+
+def test_a_quarter_turn_about_z():
+    """x goes to y, and y to -x: so do the harmonics -y, z, -x of degree 1."""
+    quarter = torch.tensor([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    found = sh_rotation(quarter, 4) @ torch.tensor([0, 2.0, 3.0, 5.0], dtype=torch.float64)
+    torch.testing.assert_close(found, torch.tensor([0, 5.0, 3.0, -2.0], dtype=torch.float64))
+
+
+def test_means_and_orientations(make_scene):
+    gaussians, _ = make_scene()
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = torch.tensor([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])
+    turn[:3, 3] = torch.tensor([1.0, 2, 3])
+    found = moved(gaussians, turn)
+    x, y, z = gaussians.means.unbind(-1)
+    torch.testing.assert_close(found.means, torch.stack((1 - y, 2 + x, 3 + z), -1))
+    w, x, y, z = gaussians.quats.unbind(-1)
+    # The quaternion of a quarter turn about z is (1, 0, 0, 1) / sqrt 2.
+    expected = torch.stack((w - z, x - y, y + x, z + w), -1) / math.sqrt(2)
+    torch.testing.assert_close(found.quats, expected)
+    assert torch.equal(found.scales, gaussians.scales)
+
+
+def test_there_and_back_is_where_it_was(make_scene):
+    gaussians, _ = make_scene(degree=3)
+    there = motion(1)
+    back = moved(moved(gaussians, there), torch.linalg.inv(there))
+    for name in ("means", "sh"):
+        torch.testing.assert_close(
+            getattr(back, name), getattr(gaussians, name), atol=1e-12, rtol=0
+        )
+    same = (back.quats * gaussians.quats).sum(-1).abs() / gaussians.quats.square().sum(-1)
+    torch.testing.assert_close(same, torch.ones_like(same))
