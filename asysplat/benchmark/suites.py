@@ -10,7 +10,7 @@ from types import ModuleType
 
 from asysplat.errors import InputError
 
-SUITES = ("render", "ops", "model")
+SUITES = ("render", "ops", "model", "data")
 
 
 def find_suite(name: str) -> ModuleType:

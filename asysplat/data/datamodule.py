@@ -84,10 +84,12 @@ class SceneDataModule(lightning.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader:
         per_epoch = self.steps_per_epoch * self.batch_size * self.trainer.world_size
-        start = self.trainer.current_epoch * per_epoch
-        epoch = Subset(TrainingTasks(self), range(start, start + per_epoch))
+        return self.tasks(self.trainer.current_epoch * per_epoch, per_epoch)
+
+    def tasks(self, start: int, count: int) -> DataLoader:
+        """Batches of training tasks `start` to `start + count`."""
         return DataLoader(
-            epoch,
+            Subset(TrainingTasks(self), range(start, start + count)),
             batch_size=self.batch_size,
             num_workers=self.workers,
             collate_fn=collate,

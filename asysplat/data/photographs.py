@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -24,6 +25,8 @@ from asysplat.data.images import (
     undistort,
 )
 from asysplat.scene import Cameras, Views
+
+Points = Float[ndarray, "P 3"]
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,17 @@ class PosedScene:
     Args:
         name: unique within the data set.
         photographs: in the order they were taken.
-        points: sparse points of the scene's surfaces, where the files have any.
+        read_points: of sparse points of the scene's surfaces, None where the files have none.
     """
 
     name: str
     photographs: list[Photograph]
-    points: Float[ndarray, "P 3"] | None = None
+    read_points: Callable[[], Points | None] | None = None
+
+    @cached_property
+    def points(self) -> Points | None:
+        """Read when first asked for, as they may take longer than all the rest."""
+        return self.read_points() if self.read_points else None
 
 
 class PhotographCapture:

@@ -8,6 +8,7 @@ import re
 import struct
 import warnings
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy import ndarray
 
 from asysplat.data.bad_frames import BadFrames
 from asysplat.data.images import Lens, image_size
-from asysplat.data.photographs import Photograph, PosedScene
+from asysplat.data.photographs import Photograph, Points, PosedScene
 from asysplat.data.readers.folders import folders_with, natural_order
 from asysplat.data.readers.pictures import images_in, scaled
 from asysplat.data.readers.poses import inverted, rigid
@@ -73,10 +74,10 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
             path = folder / image.name
             lens = scaled(lenses[image.camera_id], image_size(path), str(path))
             photographs.append(Photograph(path, lens, _cam_to_world(image, model)))
-    return PosedScene(scene.name, photographs, _points(reconstruction))
+    return PosedScene(scene.name, photographs, partial(_read_points, model))
 
 
-def points_beside(scene: Path, photographs: Sequence[Photograph]) -> Float[ndarray, "P 3"] | None:
+def points_beside(scene: Path, photographs: Sequence[Photograph]) -> Points | None:
     """Sparse points of a model beside photographs whose poses were read elsewhere.
 
     None if there is no model, or if its cameras, known by the images' names, stand elsewhere: then
@@ -196,7 +197,11 @@ def _cam_to_world(image: pycolmap.Image, model: Path) -> Float[ndarray, "4 4"]:
     return inverted(rigid(pose, f"{model}, pose of {image.name}"))
 
 
-def _points(reconstruction: pycolmap.Reconstruction) -> Float[ndarray, "P 3"] | None:
+def _read_points(model: Path) -> Points | None:
+    return _points(_read(model))
+
+
+def _points(reconstruction: pycolmap.Reconstruction) -> Points | None:
     points = sorted(reconstruction.points3D.items())
     return np.array([point.xyz for _, point in points]) if points else None
 

@@ -3,6 +3,7 @@
 https://github.com/Fyusion/LLFF#using-your-own-poses-without-running-colmap
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
     for index, (image, row) in enumerate(zip(_images(file, len(rows)), rows, strict=True)):
         with bad.caught():
             photographs.append(_photograph(image, row, f"{file}, row {index} ({image.name})"))
-    return PosedScene(scene.name, photographs, points_beside(scene, photographs))
+    return PosedScene(scene.name, photographs, partial(points_beside, scene, photographs))
 
 
 def _read_rows(file: Path) -> Float[ndarray, "N 17"]:

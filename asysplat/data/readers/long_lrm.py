@@ -3,6 +3,7 @@
 https://github.com/arthurhero/Long-LRM/blob/main/data/dataset.py
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,8 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
                 raise InputError(f"{file}, frame {index} has no file_path: name its image.")
             where = f"{file}, frame {index} ({frame['file_path']})"
             photographs.append(_photograph(frame, file.parent / frame["file_path"], where))
-    return PosedScene(file.parent.name, photographs, points_beside(file.parent, photographs))
+    read_points = partial(points_beside, file.parent, photographs)
+    return PosedScene(file.parent.name, photographs, read_points)
 
 
 def _photograph(frame: dict[str, Any], image: Path, where: str) -> Photograph:

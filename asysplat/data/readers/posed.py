@@ -3,6 +3,7 @@
 https://github.com/ardaduz/deep-video-mvs/tree/master/sample-data
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
         with bad.caught():
             where = f"{file}, pose {index} ({image.name})"
             photographs.append(_photograph(image, matrix, rigid(pose.reshape(4, 4), where)))
-    return PosedScene(scene.name, photographs, points_beside(scene, photographs))
+    return PosedScene(scene.name, photographs, partial(points_beside, scene, photographs))
 
 
 def _photograph(

@@ -18,16 +18,15 @@ https://github.com/scannetpp/scannetpp (common/scene_release.py, common/utils/ne
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from asysplat.data.bad_frames import BadFrames
 from asysplat.data.images import Lens, image_size
-from asysplat.data.photographs import Photograph, PosedScene
+from asysplat.data.photographs import Photograph, Points, PosedScene
 from asysplat.data.readers.beside import beside
 from asysplat.data.readers.folders import folders_with
 from asysplat.data.readers.json_file import read_json
@@ -115,7 +114,7 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
     return PosedScene(
         name=f"{folder.parent.name}-{folder.name}",
         photographs=read(files[0], folder, part, bad),
-        points=_points(folder / "colmap/points3D.txt"),
+        read_points=partial(_points, folder / "colmap/points3D.txt"),
     )
 
 
@@ -217,7 +216,7 @@ def _pinhole(stored: Any, size: tuple[int, int], where: str) -> Lens:
     return Lens(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
 
 
-def _points(file: Path) -> Float[ndarray, "P 3"] | None:
+def _points(file: Path) -> Points | None:
     """Columns 2 to 4 of COLMAP's text: https://colmap.github.io/format.html#points3d-txt"""
     if not file.is_file():
         return None

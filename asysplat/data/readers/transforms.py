@@ -6,6 +6,7 @@ https://docs.nerf.studio/quickstart/data_conventions.html
 
 import math
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,8 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
     """
     file = scene if scene.suffix == ".json" else scene / "transforms.json"
     photographs = read_photographs(read_frames(file), file, bad)
-    return PosedScene(file.parent.name, photographs, points_beside(file.parent, photographs))
+    read_points = partial(points_beside, file.parent, photographs)
+    return PosedScene(file.parent.name, photographs, read_points)
 
 
 def read_frames(file: Path) -> dict[str, Any]:

@@ -6,7 +6,6 @@ backward pass, which share these functions, take identical decisions.
 
 import math
 
-import llvmlite.binding
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -14,11 +13,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from asysplat.ops.cpu.kernel import inline
+from asysplat.ops.cpu.vectors import FLOATS, INTEGERS, LANES, VECTOR, fma, sum_of
 
-LANES = 16  # pixels of a tile's row, one vector of AVX-512
 FLOAT, FLOAT_BITS = ir.FloatType(), ir.IntType(32)
-LANES_TYPE = ir.VectorType(FLOAT, LANES)
-HAS_FMA = bool(llvmlite.binding.get_host_cpu_features().get("fma", True))
 
 SQRT_2, TWO_OVER_LN_2 = math.sqrt(2), 2 / math.log(2)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
@@ -43,15 +40,17 @@ P0, P1, P2, P3, P4, P5, P6 = (
 
 
 @intrinsic
-def fma(typing_context, a, b, c):
-    """a * b + c, rounded once where the processor can do that."""
+def add_to_exponent(typing_context, value, number):
+    """value * 2^n, where n stands in the lowest bits of `number`."""
 
     def generate(context, builder, signature, args):
-        if HAS_FMA:
-            return builder.fma(*args)
-        return builder.fadd(builder.fmul(args[0], args[1]), args[2])
+        bits = INTEGERS if value == VECTOR else FLOAT_BITS
+        value_bits, number_bits = (builder.bitcast(arg, bits) for arg in args)
+        shift = ir.Constant(bits, [23] * LANES if value == VECTOR else 23)
+        total = builder.add(value_bits, builder.shl(number_bits, shift))
+        return builder.bitcast(total, args[0].type)
 
-    return a(a, a, a), generate
+    return value(value, value), generate
 
 
 @intrinsic
@@ -79,14 +78,10 @@ def take_sum(typing_context, state, base):
     """Sum of the LANES numbers from `base` on, which are left at 0 for the next splat."""
 
     def generate(context, builder, signature, args):
-        pointer = _element(context, builder, signature, args, LANES_TYPE)
+        pointer = _element(context, builder, signature, args, FLOATS)
         vector = builder.load(pointer, align=4)
-        builder.store(ir.Constant(LANES_TYPE, [0.0] * LANES), pointer, align=4)
-        name = f"llvm.vector.reduce.fadd.v{LANES}f32"
-        signature_ = ir.FunctionType(FLOAT, [FLOAT, LANES_TYPE])
-        function = cgutils.get_or_insert_function(builder.module, signature_, name)
-        # Without an order to keep, it is the tree that the processor does best.
-        return builder.call(function, [FLOAT(-0.0), vector], fastmath=("reassoc",))
+        builder.store(ir.Constant(FLOATS, [0.0] * LANES), pointer, align=4)
+        return sum_of(builder, vector)
 
     return types.float32(state, base), generate
 
@@ -130,7 +125,7 @@ def exp2(x):
     p = fma(p, f, P2)
     p = fma(p, f, P1)
     p = fma(p, f, P0)
-    return from_bits(to_bits(p) + (to_bits(shifted) << np.int32(23)))
+    return add_to_exponent(p, shifted)
 
 
 @inline

@@ -1,8 +1,9 @@
-"""The selective scan for CPUs (Numba): the states of 16 channels stay in the cache.
+"""The selective scan for CPUs (Numba): a state of 16 channels at a time.
 
-A task takes a sequence and 16 of its channels, one vector wide, and walks through the tokens.
-Nothing is stored between the passes but the state at the beginning of each chunk; the backward pass
-walks through a chunk once more before it walks back.
+A task takes a sequence and 16 of its channels, one vector wide, and walks through chunks of tokens,
+one of the N states after the other: it stays in a register meanwhile. Nothing is stored between the
+passes but the state at the beginning of each chunk; the backward pass walks through a chunk once
+more before it walks back.
 """
 
 import math
@@ -12,10 +13,11 @@ import torch
 from torch import Tensor
 
 from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.lanes import LANES, ZERO, decay2, fma, take_sum
+from asysplat.ops.cpu.lanes import ZERO, decay2
 from asysplat.ops.cpu.threads import even_bounds, run_blocks
+from asysplat.ops.cpu.vectors import LANES, fma, load, store, total, zeros
 
-CHUNK = 32  # tokens: their states, CHUNK x N x LANES, fit a core's cache
+CHUNK = 32  # tokens: what is kept of each, CHUNK x LANES, fits a core's nearest cache
 LOG2_E, LN_2 = 1 / math.log(2), np.float32(math.log(2))
 
 
@@ -103,33 +105,40 @@ def _by_block(A: Tensor) -> np.ndarray:
 def _forward(start, stop, x, dt, B, C, D, A, reverse, y, carried):
     """Blocks start to stop of B x (blocks of channels)."""
     length, channels = x.shape[1:]
-    blocks, state_size = carried.shape[1], carried.shape[3]
+    blocks, chunks, state_size = carried.shape[1:4]
     state = np.empty((state_size, LANES), np.float32)
-    step, out = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
-    added = np.empty(LANES, np.float32)
+    steps, added = np.zeros((CHUNK, LANES), np.float32), np.zeros((CHUNK, LANES), np.float32)
+    out = np.empty((CHUNK, LANES), np.float32)
     for index in range(start, stop):
         batch, block = index // blocks, index % blocks
         first = block * LANES
         width = min(LANES, channels - first)
+        rates = A[block]
         state[:] = ZERO
-        step[:] = ZERO
+        steps[:] = ZERO
         added[:] = ZERO
-        for k in range(length):
-            t = length - 1 - k if reverse else k
-            if k % CHUNK == 0:
-                carried[batch, block, k // CHUNK] = state
-            for i in range(width):
-                step[i] = dt[batch, t, first + i]
-                added[i] = step[i] * x[batch, t, first + i]
+        for chunk in range(chunks):
+            carried[batch, block, chunk] = state
+            begin = chunk * CHUNK
+            count = min(CHUNK, length - begin)
+            for k in range(count):
+                t = length - 1 - begin - k if reverse else begin + k
+                for i in range(width):
+                    steps[k, i] = dt[batch, t, first + i]
+                    added[k, i] = steps[k, i] * x[batch, t, first + i]
             out[:] = ZERO
             for n in range(state_size):
-                b, c = B[batch, t, n], C[batch, t, n]
-                for i in range(LANES):
-                    decay = decay2(step[i] * A[block, n, i])
-                    state[n, i] = fma(decay, state[n, i], added[i] * b)
-                    out[i] = fma(c, state[n, i], out[i])
-            for i in range(width):
-                y[batch, t, first + i] = fma(D[first + i], x[batch, t, first + i], out[i])
+                rate, value = load(rates, n), load(state, n)
+                for k in range(count):
+                    t = length - 1 - begin - k if reverse else begin + k
+                    decay = decay2(load(steps, k) * rate)
+                    value = fma(decay, value, load(added, k) * B[batch, t, n])
+                    store(out, k, fma(C[batch, t, n], value, load(out, k)))
+                store(state, n, value)
+            for k in range(count):
+                t = length - 1 - begin - k if reverse else begin + k
+                for i in range(width):
+                    y[batch, t, first + i] = fma(D[first + i], x[batch, t, first + i], out[k, i])
 
 
 @kernel
@@ -141,66 +150,64 @@ def _backward(
     belongs to them is written."""
     length, channels = x.shape[1:]
     blocks, chunks, state_size = carried.shape[1:4]
-    states = np.empty((CHUNK + 1, state_size, LANES), np.float32)
-    decays = np.empty((CHUNK, state_size, LANES), np.float32)
     steps, added = np.zeros((CHUNK, LANES), np.float32), np.zeros((CHUNK, LANES), np.float32)
-    pull, behind = np.zeros(LANES, np.float32), np.empty((state_size, LANES), np.float32)
-    g_step, g_added = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
-    g_b, g_c = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
-    chunk_A, chunk_D = np.empty((state_size, LANES), np.float32), np.empty(LANES, np.float32)
+    pull, decays = np.zeros((CHUNK, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
+    states = np.empty((CHUNK + 1, LANES), np.float32)
+    g_steps, g_added = np.empty((CHUNK, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
+    behind, chunk_D = np.empty((state_size, LANES), np.float32), np.empty(LANES, np.float32)
     for index in range(start, stop):
         batch, block = index // blocks, index % blocks
         first = block * LANES
         width = min(LANES, channels - first)
+        rates, g_rates = A[block], grad_A[batch, block]
         behind[:] = ZERO
-        grad_A[batch, block] = ZERO
+        g_rates[:] = ZERO
         grad_D[batch, block] = ZERO
         steps[:] = ZERO
         added[:] = ZERO
         pull[:] = ZERO
         for chunk in range(chunks - 1, -1, -1):
-            chunk_A[:] = ZERO
-            chunk_D[:] = ZERO
             begin = chunk * CHUNK
             count = min(CHUNK, length - begin)
-            states[0] = carried[batch, block, chunk]
             for k in range(count):
                 t = length - 1 - begin - k if reverse else begin + k
                 for i in range(width):
                     steps[k, i] = dt[batch, t, first + i]
                     added[k, i] = steps[k, i] * x[batch, t, first + i]
-                for n in range(state_size):
-                    b = B[batch, t, n]
-                    for i in range(LANES):
-                        decay = decay2(steps[k, i] * A[block, n, i])
-                        decays[k, n, i] = decay
-                        states[k + 1, n, i] = fma(decay, states[k, n, i], added[k, i] * b)
-            for k in range(count - 1, -1, -1):
+                    pull[k, i] = grad_y[batch, t, first + i]
+            g_steps[:] = ZERO
+            g_added[:] = ZERO
+            for n in range(state_size):
+                rate, value = load(rates, n), load(carried[batch, block, chunk], n)
+                for k in range(count):
+                    t = length - 1 - begin - k if reverse else begin + k
+                    decay = decay2(load(steps, k) * rate)
+                    store(decays, k, decay)
+                    store(states, k, value)
+                    value = fma(decay, value, load(added, k) * B[batch, t, n])
+                store(states, count, value)
+                later, g_rate = load(behind, n), zeros()
+                for k in range(count - 1, -1, -1):
+                    t = length - 1 - begin - k if reverse else begin + k
+                    g_state = fma(C[batch, t, n], load(pull, k), later)
+                    grad_B[block, batch, t, n] = total(g_state * load(added, k))
+                    grad_C[block, batch, t, n] = total(load(pull, k) * load(states, k + 1))
+                    store(g_added, k, fma(g_state, B[batch, t, n], load(g_added, k)))
+                    later = g_state * load(decays, k)
+                    # Of the exponent, a factor log2(e) is in A.
+                    g_log = later * load(states, k)
+                    store(g_steps, k, fma(g_log, rate, load(g_steps, k)))
+                    g_rate = fma(g_log, load(steps, k), g_rate)
+                store(behind, n, later)
+                store(g_rates, n, load(g_rates, n) + g_rate)
+            chunk_D[:] = ZERO
+            for k in range(count):
                 t = length - 1 - begin - k if reverse else begin + k
                 for i in range(width):
-                    pull[i] = grad_y[batch, t, first + i]
-                g_step[:] = ZERO
-                g_added[:] = ZERO
-                for n in range(state_size):
-                    b, c = B[batch, t, n], C[batch, t, n]
-                    for i in range(LANES):
-                        g_state = fma(c, pull[i], behind[n, i])
-                        g_c[i] = pull[i] * states[k + 1, n, i]
-                        g_b[i] = g_state * added[k, i]
-                        g_added[i] = fma(g_state, b, g_added[i])
-                        # Of the exponent, a factor log2(e) is in A.
-                        g_log = g_state * decays[k, n, i] * states[k, n, i]
-                        g_step[i] = fma(g_log, A[block, n, i], g_step[i])
-                        chunk_A[n, i] += g_log * steps[k, i]
-                        behind[n, i] = g_state * decays[k, n, i]
-                    grad_B[block, batch, t, n] = take_sum(g_b, 0)
-                    grad_C[block, batch, t, n] = take_sum(g_c, 0)
-                for i in range(width):
                     value = x[batch, t, first + i]
-                    grad_dt[batch, t, first + i] = fma(g_added[i], value, g_step[i] * LN_2)
+                    grad_dt[batch, t, first + i] = fma(g_added[k, i], value, g_steps[k, i] * LN_2)
                     grad_x[batch, t, first + i] = fma(
-                        D[first + i], pull[i], g_added[i] * steps[k, i]
+                        D[first + i], pull[k, i], g_added[k, i] * steps[k, i]
                     )
-                    chunk_D[i] = fma(pull[i], value, chunk_D[i])
-            grad_A[batch, block] += chunk_A
+                    chunk_D[i] = fma(pull[k, i], value, chunk_D[i])
             grad_D[batch, block] += chunk_D

@@ -178,7 +178,7 @@ def test_points_that_are_cut_short_are_named(dslr):
     (dslr / "colmap").mkdir()
     (dslr / "colmap/points3D.txt").write_text("7 1.5 -2 3 255 0 0 0.5 1 2\n9 0 0.25\n")
     with pytest.raises(InputError, match=r"points3D.txt cannot be read"):
-        opened(dslr)
+        _ = opened(dslr).scene.points
 
 
 def set_arkit(name, **values):

@@ -1,0 +1,45 @@
+"""A scene on disk, made up for the measurement."""
+
+import json
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from rich.progress import track
+
+from asysplat.data import ProceduralScene
+
+RENDERED = (135, 240)  # height, width; enlarged to that of the photographs
+PICTURES = 8  # that are different to look at
+QUALITY = 90  # of the JPEG
+SHIFT = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes from OpenCV's
+
+
+def write_photographs(folder: Path, frames: int, height: int, width: int) -> None:
+    """A transforms.json and so many JPEG files, no two of the same bytes."""
+    scene = ProceduralScene(seed=0, height=RENDERED[0], width=RENDERED[1], num_frames=frames)
+    shown = scene.views([number * frames // PICTURES for number in range(PICTURES)]).images
+    pictures = [_enlarged(image.permute(1, 2, 0).numpy(), height, width) for image in shown]
+    (folder / "images").mkdir(parents=True)
+    entries = []
+    poses = scene.cameras.cam_to_world.double().numpy() @ SHIFT
+    for number in track(range(frames), "photographs", transient=True):
+        name = f"images/{number:05d}.jpg"
+        stored = BytesIO()
+        # The comment sets files of one picture apart: what is cached is known by its bytes.
+        pictures[number % PICTURES].save(
+            stored, "JPEG", quality=QUALITY, comment=f"photograph {number}"
+        )
+        (folder / name).write_bytes(stored.getvalue())
+        entries.append({"file_path": name, "transform_matrix": poses[number].tolist()})
+    focal = float(scene.cameras.intrinsics[0, 0, 0]) * width / RENDERED[1]
+    content = {"w": width, "h": height, "fl_x": focal, "frames": entries}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def _enlarged(image: np.ndarray, height: int, width: int) -> Image.Image:
+    """With grain, as photographs have it: flat areas would decode too soon."""
+    levels = Image.fromarray((image * 255).astype(np.uint8)).resize((width, height))
+    grain = np.random.default_rng(0).normal(0, 4, (height, width, 1))
+    return Image.fromarray((np.asarray(levels) + grain).clip(0, 255).astype(np.uint8))

@@ -1,0 +1,148 @@
+"""Sixteen float32 as one value of Numba's: what a loop carries stays in a register.
+
+A float32 stands for sixteen equal ones wherever a vector is asked for.
+"""
+
+import operator
+from collections.abc import Callable
+
+import llvmlite.binding
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.core.typeconv import Conversion
+from numba.extending import intrinsic, lower_cast, overload, register_model
+
+LANES = 16  # one vector of AVX-512; two or four of older ones
+HAS_FMA = bool(llvmlite.binding.get_host_cpu_features().get("fma", True))
+FLOATS, INTEGERS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(32), LANES)
+
+
+class Vector(types.Type):
+    def __init__(self):
+        super().__init__(name="Vector")
+
+    def can_convert_from(self, typing_context, other):
+        return Conversion.promote if other == types.float32 else None
+
+
+VECTOR = Vector()
+
+
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, FLOATS)
+
+
+@lower_cast(types.Float, Vector)
+def _splat(context, builder, from_type, to_type, value):
+    one = builder.insert_element(ir.Constant(FLOATS, ir.Undefined), value, ir.IntType(32)(0))
+    return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
+
+
+@intrinsic
+def fma(typing_context, a, b, c):
+    """a * b + c, rounded once where the processor can do that; of vectors or of float32."""
+    kind = VECTOR if VECTOR in (a, b, c) else a
+
+    def generate(context, builder, signature, args):
+        if not HAS_FMA:
+            return builder.fadd(builder.fmul(args[0], args[1]), args[2])
+        if kind != VECTOR:
+            return builder.fma(*args)
+        function = ir.FunctionType(FLOATS, [FLOATS] * 3)
+        name = f"llvm.fma.v{LANES}f32"
+        return builder.call(cgutils.get_or_insert_function(builder.module, function, name), args)
+
+    return kind(kind, kind, kind), generate
+
+
+@intrinsic
+def load(typing_context, rows, row):
+    """Row `row` of a contiguous array [rows, LANES]."""
+
+    def generate(context, builder, signature, args):
+        return builder.load(_place(context, builder, signature, args), align=4)
+
+    return VECTOR(rows, row), generate
+
+
+@intrinsic
+def store(typing_context, rows, row, value):
+    """Write row `row` of a contiguous array [rows, LANES]."""
+
+    def generate(context, builder, signature, args):
+        builder.store(args[2], _place(context, builder, signature, args), align=4)
+        return context.get_dummy_value()
+
+    return types.void(rows, row, VECTOR), generate
+
+
+@intrinsic
+def zeros(typing_context):
+    def generate(context, builder, signature, args):
+        return ir.Constant(FLOATS, [0.0] * LANES)
+
+    return VECTOR(), generate
+
+
+@intrinsic
+def total(typing_context, value):
+    """The sum of a vector's numbers."""
+
+    def generate(context, builder, signature, args):
+        return sum_of(builder, args[0])
+
+    return types.float32(VECTOR), generate
+
+
+def sum_of(builder: ir.IRBuilder, vector: ir.Value) -> ir.Value:
+    kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), FLOATS])
+    name = f"llvm.vector.reduce.fadd.v{LANES}f32"
+    function = cgutils.get_or_insert_function(builder.module, kind, name)
+    # Without an order to keep, it is the tree that the processor does best.
+    return builder.call(function, [ir.FloatType()(-0.0), vector], fastmath=("reassoc",))
+
+
+def _place(context, builder, signature, args):
+    array = context.make_array(signature.args[0])(context, builder, args[0])
+    row = context.cast(builder, args[1], signature.args[1], types.intp)
+    place = builder.gep(array.data, [builder.mul(row, row.type(LANES))])
+    return builder.bitcast(place, FLOATS.as_pointer())
+
+
+def _arithmetic(symbol: Callable, instruction: str) -> None:
+    """Let `symbol` take vectors."""
+
+    @intrinsic
+    def compute(typing_context, a, b):
+        def generate(context, builder, signature, args):
+            return getattr(builder, instruction)(*args)
+
+        return VECTOR(VECTOR, VECTOR), generate
+
+    @overload(symbol)
+    def _(a, b):
+        if VECTOR in (a, b):
+            return lambda a, b: compute(a, b)
+
+
+_arithmetic(operator.add, "fadd")
+_arithmetic(operator.sub, "fsub")
+_arithmetic(operator.mul, "fmul")
+
+
+@intrinsic
+def _larger(typing_context, a, b):
+    def generate(context, builder, signature, args):
+        return builder.select(builder.fcmp_ordered(">", *args), *args)
+
+    return VECTOR(VECTOR, VECTOR), generate
+
+
+@overload(max)
+def _max(a, b):
+    if VECTOR in (a, b):
+        return lambda a, b: _larger(a, b)
