@@ -24,7 +24,9 @@ class ImageCache:
         disk_gb, memory_gb: what each may take, in 2^30 bytes.
     """
 
-    def __init__(self, folder: str | Path | None, disk_gb: float = 20, memory_gb: float = 0.5):
+    def __init__(
+        self, folder: str | Path | None, disk_gb: int | float = 20, memory_gb: int | float = 0.5
+    ):
         self.folder = None if folder is None else Path(folder).expanduser()
         self.disk_bytes, self.memory_bytes = disk_gb * GIGABYTE, memory_gb * GIGABYTE
         self._memory: OrderedDict[str, ndarray] = OrderedDict()
@@ -72,8 +74,8 @@ class ImageCache:
         descriptor, aside = tempfile.mkstemp(dir=file.parent)
         with os.fdopen(descriptor, "wb") as handle:
             np.save(handle, array)
+            self._on_disk += handle.tell()
         os.replace(aside, file)
-        self._on_disk += array.nbytes
         if self._on_disk > self.disk_bytes:
             self._clear()
 
