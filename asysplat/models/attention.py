@@ -8,9 +8,9 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from asysplat.models.norm import RMSNorm
 from asysplat.models.shapes import StageShape
 from asysplat.ops import grid_attention
-from asysplat.ops.precision import without_autocast
 
 
 class MLP(nn.Sequential):
@@ -23,17 +23,15 @@ class MLP(nn.Sequential):
 
 
 class QueryKeyNorm(nn.Module):
-    """RMSNorm of queries and keys, shared by the heads, in the weights' fp32."""
+    """RMSNorm of queries and keys, shared by the heads."""
 
     def __init__(self, head_width: int):
         super().__init__()
-        self.query = nn.RMSNorm(head_width, eps=1e-6)
-        self.key = nn.RMSNorm(head_width, eps=1e-6)
+        self.query = RMSNorm(head_width)
+        self.key = RMSNorm(head_width)
 
     def forward(self, q: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
-        with without_autocast(q):
-            dtype = self.query.weight.dtype
-            return self.query(q.to(dtype)).to(q.dtype), self.key(k.to(dtype)).to(k.dtype)
+        return self.query(q), self.key(k)
 
 
 class SelfAttention(nn.Module):

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.models.depthwise import depthwise_conv
+from asysplat.models.norm import RMSNorm
 from asysplat.models.shapes import StageShape
 from asysplat.ops import ssd
 
@@ -26,7 +27,7 @@ class BiMamba2(nn.Module):
         super().__init__()
         inner = EXPAND * shape.width
         heads = inner // shape.head_width
-        self.norm = nn.RMSNorm(shape.width, eps=1e-6)
+        self.norm = RMSNorm(shape.width)
         self.project = nn.Linear(shape.width, 2 * inner + 2 * state_size + heads, bias=False)
         self.directions = nn.ModuleList(
             Mamba2Direction(inner, heads, state_size, reverse) for reverse in (False, True)
@@ -51,7 +52,7 @@ class Mamba2Direction(nn.Module):
         self.A_log = nn.Parameter(torch.empty(heads).uniform_(1, 16).log())
         self.D = nn.Parameter(torch.ones(heads))
         self.dt_bias = nn.Parameter(inverse_softplus(log_uniform(heads, 1e-3, 1e-1)))
-        self.norm = nn.RMSNorm(inner, eps=1e-6)
+        self.norm = RMSNorm(inner)
 
     def forward(self, u: Float[Tensor, "B L u"]) -> Float[Tensor, "B L inner"]:
         z, xBC, dt = u.split(self.splits, dim=-1)

@@ -1,0 +1,23 @@
+"""RMSNorm (Zhang and Sennrich 2019) that autocast does not round."""
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from asysplat.ops.precision import without_autocast
+
+
+class RMSNorm(nn.RMSNorm):
+    """In the type of its weights, fp32, whatever the input's; the output has the input's.
+
+    With weights and inputs of two types torch would not take its fused kernel.
+
+    Args:
+        width: of the last dimension.
+    """
+
+    def __init__(self, width: int):
+        super().__init__(width, eps=1e-6)
+
+    def forward(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
+        with without_autocast(x):
+            return super().forward(x.to(self.weight.dtype)).to(x.dtype)
