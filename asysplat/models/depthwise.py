@@ -1,8 +1,12 @@
 """Convolution along the tokens, each channel by itself."""
 
+import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from asysplat.ops.precision import without_autocast
 
 
 def depthwise_conv(
@@ -13,9 +17,42 @@ def depthwise_conv(
 ) -> Float[Tensor, "B L C"]:
     """Each token sees itself, the `before` tokens ahead of it and the K - 1 - before behind it.
 
-    To torch, an image one pixel high whose channels are innermost: as a sequence, they would be
-    copied outermost and back.
+    Computed in the tokens' type.
     """
-    padded = F.pad(tokens, (0, 0, before, weight.shape[-1] - 1 - before))
-    image = padded.mT.unsqueeze(-2)
+    with without_autocast(tokens):
+        bias = None if bias is None else bias.to(tokens.dtype)
+        return _DepthwiseConv.apply(tokens, weight.to(tokens.dtype), bias, before)
+
+
+class _DepthwiseConv(torch.autograd.Function):
+    """With a backward pass of its own: on a CPU torch takes long for the weights' gradient."""
+
+    @staticmethod
+    def forward(ctx, tokens, weight, bias, before):
+        ctx.save_for_backward(tokens, weight)
+        ctx.before, ctx.has_bias = before, bias is not None
+        return _convolve(tokens, weight, bias, before)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        tokens, weight = ctx.saved_tensors
+        length, size, before = tokens.shape[1], weight.shape[-1], ctx.before
+        grad_tokens = _convolve(grad, weight.flip(-1), None, size - 1 - before)
+        padded = _pad(tokens, size, before)
+        pull = grad.to(torch.promote_types(grad.dtype, torch.float32))
+        taps = [(padded[:, k : k + length] * pull).sum((0, 1)) for k in range(size)]
+        grad_weight = torch.stack(taps, -1)[:, None].to(weight.dtype)
+        grad_bias = pull.sum((0, 1)).to(weight.dtype) if ctx.has_bias else None
+        return grad_tokens, grad_weight, grad_bias, None
+
+
+def _convolve(tokens: Tensor, weight: Tensor, bias: Tensor | None, before: int) -> Tensor:
+    """To torch, an image one pixel high whose channels are innermost: as a sequence, they would be
+    copied outermost and back."""
+    image = _pad(tokens, weight.shape[-1], before).mT.unsqueeze(-2)
     return F.conv2d(image, weight.unsqueeze(-2), bias, groups=len(weight)).squeeze(-2).mT
+
+
+def _pad(tokens: Tensor, size: int, before: int) -> Tensor:
+    return F.pad(tokens, (0, 0, before, size - 1 - before))

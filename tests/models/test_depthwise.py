@@ -1,0 +1,52 @@
+"""Against torch's convolution of sequences."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from asysplat.models.depthwise import depthwise_conv
+
+SIZES = [(4, 3), (4, 0), (3, 1)]  # of the kernel, and before
+
+
+def inputs(size, dtype=torch.float64, batch=2, length=9, channels=6):
+    generator = torch.Generator().manual_seed(0)
+    shapes = ((batch, length, channels), (channels, 1, size), (channels,))
+    return [
+        torch.randn(shape, generator=generator, dtype=torch.float64).to(dtype).requires_grad_()
+        for shape in shapes
+    ]
+
+
+def as_sequences(tokens, weight, bias, before):
+    padded = F.pad(tokens.mT, (before, weight.shape[-1] - 1 - before))
+    return F.conv1d(padded, weight, bias, groups=len(weight)).mT
+
+
+@pytest.mark.parametrize("size, before", SIZES)
+def test_values_and_gradients_are_those_of_sequences(size, before):
+    leaves = inputs(size)
+    y, expected = depthwise_conv(*leaves, before), as_sequences(*leaves, before)
+    torch.testing.assert_close(y, expected, rtol=0, atol=1e-12)
+    assert torch.autograd.gradcheck(lambda *leaves: depthwise_conv(*leaves, before), leaves)
+
+
+def test_tokens_in_half_precision():
+    """As autocast gives them; the weights stay fp32, and so do their gradients."""
+    leaves = inputs(4, torch.float32, length=200)
+    half = [leaves[0].bfloat16().detach().requires_grad_(), *leaves[1:]]
+    pull = torch.randn(2, 200, 6, generator=torch.Generator().manual_seed(1))
+    with torch.autocast("cpu", torch.bfloat16):
+        y = depthwise_conv(*half, 3)
+    grads = torch.autograd.grad(y, half, pull.bfloat16())
+    expected = as_sequences(*leaves, 3)
+    exact = torch.autograd.grad(expected, leaves, pull)
+    assert y.dtype == grads[0].dtype == torch.bfloat16 and grads[1].dtype == torch.float32
+    for found, value in zip((y, *grads), (expected, *exact), strict=True):
+        assert (found.float() - value).norm() <= 1e-2 * value.norm()
+
+
+def test_no_bias():
+    tokens, weight, _ = inputs(3)
+    expected = as_sequences(tokens, weight, None, 1)
+    torch.testing.assert_close(depthwise_conv(tokens, weight, None, 1), expected)
