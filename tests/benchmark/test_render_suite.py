@@ -121,7 +121,7 @@ def test_peak_memory_is_the_rise():
 
 def test_unknown_words_are_named():
     with pytest.raises(
-        InputError, match=r"^suite=rendr is unknown: choose one of render, ops, model\.$"
+        InputError, match=r"^suite=rendr is unknown: choose one of render, ops, model, data\.$"
     ):
         find_suite("rendr")
     with pytest.raises(InputError, match=r"^scenes=D is unknown: .*A, B, C, 524k, 4M"):
