@@ -9,11 +9,11 @@ from PIL import Image
 from rich.progress import track
 
 from asysplat.data import ProceduralScene
+from asysplat.data.readers.poses import opencv_from_opengl
 
 RENDERED = (135, 240)  # height, width; enlarged to that of the photographs
 PICTURES = 8  # that are different to look at
 QUALITY = 90  # of the JPEG
-SHIFT = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes from OpenCV's
 
 
 def write_photographs(folder: Path, frames: int, height: int, width: int) -> None:
@@ -23,7 +23,8 @@ def write_photographs(folder: Path, frames: int, height: int, width: int) -> Non
     pictures = [_enlarged(image.permute(1, 2, 0).numpy(), height, width) for image in shown]
     (folder / "images").mkdir(parents=True)
     entries = []
-    poses = scene.cameras.cam_to_world.double().numpy() @ SHIFT
+    # What turns OpenGL's axes into OpenCV's turns them back as well.
+    poses = [opencv_from_opengl(pose) for pose in scene.cameras.cam_to_world.double().numpy()]
     for number in track(range(frames), "photographs", transient=True):
         name = f"images/{number:05d}.jpg"
         stored = BytesIO()

@@ -82,6 +82,8 @@ def store(typing_context, rows, row, value):
 
 @intrinsic
 def zeros(typing_context):
+    """A vector of them."""
+
     def generate(context, builder, signature, args):
         return ir.Constant(FLOATS, [0.0] * LANES)
 
