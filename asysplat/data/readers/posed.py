@@ -18,9 +18,9 @@ from asysplat.data.readers.colmap import points_beside
 from asysplat.data.readers.folders import folders_with
 from asysplat.data.readers.pictures import images_in, scaled
 from asysplat.data.readers.poses import rigid
+from asysplat.data.readers.transforms import MILLIMETRES
 from asysplat.errors import InputError
 
-MILLIMETRES = 0.001
 POSES = ("poses_refined.txt", "poses.txt")  # the first that is there
 
 
