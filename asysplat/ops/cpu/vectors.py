@@ -36,10 +36,26 @@ class _VectorModel(models.PrimitiveModel):
         super().__init__(manager, kind, FLOATS)
 
 
-@lower_cast(types.Float, Vector)
-def _splat(context, builder, from_type, to_type, value):
+def splat(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    """A vector of equal numbers."""
     one = builder.insert_element(ir.Constant(FLOATS, ir.Undefined), value, ir.IntType(32)(0))
     return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
+
+
+@lower_cast(types.Float, Vector)
+def _splat(context, builder, from_type, to_type, value):
+    return splat(builder, value)
+
+
+def emit_fma(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
+    """a * b + c, rounded once where the processor can do that; of vectors or of float32."""
+    if not HAS_FMA:
+        return builder.fadd(builder.fmul(a, b), c)
+    if a.type != FLOATS:
+        return builder.fma(a, b, c)
+    function = ir.FunctionType(FLOATS, [FLOATS] * 3)
+    name = f"llvm.fma.v{LANES}f32"
+    return builder.call(cgutils.get_or_insert_function(builder.module, function, name), [a, b, c])
 
 
 @intrinsic
@@ -48,13 +64,7 @@ def fma(typing_context, a, b, c):
     kind = VECTOR if VECTOR in (a, b, c) else a
 
     def generate(context, builder, signature, args):
-        if not HAS_FMA:
-            return builder.fadd(builder.fmul(args[0], args[1]), args[2])
-        if kind != VECTOR:
-            return builder.fma(*args)
-        function = ir.FunctionType(FLOATS, [FLOATS] * 3)
-        name = f"llvm.fma.v{LANES}f32"
-        return builder.call(cgutils.get_or_insert_function(builder.module, function, name), args)
+        return emit_fma(builder, *args)
 
     return kind(kind, kind, kind), generate
 

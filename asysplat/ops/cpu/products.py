@@ -1,0 +1,159 @@
+"""Products of small matrices inside kernels: their factors are near the processor already.
+
+A tile of ROWS x LANES sums stays in registers, and every sum is taken in the order of its terms,
+rounded once a term: how the matrices are cut changes no bit.
+"""
+
+import llvmlite.binding
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.base import BaseContext
+from numba.extending import intrinsic
+
+from asysplat.ops.cpu.kernel import inline
+from asysplat.ops.cpu.lanes import ONE
+from asysplat.ops.cpu.vectors import FLOATS, INTEGERS, LANES, emit_fma, splat
+
+HAS_32_VECTORS = bool(llvmlite.binding.get_host_cpu_features().get("avx512f", False))
+ROWS = 8 if HAS_32_VECTORS else 4
+BYTES = 4  # of a float32
+
+
+@inline
+def add_product(out, a, b, keep):
+    """out = keep out + a b; `keep` = 0 forgets what stood there, were it not a number.
+
+    Args:
+        out: [rows, columns], columns in whole vectors of LANES, one after the other.
+        a: [rows, terms], in any order.
+        b: [terms, columns], as `out`.
+    """
+    rows, terms = a.shape
+    whole = rows // ROWS * ROWS
+    for column in range(0, out.shape[1], LANES):
+        for row in range(0, whole, ROWS):
+            add_tile(out, a, b, row, column, 0, terms, keep)
+        for row in range(whole, rows):
+            add_row(out, a, b, row, column, 0, terms, keep)
+
+
+@inline
+def add_triangle(out, a, b, upper):
+    """out += a b, where square `a` has zeros below its diagonal (`upper`) or above it.
+
+    Its side is a multiple of ROWS; beside the squares of ROWS on the diagonal, no zero is read.
+    """
+    side = len(a)
+    for column in range(0, out.shape[1], LANES):
+        for row in range(0, side, ROWS):
+            first = row if upper else 0
+            last = side if upper else row + ROWS
+            add_tile(out, a, b, row, column, first, last, ONE)
+
+
+@inline
+def transpose(matrix, out):
+    """Write the transpose into the first columns of `out`; columns of `matrix` as in a product."""
+    rows, columns = matrix.shape
+    whole = rows // LANES * LANES
+    for column in range(0, columns, LANES):
+        for row in range(0, whole, LANES):
+            transpose_tile(matrix, out, row, column)
+        for row in range(whole, rows):
+            for i in range(column, column + LANES):
+                out[i, row] = matrix[row, i]
+
+
+@intrinsic
+def transpose_tile(typing_context, matrix, out, row, column):
+    """Of LANES x LANES numbers from that row and column on."""
+
+    def generate(context, builder, signature, args):
+        source, target = (_Matrix(context, builder, signature.args[i], args[i]) for i in range(2))
+        row, column = (
+            context.cast(builder, args[i], signature.args[i], types.intp) for i in (2, 3)
+        )
+        vectors = [
+            builder.load(source.vector(builder.add(row, row.type(i)), column), align=BYTES)
+            for i in range(LANES)
+        ]
+        # To put the second half's rows between those of the first, four times, swaps the indices.
+        half = LANES // 2
+        for _ in range(LANES.bit_length() - 1):
+            vectors = [
+                _interleaved(builder, vectors[i], vectors[i + half], first)
+                for i in range(half)
+                for first in (0, half)
+            ]
+        for i, vector in enumerate(vectors):
+            place = target.vector(builder.add(column, column.type(i)), row)
+            builder.store(vector, place, align=BYTES)
+        return context.get_dummy_value()
+
+    return types.void(matrix, out, row, column), generate
+
+
+def _interleaved(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, first: int) -> ir.Value:
+    """Half of both, from the number `first` on."""
+    order = [i for k in range(first, first + LANES // 2) for i in (k, LANES + k)]
+    return builder.shuffle_vector(a, b, ir.Constant(INTEGERS, order))
+
+
+def _tile(rows: int):
+    """out[row : row + rows, column : column + LANES] = keep out + a b, terms first to last."""
+
+    @intrinsic
+    def add(typing_context, out, a, b, row, column, first, last, keep):
+        def generate(context, builder, signature, args):
+            matrices = [_Matrix(context, builder, signature.args[i], args[i]) for i in range(3)]
+            place = zip(args[3:7], signature.args[3:7], strict=True)
+            place = (context.cast(builder, value, kind, types.intp) for value, kind in place)
+            _generate_tile(builder, rows, matrices, *place, args[7])
+            return context.get_dummy_value()
+
+        return types.void(out, a, b, row, column, first, last, keep), generate
+
+    return add
+
+
+def _generate_tile(builder, rows, matrices, row, column, first, last, keep):
+    out, a, b = matrices
+    numbers = [builder.add(row, row.type(i)) for i in range(rows)]
+    places = [out.vector(number, column) for number in numbers]
+    # LLVM keeps in registers what is written to such places alone.
+    sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(rows)]
+    forget = builder.fcmp_ordered("==", keep, keep.type(0.0))
+    for place, value in zip(places, sums, strict=True):
+        kept = builder.fmul(builder.load(place, align=BYTES), splat(builder, keep))
+        builder.store(builder.select(forget, ir.Constant(FLOATS, [0.0] * LANES), kept), value)
+    with cgutils.for_range_slice(builder, first, last, first.type(1)) as (term, _):
+        vector = builder.load(b.vector(term, column), align=BYTES)
+        for number, value in zip(numbers, sums, strict=True):
+            factor = splat(builder, builder.load(a.element(number, term), align=BYTES))
+            builder.store(emit_fma(builder, factor, vector, builder.load(value)), value)
+    for place, value in zip(places, sums, strict=True):
+        builder.store(builder.load(value), place, align=BYTES)
+
+
+class _Matrix:
+    """A float32 array in the code that is written, of any strides."""
+
+    def __init__(self, context: BaseContext, builder: ir.IRBuilder, kind: types.Array, value):
+        array = context.make_array(kind)(context, builder, value)
+        self.builder = builder
+        self.data = builder.bitcast(array.data, ir.IntType(8).as_pointer())
+        self.strides = [builder.extract_value(array.strides, axis) for axis in range(2)]
+
+    def element(self, row: ir.Value, column: ir.Value) -> ir.Value:
+        """Pointer to it."""
+        offsets = map(self.builder.mul, (row, column), self.strides)
+        byte = self.builder.gep(self.data, [self.builder.add(*offsets)])
+        return self.builder.bitcast(byte, ir.FloatType().as_pointer())
+
+    def vector(self, row: ir.Value, column: ir.Value) -> ir.Value:
+        """Pointer to LANES elements from this one on."""
+        return self.builder.bitcast(self.element(row, column), FLOATS.as_pointer())
+
+
+add_tile, add_row = _tile(ROWS), _tile(1)
