@@ -91,6 +91,36 @@ def store(typing_context, rows, row, value):
 
 
 @intrinsic
+def load_some(typing_context, numbers, first, count):
+    """Up to LANES numbers from `first` on of a contiguous array, and zeros behind `count`."""
+
+    def generate(context, builder, signature, args):
+        pointer, mask = _some(context, builder, signature, args)
+        kind = ir.FunctionType(FLOATS, [pointer.type, ir.IntType(32), mask.type, FLOATS])
+        name = f"llvm.masked.load.v{LANES}f32.p0"
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        nothing = ir.Constant(FLOATS, [0.0] * LANES)
+        return builder.call(function, [pointer, ir.IntType(32)(4), mask, nothing])
+
+    return VECTOR(numbers, first, count), generate
+
+
+@intrinsic
+def store_some(typing_context, numbers, first, count, value):
+    """Write the first `count` of a vector's numbers to `first` and on of a contiguous array."""
+
+    def generate(context, builder, signature, args):
+        pointer, mask = _some(context, builder, signature, args)
+        kind = ir.FunctionType(ir.VoidType(), [FLOATS, pointer.type, ir.IntType(32), mask.type])
+        name = f"llvm.masked.store.v{LANES}f32.p0"
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        builder.call(function, [args[3], pointer, ir.IntType(32)(4), mask])
+        return context.get_dummy_value()
+
+    return types.void(numbers, first, count, VECTOR), generate
+
+
+@intrinsic
 def zeros(typing_context):
     """A vector of them."""
 
@@ -123,6 +153,17 @@ def _place(context, builder, signature, args):
     row = context.cast(builder, args[1], signature.args[1], types.intp)
     place = builder.gep(array.data, [builder.mul(row, row.type(LANES))])
     return builder.bitcast(place, FLOATS.as_pointer())
+
+
+def _some(context, builder, signature, args):
+    """Pointer to the number args[1] of an array, and which of LANES are among args[2]."""
+    array = context.make_array(signature.args[0])(context, builder, args[0])
+    first = context.cast(builder, args[1], signature.args[1], types.intp)
+    pointer = builder.bitcast(builder.gep(array.data, [first]), FLOATS.as_pointer())
+    count = context.cast(builder, args[2], signature.args[2], types.int32)
+    one = builder.insert_element(ir.Constant(INTEGERS, ir.Undefined), count, ir.IntType(32)(0))
+    counts = builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
+    return pointer, builder.icmp_signed("<", ir.Constant(INTEGERS, list(range(LANES))), counts)
 
 
 def _arithmetic(symbol: Callable, instruction: str) -> None:
