@@ -76,6 +76,9 @@ def print_summary(results: dict[str, float | int | str], data: str, folder: Path
     if "cost/seconds_per_step" in results:
         step, rendering = results["cost/seconds_per_step"], results["cost/render_seconds"]
         costs.append(f"{step:.2f} s a step, {rendering / step:.1%} of it for rendering")
+    if "cost/peak_gb" in results:
+        per_token = results["cost/peak_bytes_per_token"] / 1e3
+        costs.append(f"{results['cost/peak_gb']:.2f} GB at most, {per_token:.0f} kB a token")
     console.print(", ".join(costs), soft_wrap=True)
     for picture in sorted((folder / "pictures").glob("test-*.png")):
         console.print(f"picture: {picture}", soft_wrap=True)

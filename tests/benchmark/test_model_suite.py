@@ -31,15 +31,25 @@ def conf(repository):
 
 
 @pytest.fixture(scope="module")
-def measured(conf, repository, tmp_path_factory):
+def run_suite(conf, repository, tmp_path_factory):
+    """The suite on these options of `model`: its results and the folder they are in."""
+
+    def run(**model):
+        folder = tmp_path_factory.mktemp("benchmark")
+        script = runpy.run_path(str(repository / "benchmark.py"))
+        options = compose("benchmark", ["suite=model", "repeats=2", "device=cpu"])
+        OmegaConf.set_struct(options, False)  # the words are the user's
+        tiny = {"words": WORDS, "precisions": ["fp32"], **model}
+        script["benchmark"](OmegaConf.merge(options, {"model": tiny, "output": str(folder)}))
+        return json.loads((folder / "model.json").read_text()), folder
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def measured(run_suite):
     """The numbers by model, views and precision, all of them, and the folder they are in."""
-    folder = tmp_path_factory.mktemp("benchmark")
-    script = runpy.run_path(str(repository / "benchmark.py"))
-    options = compose("benchmark", ["suite=model", "repeats=2", "device=cpu"])
-    OmegaConf.set_struct(options, False)  # the words are the user's
-    tiny = {"names": NAMES, "views": VIEWS, "words": WORDS, "precisions": ["fp32"]}
-    script["benchmark"](OmegaConf.merge(options, {"model": tiny, "output": str(folder)}))
-    results = json.loads((folder / "model.json").read_text())
+    results, folder = run_suite(names=NAMES, views=VIEWS)
     rows = {(row["model"], row["views"], row["precision"]): row for row in results["rows"]}
     return rows, results, folder
 
@@ -65,14 +75,22 @@ def test_rows_are_complete_and_consistent(measured):
             assert row["bytes_per_token"][key] * row["tokens"] == pytest.approx(
                 1e9 * row["peak_gb"][key]
             )
+            first = rows[NAMES[0], views, precision][key]["median"]
+            assert row["over_first"][key] == pytest.approx(seconds["median"] / first)
+            assert row["over_first"][key] == 1 or name != NAMES[0]
         assert row["step"]["median"] > row["forward"]["median"]
-        first = rows[NAMES[0], views, precision]["step"]["median"]
-        assert row["step_over_first"] == pytest.approx(row["step"]["median"] / first)
-        assert row["step_over_first"] == 1 or name != NAMES[0]
         kilobytes = f"{1e6 * row['peak_gb']['step'] / row['tokens']:,.0f}"
         assert NETWORKS["step\nkB / token"](row) == kilobytes
     assert len(tables(results)) == 3
     assert (folder / "model.png").stat().st_size > 0
+
+
+def test_steps_are_left_out_where_they_are_not_asked_for(run_suite):
+    results, _ = run_suite(names=NAMES, views=[2], steps=False)
+    for row in results["rows"]:
+        assert row["step"] is None and row["over_floor"]["step"] is None
+        assert row["over_first"]["step"] is None and row["over_first"]["forward"] > 0
+        assert set(row["peak_gb"]) == {"forward"} and NETWORKS["step\nGB"](row) == "-"
 
 
 def test_the_floor_is_below_the_total(measured):

@@ -90,8 +90,10 @@ def test_only_the_main_set_is_drawn(measure, together):
 def test_the_summary_shows_every_set(together, capsys):
     results, folder = together
     costs = {"cost/parameters": 1e6, "cost/geometry_share": 0.7, "cost/gaussians": 10}
+    costs |= {"cost/peak_gb": 2.0, "cost/peak_bytes_per_token": 35e3}
     print_summary(results | costs, "procedural", folder)
     printed = capsys.readouterr().out
+    assert "2.00 GB at most, 35 kB a token" in printed
     for name in ("rooms", "outdoors", "more_views"):
         (line,) = (line for line in printed.splitlines() if name in line)
         for kind in (

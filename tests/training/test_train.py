@@ -33,11 +33,12 @@ def test_a_run_leaves_what_is_promised(train):
     assert numbers["baseline/procedural/mean_colour/psnr"] < 30
     assert numbers["baseline/procedural/nearest_view/psnr"] < 30
     expected = {"parameters", "geometry_share", "gflops", "gflops_true", "gaussians"}
-    expected |= {"peak_gb"}
+    expected |= {"peak_gb", "peak_bytes_per_token"}
     assert expected <= {key.removeprefix("cost/") for key in numbers if key.startswith("cost/")}
     assert "window 11x11" in numbers["protocol/ssim"]
     assert numbers["cost/gaussians"] == 3 * 16 * 16
     assert numbers["cost/gflops_true"] > numbers["cost/gflops"] > 0
+    assert 0 < numbers["cost/peak_bytes_per_token"] < 1e9 * numbers["cost/peak_gb"]
 
     with (folder / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))

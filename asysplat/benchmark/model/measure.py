@@ -19,10 +19,11 @@ from asysplat.benchmark.model.components import (
 )
 from asysplat.benchmark.model.task import Task, make_net, make_views
 from asysplat.benchmark.products import Product, product_timers, sum_of_products
-from asysplat.benchmark.timing import Timer, rise_gb, rounds, run_timer, summary
+from asysplat.benchmark.timing import Run, Timer, rise_gb, rounds, run_timer, summary
 from asysplat.evaluation.cost import GB, count_parameters
 from asysplat.evaluation.static_cost import GIGA
 
+PASSES = ("forward", "step")
 BACKWARD = 2  # products in the backward pass for each of the forward pass
 
 Result = dict[str, Any]
@@ -31,10 +32,16 @@ Counts = Mapping[str, Mapping[Product, int]]
 
 @dataclass
 class _Row:
-    """A network at one precision and number of views."""
+    """A network at one precision and number of views.
+
+    Args:
+        passes: what is timed of it, by name.
+        counts: of products, by component.
+    """
 
     task: Task
-    counts: Counts  # of products, by component
+    passes: Mapping[str, Run]
+    counts: Counts
     result: Result
 
 
@@ -43,8 +50,8 @@ def measure(options: DictConfig, console: Console) -> Result:
 
     Returns:
         "rows": one for each network, number of views and precision, times in seconds. The floor is
-        the time that the forward pass's matrix products take by themselves. A step that would not
-        fit into memory is None.
+        the time that the forward pass's matrix products take by themselves. A step that was
+        not asked for, or would not fit into memory, is None.
 
     Raises:
         InputError: repeats below 1; an unknown model, word, precision or device; a resolution that
@@ -62,14 +69,18 @@ def measure(options: DictConfig, console: Console) -> Result:
             for count in wanted.views or [size["views"]]:
                 views = make_views(count, size["height"], size["width"], device)
                 for precision, dtype in precisions.items():
-                    rows.append(_prepare(Task(name, net, precision, dtype, views)))
+                    task = Task(name, net, precision, dtype, views)
+                    rows.append(_prepare(task, wanted.steps))
     with console.status(f"{options.repeats} rounds"):
         _measure_rows(rows, device, options.repeats)
     return {"rows": [row.result for row in rows]}
 
 
-def _prepare(task: Task) -> _Row:
+def _prepare(task: Task, steps: bool) -> _Row:
     """What is known before anything is timed."""
+    passes = {"forward": task.forward}
+    if steps and task.step_fits:
+        passes["step"] = task.step
     cameras = task.views.cameras
     counts = record_products(task)
     result = {
@@ -83,16 +94,12 @@ def _prepare(task: Task) -> _Row:
         "threads": torch.get_num_threads(),
         "gflops": sum(n * p.flops() for p, n in _all_of(counts).items()) / GIGA,
         "step_needs_gb": task.step_gb,
-        "peak_gb": {name: rise_gb(run, task.device) for name, run in _passes(task).items()},
+        "peak_gb": {name: rise_gb(run, task.device) for name, run in passes.items()},
     }
     result["bytes_per_token"] = {
         name: GB * value / task.tokens for name, value in result["peak_gb"].items()
     }
-    return _Row(task, counts, result)
-
-
-def _passes(task: Task) -> dict[str, Any]:
-    return {"forward": task.forward} | ({"step": task.step} if task.step_fits else {})
+    return _Row(task, passes, counts, result)
 
 
 def _all_of(counts: Counts) -> Counter[Product]:
@@ -104,8 +111,7 @@ def _measure_rows(rows: list[_Row], device: torch.device, repeats: int) -> None:
     timers: list[Timer] = []
     every: Counter[Product] = Counter()
     for number, row in enumerate(rows):
-        passes = _passes(row.task).items()
-        timers += [run_timer((number, name), run, device) for name, run in passes]
+        timers += [run_timer((number, name), run, device) for name, run in row.passes.items()]
         timers.append(_component_timer(number, row.task))
         every |= _all_of(row.counts)
     timers += product_timers(every, device)
@@ -113,7 +119,9 @@ def _measure_rows(rows: list[_Row], device: torch.device, repeats: int) -> None:
     for number, row in enumerate(rows):
         row.result |= _times(number, row, seconds)
     for row in rows:
-        row.result["step_over_first"] = _over_first(row.result, rows[0].result["model"], rows)
+        row.result["over_first"] = {
+            name: _over_first(name, row.result, rows[0].result["model"], rows) for name in PASSES
+        }
 
 
 def _component_timer(number: int, task: Task) -> Timer:
@@ -121,7 +129,7 @@ def _component_timer(number: int, task: Task) -> Timer:
 
 
 def _times(number: int, row: _Row, seconds: Mapping[Any, list[float]]) -> Result:
-    found = {name: summary(seconds[number, name]) for name in _passes(row.task)}
+    found = {name: summary(seconds[number, name]) for name in row.passes}
     floor = summary(sum_of_products(_all_of(row.counts), seconds))
     step = found.get("step")
     return {
@@ -159,10 +167,10 @@ def _component(
     return {"seconds": summary(measured), "floor": floor}
 
 
-def _over_first(result: Result, first: str, rows: list[_Row]) -> float | None:
-    """A step's time over that of the first model, on the same views at the same precision."""
+def _over_first(name: str, result: Result, first: str, rows: list[_Row]) -> float | None:
+    """A pass's time over that of the first model, on the same views at the same precision."""
     wanted = {**{key: result[key] for key in ("views", "precision")}, "model": first}
     for row in rows:
-        if wanted.items() <= row.result.items() and row.result["step"] and result["step"]:
-            return result["step"]["median"] / row.result["step"]["median"]
+        if wanted.items() <= row.result.items() and row.result[name] and result[name]:
+            return result[name]["median"] / row.result[name]["median"]
     return None

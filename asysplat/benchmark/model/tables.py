@@ -25,7 +25,8 @@ def tables(results: Result) -> list[Table]:
     network_notes = (
         f"{describe_machine_in_words(results['machine'])}\nmedian ± interquartile range\n"
         "floor: the forward pass's matrix products and convolutions by themselves; a step's is "
-        "three times that\nstep: forward and backward; -: would not fit into memory\n"
+        "three times that\nstep: forward and backward; -: not asked for, or would not fit into "
+        "memory\n"
         "/ first: to the first model at this precision and number of views\n"
         "tokens: those of the largest patch"
     )
@@ -77,9 +78,10 @@ NETWORKS: Columns = {
     "forward\nms": lambda row: milliseconds(row["forward"]),
     "floor\nms": lambda row: milliseconds(row["floor"]),
     "forward\n/ floor": lambda row: show_limited(row["over_floor"]["forward"], MOST_OVER_FLOOR),
+    "forward\n/ first": lambda row: show(row["over_first"]["forward"], "{:.2f}"),
     "step\nms": lambda row: milliseconds(row["step"]),
     "step\n/ floor": lambda row: show(row["over_floor"]["step"], "{:.2f}"),
-    "step\n/ first": lambda row: show(row["step_over_first"], "{:.2f}"),
+    "step\n/ first": lambda row: show(row["over_first"]["step"], "{:.2f}"),
     "forward\nkB / token": lambda row: _kilobytes(row, "forward"),
     "step\nkB / token": lambda row: _kilobytes(row, "step"),
     "step\nGB": lambda row: show(row["peak_gb"].get("step"), "{:.2f}"),

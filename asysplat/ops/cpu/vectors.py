@@ -38,7 +38,8 @@ class _VectorModel(models.PrimitiveModel):
 
 def splat(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
     """A vector of equal numbers."""
-    one = builder.insert_element(ir.Constant(FLOATS, ir.Undefined), value, ir.IntType(32)(0))
+    undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
+    one = builder.insert_element(undefined, value, ir.IntType(32)(0))
     return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
 
 
@@ -161,9 +162,8 @@ def _some(context, builder, signature, args):
     first = context.cast(builder, args[1], signature.args[1], types.intp)
     pointer = builder.bitcast(builder.gep(array.data, [first]), FLOATS.as_pointer())
     count = context.cast(builder, args[2], signature.args[2], types.int32)
-    one = builder.insert_element(ir.Constant(INTEGERS, ir.Undefined), count, ir.IntType(32)(0))
-    counts = builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
-    return pointer, builder.icmp_signed("<", ir.Constant(INTEGERS, list(range(LANES))), counts)
+    numbers = ir.Constant(INTEGERS, list(range(LANES)))
+    return pointer, builder.icmp_signed("<", numbers, splat(builder, count))
 
 
 def _arithmetic(symbol: Callable, instruction: str) -> None:

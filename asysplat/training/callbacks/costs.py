@@ -8,7 +8,7 @@ import lightning
 import torch
 
 from asysplat.data.datamodule import collate
-from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
+from asysplat.evaluation.cost import GB, peak_memory_gb, reset_peak_memory
 from asysplat.evaluation.render_time import render_seconds, wait_for
 from asysplat.evaluation.static_cost import static_costs
 
@@ -19,9 +19,11 @@ class Costs(lightning.Callback):
     """Writes `values`, "cost/..." -> number; what needs no running is known before the first step.
 
     Of one scene at the run's views and resolution: see `static_costs`. Measured: the median
-    training step and the peak of memory over all of them (seconds_per_step, peak_gb); what a step
-    renders, with its gradients (render_seconds); the median forward of the network over the test's
-    scenes and the peak of memory in the test (inference_seconds, inference_gb).
+    training step and the peak of memory over all of them (seconds_per_step, peak_gb), and what that
+    is beyond what there was before the first, for each token of the largest patch in a batch
+    (peak_bytes_per_token); what a step renders, with its gradients (render_seconds); the median
+    forward of the network over the test's scenes and the peak of memory in the test
+    (inference_seconds, inference_gb).
     """
 
     def __init__(self):
@@ -32,8 +34,12 @@ class Costs(lightning.Callback):
     def on_fit_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         # Jobs of a sweep share a process, and the peak would be that of the largest.
         reset_peak_memory(module.device)
+        self.gb_before = peak_memory_gb(module.device)
         scene = trainer.datamodule.evaluation["val"][0]["inputs"]
-        costs = static_costs(module.net, scene.num_views, *scene.images.shape[-2:])
+        height, width = scene.images.shape[-2:]
+        tokens = scene.num_views * height * width // module.net.patch**2
+        self.batch_tokens = trainer.datamodule.batch_size * tokens
+        costs = static_costs(module.net, scene.num_views, height, width)
         self.values = {f"cost/{name}": value for name, value in costs.items()}
         for logger in trainer.loggers:
             logger.log_metrics(self.values, step=0)
@@ -53,7 +59,9 @@ class Costs(lightning.Callback):
         if measured:
             self.values["cost/seconds_per_step"] = statistics.median(measured)
             self.values["cost/render_seconds"] = self._render_seconds(trainer, module)
-        self.values["cost/peak_gb"] = peak_memory_gb(module.device)
+        peak = peak_memory_gb(module.device)
+        per_token = GB * (peak - self.gb_before) / self.batch_tokens
+        self.values |= {"cost/peak_gb": peak, "cost/peak_bytes_per_token": per_token}
         for logger in trainer.loggers:
             logger.log_metrics(self.values, step=trainer.global_step)
 
