@@ -1,9 +1,9 @@
 """The selective scan for CPUs (Numba): a state of 16 channels at a time.
 
-A task takes a sequence and 16 of its channels, one vector wide, and walks through chunks of tokens,
-one of the N states after the other: it stays in a register meanwhile. Nothing is stored between the
-passes but the state at the beginning of each chunk; the backward pass walks through a chunk once
-more before it walks back.
+A task walks through a sequence by chunks of tokens, and through a chunk by blocks of 16 channels,
+one vector wide, one of the N states after the other: it stays in a register meanwhile. Nothing is
+stored between the passes but the state at the beginning of each chunk; the backward pass walks
+through a chunk once more before it walks back.
 """
 
 import math
@@ -114,8 +114,8 @@ def _forward(start, stop, x, dt, B, C, A, D, reverse, y, carried):
     length, channels = x.shape[1:]
     blocks, chunks, state_size = carried.shape[1:4]
     states = np.empty((blocks, state_size, LANES), np.float32)
+    values, out = np.empty((CHUNK, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
     steps, added = np.empty((CHUNK, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
-    out = np.empty((CHUNK, LANES), np.float32)
     while start < stop:
         batch, first_block = start // blocks, start % blocks
         last_block = min(blocks, first_block + stop - start)
@@ -129,14 +129,14 @@ def _forward(start, stop, x, dt, B, C, A, D, reverse, y, carried):
                 carried[batch, block, chunk] = state
                 first = block * LANES
                 width = min(LANES, channels - first)
-                skip = load(D[block], 0)
                 for k in range(count):
                     t = length - 1 - begin - k if reverse else begin + k
                     place = (batch * length + t) * channels + first
                     step, value = load_some(dt, place, width), load_some(x, place, width)
                     store(steps, k, step)
+                    store(values, k, value)
                     store(added, k, step * value)
-                    store(out, k, skip * value)
+                out[:] = ZERO
                 for n in range(state_size):
                     rate, value = load(rates, n), load(state, n)
                     for k in range(count):
@@ -145,10 +145,11 @@ def _forward(start, stop, x, dt, B, C, A, D, reverse, y, carried):
                         value = fma(decay, value, load(added, k) * B[batch, t, n])
                         store(out, k, fma(C[batch, t, n], value, load(out, k)))
                     store(state, n, value)
+                skip = load(D[block], 0)
                 for k in range(count):
                     t = length - 1 - begin - k if reverse else begin + k
                     place = (batch * length + t) * channels + first
-                    store_some(y, place, width, load(out, k))
+                    store_some(y, place, width, fma(skip, load(values, k), load(out, k)))
 
 
 @kernel
