@@ -20,7 +20,7 @@ def scan_operator(
     Such a module has three functions:
 
     carried_shape(x, B) -> shape in fp32 of what the backward pass needs besides the inputs
-    forward(x, dt, A, B, C, D, reverse) -> (y, carried)
+    forward(x, dt, A, B, C, D, reverse, keep) -> (y, carried), with sides of 0 if not to be kept
     backward(grad_y, x, dt, A, B, C, D, carried, reverse) -> gradients of x, dt, A, B, C, D
 
     Args:
@@ -29,7 +29,9 @@ def scan_operator(
     """
     name = f"asysplat::{scan}"
     forward = torch.library.custom_op(
-        name, mutates_args=(), schema=f"(str form, {SIGNATURE}, bool reverse) -> (Tensor, Tensor)"
+        name,
+        mutates_args=(),
+        schema=f"(str form, {SIGNATURE}, bool reverse, bool keep) -> (Tensor, Tensor)",
     )(lambda form, *args: _module(scan, form).forward(*args))
     backward = torch.library.custom_op(
         f"{name}_backward",
@@ -39,8 +41,9 @@ def scan_operator(
     )(lambda form, *args: _module(scan, form).backward(*args))
 
     @forward.register_fake
-    def _(form, x, dt, A, B, C, D, reverse):
+    def _(form, x, dt, A, B, C, D, reverse, keep):
         shape = _module(scan, form).carried_shape(x, B)
+        shape = shape if keep else (0,) * len(shape)
         return torch.empty_like(x), x.new_empty(shape, dtype=torch.float32)
 
     @backward.register_fake
@@ -48,11 +51,11 @@ def scan_operator(
         return tuple(torch.empty_like(tensor) for tensor in (x, dt, A, B, C, D))
 
     def save(ctx, inputs, output):
-        ctx.form, *tensors, ctx.reverse = inputs
+        ctx.form, *tensors, ctx.reverse, _ = inputs
         ctx.save_for_backward(*tensors, output[1])
 
     def gradients(ctx, grad_y, _):
-        return None, *backward(ctx.form, grad_y, *ctx.saved_tensors, ctx.reverse), None
+        return None, *backward(ctx.form, grad_y, *ctx.saved_tensors, ctx.reverse), None, None
 
     forward.register_autograd(gradients, setup_context=save)
     operators = torch.ops.asysplat
@@ -65,7 +68,12 @@ def scan_operator(
     def _(form, grad_shape, x_shape, dt_shape, A_shape, B_shape, *_, **__) -> int:
         return count_flops(x_shape, B_shape)[1]
 
-    return lambda *args: forward(*args)[0]
+    def run(form: str, *args: Tensor | bool) -> Tensor:
+        *tensors, reverse = args
+        keep = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+        return forward(form, *tensors, reverse, keep)[0]
+
+    return run
 
 
 def _module(scan: str, form: str) -> ModuleType:

@@ -108,17 +108,29 @@ def test_torch_sees_one_operator(name):
     scan, make, _ = SCANS[name]
     arguments = [a.requires_grad_() for a in make(length=70, dtype=torch.float32)]
     operator = getattr(torch.ops.asysplat, name).default
-    torch.library.opcheck(operator, ("cpu", *arguments, True))
+    torch.library.opcheck(operator, ("cpu", *arguments, True, True))
+    torch.library.opcheck(operator, ("cpu", *(a.detach() for a in arguments), True, False))
 
     # The public function less what checks its shapes in tests, which cannot be compiled.
     @torch.compile(backend="aot_eager", fullgraph=True)
     def compiled(*arguments):
-        return operator("cpu", *arguments, False)[0]
+        return operator("cpu", *arguments, False, True)[0]
 
     expected, got = scan(*arguments), compiled(*arguments)
     assert torch.equal(got, expected)
     grads = [torch.autograd.grad(y.square().sum(), arguments) for y in (expected, got)]
     assert all(map(torch.equal, *grads))
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_nothing_is_kept_where_no_gradient_is_asked_for(name):
+    scan, make, _ = SCANS[name]
+    arguments = make(length=70, dtype=torch.float32)
+    operator = getattr(torch.ops.asysplat, name).default
+    y, carried = operator("cpu", *arguments, False, True)
+    without, nothing = operator("cpu", *arguments, False, False)
+    assert torch.equal(without, y) and carried.numel() > 0 and nothing.numel() == 0
+    assert torch.equal(scan(*arguments), y)
 
 
 @pytest.mark.parametrize("name", SCANS)

@@ -28,16 +28,19 @@ def carried_shape(x: Tensor, B: Tensor) -> tuple:
 
 
 def forward(
-    x: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor, reverse: bool
+    x: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor, reverse: bool, keep: bool
 ) -> tuple[Tensor, Tensor]:
-    """y, and what `backward` needs besides; see `asysplat.ops.selective_scan`."""
+    """y, and what `backward` needs besides if that is to be kept.
+
+    See `asysplat.ops.selective_scan`.
+    """
     y = torch.empty(x.shape, dtype=torch.float32)
-    carried = torch.empty(carried_shape(x, B))
-    arrays = _arrays(x, dt, B, C)
+    shape = carried_shape(x, B)
+    carried = torch.empty(shape if keep else (0,) * len(shape))
     run_blocks(
         _forward,
-        even_bounds(carried.shape[0] * carried.shape[1]),
-        *arrays,
+        even_bounds(shape[0] * shape[1]),
+        *_arrays(x, dt, B, C),
         _by_block(A * LOG2_E),
         _by_block(D[:, None]),
         reverse,
@@ -112,7 +115,8 @@ def _by_channel(by_block: Tensor) -> Tensor:
 def _forward(start, stop, x, dt, B, C, A, D, reverse, y, carried):
     """Blocks start to stop of B x (blocks of channels)."""
     length, channels = x.shape[1:]
-    blocks, chunks, state_size = carried.shape[1:4]
+    blocks, state_size = A.shape[:2]
+    chunks = -(-length // CHUNK)
     states = np.empty((blocks, state_size, LANES), np.float32)
     values, out = np.empty((CHUNK, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
     steps, added = np.empty((CHUNK, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
@@ -126,7 +130,8 @@ def _forward(start, stop, x, dt, B, C, A, D, reverse, y, carried):
             count = min(CHUNK, length - begin)
             for block in range(first_block, last_block):
                 state, rates = states[block], A[block]
-                carried[batch, block, chunk] = state
+                if len(carried):
+                    carried[batch, block, chunk] = state
                 first = block * LANES
                 width = min(LANES, channels - first)
                 for k in range(count):

@@ -29,8 +29,9 @@ def forward(
     C: Float[Tensor, "B L N"],
     D: Float[Tensor, "D"],
     reverse: bool,
+    keep: bool,
 ) -> tuple[Float[Tensor, "B L D"], Float[Tensor, "0"]]:
-    """y, and an empty tensor; see `asysplat.ops.selective_scan`.
+    """y, and an empty tensor, which is all there is to keep; see `asysplat.ops.selective_scan`.
 
     Raises:
         InputError: a state size that is no power of two from 16 to 256.

@@ -33,14 +33,20 @@ def forward(
     C: Float[Tensor, "B L N"],
     D: Float[Tensor, "H"],
     reverse: bool,
-) -> tuple[Float[Tensor, "B L H P"], Float[Tensor, "B S H N W"]]:
-    """y, and what `backward` needs besides; see `asysplat.ops.ssd`."""
+    keep: bool,
+) -> tuple[Float[Tensor, "B L H P"], Float[Tensor, "_ _ _ _ _"]]:
+    """y, and what `backward` needs besides, with sides of 0 if not to be kept.
+
+    See `asysplat.ops.ssd`.
+    """
     y = torch.empty_like(x)
-    carried = torch.empty(carried_shape(x, B))
+    shape = carried_shape(x, B)
+    carried = torch.empty(shape if keep else (0,) * len(shape))
     for batch in range(len(x)):
-        states = torch.zeros(carried.shape[2:])
+        states = torch.zeros(shape[2:])
         for index, tokens in _segments(x.shape[1], reverse):
-            carried[batch, index] = states
+            if keep:
+                carried[batch, index] = states
             segment = _Segment(*(part[batch, tokens] for part in (x, dt, B, C)), A, D, reverse)
             segment.forward(states, y[batch, tokens])
     return y, carried

@@ -40,8 +40,9 @@ def forward(
     C: Float[Tensor, "B L N"],
     D: Float[Tensor, "H"],
     reverse: bool,
+    keep: bool,
 ) -> tuple[Float[Tensor, "B L H P"], Float[Tensor, "0"]]:
-    """y, and an empty tensor; see `asysplat.ops.ssd`.
+    """y, and an empty tensor, which is all there is to keep; see `asysplat.ops.ssd`.
 
     Raises:
         InputError: a head width or a state size that is no power of two from 16 to 128 or 256.
