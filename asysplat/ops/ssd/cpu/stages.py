@@ -16,7 +16,7 @@ from asysplat.ops.ssd.cpu.heads import backward_heads, forward_heads
 
 CHUNK = 64  # tokens
 SEGMENT = 16 * CHUNK  # a head's states before these chunks are 1 MB at paper scale
-GROUP = 2  # heads whose gradients of B and C are summed there
+GROUP = 2  # heads whose gradients of B and C are summed before they leave a core
 
 
 def carried_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) -> tuple:
