@@ -250,7 +250,6 @@ def _make_lists(
     skips = frame.settings.skips
     splats = np.empty((frame.images * frame.num, col.SPLAT), np.float32)
     counts = np.empty(frame.images * frame.num, np.int32)
-    corners = np.empty((frame.images * frame.num, 2), np.int32)
     counters = np.empty((frame.images, frame.blocks, col.PROJECT_COUNTERS), np.int64)
     histograms = np.empty((frame.images, frame.blocks, frame.tiles), np.int32)
     pieces = even_bounds(frame.images * frame.blocks)
@@ -267,7 +266,6 @@ def _make_lists(
         (skips.opacity, skips.frustum, skips.extent, skips.ellipse),
         splats,
         counts,
-        corners,
         counters,
         histograms,
     )
@@ -288,11 +286,11 @@ def _make_lists(
         pieces,
         splats,
         first_pair,
-        corners,
         positions,
         frame.num,
         frame.block_size,
         frame.size,
+        skips.ellipse,
         entries,
     )
     return _Lists(splats, first_pair, first_entry, entries)

@@ -30,10 +30,10 @@ TINY = 1e-20  # below the square of any distance that matters
 
 BATCH = 256
 # Rows [BATCH] of what `_ellipses` finds; SEEN is 1, OUTSIDE the image, or 0.
-CENTER_X, CENTER_Y, DEPTH, WHITEN_A, WHITEN_B, WHITEN_C, LOG_OPACITY, REACH_X, REACH_Y, SEEN = (
-    BATCH * row for row in range(10)
+CENTER_X, CENTER_Y, DEPTH, WHITEN_A, WHITEN_B, WHITEN_C, LOG_OPACITY, REACH_Y, SEEN = (
+    BATCH * row for row in range(9)
 )
-FOUND = 10
+FOUND = 9
 OUTSIDE = -1.0
 
 
@@ -55,7 +55,6 @@ def project(
     skips,
     splats,
     counts,
-    corners,
     counters,
     histograms,
 ):
@@ -70,7 +69,6 @@ def project(
         skips: whether to use the culls by opacity and frustum, the opacity's extent, the ellipse.
         splats: [B * V * N, 16], written where visible.
         counts: [B * V * N] pairs of each, 0 where culled.
-        corners: [B * V * N, 2] see `count_tiles`; written where there are pairs.
         counters: [B * V, blocks, PROJECT_COUNTERS], see `layout`.
         histograms: [B * V, blocks, tiles] pairs of each tile.
     """
@@ -81,6 +79,7 @@ def project(
     images = cameras.shape[0]
     num = splats.shape[0] // images
     functions = np.empty(16)
+    spans = np.empty((-(-size[0] // col.TILE), 2), np.int64)
     found = np.empty(FOUND * BATCH)
     chosen = np.empty(BATCH, np.int32)
     some_means, some_scales = np.empty(3 * BATCH, means.dtype), np.empty(3 * BATCH, scales.dtype)
@@ -112,9 +111,8 @@ def project(
                 _write_ellipse(found, k, splats, bases, d + i)
                 if _write_color(g + i, d + i, means, sh, cameras, image, functions, splats):
                     counts[d + i], box = count_tiles(
-                        splats, bases, d + i, found[REACH_X + k], size, exact, histogram,
-                        corners[d + i],
-                    )  # fmt: skip
+                        splats, bases, d + i, size, exact, spans, histogram
+                    )
                     touched += box
         counters[image, block, col.BOXES] = touched
         counters[image, block, col.FAINT] = faint
@@ -196,7 +194,7 @@ def _ellipses(
         found[WHITEN_B + i] = b * WHITEN_TO_LOG2
         found[WHITEN_C + i] = c * WHITEN_TO_LOG2
         found[LOG_OPACITY + i] = log_opacity
-        found[REACH_X + i], found[REACH_Y + i] = reach_x, reach_y
+        found[REACH_Y + i] = reach_y
         shown = 1.0 if inside | (not skip_frustum) else OUTSIDE
         found[SEEN + i] = shown if seen else 0.0
 
