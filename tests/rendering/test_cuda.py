@@ -182,7 +182,7 @@ def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch
     monkeypatch.setattr(stages, "sort_into_tiles", keep)
     scene = change(make_batch(make_scene, views=2, count=60, height=45, width=50))
     stats = cuda.draw(*(part.to(DEVICE) for part in scene), Settings()).stats
-    ((splats, depths, lists),) = found
+    ((splats, depths, (lists, _, _)),) = found
     rows, columns, size = 6, 7, 8
     tiles = rows * columns
     pairs = lists.first_entry.diff()

@@ -10,7 +10,14 @@ triton = pytest.importorskip("triton")
 
 TYPES = {torch.float32: "fp32", torch.float64: "fp64", torch.int16: "i16", torch.int32: "i32"}
 TYPES |= {torch.int64: "i64", torch.bool: "i1"}
-KERNELS = {"project", "place", "draw_tile", "draw_tile_backward", "sum_pairs", "project_backward"}
+KERNELS = {
+    "project",
+    "list_tiles",
+    "draw_tile",
+    "draw_tile_backward",
+    "sum_pairs",
+    "project_backward",
+}
 
 
 def compiled(kernel, arguments, constants, architecture):
@@ -43,8 +50,10 @@ def launched(request, monkeypatch):
         name = kernel.fn.__name__
         kernels[name] = compiled(kernel, arguments, constants, request.param)
         for argument, tensor in zip(kernel.arg_names, arguments, strict=False):
-            if isinstance(tensor, torch.Tensor) and not tensor.is_floating_point():
-                tensor.fill_(argument == "counts")
+            if argument in ("depths", "counts"):
+                tensor.fill_(1)
+            elif isinstance(tensor, torch.Tensor) and not tensor.is_floating_point():
+                tensor.fill_(0)
 
     monkeypatch.setattr(JITFunction, "run", run)
     monkeypatch.setattr("asysplat.rendering.cuda.stages.INTERPRETED", True)

@@ -3,7 +3,8 @@ and 27."""
 
 import pytest
 import torch
-from backends import EXACT, FIELDS, assert_same_bits, both_ways, max_error
+from backends import EXACT, FAST, FIELDS, INTERPRETED, assert_same_bits, both_ways, max_error
+from tangents import tangent_scene
 
 from asysplat.benchmark.scenes import random_scene
 from asysplat.scene import Cameras, Gaussians
@@ -32,6 +33,20 @@ def test_case_26_any_number_of_threads_gives_the_same_bits(backend, threads, dep
     one = run(1)
     for again in (run(1), run(2), run(2)):
         assert_same_bits(again, one)
+
+
+@pytest.mark.skipif(INTERPRETED, reason="too many for the interpreter")
+def test_ten_renderings_of_a_dense_scene_are_the_same(threads):
+    """Bits and statistics, on one thread and on two, where splats end at the edges of tiles."""
+    cpu = next(backend for backend in FAST if backend.name == "cpu")
+    scene = tangent_scene(40_000, 256, 256)
+    found = []
+    for index in range(10):
+        threads(1 + index % 2)
+        found.append(both_ways(cpu, *scene))
+        assert_same_bits(found[-1], found[0])
+        assert found[-1].stats == found[0].stats
+    assert found[0].stats["pairs"] > 100_000
 
 
 def test_case_27_equal_depths_are_drawn_by_index(backend, make_scene):

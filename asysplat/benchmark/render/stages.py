@@ -34,10 +34,11 @@ def stage_seconds() -> Iterator[dict[str, float]]:
     """Seconds that the cpu backend spends in each of STAGES meanwhile."""
     seconds = dict.fromkeys(STAGES, 0.0)
 
-    def timed(kernel: Callable[..., None], *args: object) -> None:
+    def timed(kernel: Callable, *args: object) -> list:
         start = time.perf_counter()
-        run_blocks(kernel, *args)
+        results = run_blocks(kernel, *args)
         seconds[kernel.__name__] += time.perf_counter() - start
+        return results
 
     # By its module's name: as an attribute of the package, `draw` is the function.
     with mock.patch.object(import_module("asysplat.rendering.cpu.draw"), "run_blocks", timed):

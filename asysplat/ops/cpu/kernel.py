@@ -15,7 +15,7 @@ PACKAGE = HERE.parent.parent
 
 
 def kernel(function: Callable) -> Callable:
-    """A function that a thread is sent into."""
+    """Compile what threads run. NUMBA_BOUNDSCHECK=1 has every index checked, for tests."""
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = _cache_folder(before)
     try:
@@ -36,11 +36,12 @@ def _bare(function: Callable) -> Callable:
 
 @cache
 def _cache_folder(asked: str) -> str:
-    """Another one for every version of the sources: Numba looks at a kernel's own file alone, and
-    would keep one whose parts, in other files, have changed."""
+    """Another one for every version of the sources, and for kernels with checks: Numba looks at a
+    kernel's own file alone, and would keep one whose parts, in other files, have changed."""
     paths = [path for folder in ("ops", "rendering") for path in (PACKAGE / folder).rglob("*.py")]
     sources = b"".join(path.read_bytes() for path in sorted(paths))
     beside = HERE / "__pycache__"
     home = Path.home() / ".cache" / "asysplat"
     root = asked or (beside if os.access(HERE, os.W_OK) else home)
-    return str(Path(root) / f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}")
+    checks = "-checked" if numba.config.BOUNDSCHECK else ""
+    return str(Path(root) / f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}{checks}")

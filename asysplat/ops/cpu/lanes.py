@@ -13,7 +13,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from asysplat.ops.cpu.kernel import inline
-from asysplat.ops.cpu.vectors import FLOATS, INTEGERS, LANES, VECTOR, fma, sum_of
+from asysplat.ops.cpu.vectors import FLOATS, INTEGERS, LANES, VECTOR, fma, sum_of, vector_at
 
 FLOAT, FLOAT_BITS = ir.FloatType(), ir.IntType(32)
 
@@ -78,7 +78,7 @@ def take_sum(typing_context, state, base):
     """Sum of the LANES numbers from `base` on, which are left at 0 for the next splat."""
 
     def generate(context, builder, signature, args):
-        pointer = _element(context, builder, signature, args, FLOATS)
+        pointer = vector_at(context, builder, signature, args, step=1)
         vector = builder.load(pointer, align=4)
         builder.store(ir.Constant(FLOATS, [0.0] * LANES), pointer, align=4)
         return sum_of(builder, vector)
@@ -104,14 +104,6 @@ def prefetch(typing_context, rows, row):
         return context.get_dummy_value()
 
     return types.void(rows, row), generate
-
-
-def _element(context, builder, signature, args, kind):
-    """Pointer to an element of a 1D array, as one to `kind`."""
-    array_type, index_type = signature.args
-    array = context.make_array(array_type)(context, builder, args[0])
-    index = context.cast(builder, args[1], index_type, types.intp)
-    return builder.bitcast(builder.gep(array.data, [index]), kind.as_pointer())
 
 
 @inline

@@ -13,7 +13,7 @@ from numba.extending import intrinsic
 
 from asysplat.ops.cpu.kernel import inline
 from asysplat.ops.cpu.lanes import ONE
-from asysplat.ops.cpu.vectors import FLOATS, INTEGERS, LANES, emit_fma, splat
+from asysplat.ops.cpu.vectors import FLOATS, INTEGERS, LANES, check_range, emit_fma, splat
 
 HAS_32_VECTORS = bool(llvmlite.binding.get_host_cpu_features().get("avx512f", False))
 ROWS = 8 if HAS_32_VECTORS else 4
@@ -74,6 +74,8 @@ def transpose_tile(typing_context, matrix, out, row, column):
         row, column = (
             context.cast(builder, args[i], signature.args[i], types.intp) for i in (2, 3)
         )
+        source.check(row, LANES, column, LANES)
+        target.check(column, LANES, row, LANES)
         vectors = [
             builder.load(source.vector(builder.add(row, row.type(i)), column), align=BYTES)
             for i in range(LANES)
@@ -119,6 +121,10 @@ def _tile(rows: int):
 
 def _generate_tile(builder, rows, matrices, row, column, first, last, keep):
     out, a, b = matrices
+    terms = builder.sub(last, first)
+    out.check(row, rows, column, LANES)
+    a.check(row, rows, first, terms)
+    b.check(first, terms, column, LANES)
     numbers = [builder.add(row, row.type(i)) for i in range(rows)]
     places = [out.vector(number, column) for number in numbers]
     # LLVM keeps in registers what is written to such places alone.
@@ -141,9 +147,16 @@ class _Matrix:
 
     def __init__(self, context: BaseContext, builder: ir.IRBuilder, kind: types.Array, value):
         array = context.make_array(kind)(context, builder, value)
-        self.builder = builder
+        self.context, self.builder = context, builder
+        self.shape = [builder.extract_value(array.shape, axis) for axis in range(2)]
         self.data = builder.bitcast(array.data, ir.IntType(8).as_pointer())
         self.strides = [builder.extract_value(array.strides, axis) for axis in range(2)]
+
+    def check(self, row, rows, column, columns) -> None:
+        """See `check_range`; counts are int or values."""
+        for first, count, length in zip((row, column), (rows, columns), self.shape, strict=True):
+            count = first.type(count) if isinstance(count, int) else count
+            check_range(self.context, self.builder, first, count, length)
 
     def element(self, row: ir.Value, column: ir.Value) -> ir.Value:
         """Pointer to it."""

@@ -4,15 +4,18 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 import torch
 
+Result = TypeVar("Result")
 PER_THREAD = 4  # portions of the work, so that an uneven one is made up for
 
 
-def run_blocks(kernel: Callable[..., None], bounds: np.ndarray, *args: object) -> None:
-    """`kernel(start, stop, *args)` for neighbouring numbers of `bounds`, in any order.
+def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:
+    """Run `kernel(start, stop, *args)` for neighbouring numbers of `bounds`, in any order; the
+    results in that of `bounds`.
 
     What a kernel writes must depend on its range alone: then the number of threads changes no bit.
     """
@@ -21,12 +24,9 @@ def run_blocks(kernel: Callable[..., None], bounds: np.ndarray, *args: object) -
         (a, b) for a, b in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True) if a < b
     ]
     if threads == 1 or len(ranges) == 1:
-        for start, stop in ranges:
-            kernel(start, stop, *args)
-        return
+        return [kernel(start, stop, *args) for start, stop in ranges]
     jobs = [_pool(threads).submit(kernel, start, stop, *args) for start, stop in ranges]
-    for job in jobs:
-        job.result()
+    return [job.result() for job in jobs]
 
 
 def even_bounds(count: int) -> np.ndarray:

@@ -7,6 +7,7 @@ import operator
 from collections.abc import Callable
 
 import llvmlite.binding
+import numba
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -59,6 +60,17 @@ def emit_fma(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir
     return builder.call(cgutils.get_or_insert_function(builder.module, function, name), [a, b, c])
 
 
+def check_range(context, builder, first, count, length) -> None:
+    """Let the kernel raise IndexError unless `count` elements from `first` on are among `length`,
+    as Numba does for single ones; nothing without NUMBA_BOUNDSCHECK=1."""
+    if not numba.config.BOUNDSCHECK:
+        return
+    with builder.if_then(builder.icmp_signed(">", count, count.type(0))):
+        last = builder.add(first, builder.sub(count, count.type(1)))
+        for index in (first, last):
+            cgutils.do_boundscheck(context, builder, index, length)
+
+
 @intrinsic
 def fma(typing_context, a, b, c):
     """a * b + c, rounded once where the processor can do that; of vectors or of float32."""
@@ -75,7 +87,7 @@ def load(typing_context, rows, row):
     """Row `row` of a contiguous array [rows, LANES]."""
 
     def generate(context, builder, signature, args):
-        return builder.load(_place(context, builder, signature, args), align=4)
+        return builder.load(vector_at(context, builder, signature, args), align=4)
 
     return VECTOR(rows, row), generate
 
@@ -85,7 +97,7 @@ def store(typing_context, rows, row, value):
     """Write row `row` of a contiguous array [rows, LANES]."""
 
     def generate(context, builder, signature, args):
-        builder.store(args[2], _place(context, builder, signature, args), align=4)
+        builder.store(args[2], vector_at(context, builder, signature, args), align=4)
         return context.get_dummy_value()
 
     return types.void(rows, row, VECTOR), generate
@@ -149,21 +161,26 @@ def sum_of(builder: ir.IRBuilder, vector: ir.Value) -> ir.Value:
     return builder.call(function, [ir.FloatType()(-0.0), vector], fastmath=("reassoc",))
 
 
-def _place(context, builder, signature, args):
+def vector_at(context, builder, signature, args, step=LANES):
+    """Pointer to LANES elements of a contiguous array, args[0], from the element args[1] x `step`
+    on."""
     array = context.make_array(signature.args[0])(context, builder, args[0])
-    row = context.cast(builder, args[1], signature.args[1], types.intp)
-    place = builder.gep(array.data, [builder.mul(row, row.type(LANES))])
-    return builder.bitcast(place, FLOATS.as_pointer())
+    index = context.cast(builder, args[1], signature.args[1], types.intp)
+    first = builder.mul(index, index.type(step))
+    check_range(context, builder, first, first.type(LANES), array.nitems)
+    return builder.bitcast(builder.gep(array.data, [first]), FLOATS.as_pointer())
 
 
 def _some(context, builder, signature, args):
     """Pointer to the number args[1] of an array, and which of LANES are among args[2]."""
     array = context.make_array(signature.args[0])(context, builder, args[0])
     first = context.cast(builder, args[1], signature.args[1], types.intp)
+    count = context.cast(builder, args[2], signature.args[2], types.intp)
+    check_range(context, builder, first, count, array.nitems)
     pointer = builder.bitcast(builder.gep(array.data, [first]), FLOATS.as_pointer())
-    count = context.cast(builder, args[2], signature.args[2], types.int32)
     numbers = ir.Constant(INTEGERS, list(range(LANES)))
-    return pointer, builder.icmp_signed("<", numbers, splat(builder, count))
+    few = builder.trunc(count, ir.IntType(32))
+    return pointer, builder.icmp_signed("<", numbers, splat(builder, few))
 
 
 def _arithmetic(symbol: Callable, instruction: str) -> None:

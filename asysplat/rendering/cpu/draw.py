@@ -253,7 +253,7 @@ def _make_lists(
     counters = np.empty((frame.images, frame.blocks, col.PROJECT_COUNTERS), np.int64)
     histograms = np.empty((frame.images, frame.blocks, frame.tiles), np.int32)
     pieces = even_bounds(frame.images * frame.blocks)
-    run_blocks(
+    tiles = run_blocks(
         project,
         pieces,
         *fields,
@@ -284,13 +284,11 @@ def _make_lists(
     run_blocks(
         place,
         pieces,
-        splats,
+        np.concatenate(tiles),
         first_pair,
         positions,
         frame.num,
         frame.block_size,
-        frame.size,
-        skips.ellipse,
         entries,
     )
     return _Lists(splats, first_pair, first_entry, entries)

@@ -22,7 +22,7 @@ from asysplat.rendering.cpu.geometry import (
     whitening,
 )
 from asysplat.rendering.cpu.sh import basis
-from asysplat.rendering.cpu.tiles import count_tiles
+from asysplat.rendering.cpu.tiles import find_box, list_tiles
 from asysplat.rendering.cpu.vectors import dot, plus, row3, triple
 from asysplat.rendering.formulas import WHITEN_TO_LOG2
 
@@ -30,10 +30,10 @@ TINY = 1e-20  # below the square of any distance that matters
 
 BATCH = 256
 # Rows [BATCH] of what `_ellipses` finds; SEEN is 1, OUTSIDE the image, or 0.
-CENTER_X, CENTER_Y, DEPTH, WHITEN_A, WHITEN_B, WHITEN_C, LOG_OPACITY, REACH_Y, SEEN = (
-    BATCH * row for row in range(9)
+CENTER_X, CENTER_Y, DEPTH, WHITEN_A, WHITEN_B, WHITEN_C, LOG_OPACITY, REACH_X, REACH_Y, SEEN = (
+    BATCH * row for row in range(10)
 )
-FOUND = 9
+FOUND = 10
 OUTSIDE = -1.0
 
 
@@ -58,7 +58,7 @@ def project(
     counters,
     histograms,
 ):
-    """Splats of blocks start to stop, and how many tiles they touch.
+    """Splats of blocks start to stop, and the tiles that they touch.
 
     Args:
         means, quats, scales, opacities, sh: [B * N, ...].
@@ -71,6 +71,9 @@ def project(
         counts: [B * V * N] pairs of each, 0 where culled.
         counters: [B * V, blocks, PROJECT_COUNTERS], see `layout`.
         histograms: [B * V, blocks, tiles] pairs of each tile.
+
+    Returns:
+        [pairs of these blocks] int32, the tile of each, splat by splat; see `list_tiles`.
     """
     alpha_min = convention[0]
     skip_opacity, skip_frustum, own_extent, exact = skips
@@ -79,7 +82,8 @@ def project(
     images = cameras.shape[0]
     num = splats.shape[0] // images
     functions = np.empty(16)
-    spans = np.empty((-(-size[0] // col.TILE), 2), np.int64)
+    boxes = np.empty((BATCH, 4), np.int32)
+    tiles, pairs = np.empty(2 * BATCH, np.int32), 0
     found = np.empty(FOUND * BATCH)
     chosen = np.empty(BATCH, np.int32)
     some_means, some_scales = np.empty(3 * BATCH, means.dtype), np.empty(3 * BATCH, scales.dtype)
@@ -103,20 +107,39 @@ def project(
                 kept, some_means, some_quats, some_scales, some_opacities, cameras[image], size,
                 convention, antialiased, skip_frustum, own_extent, found,
             )  # fmt: skip
+            in_boxes = 0
             for k in range(kept):
                 if found[SEEN + k] != 1:
                     outside += found[SEEN + k] == OUTSIDE
                     continue
                 i = chosen[k]
                 _write_ellipse(found, k, splats, bases, d + i)
-                if _write_color(g + i, d + i, means, sh, cameras, image, functions, splats):
-                    counts[d + i], box = count_tiles(
-                        splats, bases, d + i, size, exact, spans, histogram
+                if not _write_color(g + i, d + i, means, sh, cameras, image, functions, splats):
+                    found[SEEN + k] = 0
+                    continue
+                in_boxes += find_box(splats, bases, d + i, found[REACH_X + k], size, boxes[k])
+            touched += in_boxes
+            if pairs + in_boxes > len(tiles):
+                tiles = _enlarged(tiles, pairs, pairs + in_boxes)
+            for k in range(kept):
+                if found[SEEN + k] == 1:
+                    i = chosen[k]
+                    counts[d + i] = list_tiles(
+                        splats, bases, d + i, boxes[k], size, exact, histogram, tiles, pairs
                     )
-                    touched += box
+                    pairs += counts[d + i]
         counters[image, block, col.BOXES] = touched
         counters[image, block, col.FAINT] = faint
         counters[image, block, col.OUTSIDE] = outside
+    return tiles[:pairs]
+
+
+@inline
+def _enlarged(array, kept, least):
+    """A copy of the first `kept` numbers in at least twice the room."""
+    larger = np.empty(max(2 * len(array), least), array.dtype)
+    larger[:kept] = array[:kept]
+    return larger
 
 
 @inline
@@ -194,7 +217,7 @@ def _ellipses(
         found[WHITEN_B + i] = b * WHITEN_TO_LOG2
         found[WHITEN_C + i] = c * WHITEN_TO_LOG2
         found[LOG_OPACITY + i] = log_opacity
-        found[REACH_Y + i] = reach_y
+        found[REACH_X + i], found[REACH_Y + i] = reach_x, reach_y
         shown = 1.0 if inside | (not skip_frustum) else OUTSIDE
         found[SEEN + i] = shown if seen else 0.0
 

@@ -17,8 +17,8 @@ from asysplat.rendering.cuda.geometry import (
     whitening,
 )
 from asysplat.rendering.cuda.sh import basis, sum_harmonics
-from asysplat.rendering.cuda.splat import as_stored, store_splat
-from asysplat.rendering.cuda.tiles import PIXEL_MARGIN, count_tiles
+from asysplat.rendering.cuda.splat import store_splat
+from asysplat.rendering.cuda.tiles import PIXEL_MARGIN
 from asysplat.rendering.cuda.vectors import load3, load_unit_quaternion
 
 LARGEST = tl.constexpr(convention.LARGEST)
@@ -36,7 +36,6 @@ def project(
     cameras,
     splats,
     depths,
-    counts,
     counters,
     num,
     views,
@@ -51,19 +50,17 @@ def project(
     SKIP_OPACITY: tl.constexpr,
     SKIP_FRUSTUM: tl.constexpr,
     OWN_EXTENT: tl.constexpr,
-    EXACT: tl.constexpr,
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Splats of BLOCK Gaussians in one image, and how many tiles they touch.
+    """Splats of BLOCK Gaussians in one image.
 
     Args:
         means, quats, scales, opacities, sh: [B * num, ...], COUNT harmonics.
         cameras: [B * views, 20] float64, see `camera_rows`.
-        splats: [B * views * num, 16] and depths: [B * views * num], written where visible.
-        counts: [B * views * num] pairs of each, 0 where culled.
-        counters: [programs, 3]: tiles that boxes would touch in the place of ellipses; Gaussians
-            that were culled by their opacity, and outside the image.
+        splats: [B * views * num, 16], written where visible.
+        depths: [B * views * num], 0 where culled.
+        counters: [programs, 2]: Gaussians that were culled by their opacity; outside the image.
     """
     image = tl.program_id(1).to(tl.int64)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -102,22 +99,16 @@ def project(
     if SKIP_FRUSTUM:
         outside += tl.sum((shown & (inside == 0)).to(tl.int32), 0)
         shown = shown & inside
-    count = tl.zeros(n.shape, tl.int32)
-    boxes = tl.sum(count, 0)
     d = image * num + n
     if tl.max(shown.to(tl.int32), 0) > 0:
         red, green, blue, shown = colors(sh, g, offset, shown, COUNT)
         a, b, c = a * WHITEN_TO_LOG2, b * WHITEN_TO_LOG2, c * WHITEN_TO_LOG2
         reach_y *= 1 + 1e-6
         store_splat(splats, d, x, y, a, b, c, log_opacity, reach_y, red, green, blue, z, shown)
-        tl.store(depths + d, z.to(tl.float32), mask=shown)
-        ellipse = as_stored(x, y, a, b, c, reach_y)
-        count, boxes = count_tiles(ellipse, shown, height, width, EXACT)
-    tl.store(counts + d, count, mask=n < num)
-    counter = counters + 3 * (image * tl.num_programs(0) + tl.program_id(0))
-    tl.store(counter, boxes)
-    tl.store(counter + 1, faint)
-    tl.store(counter + 2, outside)
+    tl.store(depths + d, tl.where(shown, z, 0.0).to(tl.float32), mask=n < num)
+    counter = counters + 2 * (image * tl.num_programs(0) + tl.program_id(0))
+    tl.store(counter, faint)
+    tl.store(counter + 1, outside)
 
 
 @kernel

@@ -29,15 +29,6 @@ def whole_pixels(value):
 
 
 @kernel
-def as_stored(x, y, a, b, c, reach):
-    """An ellipse in float64, as the next stages read it; see `load_ellipse`."""
-    base_x, base_y = whole_pixels(x), whole_pixels(y)
-    x = base_x + rounded(x - base_x)
-    y = base_y + rounded(y - base_y)
-    return x, y, rounded(a), rounded(b), rounded(c), rounded(tl.minimum(reach, FARTHEST))
-
-
-@kernel
 def store_splat(splats, d, x, y, a, b, c, log_opacity, reach, red, green, blue, z, there):
     """Round float64 numbers, and float32 colours, to splats d."""
     splat = splats + SPLAT * d
@@ -73,6 +64,8 @@ def load_ellipse(splats, d, there):
     a = tl.load(splat + 4, mask=there, other=1.0).to(tl.float64)
     b = tl.load(splat + 5, mask=there, other=1.0).to(tl.float64)
     c = tl.load(splat + 6, mask=there, other=1.0).to(tl.float64)
+    a += tl.load(splat + 7, mask=there, other=0.0).to(tl.float64)
+    b += tl.load(splat + 8, mask=there, other=0.0).to(tl.float64)
     reach = tl.load(splat + 10, mask=there, other=1.0).to(tl.float64)
     return x, y, a, b, c, reach
 

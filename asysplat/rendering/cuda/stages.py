@@ -26,7 +26,7 @@ BLOCK = 128  # Gaussians of a program
 BACKWARD_BLOCK = 64
 # Splats of a step. In the interpreter one that is not there takes as long as one that is.
 FORWARD_STEP, BACKWARD_STEP = (2, 2) if INTERPRETED else (8, 4)
-COUNTERS = 3
+COUNTERS = 2
 # A tile's 64 pixels are two a lane of one warp: no sum leaves it.
 TILE_OPTIONS = {"num_warps": 1, "enable_fp_fusion": False}
 PROJECT_OPTIONS = {"enable_fp_fusion": False}
@@ -102,9 +102,9 @@ class _Draw(torch.autograd.Function):
         )
         cameras = camera_rows(cam_to_world, intrinsics, (height, width), settings.convention)
         with torch.cuda.device_of(fields[0]):
-            splats, depths, counts, counters = _project(frame, fields, cameras)
-            lists = sort_into_tiles(
-                splats, depths, counts, frame.images, (height, width), settings.skips.ellipse
+            splats, depths, counters = _project(frame, fields, cameras)
+            lists, counts, in_boxes = sort_into_tiles(
+                splats, depths, frame.images, (height, width), settings.skips.ellipse
             )
             pixels = _rasterize(frame, splats, lists, masks)
         image, alpha, transmittance, depth, origins, stops, halved, last_entry, wanted = pixels
@@ -112,12 +112,12 @@ class _Draw(torch.autograd.Function):
         masked = lengths.new_zeros(()) if wanted is None else (lengths * ~wanted).sum()
         drawn = (last_entry - lists.first_entry[:-1]).sum()
         # One wait for the GPU.
-        counted = torch.stack((*counters.sum(0), masked, drawn, counts.count_nonzero()))
-        boxes, faint, outside, masked, drawn, stats["visible"] = counted.tolist()
+        counted = (*counters.sum(0), in_boxes, masked, drawn, counts.count_nonzero())
+        faint, outside, in_boxes, masked, drawn, stats["visible"] = torch.stack(counted).tolist()
         pairs = len(lists.entries)
         stats["culled_by_opacity"], stats["culled_by_frustum"] = faint, outside
         stats["pairs"] = pairs
-        stats["pairs_off_ellipse"] = boxes - pairs if settings.skips.ellipse else 0
+        stats["pairs_off_ellipse"] = in_boxes - pairs if settings.skips.ellipse else 0
         stats["pairs_masked"] = masked
         stats["pairs_behind_opaque"] = pairs - masked - drawn
         stats["tile_size"] = TILE.value
@@ -211,16 +211,13 @@ class _Draw(torch.autograd.Function):
         return (*field_grads, *poses, *(None,) * 4)
 
 
-def _project(
-    frame: _Frame, fields: list[Tensor], cameras: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Splats, depths, counts of pairs, counters; see `project`."""
+def _project(frame: _Frame, fields: list[Tensor], cameras: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Splats, depths, counters; see `project`."""
     total = frame.images * frame.num
     blocks = -(-frame.num // BLOCK)
     device, skips, convention = cameras.device, frame.settings.skips, frame.settings.convention
     splats = torch.empty(total, SPLAT.value, dtype=torch.float32, device=device)
     depths = torch.empty(total, dtype=torch.float32, device=device)
-    counts = torch.empty(total, dtype=torch.int32, device=device)
     counters = torch.empty(blocks * frame.images, COUNTERS, dtype=torch.int32, device=device)
     if blocks:
         project[(blocks, frame.images)](
@@ -228,7 +225,6 @@ def _project(
             cameras,
             splats,
             depths,
-            counts,
             counters,
             frame.num,
             frame.views,
@@ -243,12 +239,11 @@ def _project(
             SKIP_OPACITY=skips.opacity,
             SKIP_FRUSTUM=skips.frustum,
             OWN_EXTENT=skips.extent,
-            EXACT=skips.ellipse,
             COUNT=frame.harmonics,
             BLOCK=BLOCK,
             **PROJECT_OPTIONS,
         )
-    return splats, depths, counts, counters
+    return splats, depths, counters
 
 
 def _rasterize(

@@ -1,0 +1,136 @@
+"""All kernels for CPUs with bounds checks, over random scenes and sequences, in memory as it comes
+and in poisoned memory: the same bits and the same statistics.
+
+NUMBA_BOUNDSCHECK=1 python tests/stress/checked_kernels.py
+"""
+
+import itertools
+
+import numba
+import numpy as np
+import torch
+from backends import FAST, Result, assert_same_bits, both_ways
+from poison import FILLS, poisoned
+from tangents import tangent_scene
+from torch import Tensor
+
+from asysplat.ops import selective_scan, ssd
+from asysplat.ops.cpu.kernel import kernel
+from asysplat.ops.cpu.lanes import take_sum
+from asysplat.ops.cpu.vectors import load, load_some, store
+from asysplat.rendering import Skips
+from asysplat.scene import Cameras, Gaussians
+
+CPU = next(backend for backend in FAST if backend.name == "cpu")
+# Lengths around chunks of 32 and 64 tokens and a segment of 1024; odd widths and states.
+SSD_SIZES = [(1, 1, 1, 1), (2, 63, 3, 5), (1, 65, 2, 16), (1, 200, 5, 20), (1, 1100, 3, 33)]
+SCAN_SIZES = [(1, 1, 1), (2, 31, 16), (1, 33, 40), (3, 64, 17), (1, 257, 128)]
+STATES = (1, 16, 20)
+
+
+def wild_scene(seed: int, height: int, width: int, degree: int) -> tuple[Gaussians, Cameras]:
+    """Points, giants and needles, around, behind and far off two scenes' two cameras each."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(2, *shape, generator=generator)
+
+    count = 700
+    gaussians = Gaussians(
+        means=normal(count, 3) * 10 ** (1.5 * normal(count, 1)) + torch.tensor([0.0, 0, 3]),
+        quats=normal(count, 4),
+        scales=10 ** (2 * normal(count, 3) - 1.5),
+        opacities=torch.rand(2, count, generator=generator),
+        sh=normal(count, (degree + 1) ** 2, 3),
+    )
+    pinhole = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+    poses = torch.eye(4).repeat(2, 2, 1, 1)
+    poses[:, 1, :3, 3] = 0.3
+    return gaussians, Cameras(pinhole.expand(2, 2, 3, 3), poses, height, width)
+
+
+def check_renderer() -> int:
+    """How many scenes were drawn; each in all memories, forward and backward."""
+    skips = Skips()
+    cases = [(tangent_scene(30_000, 256, 256, seed), {}) for seed in range(3)]
+    sizes = [(1, 1, 0), (13, 17, 3), (16, 16, 1), (33, 300, 2), (300, 15, 0)]
+    for seed, (height, width, degree) in enumerate(sizes):
+        scene = wild_scene(seed, height, width, degree)
+        cases += [(scene, {"antialiased": True}), (scene, {"depth": "median"})]
+        for name in ("ellipse", "extent", "frustum", "rows", "opaque"):
+            cases.append((scene, {"skips": skips.without(name)}))
+        masks = torch.zeros(2, 2, height, width, dtype=torch.bool)
+        masks[..., : height // 2] = True
+        cases.append((scene, {"masks": masks}))
+    for scene, options in cases:
+        in_all_memories(lambda scene=scene, options=options: both_ways(CPU, *scene, **options))
+    return len(cases)
+
+
+def check_scans() -> int:
+    """How many sequences were scanned; each in all memories, forward and backward."""
+    cases = [(ssd, size) for size in SSD_SIZES] + [(selective_scan, size) for size in SCAN_SIZES]
+    for (scan, size), state, reverse in itertools.product(cases, STATES, (False, True)):
+        in_all_memories(lambda s=scan, size=size, n=state, r=reverse: scanned(s, size, n, r))
+    return len(cases) * len(STATES) * 2
+
+
+def scanned(scan, size: tuple[int, ...], state: int, reverse: bool) -> Result:
+    generator = torch.Generator().manual_seed(len(size))
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    batch, length, channels = size[:3]
+    inputs = {
+        "x": normal(*size),
+        "dt": normal(batch, length, channels).exp(),
+        "A": -normal(*((channels,) if scan is ssd else (channels, state))).exp(),
+        "B": normal(batch, length, state),
+        "C": normal(batch, length, state),
+        "D": normal(channels),
+    }
+    leaves = [tensor.requires_grad_() for tensor in inputs.values()]
+    y = scan(*leaves, backend="cpu", reverse=reverse)
+    grads = torch.autograd.grad(y, leaves, torch.linspace(-1, 1, y.numel()).view(y.shape))
+    return Result({"y": y.detach()}, dict(zip(inputs, grads, strict=True)), {})
+
+
+def in_all_memories(run) -> None:
+    plain = run()
+    for fill in FILLS:
+        with poisoned(fill):
+            found = run()
+        assert_same_bits(found, plain)
+        assert found.stats == plain.stats
+
+
+@kernel
+def _step_out(which, numbers, rows):
+    if which == 0:
+        numbers[len(numbers)] = 1
+    elif which == 1:
+        take_sum(numbers, len(numbers) - 15)
+    elif which == 2:
+        store(rows, len(rows), load(rows, 0))
+    elif which == 3:
+        store(rows, 0, load_some(numbers, len(numbers) - 3, 4))
+
+
+def check_the_checks() -> int:
+    """A step out of an array is an error, whichever way it is taken."""
+    kinds = 4
+    for which in range(kinds):
+        try:
+            _step_out(which, np.zeros(32, np.float32), np.zeros((2, 16), np.float32))
+        except IndexError:
+            continue
+        raise AssertionError(f"step {which} out of an array went unseen")
+    return kinds
+
+
+if __name__ == "__main__":
+    assert numba.config.BOUNDSCHECK, "set NUMBA_BOUNDSCHECK=1"
+    print(f"{check_the_checks()} steps out of an array seen")
+    print(f"{check_scans()} sequences, {len(FILLS) + 1} memories: the same bits", flush=True)
+    print(f"{check_renderer()} scenes, {len(FILLS) + 1} memories: the same bits and statistics")

@@ -1,0 +1,59 @@
+"""Memory that nobody has written holds what is told, so that a kernel that trusts it is found out.
+
+Floats of torch and of NumPy on the host are NaN and their integers the largest; what malloc gives,
+and with it what kernels allocate, is filled with one byte.
+"""
+
+import ctypes
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from unittest import mock
+
+import numpy as np
+import torch
+
+import asysplat.rendering  # noqa: F401, for its modules
+
+M_PERTURB = -6  # of mallopt (glibc)
+HOSTS = ("asysplat.rendering.cpu.draw",)  # modules that allocate by NumPy outside of kernels
+# As float32 and as int32: 3.4e38 and 2139062143; -1.2e-38 and -2139062144.
+FILLS = (0x7F, 0x80)
+
+
+@contextmanager
+def poisoned(fill: int | None) -> Iterator[None]:
+    """Fill fresh memory; None leaves it as it comes."""
+    if fill is None:
+        yield
+        return
+    numpy = SimpleNamespace(**{**vars(np), "empty": _empty, "empty_like": _empty_like})
+    hosts = [mock.patch.object(sys.modules[name], "np", numpy) for name in HOSTS]
+    perturb(fill ^ 0xFF)  # it fills with the complement
+    torch.use_deterministic_algorithms(True)  # and with it torch.empty is filled
+    for host in hosts:
+        host.start()
+    try:
+        yield
+    finally:
+        for host in hosts:
+            host.stop()
+        torch.use_deterministic_algorithms(False)
+        perturb(0)
+
+
+def perturb(byte: int) -> None:
+    """Have malloc fill what it gives; 0 for no longer."""
+    if not ctypes.CDLL(None).mallopt(M_PERTURB, byte):
+        raise OSError("mallopt refuses M_PERTURB")
+
+
+def _empty(shape, dtype=np.float64, **options) -> np.ndarray:
+    dtype = np.dtype(dtype)
+    worst = np.nan if dtype.kind == "f" else True if dtype.kind == "b" else np.iinfo(dtype).max
+    return np.full(shape, worst, dtype, **options)
+
+
+def _empty_like(array: np.ndarray, **options) -> np.ndarray:
+    return _empty(array.shape, array.dtype, **options)

@@ -1,0 +1,55 @@
+"""Scenes whose splats end where a tile begins, within what float32 can tell apart."""
+
+import math
+
+import torch
+
+from asysplat.benchmark.scenes import random_scene
+from asysplat.rendering import INRIA
+from asysplat.rendering.cpu import layout as col
+from asysplat.rendering.reference.projection import find_footprint
+from asysplat.rendering.settings import Settings
+from asysplat.scene import Cameras, Gaussians
+
+BAND = 2e-5  # pixels
+
+
+def tangent_scene(
+    count: int, height: int, width: int, seed: int = 0, tile: int = col.TILE
+) -> tuple[Gaussians, Cameras]:
+    """Gaussians [N] of sigma 1 to 10 pixels and one camera. A quarter of their boxes touch a tile's
+    edge at the right, left, bottom or top each, give or take BAND, one in eight of them in both
+    directions; the field of view is so narrow that moving them changes no shape."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    gaussians, cameras = random_scene(count, height, width, seed)
+    gaussians, cameras = gaussians.to(torch.float64), cameras.to(torch.float64)
+    away = 1000.0  # times as far and as large on the image
+    gaussians.means[:, 2] *= away
+    cameras.intrinsics[:, :2, :2] *= away
+    pixel = gaussians.means[:, 2:] / cameras.intrinsics[0, 0, 0]
+    gaussians.scales[:] = 10 ** uniform(count, 1) * (0.3 + 0.7 * uniform(count, 3)) * pixel
+
+    pose, pinhole = cameras.cam_to_world[0], cameras.intrinsics[0]
+    side = torch.arange(count) % 4
+    both = torch.arange(count) // 4 % 8 == 0
+    for _ in range(2):
+        footprint = find_footprint(
+            gaussians.means, gaussians.quats, gaussians.scales, pose, pinhole, (width, height),
+            Settings(),
+        )  # fmt: skip
+        room = (gaussians.opacities / INRIA.alpha_min).log2() + col.EXPONENT_MARGIN
+        reach = (2 * math.log(2) * room).sqrt()[:, None] * footprint.deviations
+        # First and last pixel centre in reach: where one is a whole number, its tile may change.
+        last = footprint.xy + reach - 0.5 + col.PIXEL_MARGIN
+        first = footprint.xy - reach - 0.5 - col.PIXEL_MARGIN
+        to_last = (last / tile).round() * tile - last
+        to_first = ((first + 1) / tile).round() * tile - 1 - first
+        shift = torch.where((side % 2 == 0)[:, None], to_last, to_first)
+        shift += BAND * (2 * uniform(count, 2) - 1)
+        chosen = torch.stack((side < 2, side >= 2), -1) | both[:, None]
+        gaussians.means[:, :2] += shift * chosen * pixel
+    return gaussians.to(torch.float32), cameras.to(torch.float32)

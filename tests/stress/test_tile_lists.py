@@ -1,0 +1,167 @@
+"""The lists of tiles (cpu), over a million splats that end where tiles begin: every pair once, no
+tile too many, none too few."""
+
+from importlib import import_module
+
+import numpy as np
+import pytest
+import torch
+from tangents import tangent_scene
+
+from asysplat.rendering import Skips, render
+from asysplat.rendering.cpu import layout as col
+from asysplat.rendering.cpu.tiles import find_box, list_tiles, place
+from asysplat.scene import Cameras
+
+TILE, MARGIN = col.TILE, col.PIXEL_MARGIN
+SLACK = 1e-6  # pixels, of the margins themselves
+COUNT = 2**17
+
+
+@pytest.fixture
+def lists_of(monkeypatch):
+    """Renders with the cpu backend and returns what it listed."""
+    module = import_module("asysplat.rendering.cpu.draw")
+    make_lists, kept = module._make_lists, []
+
+    def keep(*args):
+        kept.append(make_lists(*args))
+        return kept[-1]
+
+    monkeypatch.setattr(module, "_make_lists", keep)
+
+    def run(gaussians, cameras, **options):
+        with torch.no_grad():
+            render(gaussians, cameras, backend="cpu", depth=False, **options)
+        return kept.pop()
+
+    return run
+
+
+class Ellipses:
+    """Splats [n, 16] as float64: f(dx, dy) = (a dx + b dy)^2 + (c dy)^2 <= limit."""
+
+    def __init__(self, splats: np.ndarray):
+        base = splats.view(np.int32)[:, [col.BASE_X, col.BASE_Y]]
+        self.x, self.y = (base + splats[:, [col.X, col.Y]].astype(np.float64)).T
+        s = splats.astype(np.float64).T
+        self.a, self.b, self.c = s[col.A] + s[col.A_REST], s[col.B] + s[col.B_REST], s[col.C]
+        self.limit = (self.c * s[col.REACH_Y]) ** 2
+        self.reach_x = s[col.REACH_Y] * np.hypot(self.b, self.c) / self.a
+        self.reach_y = s[col.REACH_Y]
+
+    def at(self, dx, dy):
+        return (self.a * dx + self.b * dy) ** 2 + (self.c * dy) ** 2
+
+    def least_over(self, left, right, top, bottom):
+        """The least f over rectangles that are given from the image's corner."""
+        left, right = left - self.x, right - self.x
+        top, bottom = top - self.y, bottom - self.y
+        least = np.full(len(self.x), np.inf)
+        for dy in (top, bottom):
+            least = np.minimum(least, self.at(np.clip(-self.b * dy / self.a, left, right), dy))
+        for dx in (left, right):
+            dy = np.clip(-self.a * self.b * dx / (self.b**2 + self.c**2), top, bottom)
+            least = np.minimum(least, self.at(dx, dy))
+        inside = (left <= 0) & (right >= 0) & (top <= 0) & (bottom >= 0)
+        return np.where(inside, 0, least)
+
+
+def check_lists(lists, height: int, width: int) -> int:
+    """Assert all that is promised of them; the number of pairs."""
+    rows, columns = -(-height // TILE), -(-width // TILE)
+    pairs, tiles = len(lists.entries), rows * columns
+    assert lists.first_pair[-1] == lists.first_entry[-1] == pairs
+    assert (np.diff(lists.first_entry) >= 0).all()
+    owner, number = lists.entries.T
+    # Each pair once, and each with its splat.
+    assert (np.bincount(number, minlength=pairs) == 1).all()
+    assert (lists.first_pair[owner] <= number).all() and (
+        number < lists.first_pair[owner + 1]
+    ).all()
+    # No tile twice, and none of another image.
+    tile = np.repeat(np.arange(len(lists.first_entry) - 1), np.diff(lists.first_entry))
+    num = (len(lists.first_pair) - 1) // ((len(lists.first_entry) - 1) // tiles)
+    assert (tile // tiles == owner // num).all()
+    assert len(np.unique(owner.astype(np.int64) * len(lists.first_entry) + tile)) == pairs
+
+    # Each tile has something of its splat between its outermost pixel centres.
+    ellipses = Ellipses(lists.splats[owner])
+    left, top = tile % tiles % columns * TILE + 0.5, tile % tiles // columns * TILE + 0.5
+    right = np.minimum(left + TILE - 1, width - 0.5)
+    bottom = np.minimum(top + TILE - 1, height - 0.5)
+    room = MARGIN + SLACK
+    assert (np.abs((left + right) / 2 - ellipses.x) <= ellipses.reach_x + TILE / 2 + room).all()
+    assert (np.abs((top + bottom) / 2 - ellipses.y) <= ellipses.reach_y + TILE / 2 + room).all()
+    least = ellipses.least_over(left - room, right + room, top - room, bottom + room)
+    # A box of one row or column is listed whole.
+    row, column = tile % tiles // columns, tile % tiles % columns
+    several = np.ones(len(lists.splats), bool)
+    for index in (row, column):
+        lowest, highest = np.full(len(several), tiles), np.zeros(len(several), int)
+        np.minimum.at(lowest, owner, index)
+        np.maximum.at(highest, owner, index)
+        several &= highest > lowest
+    assert several.any()
+    assert (least <= ellipses.limit * (1 + 1e-6))[several[owner]].all()
+
+    # Each pixel that shows a splat is in one of its tiles.
+    listed = np.zeros((len(lists.splats), tiles), bool)
+    listed[owner, tile % tiles] = True
+    some = np.flatnonzero(np.diff(lists.first_pair))[::41]
+    shown = Ellipses(lists.splats[some])
+    opacity = lists.splats[some, col.LOG_OPACITY].astype(np.float64)
+    for y in range(height):
+        dx = np.arange(width) + 0.5 - shown.x[:, None]
+        dy = (y + 0.5 - shown.y)[:, None]
+        power = (shown.a[:, None] * dx + shown.b[:, None] * dy) ** 2 + (shown.c[:, None] * dy) ** 2
+        at, x = np.nonzero(opacity[:, None] - power >= np.log2(1 / 255))
+        assert listed[some[at], y // TILE * columns + x // TILE].all()
+    return pairs
+
+
+@pytest.mark.parametrize("size", [(256, 256), (250, 256), (64, 300), (256, 17)], ids=str)
+def test_a_million_splats_that_end_where_tiles_begin(lists_of, size):
+    """Two scenes of each size: 2^20 splats in all."""
+    for seed in range(2):
+        gaussians, cameras = tangent_scene(COUNT, *size, seed=seed)
+        assert check_lists(lists_of(gaussians, cameras), *size) > COUNT
+
+
+def test_boxes_and_several_views(lists_of):
+    gaussians, cameras = tangent_scene(20_000, 100, 120)
+    views = Cameras(
+        cameras.intrinsics.repeat(3, 1, 1), cameras.cam_to_world.repeat(3, 1, 1), 100, 120
+    )
+    views.intrinsics[1, 0, 2] += 7.3
+    exact = lists_of(gaussians, views)
+    check_lists(exact, 100, 120)
+    boxes = lists_of(gaussians, views, skips=Skips(ellipse=False))
+    assert len(boxes.entries) > len(exact.entries)
+    assert (np.bincount(boxes.entries[:, 1]) == 1).all()
+
+
+def test_a_splat_whose_rows_reach_past_its_box():
+    """The box ends where a tile does: rounding put one row past it while another row fell short,
+    and tiles that were listed were not those that had been counted."""
+    splats = np.zeros((1, col.SPLAT), np.float32)
+    bases = splats.view(np.int32)
+    bases[0, [col.BASE_X, col.BASE_Y]] = 39, 41
+    splats[0, [col.X, col.Y]] = 0.31234, 0.40988
+    splats[0, [col.A, col.B, col.C]] = 0.29677019, -0.024766434, 0.29569972
+    splats[0, [col.A_REST, col.B_REST]] = 1.3566894e-08, -4.2892007e-10
+    splats[0, [col.LOG_OPACITY, col.REACH_Y]] = -0.61427963, 9.1877527
+    size, box = (256, 256, 16), np.zeros(4, np.int32)
+    reach_x = Ellipses(splats).reach_x[0]
+    for nudge in (-2e-6, -1e-6, -1e-7, 0, 1e-7, 1e-6, 2e-6):
+        room = find_box(splats, bases, 0, reach_x * (1 + nudge), size, box)
+        histogram, tiles = np.zeros(256, np.int32), np.full(room, -1, np.int32)
+        count = list_tiles(splats, bases, 0, box, size, True, histogram, tiles, 0)
+        assert sorted(set(tiles[:count]) - {35}) == [33, 34, 50]
+        assert (tiles[count:] == -1).all()
+        assert (np.flatnonzero(histogram) == np.sort(tiles[:count])).all()
+        starts = (np.cumsum(histogram) - histogram).astype(np.int64).reshape(1, 1, -1)
+        entries = np.full((count, 2), -1, np.int32)
+        place(0, 1, tiles[:count], np.array([0, count]), starts, 1, 1, entries)
+        assert (entries[:, 0] == 0).all()
+        assert (np.sort(entries[:, 1]) == np.arange(count)).all()
