@@ -1,0 +1,139 @@
+"""A scene optimised for long, as a user would: all fields of 60,000 Gaussians by Adam, on photographs.
+
+python tests/stress/soak.py path/to/scene 1000
+NUMBA_BOUNDSCHECK=1 python tests/stress/soak.py path/to/scene 1000, with memory poisoned too
+"""
+
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import torch
+from backends import FAST, assert_same_bits, both_ways
+from poison import FILLS, poisoned
+from rich.progress import track
+from torch import Tensor
+
+from asysplat import Cameras, Gaussians, Views, render
+from asysplat.data.normalise import normalise
+from asysplat.data.readers import open_scene
+from asysplat.evaluation.metrics import psnr
+
+SIDE = 256  # pixels
+COUNT = 60_000
+MOST_VIEWS = 32
+SH_COUNT = 4
+RATES = {"means": 1e-3, "quats": 1e-2, "scales": 1e-2, "opacities": 3e-2, "sh": 1e-2}
+
+
+def photographs(scene: Path) -> Views:
+    """Views of a scene in the frame of networks; of a .splat file, renderings on a circle."""
+    if scene.suffix == ".splat":
+        return circle_around(read_splat(scene))
+    capture = open_scene(scene, SIDE, SIDE)
+    count = min(MOST_VIEWS, capture.num_frames)
+    views = capture.views(np.linspace(0, capture.num_frames - 1, count).astype(int).tolist())
+    return normalise(views, views)[0]
+
+
+def read_splat(path: Path) -> Gaussians:
+    kind = [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)]
+    rows = np.fromfile(path, np.dtype(kind))
+    rgba = torch.from_numpy(rows["rgba"] / np.float32(255))
+    return Gaussians(
+        means=torch.from_numpy(rows["mean"].copy()),
+        quats=torch.from_numpy((rows["quat"].astype(np.float32) - 128) / 128),
+        scales=torch.from_numpy(rows["scale"].copy()),
+        opacities=rgba[:, 3].contiguous(),
+        sh=((rgba[:, None, :3] - 0.5) / 0.28209479177387814).contiguous(),
+    )
+
+
+def circle_around(gaussians: Gaussians, views: int = 16, radius: float = 1.6) -> Views:
+    """What cameras see that look at the origin from around it."""
+    angles = torch.linspace(0, 2 * torch.pi, views + 1)[:-1]
+    poses = torch.eye(4).repeat(views, 1, 1)
+    forward = torch.stack((-angles.sin(), torch.zeros(views), -angles.cos()), -1)
+    poses[:, :3, 2], poses[:, :3, 3] = forward, -radius * forward
+    poses[:, :3, 0] = torch.stack((-angles.cos(), torch.zeros(views), angles.sin()), -1)
+    poses[:, :3, 1] = torch.linalg.cross(poses[:, :3, 2], poses[:, :3, 0])
+    pinhole = torch.tensor([[1.2 * SIDE, 0, SIDE / 2], [0, 1.2 * SIDE, SIDE / 2], [0, 0, 1]])
+    cameras = Cameras(pinhole.repeat(views, 1, 1), poses, SIDE, SIDE)
+    with torch.no_grad():
+        return Views(cameras, render(gaussians, cameras).image.clamp(0, 1))
+
+
+def start(views: Views) -> dict[str, Tensor]:
+    """Gaussians on the rays of all views, at a distance of about 2, in the photographs' colours."""
+    side = round((COUNT / views.num_views) ** 0.5)
+    origins, directions = views.cameras.resized(side, side).rays()
+    distance = 2 * (0.3 * torch.randn(*directions.shape[:-1], 1)).exp()
+    means = (origins + distance * directions).reshape(-1, 3)
+    pixel = distance.reshape(-1, 1) * views.cameras.width / side
+    pixel = pixel / views.cameras.intrinsics[0, 0, 0]
+    small = torch.nn.functional.adaptive_avg_pool2d(views.images, side)
+    colors = small.permute(0, 2, 3, 1).reshape(-1, 1, 3)
+    sh = torch.zeros(len(means), SH_COUNT, 3)
+    sh[:, :1] = (colors - 0.5) / 0.28209479177387814
+    fields = {
+        "means": means,
+        "quats": torch.randn(len(means), 4),
+        "scales": pixel.log().expand(-1, 3) + 0.3 * torch.randn(len(means), 3),
+        "opacities": torch.zeros(len(means)),
+        "sh": sh,
+    }
+    return {name: tensor.clone().requires_grad_() for name, tensor in fields.items()}
+
+
+def activated(fields: dict[str, Tensor]) -> Gaussians:
+    scales, opacities = fields["scales"].exp(), fields["opacities"].sigmoid()
+    return Gaussians(fields["means"], fields["quats"], scales, opacities, fields["sh"])
+
+
+def soak(views: Views, steps: int) -> tuple[float, float]:
+    """PSNR of all views before and after; every step's loss and gradients are finite."""
+    fields = start(views)
+    groups = [{"params": [tensor], "lr": RATES[name]} for name, tensor in fields.items()]
+    optimizer = torch.optim.Adam(groups, eps=1e-15)
+
+    @torch.no_grad()
+    def quality() -> float:
+        return psnr(render(activated(fields), views.cameras).image, views.images).mean().item()
+
+    before = quality()
+    for step in track(range(steps), "soak", disable=not sys.stderr.isatty()):
+        view = [step % views.num_views]
+        seen = views.select(view)
+        out = render(activated(fields), seen.cameras)
+        loss = (out.image - seen.images).abs().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        assert loss.isfinite(), f"step {step}: the loss is {loss.item()}"
+        for name, tensor in fields.items():
+            assert tensor.grad.isfinite().all(), f"step {step}: the gradient of {name}"
+        optimizer.step()
+    after = quality()
+    # What a long run has made of them is drawn the same again.
+    scene = activated({name: tensor.detach() for name, tensor in fields.items()})
+    cpu = next(backend for backend in FAST if backend.name == "cpu")
+    runs = [both_ways(cpu, scene, views.cameras.map(lambda t: t[:2])) for _ in range(2)]
+    assert_same_bits(*runs)
+    assert runs[0].stats == runs[1].stats
+    return before, after
+
+
+if __name__ == "__main__":
+    scene, steps = Path(sys.argv[1]), int(sys.argv[2])
+    torch.manual_seed(0)
+    checked = numba.config.BOUNDSCHECK
+    with poisoned(FILLS[0] if checked else None):
+        views = photographs(scene)
+        before, after = soak(views, steps)
+    mean = views.images.mean((0, 2, 3))[:, None, None].expand_as(views.images)
+    flat = psnr(mean, views.images).mean().item()
+    kind = "with checks, in poisoned memory" if checked else "as it is"
+    print(
+        f"{scene.name}: {steps} steps {kind}: {before:.2f} -> {after:.2f} dB, mean colour {flat:.2f}"
+    )
+    assert after > before + 1 and after > flat + 1
