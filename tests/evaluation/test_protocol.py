@@ -1,5 +1,7 @@
 """Named protocols against scikit-image, the lpips package and torchmetrics on the same pictures."""
 
+from dataclasses import replace
+
 import lpips
 import numpy as np
 import pytest
@@ -215,3 +217,14 @@ def test_sentences_follow_from_the_settings(protocols, name):
             assert word in sentences[metric]
     for metric in ("absrel", "delta1"):
         assert "not aligned" in sentences[metric] and "mask" in sentences[metric]
+
+
+def test_every_setting_changes_a_sentence(protocols):
+    plain = protocols["default"]
+    changes = [
+        *({"eight_bit": True}, {"ssim_window": "uniform"}, {"ssim_covariance": "sample"}),
+        *({"lpips_net": "vgg"}, {"mean_over": "scenes"}, {"depth_alignment": "median"}),
+    ]
+    assert {key for change in changes for key in change} == set(vars(plain)) - {"name"}
+    texts = [replace(plain, **change).sentences() for change in [{}, *changes]]
+    assert len({tuple(text.values()) for text in texts}) == len(texts)
