@@ -1,6 +1,5 @@
 """Parameters, FLOPs and memory."""
 
-import contextlib
 import math
 import re
 import resource
@@ -71,20 +70,27 @@ def true_flops(run: Callable[[], object]) -> int:
     return counter.get_total_flops()
 
 
-def reset_peak_memory(device: torch.device | str) -> None:
-    """Let `peak_memory_gb` start anew, where it can: on CUDA, and on Linux where /proc is
-    writable."""
+def reset_peak_memory(device: torch.device | str) -> bool:
+    """Let `peak_memory_gb` start anew from what is held now.
+
+    Returns:
+        Whether it does: on CUDA, and on Linux where /proc is writable.
+    """
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-        return
-    with contextlib.suppress(OSError):
+        return True
+    try:
         CLEAR_PEAK.write_text("5")
+    except OSError:
+        return False
+    return True
 
 
 def peak_memory_gb(device: torch.device | str) -> float:
     """Peak memory in units of 1e9 bytes, since the last `reset_peak_memory` or the process began.
 
-    On CUDA what tensors held, elsewhere the resident set of the whole process.
+    On CUDA what tensors held; elsewhere the resident set of the whole process, with its libraries,
+    its data, and what was freed but not given back to the system.
     """
     if torch.device(device).type == "cuda":
         return torch.cuda.max_memory_allocated(device) / GB

@@ -19,10 +19,13 @@ def comparison(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
     """A row for each target view of one scene, without batch dimension.
 
     Columns: the nearest input, the target, the rendering with its PSNR, the absolute error, the
-    rendered inverse depth and, where the data has it, the true one on the same scale.
+    rendered inverse depth and, where the data has it, the true one on the same scale. Where a mask
+    leaves pixels out, the last three are blank.
     """
     nearest = nearest_view(inputs, targets)
-    quality = psnr(rendering.image, targets.images)
+    quality = psnr(targets.masked(rendering.image), targets.images)
+    everywhere = torch.ones_like(targets.images[:, 0], dtype=torch.bool)
+    counts = everywhere if targets.masks is None else targets.masks
     columns = 5 if targets.depths is None else 6
     rows = targets.num_views
     aspect = targets.cameras.height / targets.cameras.width
@@ -34,10 +37,11 @@ def comparison(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
     for view, row in enumerate(axes):
         target = targets.images[view]
         error = (rendering.image[view].clamp(0, 1) - target).abs().mean(0)
-        disparities = [disparity(rendering.depth[view])]
+        error = error.where(counts[view], torch.nan)
+        disparities = [disparity(rendering.depth[view]).where(counts[view], torch.nan)]
         if targets.depths is not None:
-            disparities.append(disparity(targets.depths[view]))
-        nearest_is_bright = disparities[-1].flatten().quantile(0.99).item()
+            disparities.append(disparity(targets.depths[view]).where(counts[view], torch.nan))
+        nearest_is_bright = disparities[-1].flatten().nanquantile(0.99).nan_to_num().item()
         for axis, image in zip(row, (nearest[view], target, rendering.image[view]), strict=False):
             axis.imshow(image.clamp(0, 1).permute(1, 2, 0).cpu().float().numpy())
         row[2].set_xlabel(f"{quality[view]:.1f} dB", fontsize=8)

@@ -19,6 +19,7 @@ CHOICES = (
     "data.height",
     "data.width",
     "data.batch_size",
+    "metrics.name",
     "training.learning_rate",
     "training.loss.perceptual",
     "training.loss.depth",

@@ -1,11 +1,10 @@
-import math
-
 import pytest
 import torch
+from skimage.metrics import structural_similarity
 from torchmetrics.image import StructuralSimilarityIndexMeasure
 
 from asysplat.errors import InputError
-from asysplat.evaluation.metrics import PROTOCOL, abs_rel, delta1, psnr, ssim
+from asysplat.evaluation.metrics import abs_rel, delta1, psnr, ssim
 
 
 def test_psnr_of_known_errors():
@@ -33,6 +32,10 @@ def test_low_precision_input_is_measured_in_fp32():
         noisy = target.float() + 0.1 * torch.randn(1, 3, 16, 16)
         inside = ssim(noisy, target)
     torch.testing.assert_close(inside, ssim(noisy, target), rtol=0, atol=0)
+
+
+# What scikit-image's structural_similarity is given for each window.
+SCIKIT = {"gaussian": {"gaussian_weights": True, "sigma": 1.5, "win_size": 11}, "uniform": {}}
 
 
 def slow_ssim(a, b):
@@ -105,6 +108,43 @@ def test_median_alignment_removes_the_scale_of_each_view():
     torch.testing.assert_close(delta1(depth, target, alignment="median"), torch.ones(2, 4))
 
 
-def test_every_metric_has_a_protocol():
-    assert set(PROTOCOL) == {"psnr", "ssim", "lpips", "absrel", "delta1"}
-    assert math.isclose(psnr(torch.ones(1, 3, 1, 1), torch.zeros(1, 3, 1, 1)).item(), 0.0)
+def test_a_view_without_depth_in_its_middle_is_wrong_rather_than_left_out():
+    target = torch.full((1, 2, 3), 4.0)
+    depth = torch.tensor([[[4.0, 0.0, 0.0], [0.0, 0.0, 8.0]]])
+    assert abs_rel(depth, target, "median").item() == pytest.approx(5 / 6)
+    assert delta1(depth, target, "median").item() == pytest.approx(1 / 6)
+
+
+@pytest.mark.parametrize("window, options", SCIKIT.items())
+@pytest.mark.parametrize("covariance", ["biased", "sample"])
+def test_ssim_is_that_of_scikit_image(window, options, covariance):
+    a = torch.rand(2, 2, 3, 24, 31).double()
+    a[1] = 0.5  # flat: variances are 0
+    b = (a + 0.2 * torch.randn_like(a)).clamp(0, 1)
+    expected = [
+        structural_similarity(
+            *(image.numpy() for image in pair),
+            channel_axis=0,
+            data_range=1,
+            use_sample_covariance=covariance == "sample",
+            **options,
+        )
+        for pair in zip(b.flatten(0, 1), a.flatten(0, 1), strict=True)
+    ]
+    found = ssim(b.float(), a.float(), window, covariance).flatten().tolist()
+    assert found == pytest.approx(expected, abs=1e-5)
+
+
+def test_ssim_settings_matter():
+    a = 0.5 + 0.05 * torch.rand(1, 3, 24, 31)
+    b = a + 0.02 * torch.randn_like(a)
+    values = {ssim(b, a, w, c).item() for w in SCIKIT for c in ("biased", "sample")}
+    assert len({round(value, 4) for value in values}) == 4
+
+
+def test_the_smallest_image_of_each_window():
+    for window, size in (("gaussian", 11), ("uniform", 7)):
+        image = torch.rand(1, 3, size, size)
+        torch.testing.assert_close(ssim(image, image, window), torch.ones(1))
+        with pytest.raises(InputError, match=f"{size}x{size} pixels, these have {size}x{size - 1}"):
+            ssim(image[..., 1:], image[..., 1:], window)

@@ -1,5 +1,7 @@
 """Pictures: the columns there are, and what is shown where nothing is known."""
 
+from dataclasses import replace
+
 import torch
 
 from asysplat import Cameras, Views
@@ -26,6 +28,29 @@ def test_a_row_for_each_view_and_true_depth_where_known():
         axes = comparison(views, views, rendering).axes
         assert len(axes) == 2 * columns
         assert axes[2].get_xlabel() == "100.0 dB"
+
+
+def test_masked_pixels_are_blank_and_no_part_of_the_colours_range():
+    views, rendering = scene()
+    masks = torch.ones(2, 16, 16, dtype=torch.bool)
+    masks[:, :, :4] = False
+    depths = torch.where(masks, 2.0, 0.01)  # what is masked would be the brightest by far
+    image = torch.where(masks[:, None], rendering.image, 0)
+    rendering = replace(rendering, image=image, depth=torch.where(masks, 2.0, 0.0))
+    figure = comparison(views, replace(views, depths=depths, masks=masks), rendering)
+    for row in (figure.axes[:6], figure.axes[6:]):
+        assert row[2].get_xlabel() == "100.0 dB"
+        for axis, value in zip(row[3:], (0.0, 0.5, 0.5), strict=True):
+            (picture,) = axis.images
+            shown = picture.get_array()
+            assert shown.mask[:, :4].all() and (shown[:, 4:] == value).all()
+        assert row[4].images[0].get_clim() == row[5].images[0].get_clim() == (0, 0.5)
+
+
+def test_a_view_that_is_masked_as_a_whole_can_be_drawn():
+    views, rendering = scene()
+    views = replace(views, masks=torch.zeros(2, 16, 16, dtype=torch.bool))
+    comparison(views, views, rendering).canvas.draw()
 
 
 def test_curve_shows_every_validation():

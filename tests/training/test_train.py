@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import signal
 import subprocess
 import time
@@ -33,9 +34,13 @@ def test_a_run_leaves_what_is_promised(train):
     assert numbers["baseline/procedural/mean_colour/psnr"] < 30
     assert numbers["baseline/procedural/nearest_view/psnr"] < 30
     expected = {"parameters", "geometry_share", "gflops", "gflops_true", "gaussians"}
-    expected |= {"peak_gb", "peak_bytes_per_token"}
+    expected |= {"peak_gb", "peak_bytes_per_token", "seconds_per_step", "render_seconds_per_step"}
+    works = ("inference", "render", "metrics", "rooms/inference", "outdoors/render")
+    expected |= {f"{work}_{unit}" for work in works for unit in ("seconds", "gb")}
     assert expected <= {key.removeprefix("cost/") for key in numbers if key.startswith("cost/")}
-    assert "window 11x11" in numbers["protocol/ssim"]
+    assert "window 11x11" in numbers["protocol/ssim"] and numbers["protocol/name"] == "default"
+    assert "all measurements but the longest" in numbers["protocol/seconds"]
+    assert numbers["cost/render_seconds_per_step"] < numbers["cost/seconds_per_step"]
     assert numbers["cost/gaussians"] == 3 * 16 * 16
     assert numbers["cost/gflops_true"] > numbers["cost/gflops"] > 0
     assert 0 < numbers["cost/peak_bytes_per_token"] < 1e9 * numbers["cost/peak_gb"]
@@ -76,6 +81,16 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     plugins = events.summary_metadata
     assert "custom_scalars__config__" in plugins
     assert "_hparams_/session_start_info" in plugins
+
+
+def test_a_protocol_by_name(train, shared):
+    result = train("metrics=longlrm", "steps=2", f"paths.shared={shared}")
+    numbers = metrics(run_folder(result))
+    assert numbers["protocol/name"] == "longlrm" and "metrics: longlrm" in result.stdout
+    assert "uniform window 7x7" in numbers["protocol/ssim"]
+    for name in ("psnr", "ssim", "lpips", "absrel", "delta1"):
+        assert math.isfinite(numbers[f"test/procedural/{name}"])
+        assert "over scenes" in numbers[f"protocol/{name}"]
 
 
 def test_bfloat16_with_the_perceptual_term(train, shared):
@@ -139,6 +154,8 @@ def test_a_real_scene(train, shared, name):
 REFUSED = {
     "an unknown override": (["widht=1"], "widht"),
     "an unknown model": (["model=asysplat_4m4z"], "did you mean asysplat_4m4"),
+    "an unknown protocol": (["metrics=longrm"], "did you mean longlrm"),
+    "an unknown setting of it": (["metrics.depth_alignment=mean"], "choose none or median"),
     "an unknown table": (["sweeps=layer"], "did you mean layers"),
     "no weights to start from": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
     "a size that the patches do not take": (["data.height=40"], "set 48x32"),

@@ -2,17 +2,18 @@
 
 import csv
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning
 import torch
 from torch import Tensor
 
 from asysplat.evaluation import baselines
-from asysplat.evaluation.lpips import load_lpips, lpips_distance
-from asysplat.evaluation.metrics import abs_rel, delta1, psnr, ssim
+from asysplat.evaluation.lpips import load_lpips
+from asysplat.evaluation.measured import Measured
+from asysplat.evaluation.protocol import BACKBONES, Protocol
 from asysplat.scene import Views
 from asysplat.training.reconstruction import Outcome
 
@@ -24,45 +25,45 @@ Measure = Callable[[Tensor, Views], dict[str, Tensor]]
 class Metrics(lightning.Callback):
     """PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image: to the logger, metrics.csv.
 
+    `results` has the means of every test set, the protocol's sentences, and what measuring a test
+    scene and its baselines took: cost/metrics_seconds, cost/metrics_gb, see `Measured`.
+
     Args:
+        protocol: by which all is measured.
         folder: of the run; metrics.csv is written there after the test.
-        weights: folder that may hold AlexNet for LPIPS; without it that column is missing.
+        weights: folder that may hold LPIPS' backbone; without it that column is missing.
     """
 
-    def __init__(self, folder: str, weights: str):
-        self.folder, self.weights = Path(folder), Path(weights)
+    def __init__(self, protocol: Protocol, folder: str, weights: str):
+        self.protocol, self.folder, self.weights = protocol, Path(folder), Path(weights)
         self.rows: list[Row] = []
-        self.results: dict[str, float] = {}
+        sentences = protocol.sentences()
+        self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in sentences.items()}
 
     def setup(
         self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str
     ) -> None:
         if hasattr(self, "lpips"):
             return
-        self.lpips = load_lpips("alex", self.weights)
+        self.lpips = load_lpips(self.protocol.lpips_net, self.weights)
         if self.lpips is None and trainer.is_global_zero:
             warnings.warn(
-                "AlexNet is neither in torch's hub cache nor in paths.weights: "
-                "the run goes on without LPIPS.",
+                f"{BACKBONES[self.protocol.lpips_net]} is neither in torch's hub cache nor in "
+                "paths.weights: the run goes on without LPIPS.",
                 stacklevel=2,
             )
 
     def measure(self, rendered: Tensor, targets: Views) -> dict[str, Tensor]:
         """Image metrics, [B, V] each."""
-        rendered, target = targets.masked(rendered), targets.images
-        values = {"psnr": psnr(rendered, target), "ssim": ssim(rendered, target)}
-        if self.lpips is not None:
-            values["lpips"] = lpips_distance(self.lpips.to(target.device), rendered, target)
-        return values
+        network = None if self.lpips is None else self.lpips.to(targets.images.device)
+        return self.protocol.image_metrics(rendered, targets, network)
 
     def _add(
         self, test_set: str, batch: dict[str, Any], outcome: Outcome, measure_free: Measure
     ) -> None:
         inputs, targets = batch["inputs"], batch["targets"]
         values = self.measure(outcome.rendering.image, targets)
-        if targets.depths is not None:
-            values["absrel"] = abs_rel(outcome.rendering.depth, targets.depths)
-            values["delta1"] = delta1(outcome.rendering.depth, targets.depths)
+        values |= self.protocol.depth_metrics(outcome.rendering.depth, targets)
         for name in ("mean_colour", "nearest_view"):
             free = measure_free(getattr(baselines, name)(inputs, targets), targets)
             values.update({f"{name}/{metric}": value for metric, value in free.items()})
@@ -74,14 +75,18 @@ class Metrics(lightning.Callback):
     def on_validation_epoch_start(self, *_: Any) -> None:
         self.rows = []
 
-    on_test_epoch_start = on_validation_epoch_start
+    def on_test_epoch_start(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule
+    ) -> None:
+        self.rows = []
+        self.work = Measured(module.device)
 
     def on_validation_batch_end(
         self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
     ) -> None:
         def measure_free(image: Tensor, to: Views) -> dict[str, Tensor]:
             """The curve shows the baselines' PSNR alone."""
-            return {"psnr": psnr(to.masked(image), to.images)}
+            return {"psnr": self.protocol.psnr(image, to)}
 
         self._add(trainer.datamodule.name, batch, outputs, measure_free)
 
@@ -95,24 +100,27 @@ class Metrics(lightning.Callback):
         dataloader_idx: int = 0,
     ) -> None:
         test_set = list(trainer.datamodule.tests)[dataloader_idx]
+        self.work.start()
         self._add(test_set, batch, outputs, self.measure)
+        self.work.stop()
 
     def on_validation_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
-        means = average(gather(trainer, self.rows))
+        means = average(gather(trainer, self.rows), self.protocol.mean_over)
         module.log_dict({f"val/{name}": value for name, value in means.items()})
 
     def on_test_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
-        rows = gather(trainer, self.rows)
+        rows, results = gather(trainer, self.rows), {}
         for test_set in trainer.datamodule.tests:
-            means = average(row for row in rows if row["set"] == test_set)
-            for name, value in means.items():
+            of_set = [row for row in rows if row["set"] == test_set]
+            for name, value in average(of_set, self.protocol.mean_over).items():
                 kind = "baseline" if "/" in name else "test"
-                self.results[f"{kind}/{test_set}/{name}"] = value
-        module.log_dict(self.results)
+                results[f"{kind}/{test_set}/{name}"] = value
+        module.log_dict(results)
+        self.results |= results | self.work.costs("cost/metrics")
         if trainer.is_global_zero:
             write_csv(self.folder / "metrics.csv", rows)
 
@@ -128,8 +136,14 @@ def gather(trainer: lightning.Trainer, rows: list[Row]) -> list[Row]:
     return list(images.values())
 
 
-def average(rows: Iterable[Row]) -> dict[str, float]:
-    """The mean of every numeric column over the images that have it."""
+def average(rows: Sequence[Row], over: Literal["images", "scenes"]) -> dict[str, float]:
+    """The mean of every numeric column over the images that have it, or over each scene's such
+    images and then over the scenes; NaN is left out."""
+    if over == "scenes":
+        scenes: dict[str | float, list[Row]] = {}
+        for row in rows:
+            scenes.setdefault(row["scene"], []).append(row)
+        rows = [average(images, "images") for images in scenes.values()]
     columns: dict[str, list[float]] = {}
     for row in rows:
         for name, value in row.items():

@@ -1,0 +1,54 @@
+"""Seconds are the mean of all but the longest; memory is the largest peak since each start."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from asysplat.evaluation import measured
+from asysplat.evaluation.cost import reset_peak_memory
+from asysplat.evaluation.measured import Measured, mean_but_longest
+
+CPU = torch.device("cpu")
+
+
+@pytest.mark.parametrize(
+    "seconds, expected",
+    [([2.0], 2), ([9.0, 1.0], 1), ([1.0, 60.0, 2.0, 6.0], 3), ([4.0, 4.0, 1.0], 2.5)],
+)
+def test_the_longest_is_left_out_once(seconds, expected):
+    assert mean_but_longest(seconds) == expected
+
+
+def test_work_is_timed_from_start_to_stop(monkeypatch):
+    clock = iter([10.0, 11.0, 20.0, 25.0, 30.0, 32.0])
+    monkeypatch.setattr(measured, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    work = Measured(CPU)
+    assert work.costs("cost/a") == {}
+    for _ in range(3):
+        work.start()
+        work.stop()
+    assert work.seconds == [1, 5, 2]
+    assert work.costs("cost/a")["cost/a_seconds"] == 1.5
+
+
+@pytest.mark.skipif(not reset_peak_memory("cpu"), reason="the peak of the process cannot be reset")
+def test_memory_is_that_of_the_work_alone():
+    def hold(numbers):
+        torch.ones(numbers)  # 4 bytes each, given back to the system when freed
+
+    small, large = Measured(CPU), Measured(CPU)
+    for work, numbers in ((small, 1000), (large, 50_000_000), (large, 1000), (small, 1000)):
+        work.start()
+        hold(numbers)
+        work.stop()
+    rise = large.costs("large")["large_gb"] - small.costs("small")["small_gb"]
+    assert rise == pytest.approx(0.2, abs=0.02)
+
+
+def test_no_memory_where_the_peak_cannot_start_anew(monkeypatch):
+    monkeypatch.setattr(measured, "reset_peak_memory", lambda device: False)
+    work = Measured(CPU)
+    work.start()
+    work.stop()
+    assert set(work.costs("a")) == {"a_seconds"}

@@ -1,0 +1,230 @@
+"""Named protocols against scikit-image, the lpips package and torchmetrics on the same pictures."""
+
+from dataclasses import replace
+
+import lpips
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from PIL import Image
+from skimage.metrics import structural_similarity
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from asysplat import Cameras, Views
+from asysplat.evaluation.lpips import load_lpips
+from asysplat.evaluation.protocol import Protocol
+
+NAMES = ("default", "longlrm", "pixelsplat")
+
+
+@pytest.fixture(scope="module")
+def protocols(repository) -> dict[str, Protocol]:
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        return {name: instantiate(compose("train", [f"metrics={name}"]).metrics) for name in NAMES}
+
+
+def views(images, depths=None, masks=None):
+    count, _, height, width = images.shape
+    intrinsics = torch.tensor([[20.0, 0, 8.0], [0, 20.0, 8.0], [0, 0, 1]]).repeat(count, 1, 1)
+    cameras = Cameras(intrinsics, torch.eye(4).repeat(count, 1, 1), height, width)
+    return Views(cameras, images, depths, masks)
+
+
+def made_up():
+    """Smooth pictures, between the 8-bit values."""
+    coarse = torch.rand(2, 3, 9, 12)
+    return torch.nn.functional.interpolate(coarse, (54, 72), mode="bilinear")
+
+
+def photographs(shared):
+    paths = sorted((shared / "data" / "fox" / "images").glob("*.jpg"))[:2]
+    if not paths:
+        pytest.skip("shared data has no photographs of fox")
+    small = [np.array(Image.open(path).convert("RGB").resize((72, 96))) for path in paths]
+    return torch.from_numpy(np.stack(small)).permute(0, 3, 1, 2) / 255
+
+
+@pytest.fixture(params=["made up", "photographs"])
+def pictures(request):
+    """Renderings, that leave [0, 1] here and there, and what they should have been."""
+    if request.param == "made up":
+        target = made_up()
+    else:
+        target = photographs(request.getfixturevalue("shared"))
+    return target + 0.1 * torch.randn_like(target), target
+
+
+def by_scikit(rendered, target, **options):
+    pairs = zip(rendered.double().numpy(), target.double().numpy(), strict=True)
+    return [structural_similarity(a, b, channel_axis=0, data_range=1, **options) for a, b in pairs]
+
+
+def in_a_file(rendered):
+    """What is read again of renderings written with 8 bits a channel."""
+    return (rendered.clamp(0, 1) * 255).to(torch.uint8).float() / 255
+
+
+def check(found, expected):
+    assert found.tolist() == pytest.approx(expected, abs=1e-4)
+
+
+def test_longlrm_is_scikit_images_default(protocols, pictures):
+    rendered, target = pictures
+    found = protocols["longlrm"].image_metrics(rendered, views(target), None)
+    check(found["ssim"], by_scikit(rendered.clamp(0, 1), target))
+    mse = (rendered.clamp(0, 1) - target).square().mean((1, 2, 3))
+    check(found["psnr"], (-10 * mse.log10()).tolist())
+
+
+def test_pixelsplat_is_scikit_images_gaussian_of_what_was_saved(protocols, pictures):
+    rendered, target = pictures
+    found = protocols["pixelsplat"].image_metrics(rendered, views(target), None)
+    saved = in_a_file(rendered)
+    check(found["ssim"], by_scikit(saved, target, win_size=11, gaussian_weights=True))
+    check(found["psnr"], (-10 * (saved - target).square().mean((1, 2, 3)).log10()).tolist())
+
+
+def test_default_is_torchmetrics_gaussian(protocols, pictures):
+    rendered, target = pictures
+    found = protocols["default"].image_metrics(rendered, views(target), None)["ssim"]
+    _, similarity = structural_similarity_index_measure(
+        rendered.clamp(0, 1), target, data_range=1.0, return_full_image=True
+    )
+    check(found, similarity[..., 5:-5, 5:-5].mean((1, 2, 3)).tolist())
+
+
+def test_the_protocols_differ_on_the_same_pictures(protocols):
+    target = 0.5 + 0.1 * made_up()
+    rendered = target + 0.02 * torch.randn_like(target)
+    ssim = {
+        name: protocol.image_metrics(rendered, views(target), None)["ssim"].mean().item()
+        for name, protocol in protocols.items()
+    }
+    assert len({round(value, 3) for value in ssim.values()}) == 3, ssim
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_lpips_is_the_packages(protocols, shared, name):
+    weights, protocol = shared / "weights", protocols[name]
+    stored = weights / f"{dict(alex='alexnet', vgg='vgg16')[protocol.lpips_net]}_features_fp16.pth"
+    if not stored.is_file():
+        pytest.skip(f"{stored} is absent")
+    ours = load_lpips(protocol.lpips_net, weights)
+    theirs = lpips.LPIPS(net=protocol.lpips_net, pnet_rand=True, verbose=False).eval()
+    state = torch.load(stored, weights_only=True)
+    keys = {key: "features." + key.split(".", 1)[1] for key in theirs.net.state_dict()}
+    theirs.net.load_state_dict({key: state[ours_key].float() for key, ours_key in keys.items()})
+
+    target = photographs(shared)
+    rendered = target + 0.1 * torch.randn_like(target)
+    shown = in_a_file(rendered) if name == "pixelsplat" else rendered.clamp(0, 1)
+    with torch.no_grad():
+        expected = theirs(shown, target, normalize=True).flatten().tolist()
+    check(protocol.image_metrics(rendered, views(target), ours)["lpips"], expected)
+
+
+def test_longlrm_has_the_reference_values_of_vgg(protocols, shared):
+    """LPIPS v0.1 of the LPIPS repository's pictures, by other implementations as well."""
+    weights = shared / "weights"
+    pictures = weights / "reference_images"
+    if not pictures.is_dir():
+        pytest.skip(f"{pictures} is absent")
+    reference, *distorted = (
+        torch.from_numpy(np.array(Image.open(pictures / f"ex_{name}.png").convert("RGB")))
+        for name in ("ref", "p0", "p1")
+    )
+    target = reference.permute(2, 0, 1).expand(2, -1, -1, -1) / 255
+    rendered = torch.stack(distorted).permute(0, 3, 1, 2) / 255
+    network = load_lpips("vgg", weights)
+    found = protocols["longlrm"].image_metrics(rendered, views(target), network)["lpips"]
+    check(found, [0.5686, 0.4217])
+
+
+@pytest.mark.parametrize("alignment", ["none", "median"])
+def test_masked_pixels_have_no_depth(alignment):
+    protocol = Protocol("mine", False, "gaussian", "biased", "alex", "images", alignment)
+    images, masks = torch.rand(2, 3, 8, 8), torch.rand(2, 8, 8) < 0.6
+    depths = torch.rand(2, 8, 8) + 1
+    rendered = (depths * 1.1).where(masks, 0)  # as `render` leaves them
+    found = protocol.depth_metrics(rendered, views(images, depths, masks))
+    error = 0.1 if alignment == "none" else 0.0
+    torch.testing.assert_close(found["absrel"], torch.full((2,), error), atol=1e-5, rtol=0)
+    assert found["delta1"].tolist() == [1, 1]
+
+    elsewhere = depths.where(masks, 50 * torch.rand(2, 8, 8))
+    assert torch.equal(
+        protocol.depth_metrics(rendered, views(images, elsewhere, masks))["absrel"], found["absrel"]
+    )
+    unmasked = protocol.depth_metrics(rendered, views(images, depths))
+    assert (unmasked["absrel"] > found["absrel"] + 0.05).all()
+    assert (unmasked["delta1"] < 1).all()
+
+
+def test_a_view_that_is_masked_as_a_whole_has_no_depth_metric(protocols):
+    masks = torch.tensor([True, False])[:, None, None].expand(2, 8, 8)
+    targets = views(torch.rand(2, 3, 8, 8), torch.ones(2, 8, 8), masks)
+    found = protocols["default"].depth_metrics(torch.ones(2, 8, 8), targets)
+    assert found["absrel"][0] == 0 and found["absrel"][1].isnan() and found["delta1"][1].isnan()
+    assert protocols["default"].depth_metrics(torch.ones(2, 8, 8), views(targets.images)) == {}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_masked_pixels_are_those_of_the_photograph(protocols, name):
+    target, masks = made_up(), torch.rand(2, 54, 72) < 0.5
+    rendered = target + 0.1 * torch.randn_like(target)
+    found, worse = (
+        protocols[name].image_metrics(image, views(target, masks=masks), None)
+        for image in (rendered, rendered.where(masks[:, None], 0))
+    )
+    assert torch.equal(found["psnr"], worse["psnr"])
+    assert torch.equal(found["psnr"], protocols[name].psnr(rendered, views(target, masks=masks)))
+    assert (found["psnr"] > protocols[name].psnr(rendered, views(target)) + 1).all()
+
+
+def test_eight_bits_leave_photographs_as_they_are(protocols):
+    every = (torch.arange(256.0) / 255).expand(1, 3, 16, 256)
+    assert protocols["pixelsplat"].psnr(every, views(every)).item() == pytest.approx(100)
+
+
+WORDS = {
+    "default": {
+        "psnr": ["clamped, from", "mean over images"],
+        "ssim": ["Gaussian window 11x11 sigma 1.5", "biased covariance", "mean over images"],
+        "lpips": ["AlexNet", "mean over images"],
+    },
+    "longlrm": {
+        "psnr": ["clamped, from", "mean over a scene's images, then over scenes"],
+        "ssim": ["uniform window 7x7", "sample covariance", "then over scenes"],
+        "lpips": ["VGG16", "then over scenes"],
+    },
+    "pixelsplat": {
+        "psnr": ["cut to 8 bits", "then over scenes"],
+        "ssim": ["cut to 8 bits", "Gaussian window 11x11 sigma 1.5", "sample covariance"],
+        "lpips": ["VGG16", "cut to 8 bits", "then over scenes"],
+    },
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sentences_follow_from_the_settings(protocols, name):
+    sentences = protocols[name].sentences()
+    assert set(sentences) == {"name", "psnr", "ssim", "lpips", "absrel", "delta1"}
+    assert sentences["name"] == name
+    for metric, words in WORDS[name].items():
+        for word in words:
+            assert word in sentences[metric]
+    for metric in ("absrel", "delta1"):
+        assert "not aligned" in sentences[metric] and "mask" in sentences[metric]
+
+
+def test_every_setting_changes_a_sentence(protocols):
+    plain = protocols["default"]
+    changes = [
+        *({"eight_bit": True}, {"ssim_window": "uniform"}, {"ssim_covariance": "sample"}),
+        *({"lpips_net": "vgg"}, {"mean_over": "scenes"}, {"depth_alignment": "median"}),
+    ]
+    assert {key for change in changes for key in change} == set(vars(plain)) - {"name"}
+    texts = [replace(plain, **change).sentences() for change in [{}, *changes]]
+    assert len({tuple(text.values()) for text in texts}) == len(texts)

@@ -1,0 +1,107 @@
+"""What a test's costs are of: the network alone, the rendering, the measuring."""
+
+from types import SimpleNamespace
+
+import lightning
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+
+from asysplat.evaluation import measured
+from asysplat.evaluation.cost import reset_peak_memory
+from asysplat.evaluation.measured import Measured
+from asysplat.training.callbacks import Costs
+
+MB = 1_000_000
+# What else the process does meanwhile was under 1 MB; ten times that and more is still no buffer.
+TOLERANCE_GB = 0.02
+
+
+def hold(megabytes):
+    torch.ones(megabytes * MB // 4)  # written, so resident; given back to the system when freed
+
+
+class Net(nn.Module):
+    def forward(self, megabytes):
+        hold(megabytes)
+
+
+class Module(lightning.LightningModule):
+    def __init__(self, rendering):
+        super().__init__()
+        self.net, self.rendering = Net(), rendering
+
+    def test_step(self, batch, batch_idx, dataloader_idx=0):
+        self.net(batch)
+        hold(self.rendering)
+
+
+class Afterwards(lightning.Callback):
+    """Like the callbacks that measure and draw, it works when a test step has ended."""
+
+    def on_test_batch_end(self, *_):
+        hold(700)
+
+
+def measure(sets, rendering=1):
+    """Costs of a test; `sets` gives the megabytes of each prediction of each test set."""
+    data = lightning.LightningDataModule()
+    data.name, data.tests = "main", sets
+    data.test_dataloader = lambda: [DataLoader(list(s), batch_size=None) for s in sets.values()]
+    costs, module = Costs(), Module(rendering)
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        logger=False,
+        callbacks=[costs, Afterwards()],
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.test(module, data, verbose=False)
+    assert not module.net._forward_hooks and not module.net._forward_pre_hooks
+    return {key.removeprefix("cost/"): value for key, value in costs.values.items()}
+
+
+resident = pytest.mark.skipif(
+    not reset_peak_memory("cpu"), reason="the peak of the process cannot be reset"
+)
+
+
+@resident
+def test_inference_memory_is_that_of_the_prediction_alone():
+    plain = measure({"main": [1, 1]})
+    predicting = measure({"main": [1, 300, 1]})
+    rendering = measure({"main": [1, 1]}, rendering=300)
+    rise = predicting["inference_gb"] - plain["inference_gb"]
+    assert rise == pytest.approx(0.3, abs=TOLERANCE_GB)
+    assert predicting["render_gb"] == pytest.approx(plain["render_gb"], abs=TOLERANCE_GB)
+    assert rendering["inference_gb"] == pytest.approx(plain["inference_gb"], abs=TOLERANCE_GB)
+    rise = rendering["render_gb"] - plain["render_gb"]
+    assert rise == pytest.approx(0.3, abs=TOLERANCE_GB)
+
+
+@resident
+def test_each_test_set_has_costs_of_its_own():
+    found = measure({"main": [1, 1], "more_views": [200, 1]})
+    rise = found["more_views/inference_gb"] - found["inference_gb"]
+    assert rise == pytest.approx(0.2, abs=TOLERANCE_GB)
+    assert found["inference_seconds"] > 0 and found["more_views/render_seconds"] > 0
+
+
+def test_seconds_leave_the_longest_out(monkeypatch):
+    # Of each scene: predicting starts, ends, rendering starts, ends.
+    clock = iter([0.0, 1.0, 1.0, 2.0, 10.0, 40.0, 40.0, 44.0, 50.0, 53.0, 53.0, 59.0])
+    monkeypatch.setattr(measured, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    found = measure({"main": [1, 1, 1]})
+    assert (found["inference_seconds"], found["render_seconds"]) == (2.0, 2.5)
+
+
+def test_seconds_of_steps_leave_the_longest_out(monkeypatch):
+    costs = Costs()
+    costs.step = Measured(torch.device("cpu"))
+    costs.step.seconds = [30.0, 1.0, 3.0]
+    monkeypatch.setattr(costs, "_render_seconds", lambda *_: 0.5)
+    trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
+    costs.on_fit_end(trainer, Module(1))
+    expected = {"cost/seconds_per_step": 2.0, "cost/render_seconds_per_step": 0.5}
+    assert costs.values == expected

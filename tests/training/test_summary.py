@@ -1,0 +1,45 @@
+"""metrics.json and the terminal, of runs that measured everything and of those that did not."""
+
+import json
+
+import pytest
+
+from asysplat.training.summary import print_summary, write_json
+
+METRICS = {
+    "protocol/name": "longlrm",
+    "test/rooms/psnr": 21.5,
+    "baseline/rooms/nearest_view/psnr": 16.0,
+    "baseline/rooms/mean_colour/psnr": 13.0,
+}
+STATIC = {"cost/parameters": 2e6, "cost/geometry_share": 0.7, "cost/gaussians": 10}
+STEP = {"cost/seconds_per_step": 2.0, "cost/render_seconds_per_step": 0.5}
+
+
+@pytest.mark.parametrize(
+    "results, shown, hidden",
+    [
+        (METRICS | STATIC | STEP, ["longlrm", "21.500", "2.00M", "25.0% of it for rendering"], []),
+        (METRICS, ["longlrm", "21.500"], ["parameters", "a step"]),
+        (STATIC | STEP, ["2.00M", "2.00 s a step"], ["test scenes", "PSNR"]),
+        (STATIC, ["2.00M"], ["a step", "GB"]),
+        ({}, [], ["parameters", "PSNR"]),
+    ],
+)
+def test_what_was_not_measured_is_left_out(results, shown, hidden, tmp_path, capsys):
+    print_summary(results, "rooms", tmp_path)
+    printed = capsys.readouterr().out
+    for words in shown:
+        assert words in printed
+    for words in hidden:
+        assert words not in printed
+    assert printed.splitlines()[-1] == f"run: {tmp_path}"
+
+
+def test_metrics_json_is_finite_and_says_how_seconds_are_taken(tmp_path):
+    path = tmp_path / "metrics.json"
+    write_json(path, METRICS | {"test/rooms/absrel": float("nan")})
+    found = json.loads(path.read_text())
+    assert found["test/rooms/absrel"] is None and found["test/rooms/psnr"] == 21.5
+    assert "longest" in found["protocol/seconds"]
+    assert list(tmp_path.iterdir()) == [path]
