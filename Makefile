@@ -1,4 +1,4 @@
-.PHONY: demo test format
+.PHONY: demo test slow format
 PYTHON ?= python3
 ENV := .venv/.ready
 
@@ -9,6 +9,9 @@ test: $(ENV) ## style and tests
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 # two tests at a time, a thread each
+
+slow: $(ENV) ## what takes an hour or two: long runs on real scenes, two processes for every model
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 -m slow
 
 format: $(ENV)
 	.venv/bin/ruff check --fix .

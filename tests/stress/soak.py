@@ -1,4 +1,4 @@
-"""A scene optimised for long, as a user would: all fields of 60,000 Gaussians by Adam, on photographs.
+"""A scene optimised for long, as a user would: all fields of 60,000 Gaussians, on photographs.
 
 python tests/stress/soak.py path/to/scene 1000
 NUMBA_BOUNDSCHECK=1 python tests/stress/soak.py path/to/scene 1000, with memory poisoned too
