@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any
 
 import lightning
@@ -12,17 +12,9 @@ from torch import Tensor, nn
 from asysplat.evaluation.metrics import psnr
 from asysplat.evaluation.static_cost import blank_views
 from asysplat.models.network import Network
-from asysplat.rendering import Rendering, render
-from asysplat.scene import Gaussians
+from asysplat.rendering import render
 from asysplat.training.losses import ReconstructionLoss
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a network made of a batch: handed to the callbacks, which measure and draw it."""
-
-    gaussians: Gaussians
-    rendering: Rendering
+from asysplat.training.outcome import Outcome
 
 
 class Reconstruction(lightning.LightningModule):
@@ -30,7 +22,7 @@ class Reconstruction(lightning.LightningModule):
 
     Args:
         net: views -> Gaussians; see `freeze_unread`.
-        loss: of a rendering against the target views.
+        loss: of an outcome against its batch.
         learning_rate: its peak; linear warm-up, then a cosine to zero at `total_steps`.
         weight_decay: see `decaying`.
         betas: of AdamW.
@@ -69,12 +61,12 @@ class Reconstruction(lightning.LightningModule):
         return Outcome(gaussians, rendering)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
-        rendering = self.reconstruct(batch, depth=self.loss.needs_depth).rendering
-        terms = self.loss(rendering, batch["targets"])
+        outcome = self.reconstruct(batch, depth=self.loss.needs_depth)
+        terms = self.loss(outcome, batch)
         size = len(batch["scene"])
         self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
         self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])
-        quality = psnr(rendering.image.detach(), batch["targets"].images).mean()
+        quality = psnr(outcome.rendering.image.detach(), batch["targets"].images).mean()
         self.log("train/psnr", quality, prog_bar=True, batch_size=size)
         return terms["loss"]
 

@@ -14,7 +14,7 @@ from asysplat.evaluation import baselines
 from asysplat.evaluation.lpips import load_lpips, lpips_distance
 from asysplat.evaluation.metrics import abs_rel, delta1, psnr, ssim
 from asysplat.scene import Views
-from asysplat.training.reconstruction import Outcome
+from asysplat.training.outcome import Outcome
 
 Row = dict[str, str | float]
 IMAGE = ("set", "scene", "view")  # which image a row is of
