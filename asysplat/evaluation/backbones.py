@@ -4,27 +4,27 @@ Nothing is downloaded: a machine without the files runs without these measures.
 """
 
 import pickle
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torchvision.models import alexnet, vgg16
+from torchvision.models import alexnet, vgg16, vgg19
 
 from asysplat.errors import InputError
 
-BUILDERS = {"alexnet": alexnet, "vgg16": vgg16}
+BUILDERS = {"alexnet": alexnet, "vgg16": vgg16, "vgg19": vgg19}
 # torchvision's own files in torch's hub cache; the part after the dash is a hash.
-HUB_FILES = {"alexnet": "alexnet-owt-*.pth", "vgg16": "vgg16-*.pth"}
+HUB_FILES = {"alexnet": "alexnet-owt-*.pth", "vgg16": "vgg16-*.pth", "vgg19": "vgg19-*.pth"}
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-VGG16_TAPS = (3, 8, 15, 22, 29)  # ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 within `vgg16().features`
 
 
 def find_backbone(
-    name: Literal["alexnet", "vgg16"], weights: Path | None
+    name: Literal["alexnet", "vgg16", "vgg19"], weights: Path | None
 ) -> dict[str, Tensor] | None:
     """torchvision's ImageNet weights of the convolutions: `features.N.weight` and `.bias`, fp32.
 
@@ -61,29 +61,45 @@ def _load_features(name: str, path: Path) -> dict[str, Tensor]:
 
 
 class VGGFeatures(nn.Module):
-    """Frozen VGG16 activations after ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016).
+    """Frozen activations of VGG16 or VGG19 (Simonyan and Zisserman 2015).
 
     Args:
-        weights: what `find_backbone("vgg16", ...)` returned.
+        name: of the network.
+        weights: what `find_backbone(name, ...)` returned.
+        taps: layers of torchvision's `features`, ascending, whose outputs are given.
+        std: what images, less ImageNet's mean colour, are divided by, RGB.
+        mean_pooling: in place of maximum pooling.
     """
 
-    def __init__(self, weights: dict[str, Tensor]):
+    def __init__(
+        self,
+        name: Literal["vgg16", "vgg19"],
+        weights: dict[str, Tensor],
+        taps: Sequence[int],
+        std: Sequence[float],
+        mean_pooling: bool = False,
+    ):
         super().__init__()
-        # On meta, because vgg16() would also fill 124 M classifier weights at random.
+        # On meta, because torchvision would also fill 124 M classifier weights at random.
         with torch.device("meta"):
-            self.features = vgg16().features[: VGG16_TAPS[-1] + 1]
+            layers = BUILDERS[name]().features[: taps[-1] + 1]
+        if mean_pooling:
+            pooled = [isinstance(layer, nn.MaxPool2d) for layer in layers]
+            layers = [nn.AvgPool2d(2) if p else x for p, x in zip(pooled, layers, strict=True)]
+        self.taps, self.features = taps, nn.Sequential(*layers)
         state = {key: weights[f"features.{key}"] for key in self.features.state_dict()}
         self.features.load_state_dict(state, assign=True)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None])
-        self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None])
+        self.register_buffer("std", torch.tensor(std)[:, None, None])
         self.requires_grad_(False).eval()
 
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
-        """Five activations of `images` in [0, 1], of 64 to 512 channels at 1 to 1/16 the size."""
+        """The activations of `images` in [0, 1]; those after the n-th pooling have 1 / 2^n of the
+        size."""
         x = (images - self.mean) / self.std
         activations = []
         for index, layer in enumerate(self.features):
             x = layer(x)
-            if index in VGG16_TAPS:
+            if index in self.taps:
                 activations.append(x)
         return activations

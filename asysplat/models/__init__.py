@@ -3,7 +3,7 @@
 from asysplat.models.asysplat import AsySplat, build_asysplat
 from asysplat.models.attention import FullAttention, SparseAttention
 from asysplat.models.bilateral import CoarseReadsFine, FineReadsCoarse, NoLink
-from asysplat.models.head import GaussianHead
+from asysplat.models.head import GaussianHead, LongLRMHead, PhotographHead
 from asysplat.models.mamba2 import BiMamba2
 from asysplat.models.mamba_vision import MambaVision
 from asysplat.models.shapes import StageShape, Widths
@@ -19,9 +19,11 @@ __all__ = [
     "FineSource",
     "FullAttention",
     "GaussianHead",
+    "LongLRMHead",
     "MambaVision",
     "MergedSource",
     "NoLink",
+    "PhotographHead",
     "SingleBranch",
     "SparseAttention",
     "StageShape",

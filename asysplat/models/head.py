@@ -1,9 +1,9 @@
 """The linear decoder from tokens to Gaussians (paper, Sec. 3.2, "Merging and Gaussian Prediction").
 
-The paper fixes the 59 numbers of a Gaussian, not their activations. Ours make an untrained model
-draw its input photographs at a middle distance, so that training starts from pictures: colours are
-residuals to the photograph, sizes are in units of the pixel's footprint, distances logarithmic.
+The paper fixes the 59 numbers of a Gaussian, not what they stand for: here are two readings.
 """
+
+from abc import ABC, abstractmethod
 
 import torch
 import torch.nn.functional as F
@@ -17,14 +17,73 @@ from asysplat.scene import Cameras, Gaussians, Views
 SH_C0 = 0.28209479177387814  # Y_0, so that colour = 0.5 + SH_C0 * sh_0
 
 
-class GaussianHead(nn.Module):
+class GaussianHead(nn.Module, ABC):
     """LayerNorm and Linear: each token gives p_f x p_f Gaussians, one a pixel of the image
-    downsampled by p_c / p_f.
+    downsampled by p_c / p_f, on the ray through that pixel's centre.
 
     Args:
         width: d_3.
         patch_coarse, patch_fine: p_c, p_f.
         sh_degree: 0 to 3.
+        std: of the untrained weights.
+    """
+
+    def __init__(self, width: int, patch_coarse: int, patch_fine: int, sh_degree: int, std: float):
+        super().__init__()
+        self.patch, self.stride = patch_fine, patch_coarse // patch_fine
+        # position, quaternion, scale, opacity, spherical harmonics
+        self.splits = (3, 4, 3, 1, 3 * (sh_degree + 1) ** 2)
+        self.norm = nn.LayerNorm(width, bias=False)
+        self.decode = nn.Linear(width, patch_fine**2 * sum(self.splits), bias=False)
+        nn.init.normal_(self.decode.weight, std=std)
+
+    def forward(self, features: Float[Tensor, "B V h w d"], views: Views) -> Gaussians:
+        """Gaussians [B, V h p_f w p_f], row by row of view after view."""
+        raw = rearrange(
+            self.decode(self.norm(features)),
+            "b v h w (p q z) -> b v (h p) (w q) z",
+            p=self.patch,
+            q=self.patch,
+        )
+        with without_autocast(raw):
+            raw = raw.to(views.images.dtype)
+            position, quats, scales, opacities, sh = raw.split(self.splits, dim=-1)
+            # The mean of three outputs, as in Long-LRM.
+            reach = position.mean(-1, keepdim=True).sigmoid()
+            sh = sh.unflatten(-1, (-1, 3))
+            return self.activate(reach, quats, scales, opacities[..., 0], sh, views).map(
+                lambda field: field.flatten(1, 3)
+            )
+
+    @abstractmethod
+    def activate(
+        self,
+        reach: Float[Tensor, "B V h w 1"],
+        quats: Float[Tensor, "B V h w 4"],
+        scales: Float[Tensor, "B V h w 3"],
+        opacities: Float[Tensor, "B V h w"],
+        sh: Float[Tensor, "B V h w K 3"],
+        views: Views,
+    ) -> Gaussians:
+        """Gaussians [B, V, h, w] from what was decoded.
+
+        Args:
+            reach: in [0, 1], where in the head's range of distances.
+            quats, scales, opacities, sh: any numbers.
+            views: what the tokens were made of.
+        """
+
+
+class PhotographHead(GaussianHead):
+    """Ours: an untrained model draws its input photographs at a middle distance, so that training
+    starts from pictures.
+
+    Colours are residuals to the downsampled photograph, sizes are in units of the pixel's
+    footprint, distances logarithmic. The photograph reaches the Gaussians past both branches: what
+    the appearance branch adds is less than with colours of its own.
+
+    Args:
+        width, patch_coarse, patch_fine, sh_degree: of GaussianHead.
         near, far: distances along the ray lie between them, in units of the normalised scene.
         opacity_bias: logit of an untrained opacity.
         scale_bias: log of an untrained size, in pixel footprints.
@@ -41,45 +100,30 @@ class GaussianHead(nn.Module):
         opacity_bias: float = 0.0,
         scale_bias: float = -0.5,
     ):
-        super().__init__()
-        self.patch, self.stride = patch_fine, patch_coarse // patch_fine
+        super().__init__(width, patch_coarse, patch_fine, sh_degree, std=1e-3)
         self.near, self.far = near, far
         self.opacity_bias, self.scale_bias = opacity_bias, scale_bias
-        # position, quaternion, scale, opacity, spherical harmonics
-        self.splits = (3, 4, 3, 1, 3 * (sh_degree + 1) ** 2)
-        self.norm = nn.LayerNorm(width, bias=False)
-        self.decode = nn.Linear(width, patch_fine**2 * sum(self.splits), bias=False)
-        nn.init.normal_(self.decode.weight, std=1e-3)
 
-    def forward(self, features: Float[Tensor, "B V h w d"], views: Views) -> Gaussians:
-        raw = rearrange(
-            self.decode(self.norm(features)),
-            "b v h w (p q z) -> b v (h p) (w q) z",
-            p=self.patch,
-            q=self.patch,
-        )
-        with without_autocast(raw):
-            return self._activate(raw.to(views.images.dtype), views)
-
-    def _activate(self, raw: Float[Tensor, "B V h w z"], views: Views) -> Gaussians:
-        position, quats, scales, opacities, sh = raw.split(self.splits, dim=-1)
-        cameras = views.cameras.resized(*raw.shape[2:4])
+    def activate(
+        self,
+        reach: Float[Tensor, "B V h w 1"],
+        quats: Float[Tensor, "B V h w 4"],
+        scales: Float[Tensor, "B V h w 3"],
+        opacities: Float[Tensor, "B V h w"],
+        sh: Float[Tensor, "B V h w K 3"],
+        views: Views,
+    ) -> Gaussians:
+        cameras = views.cameras.resized(*opacities.shape[2:])
         origins, directions = cameras.rays()
-        # Long-LRM's mean of three position outputs, on a logarithmic range.
-        fraction = position.mean(-1, keepdim=True).sigmoid()
-        distance = self.near * (self.far / self.near) ** fraction
-        scales = (scales + self.scale_bias).clamp(-5, 3).exp() * distance * footprint(cameras)
+        distance = self.near * (self.far / self.near) ** reach
         identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-        sh = sh.unflatten(-1, (-1, 3))
-        sh = torch.cat((sh[..., :1, :] + self._photograph(views), sh[..., 1:, :]), dim=-2)
-        per_pixel = Gaussians(
+        return Gaussians(
             means=origins + distance * directions,
             quats=quats + identity,
-            scales=scales,
-            opacities=(opacities[..., 0] + self.opacity_bias).sigmoid(),
-            sh=sh,
+            scales=(scales + self.scale_bias).clamp(-5, 3).exp() * distance * footprint(cameras),
+            opacities=(opacities + self.opacity_bias).sigmoid(),
+            sh=torch.cat((sh[..., :1, :] + self._photograph(views), sh[..., 1:, :]), dim=-2),
         )
-        return per_pixel.map(lambda field: field.flatten(1, 3))
 
     def _photograph(self, views: Views) -> Float[Tensor, "B V h w 1 3"]:
         """The downsampled photographs as spherical harmonics of degree 0."""
@@ -87,6 +131,59 @@ class GaussianHead(nn.Module):
             0, views.images.shape[:2]
         )
         return (rearrange(small, "b v c h w -> b v h w 1 c") - 0.5) / SH_C0
+
+
+class LongLRMHead(GaussianHead):
+    """Long-LRM's (Ziwen et al. 2025; the values of its public code's configs/7m1t_tm.yaml).
+
+    Colours and sizes are direct, sizes in units of the scene and at most e^largest; the distance
+    along the ray is linear from 0 to `farthest`. Those units are the normalised scene's: Long-LRM
+    puts the input cameras into the box [-1, 1]^3 about the mean camera, ours stand in the ball of
+    radius 1 (`asysplat.data.normalise`), which is up to sqrt(3) times smaller. It draws with a near
+    plane at 0.01, as `asysplat.rendering` does, and a far one at 1e6, beyond all that is predicted.
+
+    Args:
+        width, patch_coarse, patch_fine, sh_degree: of GaussianHead.
+        farthest: distance, in units of the normalised scene.
+        opacity_bias: logit of an untrained opacity.
+        scale_bias: log of an untrained size.
+        largest: log of the largest size.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        patch_coarse: int,
+        patch_fine: int,
+        sh_degree: int = 3,
+        farthest: float = 500.0,
+        opacity_bias: float = -2.0,
+        scale_bias: float = -6.9,
+        largest: float = -1.2,
+    ):
+        super().__init__(width, patch_coarse, patch_fine, sh_degree, std=0.02)
+        self.farthest = farthest
+        self.opacity_bias, self.scale_bias, self.largest = opacity_bias, scale_bias, largest
+
+    def activate(
+        self,
+        reach: Float[Tensor, "B V h w 1"],
+        quats: Float[Tensor, "B V h w 4"],
+        scales: Float[Tensor, "B V h w 3"],
+        opacities: Float[Tensor, "B V h w"],
+        sh: Float[Tensor, "B V h w K 3"],
+        views: Views,
+    ) -> Gaussians:
+        origins, directions = views.cameras.resized(*opacities.shape[2:]).rays()
+        sizes = (scales + self.scale_bias).clamp(max=self.largest).exp()
+        return Gaussians(
+            means=origins + self.farthest * reach * directions,
+            quats=quats,
+            # Not published: a size is above 0 also where the exponential is not.
+            scales=sizes.clamp_min(torch.finfo(sizes.dtype).tiny),
+            opacities=(opacities + self.opacity_bias).sigmoid(),
+            sh=sh,
+        )
 
 
 def footprint(cameras: Cameras) -> Float[Tensor, "B V 1 1 1"]:

@@ -1,13 +1,18 @@
 """One branch for everything: the paper's single-branch ablation, and Long-LRM, its baseline."""
 
+import math
 from collections.abc import Mapping, Sequence
 
-from torch import nn
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from asysplat.errors import InputError
+from asysplat.models.attention import SparseAttention
 from asysplat.models.network import Network
 from asysplat.models.shapes import StageShape, Widths
-from asysplat.models.stage import Component, Stage
+from asysplat.models.stage import Component, stage_layers, to_width
 from asysplat.models.tokenizer import Tokenizer, pixel_features
 from asysplat.scene import Gaussians, Views
 
@@ -23,9 +28,11 @@ class SingleBranch(Network):
         blocks: letter -> component built from a StageShape.
         head: component that decodes Gaussians.
         patch: side of a token's patch before any merge.
+        global_tokens: learned tokens ahead of the others, that belong to no place.
 
     Raises:
-        InputError: lists of unequal length, or an unusable layer mix.
+        InputError: lists of unequal length, an unusable layer mix, or global tokens with sparse
+            attention, which sorts tokens by their places.
     """
 
     def __init__(
@@ -37,6 +44,7 @@ class SingleBranch(Network):
         blocks: Mapping[str, Component],
         head: Component,
         patch: int = 8,
+        global_tokens: int = 0,
     ):
         super().__init__(widths, patch * 2 ** sum(merges))
         lists = {"stage_ratios": stage_ratios, "stage_layers": stage_layers, "merges": merges}
@@ -52,23 +60,96 @@ class SingleBranch(Network):
             for width, ratio in zip(widths.stages, stage_ratios, strict=True)
         ]
         self.stages = nn.ModuleList(
-            Stage(previous.width, shape, layers, blocks, merge)
+            MergingStage(previous.width, shape, layers, blocks, merge, global_tokens > 0)
             for previous, shape, layers, merge in zip(
                 [shapes[0], *shapes[:-1]], shapes, stage_layers, merges, strict=True
             )
         )
+        if global_tokens and any(isinstance(m, SparseAttention) for m in self.modules()):
+            raise InputError(
+                f"model.global_tokens={global_tokens} with sparse attention among "
+                f"model.stage_layers={list(stage_layers)}: global tokens have no place in a frame; "
+                "take layers m and t, or model.global_tokens=0."
+            )
+        self.global_tokens = None
+        if global_tokens:
+            start = nn.init.trunc_normal_(torch.empty(global_tokens, shapes[0].width), std=0.02)
+            self.global_tokens = nn.Parameter(start)
         self.head = head(widths.stages[-1], self.patch, self.patch)
 
     def predict(self, views: Views) -> Gaussians:
         """Views [B, V] -> Gaussians [B, N], N = V H W."""
         tokens = self.tokenizer(pixel_features(views))
+        extra = None
+        if self.global_tokens is not None:
+            extra = self.tokenizer.norm(self.global_tokens).expand(len(tokens), -1, -1)
         for stage in self.stages:
-            tokens = stage(tokens)
+            tokens, extra = stage(tokens, extra)
         return self.head(tokens, views)
 
     def geometry_share(self) -> float:
         """There is no appearance branch: 1."""
         return 1.0
+
+
+class MergingStage(nn.Module):
+    """Bring the tokens to the stage's width, merged or projected, then apply the layer mix to them
+    and the global tokens as one sequence.
+
+    Args:
+        previous_width: of the tokens that come in.
+        shape: of this stage.
+        layers: the layer mix, letters of `blocks`.
+        blocks: letter -> component built from a StageShape.
+        merge: whether 2 x 2 tokens become one.
+        has_global: whether there are global tokens.
+    """
+
+    def __init__(
+        self,
+        previous_width: int,
+        shape: StageShape,
+        layers: str,
+        blocks: Mapping[str, Component],
+        merge: bool,
+        has_global: bool,
+    ):
+        super().__init__()
+        self.merge = TokenMerge(previous_width, shape.width) if merge else None
+        # A merge has the new width already: it leaves the projection to global tokens.
+        needed = has_global or not merge
+        self.project = to_width(previous_width, shape.width) if needed else None
+        self.layers = stage_layers(shape, layers, blocks)
+
+    def forward(
+        self, tokens: Float[Tensor, "B V h w d"], extra: Float[Tensor, "B G d"] | None
+    ) -> tuple[Float[Tensor, "B V h2 w2 e"], Float[Tensor, "B G e"] | None]:
+        tokens = self.project(tokens) if self.merge is None else self.merge(tokens)
+        if extra is None:
+            return self.layers(tokens), None
+        sequence = torch.cat((self.project(extra), tokens.flatten(1, 3)), dim=1)
+        # As one row of one frame: none of these layers looks at places.
+        sequence = self.layers(sequence[:, None, None])[:, 0, 0]
+        count = extra.shape[1]
+        return sequence[:, count:].reshape(tokens.shape), sequence[:, :count]
+
+
+class TokenMerge(nn.Module):
+    """2 x 2 neighbouring tokens of a frame become one: a convolution of stride 2 that brings them
+    to the new width (Long-LRM, Ziwen et al. 2025).
+
+    Each of the old channels makes as many new ones, as published; where the new width is no
+    multiple of the old, the least groups of channels that divide both.
+    """
+
+    def __init__(self, width: int, new_width: int):
+        super().__init__()
+        groups = math.gcd(width, new_width)
+        self.conv = nn.Conv2d(width, new_width, kernel_size=2, stride=2, groups=groups)
+
+    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h//2 w//2 e"]:
+        maps = rearrange(tokens, "b v h w d -> (b v) d h w")
+        return rearrange(self.conv(maps), "(b v) d h w -> b v h w d", b=len(tokens))
 
 
 def build_single_branch(

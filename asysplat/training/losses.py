@@ -1,19 +1,15 @@
 """The training objective (paper, Suppl. A, Eq. 5). A term that is off costs nothing."""
 
 import warnings
-from pathlib import Path
+from collections.abc import Callable
+from typing import Any
 
-import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from asysplat.evaluation.backbones import VGGFeatures, find_backbone
-from asysplat.rendering import Rendering
-from asysplat.scene import Views
-
-DISPARITY_STRIDE = 2  # p_c / p_f of the paper: both maps are downsampled by it
-SEEN = 0.5  # where Gaussians cover less than this, their depth says nothing
+from asysplat.training.disparity import InputDisparity, RenderedDisparity
+from asysplat.training.outcome import Outcome
+from asysplat.training.perceptual import PerceptualDistance, vgg16
 
 
 class ReconstructionLoss(nn.Module):
@@ -21,80 +17,53 @@ class ReconstructionLoss(nn.Module):
 
     Args:
         mse, perceptual, depth: weights of the terms; 0 turns a term off. The perceptual term is
-            also off where VGG16 is not on this machine (said once), the depth term where the data
-            has no depths.
-        weights: folder that may hold the VGG16 backbone.
+            also off where its network is not on this machine, the depth term where the data has no
+            depths: either is said once.
+        perceptual_term, depth_term: components, built where their weight is not 0.
     """
 
-    def __init__(self, mse: float, perceptual: float, depth: float, weights: str | None = None):
+    def __init__(
+        self,
+        mse: float,
+        perceptual: float,
+        depth: float,
+        perceptual_term: Callable[[], PerceptualDistance | None] = vgg16,
+        depth_term: Callable[[], RenderedDisparity | InputDisparity] = RenderedDisparity,
+    ):
         super().__init__()
         self.mse, self.perceptual, self.depth = mse, perceptual, depth
+        distance = perceptual_term() if perceptual else None
         # In a list, so that the frozen network stays out of the checkpoints.
-        self._vgg: list[VGGFeatures] = []
-        if perceptual:
-            backbone = find_backbone("vgg16", None if weights is None else Path(weights))
-            if backbone is None:
-                warnings.warn(
-                    "VGG16 is neither in torch's hub cache nor in paths.weights: "
-                    "training goes on without the perceptual term.",
-                    stacklevel=2,
-                )
-            else:
-                self._vgg.append(VGGFeatures(backbone))
+        self._perceptual_term = [] if distance is None else [distance]
+        self._depth_term = depth_term() if depth else None
+        self._said_no_depth = False
 
     @property
     def needs_depth(self) -> bool:
-        return self.depth > 0
+        """Whether depth has to be rendered at the targets."""
+        return self._depth_term is not None and self._depth_term.renders_depth
 
-    def forward(self, rendering: Rendering, targets: Views) -> dict[str, Tensor]:
-        """The weighted sum under "loss", and each term that is on, unweighted."""
-        terms, image = {}, targets.masked(rendering.image)
+    def forward(self, outcome: Outcome, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """The weighted sum under "loss", and each term that is on, unweighted.
+
+        Args:
+            outcome: with rendered depth where `needs_depth`.
+            batch: inputs and targets, both Views.
+        """
+        targets = batch["targets"]
+        terms, image = {}, targets.masked(outcome.rendering.image)
         if self.mse:
             terms["mse"] = F.mse_loss(image, targets.images)
-        if self._vgg:
-            terms["perceptual"] = self._perceptual(image, targets.images)
-        if self.needs_depth and targets.depths is not None and rendering.depth is not None:
-            terms["depth"] = disparity_loss(rendering.depth, rendering.alpha, targets.depths)
+        for distance in self._perceptual_term:
+            terms["perceptual"] = distance.to(image.device)(image, targets.images)
+        if self._depth_term is not None:
+            depth = self._depth_term(outcome, batch)
+            if depth is not None:
+                terms["depth"] = depth
+            elif not self._said_no_depth:
+                self._said_no_depth = True
+                warnings.warn(
+                    "the data has no depths: training goes on without the depth term.",
+                    stacklevel=2,
+                )
         return {"loss": sum(getattr(self, name) * term for name, term in terms.items()), **terms}
-
-    def _perceptual(
-        self, rendered: Float[Tensor, "*batch V 3 H W"], target: Float[Tensor, "*batch V 3 H W"]
-    ) -> Float[Tensor, ""]:
-        """Mean L1 distance of VGG16 features, over five depths (Chen and Koltun 2017)."""
-        vgg = self._vgg[0].to(rendered.device)
-        with torch.no_grad():
-            expected = vgg(target.flatten(0, -4))
-        found = vgg(rendered.flatten(0, -4))
-        distances = [F.l1_loss(a, b) for a, b in zip(found, expected, strict=True)]
-        return torch.stack(distances).mean()
-
-
-def disparity_loss(
-    depth: Float[Tensor, "*batch V H W"],
-    alpha: Float[Tensor, "*batch V H W"],
-    target: Float[Tensor, "*batch V H W"],
-) -> Float[Tensor, ""]:
-    """SmoothL1 between normalised disparities at 1 / DISPARITY_STRIDE of the resolution.
-
-    Only pixels whose depth is known and which Gaussians cover count.
-    """
-    depth, alpha, target = (
-        maps.flatten(0, -3)[:, ::DISPARITY_STRIDE, ::DISPARITY_STRIDE]
-        for maps in (depth, alpha, target)
-    )
-    valid = (target > 0) & (alpha > SEEN) & (depth > 0)
-    found, expected = (normalised_disparity(maps, valid) for maps in (depth, target))
-    error = F.smooth_l1_loss(found, expected, reduction="none")
-    return (error * valid).sum() / valid.sum().clamp_min(1)
-
-
-def normalised_disparity(
-    depth: Float[Tensor, "V H W"], valid: Bool[Tensor, "V H W"]
-) -> Float[Tensor, "V H W"]:
-    """1 / depth, less its median and over its mean absolute deviation, per view; 0 elsewhere."""
-    disparity = torch.where(valid, 1 / torch.where(valid, depth, 1), torch.nan).flatten(1)
-    median = disparity.nanmedian(dim=1, keepdim=True).values
-    centered = torch.where(valid.flatten(1), disparity - median.nan_to_num(), 0)
-    count = valid.flatten(1).sum(1, keepdim=True).clamp_min(1)
-    deviation = centered.abs().sum(1, keepdim=True) / count
-    return (centered / deviation.clamp_min(1e-6)).view_as(depth)

@@ -2,36 +2,29 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import fields
 from typing import Any
 
 import lightning
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from asysplat.evaluation.metrics import psnr
+from asysplat.evaluation.static_cost import blank_views
 from asysplat.models.network import Network
-from asysplat.rendering import Rendering, render
-from asysplat.scene import Gaussians
+from asysplat.rendering import render
 from asysplat.training.losses import ReconstructionLoss
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a network made of a batch: handed to the callbacks, which measure and draw it."""
-
-    gaussians: Gaussians
-    rendering: Rendering
+from asysplat.training.outcome import Outcome
 
 
 class Reconstruction(lightning.LightningModule):
     """Predict Gaussians from the input views, render the targets, compare.
 
     Args:
-        net: views -> Gaussians.
-        loss: of a rendering against the target views.
+        net: views -> Gaussians; see `freeze_unread`.
+        loss: of an outcome against its batch.
         learning_rate: its peak; linear warm-up, then a cosine to zero at `total_steps`.
-        weight_decay: of matrices; vectors (norms, biases, A, dt, D) have none.
+        weight_decay: see `decaying`.
         betas: of AdamW.
         warmup_steps, total_steps: in optimizer steps.
         background: RGB behind the Gaussians.
@@ -52,6 +45,7 @@ class Reconstruction(lightning.LightningModule):
     ):
         super().__init__()
         net.checkpoint_layers(checkpoint_layers)
+        freeze_unread(net)
         self.net, self.loss = net, loss
         self.learning_rate, self.weight_decay, self.betas = learning_rate, weight_decay, betas
         self.warmup_steps, self.total_steps = warmup_steps, total_steps
@@ -67,12 +61,12 @@ class Reconstruction(lightning.LightningModule):
         return Outcome(gaussians, rendering)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
-        rendering = self.reconstruct(batch, depth=self.loss.needs_depth).rendering
-        terms = self.loss(rendering, batch["targets"])
+        outcome = self.reconstruct(batch, depth=self.loss.needs_depth)
+        terms = self.loss(outcome, batch)
         size = len(batch["scene"])
         self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
         self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])
-        quality = psnr(rendering.image.detach(), batch["targets"].images).mean()
+        quality = psnr(outcome.rendering.image.detach(), batch["targets"].images).mean()
         self.log("train/psnr", quality, prog_bar=True, batch_size=size)
         return terms["loss"]
 
@@ -83,12 +77,15 @@ class Reconstruction(lightning.LightningModule):
         return self.reconstruct(batch, depth=True)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        matrices = [p for p in self.parameters() if p.ndim >= 2]
-        vectors = [p for p in self.parameters() if p.ndim < 2]
+        decay = set(decaying(self.net))
+        trained = [p for p in self.parameters() if p.requires_grad]
         optimizer = torch.optim.AdamW(
             [
-                {"params": matrices, "weight_decay": self.weight_decay},
-                {"params": vectors, "weight_decay": 0.0},
+                {
+                    "params": [p for p in trained if p in decay],
+                    "weight_decay": self.weight_decay,
+                },
+                {"params": [p for p in trained if p not in decay], "weight_decay": 0.0},
             ],
             lr=self.learning_rate,
             betas=tuple(self.betas),
@@ -117,3 +114,36 @@ class Reconstruction(lightning.LightningModule):
             return (step + 1) / self.warmup_steps
         progress = (step - self.warmup_steps) / max(1, self.total_steps - self.warmup_steps)
         return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+
+
+WEIGHTED = (nn.Linear, nn.Conv1d, nn.Conv2d)
+
+
+def decaying(net: nn.Module) -> list[nn.Parameter]:
+    """The parameters that weight decay pulls to zero: the weights of products and convolutions.
+
+    What is learned otherwise has a meaning away from zero: norms, biases, A, dt and D of the scans
+    whatever their shape, tokens.
+    """
+    return [module.weight for module in net.modules() if isinstance(module, WEIGHTED)]
+
+
+def freeze_unread(net: Network) -> None:
+    """Let parameters on which no Gaussian depends take no gradient.
+
+    Nothing would ever change them, but processes that train together wait for their gradients.
+    They are there because the paper counts them: a link whose reader is not predicted from.
+    """
+    with torch.device("meta"):
+        views = blank_views(2, net.size_multiple, net.size_multiple)
+        state = {n: torch.empty(t.shape, dtype=t.dtype) for n, t in net.named_buffers()}
+        leaves = {
+            n: torch.empty(p.shape, dtype=p.dtype, requires_grad=True)
+            for n, p in net.named_parameters()
+        }
+    gaussians = torch.func.functional_call(net, state | leaves, (views,))
+    outputs = [getattr(gaussians, field.name).sum() for field in fields(gaussians)]
+    grads = torch.autograd.grad(sum(outputs), list(leaves.values()), allow_unused=True)
+    for parameter, grad in zip(net.parameters(), grads, strict=True):
+        if grad is None:
+            parameter.requires_grad_(False)

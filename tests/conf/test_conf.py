@@ -76,8 +76,8 @@ def test_trains_a_step_at_a_tiny_size(choice):
     batch = collate([TrainingTasks(data)[0]])
     optimizer = module.configure_optimizers()["optimizer"]
     before = [parameter.detach().clone() for parameter in module.net.head.parameters()]
-    rendering = module.reconstruct(batch, depth=module.loss.needs_depth).rendering
-    loss = module.loss(rendering, batch["targets"])["loss"]
+    outcome = module.reconstruct(batch, depth=module.loss.needs_depth)
+    loss = module.loss(outcome, batch)["loss"]
     loss.backward()
     optimizer.step()
     assert loss.isfinite()

@@ -100,7 +100,7 @@ def test_lpips_of_the_reference_images(weights, net, expected, capsys):
 
 def test_vgg_features_are_the_five_named_activations(weights):
     backbone = find_backbone("vgg16", weights)
-    features = VGGFeatures(backbone)
+    features = VGGFeatures("vgg16", backbone, (3, 8, 15, 22, 29), (0.229, 0.224, 0.225))
     assert not any(parameter.requires_grad for parameter in features.parameters())
     images = torch.rand(2, 3, 32, 48, requires_grad=True)
     activations = features(images)

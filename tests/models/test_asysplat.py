@@ -40,10 +40,10 @@ PARAMETERS = {
     "asysplat_0m8a": 105.72,
     "single_branch": 94.29,
     "two_branch": 90.26,
-    "longlrm": 141.91,
-    "longlrm_18": 102.98,
-    "longlrm_24": 98.88,
-    "longlrm_24h": 101.84,
+    "longlrm": 141.92,
+    "longlrm_18": 103.00,
+    "longlrm_24": 98.89,
+    "longlrm_24h": 101.85,
 }
 
 
@@ -84,6 +84,7 @@ def test_parameter_budget(build):
         (["parameter_budget=0.5"], "without a geometry_ratio"),
         (["model=longlrm", "geometry_ratio=0.5"], "leave them out"),
         (["model=longlrm", "model.merges=[true]"], "model.merges has 1 entries for 3 stages"),
+        (["model=single_branch", "model.global_tokens=2"], "model.global_tokens=2 with sparse"),
     ],
 )
 def test_what_a_model_refuses(build, overrides, complaint):

@@ -4,20 +4,41 @@ import pytest
 import torch
 
 from asysplat.evaluation.static_cost import blank_views
-from asysplat.models.stage import TokenMerge
+from asysplat.models.single_branch import TokenMerge
 
 TINY = ["width=0.125", "state_size=8"]
 
 
-def test_merge_takes_a_place_and_its_three_neighbours():
-    merge = TokenMerge(2)
-    tokens = torch.randn(1, 3, 4, 6, 2)
+@pytest.mark.parametrize(("width", "new_width", "group"), [(2, 6, 1), (4, 6, 2)])
+def test_merge_takes_a_place_and_its_three_neighbours(width, new_width, group):
+    """As published each channel makes its own new ones; else groups that divide both widths."""
+    merge = TokenMerge(width, new_width)
+    tokens = torch.randn(1, 3, 4, 6, width)
     merged = merge(tokens)
-    assert merged.shape == (1, 3, 2, 3, 2)
-    weight, bias = merge.conv.weight[:, 0], merge.conv.bias
+    assert merged.shape == (1, 3, 2, 3, new_width)
     patch = tokens[0, 1, 2:4, 4:6]  # becomes place (1, 2) of view 1
-    expected = torch.einsum("hwd,dhw->d", patch, weight) + bias
+    read = torch.stack([patch[..., i : i + group] for i in range(0, width, group)])
+    weights = merge.conv.weight.unflatten(0, (len(read), -1))
+    expected = torch.einsum("ghwc,gochw->go", read, weights).flatten() + merge.conv.bias
     torch.testing.assert_close(merged[0, 1, 1, 2], expected)
+
+
+def test_global_tokens_are_part_of_the_sequence_and_are_read(build):
+    """The same Gaussians as from one sequence put together by hand; all of it is trained."""
+    net = build(*TINY, "model=longlrm").eval()
+    assert net.global_tokens.shape[0] == 2
+    seen = []
+    for block in (layer for stage in net.stages for layer in stage.layers):
+        block.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].shape))
+    views = blank_views(3, 32, 48).map(lambda tensor: torch.rand(tensor.shape))
+    gaussians = net(views)
+    assert seen[0][1:4] == (1, 1, 2 + 3 * 4 * 6) and seen[-1][1:4] == (1, 1, 2 + 3 * 2 * 3)
+    sum(field.sum() for field in (gaussians.means, gaussians.sh, gaussians.opacities)).backward()
+    assert net.global_tokens.grad.abs().sum() > 0
+    with torch.no_grad():
+        net.global_tokens += 1
+        net.global_tokens[:, ::2] -= 3
+        assert (net(views).opacities - gaussians.opacities).abs().max() > 0
 
 
 @pytest.mark.parametrize(("model", "patch"), [("single_branch", 8), ("longlrm", 16)])

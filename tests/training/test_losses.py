@@ -1,44 +1,64 @@
 """Each term of the objective against its formula, and off where it has nothing to compare."""
 
+import warnings
+
 import pytest
 import torch
+import torch.nn.functional as F
+from torchvision.models import vgg16 as torchvision_vgg16
+from torchvision.models import vgg19 as torchvision_vgg19
 
+from asysplat.errors import InputError
 from asysplat.rendering import Rendering
-from asysplat.scene import Cameras, Views
-from asysplat.training import ReconstructionLoss
-from asysplat.training.losses import disparity_loss, normalised_disparity
+from asysplat.scene import Cameras, Gaussians, Views
+from asysplat.training import InputDisparity, Outcome, ReconstructionLoss
+from asysplat.training.disparity import disparity_distance, normalised_disparity, own_depths
+from asysplat.training.perceptual import longlrm, vgg16
+
+MEAN = torch.tensor([0.485, 0.456, 0.406])[:, None, None]
+STD = torch.tensor([0.229, 0.224, 0.225])[:, None, None]
+
+
+def cameras(size, views=2):
+    pose = torch.eye(4).expand(views, 4, 4)
+    intrinsics = torch.tensor([[30.0, 0, size / 2], [0, 30.0, size / 2], [0, 0, 1]])
+    return Cameras(intrinsics.expand(views, 3, 3), pose, size, size)
+
+
+def gaussians_at(means):
+    shape = means.shape[:-1]
+    ones = torch.ones(*shape, 4)
+    return Gaussians(means, ones, ones[..., :3], ones[..., 0] / 2, torch.zeros(*shape, 1, 3))
 
 
 def pair(size=32, depths=True):
-    pose = torch.eye(4).expand(2, 4, 4)
-    intrinsics = torch.tensor([[30.0, 0, size / 2], [0, 30.0, size / 2], [0, 0, 1]])
-    cameras = Cameras(intrinsics.expand(2, 3, 3), pose, size, size)
     depth = 1 + torch.rand(2, size, size)
-    targets = Views(cameras, torch.rand(2, 3, size, size), depth if depths else None)
+    images = torch.rand(2, 3, size, size)
+    targets = Views(cameras(size), images, depth if depths else None)
     rendering = Rendering(
         image=torch.rand(2, 3, size, size).requires_grad_(),
         alpha=torch.ones(2, size, size),
         depth=(1 + torch.rand(2, size, size)).requires_grad_(),
         stats={},
     )
-    return rendering, targets
+    outcome = Outcome(gaussians_at(torch.ones(2 * size * size, 3)), rendering)
+    return outcome, {"inputs": targets, "targets": targets}
 
 
 def test_mean_squared_error():
-    rendering, targets = pair()
-    terms = ReconstructionLoss(mse=2.0, perceptual=0.0, depth=0.0)(rendering, targets)
-    expected = (rendering.image - targets.images).square().mean()
+    outcome, batch = pair()
+    terms = ReconstructionLoss(mse=2.0, perceptual=0.0, depth=0.0)(outcome, batch)
+    expected = (outcome.rendering.image - batch["targets"].images).square().mean()
     torch.testing.assert_close(terms["loss"], 2 * expected)
     assert set(terms) == {"loss", "mse"}
 
 
 def test_disparity_does_not_see_scale_and_shift():
-    _, targets = pair()
-    ones = torch.ones_like(targets.depths)
-    disparity = 1 / targets.depths
-    other = 1 / (3 * disparity + 0.2)
-    assert disparity_loss(other, ones, targets.depths) < 1e-6
-    assert disparity_loss(targets.depths.flip(-1), ones, targets.depths) > 0.1
+    targets = pair()[1]["targets"]
+    everywhere = torch.ones_like(targets.depths, dtype=torch.bool)
+    other = 1 / (3 / targets.depths + 0.2)
+    assert disparity_distance(other, targets.depths, everywhere) < 1e-6
+    assert disparity_distance(targets.depths.flip(-1), targets.depths, everywhere) > 0.1
 
 
 def test_normalised_disparity_by_hand():
@@ -49,43 +69,213 @@ def test_normalised_disparity_by_hand():
     torch.testing.assert_close(normalised_disparity(depth, valid), expected)
 
 
-def test_pixels_without_depth_do_not_count():
-    rendering, targets = pair()
-    hole = targets.depths.clone()
-    hole[:, :8] = 0
-    terms = ReconstructionLoss(mse=0.0, perceptual=0.0, depth=1.0)(
-        rendering, Views(targets.cameras, targets.images, hole)
-    )
+# Disparities (1, 2, 4) against (1, 2, 3), normalised: (-1, 0, 2) against (-1.5, 0, 1.5), whose
+# SmoothL1 are 0.5^2 / 2, 0 and 0.5^2 / 2; the fourth pixel's depth is unknown.
+DEPTHS, TARGET = [[1, 1 / 2], [1 / 4, 7]], [[1, 1 / 2], [1 / 3, 0]]
+BY_HAND = 2 * 0.5**2 / 2 / 3
+
+
+def test_rendered_disparity_by_hand():
+    """The pixels at every second place count, and those alone."""
+    depth = torch.full((1, 4, 4), 5.0)
+    target = torch.full((1, 4, 4), 9.0)
+    depth[:, ::2, ::2], target[:, ::2, ::2] = torch.tensor(DEPTHS), torch.tensor(TARGET)
+    depth.requires_grad_()
+    views = Views(cameras(4, views=1), torch.rand(1, 3, 4, 4), target)
+    rendering = Rendering(torch.rand(1, 3, 4, 4), torch.ones(1, 4, 4), depth, {})
+    outcome = Outcome(gaussians_at(torch.ones(4, 3)), rendering)
+    loss = ReconstructionLoss(mse=0.0, perceptual=0.0, depth=1.0)
+    assert loss.needs_depth
+    terms = loss(outcome, {"inputs": None, "targets": views})
+    torch.testing.assert_close(terms["depth"].item(), BY_HAND)
     terms["loss"].backward()
-    assert (rendering.depth.grad[:, :8] == 0).all()
-    assert rendering.depth.grad.isfinite().all() and rendering.depth.grad.abs().sum() > 0
+    assert depth.grad[:, ::2, ::2].abs().sum() > 0 and (depth.grad[:, 1::2] == 0).all()
+
+
+def placed(depth, camera):
+    """Means [V * h * w, 3] at those depths of those cameras, anywhere beside the axis."""
+    local = torch.stack((torch.randn_like(depth), torch.randn_like(depth), depth), -1)
+    rotation, center = camera.cam_to_world[:, None, None, :3, :3], camera.centers[:, None, None]
+    return ((rotation @ local[..., None])[..., 0] + center).flatten(0, 2)
+
+
+def test_input_disparity_by_hand():
+    """Of Gaussians in turned and moved views, each against its own view; and the gradient."""
+    camera = cameras(4)
+    pose = camera.cam_to_world.clone()
+    spin = torch.linalg.matrix_exp(torch.tensor([[0.0, 0.3, -0.9], [-0.3, 0, 0.2], [0.9, -0.2, 0]]))
+    pose[1, :3, :3], pose[1, :3, 3] = spin, torch.tensor([1.0, -2.0, 0.5])
+    camera = Cameras(camera.intrinsics, pose, 4, 4)
+    depth = torch.tensor([DEPTHS, [[2.0, 1.0], [0.5, 3.0]]])
+    target = torch.full((2, 4, 4), 9.0)
+    # The second view's are a scaled copy: nothing to add.
+    target[:, ::2, ::2] = torch.stack((torch.tensor(TARGET), 3 * depth[1]))
+    inputs = Views(camera, torch.rand(2, 3, 4, 4), target)
+    means = placed(depth, camera).requires_grad_()
+    gaussians = gaussians_at(means)
+    torch.testing.assert_close(own_depths(gaussians, inputs), depth)
+
+    loss = ReconstructionLoss(mse=0.0, perceptual=0.0, depth=1.0, depth_term=InputDisparity)
+    assert not loss.needs_depth
+    rendering = Rendering(torch.rand(1, 3, 4, 4), torch.ones(1, 4, 4), None, {})
+    targets = Views(cameras(4, views=1), torch.rand(1, 3, 4, 4))
+    terms = loss(Outcome(gaussians, rendering), {"inputs": inputs, "targets": targets})
+    # Three pixels of the first view and four of the second.
+    torch.testing.assert_close(terms["depth"].item(), BY_HAND * 3 / 7)
+    terms["loss"].backward()
+    # Along the first view's axis; not where the depth is unknown, nor where nothing is wrong.
+    grad = means.grad.view(2, 2, 2, 3)
+    assert grad.isfinite().all() and grad[0, 1, 0, 2] != 0 and (grad[0, ..., :2] == 0).all()
+    assert (grad[0, 1, 1] == 0).all() and grad[1].abs().max() < 1e-6
+
+
+def test_input_disparity_of_a_network(build):
+    """Its Gaussians are the map that the term takes them to be, in a batch, at half the size."""
+    net = build("width=0.125", "state_size=8", "model.layers=1m1s")
+    two = cameras(32)
+    inputs = Views(two, torch.rand(2, 3, 32, 32), 1 + torch.rand(2, 32, 32))
+    inputs = Views.stack([inputs, inputs])
+    gaussians = net(inputs)
+    depths = own_depths(gaussians, inputs)
+    assert depths.shape == (2, 2, 16, 16)
+    torch.testing.assert_close(depths.flatten(1), gaussians.means[..., 2])
+    term = InputDisparity()(Outcome(gaussians, pair()[0].rendering), {"inputs": inputs})
+    term.backward()
+    assert term > 0 and net.head.decode.weight.grad.abs().sum() > 0
+
+
+def test_gaussians_that_are_no_map_of_the_views():
+    inputs = Views(cameras(4), torch.rand(2, 3, 4, 4), torch.ones(2, 4, 4))
+    outcome = Outcome(gaussians_at(torch.ones(9, 3)), pair()[0].rendering)
+    with pytest.raises(InputError, match=r"gave 9 for 2 views of 4x4.*training/depth=rendered"):
+        InputDisparity()(outcome, {"inputs": inputs})
+
+
+def test_pixels_without_depth_do_not_count():
+    outcome, batch = pair()
+    batch["targets"].depths[:, :8] = 0
+    terms = ReconstructionLoss(mse=0.0, perceptual=0.0, depth=1.0)(outcome, batch)
+    terms["loss"].backward()
+    grad = outcome.rendering.depth.grad
+    assert (grad[:, :8] == 0).all()
+    assert grad.isfinite().all() and grad.abs().sum() > 0
 
 
 def test_no_known_depth_at_all_gives_zero_and_no_nan():
-    rendering, targets = pair()
-    loss = disparity_loss(rendering.depth, rendering.alpha, torch.zeros_like(targets.depths))
-    loss.backward()
-    assert loss == 0
-    assert (rendering.depth.grad == 0).all()
+    outcome, batch = pair()
+    batch["targets"].depths.zero_()
+    terms = ReconstructionLoss(mse=0.0, perceptual=0.0, depth=1.0)(outcome, batch)
+    terms["loss"].backward()
+    assert terms["loss"] == 0
+    assert (outcome.rendering.depth.grad == 0).all()
 
 
-def test_data_without_depth_turns_the_term_off():
-    rendering, targets = pair(depths=False)
-    assert "depth" not in ReconstructionLoss(mse=1.0, perceptual=0.0, depth=1.0)(rendering, targets)
+@pytest.mark.parametrize("reading", [{}, {"depth_term": InputDisparity}])
+def test_data_without_depth_turns_the_term_off_and_is_said_once(reading):
+    outcome, batch = pair(depths=False)
+    loss = ReconstructionLoss(mse=1.0, perceptual=0.0, depth=1.0, **reading)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for _ in range(3):
+            assert "depth" not in loss(outcome, batch)
+    assert ["no depths" in str(warning.message) for warning in said] == [True]
 
 
-def test_missing_backbone_is_said_and_the_term_is_off(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("term", "name"), [(vgg16, "VGG16"), (longlrm, "VGG19")])
+def test_missing_backbone_is_said_and_the_term_is_off(tmp_path, monkeypatch, term, name):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    with pytest.warns(UserWarning, match="paths.weights"):
-        loss = ReconstructionLoss(mse=1.0, perceptual=0.5, depth=0.0, weights=str(tmp_path))
+    with pytest.warns(UserWarning, match=f"{name} is neither .* paths.weights"):
+        loss = ReconstructionLoss(
+            mse=1.0, perceptual=0.5, depth=0.0, perceptual_term=lambda: term(str(tmp_path))
+        )
     assert set(loss(*pair())) == {"loss", "mse"}
 
 
-def test_perceptual_term(shared):
-    loss = ReconstructionLoss(mse=0.0, perceptual=1.0, depth=0.0, weights=str(shared / "weights"))
-    rendering, targets = pair()
-    loss(rendering, targets)["loss"].backward()
-    assert rendering.image.grad.abs().sum() > 0
-    same = Rendering(targets.images, rendering.alpha, None, {})
-    assert loss(same, targets)["perceptual"] == 0
-    assert not loss.state_dict()
+NETWORKS = {"vgg16": (vgg16, torchvision_vgg16), "longlrm": (longlrm, torchvision_vgg19)}
+
+
+@pytest.fixture(scope="module")
+def distances(tmp_path_factory):
+    """By name: a perceptual distance of random weights, and torchvision's convolutions of them."""
+    folder, made = tmp_path_factory.mktemp("hub"), {}
+    (folder / "checkpoints").mkdir()
+    torch.manual_seed(0)
+    for name, (distance, network) in NETWORKS.items():
+        with torch.device("meta"):
+            features = network().features
+        features.to_empty(device="cpu")
+        for layer in features:
+            if isinstance(layer, torch.nn.Conv2d):
+                torch.nn.init.kaiming_normal_(layer.weight)
+                torch.nn.init.normal_(layer.bias, std=0.1)
+        file = folder / "checkpoints" / f"{network.__name__}-0a1b2c3d.pth"
+        torch.save(features.state_dict(prefix="features."), file)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(torch.hub, "get_dir", lambda: str(folder))
+            made[name] = distance(), features
+        file.unlink()
+    return made
+
+
+def test_vgg16s_layers_and_weights(distances):
+    distance, features = distances["vgg16"]
+    rendered, target = torch.rand(2, 2, 3, 32, 32), torch.rand(2, 2, 3, 32, 32)
+    a, b = ((images.flatten(0, 1) - MEAN) / STD for images in (rendered, target))
+    expected = 0.0
+    for index, layer in enumerate(features[:30]):
+        a, b = layer(a), layer(b)
+        if index in (3, 8, 15, 22, 29):
+            assert isinstance(layer, torch.nn.ReLU)
+            expected = expected + (a - b).abs().mean() / 5
+    torch.testing.assert_close(distance(rendered, target), expected)
+
+
+def test_long_lrms_layers_and_weights(distances):
+    """Blocks of VGG19 with mean pooling that end before layers 4, 9, 14, 23 and 32."""
+    distance, features = distances["longlrm"]
+    rendered, target = torch.rand(2, 2, 3, 32, 32), torch.rand(2, 2, 3, 32, 32)
+    a, b = (255 * (images.flatten(0, 1) - MEAN) for images in (rendered, target))
+    expected, start = (a - b).abs().mean(), 0
+    weights = (0.3846, 0.2083, 0.2703, 0.1786, 6.6667)
+    for weight, end in zip(weights, (4, 9, 14, 23, 32), strict=True):
+        for layer in features[start:end]:
+            pools = isinstance(layer, torch.nn.MaxPool2d)
+            a, b = (F.avg_pool2d(x, 2) if pools else layer(x) for x in (a, b))
+        expected, start = expected + weight * (a - b).abs().mean(), end
+    torch.testing.assert_close(distance(rendered, target), expected / 255)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_perceptual_term_has_the_same_bits_under_autocast(distances, name):
+    distance, _ = distances[name]
+    target = torch.rand(1, 2, 3, 32, 32)
+
+    def value_and_gradient(enabled):
+        rendered = target.flip(-1).requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            value = distance(rendered, target)
+        return value.detach(), *torch.autograd.grad(value, rendered)
+
+    plain, cast = value_and_gradient(False), value_and_gradient(True)
+    assert cast[0].dtype == torch.float32 and all(map(torch.equal, plain, cast))
+    assert plain[0] > 0 and plain[1].abs().sum() > 0
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_perceptual_term(distances, name):
+    distance, _ = distances[name]
+    loss = ReconstructionLoss(mse=0.0, perceptual=1.0, depth=0.0, perceptual_term=lambda: distance)
+    outcome, batch = pair()
+    terms = loss(outcome, batch)
+    terms["loss"].backward()
+    assert terms["perceptual"] > 0 and outcome.rendering.image.grad.abs().sum() > 0
+    assert not any(p.requires_grad for p in distance.parameters())
+    same = Rendering(batch["targets"].images, outcome.rendering.alpha, None, {})
+    assert loss(Outcome(outcome.gaussians, same), batch)["perceptual"] == 0
+    assert not loss.state_dict() and not list(loss.parameters())
+
+
+def test_with_the_weights_of_imagenet(shared):
+    distance = vgg16(str(shared / "weights"))
+    outcome, batch = pair()
+    assert 0 < distance(outcome.rendering.image, batch["targets"].images) < 10

@@ -28,9 +28,9 @@ def test_one_scene_overfitted_passes_30_db(build):
     options = module.configure_optimizers()
     optimizer, schedule = options["optimizer"], options["lr_scheduler"]["scheduler"]
     for _ in range(STEPS):
-        rendering = module.reconstruct(batch, depth=False).rendering
+        outcome = module.reconstruct(batch, depth=False)
         optimizer.zero_grad()
-        module.loss(rendering, batch["targets"])["loss"].backward()
+        module.loss(outcome, batch)["loss"].backward()
         optimizer.step()
         schedule.step()
     with torch.no_grad():

@@ -15,7 +15,7 @@ from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.measured import Measured
 from asysplat.evaluation.protocol import BACKBONES, Protocol
 from asysplat.scene import Views
-from asysplat.training.reconstruction import Outcome
+from asysplat.training.outcome import Outcome
 
 Row = dict[str, str | float]
 IMAGE = ("set", "scene", "view")  # which image a row is of

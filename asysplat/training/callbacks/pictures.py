@@ -7,7 +7,7 @@ import lightning
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from asysplat.evaluation.pictures import comparison
-from asysplat.training.reconstruction import Outcome
+from asysplat.training.outcome import Outcome
 
 
 class Pictures(lightning.Callback):

@@ -1,0 +1,101 @@
+"""Perceptual distances of images, by frozen networks that are looked for on this machine."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from asysplat.evaluation.backbones import IMAGENET_STD, VGGFeatures, find_backbone
+from asysplat.ops.precision import without_autocast
+
+
+class PerceptualDistance(nn.Module):
+    """Weighted sum of the mean absolute differences of activations; fp32 also under autocast.
+
+    Args:
+        features: frozen; images [B, 3, H, W] in [0, 1] -> activations.
+        weights: one an activation.
+        image_weight: of the mean absolute difference of the images themselves.
+    """
+
+    def __init__(self, features: VGGFeatures, weights: Sequence[float], image_weight: float):
+        super().__init__()
+        self.features, self.weights, self.image_weight = features, weights, image_weight
+
+    def forward(
+        self, rendered: Float[Tensor, "*batch V 3 H W"], target: Float[Tensor, "*batch V 3 H W"]
+    ) -> Float[Tensor, ""]:
+        with without_autocast(rendered):
+            with torch.no_grad():
+                expected = self.features(target.flatten(0, -4))
+            found = self.features(rendered.flatten(0, -4))
+            distance = self.image_weight * F.l1_loss(rendered, target)
+            for weight, a, b in zip(self.weights, found, expected, strict=True):
+                distance = distance + weight * F.l1_loss(a, b)
+            return distance
+
+
+def vgg16(weights: str | None = None) -> PerceptualDistance | None:
+    """The mean over VGG16's ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016), on images as
+    ImageNet's are normalised.
+
+    Args:
+        weights: folder that may hold the network's.
+
+    Returns:
+        None, with a warning, where the weights are not on this machine.
+    """
+    backbone = _backbone("vgg16", weights)
+    if backbone is None:
+        return None
+    features = VGGFeatures("vgg16", backbone, taps=(3, 8, 15, 22, 29), std=IMAGENET_STD)
+    return PerceptualDistance(features, weights=[1 / 5] * 5, image_weight=0.0)
+
+
+LONG_LRM_WEIGHTS = (0.3846, 0.2083, 0.2703, 0.1786, 6.6667)  # 1/2.6, 1/4.8, 1/3.7, 1/5.6, 10/1.5
+LONG_LRM_SCALE = 255.0
+
+
+def longlrm(weights: str | None = None) -> PerceptualDistance | None:
+    """Long-LRM's: VGG19's ReLU 1_2, 2_2, 3_2, 4_2 and 5_2 with mean pooling in place of maximum
+    pooling, and the images, in the weights of Chen and Koltun 2017 (Long-LRM's public code,
+    model/loss.py and configs/7m1t_tm.yaml).
+
+    Images are given in units of 1/255 less ImageNet's mean, and distances divided by 255. What is
+    published are weights converted from MatConvNet, for which those units are. torchvision's, which
+    are looked for, stand in for them, as in that code's own default; the published ones, as
+    vgg19_features_fp16.pth in `weights`, are taken where torch's hub cache has no VGG19.
+
+    Args:
+        weights: folder that may hold the network's.
+
+    Returns:
+        None, with a warning, where the weights are not on this machine.
+    """
+    backbone = _backbone("vgg19", weights)
+    if backbone is None:
+        return None
+    features = VGGFeatures(
+        "vgg19",
+        backbone,
+        taps=(3, 8, 13, 22, 31),
+        std=(1 / LONG_LRM_SCALE,) * 3,
+        mean_pooling=True,
+    )
+    scaled = [weight / LONG_LRM_SCALE for weight in LONG_LRM_WEIGHTS]
+    return PerceptualDistance(features, scaled, image_weight=1.0)
+
+
+def _backbone(name: str, weights: str | None) -> dict[str, Tensor] | None:
+    backbone = find_backbone(name, None if weights is None else Path(weights))
+    if backbone is None:
+        warnings.warn(
+            f"{name.upper()} is neither in torch's hub cache nor in paths.weights: "
+            "training goes on without the perceptual term.",
+            stacklevel=3,
+        )
+    return backbone

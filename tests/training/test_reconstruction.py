@@ -1,0 +1,68 @@
+"""What the optimiser is given: which parameters decay, and which are not trained at all."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from asysplat.training import Reconstruction, ReconstructionLoss
+
+PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
+FOLDER = Path(__file__).parents[2] / "conf" / "model"
+MODELS = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem not in PARTS)
+
+
+def make_module(net):
+    return Reconstruction(
+        net=net,
+        loss=ReconstructionLoss(mse=1.0, perceptual=0.0, depth=0.0),
+        learning_rate=1e-3,
+        weight_decay=0.05,
+        betas=(0.9, 0.95),
+        warmup_steps=1,
+        total_steps=2,
+        background=(0.5, 0.5, 0.5),
+    )
+
+
+UNREAD = {
+    "asysplat_pred_coarse": "appearance.links.2.",
+    "asysplat_pred_fine": "geometry.links.2.",
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_which_parameters_are_trained_and_which_decay(build, model):
+    module = make_module(build("width=0.125", "state_size=8", f"model={model}", device="meta"))
+    named = dict(module.net.named_parameters())
+    unread = {name for name in named if name.startswith(UNREAD.get(model, "none"))}
+    assert {name for name, p in named.items() if not p.requires_grad} == unread
+    assert bool(unread) == (model in UNREAD)
+
+    names = {parameter: name for name, parameter in named.items()}
+    groups = module.configure_optimizers()["optimizer"].param_groups
+    assert [group["weight_decay"] for group in groups] == [0.05, 0.0]
+    decaying, steady = ([names[p] for p in group["params"]] for group in groups)
+    assert set(decaying) | set(steady) == set(named) - unread and decaying and steady
+    # By name, which the code does not look at.
+    for name in decaying:
+        assert name.endswith(".weight") and "norm" not in name, name
+    modules = dict(module.net.named_modules())
+    for name in steady:
+        kind = type(modules[name.rpartition(".")[0]]).__name__
+        assert not name.endswith(".weight") or "Norm" in kind, name
+
+
+def test_the_matrix_a_of_mamba_vision_does_not_decay(build):
+    module = make_module(build("width=0.125", "state_size=8", device="meta"))
+    matrix = module.net.appearance["stages"][0][0].mixer.A_log
+    steady = module.configure_optimizers()["optimizer"].param_groups[1]["params"]
+    assert matrix.ndim == 2 and any(p is matrix for p in steady)
+
+
+def test_a_branch_that_nothing_reads_is_not_trained(build):
+    overrides = ("model/source=fine", "model/links=only_fine_to_coarse", "width=0.125")
+    net = make_module(build(*overrides, "state_size=8")).net
+    assert not any(p.requires_grad for p in net.geometry.parameters())
+    assert all(p.requires_grad for p in net.appearance.parameters())
+    assert all(isinstance(p, torch.nn.Parameter) and not p.is_meta for p in net.parameters())
