@@ -132,8 +132,6 @@ if __name__ == "__main__":
         before, after = soak(views, steps)
     mean = views.images.mean((0, 2, 3))[:, None, None].expand_as(views.images)
     flat = psnr(mean, views.images).mean().item()
-    kind = "with checks, in poisoned memory" if checked else "as it is"
-    print(
-        f"{scene.name}: {steps} steps {kind}: {before:.2f} -> {after:.2f} dB, mean colour {flat:.2f}"
-    )
+    kind = " with checks, in poisoned memory" if checked else ""
+    print(f"{scene.name}: {steps} steps{kind}, {before:.2f} to {after:.2f} dB, flat {flat:.2f} dB")
     assert after > before + 1 and after > flat + 1

@@ -1,4 +1,4 @@
-"""Long runs on real scenes, as they are and with bounds checks in poisoned memory: pytest -m slow"""
+"""Long runs on real scenes, as they are, and with bounds checks in poisoned memory: make slow."""
 
 import json
 import os
