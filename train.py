@@ -1,6 +1,7 @@
 """Fit, then test, one configuration: python train.py model=asysplat_4m4s scale=laptop"""
 
 import logging
+import os
 import sys
 import traceback
 import warnings
@@ -16,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError, input_error_behind
 from asysplat.training.checkpoints import check_checkpoint, find_checkpoint, load_weights
+from asysplat.training.ranges import check_ranges
 from asysplat.training.runs import describe_run, find_run
 from asysplat.training.summary import print_summary, write_json
 from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
@@ -65,6 +67,7 @@ def train(config: DictConfig) -> float | None:
     """Train and test; returns the test PSNR, which a sweep may optimise."""
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
+    check_ranges(config)
     quiet_lightning()
     folder = Path(config.paths.run)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
@@ -79,15 +82,25 @@ def train(config: DictConfig) -> float | None:
     print(f"model: {net.describe()}")
 
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
-    callbacks = instantiate(config.callbacks)
+    callbacks = instantiate(config.get("callbacks") or {})
     logger = make_logger(folder)
     log_choices(logger, config)
-    trainer = instantiate(config.trainer, callbacks=list(callbacks.values()), logger=logger)
+    trainer = instantiate(
+        config.trainer,
+        callbacks=list(callbacks.values()),
+        logger=logger,
+        # Lightning has its own in place of those that are left out.
+        enable_checkpointing="checkpoints" in callbacks,
+        enable_progress_bar="progress" in callbacks,
+    )
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
-    trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     trainer.test(module, data, verbose=False)
 
-    results = describe_run(config) | callbacks.costs.values | callbacks.metrics.results
+    results = describe_run(config)
+    if "costs" in callbacks:
+        results |= callbacks["costs"].values
+    if "metrics" in callbacks:
+        results |= callbacks["metrics"].results
     if trainer.is_global_zero:
         write_json(folder / "metrics.json", results)
         log_outcome(logger, results, data.name)
@@ -96,5 +109,6 @@ def train(config: DictConfig) -> float | None:
 
 
 if __name__ == "__main__":
-    exit_at_unknown_words()
+    os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
+    exit_at_unknown_words("train")
     main()

@@ -24,19 +24,27 @@ class ReconstructionLoss(nn.Module):
             also off where VGG16 is not on this machine (said once), the depth term where the data
             has no depths.
         weights: folder that may hold the VGG16 backbone.
+        download: VGG16 where it is missing.
     """
 
-    def __init__(self, mse: float, perceptual: float, depth: float, weights: str | None = None):
+    def __init__(
+        self,
+        mse: float,
+        perceptual: float,
+        depth: float,
+        weights: str | None = None,
+        download: bool = False,
+    ):
         super().__init__()
         self.mse, self.perceptual, self.depth = mse, perceptual, depth
         # In a list, so that the frozen network stays out of the checkpoints.
         self._vgg: list[VGGFeatures] = []
         if perceptual:
-            backbone = find_backbone("vgg16", None if weights is None else Path(weights))
+            backbone = find_backbone("vgg16", None if weights is None else Path(weights), download)
             if backbone is None:
                 warnings.warn(
                     "VGG16 is neither in torch's hub cache nor in paths.weights: "
-                    "training goes on without the perceptual term.",
+                    "training goes on without the perceptual term; paths.download=true fetches it.",
                     stacklevel=2,
                 )
             else:

@@ -64,22 +64,27 @@ def print_summary(results: dict[str, float | int | str], data: str, folder: Path
         folder: of the run.
     """
     console = Console()
-    console.print(quality_table(results, data))
-    others = [name for name in test_sets(results) if name != data]
+    measured = test_sets(results)
+    if data in measured:
+        console.print(quality_table(results, data))
+    others = [name for name in measured if name != data]
     if others:
         console.print(psnr_table(results, others))
-    costs = [
-        f"{results['cost/parameters'] / 1e6:.2f}M parameters",
-        f"{results['cost/geometry_share']:.1%} of them in the geometry branch",
-        f"{results['cost/gaussians']:.0f} Gaussians a scene",
-    ]
+    costs = []
+    if "cost/parameters" in results:
+        costs += [
+            f"{results['cost/parameters'] / 1e6:.2f}M parameters",
+            f"{results['cost/geometry_share']:.1%} of them in the geometry branch",
+            f"{results['cost/gaussians']:.0f} Gaussians a scene",
+        ]
     if "cost/seconds_per_step" in results:
         step, rendering = results["cost/seconds_per_step"], results["cost/render_seconds"]
         costs.append(f"{step:.2f} s a step, {rendering / step:.1%} of it for rendering")
     if "cost/peak_gb" in results:
         per_token = results["cost/peak_bytes_per_token"] / 1e3
         costs.append(f"{results['cost/peak_gb']:.2f} GB at most, {per_token:.0f} kB a token")
-    console.print(", ".join(costs), soft_wrap=True)
+    if costs:
+        console.print(", ".join(costs), soft_wrap=True)
     for picture in sorted((folder / "pictures").glob("test-*.png")):
         console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"run: {folder}", soft_wrap=True)

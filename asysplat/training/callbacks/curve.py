@@ -13,7 +13,7 @@ COLUMNS = ("psnr", "nearest_view/psnr", "mean_colour/psnr", "ssim", "lpips", "ab
 
 
 class Curve(lightning.Callback):
-    """Keeps a row each validation and draws them when training ends.
+    """Keeps a row each validation that was measured and draws them when training ends.
 
     Args:
         folder: of the run.
@@ -37,6 +37,8 @@ class Curve(lightning.Callback):
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
         found = trainer.callback_metrics
+        if "val/psnr" not in found:  # nothing measures
+            return
         row = {"step": trainer.global_step, "minutes": (time.monotonic() - self.started) / 60}
         row |= {name: found[f"val/{name}"].item() for name in COLUMNS if f"val/{name}" in found}
         self.rows.append(row)

@@ -27,10 +27,11 @@ class Metrics(lightning.Callback):
     Args:
         folder: of the run; metrics.csv is written there after the test.
         weights: folder that may hold AlexNet for LPIPS; without it that column is missing.
+        download: AlexNet where it is missing.
     """
 
-    def __init__(self, folder: str, weights: str):
-        self.folder, self.weights = Path(folder), Path(weights)
+    def __init__(self, folder: str, weights: str, download: bool = False):
+        self.folder, self.weights, self.download = Path(folder), Path(weights), download
         self.rows: list[Row] = []
         self.results: dict[str, float] = {}
 
@@ -39,11 +40,11 @@ class Metrics(lightning.Callback):
     ) -> None:
         if hasattr(self, "lpips"):
             return
-        self.lpips = load_lpips("alex", self.weights)
+        self.lpips = load_lpips("alex", self.weights, self.download)
         if self.lpips is None and trainer.is_global_zero:
             warnings.warn(
                 "AlexNet is neither in torch's hub cache nor in paths.weights: "
-                "the run goes on without LPIPS.",
+                "the run goes on without LPIPS; paths.download=true fetches it.",
                 stacklevel=2,
             )
 
