@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
@@ -43,11 +44,11 @@ def check_words(words: Iterable[str], script: str = "train") -> None:
 
 def exit_at_unknown_words(script: str) -> None:
     """`check_words` of this process's command line; a mistake ends the process."""
-    flags = [word for word in sys.argv[1:] if word.startswith("-")]
-    if any(flag.startswith(("-c", "--config")) for flag in flags):
-        return  # another folder of files than ours
+    given = get_args_parser().parse_args()
+    if given.config_dir or given.config_name or given.config_path or given.shell_completion:
+        return  # other files than ours, or no run
     try:
-        check_words([word for word in sys.argv[1:] if word not in flags], script)
+        check_words(given.overrides, script)
     except InputError as error:
         sys.exit(f"error: {error}")
 

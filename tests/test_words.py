@@ -26,6 +26,11 @@ def test_words_that_are_known(words):
     check_words(words)
 
 
+def test_tables_are_found_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    check_words(["sweeps=layers"])
+
+
 UNKNOWN = {
     "widht=0.5": "widht is unknown: did you mean width?",
     "data.inptus=4": "data.inptus is unknown: did you mean data.inputs?",

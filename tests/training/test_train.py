@@ -78,6 +78,33 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     assert "_hparams_/session_start_info" in plugins
 
 
+LEFT_OUT = [("metrics", "guard", "pictures"), ("costs", "curve", "checkpoints", "progress")]
+
+
+@pytest.mark.parametrize("names", LEFT_OUT, ids="+".join)
+def test_without_some_callbacks_the_rest_is_there(train, names):
+    result = train(*(f"~callbacks.{name}" for name in names))
+    folder = run_folder(result)
+    numbers = metrics(folder)
+    left = {
+        "metrics": ("test/procedural/psnr" in numbers, (folder / "metrics.csv").exists()),
+        "costs": ("cost/parameters" in numbers, "Gaussians a scene" in result.stdout),
+        "pictures": ((folder / "pictures" / "test-0.png").exists(),),
+        # Of what metrics measure.
+        "curve": ((folder / "curve.csv").exists() or "metrics" in names,),
+        "checkpoints": (
+            (folder / "checkpoints" / "last.ckpt").exists(),
+            (folder / "checkpoints" / "best.ckpt").exists() or "metrics" in names,
+        ),
+        "progress": ("step 2 of 4" in result.stdout,),
+    }
+    assert {name: set(there) for name, there in left.items()} == {
+        name: {name not in names} for name in left
+    }
+    assert not list(folder.glob("tensorboard/**/*.ckpt"))
+    assert "Epoch" not in result.stdout + result.stderr
+
+
 def test_bfloat16_with_the_perceptual_term(train, shared):
     perceptual = ["training.loss.perceptual=0.5", f"paths.shared={shared}"]
     folder = run_folder(train("trainer.precision=bf16-mixed", "steps=2", *perceptual))
@@ -115,6 +142,30 @@ def test_killed_and_resumed_ends_with_the_same_bits(train, repository, tmp_path)
         assert torch.equal(tensor, weights[1][name]), name
 
 
+def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repository, tmp_path):
+    command = [train.command[0], repository / "train.py", *train.command[2:], "steps=1000"]
+    environment = {k: v for k, v in train.environment.items() if k != "ASYSPLAT_SHARED"}
+    process = subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 300
+    while not list(tmp_path.rglob("last.ckpt")):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate(timeout=60)
+    assert process.returncode != 0 and "Traceback" not in errors
+    checkpoint = next(tmp_path.rglob("last.ckpt"))
+    assert f"add ckpt_path={checkpoint} to the same command" in said
+    paths = yaml.safe_load((checkpoint.parents[1] / "config.yaml").read_text())["paths"]
+    assert paths["shared"] == str(repository.parent / "shared")
+
+
 def test_geometry_ratio_sweep(train, tmp_path):
     result = train("-m", "geometry_ratio=0.5,0.7,0.9", "model.layers=4m4s", "width=0.25", "steps=1")
     assert result.returncode == 0, result.stderr
@@ -137,9 +188,12 @@ def test_a_real_scene(train, shared, name):
 
 
 REFUSED = {
-    "an unknown override": (["widht=1"], "widht"),
-    "an unknown model": (["model=asysplat_4m4z"], "did you mean asysplat_4m4"),
-    "an unknown table": (["sweeps=layer"], "did you mean layers"),
+    "an unknown option": (["widht=1"], "error: widht is unknown: did you mean width?\n"),
+    "a number out of range": (
+        ["steps=-5"],
+        "error: steps=-5: give a whole number of at least 1.\n",
+    ),
+    "one of a sweep": (["-m", "seed=-1,x"], "seed=x: give a whole number from 0"),
     "no weights to start from": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
     "a size that the patches do not take": (["data.height=40"], "set 48x32"),
     "an unusable layer mix": (["model.layers=4q"], "such as 4m4s"),

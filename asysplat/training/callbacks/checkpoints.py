@@ -8,18 +8,19 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 
 class Checkpoints(ModelCheckpoint):
-    """Lightning's, with a last.ckpt after every validation and when training ends, whether it is
-    the best or not. Where nothing measures what is monitored, there is no best."""
+    """Lightning's, with a last.ckpt after every epoch, which ends with a validation, and when
+    training ends, whether it is the best or not. Where nothing measures what is monitored, there is
+    no best."""
 
     @property
     def last(self) -> Path:
         return Path(self.dirpath) / "last.ckpt"
 
-    def on_validation_end(
+    def on_train_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
         if self.monitor in trainer.callback_metrics:
-            super().on_validation_end(trainer, module)
+            super().on_train_epoch_end(trainer, module)
         trainer.save_checkpoint(self.last)
 
     def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
