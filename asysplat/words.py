@@ -35,10 +35,11 @@ def check_words(words: Iterable[str], script: str = "train") -> None:
     for override in ours:
         _check_choices(override)
     composed = [override for override in ours if _folder(override) or _adds(override)]
-    known = set(_paths(_compose(script, composed)))
-    for override in ours:
+    settings = [override for override in ours if override not in composed]
+    known = set(_paths(_compose(script, composed))) if settings else set()
+    for override in settings:
         key = override.key_or_group
-        if override not in composed and key not in known:
+        if key not in known:
             raise InputError(f"{key} is unknown: {_hint(key, known, script)}")
 
 

@@ -1,9 +1,12 @@
 """What the words of a command name must be there; else the nearest that is, in one sentence."""
 
+import re
+import shlex
 import subprocess
 import sys
 
 import pytest
+from hydra._internal.utils import get_args_parser
 
 from asysplat.errors import InputError
 from asysplat.words import check_words
@@ -28,7 +31,7 @@ def test_words_that_are_known(words):
 
 def test_tables_are_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    check_words(["sweeps=layers"])
+    check_words(["sweeps=layers", "steps=1"])
 
 
 UNKNOWN = {
@@ -71,3 +74,26 @@ def test_a_script_says_it_from_any_folder(repository, tmp_path):
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert result.returncode != 0
     assert result.stderr == "error: cots is unknown: did you mean costs?\n"
+
+
+COMMAND = re.compile(r"python (train|report|benchmark)\.py((?: [^\s#`:,;()]+(?:,[^\s`]+)*)*)")
+IN_A_TABLE = re.compile(r"\| `([\w./]+=[^`]+)`")
+
+
+def printed_commands(repository) -> list[tuple[str, str]]:
+    """Scripts and words, as the READMEs and the comments under conf/ and sweeps/ have them."""
+    texts = [(repository / name).read_text() for name in ("README.md", "data/README.md")]
+    found = {("train", words) for words in IN_A_TABLE.findall(texts[0])}
+    for folder in ("conf", "sweeps"):
+        for path in (repository / folder).rglob("*.yaml"):
+            texts += [line for line in path.read_text().splitlines() if line.startswith("# ")]
+    for text in texts:
+        found |= set(COMMAND.findall(text.replace("\\\n", " ")))
+    return sorted(found)
+
+
+def test_every_printed_command_names_what_is_there(repository):
+    printed = printed_commands(repository)
+    assert len(printed) > 100
+    for script, words in printed:
+        check_words(get_args_parser().parse_args(shlex.split(words)).overrides, script)
