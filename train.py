@@ -10,9 +10,10 @@ from pathlib import Path
 import hydra
 import lightning
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException
+from hydra.errors import CompactHydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
+from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError, input_error_behind
@@ -82,17 +83,11 @@ def train(config: DictConfig) -> float | None:
     print(f"model: {net.describe()}")
 
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
-    callbacks = instantiate(config.get("callbacks") or {})
+    made = instantiate(config.get("callbacks") or {})
+    callbacks = {name: callback for name, callback in made.items() if callback is not None}
     logger = make_logger(folder)
     log_choices(logger, config)
-    trainer = instantiate(
-        config.trainer,
-        callbacks=list(callbacks.values()),
-        logger=logger,
-        # Lightning has its own in place of those that are left out.
-        enable_checkpointing="checkpoints" in callbacks,
-        enable_progress_bar="progress" in callbacks,
-    )
+    trainer = make_trainer(config, callbacks, logger)
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(module, data, verbose=False)
 
@@ -106,6 +101,27 @@ def train(config: DictConfig) -> float | None:
         log_outcome(logger, results, data.name)
         print_summary(results, data.name, folder)
     return results.get(f"test/{data.name}/psnr")
+
+
+def make_trainer(
+    config: DictConfig, callbacks: dict[str, lightning.Callback], logger: Logger
+) -> lightning.Trainer:
+    """Lightning's.
+
+    Raises:
+        InputError: options that it refuses, or a device that is not there.
+    """
+    try:
+        return instantiate(
+            config.trainer,
+            callbacks=list(callbacks.values()),
+            logger=logger,
+            # Lightning has its own in place of those that are left out.
+            enable_checkpointing="checkpoints" in callbacks,
+            enable_progress_bar="progress" in callbacks,
+        )
+    except InstantiationException as error:
+        raise InputError(f"trainer: {error.__cause__}") from error
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from asysplat.errors import InputError
 
@@ -18,6 +18,10 @@ def is_number(value: object) -> bool:
     return is_whole(value) or (isinstance(value, float) and math.isfinite(value))
 
 
+def is_window(value: object) -> bool:
+    return isinstance(value, ListConfig) and list(map(is_whole, value)) == [True, True]
+
+
 # What to give, whether a value is that, and the options it holds for.
 RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
     (
@@ -26,6 +30,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         (
             *("steps", "validate_every", "state_size"),
             *("data.inputs", "data.targets", "data.height", "data.width", "data.batch_size"),
+            *("data.val_scenes", "data.test_scenes"),
         ),
     ),
     (
@@ -56,6 +61,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         lambda value: value is None or (is_number(value) and 0 < value < 1),
         ("geometry_ratio",),
     ),
+    ("two whole numbers, such as [64,96]", is_window, ("data.window",)),
 )
 
 

@@ -1,10 +1,13 @@
 """What is kept of a run: the best by its validation, and the last whether it is the best or not."""
 
 import lightning
+import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from asysplat.errors import InputError
 from asysplat.training.callbacks import Checkpoints
+from asysplat.training.checkpoints import check_checkpoint
 
 
 class Module(lightning.LightningModule):
@@ -64,3 +67,10 @@ def test_the_end_is_kept_though_it_is_within_an_epoch(tmp_path):
 
 def test_nothing_is_the_best_where_nothing_measures(tmp_path):
     assert steps_kept(tmp_path, 4, measured=False) == {"last": 4}
+
+
+def test_a_file_that_is_none_is_one_sentence(tmp_path):
+    path = tmp_path / "notes.ckpt"
+    path.write_text("a text")
+    with pytest.raises(InputError, match=r"notes\.ckpt cannot be read as a checkpoint: [^\n]*$"):
+        check_checkpoint(path, torch.nn.Linear(1, 1))

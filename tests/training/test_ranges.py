@@ -27,6 +27,9 @@ REFUSED = {
     "data.height=abc": "data.height=abc: give a whole number of at least 1.",
     "training.learning_rate=nan": "training.learning_rate=nan: give a number above 0.",
     "training.loss.depth=-1": "training.loss.depth=-1: give a number of at least 0.",
+    "data.val_scenes=0": "data.val_scenes=0: give a whole number of at least 1.",
+    "data.window=12": "data.window=12: give two whole numbers, such as [64,96].",
+    "data.window=[12]": "data.window=[12]: give two whole numbers, such as [64,96].",
     "geometry_ratio=1.5": "geometry_ratio=1.5: give a share between 0 and 1",
     "geometry_ratio=half": "geometry_ratio=half: give a share between 0 and 1",
 }
