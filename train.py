@@ -31,6 +31,8 @@ def main(config: DictConfig) -> float | None:
         return train_in_sweep(config)
     try:
         return train(config)
+    except KeyboardInterrupt:
+        sys.exit("stopped.")  # before the training or after the test
     except Exception as error:
         mistake = input_error_behind(error)
         if mistake is None:
@@ -59,9 +61,11 @@ def train_in_sweep(config: DictConfig) -> float | None:
 
 
 def quiet_lightning() -> None:
-    """Lightning's tips and deprecations speak to its developers, not to who runs this."""
+    """Lightning's tips and deprecations speak to its developers, not to who runs this; of other
+    warnings the sentence is shown, not the line of code."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning")
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
 
 
 def train(config: DictConfig) -> float | None:

@@ -4,6 +4,8 @@ from urllib.error import URLError
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from torchvision.models import alexnet
 
 from asysplat.errors import InputError
@@ -44,6 +46,22 @@ def test_a_folder_s_file_needs_no_download(network, tmp_path):
     )
     assert find_backbone("alexnet", tmp_path, download=True)
     assert len(network) == 1
+
+
+def test_the_option_reaches_all_that_looks_for_weights(repository):
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        config = compose("train", ["paths.download=true", "paths.run=unused"])
+
+    def looking(node):
+        if isinstance(node, dict):
+            if "_target_" in node and "weights" in node:
+                yield node
+            for value in node.values():
+                yield from looking(value)
+
+    found = list(looking(OmegaConf.to_container(config, resolve=True)))
+    assert len(found) == 2  # LPIPS and the perceptual term
+    assert all(node["download"] is True for node in found)
 
 
 @pytest.mark.parametrize("error", [URLError("no route"), RuntimeError("invalid hash value")])

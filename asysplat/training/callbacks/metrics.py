@@ -45,7 +45,7 @@ class Metrics(lightning.Callback):
             warnings.warn(
                 "AlexNet is neither in torch's hub cache nor in paths.weights: "
                 "the run goes on without LPIPS; paths.download=true fetches it.",
-                stacklevel=2,
+                stacklevel=1,  # Lightning calls this, and its own warnings are not shown
             )
 
     def measure(self, rendered: Tensor, targets: Views) -> dict[str, Tensor]:
