@@ -4,6 +4,7 @@ ENV := .venv/.ready
 
 demo: $(ENV) ## train a small model on made-up scenes, measure it, draw what it sees
 	.venv/bin/python train.py name=demo
+	@echo "to go on with commands of your own: source .venv/bin/activate"
 
 test: $(ENV) ## style and tests
 	.venv/bin/ruff check .

@@ -38,5 +38,5 @@ def benchmark(options: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    exit_at_unknown_words()
+    exit_at_unknown_words("benchmark")
     main()

@@ -50,5 +50,5 @@ def compose_train(overrides: Sequence[str]) -> DictConfig:
 
 
 if __name__ == "__main__":
-    exit_at_unknown_words()
+    exit_at_unknown_words("report")
     main()

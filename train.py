@@ -1,6 +1,7 @@
 """Fit, then test, one configuration: python train.py model=asysplat_4m4s scale=laptop"""
 
 import logging
+import os
 import sys
 import traceback
 import warnings
@@ -9,13 +10,15 @@ from pathlib import Path
 import hydra
 import lightning
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException
+from hydra.errors import CompactHydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
+from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError, input_error_behind
 from asysplat.training.checkpoints import check_checkpoint, find_checkpoint, load_weights
+from asysplat.training.ranges import check_ranges
 from asysplat.training.runs import describe_run, find_run
 from asysplat.training.summary import print_summary, write_json
 from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
@@ -28,6 +31,8 @@ def main(config: DictConfig) -> float | None:
         return train_in_sweep(config)
     try:
         return train(config)
+    except KeyboardInterrupt:
+        sys.exit("stopped.")  # before the training or after the test
     except Exception as error:
         mistake = input_error_behind(error)
         if mistake is None:
@@ -56,15 +61,18 @@ def train_in_sweep(config: DictConfig) -> float | None:
 
 
 def quiet_lightning() -> None:
-    """Lightning's tips and deprecations speak to its developers, not to who runs this."""
+    """Lightning's tips and deprecations speak to its developers, not to who runs this; of other
+    warnings the sentence is shown, not the line of code."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning")
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
 
 
 def train(config: DictConfig) -> float | None:
     """Train and test; returns the test PSNR, which a sweep may optimise."""
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
+    check_ranges(config)
     quiet_lightning()
     folder = Path(config.paths.run)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
@@ -79,15 +87,19 @@ def train(config: DictConfig) -> float | None:
     print(f"model: {net.describe()}")
 
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
-    callbacks = instantiate(config.callbacks)
+    made = instantiate(config.get("callbacks") or {})
+    callbacks = {name: callback for name, callback in made.items() if callback is not None}
     logger = make_logger(folder)
     log_choices(logger, config)
-    trainer = instantiate(config.trainer, callbacks=list(callbacks.values()), logger=logger)
+    trainer = make_trainer(config, callbacks, logger)
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
-    trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     trainer.test(module, data, verbose=False)
 
-    results = describe_run(config) | callbacks.costs.values | callbacks.metrics.results
+    results = describe_run(config)
+    if "costs" in callbacks:
+        results |= callbacks["costs"].values
+    if "metrics" in callbacks:
+        results |= callbacks["metrics"].results
     if trainer.is_global_zero:
         write_json(folder / "metrics.json", results)
         log_outcome(logger, results, data.name)
@@ -95,6 +107,28 @@ def train(config: DictConfig) -> float | None:
     return results.get(f"test/{data.name}/psnr")
 
 
+def make_trainer(
+    config: DictConfig, callbacks: dict[str, lightning.Callback], logger: Logger
+) -> lightning.Trainer:
+    """Lightning's.
+
+    Raises:
+        InputError: options that it refuses, or a device that is not there.
+    """
+    try:
+        return instantiate(
+            config.trainer,
+            callbacks=list(callbacks.values()),
+            logger=logger,
+            # Lightning has its own in place of those that are left out.
+            enable_checkpointing="checkpoints" in callbacks,
+            enable_progress_bar="progress" in callbacks,
+        )
+    except InstantiationException as error:
+        raise InputError(f"trainer: {error.__cause__}") from error
+
+
 if __name__ == "__main__":
-    exit_at_unknown_words()
+    os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
+    exit_at_unknown_words("train")
     main()

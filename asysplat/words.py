@@ -1,44 +1,152 @@
-"""Words of a command that name a file of conf/ or sweeps/, checked before Hydra reads them."""
+"""The words of a command, checked before Hydra reads them: what they name must be there."""
 
+import contextlib
 import difflib
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+
+import hydra
+from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError
 
-ROOT = Path(__file__).parents[1]
-SWEEPS = "sweeps"
+CONF = Path(__file__).parents[1] / "conf"
+ALIKE = 0.8  # difflib's ratio of widht and width
 
 
-def check_words(words: Iterable[str]) -> None:
-    """Raise InputError for a `group=choice` whose choice is no file, naming the nearest ones."""
-    for word in words:
-        group, equals, choices = word.lstrip("+").partition("=")
-        folder = _folder(group)
-        if not equals or folder is None:
-            continue
-        known = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-        for choice in choices.split(","):
-            if choice not in known and choice != "null":
-                nearest = difflib.get_close_matches(choice, known, n=3, cutoff=0.4) or known
-                raise InputError(
-                    f"{group}={choice} is unknown: did you mean {', '.join(nearest)}? "
-                    f"All are in {folder.relative_to(ROOT)}/."
-                )
+def check_words(words: Iterable[str], script: str = "train") -> None:
+    """Check that each word sets an option that there is, or chooses a file of its group.
+
+    Args:
+        words: `key=value` as Hydra takes them; those of Hydra's own options are left to Hydra.
+        script: the file of conf/ that names the options.
+
+    Raises:
+        InputError: a word that cannot be read, or that names what is not there; gives the nearest.
+    """
+    overrides = [_parse(word) for word in words]
+    ours = [override for override in overrides if not override.key_or_group.startswith("hydra")]
+    for override in ours:
+        _check_choices(override)
+    composed = [override for override in ours if _folder(override) or _adds(override)]
+    settings = [override for override in ours if override not in composed]
+    known = set(_paths(_compose(script, composed))) if settings else set()
+    for override in settings:
+        key = override.key_or_group
+        if key not in known:
+            raise InputError(f"{key} is unknown: {_hint(key, known, script)}")
 
 
-def exit_at_unknown_words() -> None:
+def exit_at_unknown_words(script: str) -> None:
     """`check_words` of this process's command line; a mistake ends the process."""
+    given = get_args_parser().parse_args()
+    if given.config_dir or given.config_name or given.config_path or given.shell_completion:
+        return  # other files than ours, or no run
     try:
-        check_words(sys.argv[1:])
+        check_words(given.overrides, script)
     except InputError as error:
         sys.exit(f"error: {error}")
 
 
-def _folder(group: str) -> Path | None:
+def _parse(word: str) -> Override:
+    key, equals, _ = word.partition("=")
+    if not (key and equals) and not word.startswith("~"):
+        raise InputError(f"{word} sets nothing: write {word}=value, or ~{word} to leave it out.")
+    try:
+        return OverridesParser.create().parse_override(word)
+    except HydraException:
+        raise InputError(
+            f"{word} cannot be read: a value that holds brackets, quotes or = needs quotes of its "
+            """own within those of the shell, as in 'data.root="my (scene)"'."""
+        ) from None
+
+
+def _adds(override: Override) -> bool:
+    return override.is_add() or override.is_force_add()
+
+
+def _check_choices(override: Override) -> None:
+    folder, group = _folder(override), override.key_or_group
+    if folder is None or override.is_delete():
+        return
+    known = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    choices = (choice for value in _values(override) for choice in value.strip("[]").split(","))
+    for choice in choices:
+        if choice and choice not in known:
+            nearest = difflib.get_close_matches(choice, known, n=3, cutoff=0.4) or known
+            raise InputError(
+                f"{group}={choice} is unknown: did you mean {', '.join(nearest)}? "
+                f"All are in {folder.resolve().relative_to(CONF.parent)}/."
+            )
+
+
+def _folder(override: Override) -> Path | None:
     """Where the choices of a group are; None for what is no group of ours."""
-    if group == SWEEPS:
-        return ROOT / SWEEPS
-    folder = ROOT / "conf" / group
-    return folder if group and not group.startswith("hydra") and folder.is_dir() else None
+    folder = CONF / override.key_or_group
+    return folder if folder.is_dir() else None
+
+
+def _values(override: Override) -> list[str]:
+    """As they were typed; of a sweep each, where it names them."""
+    if not override.is_sweep_override():
+        return [override.get_value_element_as_str()]
+    named = isinstance(override.value(), ChoiceSweep | RangeSweep)
+    return list(override.sweep_string_iterator()) if named else []
+
+
+def _compose(script: str, overrides: Sequence[Override]) -> DictConfig:
+    """The options that there are with these words; of a sweep with its first values."""
+    words = [override.input_line for override in overrides if override.is_delete()]
+    for override in overrides:
+        if not override.is_delete():
+            words += [f"{override.get_key_element()}={value}" for value in _values(override)[:1]]
+    ready = GlobalHydra.instance().is_initialized()
+    with (
+        contextlib.nullcontext()
+        if ready
+        else hydra.initialize_config_dir(str(CONF), version_base="1.3")
+    ):
+        try:
+            return hydra.compose(script, words)
+        except HydraException as error:
+            raise InputError(f"{' '.join(words)}: {str(error).splitlines()[0]}") from error
+
+
+def _paths(config: DictConfig) -> Iterator[str]:
+    """Every option, data.cache.folder for one, and every node above one."""
+
+    def below(node: dict, prefix: str) -> Iterator[str]:
+        for key, value in node.items():
+            yield f"{prefix}{key}"
+            if isinstance(value, dict):
+                yield from below(value, f"{prefix}{key}.")
+
+    return below(OmegaConf.to_container(config), "")
+
+
+def _hint(key: str, known: Iterable[str], script: str) -> str:
+    nearest = _nearest(key, known)
+    if nearest:
+        return f"did you mean {nearest}?"
+    group = key.partition(".")[0]
+    choices = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    having = [c for c in choices if key in _paths(_compose(script, [_parse(f"{group}={c}")]))]
+    if having:
+        return f"it is an option of {group}={', '.join(having)}."
+    return f"python {script}.py --cfg job shows all."
+
+
+def _nearest(key: str, known: Iterable[str]) -> str | None:
+    """The known option that is spelled alike, in whole or from any of its dots on."""
+    ends: dict[str, str] = {}
+    for path in sorted(known, key=lambda path: (path.count("."), path)):
+        parts = path.split(".")
+        for start in range(len(parts)):
+            ends.setdefault(".".join(parts[start:]), path)
+    return next((ends[end] for end in difflib.get_close_matches(key, ends, 1, ALIKE)), None)

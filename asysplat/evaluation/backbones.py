@@ -1,17 +1,18 @@
 """ImageNet features for LPIPS and for a perceptual loss, from files that are already here.
 
-Nothing is downloaded: a machine without the files runs without these measures.
+Nothing is downloaded unasked: a machine without the files runs without these measures.
 """
 
 import pickle
 from collections.abc import Sequence
+from http.client import HTTPException
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torchvision.models import alexnet, vgg16, vgg19
+from torchvision.models import alexnet, get_model_weights, vgg16, vgg19
 
 from asysplat.errors import InputError
 
@@ -24,37 +25,59 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def find_backbone(
-    name: Literal["alexnet", "vgg16", "vgg19"], weights: Path | None
+    name: Literal["alexnet", "vgg16", "vgg19"], weights: Path | None, download: bool = False
 ) -> dict[str, Tensor] | None:
     """torchvision's ImageNet weights of the convolutions: `features.N.weight` and `.bias`, fp32.
 
-    Looks in torch's hub cache, then for `<name>_features_fp16.pth` in the folder `weights`.
-    None if neither has them.
+    Looks in torch's hub cache, then for `<name>_features_fp16.pth` in the folder `weights`; where
+    neither has them they are downloaded into the cache, if `download` allows it. Else None.
 
     Raises:
-        InputError: the file found cannot be read or holds something else.
+        InputError: the file found cannot be read or holds something else, or the download failed.
     """
-    candidates = sorted((Path(torch.hub.get_dir()) / "checkpoints").glob(HUB_FILES[name]))
+    candidates = sorted(_hub_cache().glob(HUB_FILES[name]))
     if weights is not None:
         candidates.append(weights / f"{name}_features_fp16.pth")
     path = next((candidate for candidate in candidates if candidate.is_file()), None)
-    return None if path is None else _load_features(name, path)
+    if path is not None:
+        return _features(name, _read(name, path), path)
+    if download:
+        return _features(name, _download(name), _hub_cache())
+    return None
 
 
-def _load_features(name: str, path: Path) -> dict[str, Tensor]:
+def _hub_cache() -> Path:
+    return Path(torch.hub.get_dir()) / "checkpoints"
+
+
+def _read(name: str, path: Path) -> Any:
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
         raise InputError(
             f"{path} cannot be read as weights of {name}: delete it or copy it again."
         ) from error
+
+
+def _download(name: str) -> dict[str, Tensor]:
+    weights = get_model_weights(name).IMAGENET1K_V1
+    try:
+        return weights.get_state_dict(progress=True, check_hash=True)
+    except (OSError, RuntimeError, HTTPException) as error:  # no network, no space, another hash
+        raise InputError(
+            f"{weights.url} could not be downloaded ({error}): put it into {_hub_cache()} by other "
+            "means, or leave paths.download out to go on without it."
+        ) from error
+
+
+def _features(name: str, state: Any, source: Path) -> dict[str, Tensor]:
     with torch.device("meta"):
         expected = BUILDERS[name]().features.state_dict(prefix="features.")
     for key, tensor in expected.items():
         found = state.get(key) if isinstance(state, dict) else None
         if not isinstance(found, Tensor) or found.shape != tensor.shape:
             raise InputError(
-                f"{path} has no {key} of shape {tuple(tensor.shape)}: "
+                f"{source} has no {key} of shape {tuple(tensor.shape)}: "
                 f"give torchvision's ImageNet weights of {name}."
             )
     return {key: state[key].float() for key in expected}

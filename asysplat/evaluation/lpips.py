@@ -1,4 +1,4 @@
-"""LPIPS v0.1 (Zhang et al. 2018), without a download."""
+"""LPIPS v0.1 (Zhang et al. 2018)."""
 
 import warnings
 from pathlib import Path
@@ -13,13 +13,15 @@ from asysplat.evaluation.backbones import find_backbone
 from asysplat.ops.precision import without_autocast
 
 
-def load_lpips(net: Literal["alex", "vgg"], weights: Path | None) -> lpips.LPIPS | None:
+def load_lpips(
+    net: Literal["alex", "vgg"], weights: Path | None, download: bool = False
+) -> lpips.LPIPS | None:
     """The frozen LPIPS network, or None where its backbone is not on this machine.
 
-    Build it once and keep it. `weights` is a folder that may hold the backbone
-    (see `find_backbone`); the linear heads come with the lpips package.
+    Build it once and keep it. `weights` is a folder that may hold the backbone, and `download`
+    lets it be fetched (see `find_backbone`); the linear heads come with the lpips package.
     """
-    backbone = find_backbone("alexnet" if net == "alex" else "vgg16", weights)
+    backbone = find_backbone("alexnet" if net == "alex" else "vgg16", weights, download)
     if backbone is None:
         return None
     # On meta, because the package would fill a whole torchvision model at random, 0.55 GB for VGG;

@@ -44,7 +44,9 @@ def check_checkpoint(path: Path | None, module: nn.Module) -> None:
     try:
         state = torch.load(path, map_location="meta", weights_only=True)["state_dict"]
     except Exception as error:
-        raise InputError(f"{path} cannot be read as a checkpoint ({error}).") from error
+        raise InputError(
+            f"{path} cannot be read as a checkpoint: name a .ckpt file that a run has written."
+        ) from error
     expected = module.state_dict()
     for name in sorted(expected.keys() | state.keys()):
         there, here = state.get(name), expected.get(name)

@@ -39,17 +39,18 @@ class PerceptualDistance(nn.Module):
             return distance
 
 
-def vgg16(weights: str | None = None) -> PerceptualDistance | None:
+def vgg16(weights: str | None = None, download: bool = False) -> PerceptualDistance | None:
     """The mean over VGG16's ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016), on images as
     ImageNet's are normalised.
 
     Args:
         weights: folder that may hold the network's.
+        download: them where they are missing.
 
     Returns:
         None, with a warning, where the weights are not on this machine.
     """
-    backbone = _backbone("vgg16", weights)
+    backbone = _backbone("vgg16", weights, download)
     if backbone is None:
         return None
     features = VGGFeatures("vgg16", backbone, taps=(3, 8, 15, 22, 29), std=IMAGENET_STD)
@@ -60,7 +61,7 @@ LONG_LRM_WEIGHTS = (0.3846, 0.2083, 0.2703, 0.1786, 6.6667)  # 1/2.6, 1/4.8, 1/3
 LONG_LRM_SCALE = 255.0
 
 
-def longlrm(weights: str | None = None) -> PerceptualDistance | None:
+def longlrm(weights: str | None = None, download: bool = False) -> PerceptualDistance | None:
     """Long-LRM's: VGG19's ReLU 1_2, 2_2, 3_2, 4_2 and 5_2 with mean pooling in place of maximum
     pooling, and the images, in the weights of Chen and Koltun 2017 (Long-LRM's public code,
     model/loss.py and configs/7m1t_tm.yaml).
@@ -72,11 +73,12 @@ def longlrm(weights: str | None = None) -> PerceptualDistance | None:
 
     Args:
         weights: folder that may hold the network's.
+        download: them where they are missing.
 
     Returns:
         None, with a warning, where the weights are not on this machine.
     """
-    backbone = _backbone("vgg19", weights)
+    backbone = _backbone("vgg19", weights, download)
     if backbone is None:
         return None
     features = VGGFeatures(
@@ -90,12 +92,12 @@ def longlrm(weights: str | None = None) -> PerceptualDistance | None:
     return PerceptualDistance(features, scaled, image_weight=1.0)
 
 
-def _backbone(name: str, weights: str | None) -> dict[str, Tensor] | None:
-    backbone = find_backbone(name, None if weights is None else Path(weights))
+def _backbone(name: str, weights: str | None, download: bool) -> dict[str, Tensor] | None:
+    backbone = find_backbone(name, None if weights is None else Path(weights), download)
     if backbone is None:
         warnings.warn(
             f"{name.upper()} is neither in torch's hub cache nor in paths.weights: "
-            "training goes on without the perceptual term.",
+            "training goes on without the perceptual term; paths.download=true fetches it.",
             stacklevel=3,
         )
     return backbone

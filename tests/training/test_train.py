@@ -1,5 +1,6 @@
 """The script: fit, resume, measure, and what it refuses, on tiny made-up scenes."""
 
+import contextlib
 import csv
 import json
 import math
@@ -91,6 +92,38 @@ def test_a_protocol_by_name(train, shared):
     for name in ("psnr", "ssim", "lpips", "absrel", "delta1"):
         assert math.isfinite(numbers[f"test/procedural/{name}"])
         assert "over scenes" in numbers[f"protocol/{name}"]
+LEFT_OUT = [
+    ["~callbacks.metrics", "~callbacks.guard", "callbacks.pictures=null"],
+    ["~callbacks.costs", "~callbacks.curve", "~callbacks.checkpoints", "~callbacks.progress"],
+]
+
+
+@pytest.mark.parametrize("words", LEFT_OUT, ids=" ".join)
+def test_without_some_callbacks_the_rest_is_there(train, words, tmp_path):
+    train.environment |= {"TORCH_HOME": str(tmp_path), "ASYSPLAT_SHARED": str(tmp_path)}
+    names = [word.partition(".")[2].removesuffix("=null") for word in words]
+    result = train(*words)
+    folder = run_folder(result)
+    numbers = metrics(folder)
+    left = {
+        "metrics": ("test/procedural/psnr" in numbers, (folder / "metrics.csv").exists()),
+        "costs": ("cost/parameters" in numbers, "Gaussians a scene" in result.stdout),
+        "pictures": ((folder / "pictures" / "test-0.png").exists(),),
+        # Of what metrics measure.
+        "curve": ((folder / "curve.csv").exists() or "metrics" in names,),
+        "checkpoints": (
+            (folder / "checkpoints" / "last.ckpt").exists(),
+            (folder / "checkpoints" / "best.ckpt").exists() or "metrics" in names,
+        ),
+        "progress": ("step 2 of 4" in result.stdout,),
+    }
+    assert {name: set(there) for name, there in left.items()} == {
+        name: {name not in names} for name in left
+    }
+    said = "warning: AlexNet is neither in torch's hub cache nor in paths.weights: the run goes on "
+    assert (said in result.stderr) == ("metrics" not in names)
+    assert not list(folder.glob("tensorboard/**/*.ckpt"))
+    assert "Epoch" not in result.stdout + result.stderr
 
 
 def test_bfloat16_with_the_perceptual_term(train, shared):
@@ -130,6 +163,33 @@ def test_killed_and_resumed_ends_with_the_same_bits(train, repository, tmp_path)
         assert torch.equal(tensor, weights[1][name]), name
 
 
+def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repository, tmp_path):
+    command = [train.command[0], repository / "train.py", *train.command[2:], "steps=1000"]
+    environment = {k: v for k, v in train.environment.items() if k != "ASYSPLAT_SHARED"}
+    process = subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 300
+    while not list(tmp_path.rglob("last.ckpt")):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+    for _ in range(4):  # Python drops an interrupt where it cannot raise it, as in a destructor
+        process.send_signal(signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            said, errors = process.communicate(timeout=20)
+            break
+    assert process.returncode != 0 and "Traceback" not in errors
+    checkpoint = next(tmp_path.rglob("last.ckpt"))
+    assert f"add ckpt_path={checkpoint} to the same command" in said
+    paths = yaml.safe_load((checkpoint.parents[1] / "config.yaml").read_text())["paths"]
+    assert paths["shared"] == str(repository.parent / "shared")
+
+
 def test_geometry_ratio_sweep(train, tmp_path):
     result = train("-m", "geometry_ratio=0.5,0.7,0.9", "model.layers=4m4s", "width=0.25", "steps=1")
     assert result.returncode == 0, result.stderr
@@ -152,11 +212,18 @@ def test_a_real_scene(train, shared, name):
 
 
 REFUSED = {
-    "an unknown override": (["widht=1"], "widht"),
-    "an unknown model": (["model=asysplat_4m4z"], "did you mean asysplat_4m4"),
-    "an unknown protocol": (["metrics=longrm"], "did you mean longlrm"),
-    "an unknown setting of it": (["metrics.depth_alignment=mean"], "choose none or median"),
-    "an unknown table": (["sweeps=layer"], "did you mean layers"),
+    "an unknown option": (["widht=1"], "error: widht is unknown: did you mean width?\n"),
+    "a number out of range": (
+        ["steps=-5"],
+        "error: steps=-5: give a whole number of at least 1.\n",
+    ),
+    "one of a sweep": (["-m", "seed=-1,x"], "seed=x: give a whole number from 0"),
+    "an unknown setting of a protocol": (["metrics.depth_alignment=mean"], "choose none or median"),
+    "a trainer that cannot be": (["trainer.precision=bf17"], "error: trainer: Precision 'bf17' is"),
+    "no checkpoint, but a text": (
+        ["ckpt_path=README.md"],
+        "README.md cannot be read as a checkpoint",
+    ),
     "no weights to start from": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
     "a size that the patches do not take": (["data.height=40"], "set 48x32"),
     "an unusable layer mix": (["model.layers=4q"], "such as 4m4s"),

@@ -1,9 +1,19 @@
-"""What watches a run: metrics, pictures, learning curve, costs, non-finite steps."""
+"""What watches a run: metrics, pictures, learning curve, costs, non-finite steps, progress."""
 
+from asysplat.training.callbacks.checkpoints import Checkpoints
 from asysplat.training.callbacks.costs import Costs
 from asysplat.training.callbacks.curve import Curve
 from asysplat.training.callbacks.guard import SkipNonFiniteSteps
 from asysplat.training.callbacks.metrics import Metrics
 from asysplat.training.callbacks.pictures import Pictures
+from asysplat.training.callbacks.progress import Progress
 
-__all__ = ["Costs", "Curve", "Metrics", "Pictures", "SkipNonFiniteSteps"]
+__all__ = [
+    "Checkpoints",
+    "Costs",
+    "Curve",
+    "Metrics",
+    "Pictures",
+    "Progress",
+    "SkipNonFiniteSteps",
+]

@@ -32,10 +32,12 @@ class Metrics(lightning.Callback):
         protocol: by which all is measured.
         folder: of the run; metrics.csv is written there after the test.
         weights: folder that may hold LPIPS' backbone; without it that column is missing.
+        download: the backbone where it is missing.
     """
 
-    def __init__(self, protocol: Protocol, folder: str, weights: str):
-        self.protocol, self.folder, self.weights = protocol, Path(folder), Path(weights)
+    def __init__(self, protocol: Protocol, folder: str, weights: str, download: bool = False):
+        self.protocol, self.folder = protocol, Path(folder)
+        self.weights, self.download = Path(weights), download
         self.rows: list[Row] = []
         sentences = protocol.sentences()
         self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in sentences.items()}
@@ -45,12 +47,12 @@ class Metrics(lightning.Callback):
     ) -> None:
         if hasattr(self, "lpips"):
             return
-        self.lpips = load_lpips(self.protocol.lpips_net, self.weights)
+        self.lpips = load_lpips(self.protocol.lpips_net, self.weights, self.download)
         if self.lpips is None and trainer.is_global_zero:
             warnings.warn(
                 f"{BACKBONES[self.protocol.lpips_net]} is neither in torch's hub cache nor in "
-                "paths.weights: the run goes on without LPIPS.",
-                stacklevel=2,
+                "paths.weights: the run goes on without LPIPS; paths.download=true fetches it.",
+                stacklevel=1,  # Lightning calls this, and its own warnings are not shown
             )
 
     def measure(self, rendered: Tensor, targets: Views) -> dict[str, Tensor]:

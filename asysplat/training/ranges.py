@@ -1,0 +1,80 @@
+"""What the options that are set most may be, checked before any work starts."""
+
+import math
+from collections.abc import Callable
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from asysplat.errors import InputError
+
+SEEDS = 2**32  # that NumPy takes
+
+
+def is_whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def is_number(value: object) -> bool:
+    return is_whole(value) or (isinstance(value, float) and math.isfinite(value))
+
+
+def is_window(value: object) -> bool:
+    return isinstance(value, ListConfig) and list(map(is_whole, value)) == [True, True]
+
+
+# What to give, whether a value is that, and the options it holds for.
+RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
+    (
+        "a whole number of at least 1",
+        lambda value: is_whole(value) and value >= 1,
+        (
+            *("steps", "validate_every", "state_size"),
+            *("data.inputs", "data.targets", "data.height", "data.width", "data.batch_size"),
+            *("data.val_scenes", "data.test_scenes"),
+        ),
+    ),
+    (
+        "a whole number of at least 0",
+        lambda value: is_whole(value) and value >= 0,
+        ("data.workers", "training.warmup_steps", "callbacks.pictures.scenes"),
+    ),
+    (
+        f"a whole number from 0 to {SEEDS - 1}",
+        lambda value: is_whole(value) and 0 <= value < SEEDS,
+        ("seed",),
+    ),
+    (
+        "a number above 0",
+        lambda value: is_number(value) and value > 0,
+        ("width", "parameter_budget", "training.learning_rate"),
+    ),
+    (
+        "a number of at least 0",
+        lambda value: is_number(value) and value >= 0,
+        (
+            "training.weight_decay",
+            *("training.loss.mse", "training.loss.perceptual", "training.loss.depth"),
+        ),
+    ),
+    (
+        "a share between 0 and 1, such as 0.9, or null for the model's own",
+        lambda value: value is None or (is_number(value) and 0 < value < 1),
+        ("geometry_ratio",),
+    ),
+    ("two whole numbers, such as [64,96]", is_window, ("data.window",)),
+)
+
+
+def check_ranges(config: DictConfig) -> None:
+    """Check the options of `RANGES` that a configuration has.
+
+    Raises:
+        InputError: a value of another type, or out of range; the first in the order above.
+    """
+    absent = object()
+    for expected, fits, keys in RANGES:
+        for key in keys:
+            value = OmegaConf.select(config, key, default=absent)
+            if value is not absent and not fits(value):
+                found = "null" if value is None else value
+                raise InputError(f"{key}={found}: give {expected}.")

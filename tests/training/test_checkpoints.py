@@ -1,0 +1,76 @@
+"""What is kept of a run: the best by its validation, and the last whether it is the best or not."""
+
+import lightning
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from asysplat.errors import InputError
+from asysplat.training.callbacks import Checkpoints
+from asysplat.training.checkpoints import check_checkpoint
+
+
+class Module(lightning.LightningModule):
+    """One weight, worse with every validation."""
+
+    def __init__(self, measured):
+        super().__init__()
+        self.measured = measured
+        self.layer = torch.nn.Linear(2, 1, bias=False)
+
+    def training_step(self, batch, index):
+        return self.layer(batch).sum()
+
+    def validation_step(self, batch, index):
+        if self.measured:
+            self.log("val/psnr", 20.0 - self.global_step)
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def steps_kept(folder, steps, measured=True) -> dict[str, int]:
+    """Of a training of two steps an epoch."""
+    checkpoints = Checkpoints(
+        dirpath=folder,
+        filename="best",
+        monitor="val/psnr",
+        mode="max",
+        save_on_train_epoch_end=True,
+        enable_version_counter=False,
+    )
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        max_epochs=-1,
+        num_sanity_val_steps=0,
+        callbacks=[checkpoints],
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    data = DataLoader(torch.zeros(2, 2))
+    trainer.fit(Module(measured), data, data)
+    return {
+        path.stem: torch.load(path, weights_only=True)["global_step"]
+        for path in folder.glob("*.ckpt")
+    }
+
+
+def test_the_last_is_kept_though_an_earlier_one_is_the_best(tmp_path):
+    assert steps_kept(tmp_path, 6) == {"best": 2, "last": 6}
+
+
+def test_the_end_is_kept_though_it_is_within_an_epoch(tmp_path):
+    assert steps_kept(tmp_path, 5) == {"best": 2, "last": 5}
+
+
+def test_nothing_is_the_best_where_nothing_measures(tmp_path):
+    assert steps_kept(tmp_path, 4, measured=False) == {"last": 4}
+
+
+def test_a_file_that_is_none_is_one_sentence(tmp_path):
+    path = tmp_path / "notes.ckpt"
+    path.write_text("a text")
+    with pytest.raises(InputError, match=r"notes\.ckpt cannot be read as a checkpoint: [^\n]*$"):
+        check_checkpoint(path, torch.nn.Linear(1, 1))

@@ -1,0 +1,117 @@
+"""What a run shows of its progress: its steps, wherever it began; bars only on a terminal."""
+
+import io
+
+import lightning
+import pytest
+import torch
+from rich.console import Console
+from torch.utils.data import DataLoader
+
+from asysplat.training.callbacks import Progress, progress
+
+
+class Module(lightning.LightningModule):
+    """One weight, and always the same quality."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(2, 1, bias=False)
+
+    def training_step(self, batch, index):
+        self.log("train/psnr", 20.0, prog_bar=True)
+        return self.layer(batch).sum()
+
+    def validation_step(self, batch, index):
+        self.log("val/psnr", 18.5)
+
+    def test_step(self, batch, index, dataloader_idx=0):
+        pass
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def loader(count=2):
+    return DataLoader(torch.zeros(count, 2))
+
+
+def fit(tmp_path, steps, checkpoint=None):
+    """Two steps an epoch, a validation after each, then a test of two sets of three scenes."""
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        max_epochs=-1,
+        num_sanity_val_steps=0,
+        callbacks=[Progress()],
+        logger=False,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+        default_root_dir=tmp_path,
+    )
+    trainer.fit(Module(), loader(), loader(3), ckpt_path=checkpoint, weights_only=True)
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    trainer.test(Module(), [loader(3), loader(3)], verbose=False)
+
+
+def lines(text):
+    return [line for line in text.splitlines() if line.startswith("step")]
+
+
+def test_without_a_terminal_a_line_after_each_validation(tmp_path, capsys):
+    fit(tmp_path, 6)
+    said = lines(capsys.readouterr().out)
+    assert [line.partition(" left")[0].rpartition(",")[0] for line in said] == [
+        "step 2 of 6",
+        "step 4 of 6",
+        "step 6 of 6",
+    ]
+    assert all(line.endswith("left: PSNR 20.0, validation 18.5") for line in said)
+
+
+def test_in_between_a_line_when_a_minute_and_a_share_have_passed(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0)
+    monkeypatch.setattr(progress, "LINE_SHARE", 0.5)
+    fit(tmp_path, 2)
+    said = lines(capsys.readouterr().out)
+    steps = [line.split(",")[0].split(":")[0] for line in said]
+    assert steps == ["step 1 of 2", "step 2 of 2", "step 2 of 2"]  # the last after the validation
+
+
+def test_a_resumed_run_starts_at_its_step(tmp_path, capsys):
+    fit(tmp_path, 4)
+    capsys.readouterr()
+    fit(tmp_path, 8, checkpoint=tmp_path / "last.ckpt")
+    said = lines(capsys.readouterr().out)
+    assert [line.split(",")[0] for line in said] == ["step 6 of 8", "step 8 of 8"]
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=80)
+    monkeypatch.setattr(progress, "Console", lambda: console)
+    monkeypatch.setattr(progress, "REFRESH_SECONDS", 0)
+    return screen
+
+
+def test_on_a_terminal_bars_of_training_validation_and_test(tmp_path, capsys, terminal):
+    fit(tmp_path, 6)
+    assert not lines(capsys.readouterr().out)
+    shown = terminal.getvalue()
+    for text in ("training", "0/6", "6/6", "validation", "1/3", "3/3", "PSNR 20.0", "test"):
+        assert text in shown
+    assert "Epoch" not in shown
+    assert "…" not in shown  # nothing was cut off at 80 columns
+    hidden, restored = "\x1b[?25l", "\x1b[?25h"
+    assert shown.count(hidden) == shown.count(restored) == 2
+
+
+def test_an_error_gives_the_terminal_back(tmp_path, terminal, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(Module, "validation_step", fail)
+    with pytest.raises(RuntimeError):
+        fit(tmp_path, 6)
+    assert terminal.getvalue().count("\x1b[?25h") == 1

@@ -1,0 +1,58 @@
+"""What users set most is refused out of its range, in one sentence, and taken within."""
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from asysplat.errors import InputError
+from asysplat.training.ranges import RANGES, check_ranges
+
+
+@pytest.fixture(scope="module")
+def composed(repository):
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        yield lambda *words: compose("train", list(words))
+
+
+REFUSED = {
+    "steps=-5": "steps=-5: give a whole number of at least 1.",
+    "steps=0": "steps=0: give a whole number of at least 1.",
+    "steps=1e3": "steps=1000.0: give a whole number",
+    "steps=null": "steps=null: give a whole number",
+    "validate_every=true": "validate_every=True: give a whole number",
+    "stages.stage1.batch_size=0": "data.batch_size=0: give a whole number of at least 1.",
+    "seed=-1": "seed=-1: give a whole number from 0 to 4294967295.",
+    "width=0": "width=0: give a number above 0.",
+    "width=wide": "width=wide: give a number above 0.",
+    "data.workers=-1": "data.workers=-1: give a whole number of at least 0.",
+    "data.height=abc": "data.height=abc: give a whole number of at least 1.",
+    "training.learning_rate=nan": "training.learning_rate=nan: give a number above 0.",
+    "training.loss.depth=-1": "training.loss.depth=-1: give a number of at least 0.",
+    "data.val_scenes=0": "data.val_scenes=0: give a whole number of at least 1.",
+    "data.window=12": "data.window=12: give two whole numbers, such as [64,96].",
+    "data.window=[12]": "data.window=[12]: give two whole numbers, such as [64,96].",
+    "geometry_ratio=1.5": "geometry_ratio=1.5: give a share between 0 and 1",
+    "geometry_ratio=half": "geometry_ratio=half: give a share between 0 and 1",
+}
+
+
+@pytest.mark.parametrize("word", REFUSED)
+def test_out_of_range(composed, word):
+    with pytest.raises(InputError) as raised:
+        check_ranges(composed(word))
+    assert str(raised.value).startswith(REFUSED[word])
+
+
+@pytest.mark.parametrize("scale", ["laptop", "gpu", "paper"])
+def test_every_scale_is_within_and_has_every_option(composed, scale):
+    config = composed(f"scale={scale}")
+    check_ranges(config)
+    for _, _, keys in RANGES:
+        for key in keys:
+            node = config
+            for part in key.split("."):
+                assert part in node, key
+                node = node[part]
+
+
+def test_an_option_that_is_left_out_is_not_missed(composed):
+    check_ranges(composed("~callbacks", "~training.warmup_steps", "geometry_ratio=0.7"))
