@@ -19,8 +19,8 @@ def check_words(words: Iterable[str]) -> None:
         if not equals or folder is None:
             continue
         known = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-        for choice in choices.split(","):
-            if choice not in known and choice != "null":
+        for choice in choices.strip("[]").split(","):
+            if choice not in known and choice not in ("null", ""):
                 nearest = difflib.get_close_matches(choice, known, n=3, cutoff=0.4) or known
                 raise InputError(
                     f"{group}={choice} is unknown: did you mean {', '.join(nearest)}? "

@@ -46,12 +46,15 @@ def measure(repository, tmp_path_factory):
     return run
 
 
-MORE_VIEWS = "+data.test_sets.more_views={inputs: 5, test_scenes: 2}"
+MORE_SETS = [
+    "+data.test_sets.more_views={inputs: 5, test_scenes: 2}",
+    "+data.test_sets.wide={width: 64}",
+]
 
 
 @pytest.fixture(scope="module")
 def together(measure):
-    return measure(MORE_VIEWS)
+    return measure(*MORE_SETS)
 
 
 ALONE = {
@@ -59,6 +62,7 @@ ALONE = {
     "rooms": ["data.places=rooms"],
     "outdoors": ["data.places=outdoors"],
     "more_views": ["data.inputs=5", "data.test_scenes=2"],
+    "wide": ["data.width=64"],
 }
 
 
@@ -76,7 +80,7 @@ def test_every_image_is_a_row_that_names_its_set(together):
         rows = list(csv.DictReader(file))
     assert next(iter(rows[0])) == "set"
     counts = {name: sum(row["set"] == name for row in rows) for name in ALONE}
-    assert counts == {"procedural": 2, "rooms": 2, "outdoors": 2, "more_views": 4}
+    assert counts == {"procedural": 2, "rooms": 2, "outdoors": 2, "more_views": 4, "wide": 2}
     values = [float(row["psnr"]) for row in rows if row["set"] == "rooms"]
     assert abs(sum(values) / 2 - results["test/rooms/psnr"]) < 1e-4
 
