@@ -42,6 +42,23 @@ def test_an_interrupted_sweep_runs_only_what_is_missing(train, repository, tmp_p
     assert finished_seeds(tmp_path) == [0, 1, 2, 2]
 
 
+def test_what_another_revision_finished_is_told_and_run_again_where_asked(train, tmp_path):
+    assert train(*SWEEP, "seed=0").returncode == 0
+    (path,) = tmp_path.rglob("metrics.json")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"run/revision": "0123456789ab"}))
+
+    result = train(*SWEEP, "seed=0")
+    assert "finished already by 0123456789ab, while this is" in result.stdout
+    assert f"run: {path.parent}" in result.stdout
+    assert finished_seeds(tmp_path) == [0]
+
+    assert "finished already" not in train(*SWEEP, "seed=0", "rerun=true").stdout
+    assert finished_seeds(tmp_path) == [0, 0]
+    result = train(*SWEEP, "seed=0", "rerun=true")
+    assert "finished already\n" in result.stdout
+    assert finished_seeds(tmp_path) == [0, 0]
+
+
 def test_a_failure_is_named_and_the_others_go_on(train, tmp_path):
     result = train(*SWEEP, "seed=0", "data.height=40,32", "data.width=32")
     assert result.returncode != 0
