@@ -99,7 +99,7 @@ def test_table_5_takes_the_frames_of_an_index(compose_train):
 
 @pytest.mark.parametrize("data", ["dl3dv", "realestate10k"])
 def test_data_with_scenes_to_test_asks_for_them(compose_train, data):
-    config = compose_train(f"data={data}", "data.root=train")
+    config = compose_train(f"data={data}", "data.root=train", "paths.run=here")
     task = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
     assert OmegaConf.missing_keys(task) == {"data.test_root"}
 
