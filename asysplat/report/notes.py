@@ -37,7 +37,7 @@ def protocol_notes(filled: FilledTable) -> list[Note]:
         sentences = [
             f"{kind_titles()[kind]}: {text}" for kind, text in protocol.items() if kind in kinds
         ]
-        lines.append(Note("Metrics", f"protocol {name}. {'. '.join(sentences)}".strip()))
+        lines.append(Note("Metrics", ". ".join([f"protocol {name}", *sentences])))
     return lines
 
 
