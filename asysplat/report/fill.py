@@ -149,7 +149,9 @@ def _result_key(column: str, row: Row, sets: dict[str, str]) -> str | None:
     steps = row.post_optimisation
     if column in MEASURED:
         plain, optimised = MEASURED[column]
-        return optimised and optimised.format(steps) if steps else plain
+        if steps:
+            return optimised and optimised.format(steps)
+        return plain.replace("cost/", f"cost/{row.test_set}/") if row.test_set else plain
     paper_set, _, metric = column.partition("/")
     if not metric:
         return None

@@ -126,6 +126,16 @@ def test_a_run_that_was_tested_on_all_sets_comes_first(compose, tmp_path):
     assert first_row("layers") == {"dl3dv/psnr": [3.0]}
 
 
+def test_a_row_of_a_further_test_set_has_its_costs(compose, tmp_path):
+    costs = {"cost/inference_seconds": 0.5, "cost/more_views/inference_seconds": 0.9}
+    config = compose(["sweeps=more_views"])
+    write_run(tmp_path / "run", config, costs | {"test/more_views/psnr": 18.0}, 0)
+    filled = fill_table(load_paper()["more_views"], [], compose, finished_runs(tmp_path))
+    ours = [row.values for row in filled.rows if not row.row.quoted]
+    assert [values["inference_seconds"] for values in ours] == [[0.5], [0.9]]
+    assert [values.get("dl3dv/psnr") for values in ours] == [None, [18.0]]
+
+
 @pytest.mark.parametrize("data", ["files", "colmap", "mipnerf360", "replica", "realestate10k"])
 def test_a_table_on_any_data(compose, data):
     filled = fill_table(load_paper()["more_views"], [f"data={data}"], compose, {})

@@ -22,8 +22,9 @@ class Costs(lightning.Callback):
     training step and the peak of memory over all of them (seconds_per_step, peak_gb), and what that
     is beyond what there was before the first, for each token of the largest patch in a batch
     (peak_bytes_per_token); what a step renders, with its gradients (render_seconds); the median
-    forward of the network over the test's scenes and the peak of memory in the test
-    (inference_seconds, inference_gb).
+    forward of the network over the scenes of the test and the peak of memory in it
+    (inference_seconds, inference_gb). The last two of a further test set, whose views may be more
+    or larger, are "cost/<its name>/...".
     """
 
     def __init__(self):
@@ -81,7 +82,6 @@ class Costs(lightning.Callback):
         )
 
     def on_test_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        reset_peak_memory(module.device)
         self.hooks = [
             module.net.register_forward_pre_hook(lambda *_: self._start(module)),
             module.net.register_forward_hook(
@@ -89,11 +89,35 @@ class Costs(lightning.Callback):
             ),
         ]
 
+    def on_test_batch_start(
+        self,
+        trainer: lightning.Trainer,
+        module: lightning.LightningModule,
+        batch: Any,
+        index: int,
+        test_set: int = 0,
+    ) -> None:
+        if index == 0:
+            self.forwards = []
+            reset_peak_memory(module.device)
+
+    def on_test_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        module: lightning.LightningModule,
+        outputs: Any,
+        batch: Any,
+        index: int,
+        test_set: int = 0,
+    ) -> None:
+        """What is known of a test set after each of its scenes; the last one has it all."""
+        cost = f"cost/{list(trainer.datamodule.tests)[test_set]}" if test_set else "cost"
+        self.values[f"{cost}/inference_seconds"] = statistics.median(self.forwards)
+        self.values[f"{cost}/inference_gb"] = peak_memory_gb(module.device)
+
     def on_test_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         for hook in self.hooks:
             hook.remove()
-        self.values["cost/inference_seconds"] = statistics.median(self.forwards)
-        self.values["cost/inference_gb"] = peak_memory_gb(module.device)
 
     def _start(self, module: lightning.LightningModule) -> None:
         wait_for(module.device)
