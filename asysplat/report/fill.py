@@ -69,7 +69,7 @@ def fill_table(table: Table, words: Sequence[str], compose: Compose, runs: Runs)
         scale=_scale_text(config),
         command=f"python train.py {' '.join(words)}",
         sets=sets,
-        protocols=_protocols(found) or ({"name": config.metrics.name},),
+        protocols=_protocols(found, config.metrics.name),
         baselines=_baselines(sets, found),
         machine=", ".join(sorted({run.results.get("run/machine", "") for run in found})),
         folders=tuple(sorted({_folders(run) for run in found} - {""})),
@@ -178,17 +178,15 @@ def _scale_text(config: DictConfig) -> str:
     )
 
 
-def _protocols(runs: Sequence[Run]) -> tuple[dict[str, str], ...]:
-    """Those that metrics.json states, each once."""
-    stated = [
-        {
-            key.removeprefix("protocol/"): text
-            for key, text in run.results.items()
-            if key.startswith("protocol/")
-        }
-        for run in runs
-    ]
-    return tuple(one for number, one in enumerate(stated) if one not in stated[:number])
+def _protocols(runs: Sequence[Run], name: str) -> tuple[dict[str, str], ...]:
+    """Those that metrics.json states, each once; without a run the configuration's name alone."""
+    stated: list[dict[str, str]] = []
+    for run in runs:
+        keys = [key for key in run.results if key.startswith("protocol/")]
+        one = {"name": name} | {key.partition("/")[2]: run.results[key] for key in keys}
+        if one not in stated:
+            stated.append(one)
+    return tuple(stated) or ({"name": name},)
 
 
 def _baselines(sets: dict[str, str], runs: Sequence[Run]) -> dict[str, dict[str, Number]]:

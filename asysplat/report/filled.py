@@ -64,7 +64,7 @@ class FilledTable:
         scale: of our runs, such as "laptop: 8 views of 64x64, 240 steps".
         command: what made our numbers.
         sets: the paper's test set -> ours whose numbers stand beside it.
-        protocols: that our metrics follow: name, and a sentence a metric where runs have them;
+        protocols: that our metrics follow: "name", and a sentence a metric where runs state them;
             several where runs differ.
         baselines: our test set -> what one gets for nothing -> PSNR.
         machine: that ours were measured on.

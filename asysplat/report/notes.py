@@ -28,16 +28,15 @@ def notes(filled: FilledTable) -> list[Note]:
 
 def protocol_notes(filled: FilledTable) -> list[Note]:
     """By what protocol ours were measured; of a protocol that runs state, a sentence a metric."""
-    names = [protocol.get("name", "without a name") for protocol in filled.protocols]
     kinds = {column.key.rpartition("/")[-1] for column in filled.table.columns}
     lines = []
-    if len(names) > 1:
+    if len(filled.protocols) > 1:
         lines.append(Note("Metrics", "runs of several protocols are mixed, see below"))
-    for name, protocol in zip(names, filled.protocols, strict=True):
+    for protocol in filled.protocols:
         sentences = [
             f"{kind_titles()[kind]}: {text}" for kind, text in protocol.items() if kind in kinds
         ]
-        lines.append(Note("Metrics", ". ".join([f"protocol {name}", *sentences])))
+        lines.append(Note("Metrics", ". ".join([f"protocol {protocol['name']}", *sentences])))
     return lines
 
 

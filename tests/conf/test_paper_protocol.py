@@ -7,7 +7,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from asysplat.errors import InputError
 from asysplat.report.paper import load_paper
+from asysplat.words import check_words
 
 ROOT = Path(__file__).parents[2]
 PLACES = ["data.root=train", "data.test_root=test"]
@@ -129,3 +131,9 @@ def test_the_command_for_a_cluster(compose_train):
         assert (row.data.height, row.data.width, row.steps) == (256, 256, 10000)
         assert row.data.selection == "first_96" and f"seed={row.seed}" in chosen
         assert f"model={row.hydra.runtime.choices.model}" in chosen
+
+
+def test_a_test_set_that_is_none_is_named():
+    check_words(["test_sets=[mipnerf360,replica]", "test_sets=[]"])
+    with pytest.raises(InputError, match=r"test_sets=mipnerf is unknown: did you mean mipnerf360"):
+        check_words(["test_sets=[replica,mipnerf]"])
