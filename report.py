@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import track
@@ -16,6 +17,8 @@ from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import find_tables
 from asysplat.report.terminal import render_terminal
 from asysplat.words import check_words, exit_at_unknown_words
+
+OWN_WORDS = ("table", "costs", "overrides", "logs", "output")
 
 
 @hydra.main(config_path="conf", config_name="report", version_base="1.3")
@@ -29,7 +32,7 @@ def main(options: DictConfig) -> None:
 def report(options: DictConfig) -> None:
     """Fill the tables, print them, write report.md and report.html."""
     tables = find_tables(options.table)
-    words = [*([] if options.scale == "laptop" else [f"scale={options.scale}"]), *options.overrides]
+    words = [*sweep_words(HydraConfig.get().overrides.task), *options.overrides]
     check_words(words)
     runs = finished_runs(Path(options.logs))
     filled = [fill_table(table, words, compose_train, runs) for table in tables]
@@ -42,6 +45,11 @@ def report(options: DictConfig) -> None:
     (folder / "report.md").write_text(render_markdown(filled))
     (folder / "report.html").write_text(render_html(filled))
     console.print(f"page: {folder / 'report.html'}", soft_wrap=True)
+
+
+def sweep_words(words: Sequence[str]) -> list[str]:
+    """Of a command's words those that choose the sweeps' data and scale."""
+    return [word for word in words if word.partition("=")[0] not in OWN_WORDS]
 
 
 def compose_train(overrides: Sequence[str]) -> DictConfig:

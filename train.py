@@ -19,7 +19,8 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.errors import InputError, input_error_behind
 from asysplat.training.checkpoints import check_checkpoint, find_checkpoint, load_weights
 from asysplat.training.ranges import check_ranges
-from asysplat.training.runs import describe_run, find_run
+from asysplat.training.revision import revision
+from asysplat.training.runs import Run, describe_run, find_run
 from asysplat.training.summary import print_summary, write_json
 from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
 from asysplat.words import exit_at_unknown_words
@@ -41,15 +42,15 @@ def main(config: DictConfig) -> float | None:
 
 
 def train_in_sweep(config: DictConfig) -> float | None:
-    """Train unless it was done before. A failure is named at once and the other jobs go on; Hydra
-    ends the sweep with it."""
+    """Train unless it was done before; with `rerun`, by this revision of the code. A failure is
+    named at once and the other jobs go on; Hydra ends the sweep with it."""
     job = HydraConfig.get().job
     try:
         finished = find_run(Path(config.paths.logs), config)
-        if finished is None:
+        if finished is None or (config.rerun and finished.revision != revision()):
             print(f"job {job.num}: {job.override_dirname}", flush=True)
             return train(config)
-        print(f"job {job.num}: finished already\nrun: {finished.folder}", flush=True)
+        print(f"job {job.num}: {finished_text(finished)}", flush=True)
         return finished.results.get(f"test/{config.data.name}/psnr")
     except Exception as error:
         mistake = input_error_behind(error)
@@ -58,6 +59,12 @@ def train_in_sweep(config: DictConfig) -> float | None:
         sentence = f"failed: job {job.num}: {job.override_dirname}: {mistake or repr(error)}"
         print(sentence, file=sys.stderr, flush=True)
         raise CompactHydraException(sentence) from None
+
+
+def finished_text(run: Run) -> str:
+    """What a sweep says of a run that it does not start again."""
+    other = f" by {run.revision}, while this is {revision()}; to run it again: rerun=true"
+    return f"finished already{other if run.revision != revision() else ''}\nrun: {run.folder}"
 
 
 def quiet_lightning() -> None:
@@ -75,12 +82,13 @@ def train(config: DictConfig) -> float | None:
     check_ranges(config)
     quiet_lightning()
     folder = Path(config.paths.run)
+    described = describe_run(config)  # before anybody changes a file
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     checkpoint = find_checkpoint(config.ckpt_path, Path(config.paths.logs) / config.name)
     data = instantiate(config.data)
     data.setup()
     net = instantiate(config.model)
-    net.check_size(data.height, data.width)
+    data.check_sizes(net.check_size)
     module = instantiate(config.training, net=net)
     check_checkpoint(checkpoint, module)
     load_weights(config.init_path, module)
@@ -95,7 +103,7 @@ def train(config: DictConfig) -> float | None:
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(module, data, verbose=False)
 
-    results = describe_run(config)
+    results = described
     if "costs" in callbacks:
         results |= callbacks["costs"].values
     if "metrics" in callbacks:

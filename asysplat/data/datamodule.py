@@ -29,7 +29,8 @@ class SceneDataModule(lightning.LightningDataModule):
         name: the data set's name in metrics.
         source: where tasks come from.
         inputs, targets: views given and views to predict, per scene.
-        height, width: of every view, in pixels; the source has made them so.
+        height, width: of every view, in pixels, but for test sets of another size; the sources
+            have made them so.
         batch_size: scenes per step.
         workers: processes that load ahead; 0 loads in the training process.
         seed: of the training tasks.
@@ -81,6 +82,15 @@ class SceneDataModule(lightning.LightningDataModule):
                     self.tests[name] = FixedTasks(make_tasks())
                 except InputError as error:
                     raise InputError(f"data.test_sets.{name}: {error}") from error
+
+    def check_sizes(self, check: Callable[[int, int], None]) -> None:
+        """Call `check(height, width)` for every set; its InputError names the set."""
+        check(self.height, self.width)
+        for name, tasks in self.tests.items():
+            try:
+                check(*tasks[0]["inputs"].images.shape[-2:])
+            except InputError as error:
+                raise InputError(f"data.test_sets.{name}: {error}") from error
 
     def train_dataloader(self) -> DataLoader:
         per_epoch = self.steps_per_epoch * self.batch_size * self.trainer.world_size

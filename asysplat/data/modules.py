@@ -1,5 +1,6 @@
 """What `conf/data` names: a source and the data module that draws from it."""
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -19,15 +20,18 @@ def procedural_data(
     val_scenes: int,
     test_scenes: int,
     places: str,
+    test_sets: Mapping[str, Any] | None = None,
     **options,
 ) -> SceneDataModule:
     """Made-up scenes; arguments are those of ProceduralSource and `scene_data`."""
 
-    def source(num_frames: int, test_scenes: int, places: str) -> ProceduralSource:
-        return ProceduralSource(height, width, num_frames, window, val_scenes, test_scenes, places)
+    def source(height: int, width: int, num_frames: int, **others) -> ProceduralSource:
+        return ProceduralSource(height, width, num_frames, window, val_scenes, **others)
 
-    own = {"num_frames": num_frames, "test_scenes": test_scenes, "places": places}
-    return scene_data(source(**own), source, own, height=height, width=width, **options)
+    own = {"height": height, "width": width, "num_frames": num_frames}
+    own |= {"test_scenes": test_scenes, "places": places}
+    tested = tested_sets(test_sets, options["name"], on_disk=False)
+    return scene_data(source(**own), source, own, test_sets=tested, **options)
 
 
 def files_data(
@@ -43,18 +47,21 @@ def files_data(
     index: str | None = None,
     val_scenes: int = 8,
     targets_may_be_inputs: bool = False,
+    test_sets: Mapping[str, Any] | None = None,
     **options,
 ) -> SceneDataModule:
     """Scenes on disk; arguments are those of FilesSource and `scene_data`.
 
-    A further test set may differ in the root of what it tests, layout, selection and index.
+    A further test set may differ in the root of what it tests, layout, selection, index and size.
+    One whose root is null is left out, with a warning.
     """
 
-    def source(root: str, **others) -> FilesSource:
+    def source(root: str, height: int, width: int, **others) -> FilesSource:
         reading = {"on_bad_frame": on_bad_frame, "cache": cache, **others}
         return FilesSource(root, height, width, window, **reading)
 
-    own = {"layout": layout, "selection": selection, "index": index}
+    own = {"height": height, "width": width}
+    own |= {"layout": layout, "selection": selection, "index": index}
     main = source(
         root,
         test_root=test_root,
@@ -63,7 +70,9 @@ def files_data(
         **own,
     )
     own["root"] = test_root or root
-    return scene_data(main, source, own, height=height, width=width, **options)
+    _warn_of_untested(test_sets or {}, options["name"])
+    tested = tested_sets(test_sets, options["name"], on_disk=True)
+    return scene_data(main, source, own, test_sets=tested, **options)
 
 
 def scene_data(
@@ -82,7 +91,7 @@ def scene_data(
         source: of the data set itself.
         make_source: of a test set, from the options `own`, in which test sets may differ.
         test_sets: name -> the options that differ: any of `own`, inputs and targets.
-        name, inputs, targets, options: those of SceneDataModule.
+        name, inputs, targets, options: those of SceneDataModule; the size is among `own`.
 
     Raises:
         InputError: a test set that is called as the data set, or with an unknown option.
@@ -97,9 +106,46 @@ def scene_data(
         source=source,
         inputs=inputs,
         targets=targets,
+        height=own["height"],
+        width=own["width"],
         test_sets=sets,
         **options,
     )
+
+
+def tested_sets(test_sets: Mapping[str, Any] | None, name: str, on_disk: bool) -> dict[str, Any]:
+    """Of the further test sets of a configuration, those that a run tests.
+
+    Of those that have a root of their own, made-up data tests none: made-up scenes stand for them.
+    Data on disk tests those whose root is given, but for one that is called as the data itself.
+
+    Args:
+        test_sets: name -> the options in which it differs from the data set.
+        name, on_disk: of the data set.
+    """
+    return {
+        other: options
+        for other, options in (test_sets or {}).items()
+        if not _has_root(options) or (on_disk and options["root"] is not None and other != name)
+    }
+
+
+def _has_root(options: Any) -> bool:
+    return isinstance(options, Mapping) and "root" in options
+
+
+def _warn_of_untested(test_sets: Mapping[str, Any], name: str) -> None:
+    lacking = [
+        other
+        for other, options in test_sets.items()
+        if _has_root(options) and options["root"] is None and other != name
+    ]
+    if lacking:
+        warnings.warn(
+            f"Not tested for want of a path: {', '.join(lacking)}. To test them, add "
+            f"{' '.join(f'paths.{other}=...' for other in lacking)} to the command.",
+            stacklevel=3,
+        )
 
 
 def _test_tasks(

@@ -11,12 +11,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.report.filled import Costs, FilledRow, FilledTable, Number
-from asysplat.report.paper import Row, Table, set_titles, stand_ins
-from asysplat.training.runs import Run, find_runs, identity
+from asysplat.report.paper import Row, Table, our_sets
+from asysplat.training.runs import Run, data_of, find_runs, identity
 
 # Overrides of train.py -> its configuration, the node `hydra` included.
 Compose = Callable[[Sequence[str]], DictConfig]
-Runs = dict[str, dict[int, Run]]  # by identity and seed
+Runs = dict[str, list[Run]]  # by identity, oldest first
 
 BASELINES = ("mean_colour", "nearest_view")
 # Columns that every run measures in passing, as it calls them, without and with post-optimisation.
@@ -31,10 +31,10 @@ SETTINGS = {"batch": "data.batch_size", "train_steps": "steps"}
 
 
 def finished_runs(logs: Path) -> Runs:
-    """All of them; of equal ones the newest."""
+    """All of them."""
     runs: Runs = {}
     for run in find_runs(logs):
-        runs.setdefault(run.identity, {})[run.seed] = run
+        runs.setdefault(run.identity, []).append(run)
     return runs
 
 
@@ -43,25 +43,24 @@ def fill_table(table: Table, words: Sequence[str], compose: Compose, runs: Runs)
 
     Args:
         table: the paper's.
-        words: of the command that the sweep was started with, but for `sweeps=`.
+        words: of the command that the sweep was started with, but for `sweeps=`. Paths may be left
+            out; one that is given has to have the name of the run's.
         compose: train.py's configuration.
         runs: to look among.
-
-    Raises:
-        InputError: a data set without stand-ins for the paper's.
     """
     words = [f"sweeps={table.key}", *words]
     config = compose(words)
-    sets = stand_ins(config.data.name)
+    sets = our_sets(table, config.data.name, config.data.test_sets or ())
     seeds = str(config.hydra.sweeper.params.get("seed", config.seed))
     wanted = [int(seed) for seed in seeds.split(",")]
-    rows, found = [], []
+    rows: list[FilledRow] = []
+    found: list[Run] = []
     for row in table.rows:
         if row.quoted:
             rows.append(FilledRow(row))
             continue
         row_config = _task(compose([*words, *row.run]))
-        same = runs.get(identity(row_config), {})
+        same = _runs_of(row_config, runs)
         found += same.values()
         rows.append(_measured_row(row, table, row_config, same, wanted, sets))
     return FilledTable(
@@ -69,9 +68,12 @@ def fill_table(table: Table, words: Sequence[str], compose: Compose, runs: Runs)
         tuple(rows),
         scale=_scale_text(config),
         command=f"python train.py {' '.join(words)}",
-        stand_ins=_stand_ins_text(table, sets),
-        baselines=_baselines(table, sets, found),
+        sets=sets,
+        protocols=_protocols(found, config.metrics.name),
+        baselines=_baselines(sets, found),
         machine=", ".join(sorted({run.results.get("run/machine", "") for run in found})),
+        folders=tuple(sorted({_folders(run) for run in found} - {""})),
+        untested=_untested(sets, config, rows),
     )
 
 
@@ -102,6 +104,13 @@ def _costs(compose: Compose, run: tuple[str, ...], views: int, size: tuple[int, 
     return static_costs(net, views, *size)
 
 
+def _runs_of(config: DictConfig, runs: Runs) -> dict[int, Run]:
+    """By seed: of several the newest, those that were tested on all that is asked for first."""
+    data = data_of(config)
+    same = [run for run in runs.get(identity(config), []) if run.agrees(data)]
+    return {run.seed: run for run in sorted(same, key=lambda run: run.covers(data))}
+
+
 def _task(config: DictConfig) -> DictConfig:
     """What the run itself is given."""
     return OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
@@ -129,6 +138,7 @@ def _measured_row(
         row,
         values=values,
         seeds=tuple(sorted(runs)) if values else (),
+        revisions=tuple(sorted({run.revision for run in runs.values()})) if values else (),
         missing=tuple(seed for seed in wanted if seed not in runs),
         note=_note(row, values, runs, wanted),
     )
@@ -139,11 +149,13 @@ def _result_key(column: str, row: Row, sets: dict[str, str]) -> str | None:
     steps = row.post_optimisation
     if column in MEASURED:
         plain, optimised = MEASURED[column]
-        return optimised and optimised.format(steps) if steps else plain
+        if steps:
+            return optimised and optimised.format(steps)
+        return plain.replace("cost/", f"cost/{row.test_set}/") if row.test_set else plain
     paper_set, _, metric = column.partition("/")
-    ours = row.test_set or sets.get(paper_set)
-    if not metric or ours is None:
+    if not metric:
         return None
+    ours = row.test_set or sets[paper_set]
     return f"test/{ours}/post{steps}/{metric}" if steps else f"test/{ours}/{metric}"
 
 
@@ -166,18 +178,21 @@ def _scale_text(config: DictConfig) -> str:
     )
 
 
-def _stand_ins_text(table: Table, sets: dict[str, str]) -> str:
-    used = [key for key in _paper_sets(table) if sets.get(key, key) != key]
-    pairs = [f"{set_titles()[key]} by our test set {sets[key]}" for key in used]
-    return "; ".join(pairs)
+def _protocols(runs: Sequence[Run], name: str) -> tuple[dict[str, str], ...]:
+    """Those that metrics.json states, each once; without a run the configuration's name alone."""
+    stated: list[dict[str, str]] = []
+    for run in runs:
+        keys = [key for key in run.results if key.startswith("protocol/")]
+        one = {"name": name} | {key.partition("/")[2]: run.results[key] for key in keys}
+        if one not in stated:
+            stated.append(one)
+    return tuple(stated) or ({"name": name},)
 
 
-def _baselines(
-    table: Table, sets: dict[str, str], runs: Sequence[Run]
-) -> dict[str, dict[str, Number]]:
+def _baselines(sets: dict[str, str], runs: Sequence[Run]) -> dict[str, dict[str, Number]]:
     """Per test set of ours: the same in every run that was tested on it."""
     found: dict[str, dict[str, Number]] = {}
-    for name in dict.fromkeys(sets[key] for key in _paper_sets(table) if key in sets):
+    for name in dict.fromkeys(sets.values()):
         for run in runs:
             keys = {baseline: f"baseline/{name}/{baseline}/psnr" for baseline in BASELINES}
             if all(key in run.results for key in keys.values()):
@@ -185,7 +200,18 @@ def _baselines(
     return found
 
 
-def _paper_sets(table: Table) -> list[str]:
-    """The test sets of its columns, in order."""
-    keys = [column.key.partition("/") for column in table.columns]
-    return list(dict.fromkeys(test_set for test_set, slash, _ in keys if slash))
+def _folders(run: Run) -> str:
+    keys = ("run/data/root", "run/data/test_root")
+    return " and ".join(run.results[key] for key in keys if key in run.results)
+
+
+def _untested(
+    sets: dict[str, str], config: DictConfig, rows: Sequence[FilledRow]
+) -> tuple[str, ...]:
+    """Test sets of the paper that the sweep names, that have no path, and no numbers in any row."""
+    measured = {key.partition("/")[0] for row in rows for key in row.values}
+    data = OmegaConf.to_container(config.data, resolve=True)
+    if "root" not in data:  # made-up data, which tests none on disk
+        return ()
+    lacking = [name for name, how in data["test_sets"].items() if how.get("root", "") is None]
+    return tuple(key for key, ours in sets.items() if ours in lacking and key not in measured)

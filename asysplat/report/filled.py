@@ -35,6 +35,7 @@ class FilledRow:
         reading_costs: one for each of `row.readings`, or empty where not asked for.
         values: column key -> measured numbers, one a seed; a column without any was not run.
         seeds: those measured.
+        revisions: of the code that measured them, see `asysplat.training.revision`.
         missing: those still to be run.
         note: what a reader should know of this row, such as "needs evaluate.py".
     """
@@ -44,6 +45,7 @@ class FilledRow:
     reading_costs: tuple[Costs, ...] = ()
     values: dict[str, list[Number]] = field(default_factory=dict)
     seeds: tuple[int, ...] = ()
+    revisions: tuple[str, ...] = ()
     missing: tuple[int, ...] = ()
     note: str = ""
 
@@ -61,18 +63,25 @@ class FilledTable:
         rows: in the paper's order.
         scale: of our runs, such as "laptop: 8 views of 64x64, 240 steps".
         command: what made our numbers.
-        stand_ins: which of our test sets stands for which of the paper's.
-        baselines: the paper's test set -> what one gets for nothing -> PSNR.
+        sets: the paper's test set -> ours whose numbers stand beside it.
+        protocols: that our metrics follow: "name", and a sentence a metric where runs state them;
+            several where runs differ.
+        baselines: our test set -> what one gets for nothing -> PSNR.
         machine: that ours were measured on.
+        folders: that the data of our runs lay in, by name.
+        untested: the paper's test sets that no run was given a path of.
     """
 
     table: Table
     rows: tuple[FilledRow, ...]
     scale: str
     command: str
-    stand_ins: str = ""
+    sets: dict[str, str] = field(default_factory=dict)
+    protocols: tuple[dict[str, str], ...] = ()
     baselines: dict[str, dict[str, Number]] = field(default_factory=dict)
     machine: str = ""
+    folders: tuple[str, ...] = ()
+    untested: tuple[str, ...] = ()
 
     @property
     def title(self) -> str:
@@ -82,6 +91,11 @@ class FilledTable:
     def networks(self) -> list[FilledRow]:
         """Rows without post-optimisation, which changes no cost of the network."""
         return [row for row in self.rows if row.row.post_optimisation == 0]
+
+    def our_title(self, column: Column) -> str:
+        """Of our numbers in this column: a set that stands for the paper's has its own name."""
+        ours = self.sets.get(column.test_set, column.test_set)
+        return column.title if ours == column.test_set else column.title_of(ours)
 
     @property
     def measured_columns(self) -> list[Column]:

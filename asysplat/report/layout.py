@@ -4,14 +4,15 @@ from collections.abc import Sequence
 
 from asysplat.report.cost_layout import cost_grid
 from asysplat.report.filled import FilledRow, FilledTable, Number, check, mean_and_spread
-from asysplat.report.notes import notes, rho_text
+from asysplat.report.notes import notes, protocol_notes, rho_text
 from asysplat.report.paper import Column
 from asysplat.report.sheet import Cell, Grid, Heading, Sheet, anchor
 
 TITLE = "AsySplat: our numbers beside the paper's"
 INTRODUCTION = (
-    "Each column gives the paper's number, then ours: measured on our data at our scale, so "
-    "compare the order of the rows and not the numbers. Bold is the best of its column. "
+    "Each column of the paper stands beside ours: measured at our scale, on the test set that its "
+    "heading names, so compare the order of the rows and not the numbers. Bold is the best of its "
+    "column. "
     "† marks a row whose layout the paper leaves open."
 )
 OVERVIEW = (
@@ -27,7 +28,8 @@ def make_sheet(filled: FilledTable) -> Sheet:
     grids = [_measured_grid(filled)]
     if any(row.costs for row in filled.rows):
         grids.append(cost_grid(filled.networks))
-    return Sheet(filled.title, tuple(grids), tuple(notes(filled)))
+    above = tuple(protocol_notes(filled))
+    return Sheet(filled.title, above, tuple(grids), tuple(notes(filled)))
 
 
 def make_overview(tables: Sequence[FilledTable]) -> Grid:
@@ -74,8 +76,9 @@ def _measured_grid(filled: FilledTable) -> Grid:
     headings = [Heading("Row")]
     columns = [[Cell(row.name) for row in filled.rows]]
     for column in filled.measured_columns:
-        title = column.title + ARROWS[column.better]
-        headings += [Heading(title, "paper"), Heading(title, "ours")]
+        arrow = ARROWS[column.better]
+        headings += [Heading(column.title + arrow, "paper")]
+        headings += [Heading(filled.our_title(column) + arrow, "ours")]
         columns += [_paper_cells(filled.rows, column), _our_cells(filled.rows, column)]
     return Grid("Measured", tuple(headings), tuple(zip(*columns, strict=True)))
 

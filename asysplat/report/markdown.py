@@ -15,6 +15,7 @@ def render_markdown(tables: Sequence[FilledTable]) -> str:
         parts.append(_grid(make_overview(tables)))
     for sheet in map(make_sheet, tables):
         parts.append(f"## {escape(sheet.title)}")
+        parts.append("\n".join(map(_note, sheet.above)))
         parts += map(_grid, sheet.grids)
         parts.append("\n".join(map(_note, sheet.notes)))
     return "\n\n".join(parts) + "\n"

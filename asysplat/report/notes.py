@@ -1,6 +1,7 @@
 """What stands under a table: how both sides were measured, and how far to trust the order."""
 
 from asysplat.report.filled import CLEAR_SIGNAL, FilledTable, RankAgreement, rank_agreement
+from asysplat.report.paper import kind_titles, set_titles
 from asysplat.report.sheet import Note
 
 BASELINES = {"mean_colour": "mean colour", "nearest_view": "nearest view, copied"}
@@ -11,15 +12,32 @@ def notes(filled: FilledTable) -> list[Note]:
     lines = [
         Note("Paper", filled.table.protocol),
         Note("Ours", filled.scale),
-        Note("Stand-ins", filled.stand_ins),
+        Note("Stand-ins", _stand_ins(filled)),
+        Note("Not tested", _untested(filled)),
         Note("For nothing", _baselines(filled)),
         Note("Seeds", _seeds(filled)),
         Note("Order", _order(filled)),
         *_remarks(filled),
+        Note("Data", _folders(filled)),
+        Note("Revision", _revisions(filled)),
         Note("Machine", filled.machine),
         Note("Command", filled.command, code=True),
     ]
     return [line for line in lines if line.text]
+
+
+def protocol_notes(filled: FilledTable) -> list[Note]:
+    """By what protocol ours were measured; of a protocol that runs state, a sentence a metric."""
+    kinds = {column.key.rpartition("/")[-1] for column in filled.table.columns}
+    lines = []
+    if len(filled.protocols) > 1:
+        lines.append(Note("Metrics", "runs of several protocols are mixed, see below"))
+    for protocol in filled.protocols:
+        sentences = [
+            f"{kind_titles()[kind]}: {text}" for kind, text in protocol.items() if kind in kinds
+        ]
+        lines.append(Note("Metrics", ". ".join([f"protocol {protocol['name']}", *sentences])))
+    return lines
 
 
 def rho_text(filled: FilledTable) -> str:
@@ -31,6 +49,34 @@ def rho_text(filled: FilledTable) -> str:
         return "-"
     doubt = "?" if agreement.signal is None or agreement.signal < CLEAR_SIGNAL else ""
     return f"{agreement.rho:.2f}{doubt} ({agreement.rows} rows)"
+
+
+def _stand_ins(filled: FilledTable) -> str:
+    pairs = [(key, ours) for key, ours in filled.sets.items() if ours != key]
+    return "; ".join(f"{set_titles()[key]} by our test set {ours}" for key, ours in pairs)
+
+
+def _untested(filled: FilledTable) -> str:
+    return "; ".join(f"{set_titles()[key]}, for want of paths.{key}=..." for key in filled.untested)
+
+
+def _folders(filled: FilledTable) -> str:
+    if len(filled.folders) < 2:
+        return "".join(filled.folders)
+    folders = "; ".join(filled.folders)
+    return f"runs on several are mixed, name one with data.root=... in overrides: {folders}"
+
+
+def _revisions(filled: FilledTable) -> str:
+    """Of the code; which rows are of which, where there are several."""
+    rows: dict[str, list[str]] = {}
+    for row in filled.rows:
+        for revision in row.revisions:
+            rows.setdefault(revision, []).append(row.name)
+    if len(rows) < 2:
+        return "".join(rows)
+    parts = [f"{revision}: {', '.join(names)}" for revision, names in rows.items()]
+    return f"runs of several are mixed: {'; '.join(parts)}"
 
 
 def _baselines(filled: FilledTable) -> str:
@@ -55,12 +101,13 @@ def _order(filled: FilledTable) -> str:
     if filled.table.rank_by is None:
         return ""
     agreement = rank_agreement(filled, filled.table.rank_by)
-    title = next(c.title for c in filled.table.columns if c.key == filled.table.rank_by)
+    column = next(c for c in filled.table.columns if c.key == filled.table.rank_by)
+    ours = filled.our_title(column)
     if agreement.rho is None:
-        return f"cannot be compared by {title}: rows with both numbers: {agreement.rows}"
+        return f"cannot be compared by {ours}: rows with both numbers: {agreement.rows}"
     return (
-        f"by {title}, Spearman's rho with the paper's is {agreement.rho:.2f} over {agreement.rows} "
-        f"rows; {_trust(agreement)}"
+        f"Spearman's rho of our {ours} with the paper's {column.title} is {agreement.rho:.2f} over "
+        f"{agreement.rows} rows; {_trust(agreement)}"
     )
 
 

@@ -1,7 +1,7 @@
 """The paper's tables as values: paper.yaml holds every number that the paper prints."""
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -19,17 +19,31 @@ class Column:
 
     Args:
         key: "parameters", "gflops", ..., or "<test set>/<metric>" such as "dl3dv/psnr".
-        title: as printed.
+        kind: of number, as printed, such as "PSNR".
         better: "higher" or "lower"; None where neither is.
         format: of one number in `unit`, as for str.format.
         unit: what the title's unit is worth, such as 1e6 where it says (M).
     """
 
     key: str
-    title: str
+    kind: str
     better: str | None
     format: str
     unit: float = 1.0
+
+    @property
+    def test_set(self) -> str:
+        """Its key; "" where the number is of none."""
+        return self.key.rpartition("/")[0]
+
+    @property
+    def title(self) -> str:
+        """As the paper prints it."""
+        return self.title_of(set_titles()[self.test_set]) if self.test_set else self.kind
+
+    def title_of(self, test_set: str) -> str:
+        """That of the same kind of number, measured on a set of this name."""
+        return f"{test_set} {self.kind}"
 
     def text(self, value: float) -> str:
         """`value`, the paper's or ours, as printed."""
@@ -108,6 +122,11 @@ class Table:
     rows: tuple[Row, ...] = field(repr=False)
     rank_by: str | None = None
 
+    @property
+    def test_sets(self) -> list[str]:
+        """Those of its columns, in order."""
+        return list(dict.fromkeys(c.test_set for c in self.columns if c.test_set))
+
 
 @cache
 def load_paper() -> dict[str, Table]:
@@ -134,26 +153,30 @@ def find_tables(names: str | Sequence[str]) -> list[Table]:
     return [tables[word] for word in words]
 
 
-def stand_ins(data: str) -> dict[str, str]:
-    """The paper's test set -> the one of ours that stands for it, for a run of data=`data`.
+def our_sets(table: Table, data: str, test_sets: Collection[str]) -> dict[str, str]:
+    """Each test set of a table -> the one of ours whose numbers stand beside the paper's.
 
-    A test set of the paper that is missing has no stand-in.
+    It is the stand-in that this data has for it; else, for the table's first set where the sweep
+    names no other, the data itself; else the set itself.
 
-    Raises:
-        InputError: no stand-ins are written down for this data set.
+    Args:
+        data: the data set of the runs, which is tested as well.
+        test_sets: the further ones that their configuration names.
     """
-    known = _raw()["stand_ins"]
-    if data not in known:
-        raise InputError(
-            f"data={data} has no entry under stand_ins in {PAPER.name}: write there which of its "
-            f"test sets stands for which of the paper's, or use {', '.join(known)}."
-        )
-    return known[data]
+    stand_ins = _raw()["stand_ins"].get(data, {})
+    itself = {key: key for key in table.test_sets}
+    first = {key: data for key in table.test_sets[:1] if key not in test_sets}
+    return itself | first | {key: stand_ins[key] for key in itself if key in stand_ins}
 
 
 def set_titles() -> dict[str, str]:
     """The paper's test sets, as it prints them."""
     return _raw()["test_sets"]
+
+
+def kind_titles() -> dict[str, str]:
+    """Kinds of numbers, as printed, by the last part of a column's key."""
+    return {kind: entry["title"] for kind, entry in _raw()["columns"].items()}
 
 
 @cache
@@ -178,11 +201,10 @@ def _table(key: str, entry: dict) -> Table:
 
 
 def _column(key: str) -> Column:
-    """A column's title and direction come from its kind, the last part of its key."""
-    *test_set, kind = key.split("/")
-    entry = _raw()["columns"][kind]
-    title = " ".join([*(set_titles()[name] for name in test_set), entry["title"]])
-    return Column(key, title, entry.get("better"), entry["format"], float(entry.get("unit", 1)))
+    """What its kind, the last part of its key, says of it."""
+    entry = _raw()["columns"][key.rpartition("/")[-1]]
+    unit = float(entry.get("unit", 1))
+    return Column(key, entry["title"], entry.get("better"), entry["format"], unit)
 
 
 def _row(row: dict, table: dict) -> Row:

@@ -42,9 +42,12 @@ def pareto_plot(filled: FilledTable, quality: Column) -> list[tuple[str, Figure]
     left, right = figure.subplots(1, 2)
     _draw(left, ours, quality.better, OURS)
     _draw(right, paper, quality.better, PAPER)
-    left.set(title="ours", xlabel=cost.title, ylabel=quality.title + ARROWS[quality.better])
-    right.set(title="paper", xlabel=cost.title)
-    words = f"{quality.title} against {cost.title}: no row beats those on the line in both."
+    for axes, title, label in (
+        (left, "ours", filled.our_title(quality)),
+        (right, "paper", quality.title),
+    ):
+        axes.set(title=title, xlabel=cost.title, ylabel=label + ARROWS[quality.better])
+    words = f"{quality.kind} against {cost.title}: no row beats those on the line in both."
     return [(words, figure)]
 
 

@@ -51,12 +51,13 @@ def _seed_plot(filled: FilledTable, column: Column) -> tuple[str, Figure]:
             paper.plot(row.row.paper[column.key], place, "|", color=PAPER, ms=16, mew=2.5)
     ours.set_yticks(range(len(rows)), [row.name for row in rows])
     ours.set_ylim(len(rows) - 0.5, -0.5)
-    for axes, title in ((ours, "ours"), (paper, "paper")):
-        axes.set(title=title, xlabel=column.title + ARROWS[column.better])
+    labels = {"ours": filled.our_title(column), "paper": column.title}
+    for axes, (title, label) in zip((ours, paper), labels.items(), strict=True):
+        axes.set(title=title, xlabel=label + ARROWS[column.better])
         axes.margins(x=0.08)
         axes.locator_params(axis="x", nbins=5)
         axes.tick_params(axis="y", length=0)
-    return f"{column.title} of each row: a dot for each seed, a bar at the mean.", figure
+    return f"{column.kind} of each row: a dot for each seed, a bar at the mean.", figure
 
 
 def _say(axes: Axes, place: int, text: str) -> None:
@@ -75,7 +76,8 @@ def _ratio_plot(filled: FilledTable) -> tuple[str, Figure]:
             _ratio(r): r.row.paper[column.key] for r in filled.rows if column.key in r.row.paper
         }
         paper.plot(points.keys(), points.values(), "o-", color=PAPER)
-        ours.set_ylabel(column.title + ARROWS[column.better])
+        ours.set_ylabel(filled.our_title(column) + ARROWS[column.better])
+        paper.set_ylabel(column.title + ARROWS[column.better])
     grid[0, 0].set_title("ours")
     grid[0, 1].set_title("paper")
     for axes in grid[-1]:
@@ -106,9 +108,8 @@ def _first_metrics(filled: FilledTable) -> list[Column]:
     """The first column of each test set."""
     first: dict[str, Column] = {}
     for column in filled.table.columns:
-        test_set, slash, _ = column.key.partition("/")
-        if slash:
-            first.setdefault(test_set, column)
+        if column.test_set:
+            first.setdefault(column.test_set, column)
     return list(first.values())
 
 

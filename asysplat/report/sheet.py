@@ -42,7 +42,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Note:
-    """A line under a table; `code` is set in type-writer."""
+    """A line above or under a table; `code` is set in type-writer."""
 
     label: str
     text: str
@@ -54,6 +54,7 @@ class Sheet:
     """One table of the report."""
 
     title: str
+    above: tuple[Note, ...]
     grids: tuple[Grid, ...]
     notes: tuple[Note, ...]
 

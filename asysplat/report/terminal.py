@@ -10,7 +10,7 @@ from rich.text import Text
 
 from asysplat.report.filled import FilledTable
 from asysplat.report.layout import make_overview, make_sheet
-from asysplat.report.sheet import Cell, Grid, Heading
+from asysplat.report.sheet import Cell, Grid, Heading, Note
 
 STYLES = {"": "", "best": "bold green", "muted": "dim", "alarm": "bold red"}
 # What rich puts around the text of a column: a space on either side, and a line.
@@ -21,13 +21,18 @@ def render_terminal(tables: Sequence[FilledTable], console: Console) -> None:
     """The tables one after the other, the overview last, where it is seen."""
     for sheet in map(make_sheet, tables):
         console.print(Text(sheet.title, style="bold underline"))
+        _print_notes(sheet.above, console)
         for grid in sheet.grids:
             _print_grid(grid, console)
-        for note in sheet.notes:
-            console.print(Text.assemble((f"{note.label}: ", "bold"), note.text))
+        _print_notes(sheet.notes, console)
         console.print()
     if len(tables) > 1:
         _print_grid(make_overview(tables), console)
+
+
+def _print_notes(notes: Sequence[Note], console: Console) -> None:
+    for note in notes:
+        console.print(Text.assemble((f"{note.label}: ", "bold"), note.text))
 
 
 def _print_grid(grid: Grid, console: Console) -> None:

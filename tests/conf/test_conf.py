@@ -19,7 +19,8 @@ GROUPS = [
     if path.parent != CONF
 ]
 # Shared parts of the files that use them.
-PARTS = {("model", "asysplat"), ("model", "blocks"), ("model", "one_branch"), ("data", "views")}
+PARTS = {("model", "asysplat"), ("model", "blocks"), ("model", "one_branch")}
+PARTS |= {("data", "views"), ("data", "disk")}
 TRAINED = [(group, name) for group, name in GROUPS if group in ("model", "experiment")]
 TRAINED += [("sweeps", path.stem) for path in sorted(SWEEPS.glob("*.yaml"))]
 TINY = ["width=0.125", "state_size=8", "data.workers=0", "data.num_frames=32"]

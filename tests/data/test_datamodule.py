@@ -184,6 +184,38 @@ def test_an_unusable_test_set_is_named(case):
         with_test_sets(test_sets).setup()
 
 
+def test_a_test_set_has_a_size_of_its_own():
+    data = with_test_sets({"wide": {"height": 24, "width": 40}})
+    data.setup()
+    images = {name: scenes[0]["inputs"].images for name, scenes in data.tests.items()}
+    assert images["procedural"].shape[-2:] == (16, 16)
+    assert images["wide"].shape[-2:] == (24, 40)
+    checked = []
+    data.check_sizes(lambda *size: checked.append(size))
+    assert set(checked) == {(16, 16), (24, 40)}
+
+    def check(height, width):
+        if width == 40:
+            raise InputError("40 is too wide.")
+
+    with pytest.raises(InputError, match=r"^data\.test_sets\.wide: 40 is too wide\.$"):
+        data.check_sizes(check)
+
+
+def test_which_test_sets_are_tested(tmp_path):
+    scene = ProceduralScene(3, 16, 16, num_frames=24)
+    write_transforms(scene.views(range(24)), tmp_path)
+    sets = {"here": {"root": str(tmp_path), "selection": "kmeans"}, "nowhere": {"root": None}}
+    assert not with_test_sets(sets).test_sets
+    own = {"root": str(tmp_path), "name": "own", "on_bad_frame": "fail"} | READ_WITH
+    same = {"own": {"root": "elsewhere"}, "more": {"inputs": 5}}
+    with pytest.warns(UserWarning, match=r"Not tested for want of a path: nowhere\. .* paths\.no"):
+        data = files_data(test_sets=sets | same, **own)
+    assert list(data.test_sets) == ["here", "more"]
+    with pytest.raises(InputError, match=r"data\.test_sets\.own has the name of the data"):
+        files_data(test_sets={"own": {"inputs": 5}}, **own)
+
+
 def test_a_test_set_beside_scenes_that_are_tested(tmp_path):
     """Its root is what it tests, as test_root is of the data set; options are its own."""
     for name, seeds in {"train": (3, 4, 5), "test": (6,), "other": (7,)}.items():

@@ -10,6 +10,7 @@ from hydra import initialize_config_dir
 from asysplat.report.fill import fill_table, finished_runs, with_costs
 from asysplat.report.filled import check, fits
 from asysplat.report.paper import find_tables, load_paper
+from asysplat.training.revision import revision
 from asysplat.training.runs import describe_run, find_run
 
 WORDS = ["steps=7"]
@@ -83,6 +84,63 @@ def test_one_run_serves_every_table_that_names_its_configuration(compose, logs, 
         ours = [row for row in filled.rows if row.values]
         assert [row.values["dl3dv/psnr"] for row in ours] == [[20.0]]
     assert ours[0].values["mipnerf360/psnr"] == [19.0]
+
+
+DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
+
+
+def test_runs_on_the_papers_data(compose, tmp_path):
+    """Found though the report is given no path; a test set without one has no numbers."""
+    config = compose(["sweeps=geometry_ratio", *DL3DV, "paths.mipnerf360=/a/360_v2"])
+    numbers = {"test/dl3dv/psnr": 19.0, "test/mipnerf360/psnr": 17.0, "protocol/name": "longlrm"}
+    write_run(tmp_path / "run", config, numbers | {"protocol/psnr": "of each image"}, 0)
+    runs = finished_runs(tmp_path)
+    filled = fill_table(load_paper()["geometry_ratio"], ["data=dl3dv"], compose, runs)
+    assert filled.rows[0].values == {"dl3dv/psnr": [19.0], "mipnerf360/psnr": [17.0]}
+    assert filled.sets == {"dl3dv": "dl3dv", "mipnerf360": "mipnerf360"}
+    assert filled.protocols == ({"name": "longlrm", "psnr": "of each image"},)
+    assert filled.folders == ("DL3DV and Benchmark",)
+    assert filled.rows[0].revisions == (revision(),)
+    assert filled.untested == ()
+
+    filled = fill_table(load_paper()["mamba_ratio"], ["data=dl3dv"], compose, {})
+    assert filled.untested == ("mipnerf360", "scannetpp")
+    assert filled.protocols == ({"name": "longlrm"},)
+    other = ["data=dl3dv", "data.root=/a/DL3DV-small"]
+    assert not fill_table(load_paper()["layers"], other, compose, runs).rows[0].values
+    moved = ["data=dl3dv", "data.root=/b/c/DL3DV"]
+    assert fill_table(load_paper()["layers"], moved, compose, runs).rows[0].values
+
+
+def test_a_run_that_was_tested_on_all_sets_comes_first(compose, tmp_path):
+    paths = ["paths.mipnerf360=/a/360_v2"]
+    every = compose(["sweeps=geometry_ratio", *DL3DV, *paths])
+    write_run(tmp_path / "a", every, {"test/dl3dv/psnr": 1.0, "test/mipnerf360/psnr": 2.0}, 0)
+    write_run(tmp_path / "b", compose(["sweeps=layers", *DL3DV]), {"test/dl3dv/psnr": 3.0}, 0)
+    runs = finished_runs(tmp_path)
+
+    def first_row(key, *words):
+        return fill_table(load_paper()[key], [*DL3DV, *words], compose, runs).rows[0].values
+
+    assert first_row("geometry_ratio", *paths) == {"dl3dv/psnr": [1.0], "mipnerf360/psnr": [2.0]}
+    assert first_row("layers") == {"dl3dv/psnr": [3.0]}
+
+
+def test_a_row_of_a_further_test_set_has_its_costs(compose, tmp_path):
+    costs = {"cost/inference_seconds": 0.5, "cost/more_views/inference_seconds": 0.9}
+    config = compose(["sweeps=more_views"])
+    write_run(tmp_path / "run", config, costs | {"test/more_views/psnr": 18.0}, 0)
+    filled = fill_table(load_paper()["more_views"], [], compose, finished_runs(tmp_path))
+    ours = [row.values for row in filled.rows if not row.row.quoted]
+    assert [values["inference_seconds"] for values in ours] == [[0.5], [0.9]]
+    assert [values.get("dl3dv/psnr") for values in ours] == [None, [18.0]]
+
+
+@pytest.mark.parametrize("data", ["files", "colmap", "mipnerf360", "replica", "realestate10k"])
+def test_a_table_on_any_data(compose, data):
+    filled = fill_table(load_paper()["more_views"], [f"data={data}"], compose, {})
+    assert filled.sets == {"dl3dv": data} and filled.untested == ()
+    assert f"{data} data" in filled.scale
 
 
 def test_post_optimisation_is_not_run_until_evaluation_adds_it(compose, tmp_path):

@@ -17,7 +17,7 @@ from asysplat.report.filled import (
 )
 from asysplat.report.paper import Column, Row, Table
 
-PSNR = Column("dl3dv/psnr", "DL3DV-140 PSNR", "higher", "{:.2f}")
+PSNR = Column("dl3dv/psnr", "PSNR", "higher", "{:.2f}")
 
 
 def row(name: str = "row", run: tuple[str, ...] | None = ("model=x",), **paper: float) -> Row:

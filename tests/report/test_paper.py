@@ -5,7 +5,7 @@ import re
 import pytest
 
 from asysplat.errors import InputError
-from asysplat.report.paper import Row, Table, find_tables, load_paper, stand_ins
+from asysplat.report.paper import Row, Table, find_tables, load_paper, our_sets, set_titles
 
 # What the cells before a row's numbers are, where it is more than the name.
 LEADING = {
@@ -134,8 +134,20 @@ def test_a_table_is_found_by_its_name():
         find_tables("layer")
 
 
-def test_stand_ins_are_those_of_the_data():
-    assert stand_ins("procedural")["scannetpp"] == "rooms"
-    assert "deep_blending" not in stand_ins("procedural")
-    with pytest.raises(InputError, match="data=nowhere has no entry under stand_ins"):
-        stand_ins("nowhere")
+def test_our_set_beside_each_of_the_papers():
+    tables = load_paper()
+    ours = our_sets(tables["mamba_ratio"], "procedural", ["rooms", "outdoors", "mipnerf360"])
+    assert ours == {"dl3dv": "procedural", "mipnerf360": "outdoors", "scannetpp": "rooms"}
+    assert our_sets(tables["replica"], "procedural", ["rooms", "replica"]) == {"replica": "rooms"}
+    ours = our_sets(tables["geometry_ratio"], "files", ["mipnerf360", "scannetpp"])
+    assert ours == {"dl3dv": "files", "mipnerf360": "mipnerf360"}
+    ours = our_sets(tables["geometry_ratio"], "realestate10k", ["dl3dv", "mipnerf360"])
+    assert ours == {"dl3dv": "dl3dv", "mipnerf360": "mipnerf360"}
+    assert our_sets(tables["two_views"], "files", []) == {"realestate10k": "files"}
+    assert our_sets(tables["replica"], "dl3dv", ["replica"]) == {"replica": "replica"}
+
+
+def test_every_set_of_the_paper_is_a_test_set_and_a_data_set(repository):
+    for group in ("test_sets", "data"):
+        files = {path.stem for path in (repository / "conf" / group).glob("*.yaml")}
+        assert set(set_titles()) <= files

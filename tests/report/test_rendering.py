@@ -19,8 +19,8 @@ from asysplat.report.terminal import render_terminal
 COLUMNS = (
     Column("parameters", "Param (M)", None, "{:.1f}", 1e6),
     Column("inference_seconds", "Time (s)", "lower", "{:.2f}"),
-    Column("dl3dv/psnr", "DL3DV-140 PSNR", "higher", "{:.2f}"),
-    Column("dl3dv/lpips", "DL3DV-140 LPIPS", "lower", "{:.3f}"),
+    Column("dl3dv/psnr", "PSNR", "higher", "{:.2f}"),
+    Column("dl3dv/lpips", "LPIPS", "lower", "{:.3f}"),
 )
 
 
@@ -89,8 +89,9 @@ def table() -> FilledTable:
         rows,
         "laptop: 8 views of 64x64",
         "python train.py sweeps=layers",
-        "made-up scenes stand for DL3DV-140",
-        {"DL3DV-140": {"mean_colour": 13.2, "nearest_view": 14.5}},
+        {"dl3dv": "made_up"},
+        ({"name": "longlrm", "psnr": "mean of *all* images", "absrel": "of depths"},),
+        {"made_up": {"mean_colour": 13.2, "nearest_view": 14.5}},
         "2 cores",
     )
 
@@ -174,12 +175,12 @@ def test_notes_under_a_table(table):
     for note in (
         "**Paper**: 32 views",
         "**Ours**: laptop: 8 views of 64x64",
-        "**Stand-ins**: made-up scenes stand for DL3DV-140",
-        "**For nothing**: DL3DV-140: mean colour 13.20 dB, nearest view, copied 14.50 dB",
+        "**Stand-ins**: DL3DV-140 by our test set made\\_up",
+        "**For nothing**: made\\_up: mean colour 13.20 dB, nearest view, copied 14.50 dB",
         "**Seeds**: 0, 1, 2: mean ± sample standard deviation over them",
         # Means 22, 20.6, 21.5: 0.71 between rows; sqrt((2 + 0.02) / 3) = 0.82 between seeds,
         # of which there are two a row on average.
-        "Spearman's rho with the paper's is 1.00 over 3 rows; "
+        "Spearman's rho of our made\\_up PSNR with the paper's DL3DV-140 PSNR is 1.00 over 3 rows; "
         "rows differ 1.2 x as much as seeds alone make them: the order means little",
         "**Quoted**: Quoted\\|net",
         "**2 of 3 seeds**: Off",
@@ -189,6 +190,66 @@ def test_notes_under_a_table(table):
         "**Command**: `python train.py sweeps=layers`",
     ):
         assert note in text
+
+
+def test_a_number_of_ours_stands_under_the_name_of_our_test_set(table, ratios):
+    """In every writer: ours under made_up, the paper's under DL3DV-140."""
+    ratios = replace(ratios, sets=table.sets)
+    markdown = render_markdown([table])
+    assert "| DL3DV-140 PSNR ↑ paper | made\\_up PSNR ↑ ours |".replace(" ↑", "\u00a0↑") in markdown
+    terminal = Console(width=300, file=StringIO())
+    render_terminal([table], terminal)
+    texts = [markdown, terminal.file.getvalue(), *Page(render_html([table])).cells]
+    assert not any(re.search(r"DL3DV-140 (PSNR|LPIPS)[^|]{0,4}ours", text) for text in texts)
+    headings = [text for text in texts if re.fullmatch(r"\S+ (PSNR|LPIPS).*", text)]
+    assert headings == [
+        f"{name} {kind}\u00a0{arrow}"
+        for kind, arrow in (("PSNR", "↑"), ("LPIPS", "↓"))
+        for name in ("DL3DV-140", "made_up")
+    ]
+    lines = [line for line in texts[1].splitlines() if "DL3DV-140" in line and "│" in line]
+    assert [word for word in lines[0].split() if word in ("DL3DV-140", "made_up")] == [
+        *("DL3DV-140", "made_up"),
+        *("DL3DV-140", "made_up"),
+    ]
+    for filled in (table, ratios):
+        for caption, figure in make_plots(filled):
+            ours, paper = figure.axes
+            labels = [f"{axes.get_xlabel()} {axes.get_ylabel()}" for axes in (ours, paper)]
+            assert "made_up PSNR" in labels[0] and "DL3DV-140 PSNR" in labels[1]
+            assert "DL3DV" not in labels[0] + caption and "made_up" not in labels[1]
+
+
+def test_a_set_of_the_papers_has_one_heading(table):
+    text = render_markdown([replace(table, sets={"dl3dv": "dl3dv"})])
+    assert "| DL3DV-140 PSNR\u00a0↑ paper | DL3DV-140 PSNR\u00a0↑ ours |" in text
+    assert "Stand-ins" not in text
+
+
+def test_the_protocol_stands_above_the_numbers(table):
+    """Of the metrics that the table prints."""
+    console = Console(width=200, file=StringIO())
+    render_terminal([table], console)
+    page = Page(render_html([table]))
+    for text in (render_markdown([table]), console.file.getvalue(), " ".join(page.cells)):
+        text = text.replace("\\", "")
+        assert text.index("protocol longlrm. PSNR: mean of *all* images") < text.index("Measured")
+        assert "of depths" not in text
+
+
+def test_several_protocols_and_revisions_are_told(table):
+    rows = [replace(row, revisions=("0123456",) if row.values else ()) for row in table.rows]
+    one = render_markdown([replace(table, rows=tuple(rows))])
+    assert "- **Revision**: 0123456\n" in one and "mixed" not in one
+    rows[1] = replace(rows[1], revisions=("0123456", "789abcd+12"))
+    protocols = (*table.protocols, {"name": "default", "psnr": "of all pixels"})
+    folders = ("DL3DV", "DL3DV-small")
+    text = render_markdown([replace(table, rows=tuple(rows), protocols=protocols, folders=folders)])
+    assert "- **Metrics**: runs of several protocols are mixed" in text
+    assert "protocol longlrm. PSNR: mean" in text
+    assert "protocol default. PSNR: of all pixels" in text
+    assert "runs of several are mixed: 0123456: Net\\*, Off, Open †; 789abcd+12: Net\\*" in text
+    assert "are mixed, name one with data.root=... in overrides: DL3DV; DL3DV-small" in text
 
 
 def test_overview_has_a_line_a_table(table, ratios):

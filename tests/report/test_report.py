@@ -20,6 +20,17 @@ def test_writes_markdown_and_a_page(repository, tmp_path):
     assert "18.78" in (tmp_path / "report" / "report.md").read_text()
 
 
+def test_words_of_the_sweeps_reach_the_configuration(repository, tmp_path):
+    words = ["table=layers", "data=dl3dv", "scale=paper", "data.root=/a/DL3DV", f"logs={tmp_path}"]
+    result = run(repository, *words, 'overrides=["steps=7"]')
+    assert result.returncode == 0, result.stderr
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "dl3dv data, 32 input views of 256x256, 7 steps of batch 8" in text
+    command = "python train.py sweeps=layers data=dl3dv scale=paper data.root=/a/DL3DV steps=7"
+    assert f"`{command}`" in text
+    assert "protocol longlrm" in text
+
+
 def test_an_unknown_table_lists_the_nearest(repository, tmp_path):
     result = run(repository, "table=layer", f"logs={tmp_path}")
     assert result.returncode != 0

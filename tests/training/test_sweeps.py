@@ -6,6 +6,9 @@ import subprocess
 import time
 
 import pytest
+from hydra import compose, initialize_config_dir
+
+from asysplat.training.runs import describe_run
 
 SWEEP = ["sweeps=layers", "model=asysplat_7m1s", "model.layers=1m1s", "steps=1"]
 
@@ -40,6 +43,30 @@ def test_an_interrupted_sweep_runs_only_what_is_missing(train, repository, tmp_p
     other = train(*SWEEP, "seed=2", "training.learning_rate=1e-4")
     assert "finished already" not in other.stdout
     assert finished_seeds(tmp_path) == [0, 1, 2, 2]
+
+
+def test_what_another_revision_finished_is_told_and_run_again_where_asked(
+    train, repository, monkeypatch, tmp_path
+):
+    monkeypatch.chdir(repository)  # sweeps/ is looked for there
+    words = [*train.command[2:], *SWEEP]
+    for seed, changes in enumerate(({"run/revision": "0123456789ab"}, {})):
+        with initialize_config_dir(str(repository / "conf"), version_base=None):
+            config = compose("train", [*words, f"seed={seed}"])
+        (tmp_path / str(seed)).mkdir()
+        described = json.dumps(describe_run(config) | changes)
+        (tmp_path / str(seed) / "metrics.json").write_text(described)
+
+    result = train(*SWEEP, "seed=0,1")
+    told = [line for line in result.stdout.splitlines() if "finished already" in line]
+    assert told[0].startswith("job 0: finished already by 0123456789ab, while this is")
+    assert told[1:] == ["job 1: finished already"]
+    assert f"run: {tmp_path / '0'}" in result.stdout
+    assert finished_seeds(tmp_path) == [0, 1]
+
+    result = train(*SWEEP, "seed=0,1", "rerun=true")
+    assert result.stdout.count("finished already") == 1
+    assert finished_seeds(tmp_path) == [0, 0, 1]
 
 
 def test_a_failure_is_named_and_the_others_go_on(train, tmp_path):

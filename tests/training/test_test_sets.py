@@ -2,6 +2,7 @@
 
 import csv
 import warnings
+from pathlib import Path
 
 import lightning
 import pytest
@@ -9,7 +10,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from asysplat.training.callbacks import Metrics, Pictures
+from asysplat.training.callbacks import Costs, Metrics, Pictures
 from asysplat.training.callbacks.metrics import gather
 from asysplat.training.summary import print_summary
 
@@ -18,6 +19,9 @@ TINY = [
     *("data.height=32", "data.width=32", "data.inputs=3", "data.targets=2", "data.workers=0"),
     *("data.num_frames=24", "data.window=[12,24]", "data.val_scenes=1", "data.test_scenes=1"),
 ]
+
+
+measured_costs: dict[Path, dict] = {}  # by the folder of a run
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +37,12 @@ def measure(repository, tmp_path_factory):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             metrics = Metrics(instantiate(config.metrics), str(folder), weights=str(folder))
+            costs = Costs()
+            measured_costs[folder] = costs.values
             trainer = lightning.Trainer(
                 accelerator="cpu",
                 logger=False,
-                callbacks=[metrics, Pictures(str(folder), scenes=2)],
+                callbacks=[metrics, costs, Pictures(str(folder), scenes=2)],
                 enable_progress_bar=False,
                 enable_model_summary=False,
             )
@@ -46,19 +52,24 @@ def measure(repository, tmp_path_factory):
     return run
 
 
-MORE_VIEWS = "+data.test_sets.more_views={inputs: 5, test_scenes: 2}"
+MORE_SETS = [
+    "+data.test_sets.more_views={inputs: 5, test_scenes: 2}",
+    "+data.test_sets.wide={width: 64}",
+]
 
 
 @pytest.fixture(scope="module")
 def together(measure):
-    return measure(MORE_VIEWS)
+    return measure(*MORE_SETS)
 
 
+KINDS = ("inference_seconds", "inference_gb")
 ALONE = {
     "procedural": [],
     "rooms": ["data.places=rooms"],
     "outdoors": ["data.places=outdoors"],
     "more_views": ["data.inputs=5", "data.test_scenes=2"],
+    "wide": ["data.width=64"],
 }
 
 
@@ -79,9 +90,18 @@ def test_every_image_is_a_row_that_names_its_set(together):
         rows = list(csv.DictReader(file))
     assert next(iter(rows[0])) == "set"
     counts = {name: sum(row["set"] == name for row in rows) for name in ALONE}
-    assert counts == {"procedural": 2, "rooms": 2, "outdoors": 2, "more_views": 4}
+    assert counts == {"procedural": 2, "rooms": 2, "outdoors": 2, "more_views": 4, "wide": 2}
     values = [float(row["psnr"]) for row in rows if row["set"] == "rooms"]
     assert abs(sum(values) / 2 - results["test/rooms/psnr"]) < 1e-4
+
+
+def test_a_set_has_costs_of_its_own(together):
+    """Those of another set, of more or larger views, are no part of them."""
+    costs = measured_costs[together[1]]
+    prefixes = ["cost", *(f"cost/{name}" for name in ALONE if name != "procedural")]
+    keys = {f"{prefix}/{kind}" for prefix in prefixes for kind in KINDS}
+    assert set(costs) == keys and all(value > 0 for value in costs.values())
+    assert len({costs[f"{prefix}/inference_seconds"] for prefix in prefixes}) == len(prefixes)
 
 
 def test_only_the_main_set_is_drawn(measure, together):

@@ -1,0 +1,139 @@
+"""What every sweep composes on the paper's data, against what the paper says of its tables."""
+
+from itertools import product
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from asysplat.errors import InputError
+from asysplat.report.paper import load_paper
+from asysplat.words import check_words
+
+ROOT = Path(__file__).parents[2]
+PLACES = ["data.root=train", "data.test_root=test"]
+
+# Suppl. A, "Evaluation settings": k-means everywhere, the first 96 frames in the ablations, both on
+# DL3DV; Sec. 4.1: which sets are tested. LongLRM's protocol, but for Table 5, where pixelSplat's
+# line of work is compared with. Tables 2 and 3 are of the same models, and so are those of the
+# ablations: each model is tested once on the sets of all of them.
+ZERO_SHOT = {"tanks_and_temples", "mipnerf360", "deep_blending", "replica"}
+DEPTHS = {"mipnerf360", "scannetpp"}
+PAPER = {
+    "training_overhead": ("longlrm", "kmeans", set()),
+    "state_of_the_art": ("longlrm", "kmeans", ZERO_SHOT),
+    "replica": ("longlrm", "kmeans", ZERO_SHOT),
+    "inference_overhead": ("longlrm", "kmeans", set()),
+    "two_views": ("pixelsplat", "kmeans", set()),
+    "architecture": ("longlrm", "first_96", DEPTHS),
+    "layers": ("longlrm", "first_96", DEPTHS),
+    "asymmetry": ("longlrm", "first_96", DEPTHS),
+    "matched_parameters": ("longlrm", "first_96", DEPTHS),
+    "more_views": ("longlrm", "kmeans", {"more_views"}),
+    "mamba_ratio": ("longlrm", "first_96", DEPTHS),
+    "geometry_ratio": ("longlrm", "first_96", DEPTHS),
+}
+HOW = {
+    "tanks_and_temples": ("colmap", "kmeans"),
+    "mipnerf360": ("colmap", "kmeans"),
+    "deep_blending": ("colmap", "kmeans"),
+    "replica": ("replica", "kmeans"),
+    "scannetpp": ("scannetpp", "kmeans"),
+}
+
+
+@pytest.fixture(autouse=True)
+def in_the_root(monkeypatch):
+    monkeypatch.chdir(ROOT)  # sweeps/ is looked for there
+
+
+@pytest.fixture
+def compose_train():
+    def run(*words):
+        return compose("train", list(words), return_hydra_config=True)
+
+    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
+        yield run
+
+
+def test_every_table_is_listed():
+    assert set(PAPER) == set(load_paper())
+
+
+@pytest.mark.parametrize("sweep", PAPER)
+def test_every_row_on_dl3dv(compose_train, sweep):
+    metrics, selection, test_sets = PAPER[sweep]
+    for row in load_paper()[sweep].rows:
+        if row.quoted:
+            continue
+        config = compose_train(f"sweeps={sweep}", "scale=paper", "data=dl3dv", *PLACES, *row.run)
+        assert config.metrics.name == metrics
+        assert config.data.selection == selection
+        assert config.data.inputs == (2 if sweep == "two_views" else 32)
+        assert set(config.data.test_sets) == test_sets
+        for name in test_sets - {"more_views"}:
+            how = config.data.test_sets[name]
+            assert (how.layout, how.selection, how.root) == (*HOW[name], None)
+    if "replica" in test_sets:
+        how = config.data.test_sets.replica
+        assert [how.height, how.width] == list(load_paper()["replica"].rows[0].size)
+    if "more_views" in test_sets:
+        assert config.data.test_sets.more_views.inputs == 64
+
+
+@pytest.mark.parametrize("sweep", PAPER)
+def test_every_set_that_a_table_prints_is_tested(sweep):
+    _, _, test_sets = PAPER[sweep]
+    first, *others = load_paper()[sweep].test_sets or [None]
+    assert set(others) <= test_sets
+    assert first in {None, "dl3dv", "realestate10k"} | test_sets
+
+
+def test_table_5_takes_the_frames_of_an_index(compose_train):
+    words = ["sweeps=two_views", "scale=paper", "data=realestate10k", *PLACES]
+    config = compose_train(*words, "data.index=index.json")
+    assert (config.metrics.name, config.data.inputs) == ("pixelsplat", 2)
+    assert (config.data.selection, config.data.index) == ("index", "index.json")
+    assert (config.data.height, config.data.width) == (256, 256)
+    assert compose_train("data=realestate10k", *PLACES).data.selection == "every_8th"
+
+
+@pytest.mark.parametrize("data", ["dl3dv", "realestate10k"])
+def test_data_with_scenes_to_test_asks_for_them(compose_train, data):
+    config = compose_train(f"data={data}", "data.root=train", "paths.run=here")
+    task = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    assert OmegaConf.missing_keys(task) == {"data.test_root"}
+
+
+def test_a_set_has_the_path_that_is_given(compose_train):
+    config = compose_train("sweeps=layers", "data=dl3dv", *PLACES, "paths.mipnerf360=elsewhere")
+    assert config.data.test_sets.mipnerf360.root == "elsewhere"
+    assert config.data.test_sets.scannetpp.root is None
+
+
+def test_the_command_for_a_cluster(compose_train):
+    """As the README has it, and every one of its jobs."""
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    readme = (ROOT / "README.md").read_text().splitlines()
+    (line,) = (line for line in readme if "hydra/launcher=submitit_slurm" in line)
+    words = line.split("#")[0].removeprefix("python train.py ").split()
+    config = compose_train(*words)
+    assert config.hydra.runtime.choices["hydra/launcher"] == "submitit_slurm"
+    assert config.hydra.mode.name == "MULTIRUN"
+    varied = config.hydra.sweeper.params
+    jobs = list(product(*(str(values).split(",") for values in varied.values())))
+    assert len(jobs) == 3 * 6
+    for job in jobs:
+        chosen = [f"{word}={value}" for word, value in zip(varied, job, strict=True)]
+        row = compose_train(*words, *chosen)
+        assert (row.data.name, row.metrics.name, row.data.inputs) == ("dl3dv", "longlrm", 32)
+        assert (row.data.height, row.data.width, row.steps) == (256, 256, 10000)
+        assert row.data.selection == "first_96" and f"seed={row.seed}" in chosen
+        assert f"model={row.hydra.runtime.choices.model}" in chosen
+
+
+def test_a_test_set_that_is_none_is_named():
+    check_words(["test_sets=[mipnerf360,replica]", "test_sets=[]"])
+    with pytest.raises(InputError, match=r"test_sets=mipnerf is unknown: did you mean mipnerf360"):
+        check_words(["test_sets=[replica,mipnerf]"])

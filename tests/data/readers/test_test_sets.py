@@ -1,0 +1,74 @@
+"""The paper's test sets as sweeps name them, from tiny scenes as their publishers lay them out."""
+
+import json
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from layouts import colmap, dl3dv, realestate10k, replica, scannetpp
+
+TINY = ["data.inputs=4", "data.targets=2", "data.window=[8,12]", "data.val_scenes=1"]
+TINY += ["data.height=16", "data.width=16", "data.cache.folder=null", "data.workers=0"]
+
+
+@pytest.fixture(scope="module")
+def published(views, tmp_path_factory):
+    """Words that say where each data set is."""
+    root = tmp_path_factory.mktemp("published")
+    for letter in "abc":
+        dl3dv.write_scene(views, root / "DL3DV" / "1K" / (letter * 64))
+    dl3dv.write_benchmark(views, root / "Benchmark")
+    replica.write(views, root / "Replica")
+    scannetpp.write(views, root / "scannetpp")
+    realestate10k.write(views, root / "re10k")
+    index = {realestate10k.KEY: {"context": [1, 9], "target": [3, 5, 7]}}
+    (root / "index.json").write_text(json.dumps(index))
+    places = {"replica": "Replica", "scannetpp": "scannetpp", "realestate10k": "re10k"}
+    places["realestate10k_index"] = "index.json"
+    for name in ("tanks_and_temples", "mipnerf360", "deep_blending"):
+        colmap.write(views, root / name / "place")
+        places[name] = name
+    words = [f"paths.{name}={root / place}" for name, place in places.items()]
+    return [f"data.root={root / 'DL3DV'}", f"data.test_root={root / 'Benchmark'}", *words]
+
+
+@pytest.fixture
+def tests_of(repository, monkeypatch, published):
+    """Name -> its first scene, as a command's words have them."""
+    monkeypatch.chdir(repository)  # sweeps/ is looked for there
+
+    def make(*words):
+        with initialize_config_dir(str(repository / "conf"), version_base=None):
+            config = compose("train", ["data=dl3dv", *TINY, *published, *words])
+        data = instantiate(config.data)
+        data.setup()
+        return {name: tasks[0] for name, tasks in data.tests.items()}
+
+    return make
+
+
+def counts(sample):
+    return sample["inputs"].num_views, sample["targets"].num_views
+
+
+def test_the_zero_shot_sets_of_tables_2_and_3(tests_of):
+    tests = tests_of("sweeps=state_of_the_art", "replica_size.height=16", "replica_size.width=22")
+    assert list(tests) == ["dl3dv", "tanks_and_temples", "mipnerf360", "deep_blending", "replica"]
+    assert tests["dl3dv"]["scene"] == dl3dv.HASH
+    for name, sample in tests.items():
+        assert counts(sample) == (4, 2)  # every 8th of twelve is a target
+        size = (16, 22) if name == "replica" else (16, 16)
+        assert sample["targets"].images.shape[-2:] == size
+        assert (sample["targets"].cameras.height, sample["targets"].cameras.width) == size
+    assert tests["replica"]["targets"].depths.shape[-2:] == (16, 22)
+
+
+def test_the_depths_of_table_a2(tests_of):
+    tests = tests_of("sweeps=mamba_ratio")
+    assert list(tests) == ["dl3dv", "mipnerf360", "scannetpp"]
+    assert (tests["scannetpp"]["targets"].depths > 0).any()
+
+
+def test_the_index_of_table_5(tests_of):
+    tests = tests_of("sweeps=two_views", "test_sets=[realestate10k]", "data.inputs=3")
+    assert counts(tests["realestate10k"]) == (2, 3) and counts(tests["dl3dv"]) == (3, 2)

@@ -1,0 +1,163 @@
+"""Which finished run a configuration is: what makes another of it, and what does not."""
+
+import json
+import subprocess
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from asysplat.training import revision as revisions
+from asysplat.training.runs import data_of, describe_run, find_run, find_runs, identity
+
+DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
+
+
+@pytest.fixture
+def composed(repository, monkeypatch):
+    monkeypatch.chdir(repository)  # sweeps/ is looked for there
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        yield lambda *words: compose("train", list(words))
+
+
+@pytest.fixture
+def write_run(tmp_path):
+    def write(name, config, **changes):
+        folder = tmp_path / name
+        folder.mkdir()
+        described = {key.replace("__", "/"): value for key, value in changes.items()}
+        (folder / "metrics.json").write_text(json.dumps(describe_run(config) | described))
+        return folder
+
+    return write
+
+
+SAME = {
+    "moved data": ["data.root=/b/DL3DV", "data.test_root=/b/c/Benchmark/"],
+    "another cache": ["data.cache.folder=/b/cache", "data.cache.memory_gb=2"],
+    "moved weights": ["paths.weights=/b/weights", "training.loss.weights=/c"],
+    "another test set": ["test_sets=[mipnerf360]", "paths.mipnerf360=/b/360_v2"],
+    "other names": ["name=other", "paths.logs=/b/logs", "rerun=true"],
+    "other processes": ["data.workers=3", "callbacks.pictures.scenes=0"],
+    "another seed": ["seed=5"],
+    "size of a test that is not made": ["replica_size.width=96"],
+}
+OTHER = {
+    "selection": ["data.selection=uniform"],
+    "targets": ["data.targets=3"],
+    "size": ["data.height=96"],
+    "model": ["model=asysplat_7m1t"],
+    "steps": ["steps=241"],
+    "metrics": ["metrics=longlrm"],
+    "weights to start from": ["init_path=/b/last.ckpt"],
+    "frames instead of scenes": ["data.test_root=null"],
+}
+
+
+@pytest.mark.parametrize("case", SAME)
+def test_what_changes_no_number_makes_no_other_run(composed, case):
+    plain, changed = composed(*DL3DV), composed(*DL3DV, *SAME[case])
+    assert identity(changed) == identity(plain)
+    places = {key: value for key, value in data_of(changed).items() if "test_sets" not in key}
+    assert places == data_of(plain)
+
+
+@pytest.mark.parametrize("case", OTHER)
+def test_what_changes_numbers_makes_another_run(composed, case):
+    assert identity(composed(*DL3DV, *OTHER[case])) != identity(composed(*DL3DV))
+
+
+def test_paths_may_be_left_out(composed):
+    assert identity(composed("data=dl3dv")) == identity(composed(*DL3DV))
+    assert data_of(composed("data=dl3dv")) == {}
+    assert data_of(composed(*DL3DV)) == {
+        "run/data/root": "DL3DV",
+        "run/data/test_root": "Benchmark",
+    }
+
+
+def test_other_data_makes_another_run(composed, write_run, tmp_path):
+    words = ["data=files", "data.root=/a/garden"]
+    folder = write_run("one", composed(*words))
+    assert find_run(tmp_path, composed(*words)).folder == folder
+    assert find_run(tmp_path, composed("data=files", "data.root=/b/garden")).folder == folder
+    assert find_run(tmp_path, composed("data=files", "data.root=/a/bicycle")) is None
+
+
+@pytest.mark.parametrize("option", ["data.index", "init_path"])
+def test_a_file_is_what_it_holds(composed, write_run, tmp_path, option):
+    paths = [tmp_path / f"{number}.json" for number in range(3)]
+    for path, text in zip(paths, ("[1]", "[1]", "[2]"), strict=True):
+        path.write_text(text)
+    words = ["data=realestate10k", "data.root=/a/train", "data.test_root=/a/test"]
+    words += ["data.selection=index"] * (option == "data.index")
+    first, moved, other = (composed(*words, f"{option}={path}") for path in paths)
+    write_run("run", first)
+    assert find_run(tmp_path, moved) is not None
+    assert find_run(tmp_path, other) is None
+
+
+def test_a_run_that_was_tested_on_more_serves_less(composed, write_run, tmp_path):
+    tested = [*DL3DV, "test_sets=[mipnerf360,replica]", "paths.replica=/a/Replica"]
+    folder = write_run("run", composed(*tested))
+    assert find_run(tmp_path, composed(*DL3DV)).folder == folder
+    assert find_run(tmp_path, composed(*tested)).folder == folder
+    assert find_run(tmp_path, composed(*tested, "paths.mipnerf360=/a/360_v2")) is None
+    width = "data.test_sets.replica.width=128"
+    assert find_run(tmp_path, composed(*tested, width)) is None
+    assert find_run(tmp_path, composed(*tested, "replica_size.width=128")) is None
+
+
+def test_the_run_of_this_revision_comes_first(composed, write_run, tmp_path):
+    config = composed()
+    write_run("a", config)
+    write_run("b", config, run__revision="0123456")
+    assert [run.folder.name for run in find_runs(tmp_path)] == ["a", "b"]
+    assert find_run(tmp_path, config).folder.name == "a"
+    write_run("c", config)
+    assert find_run(tmp_path, config).folder.name == "c"
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A repository with one commit, in the place of this one."""
+
+    def git(*words):
+        name = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        subprocess.run(["git", *name, *words], cwd=tmp_path, check=True, capture_output=True)
+
+    git("init")
+    (tmp_path / "train.py").write_text("1")
+    (tmp_path / "README.md").write_text("1")
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf" / "train.yaml").write_text("steps: 1")
+    git("add", ".")
+    git("commit", "-m", "first")
+    monkeypatch.setattr(revisions, "ROOT", tmp_path)
+    return tmp_path
+
+
+def fresh() -> str:
+    revisions.revision.cache_clear()
+    found = revisions.revision()
+    revisions.revision.cache_clear()
+    return found
+
+
+def test_a_revision_is_a_commit_and_its_changes(checkout):
+    commit = fresh()
+    assert len(commit) == 12 and "+" not in commit
+    (checkout / "README.md").write_text("2")
+    assert fresh() == commit
+    (checkout / "train.py").write_text("2")
+    changed = fresh()
+    assert changed.startswith(f"{commit}+")
+    (checkout / "train.py").write_text("3")
+    assert fresh().startswith(f"{commit}+") and fresh() != changed
+    (checkout / "train.py").write_text("1")
+    assert fresh() == commit
+
+
+def test_without_a_repository_of_its_own_a_package_has_a_version(checkout, monkeypatch):
+    (checkout / "site-packages").mkdir()
+    monkeypatch.setattr(revisions, "ROOT", checkout / "site-packages")
+    assert fresh() in (f"version {revisions.version('asysplat')}", "unknown")
