@@ -6,7 +6,7 @@ from typing import Any
 
 import lightning
 import numpy as np
-from torch.utils.data import DataLoader, Dataset, Subset
+from torch.utils.data import DataLoader, Dataset, DistributedSampler, Subset
 
 from asysplat.data.augment import Augmentation, cropped
 from asysplat.data.normalise import normalise
@@ -97,10 +97,18 @@ class SceneDataModule(lightning.LightningDataModule):
         return self.tasks(self.trainer.current_epoch * per_epoch, per_epoch)
 
     def tasks(self, start: int, count: int) -> DataLoader:
-        """Batches of training tasks `start` to `start + count`."""
+        """Batches of training tasks `start` to `start + count`; processes that train together take
+        turns at them, so that their steps are those of one process with larger batches."""
+        tasks, sampler = Subset(TrainingTasks(self), range(start, start + count)), None
+        if self.trainer is not None and self.trainer.world_size > 1:
+            # Lightning's own would shuffle them.
+            sampler = DistributedSampler(
+                tasks, self.trainer.world_size, self.trainer.global_rank, shuffle=False
+            )
         return DataLoader(
-            Subset(TrainingTasks(self), range(start, start + count)),
+            tasks,
             batch_size=self.batch_size,
+            sampler=sampler,
             num_workers=self.workers,
             collate_fn=collate,
             prefetch_factor=4 if self.workers else None,

@@ -44,8 +44,8 @@ class Reconstruction(lightning.LightningModule):
         checkpoint_layers: bool = False,
     ):
         super().__init__()
-        net.checkpoint_layers(checkpoint_layers)
         freeze_unread(net)
+        net.checkpoint_layers(checkpoint_layers)
         self.net, self.loss = net, loss
         self.learning_rate, self.weight_decay, self.betas = learning_rate, weight_decay, betas
         self.warmup_steps, self.total_steps = warmup_steps, total_steps

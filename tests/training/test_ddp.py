@@ -135,3 +135,22 @@ def test_two_processes_take_the_step_of_one(results, model):
         worst = max(result["errors"], key=result["errors"].get)
         assert result["errors"][worst] < 1e-3, worst
         assert result["same"] and result["finite"]
+
+
+def first_moments(train, *overrides):
+    """Of AdamW after a run's last step: means of its gradients."""
+    batches = ["model=asysplat_pred_fine", "model.layers=1m1t", "training.loss.depth=0"]
+    result = train(*batches, *overrides)
+    assert result.returncode == 0, result.stderr
+    (line,) = [line for line in result.stdout.splitlines() if line.startswith("run: ")]
+    path = Path(line.removeprefix("run: ")) / "checkpoints" / "last.ckpt"
+    states = torch.load(path, weights_only=True)["optimizer_states"][0]["state"]
+    return torch.cat([states[key]["exp_avg"].flatten() for key in sorted(states)])
+
+
+def test_the_script_with_two_devices(train):
+    """The run of one process on batches as large as theirs together."""
+    two = first_moments(train, "name=two", "trainer.devices=2", "data.batch_size=1")
+    one = first_moments(train, "name=one", "trainer.devices=1", "data.batch_size=2")
+    other = first_moments(train, "name=other", "trainer.devices=1", "data.batch_size=1")
+    assert (two - one).norm() < 1e-4 * one.norm() < 1e-3 * (other - one).norm()
