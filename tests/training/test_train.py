@@ -92,6 +92,8 @@ def test_a_protocol_by_name(train, shared):
     for name in ("psnr", "ssim", "lpips", "absrel", "delta1"):
         assert math.isfinite(numbers[f"test/procedural/{name}"])
         assert "over scenes" in numbers[f"protocol/{name}"]
+
+
 LEFT_OUT = [
     ["~callbacks.metrics", "~callbacks.guard", "callbacks.pictures=null"],
     ["~callbacks.costs", "~callbacks.curve", "~callbacks.checkpoints", "~callbacks.progress"],
