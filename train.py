@@ -89,6 +89,7 @@ def train(config: DictConfig) -> float | None:
     data.setup()
     net = instantiate(config.model)
     data.check_sizes(net.check_size)
+    data.check_sizes(instantiate(config.metrics).check_size)
     module = instantiate(config.training, net=net)
     check_checkpoint(checkpoint, module)
     load_weights(config.init_path, module)

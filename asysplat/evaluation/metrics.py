@@ -51,12 +51,8 @@ def ssim(
         InputError: an image is smaller than the window.
     """
     height, width = rendered.shape[-2:]
+    check_ssim_size(height, width, window)
     size = SSIM_WINDOWS[window]
-    if min(height, width) < size:
-        raise InputError(
-            f"SSIM needs images of at least {size}x{size} pixels, these have {height}x{width}: "
-            "raise the resolution."
-        )
     # Variances times n / (n - 1) throughout are the same as their constant, k2 squared, over it.
     k2 = SSIM_K2 if covariance == "biased" else SSIM_K2 * math.sqrt(1 - 1 / size**2)
     with without_autocast(rendered):
@@ -75,6 +71,16 @@ def ssim(
     border = size // 2
     inside = similarity[..., border : height - border, border : width - border]
     return inside.mean((-3, -2, -1)).reshape(rendered.shape[:-3])
+
+
+def check_ssim_size(height: int, width: int, window: Window) -> None:
+    """Raise InputError for images smaller than the window."""
+    size = SSIM_WINDOWS[window]
+    if min(height, width) < size:
+        raise InputError(
+            f"SSIM needs images of at least {size}x{size} pixels, these have {height}x{width}: "
+            "raise data.height and data.width."
+        )
 
 
 def abs_rel(depth: Depths, target_depth: Depths, alignment: Alignment = "none") -> PerView:

@@ -17,6 +17,7 @@ from asysplat.evaluation.metrics import (
     PerView,
     Window,
     abs_rel,
+    check_ssim_size,
     delta1,
     psnr,
     ssim,
@@ -62,6 +63,10 @@ class Protocol:
                 raise InputError(
                     f"metrics.{field.name} is {value!r}: choose {' or '.join(map(str, choices))}."
                 )
+
+    def check_size(self, height: int, width: int) -> None:
+        """Raise InputError for images that cannot be measured."""
+        check_ssim_size(height, width, self.ssim_window)
 
     def psnr(self, rendered: Images, targets: Views) -> PerView:
         """PSNR of each image in dB."""

@@ -7,6 +7,7 @@ from typing import Any
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from asysplat.errors import InputError
 from asysplat.training.disparity import InputDisparity, RenderedDisparity
 from asysplat.training.outcome import Outcome
 from asysplat.training.perceptual import PerceptualDistance, vgg16
@@ -20,6 +21,9 @@ class ReconstructionLoss(nn.Module):
             also off where its network is not on this machine, the depth term where the data has no
             depths: either is said once.
         perceptual_term, depth_term: components, built where their weight is not 0.
+
+    Raises:
+        InputError: no term is on.
     """
 
     def __init__(
@@ -36,6 +40,11 @@ class ReconstructionLoss(nn.Module):
         # In a list, so that the frozen network stays out of the checkpoints.
         self._perceptual_term = [] if distance is None else [distance]
         self._depth_term = depth_term() if depth else None
+        if not (mse or self._perceptual_term or depth):
+            raise InputError(
+                "training.loss has no term that is on: give mse, perceptual or depth a weight "
+                "above 0, and for perceptual alone its network (paths.download=true fetches it)."
+            )
         self._said_no_depth = False
 
     @property

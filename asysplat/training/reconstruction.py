@@ -66,7 +66,8 @@ class Reconstruction(lightning.LightningModule):
         size = len(batch["scene"])
         self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
         self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])
-        quality = psnr(outcome.rendering.image.detach(), batch["targets"].images).mean()
+        targets = batch["targets"]
+        quality = psnr(targets.masked(outcome.rendering.image.detach()), targets.images).mean()
         self.log("train/psnr", quality, prog_bar=True, batch_size=size)
         return terms["loss"]
 

@@ -228,6 +228,14 @@ REFUSED = {
     ),
     "no weights to start from": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
     "a size that the patches do not take": (["data.height=40"], "set 48x32"),
+    "images too small to measure": (
+        ["data.height=4", "data.width=4", "model.patch_coarse=4", "model.patch_fine=2"],
+        "SSIM needs images of at least 11x11 pixels, these have 4x4",
+    ),
+    "a loss of nothing": (
+        ["training.loss.mse=0", "training.loss.perceptual=0", "training.loss.depth=0"],
+        "training.loss has no term that is on",
+    ),
     "an unusable layer mix": (["model.layers=4q"], "such as 4m4s"),
     "a ratio out of reach": (["geometry_ratio=1.5"], "geometry_ratio=1.5: give a share"),
     "a missing folder": (["data=transforms", "data.root=nowhere"], "data.root=nowhere"),
