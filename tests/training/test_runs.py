@@ -34,7 +34,7 @@ def write_run(tmp_path):
 SAME = {
     "moved data": ["data.root=/b/DL3DV", "data.test_root=/b/c/Benchmark/"],
     "another cache": ["data.cache.folder=/b/cache", "data.cache.memory_gb=2"],
-    "moved weights": ["paths.weights=/b/weights", "training.loss.weights=/c"],
+    "moved weights": ["paths.weights=/b/weights", "training.loss.perceptual_term.weights=/c"],
     "another test set": ["test_sets=[mipnerf360]", "paths.mipnerf360=/b/360_v2"],
     "other names": ["name=other", "paths.logs=/b/logs", "rerun=true"],
     "other processes": ["data.workers=3", "callbacks.pictures.scenes=0"],

@@ -42,7 +42,7 @@ def measure(repository, tmp_path_factory):
             trainer = lightning.Trainer(
                 accelerator="cpu",
                 logger=False,
-                callbacks=[metrics, costs, Pictures(str(folder), scenes=2)],
+                callbacks=[costs, metrics, Pictures(str(folder), scenes=2)],
                 enable_progress_bar=False,
                 enable_model_summary=False,
             )
@@ -63,7 +63,7 @@ def together(measure):
     return measure(*MORE_SETS)
 
 
-KINDS = ("inference_seconds", "inference_gb")
+KINDS = ("inference_seconds", "inference_gb", "render_seconds", "render_gb")
 ALONE = {
     "procedural": [],
     "rooms": ["data.places=rooms"],
