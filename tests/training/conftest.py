@@ -22,15 +22,19 @@ def train(tmp_path, repository, monkeypatch):
     """Runs train.py with overrides; logs go below tmp_path."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
 
-    def run(*overrides):
+    def words(*overrides):
         made_up = not any(word.startswith("data=") for word in overrides)
         scenes = TINY_SCENES if made_up else []
-        command = [sys.executable, "train.py", *overrides, f"paths.logs={tmp_path}", *scenes]
-        command += [word for word in TINY if word.split("=")[0] not in str(overrides)]
+        tiny = [word for word in TINY if word.split("=")[0] not in str(overrides)]
+        return [*overrides, f"paths.logs={tmp_path}", *scenes, *tiny]
+
+    def run(*overrides):
+        command = [sys.executable, "train.py", *words(*overrides)]
         return subprocess.run(
             command, cwd=repository, env=environment, capture_output=True, text=True
         )
 
+    run.words = words
     run.command = [sys.executable, "train.py", f"paths.logs={tmp_path}", *TINY, *TINY_SCENES]
     run.environment = environment
     return run

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import json
 import math
+import runpy
 import signal
 import subprocess
 import time
@@ -12,7 +13,10 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from hydra import compose, initialize_config_dir
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from asysplat.errors import input_error_behind
 
 
 def run_folder(result: subprocess.CompletedProcess) -> Path:
@@ -245,13 +249,44 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
+# As a user meets them; two of them only there: these types are checked first in tests.
+IN_THE_SCRIPT = (
+    "an unknown option",
+    "one of a sweep",
+    "a missing folder",
+    "an unknown setting of a protocol",
+    "a loss of nothing",
+)
+
+
+@pytest.mark.parametrize("case", IN_THE_SCRIPT)
 def test_mistakes_are_one_clear_sentence(train, case, tmp_path):
     overrides, words = REFUSED[case]
     result = train(*overrides)
     assert result.returncode != 0
     assert words in result.stderr
     assert "Traceback" not in result.stderr
+    assert not list(tmp_path.rglob("checkpoints"))
+
+
+@pytest.fixture(scope="module")
+def script(repository):
+    """The names of train.py, whose imports take longer than a refusal."""
+    return runpy.run_path(str(repository / "train.py"))
+
+
+@pytest.mark.parametrize("case", sorted(REFUSED.keys() - set(IN_THE_SCRIPT)))
+def test_mistakes_are_refused_before_work_starts(
+    train, script, repository, case, tmp_path, monkeypatch
+):
+    overrides, words = REFUSED[case]
+    monkeypatch.chdir(repository)
+    given = [f"paths.run={tmp_path}", *train.words(*overrides)]
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        config = compose("train", given)
+    with pytest.raises(Exception) as raised:
+        script["train"](config)
+    assert words in f"error: {input_error_behind(raised.value)}\n"
     assert not list(tmp_path.rglob("checkpoints"))
 
 
