@@ -38,11 +38,6 @@ def first_rows(config) -> list[str]:
     return [f"{k}={str(v).split(',')[0]}" for k, v in config.hydra.sweeper.params.items()]
 
 
-@pytest.fixture(autouse=True)
-def in_the_root(monkeypatch):
-    monkeypatch.chdir(ROOT)  # sweeps/ is looked for there
-
-
 @pytest.mark.parametrize("group", sorted(set(GROUPS) - PARTS), ids="/".join)
 def test_composes_and_builds_its_model(group):
     config = compose_train("=".join(group))

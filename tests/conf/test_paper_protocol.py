@@ -43,11 +43,6 @@ HOW = {
 }
 
 
-@pytest.fixture(autouse=True)
-def in_the_root(monkeypatch):
-    monkeypatch.chdir(ROOT)  # sweeps/ is looked for there
-
-
 @pytest.fixture
 def compose_train():
     def run(*words):

@@ -17,8 +17,7 @@ WORDS = ["steps=7"]
 
 
 @pytest.fixture
-def compose(repository, monkeypatch):
-    monkeypatch.chdir(repository)  # sweeps/ is looked for there
+def compose(repository):
     with initialize_config_dir(str(repository / "conf"), version_base=None):
         yield compose_train
 

@@ -13,8 +13,7 @@ DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
 
 
 @pytest.fixture
-def composed(repository, monkeypatch):
-    monkeypatch.chdir(repository)  # sweeps/ is looked for there
+def composed(repository):
     with initialize_config_dir(str(repository / "conf"), version_base=None):
         yield lambda *words: compose("train", list(words))
 

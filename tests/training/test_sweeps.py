@@ -46,9 +46,8 @@ def test_an_interrupted_sweep_runs_only_what_is_missing(train, repository, tmp_p
 
 
 def test_what_another_revision_finished_is_told_and_run_again_where_asked(
-    train, repository, monkeypatch, tmp_path
+    train, repository, tmp_path
 ):
-    monkeypatch.chdir(repository)  # sweeps/ is looked for there
     words = [*train.command[2:], *SWEEP]
     for seed, changes in enumerate(({"run/revision": "0123456789ab"}, {})):
         with initialize_config_dir(str(repository / "conf"), version_base=None):

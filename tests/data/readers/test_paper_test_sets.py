@@ -33,9 +33,8 @@ def published(views, tmp_path_factory):
 
 
 @pytest.fixture
-def tests_of(repository, monkeypatch, published):
+def tests_of(repository, published):
     """Name -> its first scene, as a command's words have them."""
-    monkeypatch.chdir(repository)  # sweeps/ is looked for there
 
     def make(*words):
         with initialize_config_dir(str(repository / "conf"), version_base=None):
