@@ -1,0 +1,44 @@
+"""Put a Gaussian on every pixel of three photographs and look at them from between:
+python examples/render_scene.py [picture.png]
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+
+from asysplat import Gaussians, Views, render
+from asysplat.data import ProceduralScene
+from asysplat.evaluation.pictures import comparison
+
+SH_0 = 0.28209479177387814  # the constant SH basis function: colour = 0.5 + SH_0 sh[0]
+
+
+def gaussians_of(views: Views) -> Gaussians:
+    """Make round Gaussians, as wide as a pixel, where the depths say that its surface is."""
+    cameras = views.cameras
+    rotations = cameras.cam_to_world[:, None, None, :3, :3]
+    directions = (rotations @ cameras.pixel_directions()[..., None]).squeeze(-1)
+    means = cameras.centers[:, None, None] + views.depths[..., None] * directions
+    pixel = views.depths / cameras.intrinsics[:, 0, 0, None, None]  # its side there, scene units
+    colours = views.images.movedim(1, -1)
+    num = pixel.numel()
+    return Gaussians(
+        means=means.reshape(num, 3),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1),
+        scales=0.6 * pixel.reshape(num, 1).repeat(1, 3),
+        opacities=torch.full((num,), 0.95),
+        sh=((colours - 0.5) / SH_0).reshape(num, 1, 3),
+    )
+
+
+def main(picture: Path) -> None:
+    scene = ProceduralScene(seed=5, height=128, width=128)
+    inputs, targets = scene.views([0, 12, 24]), scene.views([6, 18])
+    rendering = render(gaussians_of(inputs), targets.cameras)
+    comparison(inputs, targets, rendering).savefig(picture, dpi=120)
+    print(f"{rendering.stats['visible']:,} Gaussians seen; picture: {picture}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "render_scene.png"))
