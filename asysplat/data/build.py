@@ -1,4 +1,4 @@
-"""What `conf/data` names: a source and the data module that draws from it."""
+"""Build what `conf/data` names: a source of tasks, and the data module that draws from it."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +23,10 @@ def procedural_data(
     test_sets: Mapping[str, Any] | None = None,
     **options,
 ) -> SceneDataModule:
-    """Made-up scenes; arguments are those of ProceduralSource and `scene_data`."""
+    """Build a data module of synthetic scenes.
+
+    The arguments are those of ProceduralSource and `scene_data`.
+    """
 
     def source(height: int, width: int, num_frames: int, **others) -> ProceduralSource:
         return ProceduralSource(height, width, num_frames, window, val_scenes, **others)
@@ -50,10 +53,10 @@ def files_data(
     test_sets: Mapping[str, Any] | None = None,
     **options,
 ) -> SceneDataModule:
-    """Scenes on disk; arguments are those of FilesSource and `scene_data`.
+    """Build a data module of scenes on disk.
 
-    A further test set may differ in the root of what it tests, layout, selection, index and size.
-    One whose root is null is left out, with a warning.
+    The arguments are those of FilesSource and `scene_data`. A further test set may have its own
+    root, layout, selection, index and size; one whose root is null is left out, with a warning.
     """
 
     def source(root: str, height: int, width: int, **others) -> FilesSource:
@@ -85,16 +88,18 @@ def scene_data(
     test_sets: Mapping[str, Any] | None = None,
     **options,
 ) -> SceneDataModule:
-    """A data module that is tested on further sets as well.
+    """Build a data module that is tested on further sets as well.
 
     Args:
-        source: of the data set itself.
-        make_source: of a test set, from the options `own`, in which test sets may differ.
+        source: the data set itself.
+        make_source: makes the source of a test set from options like `own`.
+        own: the options in which test sets may differ from the data set, with the data set's
+            values; height and width are among them.
         test_sets: name -> the options that differ: any of `own`, inputs and targets.
-        name, inputs, targets, options: those of SceneDataModule; the size is among `own`.
+        name, inputs, targets, options: those of SceneDataModule.
 
     Raises:
-        InputError: a test set that is called as the data set, or with an unknown option.
+        InputError: a test set with the name of the data set, or with an unknown option.
     """
     main = {"inputs": inputs, "targets": targets, **own}
     sets = {}
@@ -114,14 +119,16 @@ def scene_data(
 
 
 def tested_sets(test_sets: Mapping[str, Any] | None, name: str, on_disk: bool) -> dict[str, Any]:
-    """Of the further test sets of a configuration, those that a run tests.
+    """Choose the further test sets of a configuration that a run tests.
 
-    Of those that have a root of their own, made-up data tests none: made-up scenes stand for them.
-    Data on disk tests those whose root is given, but for one that is called as the data itself.
+    A set without a root of its own is always tested. One with a root is tested only by data on
+    disk, if the root is given and the set has another name than the data; synthetic data tests
+    synthetic scenes alone.
 
     Args:
         test_sets: name -> the options in which it differs from the data set.
-        name, on_disk: of the data set.
+        name: the data set's.
+        on_disk: whether the data set is read from disk.
     """
     return {
         other: options

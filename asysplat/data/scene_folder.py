@@ -1,4 +1,4 @@
-"""Scenes on disk, of which only those in use are open."""
+"""The scenes in a folder, of which only those in use are open."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -6,21 +6,23 @@ from pathlib import Path
 
 from asysplat.data.bad_frames import Policy
 from asysplat.data.cache import ImageCache
-from asysplat.data.photographs import PhotographCapture
+from asysplat.data.capture import PhotographCapture
 from asysplat.data.readers import find_scenes, open_scene
 
 MOST_OPEN = 64
 
 
-class Scenes(Sequence):
-    """The scenes that a folder is or holds, each opened when asked for; the last used stay open.
+class SceneFolder(Sequence):
+    """The scenes that a folder is or holds, each opened when first used.
+
+    The MOST_OPEN last used stay open.
 
     Args:
         root: one scene, or a folder of scenes.
         height, width, layout, on_bad_frame, cache: as `open_scene` takes them.
 
     Raises:
-        InputError: no scene; when a scene is asked for, one that cannot be used.
+        InputError: no scene; and, when a scene is opened, files that cannot be used.
     """
 
     def __init__(
@@ -52,6 +54,6 @@ class Scenes(Sequence):
         return self._open[index]
 
     def folders(self, index: int) -> set[str]:
-        """The names that lead to a scene from the root, its own among them; it stays closed."""
+        """Return the folder names between the root and a scene, and its own; it stays closed."""
         path = self.paths[index]
         return {*path.parts} - {*self.root.parts} | {path.name}
