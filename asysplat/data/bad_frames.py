@@ -12,7 +12,7 @@ FEWEST = 2  # frames of a scene
 
 
 class BadFrames:
-    """Collects what is wrong with single frames while a scene is read.
+    """What is wrong with single frames, collected while a scene is read.
 
     Args:
         policy: "fail", or "skip" to go on without the frames that cannot be used.

@@ -20,8 +20,8 @@ from asysplat.data.images import Lens
 from asysplat.scene import Cameras
 
 # The screen.
-MOST_LENSES = 3  # printed one by one
-MOST_DAMAGED = 10  # the same
+MOST_LENSES = 3  # printed one by one; of more, the number
+MOST_DAMAGED = 10  # printed one by one
 AGREES = (0.8, 1.25)  # median of depth maps over triangulated depths without a complaint
 
 # The picture.

@@ -86,7 +86,7 @@ def find_scenes(root: Path) -> list[Path]:
 
 
 def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """One camera's photographs, named <scene>-dslr or <scene>-iphone, and COLMAP's sparse points.
+    """Read one camera's photographs and COLMAP's points; the name is <scene>-dslr or -iphone.
 
     The benchmark's test frames are among them where their images were published. Frames that the
     file marks `is_bad` are left out, with a warning.
