@@ -50,8 +50,8 @@ def opened(monkeypatch):
         names.append(path.name)
         return real(path, *arguments, **options)
 
-    real = scenes.open_scene
-    monkeypatch.setattr(scenes, "open_scene", open_scene)
+    real = scene_folder.open_scene
+    monkeypatch.setattr(scene_folder, "open_scene", open_scene)
     return names
 
 
@@ -98,7 +98,7 @@ def test_scenes_are_opened_when_they_are_drawn(folder, opened):
 
 
 def test_scenes_that_were_long_unused_are_closed(folder, opened, monkeypatch):
-    monkeypatch.setattr(scenes, "MOST_OPEN", 2)
+    monkeypatch.setattr(scene_folder, "MOST_OPEN", 2)
     folder = scene_folder.SceneFolder(folder("many", 0, 1, 2), *SIZE)
     assert len(folder) == 3
     first = folder[0]
