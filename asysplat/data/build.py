@@ -28,13 +28,17 @@ def procedural_data(
     The arguments are those of ProceduralSource and `scene_data`.
     """
 
-    def source(height: int, width: int, num_frames: int, **others) -> ProceduralSource:
-        return ProceduralSource(height, width, num_frames, window, val_scenes, **others)
-
-    own = {"height": height, "width": width, "num_frames": num_frames}
-    own |= {"test_scenes": test_scenes, "places": places}
+    make_source = partial(ProceduralSource, window=window, val_scenes=val_scenes)
+    changeable = {
+        "height": height,
+        "width": width,
+        "num_frames": num_frames,
+        "test_scenes": test_scenes,
+        "places": places,
+    }
     tested = tested_sets(test_sets, options["name"], on_disk=False)
-    return scene_data(source(**own), source, own, test_sets=tested, **options)
+    source = make_source(**changeable)
+    return scene_data(source, make_source, changeable, test_sets=tested, **options)
 
 
 def files_data(
@@ -59,29 +63,31 @@ def files_data(
     root, layout, selection, index and size; one whose root is null is left out, with a warning.
     """
 
-    def source(root: str, height: int, width: int, **others) -> FilesSource:
-        reading = {"on_bad_frame": on_bad_frame, "cache": cache, **others}
-        return FilesSource(root, height, width, window, **reading)
-
-    own = {"height": height, "width": width}
-    own |= {"layout": layout, "selection": selection, "index": index}
-    main = source(
-        root,
+    make_source = partial(FilesSource, window=window, on_bad_frame=on_bad_frame, cache=cache)
+    changeable = {
+        "height": height,
+        "width": width,
+        "layout": layout,
+        "selection": selection,
+        "index": index,
+    }
+    source = make_source(
+        root=root,
         test_root=test_root,
         val_scenes=val_scenes,
         targets_may_be_inputs=targets_may_be_inputs,
-        **own,
+        **changeable,
     )
-    own["root"] = test_root or root
+    changeable["root"] = test_root or root
     _warn_of_untested(test_sets or {}, options["name"])
     tested = tested_sets(test_sets, options["name"], on_disk=True)
-    return scene_data(main, source, own, test_sets=tested, **options)
+    return scene_data(source, make_source, changeable, test_sets=tested, **options)
 
 
 def scene_data(
     source: Source,
     make_source: Callable[..., Source],
-    own: dict[str, Any],
+    changeable: dict[str, Any],
     name: str,
     inputs: int,
     targets: int,
@@ -92,16 +98,16 @@ def scene_data(
 
     Args:
         source: the data set itself.
-        make_source: makes the source of a test set from options like `own`.
-        own: the options in which test sets may differ from the data set, with the data set's
-            values; height and width are among them.
-        test_sets: name -> the options that differ: any of `own`, inputs and targets.
+        make_source: makes the source of a test set from options like `changeable`.
+        changeable: the options in which test sets may differ from the data set, with the data
+            set's values; height and width are among them.
+        test_sets: name -> the options that differ: any of `changeable`, inputs and targets.
         name, inputs, targets, options: those of SceneDataModule.
 
     Raises:
         InputError: a test set with the name of the data set, or with an unknown option.
     """
-    main = {"inputs": inputs, "targets": targets, **own}
+    main = {"inputs": inputs, "targets": targets, **changeable}
     sets = {}
     for other, changes in (test_sets or {}).items():
         _check_test_set(other, changes, name, main)
@@ -111,8 +117,8 @@ def scene_data(
         source=source,
         inputs=inputs,
         targets=targets,
-        height=own["height"],
-        width=own["width"],
+        height=changeable["height"],
+        width=changeable["width"],
         test_sets=sets,
         **options,
     )
@@ -156,9 +162,9 @@ def _warn_of_untested(test_sets: Mapping[str, Any], name: str) -> None:
 
 
 def _test_tasks(
-    make_source: Callable[..., Source], inputs: int, targets: int, **own: Any
+    make_source: Callable[..., Source], inputs: int, targets: int, **options: Any
 ) -> list[Task]:
-    return make_source(**own).evaluation("test", inputs, targets)
+    return make_source(**options).evaluation("test", inputs, targets)
 
 
 def _check_test_set(other: str, changes: Any, name: str, main: Mapping[str, Any]) -> None:

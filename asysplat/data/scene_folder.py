@@ -36,9 +36,12 @@ class SceneFolder(Sequence):
     ):
         self.root = Path(root).absolute()
         self.layout, self.paths = find_scenes(root, layout)
-        self._reading = {
-            **{"height": height, "width": width, "layout": self.layout},
-            **{"on_bad_frame": on_bad_frame, "cache": cache},
+        self._options = {
+            "height": height,
+            "width": width,
+            "layout": self.layout,
+            "on_bad_frame": on_bad_frame,
+            "cache": cache,
         }
         self._open: OrderedDict[int, PhotographCapture] = OrderedDict()
 
@@ -47,7 +50,7 @@ class SceneFolder(Sequence):
 
     def __getitem__(self, index: int) -> PhotographCapture:
         if index not in self._open:
-            self._open[index] = open_scene(self.paths[index], **self._reading)
+            self._open[index] = open_scene(self.paths[index], **self._options)
         self._open.move_to_end(index)
         while len(self._open) > MOST_OPEN:
             self._open.popitem(last=False)
