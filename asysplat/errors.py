@@ -10,7 +10,10 @@ class InputError(ValueError):
 
 
 def input_error_behind(error: BaseException) -> InputError | None:
-    """The InputError that `error` is, or was raised from; Hydra wraps those of constructors."""
+    """Return the InputError that `error` is or was raised from, else None.
+
+    Hydra wraps the errors of the constructors that it calls.
+    """
     seen: BaseException | None = error
     while seen is not None and not isinstance(seen, InputError):
         seen = seen.__cause__ or seen.__context__

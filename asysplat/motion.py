@@ -1,4 +1,4 @@
-"""Gaussians, carried from one coordinate frame to another."""
+"""Gaussians, moved from one coordinate frame to another."""
 
 from dataclasses import replace
 
@@ -12,9 +12,9 @@ from asysplat.scene import Gaussians
 
 
 def moved(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
-    """The Gaussians after a rigid motion: cameras moved alike see the same of them.
+    """Apply a rigid motion to Gaussians: cameras moved alike render the same images.
 
-    Computed in float64; fields keep their types.
+    Computed in float64; the fields keep their types.
 
     Args:
         motion: from the Gaussians' frame to the new one.
@@ -34,11 +34,11 @@ def moved(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
 
 
 def sh_rotation(rotation: Float[Tensor, "3 3"], count: int) -> Float[Tensor, "{count} {count}"]:
-    """The matrix that turns `count` (1, 4, 9 or 16) harmonics: what they give along d before, they
-    give along R d after.
+    """Return the matrix that rotates SH coefficients.
 
-    Rotated harmonics are again harmonics of their degree, so that values at enough directions
-    settle the matrix exactly.
+    The colour that `count` (1, 4, 9 or 16) coefficients give along d is the one that the rotated
+    coefficients give along R d. A rotated SH function is a sum of SH functions of its degree, so
+    its values in enough directions determine the matrix exactly.
     """
     directions = _around_the_sphere(2 * count).to(rotation)
     before = sh_basis(directions @ rotation, count)  # along R^-1 d
@@ -46,7 +46,7 @@ def sh_rotation(rotation: Float[Tensor, "3 3"], count: int) -> Float[Tensor, "{c
 
 
 def _around_the_sphere(count: int) -> Float[Tensor, "{count} 3"]:
-    """Directions on a Fibonacci spiral: nearly even."""
+    """Spread directions nearly evenly, on a Fibonacci spiral."""
     index = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - 2 * index / count
     angle = index * torch.pi * (1 + 5**0.5)
@@ -57,7 +57,7 @@ def _around_the_sphere(count: int) -> Float[Tensor, "{count} 3"]:
 def _quaternion_product(
     first: Float[Tensor, "4"], second: Float[Tensor, "*batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
-    """Rotation by `second`, then by `first`; wxyz."""
+    """Multiply quaternions wxyz: the rotation by `second`, then by `first`."""
     w, x, y, z = first.tolist()
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     return second @ second.new_tensor(rows).mT

@@ -34,7 +34,7 @@ class TensorRecord:
         return replace(self, **changed)
 
     def to(self: Record, *args, **kwargs) -> Record:
-        """`Tensor.to` for every tensor."""
+        """Apply `Tensor.to` to every tensor."""
         return self.map(lambda tensor: tensor.to(*args, **kwargs))
 
     @classmethod
@@ -98,7 +98,7 @@ class Cameras(TensorRecord):
         return self.cam_to_world[..., :3, 3]
 
     def select(self, views: Sequence[int] | Tensor) -> "Cameras":
-        """The named views, in the given order."""
+        """Return the named views, in the given order."""
         index = torch.as_tensor(views, device=self.intrinsics.device)
         return replace(
             self,
@@ -107,14 +107,14 @@ class Cameras(TensorRecord):
         )
 
     def resized(self, height: int, width: int) -> "Cameras":
-        """The same cameras with `height` x `width` pixels over the same field of view."""
+        """Return the same cameras with `height` x `width` pixels over the same field of view."""
         factors = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
         return replace(
             self, intrinsics=factors[:, None] * self.intrinsics, height=height, width=width
         )
 
     def pixel_directions(self) -> Float[Tensor, "*batch V H W 3"]:
-        """Camera-space directions through every pixel centre, of z = 1."""
+        """Return the camera-space directions through every pixel centre, with z = 1."""
         options = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
         y, x = torch.meshgrid(
             torch.arange(self.height, **options) + 0.5,
@@ -127,7 +127,7 @@ class Cameras(TensorRecord):
         return torch.stack((x, y, z), dim=-1)
 
     def rays(self) -> tuple[Float[Tensor, "*batch V H W 3"], Float[Tensor, "*batch V H W 3"]]:
-        """World-space origins and unit directions through every pixel centre."""
+        """Return the world-space origins and unit directions of every pixel centre's ray."""
         # Not a matrix product: autocast would round those to half precision.
         rotation = self.cam_to_world[..., None, None, :3, :3]
         directions = (rotation * self.pixel_directions()[..., None, :]).sum(-1)
@@ -197,7 +197,7 @@ class Views(TensorRecord):
         return self.cameras.num_views
 
     def select(self, views: Sequence[int] | Tensor) -> "Views":
-        """The named views, in the given order."""
+        """Return the named views, in the given order."""
         index = torch.as_tensor(views, device=self.images.device)
 
         def pick(tensor: Tensor | None, dim: int) -> Tensor | None:
@@ -212,7 +212,7 @@ class Views(TensorRecord):
         )
 
     def masked(self, rendered: Float[Tensor, "*batch V 3 H W"]) -> Float[Tensor, "*batch V 3 H W"]:
-        """`rendered` where pixels count, the photographs elsewhere: no error, no gradient there."""
+        """Replace pixels that do not count by the photographs': no error, no gradient there."""
         if self.masks is None:
             return rendered
         return torch.where(self.masks[..., None, :, :], rendered, self.images)
@@ -221,7 +221,7 @@ class Views(TensorRecord):
         """Return self if every number can be used.
 
         Raises:
-            InputError: as `Cameras.validate`, and for images outside [0, 1] or depths below 0.
+            InputError: as for `Cameras.validate`; also images outside [0, 1] or depths below 0.
         """
         self.cameras.validate(f"{name}.cameras")
         _check_finite(f"{name}.images", self.images, 3)
@@ -275,15 +275,15 @@ class Gaussians(TensorRecord):
         return self.opacities.shape[-1]
 
     def scale_by(self, factor: float) -> "Gaussians":
-        """The same scene in units that are `factor` times smaller."""
+        """Return the same scene in units that are `factor` times smaller."""
         return replace(self, means=self.means * factor, scales=self.scales * factor)
 
     def keep(self, mask: Bool[Tensor, "N"]) -> "Gaussians":
-        """The Gaussians where `mask` is True; for one scene, without batch dimensions."""
+        """Return the Gaussians where `mask` is True; for one scene, without batch dimensions."""
         return self.map(lambda tensor: tensor[mask])
 
     def crop(self, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> "Gaussians":
-        """The Gaussians whose mean lies in the closed box from `lower` to `upper`."""
+        """Return the Gaussians whose mean lies in the closed box from `lower` to `upper`."""
         return self.keep(((self.means >= lower) & (self.means <= upper)).all(-1))
 
     def validate(self, name: str = "Gaussians") -> "Gaussians":

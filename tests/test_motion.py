@@ -20,7 +20,7 @@ def motion(seed: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("count", [1, 4, 9, 16])
 @pytest.mark.parametrize("seed", range(3))
-def test_harmonics_turn_with_their_directions(count, seed):
+def test_sh_turns_with_its_directions(count, seed):
     rotation = motion(seed)[:3, :3]
     directions = torch.nn.functional.normalize(torch.randn(200, 3, dtype=torch.float64), dim=-1)
     sh = torch.randn(count, dtype=torch.float64)
@@ -32,7 +32,7 @@ def test_harmonics_turn_with_their_directions(count, seed):
     torch.testing.assert_close(after, before, atol=1e-12, rtol=0)
 
 
-def test_a_rotation_of_harmonics_is_orthogonal_and_keeps_degrees_apart():
+def test_an_sh_rotation_is_orthogonal_and_keeps_degrees_apart():
     matrix = sh_rotation(motion(0)[:3, :3], 16)
     torch.testing.assert_close(matrix @ matrix.mT, torch.eye(16).double(), atol=1e-12, rtol=0)
     apart = torch.block_diag(*(torch.ones(2 * d + 1, 2 * d + 1) for d in range(4))) == 0
@@ -40,7 +40,7 @@ def test_a_rotation_of_harmonics_is_orthogonal_and_keeps_degrees_apart():
 
 
 def test_a_quarter_turn_about_z():
-    """x goes to y, and y to -x: so do the harmonics -y, z, -x of degree 1."""
+    """x goes to y, and y to -x: so do the SH functions -y, z, -x of degree 1."""
     quarter = torch.tensor([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
     found = sh_rotation(quarter, 4) @ torch.tensor([0, 2.0, 3.0, 5.0], dtype=torch.float64)
     torch.testing.assert_close(found, torch.tensor([0, 5.0, 3.0, -2.0], dtype=torch.float64))

@@ -109,7 +109,7 @@ def test_bad_gaussians(field, value, complaint):
         scene.validate()
 
 
-def test_unusable_number_of_harmonics():
+def test_unusable_number_of_sh_coefficients():
     scene = gaussians()
     with pytest.raises(InputError, match="1, 4, 9 or 16"):
         Gaussians(scene.means, scene.quats, scene.scales, scene.opacities, torch.rand(5, 5, 3))

@@ -1,9 +1,9 @@
-"""Posed photographs from made-up places and from files, as batches of reconstruction tasks."""
+"""Posed photographs, synthetic or from files, as batches of reconstruction tasks."""
 
 from asysplat.data.augment import Augmentation
+from asysplat.data.build import files_data, procedural_data
 from asysplat.data.cache import ImageCache
 from asysplat.data.datamodule import SceneDataModule
-from asysplat.data.modules import files_data, procedural_data
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.readers import find_scenes, open_scene
 from asysplat.data.sources import FilesSource, ProceduralSource

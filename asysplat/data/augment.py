@@ -1,5 +1,7 @@
-"""What varies a training task, as Long-LRM does (arXiv 2410.12781): the order of its inputs, and a
-crop. Evaluation has none of it."""
+"""Augmentation of training tasks: the order of the inputs, and a crop; never in evaluation.
+
+As in Long-LRM (arXiv 2410.12781).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +40,7 @@ class Augmentation:
                 )
 
     def order(self, inputs: Sequence[int], rng: np.random.Generator) -> list[int]:
-        """The same frames, maybe in another order."""
+        """Return the same frames, maybe in another order."""
         ordered = list(inputs)
         if rng.random() < self.reverse:
             ordered.reverse()
@@ -47,12 +49,12 @@ class Augmentation:
         return ordered
 
     def share(self, rng: np.random.Generator) -> float:
-        """What a crop keeps of the sides; one for all views of a task."""
+        """Draw the share of the sides that a crop keeps; one for all views of a task."""
         return float(rng.uniform(self.crop, 1.0))
 
 
 def cropped(views: Views, share: float) -> Views:
-    """The middle of every view, at the size that the views have.
+    """Crop every view to its middle, enlarged to the size that the views had.
 
     Cut out at whole pixels and enlarged: images bilinearly, depths and masks without mixing. The
     intrinsics follow exactly; poses stay as they are.

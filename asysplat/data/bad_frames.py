@@ -1,4 +1,4 @@
-"""Frames that cannot be used: all of them are found, and told together, before anything starts."""
+"""Frames that cannot be used: all are found and reported together, before anything starts."""
 
 import warnings
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ FEWEST = 2  # frames of a scene
 
 
 class BadFrames:
-    """Collects what is wrong with single frames while a scene is read.
+    """What is wrong with single frames, collected while a scene is read.
 
     Args:
         policy: "fail", or "skip" to go on without the frames that cannot be used.
@@ -29,14 +29,18 @@ class BadFrames:
 
     @contextmanager
     def caught(self) -> Iterator[None]:
-        """An InputError raised inside is noted, and what follows goes on."""
+        """Note an InputError that is raised inside, and go on after the block."""
         try:
             yield
         except InputError as error:
             self.sentences.append(str(error))
 
     def settle(self, scene: str, left: int) -> None:
-        """After all frames: say what was noted, the `left` usable ones of `scene` counted.
+        """Report what was noted, after all frames were read.
+
+        Args:
+            scene: its name, for the message.
+            left: how many of its frames can be used.
 
         Raises:
             InputError: there were bad frames and they are not to be skipped, or too few are left.

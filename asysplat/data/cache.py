@@ -1,5 +1,8 @@
-"""Photographs as they are used, undistorted and resized: kept in memory, and on disk beside no data
-set. Both are bounded; what was longest unused goes first."""
+"""A cache of photographs as they are used, undistorted and resized, in memory and on disk.
+
+Both are bounded, and what was longest unused is removed first. The folder on disk is never inside a
+data set.
+"""
 
 import os
 import tempfile
@@ -15,7 +18,7 @@ KEPT = 0.9  # of the limit, when a full disk cache is cleared
 
 
 class ImageCache:
-    """Arrays by key. A key names all that an array was made from, so that nothing is ever outdated.
+    """Arrays by key. A key names everything an array was made from, so no entry can be outdated.
 
     Processes may share the folder; each has memory of its own.
 
@@ -31,10 +34,10 @@ class ImageCache:
         self.disk_bytes, self.memory_bytes = disk_gb * GIGABYTE, memory_gb * GIGABYTE
         self._memory: OrderedDict[str, ndarray] = OrderedDict()
         self._in_memory = 0
-        self._on_disk: int | None = None  # as last counted, and what this process has added
+        self._on_disk: int | None = None  # bytes when last counted, and what this process has added
 
     def get(self, key: str, make: Callable[[], ndarray], to_disk: bool) -> ndarray:
-        """What is kept under `key`, else what `make` makes; treat it as read-only."""
+        """Return the array kept under `key`, else make and keep it; treat it as read-only."""
         if key in self._memory:
             self._memory.move_to_end(key)
             return self._memory[key]
@@ -80,7 +83,7 @@ class ImageCache:
             self._clear()
 
     def _files(self) -> list[tuple[float, int, Path]]:
-        """Last use, bytes and path of all that is on disk."""
+        """List the last use, the bytes and the path of every file on disk."""
         entries = []
         for file in self.folder.glob("*/*.npy"):
             try:

@@ -10,17 +10,17 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler, Subset
 
 from asysplat.data.augment import Augmentation, cropped
 from asysplat.data.normalise import normalise
-from asysplat.data.selection import Split
+from asysplat.data.selection import Selection
 from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
-KEPT_BYTES = 2**30  # of a set of fixed tasks
+KEPT_BYTES = 2**30  # of images that one set of fixed tasks keeps loaded
 Sample = dict[str, Any]  # scene: name, inputs: Views, targets: Views; a batch has lists of names
 
 
 class SceneDataModule(lightning.LightningDataModule):
-    """Training tasks drawn at random, evaluation tasks fixed.
+    """Lightning's data module of reconstruction tasks: random for training, fixed for evaluation.
 
     An epoch is the steps between two validations. Task i of a run is a pure function of the seed
     and i, and an epoch reads the tasks after those of the epochs before it.
@@ -29,18 +29,18 @@ class SceneDataModule(lightning.LightningDataModule):
         name: the data set's name in metrics.
         source: where tasks come from.
         inputs, targets: views given and views to predict, per scene.
-        height, width: of every view, in pixels, but for test sets of another size; the sources
-            have made them so.
+        height, width: size in pixels of every view that `source` gives; further test sets may
+            have another.
         batch_size: scenes per step.
-        workers: processes that load ahead; 0 loads in the training process.
+        num_workers: number of processes that load ahead; 0 loads in the training process.
         seed: of the training tasks.
         steps_per_epoch: steps between two validations.
         test_sets: further test sets by name, each a function that makes its tasks.
-        augmentation: of the training tasks; none where it is left out.
+        augmentation: how training tasks are varied; None leaves them as they are.
 
     Raises:
-        InputError: a task that cannot be loaded; the fixed ones are tried in `setup`, as many as
-            fit into memory.
+        InputError: a task that cannot be loaded. `setup` tries one training task, and as many of
+            the fixed ones as are kept in memory.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class SceneDataModule(lightning.LightningDataModule):
         height: int,
         width: int,
         batch_size: int,
-        workers: int,
+        num_workers: int,
         seed: int,
         steps_per_epoch: int,
         test_sets: Mapping[str, Callable[[], list[Task]]] | None = None,
@@ -62,7 +62,7 @@ class SceneDataModule(lightning.LightningDataModule):
         self.name, self.source = name, source
         self.inputs, self.targets = inputs, targets
         self.height, self.width = height, width
-        self.batch_size, self.workers, self.seed = batch_size, workers, seed
+        self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
         self.steps_per_epoch = steps_per_epoch
         self.test_sets = test_sets or {}
         self.augmentation = augmentation or Augmentation()
@@ -97,11 +97,14 @@ class SceneDataModule(lightning.LightningDataModule):
         return self.tasks(self.trainer.current_epoch * per_epoch, per_epoch)
 
     def tasks(self, start: int, count: int) -> DataLoader:
-        """Batches of training tasks `start` to `start + count`; processes that train together take
-        turns at them, so that their steps are those of one process with larger batches."""
+        """Return batches of the training tasks `start` to `start + count`.
+
+        Processes that train together take turns at the tasks, so that their steps are those of one
+        process with larger batches.
+        """
         tasks, sampler = Subset(TrainingTasks(self), range(start, start + count)), None
         if self.trainer is not None and self.trainer.world_size > 1:
-            # Lightning's own would shuffle them.
+            # Lightning's own sampler would shuffle them.
             sampler = DistributedSampler(
                 tasks, self.trainer.world_size, self.trainer.global_rank, shuffle=False
             )
@@ -109,23 +112,24 @@ class SceneDataModule(lightning.LightningDataModule):
             tasks,
             batch_size=self.batch_size,
             sampler=sampler,
-            num_workers=self.workers,
+            num_workers=self.num_workers,
             collate_fn=collate,
-            prefetch_factor=4 if self.workers else None,
-            # The platform's own: joblib's, the default in its jobs, cannot start these workers.
-            multiprocessing_context=get_all_start_methods()[0] if self.workers else None,
+            prefetch_factor=4 if self.num_workers else None,
+            # The platform's own way: inside a joblib job the default is joblib's, which cannot
+            # start these workers.
+            multiprocessing_context=get_all_start_methods()[0] if self.num_workers else None,
         )
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.evaluation["val"], collate_fn=collate)
 
     def test_dataloader(self) -> list[DataLoader]:
-        """One a test set, in the order of `tests`."""
+        """Return one loader a test set, in the order of `tests`."""
         return [DataLoader(scenes, collate_fn=collate) for scenes in self.tests.values()]
 
 
 class TrainingTasks(Dataset):
-    """Task i, drawn with a generator of its own; there is no last one."""
+    """An endless list of training tasks; task i is drawn with a generator of its own."""
 
     def __init__(self, data: SceneDataModule):
         self.source, self.seed, self.augmentation = data.source, data.seed, data.augmentation
@@ -134,13 +138,13 @@ class TrainingTasks(Dataset):
     def __getitem__(self, index: int) -> Sample:
         rng = np.random.default_rng((self.seed, index))
         task = self.source.training(self.inputs, self.targets, rng)
-        inputs = self.augmentation.order(task.split.inputs, rng)
+        inputs = self.augmentation.order(task.selection.inputs, rng)
         share = self.augmentation.share(rng)
-        return load(Task(task.capture, Split(inputs, task.split.targets)), share)
+        return load(Task(task.capture, Selection(inputs, task.selection.targets)), share)
 
 
 class FixedTasks(Dataset):
-    """Tasks that come again; the first of them stay loaded, up to KEPT_BYTES."""
+    """Evaluation tasks; the first of them stay loaded, up to KEPT_BYTES."""
 
     def __init__(self, tasks: Sequence[Task]):
         self.tasks = tasks
@@ -160,16 +164,15 @@ class FixedTasks(Dataset):
 
 
 def load(task: Task, share: float = 1.0) -> Sample:
-    """The task's views, validated, cropped to that share of their sides, and normalised."""
-    split = task.split
-    # An input that is a target as well is decoded once.
-    frames = list(dict.fromkeys(split.inputs + split.targets))
+    """Read a task's views, validate, crop to `share` of their sides, and normalise them."""
+    inputs, targets = task.selection.inputs, task.selection.targets
+    # A frame that is both input and target is decoded once.
+    frames = list(dict.fromkeys(inputs + targets))
     views = cropped(task.capture.views(frames).validate(task.capture.name), share)
-    inputs, targets = (
-        views.select([frames.index(frame) for frame in chosen])
-        for chosen in (split.inputs, split.targets)
+    inputs, targets, _ = normalise(
+        views.select([frames.index(frame) for frame in inputs]),
+        views.select([frames.index(frame) for frame in targets]),
     )
-    inputs, targets, _ = normalise(inputs, targets)
     return {"scene": task.capture.name, "inputs": inputs, "targets": targets}
 
 

@@ -1,7 +1,7 @@
 """Photographs, depth maps and masks from files, without lens distortion and at the asked size.
 
 Pixel positions count from the image's corner: the first pixel's centre is at +0.5. Nothing is ever
-written, and the exif orientation is not applied: calibrations speak of the pixels as stored.
+written. The exif orientation is not applied, since calibrations are for the pixels as stored.
 """
 
 import hashlib
@@ -29,8 +29,8 @@ class EncodedImage:
     """An image file's bytes inside another file.
 
     Args:
-        name: where they stand, for error messages.
-        data: as the file on its own would hold them.
+        name: where the bytes are, for error messages.
+        data: what a file of its own would hold.
     """
 
     name: str
@@ -45,7 +45,7 @@ ImageFile = Path | EncodedImage
 
 @dataclass(frozen=True)
 class Lens:
-    """How one photograph's pixels follow from directions.
+    """The camera model of one photograph: which direction each pixel shows.
 
     Args:
         width, height: the photograph's size in pixels.
@@ -65,12 +65,12 @@ class Lens:
 
     @property
     def is_distorted(self) -> bool:
-        # Even with all coefficients 0, a fisheye is not a pinhole.
+        # A fisheye is not a pinhole even with all coefficients 0.
         return self.fisheye or any(self.distortion)
 
 
 def image_size(path: ImageFile) -> tuple[int, int]:
-    """(width, height), from the header; only a file whose end is missing is decoded as well.
+    """Read (width, height) from the header; a file whose end is missing is decoded as well.
 
     Raises:
         InputError: the file is missing, empty, not an image or cut short.
@@ -79,7 +79,7 @@ def image_size(path: ImageFile) -> tuple[int, int]:
 
 
 def load_photograph(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
-    """RGB in 0..255; transparent pixels are laid on white.
+    """Read RGB in 0..255; transparent pixels are laid on white.
 
     Raises:
         InputError: the file is damaged, or holds more than 8 bits of grey (a depth map).
@@ -88,7 +88,7 @@ def load_photograph(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
 
 
 def load_depth(path: ImageFile) -> Float32[ndarray, "h w"]:
-    """The stored integers of a one-channel (16-bit) image; 0 where unknown.
+    """Read the stored integers of a one-channel (16-bit) image; 0 where unknown.
 
     Raises:
         InputError: the file is damaged or has several channels.
@@ -102,7 +102,7 @@ def load_depth(path: ImageFile) -> Float32[ndarray, "h w"]:
 
 
 def load_mask(path: ImageFile) -> Bool[ndarray, "h w"]:
-    """True where the stored value is not 0.
+    """Read a mask: True where the stored value is not 0.
 
     Raises:
         InputError: the file is damaged.
@@ -113,7 +113,7 @@ def load_mask(path: ImageFile) -> Bool[ndarray, "h w"]:
 def undistort(
     pixels: Shaped[ndarray, "h w *channels"], lens: Lens, nearest: bool = False
 ) -> Shaped[ndarray, "h w *channels"]:
-    """The image a pinhole camera with the lens's own fx, fy, cx, cy would have taken.
+    """Resample to what a pinhole camera with the lens's own fx, fy, cx, cy would have taken.
 
     `pixels` may be smaller or larger than the photograph, as depth maps are, if it shows the same
     field of view. Beyond the photograph's border the nearest pixel is repeated, or, with `nearest`
@@ -130,7 +130,7 @@ def undistort(
 def resize_and_crop(
     pixels: Shaped[ndarray, "h w *channels"], height: int, width: int, nearest: bool = False
 ) -> Shaped[ndarray, "height width *channels"]:
-    """The largest centred part with the asked proportions, resampled to `height` x `width`.
+    """Crop to the largest centred part with the asked proportions; resample to `height` x `width`.
 
     Antialiased (Lanczos), or the pixel under each new centre with `nearest`.
     """
@@ -140,7 +140,7 @@ def resize_and_crop(
 
 
 def resized_intrinsics(lens: Lens, height: int, width: int) -> Float[ndarray, "3 3"]:
-    """The pinhole matrix that belongs to the output of `resize_and_crop`."""
+    """Return the pinhole matrix that belongs to the output of `resize_and_crop`."""
     scale, left, top, _, _ = _centred_box(lens.width, lens.height, height, width)
     return np.array(
         [
@@ -154,7 +154,10 @@ def resized_intrinsics(lens: Lens, height: int, width: int) -> Float[ndarray, "3
 def _centred_box(
     old_width: int, old_height: int, height: int, width: int
 ) -> tuple[float, float, float, float, float]:
-    """The scale, and left, top, right, bottom in old pixels; fractions keep it exactly centred."""
+    """Return the scale, and left, top, right, bottom in old pixels.
+
+    Fractions of pixels keep the box exactly centred.
+    """
     scale = max(width / old_width, height / old_height)
     left = max(0.0, (old_width - width / scale) / 2)
     top = max(0.0, (old_height - height / scale) / 2)
@@ -165,7 +168,7 @@ def _centred_box(
 def _undistortion_maps(
     lens: Lens, width: int, height: int
 ) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
-    """Where to look in the distorted image for each undistorted pixel."""
+    """Return x and y in the distorted image for each undistorted pixel."""
     scale_x, scale_y = width / lens.width, height / lens.height
     # OpenCV puts the first pixel's centre at 0.
     matrix = np.array(
@@ -191,7 +194,7 @@ def _to_rgb(image: Image.Image) -> UInt8[ndarray, "h w 3"]:
 
 
 def content_hash(file: ImageFile) -> str:
-    """Of the stored bytes, read once while the file does not change.
+    """Hash the stored bytes; a file is read once, and again only if it changes.
 
     Raises:
         InputError: the file is missing or empty.
@@ -209,7 +212,7 @@ def _hash_of(path: Path, size: int, modified: int) -> str:
 
 
 def _size_if_whole(image: Image.Image) -> tuple[int, int]:
-    """A file that does not end as its format ends is decoded, which fails if it was cut short."""
+    """Return the size; decode a file without an end marker, which fails if it is cut short."""
     marker = END_MARKERS.get(image.format or "")
     if marker:
         position = image.fp.tell()
@@ -223,7 +226,7 @@ def _size_if_whole(image: Image.Image) -> tuple[int, int]:
 
 
 def _read(file: ImageFile, extract: Callable[[Image.Image], Any]) -> Any:
-    """What `extract` makes of the opened image, with every failure as one InputError."""
+    """Return `extract` of the opened image; every failure becomes an InputError."""
     if isinstance(file, Path):
         _check_there(file)
     stored = file if isinstance(file, Path) else BytesIO(file.data.tobytes())

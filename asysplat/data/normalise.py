@@ -1,4 +1,4 @@
-"""One world frame and scale for every scene, so that networks meet like with like."""
+"""Bring every scene into the same world frame and scale before a network sees it."""
 
 from dataclasses import dataclass, replace
 
@@ -12,18 +12,18 @@ from asysplat.scene import Gaussians, TensorRecord, Views
 
 @dataclass(frozen=True)
 class Normalisation(TensorRecord):
-    """How a scene was brought into the frame of networks, and how to come back.
+    """How a scene was brought into the network's frame, and the way back.
 
     Args:
         world_to_mean: rigid, float64, from the data set's world to the mean input camera.
-        scale: what lengths were multiplied by after that.
+        scale: factor of all lengths, applied after that.
     """
 
     world_to_mean: Float[Tensor, "4 4"]
     scale: float
 
     def apply(self, views: Views) -> Views:
-        """The data set's views in the frame of networks, depths included."""
+        """Bring views from the data set's world into the network's frame, depths included."""
         poses = self.world_to_mean @ views.cameras.cam_to_world.double()
         poses[:, :3, 3] *= self.scale
         cameras = replace(views.cameras, cam_to_world=poses.to(views.cameras.cam_to_world))
@@ -31,7 +31,7 @@ class Normalisation(TensorRecord):
         return replace(views, cameras=cameras, depths=depths)
 
     def undo(self, gaussians: Gaussians) -> Gaussians:
-        """What a network made, in the data set's world: its own cameras see the same of it."""
+        """Bring Gaussians back to the data set's world, where its own cameras see the same."""
         return moved(gaussians.scale_by(1 / self.scale), torch.linalg.inv(self.world_to_mean))
 
 
@@ -51,7 +51,7 @@ def normalise(inputs: Views, targets: Views) -> tuple[Views, Views, Normalisatio
     mean_pose[:3, :3] = _mean_rotation(poses[:, :3, :3])
     mean_pose[:3, 3] = centers.mean(0)
     radius = (centers - centers.mean(0)).norm(dim=-1).max()
-    # Below this, what differs between the centres is rounding.
+    # Smaller differences between the centres are rounding.
     apart = radius > 1e-6 * centers.abs().max()
     frame = Normalisation(torch.linalg.inv(mean_pose), 1 / radius.item() if apart else 1.0)
     return frame.apply(inputs), frame.apply(targets), frame
@@ -60,7 +60,7 @@ def normalise(inputs: Views, targets: Views) -> tuple[Views, Views, Normalisatio
 def _mean_rotation(rotations: Float[Tensor, "V 3 3"]) -> Float[Tensor, "3 3"]:
     forward, down = rotations[:, :, 2].mean(0), rotations[:, :, 1].mean(0)
     right = torch.linalg.cross(down, forward)
-    # On a full circle the forward axes cancel: any camera's axes are then as good.
+    # On a full circle the forward axes cancel: then take the first camera's axes.
     if right.norm() < 1e-3:
         return rotations[0]
     forward, right = forward / forward.norm(), right / right.norm()

@@ -1,4 +1,4 @@
-"""Where scenes come from: which captures train, validate and test, and which of their frames."""
+"""Sources of tasks: which captures train, validate and test, and which of their frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,18 +9,17 @@ import numpy as np
 
 from asysplat.data.bad_frames import Policy
 from asysplat.data.cache import ImageCache
-from asysplat.data.capture import Capture
-from asysplat.data.photographs import PhotographCapture
+from asysplat.data.capture import Capture, PhotographCapture
 from asysplat.data.procedural import ProceduralScene, split_seed
-from asysplat.data.scenes import Scenes
+from asysplat.data.scene_folder import SceneFolder
 from asysplat.data.selection import (
+    Selection,
     Split,
-    Stage,
-    evaluation_split,
-    selected_split,
+    named_selection,
     spread,
     trained,
-    training_split,
+    training_selection,
+    uniform_selection,
 )
 from asysplat.data.selection.index import read_index
 from asysplat.errors import InputError
@@ -31,31 +30,33 @@ class Task:
     """One reconstruction: the frames of a capture that are given and those to predict."""
 
     capture: Capture
-    split: Split
+    selection: Selection
 
 
 @runtime_checkable
 class Source(Protocol):
-    """What the data module draws from."""
+    """Where the data module gets its tasks."""
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
-        """A random training task; the same generator gives the same task."""
+        """Draw a random training task; the same state of `rng` gives the same task."""
         ...
 
-    def evaluation(self, stage: Stage, inputs: int, targets: int) -> list[Task]:
-        """The fixed tasks of a stage, none of whose target frames was ever trained on."""
+    def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
+        """Return the fixed tasks of a split; none of their targets is ever trained on."""
         ...
 
 
 class ProceduralSource:
-    """Endless training scenes, and validation and test scenes whose seeds never meet them.
+    """Synthetic scenes: endless ones to train, and fixed ones to validate and test.
+
+    No seed is used in two splits.
 
     Args:
-        height, width: of every view, in pixels.
+        height, width: size of every view, in pixels.
         num_frames: length of each camera path.
-        window: how many consecutive frames a training task is drawn from, least and most.
-        val_scenes, test_scenes: how many scenes each stage has.
-        places: both, rooms or outdoors: of every scene.
+        window: least and greatest number of consecutive frames that a training task is drawn from.
+        val_scenes, test_scenes: how many scenes each split has.
+        places: what the scenes show: both, rooms or outdoors.
     """
 
     def __init__(
@@ -75,11 +76,11 @@ class ProceduralSource:
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         scene = self._scene("train", int(rng.integers(2**31)))
-        return Task(scene, training_split(self.num_frames, inputs, targets, self.window, rng))
+        return Task(scene, training_selection(self.num_frames, inputs, targets, self.window, rng))
 
-    def evaluation(self, stage: Stage, inputs: int, targets: int) -> list[Task]:
-        split = evaluation_split(self.num_frames, inputs, targets)
-        return [Task(self._scene(stage, index), split) for index in range(self.counts[stage])]
+    def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
+        selection = uniform_selection(self.num_frames, inputs, targets)
+        return [Task(self._scene(split, index), selection) for index in range(self.counts[split])]
 
     def _scene(self, split: Literal["train", "val", "test"], index: int) -> ProceduralScene:
         seed = split_seed(split, index)
@@ -89,27 +90,27 @@ class ProceduralSource:
 class FilesSource:
     """Scenes on disk.
 
-    With a `test_root`, its scenes are tested, some scenes of `root` validate, and the others train
-    with all their frames; a scene that is tested is not trained on though `root` holds it as well.
-    Without one, every scene of `root` is tested on frames that it is not trained on: of every 8 the
-    first is tested and the fifth validates.
+    With a `test_root`, splits are made by scenes: those of `test_root` test, some scenes of `root`
+    validate, and the others train with all their frames. A scene that is tested is never trained
+    on, even if `root` holds it as well. Without a `test_root`, splits are made by frames: in every
+    scene of `root`, the first of every 8 frames tests, the fifth validates, the others train.
 
     Args:
         root: one scene, or a folder of scenes.
-        height, width: of every view, in pixels.
+        height, width: size of every view, in pixels.
         window: as for ProceduralSource.
         layout, on_bad_frame, cache: as `open_scene` takes them.
         test_root: one scene, or a folder of scenes.
-        selection: how the frames of an evaluation are chosen: every_8th, kmeans (the paper's
-            tests), first_96 (its ablations), uniform, or index.
-        index: with selection=index, the file that names the frames of the test; scenes that it does
-            not name are not tested, and validation takes every_8th.
-        val_scenes: at most so many scenes validate.
-        targets_may_be_inputs: of training tasks.
+        selection: how the frames of a test are chosen: every_8th, kmeans (the paper's tests),
+            first_96 (its ablations), uniform, or index.
+        index: with selection=index, the file that names the frames; scenes that it does not name
+            are not tested, and validation takes every_8th.
+        val_scenes: greatest number of scenes that validate.
+        targets_may_be_inputs: whether a training task's targets may be among its inputs.
 
     Raises:
-        InputError: no scene, an index that does not fit, or options that do not go together; when a
-            scene is first used, one that cannot be.
+        InputError: no scene, an index that does not fit, or options that do not go together; and,
+            when a scene is first used, files that cannot be used.
     """
 
     def __init__(
@@ -127,9 +128,9 @@ class FilesSource:
         val_scenes: int = 8,
         targets_may_be_inputs: bool = False,
     ):
-        def scenes(option: str, folder: str) -> Scenes:
+        def scenes(option: str, folder: str) -> SceneFolder:
             try:
-                return Scenes(folder, height, width, layout, on_bad_frame, cache)
+                return SceneFolder(folder, height, width, layout, on_bad_frame, cache)
             except InputError as error:
                 raise InputError(f"data.{option}={folder}: {error}") from error
 
@@ -154,21 +155,20 @@ class FilesSource:
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         capture = self.scenes[self._trained[rng.integers(len(self._trained))]]
         frames = range(capture.num_frames) if self.split_by_scenes else trained(capture.num_frames)
-        split = training_split(
+        drawn = training_selection(
             len(frames), inputs, targets, self.window, rng, self.targets_may_be_inputs
         )
-        return Task(
-            capture, Split([frames[i] for i in split.inputs], [frames[i] for i in split.targets])
-        )
+        chosen = Selection([frames[i] for i in drawn.inputs], [frames[i] for i in drawn.targets])
+        return Task(capture, chosen)
 
-    def evaluation(self, stage: Stage, inputs: int, targets: int) -> list[Task]:
-        if stage == "test" and self.selection == "index":
+    def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
+        if split == "test" and self.selection == "index":
             return self._indexed(inputs)
         selection = "every_8th" if self.selection == "index" else self.selection
         validated = (self.scenes[scene] for scene in self._validated)
         return [
-            Task(capture, selected_split(selection, capture.cameras, inputs, targets, stage))
-            for capture in (self._tested if stage == "test" else validated)
+            Task(capture, named_selection(selection, capture.cameras, inputs, targets, split))
+            for capture in (self._tested if split == "test" else validated)
         ]
 
     @cached_property
@@ -208,7 +208,7 @@ class FilesSource:
     def _indexed(self, inputs: int) -> list[Task]:
         index = read_index(self.index, inputs)
         tasks = [
-            Task(capture, index.split(capture.name, capture.cameras, inputs))
+            Task(capture, index.selection(capture.name, capture.cameras, inputs))
             for capture in self._tested
             if capture.name in index.entries
         ]

@@ -1,4 +1,4 @@
-"""Views to disk, in the layout of nerfstudio: transforms.json beside images/ and depth/."""
+"""Write views to disk in nerfstudio's layout: transforms.json beside images/ and depth/."""
 
 import json
 from pathlib import Path
@@ -12,8 +12,8 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
-MILLIMETRES = 1000  # depth steps a scene unit
-FARTHEST = 2**16 - 1  # what a 16-bit image can hold
+STEPS_PER_UNIT = 1000  # of stored depths
+FARTHEST = 2**16 - 1  # the largest depth step that a 16-bit image holds
 
 
 def write_transforms(views: Views, folder: Path) -> None:
@@ -52,7 +52,7 @@ def write_transforms(views: Views, folder: Path) -> None:
 
 
 def _opengl(cam_to_world: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
-    """The same cameras with the y and z axes turned about."""
+    """Convert OpenCV axes to OpenGL's: y up, z backward."""
     return cam_to_world * cam_to_world.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 
@@ -62,10 +62,10 @@ def _pinhole(matrix: Float[Tensor, "3 3"]) -> dict[str, float]:
 
 
 def _with_shared_intrinsics(views: Views, frames: list[dict]) -> dict:
-    """The whole file; intrinsics that all frames share are named once, at the top."""
+    """Return the file's content; intrinsics that all frames share are given once, at the top."""
     top = {"camera_model": "PINHOLE", "w": views.cameras.width, "h": views.cameras.height}
     if views.depths is not None:
-        top["depth_unit_scale_factor"] = 1 / MILLIMETRES
+        top["depth_unit_scale_factor"] = 1 / STEPS_PER_UNIT
     for name in ("fl_x", "fl_y", "cx", "cy"):
         if len({frame[name] for frame in frames}) == 1:
             top[name] = frames[0][name]
@@ -80,6 +80,6 @@ def _write_image(path: Path, image: Float[Tensor, "3 H W"]) -> None:
 
 
 def _write_depth(path: Path, depth: Float[Tensor, "H W"]) -> None:
-    """Depths beyond what 16 bits hold are written as 0, unknown."""
-    steps = (depth.double() * MILLIMETRES).round().numpy()
+    """Write a depth map; depths beyond what 16 bits hold become 0, unknown."""
+    steps = (depth.double() * STEPS_PER_UNIT).round().numpy()
     Image.fromarray(np.where(steps > FARTHEST, 0, steps).astype(np.uint16)).save(path)

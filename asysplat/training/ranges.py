@@ -36,7 +36,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
     (
         "a whole number of at least 0",
         lambda value: is_whole(value) and value >= 0,
-        ("data.workers", "training.warmup_steps", "callbacks.pictures.scenes"),
+        ("data.num_workers", "training.warmup_steps", "callbacks.pictures.scenes"),
     ),
     (
         f"a whole number from 0 to {SEEDS - 1}",

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
-from asysplat.data.modules import tested_sets
+from asysplat.data.build import tested_sets
 from asysplat.training.revision import revision
 
 RESULTS = "metrics.json"
@@ -70,7 +70,7 @@ def identity(config: DictConfig) -> str:
     config = config.copy()
     with open_dict(config):
         config.paths = dict.fromkeys(config.paths, "")
-        config.seed = config.data.workers = config.data.test_sets = None
+        config.seed = config.data.num_workers = config.data.test_sets = None
     resolved = OmegaConf.to_container(config, resolve=True)
     resolved["init_path"] = resolved["init_path"] is not None
     resolved["data"]["test_root"] = resolved["data"].get("test_root") is not None

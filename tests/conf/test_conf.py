@@ -23,7 +23,7 @@ PARTS = {("model", "asysplat"), ("model", "blocks"), ("model", "one_branch")}
 PARTS |= {("data", "views"), ("data", "disk")}
 TRAINED = [(group, name) for group, name in GROUPS if group in ("model", "experiment")]
 TRAINED += [("sweeps", path.stem) for path in sorted(SWEEPS.glob("*.yaml"))]
-TINY = ["width=0.125", "state_size=8", "data.workers=0", "data.num_frames=32"]
+TINY = ["width=0.125", "state_size=8", "data.num_workers=0", "data.num_frames=32"]
 TINY += ["data.inputs=2", "data.targets=1", "data.window=[12,32]"]
 TINY += ["data.val_scenes=1", "data.test_scenes=1", "data.test_sets=null"]
 

@@ -14,7 +14,7 @@ from asysplat.data import (
 )
 from asysplat.data.datamodule import FixedTasks, TrainingTasks, collate, load
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection import Split, held_out_split
+from asysplat.data.selection import Selection, every_8th_selection
 from asysplat.data.sources import Task
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
@@ -24,7 +24,7 @@ def procedural(**changes):
     source = ProceduralSource(16, 16, 24, (12, 24), val_scenes=1, test_scenes=1)
     options = {
         **{"name": "procedural", "source": source, "inputs": 3, "targets": 2},
-        **{"height": 16, "width": 16, "batch_size": 2, "workers": 0, "seed": 5},
+        **{"height": 16, "width": 16, "batch_size": 2, "num_workers": 0, "seed": 5},
         "steps_per_epoch": 3,
     }
     return SceneDataModule(**(options | changes))
@@ -32,7 +32,7 @@ def procedural(**changes):
 
 READ_WITH = {
     **{"inputs": 3, "targets": 2, "height": 16, "width": 16, "window": (12, 24)},
-    **{"batch_size": 2, "workers": 0, "seed": 5, "steps_per_epoch": 3},
+    **{"batch_size": 2, "num_workers": 0, "seed": 5, "steps_per_epoch": 3},
 }
 
 
@@ -103,7 +103,7 @@ class Counting:
 
 def test_an_input_that_is_a_target_is_decoded_once():
     capture = Counting(ProceduralScene(3, 16, 16, num_frames=24))
-    sample = load(Task(capture, Split([9, 2, 5], [5, 7, 9])))
+    sample = load(Task(capture, Selection([9, 2, 5], [5, 7, 9])))
     assert sorted(capture.decoded) == [2, 5, 7, 9]
     images = capture.scene.views([9, 2, 5, 7]).images
     assert torch.equal(sample["inputs"].images, images[:3])
@@ -112,7 +112,7 @@ def test_an_input_that_is_a_target_is_decoded_once():
 
 def test_fixed_tasks_stay_loaded_as_long_as_there_is_room(monkeypatch):
     captures = [Counting(ProceduralScene(seed, 16, 16, num_frames=24)) for seed in range(3)]
-    tasks = [Task(capture, Split([0, 1], [2])) for capture in captures]
+    tasks = [Task(capture, Selection([0, 1], [2])) for capture in captures]
     monkeypatch.setattr(datamodule, "KEPT_BYTES", 1.5 * 3 * 3 * 16 * 16 * 4)
     fixed = FixedTasks(tasks)
     assert [len(capture.decoded) for capture in captures] == [3, 3, 0]
@@ -124,7 +124,7 @@ def test_fixed_tasks_stay_loaded_as_long_as_there_is_room(monkeypatch):
 def test_evaluation_scenes_are_never_trained_on():
     data = procedural()
     data.setup()
-    evaluated = {sample["scene"] for stage in data.evaluation.values() for sample in stage}
+    evaluated = {sample["scene"] for split in data.evaluation.values() for sample in split}
     trained_on = {TrainingTasks(data)[i]["scene"] for i in range(5)}
     assert len(evaluated) == 2 and not evaluated & trained_on
 
@@ -140,7 +140,7 @@ def test_inputs_are_normalised_and_batches_stack():
 
 def test_too_short_a_folder():
     with pytest.raises(InputError, match=r"data\.inputs"):
-        held_out_split(6, 8, 4, "test")
+        every_8th_selection(6, 8, 4, "test")
 
 
 def test_a_test_set_differs_in_its_options_alone():
@@ -161,7 +161,7 @@ def test_a_set_of_one_kind_of_place(places):
     tasks = source.evaluation("val", 3, 2) + source.evaluation("test", 3, 2)
     tasks += [source.training(3, 2, np.random.default_rng(seed)) for seed in range(3)]
     # Nothing in a room is as far as 12 m, and the sky is 60 m away.
-    farthest = [task.capture.views(task.split.targets).depths.max() for task in tasks]
+    farthest = [task.capture.views(task.selection.targets).depths.max() for task in tasks]
     assert all((depth < 12) == (places == "rooms") for depth in farthest)
     seeds = [int(task.capture.name.removeprefix(f"{places}-")) for task in tasks]
     assert [seed % 3 for seed in seeds] == 2 * [1] + 3 * [2] + 3 * [0]
@@ -179,8 +179,8 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_an_unusable_test_set_is_named(case):
-    test_sets, words = REFUSED[case]
-    with pytest.raises(InputError, match=words):
+    test_sets, message = REFUSED[case]
+    with pytest.raises(InputError, match=message):
         with_test_sets(test_sets).setup()
 
 

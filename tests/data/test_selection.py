@@ -6,15 +6,15 @@ import torch
 
 from asysplat.data import ProceduralScene
 from asysplat.data.selection import (
-    Split,
-    evaluation_split,
-    first_96_split,
+    Selection,
+    every_8th_selection,
+    first_96_selection,
     held_out,
-    held_out_split,
-    kmeans_split,
-    selected_split,
+    kmeans_selection,
+    named_selection,
     trained,
-    training_split,
+    training_selection,
+    uniform_selection,
 )
 from asysplat.data.selection.__main__ import main as index_command
 from asysplat.data.selection.index import Entry, camera_hash, read_index, write_index
@@ -46,80 +46,82 @@ def cameras_at(centers, forwards=None) -> Cameras:
 
 
 def test_evaluation_inputs_are_even_and_targets_midway():
-    split = evaluation_split(num_frames=17, num_inputs=5, num_targets=4)
-    assert split.inputs == [0, 4, 8, 12, 16]
-    assert split.targets == [2, 6, 10, 14]
+    selected = uniform_selection(num_frames=17, num_inputs=5, num_targets=4)
+    assert selected.inputs == [0, 4, 8, 12, 16]
+    assert selected.targets == [2, 6, 10, 14]
 
 
 def test_evaluation_targets_are_spread_over_the_gaps():
-    split = evaluation_split(num_frames=81, num_inputs=9, num_targets=2)
-    assert split.targets == [25, 65]
+    selected = uniform_selection(num_frames=81, num_inputs=9, num_targets=2)
+    assert selected.targets == [25, 65]
 
 
 def test_evaluation_uses_every_frame_of_the_shortest_sequence():
-    split = evaluation_split(num_frames=7, num_inputs=4, num_targets=3)
-    assert split.inputs == [0, 2, 4, 6]
-    assert split.targets == [1, 3, 5]
+    selected = uniform_selection(num_frames=7, num_inputs=4, num_targets=3)
+    assert selected.inputs == [0, 2, 4, 6]
+    assert selected.targets == [1, 3, 5]
 
 
 @pytest.mark.parametrize("num_frames", range(8, 60))
 def test_evaluation_never_shares_or_repeats_a_frame(num_frames):
-    split = evaluation_split(num_frames, num_inputs=3, num_targets=5)
-    chosen = split.inputs + split.targets
+    selected = uniform_selection(num_frames, num_inputs=3, num_targets=5)
+    chosen = selected.inputs + selected.targets
     assert len(set(chosen)) == 8 and min(chosen) >= 0 and max(chosen) < num_frames
-    assert split.targets == sorted(split.targets)
+    assert selected.targets == sorted(selected.targets)
 
 
 def test_training_stays_in_its_window_and_never_shares_a_frame():
     rng = np.random.default_rng(0)
     starts = set()
     for _ in range(200):
-        split = training_split(50, num_inputs=4, num_targets=3, window=(10, 20), rng=rng)
-        ordered = split.inputs
-        assert len(set(split.inputs + split.targets)) == 7
+        selected = training_selection(50, num_inputs=4, num_targets=3, window=(10, 20), rng=rng)
+        ordered = selected.inputs
+        assert len(set(selected.inputs + selected.targets)) == 7
         assert 10 <= ordered[-1] - ordered[0] + 1 <= 20
-        assert ordered[0] < min(split.targets) and max(split.targets) < ordered[-1]
+        assert ordered[0] < min(selected.targets) and max(selected.targets) < ordered[-1]
         assert np.ptp(np.diff(ordered)) <= 1
-        assert split.targets == sorted(split.targets)
+        assert selected.targets == sorted(selected.targets)
         starts.add(ordered[0])
     assert min(starts) <= 1 and max(starts) >= 36 and len(starts) > 30
 
 
 def test_training_is_repeated_by_its_seed():
-    drawn = [training_split(50, 4, 3, (10, 20), np.random.default_rng(seed)) for seed in (1, 1, 2)]
+    drawn = [
+        training_selection(50, 4, 3, (10, 20), np.random.default_rng(seed)) for seed in (1, 1, 2)
+    ]
     assert drawn[0] == drawn[1] != drawn[2]
 
 
 def test_window_is_clipped_to_a_short_sequence():
-    split = training_split(9, 4, 3, (64, 128), np.random.default_rng(0))
-    assert split.inputs == [0, 3, 5, 8]
+    selected = training_selection(9, 4, 3, (64, 128), np.random.default_rng(0))
+    assert selected.inputs == [0, 3, 5, 8]
 
 
 def test_too_short_a_sequence_says_what_to_set():
     with pytest.raises(InputError, match=r"has 6 frames.*data\.inputs and data\.targets.*6"):
-        evaluation_split(6, num_inputs=4, num_targets=3)
+        uniform_selection(6, num_inputs=4, num_targets=3)
     with pytest.raises(InputError, match="has 6 frames"):
-        training_split(6, 4, 3, (8, 9), np.random.default_rng(0))
+        training_selection(6, 4, 3, (8, 9), np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("window", [(6, 20), (20, 10)])
 def test_unusable_window_is_named(window):
     with pytest.raises(InputError, match=r"data\.window"):
-        training_split(50, 4, 3, window, np.random.default_rng(0))
+        training_selection(50, 4, 3, window, np.random.default_rng(0))
 
 
 def test_zero_inputs_are_refused():
     with pytest.raises(InputError, match=r"data\.inputs is 0"):
-        evaluation_split(9, num_inputs=0, num_targets=3)
+        uniform_selection(9, num_inputs=0, num_targets=3)
 
 
 def test_targets_of_training_may_be_inputs():
     rng = np.random.default_rng(0)
     shared = []
     for _ in range(100):
-        split = training_split(50, 4, 3, (8, 8), rng, targets_may_be_inputs=True)
-        assert len(set(split.targets)) == 3 and min(split.inputs) <= min(split.targets)
-        shared.append(len(set(split.inputs) & set(split.targets)))
+        selected = training_selection(50, 4, 3, (8, 8), rng, targets_may_be_inputs=True)
+        assert len(set(selected.targets)) == 3 and min(selected.inputs) <= min(selected.targets)
+        shared.append(len(set(selected.inputs) & set(selected.targets)))
     # 3 of 8 frames, of which 4 are inputs.
     assert 1.2 < np.mean(shared) < 1.8
 
@@ -128,44 +130,46 @@ def test_frames_of_a_folder_are_tested_or_validated_or_trained():
     sets = [set(held_out(50, "test")), set(held_out(50, "val")), set(trained(50))]
     assert set.union(*sets) == set(range(50))
     assert sum(map(len, sets)) == 50
-    split = held_out_split(50, 8, 4, "test")
-    assert set(split.inputs) <= sets[2] and set(split.targets) <= sets[0]
-    assert len(split.inputs) == 8 and len(split.targets) == 4
+    selected = every_8th_selection(50, 8, 4, "test")
+    assert set(selected.inputs) <= sets[2] and set(selected.targets) <= sets[0]
+    assert len(selected.inputs) == 8 and len(selected.targets) == 4
 
 
 def test_first_96_frames():
-    split = first_96_split(300, 32, 8, "test")
-    assert split.targets == [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88]
+    selected = first_96_selection(300, 32, 8, "test")
+    assert selected.targets == [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88]
     # Every 2.68th of the 84 others, which begin with 1 and end with 95.
-    assert split.inputs[:8] == [1, 4, 6, 10, 13, 15, 19, 22]
-    assert split.inputs[-3:] == [90, 92, 95] and len(set(split.inputs)) == 32
-    assert split == first_96_split(96, 32, 8, "test") == first_96_split(1000, 32, 8, "test")
-    assert not set(split.inputs) & set(split.targets)
+    assert selected.inputs[:8] == [1, 4, 6, 10, 13, 15, 19, 22]
+    assert selected.inputs[-3:] == [90, 92, 95] and len(set(selected.inputs)) == 32
+    assert (
+        selected == first_96_selection(96, 32, 8, "test") == first_96_selection(1000, 32, 8, "test")
+    )
+    assert not set(selected.inputs) & set(selected.targets)
 
 
 @pytest.mark.parametrize("selection", ["every_8th", "kmeans", "first_96"])
 def test_validation_sees_no_frame_of_the_test(selection):
     cameras = cameras_at(np.random.default_rng(0).normal(size=(70, 3)))
-    split = selected_split(selection, cameras, 8, 4, "val")
-    assert len(split.inputs) == 8 and len(split.targets) == 4
-    assert not set(split.inputs + split.targets) & set(held_out(70, "test"))
-    assert set(split.targets) <= set(held_out(70, "val"))
-    tested = selected_split(selection, cameras, 8, 4, "test")
+    selected = named_selection(selection, cameras, 8, 4, "val")
+    assert len(selected.inputs) == 8 and len(selected.targets) == 4
+    assert not set(selected.inputs + selected.targets) & set(held_out(70, "test"))
+    assert set(selected.targets) <= set(held_out(70, "val"))
+    tested = named_selection(selection, cameras, 8, 4, "test")
     assert not set(tested.targets) & set(trained(70))
 
 
 def test_uniform_is_the_evaluation_of_made_up_scenes():
-    found = selected_split("uniform", cameras_at(torch.rand(17, 3)), 5, 4, "test")
-    assert found == evaluation_split(17, 5, 4)
+    found = named_selection("uniform", cameras_at(torch.rand(17, 3)), 5, 4, "test")
+    assert found == uniform_selection(17, 5, 4)
 
 
 def test_unknown_selections_and_short_sequences_are_named():
     cameras = cameras_at(torch.rand(20, 3))
     with pytest.raises(InputError, match=r"data\.selection is 'k_means': expected one of every_8"):
-        selected_split("k_means", cameras, 4, 4, "test")
+        named_selection("k_means", cameras, 4, 4, "test")
     for selection in ("every_8th", "kmeans", "first_96"):
         with pytest.raises(InputError, match=r"20 frames, of which 1\d are not .*data\.inputs"):
-            selected_split(selection, cameras, 19, 4, "test")
+            named_selection(selection, cameras, 19, 4, "test")
 
 
 MIDDLES = [5, 14, 23, 33]
@@ -183,8 +187,8 @@ def planted():
 
 
 def test_kmeans_finds_the_middle_of_planted_clusters():
-    split = kmeans_split(planted(), 4, 2, "test")
-    assert split == Split(MIDDLES, [0, 8, 16, 24, 32])
+    selected = kmeans_selection(planted(), 4, 2, "test")
+    assert selected == Selection(MIDDLES, [0, 8, 16, 24, 32])
 
 
 def test_kmeans_tells_directions_apart_as_well():
@@ -195,8 +199,8 @@ def test_kmeans_tells_directions_apart_as_well():
     centers = place[:, None] * np.array([2.0, 0, 0]) + 0.05 * rng.normal(size=(40, 3))
     forwards = np.stack((2 * look - 1.0, 0 * look, 0 * look + 0.3), -1)
     for unit in (1e-3, 1.0, 1e3):
-        split = kmeans_split(cameras_at(unit * centers + unit, forwards), 4, 4, "test")
-        assert {(place[i], look[i]) for i in split.inputs} == {(0, 0), (0, 1), (1, 0), (1, 1)}
+        selected = kmeans_selection(cameras_at(unit * centers + unit, forwards), 4, 4, "test")
+        assert {(place[i], look[i]) for i in selected.inputs} == {(0, 0), (0, 1), (1, 0), (1, 1)}
 
 
 def circle(count=120):
@@ -218,18 +222,18 @@ SCENES = {
 @pytest.mark.parametrize("scene", SCENES)
 def test_float_noise_changes_nothing(scene):
     cameras = SCENES[scene]()
-    split = kmeans_split(cameras, 4 if scene == "planted" else 16, 4, "test")
+    selected = kmeans_selection(cameras, 4 if scene == "planted" else 16, 4, "test")
     for seed in range(5):
         noise = np.random.default_rng(seed).normal(size=cameras.cam_to_world[:, :3].shape)
         moved = cameras.cam_to_world.clone()
         moved[:, :3] += 1e-7 * torch.tensor(noise)
         again = Cameras(cameras.intrinsics, moved, 4, 4)
-        assert kmeans_split(again, len(split.inputs), 4, "test") == split
+        assert kmeans_selection(again, len(selected.inputs), 4, "test") == selected
 
 
 def test_kmeans_of_a_circle_and_of_a_walk():
-    assert kmeans_split(circle(), 8, 4, "test").inputs == CIRCLE
-    assert kmeans_split(line(), 8, 4, "test").inputs == LINE
+    assert kmeans_selection(circle(), 8, 4, "test").inputs == CIRCLE
+    assert kmeans_selection(line(), 8, 4, "test").inputs == LINE
     assert np.ptp(np.diff(CIRCLE)) <= 5 and np.ptp(np.diff(LINE)) <= 5
 
 
@@ -259,18 +263,18 @@ def test_kmeans_of_a_real_walk(shared):
     frames = json.loads(file.read_text())["frames"]
     poses = np.linalg.inv([frame["w2c"] for frame in frames])
     cameras = Cameras(torch.eye(3).double().repeat(498, 1, 1), torch.tensor(poses), 4, 4)
-    split = kmeans_split(cameras, 32, 8, "test")
-    assert split.inputs == MYDESK
-    assert split.targets == list(range(0, 498, 8))
-    published = read_index(file, 32).split("mydesk", cameras, 32)
-    assert published.targets == split.targets and len(published.inputs) == 32
+    selected = kmeans_selection(cameras, 32, 8, "test")
+    assert selected.inputs == MYDESK
+    assert selected.targets == list(range(0, 498, 8))
+    published = read_index(file, 32).selection("mydesk", cameras, 32)
+    assert published.targets == selected.targets and len(published.inputs) == 32
     # They cover the walk about as well: the farthest frame from an input is about as far.
     features = pose_features(cameras)
-    reach = [
+    distance = [
         np.linalg.norm(features[:, None] - features[inputs], axis=-1).min(1).max()
-        for inputs in (split.inputs, published.inputs)
+        for inputs in (selected.inputs, published.inputs)
     ]
-    assert reach[0] < 1.2 * reach[1]
+    assert distance[0] < 1.2 * distance[1]
 
 
 def test_pixelsplat_s_index(tmp_path):
@@ -278,11 +282,11 @@ def test_pixelsplat_s_index(tmp_path):
     file.write_text('{"5aca": {"context": [2, 9], "target": [2, 4, 9]}, "322": null}')
     index = read_index(file, 2)
     assert list(index.entries) == ["5aca"]
-    assert index.split("5aca", line(10), 2) == Split([2, 9], [2, 4, 9])
+    assert index.selection("5aca", line(10), 2) == Selection([2, 9], [2, 4, 9])
     with pytest.raises(InputError, match=r"index\.json, scene 5aca has 2 inputs and data\.inputs"):
-        index.split("5aca", line(10), 3)
+        index.selection("5aca", line(10), 3)
     with pytest.raises(InputError, match="names frame 9, and the scene has 9 frames"):
-        index.split("5aca", line(9), 2)
+        index.selection("5aca", line(9), 2)
 
 
 def test_long_lrm_s_lists(tmp_path):
@@ -290,7 +294,7 @@ def test_long_lrm_s_lists(tmp_path):
         content = {"scene_name": scene, "frames": [{}] * 20, "fold_8_kmeans_2_input": [3, 12]}
         (tmp_path / scene).mkdir()
         (tmp_path / scene / "opencv_cameras.json").write_text(json.dumps(content))
-    expected = Split([3, 12], [0, 8, 16])
+    expected = Selection([3, 12], [0, 8, 16])
     one = read_index(tmp_path / "a/opencv_cameras.json", 2)
     assert one.entries == {"a": Entry(expected)}
     assert read_index(tmp_path, 2).entries == {"a": Entry(expected), "b": Entry(expected)}
@@ -300,11 +304,11 @@ def test_long_lrm_s_lists(tmp_path):
 
 def test_our_index_is_of_these_cameras_and_unchanged(tmp_path):
     file = tmp_path / "index.json"
-    split = kmeans_split(line(), 4, 4, "test")
-    write_index(file, "kmeans", {"walk": Entry(split, camera_hash(line()))})
-    assert read_index(file, 4).split("walk", line(), 4) == split
+    selected = kmeans_selection(line(), 4, 4, "test")
+    write_index(file, "kmeans", {"walk": Entry(selected, camera_hash(line()))})
+    assert read_index(file, 4).selection("walk", line(), 4) == selected
     with pytest.raises(InputError, match="made for other cameras"):
-        read_index(file, 4).split("walk", circle(), 4)
+        read_index(file, 4).selection("walk", circle(), 4)
     with pytest.raises(InputError, match=r"index\.json exists"):
         write_index(file, "kmeans", {})
     file.write_text(file.read_text().replace("kmeans", "uniform"))
@@ -323,7 +327,7 @@ def test_the_hash_is_of_the_cameras_alone():
 
 UNUSABLE = {
     "a list": ("[]", "is no index"),
-    "a word": ('{"a": "b"}', "scene a, context is None"),
+    "a string": ('{"a": "b"}', "scene a, context is None"),
     "no target": ('{"a": {"context": [1]}}', "scene a, target is None"),
     "a negative number": ('{"a": {"context": [-1], "target": [2]}}', "different frame numbers"),
     "twice the same": ('{"a": {"context": [1, 1], "target": [2]}}', "different frame numbers"),
@@ -333,9 +337,9 @@ UNUSABLE = {
 
 @pytest.mark.parametrize("case", UNUSABLE)
 def test_an_unusable_index_is_named(case, tmp_path):
-    text, words = UNUSABLE[case]
+    text, message = UNUSABLE[case]
     (tmp_path / "index.json").write_text(text)
-    with pytest.raises(InputError, match=rf"index\.json.*{words}"):
+    with pytest.raises(InputError, match=rf"index\.json.*{message}"):
         read_index(tmp_path / "index.json", 2)
 
 
@@ -348,7 +352,7 @@ def test_the_command_writes_an_index_outside_of_the_data_set(tmp_path, capsys):
     assert "2 scenes" in capsys.readouterr().out
     index = read_index(file, 4)
     cameras = ProceduralScene(4, 8, 8, num_frames=24).cameras
-    assert index.split("4", cameras, 4) == kmeans_split(cameras, 4, 8, "test")
+    assert index.selection("4", cameras, 4) == kmeans_selection(cameras, 4, 8, "test")
     inside = tmp_path / "scenes/index.json"
     with pytest.raises(SystemExit, match="lies in the data set"):
         index_command([str(tmp_path / "scenes"), str(inside), "--inputs", "4"])

@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
-from asysplat.data import FilesSource, scenes
+from asysplat.data import FilesSource, scene_folder
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection import Split, held_out, kmeans_split
+from asysplat.data.selection import Selection, held_out, kmeans_selection
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 
@@ -50,8 +50,8 @@ def opened(monkeypatch):
         names.append(path.name)
         return real(path, *arguments, **options)
 
-    real = scenes.open_scene
-    monkeypatch.setattr(scenes, "open_scene", open_scene)
+    real = scene_folder.open_scene
+    monkeypatch.setattr(scene_folder, "open_scene", open_scene)
     return names
 
 
@@ -65,14 +65,14 @@ def names(tasks):
 
 
 def frames(tasks):
-    return {frame for task in tasks for frame in task.split.inputs + task.split.targets}
+    return {frame for task in tasks for frame in task.selection.inputs + task.selection.targets}
 
 
 def test_a_written_scene_trains_like_the_scene_itself(folder):
     source = FilesSource(folder("one", 3), *SIZE, (12, 24))
     (task,) = source.evaluation("test", 4, 2)
-    read = task.capture.views(task.split.targets)
-    views = made(3).views(task.split.targets)
+    read = task.capture.views(task.selection.targets)
+    views = made(3).views(task.selection.targets)
     assert (read.images - views.images).abs().max() < 1 / 255
     assert (read.depths - views.depths).abs().max() < 1e-3
     assert (read.cameras.cam_to_world - views.cameras.cam_to_world).abs().max() < 1e-5
@@ -98,8 +98,8 @@ def test_scenes_are_opened_when_they_are_drawn(folder, opened):
 
 
 def test_scenes_that_were_long_unused_are_closed(folder, opened, monkeypatch):
-    monkeypatch.setattr(scenes, "MOST_OPEN", 2)
-    folder = scenes.Scenes(folder("many", 0, 1, 2), *SIZE)
+    monkeypatch.setattr(scene_folder, "MOST_OPEN", 2)
+    folder = scene_folder.SceneFolder(folder("many", 0, 1, 2), *SIZE)
     assert len(folder) == 3
     first = folder[0]
     assert folder[0] is first and folder[1].name == "s1" and folder[0] is first
@@ -150,7 +150,7 @@ def test_targets_may_be_inputs_where_asked(folder):
     root = folder("one", 3)
     shared = [
         any(
-            set(task.split.inputs) & set(task.split.targets)
+            set(task.selection.inputs) & set(task.selection.targets)
             for task in drawn(FilesSource(root, *SIZE, (12, 24), targets_may_be_inputs=asked))
         )
         for asked in (False, True)
@@ -163,8 +163,8 @@ def test_the_selection_is_that_of_the_test(folder):
     source = FilesSource(root, *SIZE, (12, 24), selection="kmeans")
     for task in source.evaluation("test", 4, 2):
         cameras = made(int(task.capture.name[1:])).cameras
-        assert task.split == kmeans_split(cameras, 4, 2, "test")
-        assert task.split.targets == [0, 8, 16]
+        assert task.selection == kmeans_selection(cameras, 4, 2, "test")
+        assert task.selection.targets == [0, 8, 16]
     assert not frames(drawn(source)) & {0, 8, 16}
     with pytest.raises(InputError, match=r"data\.selection is 'k-means'"):
         FilesSource(root, *SIZE, (12, 24), selection="k-means").evaluation("test", 4, 2)
@@ -190,7 +190,7 @@ def test_an_index_names_the_scenes_and_frames_of_the_test(folder, index):
         val_scenes=2,
     )
     (task,) = source.evaluation("test", 2, 7)
-    assert task.capture.name == "s2" and task.split == Split([3, 20], [3, 9])
+    assert task.capture.name == "s2" and task.selection == Selection([3, 20], [3, 9])
     assert len(source.evaluation("val", 2, 2)) == 2
     assert not names(drawn(source)) & {"s2", "s5"}
 

@@ -9,7 +9,7 @@ import pytest
 TINY = [
     *("width=0.125", "state_size=8", "model.layers=1m1s", "steps=4", "validate_every=2"),
     "trainer.log_every_n_steps=1",
-    *("data.height=32", "data.width=32", "data.inputs=3", "data.targets=2", "data.workers=0"),
+    *("data.height=32", "data.width=32", "data.inputs=3", "data.targets=2", "data.num_workers=0"),
 ]
 TINY_SCENES = [
     *("data.num_frames=24", "data.window=[12,24]"),

@@ -4,7 +4,7 @@ import torch
 
 from asysplat.data.datamodule import collate, load
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection import evaluation_split
+from asysplat.data.selection import uniform_selection
 from asysplat.data.sources import Task
 from asysplat.evaluation.metrics import psnr
 from asysplat.training import Reconstruction, ReconstructionLoss
@@ -14,7 +14,7 @@ STEPS = 250
 
 def test_one_scene_overfitted_passes_30_db(build):
     scene = ProceduralScene(3, 32, 32)
-    batch = collate([load(Task(scene, evaluation_split(96, 4, 2)))])
+    batch = collate([load(Task(scene, uniform_selection(96, 4, 2)))])
     module = Reconstruction(
         net=build("width=0.25", "state_size=32", "model.layers=1m1s"),
         loss=ReconstructionLoss(mse=1.0, perceptual=0.0, depth=0.0),

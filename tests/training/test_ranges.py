@@ -23,7 +23,7 @@ REFUSED = {
     "seed=-1": "seed=-1: give a whole number from 0 to 4294967295.",
     "width=0": "width=0: give a number above 0.",
     "width=wide": "width=wide: give a number above 0.",
-    "data.workers=-1": "data.workers=-1: give a whole number of at least 0.",
+    "data.num_workers=-1": "data.num_workers=-1: give a whole number of at least 0.",
     "data.height=abc": "data.height=abc: give a whole number of at least 1.",
     "training.learning_rate=nan": "training.learning_rate=nan: give a number above 0.",
     "training.loss.depth=-1": "training.loss.depth=-1: give a number of at least 0.",

@@ -36,7 +36,7 @@ SAME = {
     "moved weights": ["paths.weights=/b/weights", "training.loss.perceptual_term.weights=/c"],
     "another test set": ["test_sets=[mipnerf360]", "paths.mipnerf360=/b/360_v2"],
     "other names": ["name=other", "paths.logs=/b/logs", "rerun=true"],
-    "other processes": ["data.workers=3", "callbacks.pictures.scenes=0"],
+    "other processes": ["data.num_workers=3", "callbacks.pictures.scenes=0"],
     "another seed": ["seed=5"],
     "size of a test that is not made": ["replica_size.width=96"],
 }

@@ -80,7 +80,7 @@ def test_a_failure_is_named_and_the_others_go_on(train, tmp_path):
 def test_launchers(train, tmp_path, launcher):
     plugin = launcher.partition("_")[0]
     pytest.importorskip(f"hydra_plugins.hydra_{plugin}_launcher")
-    words = [f"hydra/launcher={launcher}", "data.workers=1"]
+    words = [f"hydra/launcher={launcher}", "data.num_workers=1"]
     result = train(*SWEEP, "seed=0,1", *words)
     assert result.returncode == 0, result.stderr
     assert finished_seeds(tmp_path) == [0, 1]

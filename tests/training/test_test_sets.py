@@ -16,7 +16,7 @@ from asysplat.training.summary import print_summary
 
 TINY = [
     *("width=0.125", "state_size=8", "model.layers=1m1s", "paths.run=unused"),
-    *("data.height=32", "data.width=32", "data.inputs=3", "data.targets=2", "data.workers=0"),
+    *("data.height=32", "data.width=32", "data.inputs=3", "data.targets=2", "data.num_workers=0"),
     *("data.num_frames=24", "data.window=[12,24]", "data.val_scenes=1", "data.test_scenes=1"),
 ]
 

@@ -108,7 +108,7 @@ def _data(
         inputs=size["views"],
         targets=wanted.targets,
         batch_size=1,
-        workers=wanted.workers,
+        num_workers=wanted.workers,
         seed=0,
         steps_per_epoch=1,
     )

@@ -9,7 +9,7 @@ from PIL import Image
 from rich.progress import track
 
 from asysplat.data import ProceduralScene
-from asysplat.data.readers.poses import opencv_from_opengl
+from asysplat.data.readers.common import opencv_from_opengl
 
 RENDERED = (135, 240)  # height, width; enlarged to that of the photographs
 PICTURES = 8  # that are different to look at

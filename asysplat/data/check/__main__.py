@@ -1,4 +1,5 @@
-"""What the reader sees in a scene, on one screen and as a picture:
+"""Show what a reader sees in a scene, on one screen and as a picture.
+
 python -m asysplat.data.check path/to/scene
 
 Ends with 0 where the cameras fit the images, with 1 where they do not, with 2 where the scene
@@ -15,19 +16,18 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asysplat.data.bad_frames import BadFrames, Policy
-from asysplat.data.check.matching import PLACES
-from asysplat.data.check.picture import draw_report
+from asysplat.data.check.matches import PLACES
 from asysplat.data.check.report import Report, check_scene
-from asysplat.data.check.terminal import print_report
+from asysplat.data.check.show import draw_report, print_report
 from asysplat.data.readers import LAYOUTS, find_scenes
 from asysplat.errors import InputError
 
-FIRST_SCENES = 3  # that are checked of a folder of many
+FIRST_SCENES = 3  # so many are checked of a folder of more
 RESOLUTION = 110  # pixels an inch of the picture
 
 
-def main(words: list[str] | None = None) -> int:
-    options = parse(words)
+def main(arguments: list[str] | None = None) -> int:
+    options = parse(arguments)
     try:
         return check(options, Console())
     except InputError as error:
@@ -35,7 +35,7 @@ def main(words: list[str] | None = None) -> int:
         return 2
 
 
-def parse(words: list[str] | None) -> Namespace:
+def parse(arguments: list[str] | None) -> Namespace:
     parser = ArgumentParser(prog="python -m asysplat.data.check", description=__doc__)
     parser.add_argument("path", type=Path, help="a scene, or a folder of scenes")
     parser.add_argument("--layout", default="auto", choices=("auto", *LAYOUTS))
@@ -49,7 +49,7 @@ def parse(words: list[str] | None) -> Namespace:
         default=Path("check"),
         help="where SCENE/check.png is put, outside the data set; nothing is overwritten",
     )
-    return parser.parse_args(words)
+    return parser.parse_args(arguments)
 
 
 def check(options: Namespace, console: Console) -> int:
@@ -72,7 +72,7 @@ def check(options: Namespace, console: Console) -> int:
 
 
 def check_one(layout: str, path: Path, on_bad_frame: Policy, console: Console) -> Report:
-    """The report of one scene, made under progress bars."""
+    """Make the report of one scene, under progress bars."""
     bad = BadFrames(on_bad_frame)
     scene = LAYOUTS[layout].read_scene(path, bad)
     with Progress(console=console, transient=True) as progress, warnings.catch_warnings():
@@ -82,11 +82,11 @@ def check_one(layout: str, path: Path, on_bad_frame: Policy, console: Console) -
             "decode": progress.add_task(f"{scene.name}: decoding", total=len(scene.photographs)),
             "match": progress.add_task(f"{scene.name}: matching", total=PLACES),
         }
-        return check_scene(scene, bad, lambda stage: progress.advance(bars[stage]))
+        return check_scene(scene, bad, lambda bar: progress.advance(bars[bar]))
 
 
 def save_picture(report: Report, title: str, out: Path) -> Path:
-    """Under the first name that is free."""
+    """Save the report's picture under the first free name: check.png, check-2.png, ..."""
     folder = out / report.capture.name.replace("/", "-")
     folder.mkdir(parents=True, exist_ok=True)
     names = chain(["check.png"], (f"check-{number}.png" for number in count(2)))

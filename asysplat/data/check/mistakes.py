@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from asysplat.data.readers.folders import natural_order
+from asysplat.data.readers.common import natural_order
 from asysplat.scene import Cameras
 
 EXPECTED = ("right", "down", "forward")
 OPPOSITES = ("left", "up", "backward")
-# What the columns of a camera-to-world rotation are elsewhere.
+# Directions of the columns of a camera-to-world rotation in other conventions.
 CONVENTIONS = {
     ("right", "up", "backward"): "OpenGL",
     ("down", "right", "backward"): "LLFF",
@@ -25,9 +25,9 @@ CONVENTIONS = {
 RESOLUTIONS = (0.5, 2.0, 0.25, 4.0, 0.125, 8.0)
 OFFSETS = (1, -1, 2, -2, 3, -3)  # frames
 
-# Of the rotations and positions of all cameras, what they should have been.
+# From the rotations and positions of all cameras as read to what they should be.
 PoseChange = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-# The same of (fx, fy) and (cx, cy).
+# The same for (fx, fy) and (cx, cy).
 LensChange = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
@@ -38,7 +38,7 @@ class Mistake:
     Args:
         name: what was done, as a sentence without its end.
         mend: what to do about it.
-        undo: the cameras as they should be, from those as read.
+        undo: turns the cameras as read into what they should be.
     """
 
     name: str
@@ -47,10 +47,13 @@ class Mistake:
 
 
 def usual_mistakes(names: Sequence[str]) -> list[Mistake]:
-    """The likelier first; those with a number to be fitted are made by the functions below.
+    """List the usual mistakes, the likelier first.
+
+    Those with a number to be fitted are not among them: `other_resolution` and `other_focal` make
+    them.
 
     Args:
-        names: of the image files, in the order of the frames.
+        names: image files, in the order of the frames.
     """
     resolutions = [other_resolution(factor) for factor in RESOLUTIONS]
     axes = _swapped_axes()
@@ -59,7 +62,7 @@ def usual_mistakes(names: Sequence[str]) -> list[Mistake]:
 
 
 def other_resolution(factor: float) -> Mistake:
-    """The intrinsics belong to images `factor` times as large."""
+    """Suppose that the intrinsics belong to images `factor` times as large."""
     times = f"{factor:.4g} times" if factor >= 1 else f"1/{1 / factor:.4g}"
     return Mistake(
         f"the intrinsics are those of images {times} the size",
@@ -69,7 +72,7 @@ def other_resolution(factor: float) -> Mistake:
 
 
 def other_focal(factor: float) -> Mistake:
-    """The focal lengths alone are `factor` times what they should be."""
+    """Suppose that the focal lengths alone are `factor` times what they should be."""
     return Mistake(
         f"the focal lengths are {factor:.4g} times what the images show",
         f"divide fx and fy by {factor:.4g}",
@@ -91,20 +94,23 @@ def _swapped_intrinsics() -> list[Mistake]:
 
 
 def _swapped_axes() -> list[Mistake]:
-    """All other names and signs of the three axes. Where they mirror, the world is mirrored too:
-    the reader would have refused a matrix that is no rotation."""
+    """List all other orders and signs of the three axes.
+
+    Those that mirror the axes mirror the world too: else the matrix would be no rotation, and the
+    reader would have refused it.
+    """
     mistakes = []
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
         named = zip(order, signs, strict=True)
         columns = tuple((EXPECTED if sign > 0 else OPPOSITES)[axis] for axis, sign in named)
-        # All turned about is the same as positions that are negated.
+        # All three signs changed is the same mistake as negated positions.
         if columns not in (EXPECTED, OPPOSITES):
             mistakes.append(_axes(order, signs, columns))
     return mistakes
 
 
 def _axes(order: tuple[int, ...], signs: tuple[int, ...], columns: tuple[str, ...]) -> Mistake:
-    # Column j as read is what should be column order[j], but for its sign.
+    # Column j as read should be column order[j], with the sign signs[j].
     turn = torch.zeros(3, 3, dtype=torch.float64)
     turn[range(3), order] = torch.tensor(signs, dtype=turn.dtype)
     mirror = torch.linalg.det(turn).round()
@@ -142,7 +148,7 @@ def _inverse(axes: Mistake | None = None) -> Mistake:
 
 
 def _halves() -> list[Mistake]:
-    """Rotations right and positions wrong, or the reverse."""
+    """List mistakes in the rotations alone or in the positions alone."""
     return [
         Mistake(
             "the rotations are transposed, the positions are not",
@@ -163,7 +169,7 @@ def _halves() -> list[Mistake]:
 
 
 def _orders(names: Sequence[str]) -> list[Mistake]:
-    """Poses that belong to other images of the sequence."""
+    """List the ways in which poses belong to other images of the sequence."""
     frames = range(len(names))
     paths = [Path(name) for name in names]
     orders = {

@@ -1,4 +1,4 @@
-"""Made-up places, the data set that needs no download."""
+"""Synthetic places, the data set that needs no download."""
 
 from asysplat.data.procedural.scene import ProceduralScene, split_seed
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 MARCH_STEPS = 18
 REFINE_STEPS = 8
-TINY = 1e-20  # keeps 0 from being divided by 0
-NEAREST = 0.5  # no ray meets the ground before this t: cameras are at eye level
+TINY = 1e-20  # avoids division by 0
+NEAREST = 0.5  # no ray meets the ground before this t, as cameras are at eye level
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Boxes:
     halves: Float[Tensor, "B 3"]
     axes: Float[Tensor, "B 3 3"]
 
-    def _local(self, vectors: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
-        return (self._axes_first() @ vectors).view(3, -1, vectors.shape[1])
+    def _local(self, directions: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
+        return (self._axes_first() @ directions).view(3, -1, directions.shape[1])
 
     def _to_centers(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
-        """From each point to each box's centre, along the box's axes."""
+        """Return the offsets from each point to each box's centre, along the box's axes."""
         centers = torch.einsum("bij,bj->ib", self.axes, self.centers).reshape(-1, 1)
         offsets = torch.addmm(centers, self._axes_first(), points, alpha=-1)
         return offsets.view(3, -1, points.shape[1])
@@ -39,15 +39,15 @@ class Boxes:
     def hit(
         self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
     ) -> Float[Tensor, "B R"]:
-        """Where each ray enters each box (slab test; Kay and Kajiya, 1986)."""
+        """Return the t at which each ray enters each box (slab test; Kay and Kajiya, 1986)."""
         inverse = 1 / (self._local(directions) + TINY)
         middle = self._to_centers(origins) * inverse
-        reach = self.halves.T[..., None] * inverse.abs()
-        enter, leave = (middle - reach).amax(0), (middle + reach).amin(0)
+        half_span = self.halves.T[..., None] * inverse.abs()
+        enter, leave = (middle - half_span).amax(0), (middle + half_span).amin(0)
         return torch.where((enter <= leave) & (enter > 0), enter, torch.inf)
 
     def facing(self, points: Float[Tensor, "3 R"], box: Int[Tensor, " R"]) -> Int[Tensor, " R"]:
-        """Which axis of its box each point's face looks along."""
+        """Return the axis of its box that is normal to each point's face."""
         to_box = self.axes / self.halves[..., None]
         offset = points - self.centers.T.index_select(1, box)
         local = (to_box.permute(1, 2, 0).index_select(2, box) * offset).sum(1)
@@ -55,7 +55,7 @@ class Boxes:
         return torch.where(z > torch.maximum(x, y), 2, (y > x).long())
 
     def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
-        """From each point to the nearest box; 0 inside."""
+        """Return the distance from each point to the nearest box; 0 inside."""
         outside = (self._to_centers(points).abs() - self.halves.T[..., None]).clamp(min=0)
         return (outside * outside).sum(0).amin(0).sqrt()
 
@@ -70,7 +70,7 @@ class Spheres:
     def hit(
         self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
     ) -> Float[Tensor, "S R"]:
-        """Where each ray enters each sphere."""
+        """Return the t at which each ray enters each sphere."""
         nearest, half_chord = self._chord(origins, directions)
         enter = nearest - half_chord
         return torch.where(enter > 0, enter, torch.inf)
@@ -78,14 +78,14 @@ class Spheres:
     def leave(
         self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
     ) -> Float[Tensor, "S R"]:
-        """Where each ray leaves each sphere, for origins inside."""
+        """Return the t at which each ray leaves each sphere, for origins inside."""
         nearest, half_chord = self._chord(origins, directions)
         return nearest + half_chord
 
     def _chord(
         self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
     ) -> tuple[Float[Tensor, "S R"], Float[Tensor, "S R"]]:
-        """The middle of the chord that each ray cuts, and half its length; NaN for a miss."""
+        """Return the t of the middle of each ray's chord, and half its length; NaN for a miss."""
         square = (directions * directions).sum(0)
         to_center = self.centers[..., None] - origins
         nearest = (to_center * directions).sum(1) / square
@@ -94,7 +94,7 @@ class Spheres:
         return nearest, (left / square).sqrt()
 
     def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
-        """From each point to the nearest sphere; 0 inside."""
+        """Return the distance from each point to the nearest sphere; 0 inside."""
         offset = points - self.centers[..., None]
         return ((offset * offset).sum(1).sqrt() - self.radii[:, None]).amin(0).clamp(min=0)
 
@@ -109,14 +109,14 @@ class Room:
     def hit(
         self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
     ) -> tuple[Float[Tensor, " R"], Int[Tensor, " R"]]:
-        """Where each ray, which starts inside, meets a wall, and which: +x -x +y -y +z -z."""
+        """Return the t and the wall (+x -x +y -y +z -z) that each ray from inside meets."""
         forward = directions > 0
         ahead = torch.where(forward, self.upper[:, None] - origins, origins - self.lower[:, None])
         t, axis = (ahead / directions.abs()).min(0)
         return t, 2 * axis + 1 - forward.gather(0, axis[None])[0].long()
 
     def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
-        """From each point inside to the nearest wall."""
+        """Return the distance from each point inside to the nearest wall."""
         return torch.minimum(points - self.lower[:, None], self.upper[:, None] - points).amin(0)
 
 
@@ -134,7 +134,7 @@ class Terrain:
     def sample(
         self, x: Float[Tensor, "T R"], y: Float[Tensor, "T R"], channels: slice
     ) -> Float[Tensor, "C T R"]:
-        """The named channels of the field, those of the border outside the square."""
+        """Interpolate the named channels of the field; outside the square, those of its border."""
         return torch.nn.functional.grid_sample(
             self.field[None, channels],
             torch.stack((x, y), -1)[None] / self.extent,
@@ -143,12 +143,12 @@ class Terrain:
         )[0]
 
     def above(self, points: Float[Tensor, "3 T R"]) -> Float[Tensor, "T R"]:
-        """How far each point lies above the ground."""
+        """Return the height of each point above the ground."""
         x, y, z = points
         return z - self.sample(x, y, slice(0, 1))[0]
 
     def normals(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 R"]:
-        """Unit normals of the ground below each point, smooth across samples."""
+        """Return the unit normals of the ground below each point, smooth across samples."""
         slopes = self.sample(points[0, None], points[1, None], slice(1, 3))[:, 0]
         upward = torch.cat((-slopes, torch.ones_like(slopes[:1])))
         return upward * (upward * upward).sum(0).rsqrt()
@@ -159,7 +159,7 @@ class Terrain:
         directions: Float[Tensor, "3 R"],
         limits: Float[Tensor, " R"],
     ) -> Float[Tensor, " R"]:
-        """Where each ray first dives under the ground before its limit.
+        """Return the t at which each ray first goes under the ground, before its limit.
 
         Steps grow with distance; the step that crosses is narrowed by false position (Illinois).
         """
@@ -179,7 +179,7 @@ class Terrain:
             gap = self.above(origins[:, None] + middle * directions[:, None])
             over = gap > 0
             low, high = torch.where(over, middle, low), torch.where(over, high, middle)
-            # Halving the side that stays makes the next guess fall beyond the root.
+            # Halving the gap of the side that stays makes the next guess fall beyond the root.
             gap_low, gap_high = (
                 torch.where(over, gap, gap_low / 2),
                 torch.where(over, gap_high / 2, gap),

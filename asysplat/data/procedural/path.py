@@ -9,7 +9,7 @@ UP = np.array([0.0, 0.0, 1.0])
 def sway(
     rng: np.random.Generator, time: Float[np.ndarray, " T"], cycles: tuple[float, ...]
 ) -> Float[np.ndarray, " T"]:
-    """Band-limited noise in about [-1, 1]: sines of the given numbers of cycles a walk."""
+    """Draw band-limited noise in about [-1, 1]: sines of the given numbers of cycles a walk."""
     phases = rng.uniform(0, 2 * np.pi, len(cycles))
     waves = np.sin(2 * np.pi * np.outer(time, cycles) + phases)
     return waves.mean(1)
@@ -18,7 +18,7 @@ def sway(
 def walk(
     rng: np.random.Generator, num_frames: int, radius: float
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3"]]:
-    """Positions and look-at targets, metres, z up, around the origin.
+    """Draw positions and look-at targets, in metres, z up, around the origin.
 
     The walker circles at about `radius` by 65 to 110 degrees, at eye level, and looks across the
     middle. `num_frames` samples the same walk more or less finely.
@@ -40,7 +40,7 @@ def look_at(
     targets: Float[np.ndarray, "T 3"],
     rolls: Float[np.ndarray, " T"],
 ) -> Float[np.ndarray, "T 4 4"]:
-    """OpenCV camera-to-world matrices; a roll, in radians, turns the camera about its axis."""
+    """Return OpenCV camera-to-world matrices; a roll (radians) turns a camera about its axis."""
     forward = targets - positions
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(forward, UP)
@@ -58,7 +58,7 @@ def look_at(
 def hand_held_path(
     rng: np.random.Generator, num_frames: int, radius: float
 ) -> Float[np.ndarray, "T 4 4"]:
-    """Camera-to-world matrices of a walk (see `walk`) with a slight roll."""
+    """Draw the camera-to-world matrices of a walk (see `walk`) with a slight roll."""
     positions, targets = walk(rng, num_frames, radius)
     rolls = 0.035 * sway(rng, np.linspace(0, 1, num_frames), (1.3, 3.1))
     return look_at(positions, targets, rolls)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.data.procedural import layout as layouts
+from asysplat.data.procedural.floor_plan import furnished_room, outdoor_place
 from asysplat.data.procedural.path import hand_held_path
 from asysplat.data.procedural.world import World
 from asysplat.errors import InputError
@@ -16,16 +16,18 @@ from asysplat.scene import Cameras, Views
 
 SPLITS = ("train", "val", "test")
 PLACES = ("both", "rooms", "outdoors")
-RAYS_IN_CACHE = 4096
-PROBE_FRAMES = 4  # that the light meter looks at
-PROBE_SIZE = 16  # pixels a side of those
+RAYS_IN_CACHE = 4096  # traced at once on a CPU
+PROBE_FRAMES = 4  # frames by which the exposure is set
+PROBE_SIZE = 16  # pixels a side of those frames
 DARKEST = 1e-3  # light below this is black
 CONTRAST = 1.1  # standard deviation of a walk's log light before the film's S-curve
 BRIGHTNESS = -0.2  # mean of the same
 
 
 def split_seed(split: Literal["train", "val", "test"], index: int) -> int:
-    """The seed of scene `index` of a split: splits take every third number, so they never meet.
+    """Return the seed of scene `index` of a split; no seed is in two splits.
+
+    Each split takes every third number.
 
     Raises:
         InputError: unknown split or negative index.
@@ -38,7 +40,7 @@ def split_seed(split: Literal["train", "val", "test"], index: int) -> int:
 
 
 class ProceduralScene:
-    """A `Capture` of a made-up place: textured boxes, spheres, walls or hills, along a walk.
+    """A `Capture` of a synthetic place: textured boxes, spheres, walls or hills, along a walk.
 
     One unit is a metre, z is up. The same seed gives the same place and walk on every device, and
     the same bits on a CPU.
@@ -47,8 +49,8 @@ class ProceduralScene:
         seed: any integer >= 0; see `split_seed`.
         height, width: of the images, pixels.
         num_frames: how finely the walk is sampled.
-        device: where images are made.
-        places: rooms or outdoors settles what the seed leaves to chance, in both.
+        device: where images are computed.
+        places: rooms or outdoors; with both, the seed decides.
 
     Raises:
         InputError: unknown places.
@@ -68,30 +70,28 @@ class ProceduralScene:
         rng = np.random.default_rng(seed)
         self.name = f"{'procedural' if places == 'both' else places}-{seed}"
         self.num_frames = num_frames
-        # Drawn even where it is settled, so that what follows stays the same.
+        # Drawn even if `places` decides, so that all later draws stay the same.
         heads = rng.random() < 0.5
         indoors = heads if places == "both" else places == "rooms"
         half = rng.uniform((2.8, 2.8, 1.3), (4.0, 4.0, 1.6))
         radius = 0.58 * half[:2].min() if indoors else rng.uniform(2.4, 3.2)
         poses = hand_held_path(rng, num_frames, radius)
         walk = poses[:, :2, 3]
-        layout = (
-            layouts.furnished_room(rng, walk, half) if indoors else layouts.outdoor_place(rng, walk)
-        )
+        plan = furnished_room(rng, walk, half) if indoors else outdoor_place(rng, walk)
         self.cameras = _cameras(poses, rng.uniform(60, 75), height, width).to(device)
-        self._world = World(layout, rng, self.cameras.intrinsics.device)
+        self._world = World(plan, rng, self.cameras.intrinsics.device)
         self._expose()
 
     def views(self, frames: Sequence[int]) -> Views:
-        """The named frames, with the exact depth of every pixel centre's ray."""
+        """Return the named frames, with the exact depth of every pixel centre's ray."""
         cameras = self.cameras.select(list(frames))
         light, depths = self._shoot(cameras)
         return Views(cameras, self._develop(light), depths)
 
     def _shoot(self, cameras: Cameras) -> tuple[Float[Tensor, "V 3 H W"], Float[Tensor, "V H W"]]:
-        """Light and depth at every pixel."""
+        """Trace the light and the depth at every pixel."""
         size = (cameras.height, cameras.width)
-        # All frames share their intrinsics; directions of z = 1 make t the depth.
+        # All frames share their intrinsics; with directions of z = 1, t is the depth.
         in_camera = cameras.select([0]).pixel_directions().flatten(0, 2).T.contiguous()
         light = in_camera.new_empty(cameras.num_views, 3, size[0] * size[1])
         depths = in_camera.new_empty(cameras.num_views, size[0] * size[1])
@@ -107,7 +107,7 @@ class ProceduralScene:
         return light.unflatten(-1, size), depths.unflatten(-1, size)
 
     def _develop(self, light: Float[Tensor, "V 3 H W"]) -> Float[Tensor, "V 3 H W"]:
-        """Film: an S-curve of the logarithm of light, into [0, 1]."""
+        """Map light into [0, 1] as film does: by an S-curve of its logarithm."""
         return torch.sigmoid(light.clamp(min=DARKEST).log() * self._gamma - self._threshold)
 
     def _expose(self) -> None:
@@ -120,7 +120,7 @@ class ProceduralScene:
 
 
 def _cameras(poses: np.ndarray, fov: float, height: int, width: int) -> Cameras:
-    """Square pixels, the principal point in the middle, `fov` degrees along the longer side."""
+    """Make cameras with square pixels, centred, with `fov` degrees along the longer side."""
     focal = max(height, width) / 2 / np.tan(np.radians(fov) / 2)
     matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     intrinsics = torch.as_tensor(matrix, dtype=torch.float32)

@@ -27,9 +27,9 @@ class Material:
     base: Colour
     accent: Colour
     cell: tuple[float, float] = (PLAIN, PLAIN)
-    shift: float = 0.0  # of each row of cells against the one below, in cells
+    shift: float = 0.0  # offset of each row of cells from the one below, in cells
     joint: float = 0.0  # width of the joints
-    variation: float = 0.0  # of brightness from cell to cell
+    variation: float = 0.0  # brightness differences between cells
     checker: float = 0.0  # brightness difference of a chequered pattern
     grain: tuple[float, float] = (1.0, 1.0)  # lattice points of the coarsest noise a metre
 
@@ -91,7 +91,7 @@ def tiles(rng: np.random.Generator) -> Material:
 
 
 def cloth(rng: np.random.Generator) -> Material:
-    """Plain or striped, of any hue."""
+    """Draw a plain or striped cloth of any hue."""
     hue, value = rng.uniform(), rng.uniform(0.25, 0.8)
     saturation = rng.uniform(0.3, 0.7)
     striped = rng.random() < 0.5
@@ -123,7 +123,7 @@ def stone(rng: np.random.Generator) -> Material:
 
 
 def noise_lattice(rng: np.random.Generator) -> Float[np.ndarray, "2 N N"]:
-    """Two channels of uniform numbers in [-1, 1]; the first row and column repeat at the end."""
+    """Draw two channels of numbers in [-1, 1]; the first row and column repeat at the end."""
     lattice = rng.uniform(-1, 1, (2, LATTICE, LATTICE))
     return np.pad(lattice, ((0, 0), (0, 1), (0, 1)), mode="wrap")
 
@@ -131,7 +131,9 @@ def noise_lattice(rng: np.random.Generator) -> Float[np.ndarray, "2 N N"]:
 def fractal_noise(
     lattice: Float[Tensor, "2 N N"], uv: Float[Tensor, "2 R"], footprint: Float[Tensor, " R"]
 ) -> Float[Tensor, "2 R"]:
-    """Value noise over OCTAVES octaves, about unit amplitude, without what a pixel cannot resolve.
+    """Sum value noise over OCTAVES octaves, leaving out what a pixel cannot resolve.
+
+    The amplitude is about 1.
 
     Args:
         uv: in lattice points of the coarsest octave.
@@ -139,7 +141,7 @@ def fractal_noise(
     """
     octave = torch.arange(OCTAVES, device=uv.device)
     frequency = 2.0**octave
-    # Lattices of different octaves are shifted against each other, lest their points coincide.
+    # The lattices of the octaves are shifted so that their points do not coincide.
     point = uv * frequency[:, None, None] + 17.3 * octave[:, None, None]
     corner = point.floor()
     step = point - corner
@@ -160,9 +162,10 @@ def cell_pattern(
     shift: Float[Tensor, " R"],
     joint: Float[Tensor, " R"],
 ) -> tuple[Float[Tensor, " R"], Float[Tensor, " R"], Float[Tensor, " R"]]:
-    """A grid of cells: a random tone a cell and a chequered one in [-1, 1], and joint coverage.
+    """Evaluate a grid of cells: a random tone a cell, a chequered tone, and joint coverage.
 
-    Tones fade towards a cell's edge over the footprint, so that edges do not alias.
+    Tones are in [-1, 1], and fade towards a cell's edge over the footprint, so that edges do not
+    alias.
     """
     in_cells = uv / cell
     row = in_cells[1].floor()
@@ -184,7 +187,7 @@ def albedo(
     uv: Float[Tensor, "2 R"],
     footprint: Float[Tensor, " R"],
 ) -> Float[Tensor, "3 R"]:
-    """Linear colour of each hit.
+    """Compute the linear colour of each hit.
 
     Args:
         rows: `Material.row` of each hit's surface.

@@ -1,9 +1,15 @@
-"""Readers of the public layouts of posed photographs, each straight from its own files.
+"""Readers of posed photographs in the layouts in which they are published.
 
-A layout is a module with two functions:
+A layout is how a data set's files are arranged in its folder. Each has a reader, a module with two
+functions:
 
-find_scenes(root) -> the scenes of this layout that `root` is or holds
-read_scene(scene, bad) -> PosedScene of one of them; what is wrong with single frames goes to `bad`
+find_scenes(root) -> list[Path]         the scenes of this layout that `root` is or holds
+read_scene(scene, bad) -> PosedScene    one of them; frames that cannot be used are noted in `bad`
+
+To add a data set whose layout is not here: write such a module (`llff` is a short one, `common` has
+what readers share), add it to LAYOUTS, write conf/data/NAME.yaml and a section of data/README.md,
+and let tests/data/readers/layouts/NAME.py write a scene to read. A data set whose layout is here
+needs no code: see conf/data/mipnerf360.yaml.
 """
 
 from pathlib import Path
@@ -11,7 +17,7 @@ from types import ModuleType
 
 from asysplat.data.bad_frames import BadFrames, Policy
 from asysplat.data.cache import ImageCache
-from asysplat.data.photographs import PhotographCapture
+from asysplat.data.capture import PhotographCapture
 from asysplat.data.readers import (
     colmap,
     dl3dv,
@@ -25,7 +31,7 @@ from asysplat.data.readers import (
 )
 from asysplat.errors import InputError
 
-# Where a folder has several, the first counts.
+# Where a folder fits several, the first of them reads it.
 LAYOUTS: dict[str, ModuleType] = {
     "long_lrm": long_lrm,
     "realestate10k": realestate10k,
@@ -40,7 +46,7 @@ LAYOUTS: dict[str, ModuleType] = {
 
 
 def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]]:
-    """The layout of the scenes that `root` is or holds, and the scenes.
+    """Return the layout of the scenes that `root` is or holds, and the scenes.
 
     Raises:
         InputError: an unknown layout, or no scene.
@@ -68,15 +74,15 @@ def open_scene(
     on_bad_frame: Policy = "fail",
     cache: ImageCache | None = None,
 ) -> PhotographCapture:
-    """One scene, its images unread.
+    """Open one scene, its images unread.
 
     Args:
-        scene: its folder, or as `find_scenes` names it.
-        height, width: of every view, in pixels.
+        scene: its folder, or a path that `find_scenes` returned.
+        height, width: size of every view, in pixels.
         layout: a name in LAYOUTS, or auto.
-        on_bad_frame: "fail" names every frame whose files cannot be used; "skip" leaves them out,
-            with a warning, and decodes each image once to know.
-        cache: of what was decoded.
+        on_bad_frame: "fail" raises an error that names every frame whose files cannot be used;
+            "skip" leaves them out, with a warning, for which each image is decoded once.
+        cache: where decoded pixels are kept.
 
     Raises:
         InputError: files that cannot be used, or fewer than two frames.

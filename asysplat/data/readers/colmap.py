@@ -1,5 +1,6 @@
-"""Reader of COLMAP's sparse models, text and binary, also of MipNeRF-360, Tanks&Temples and Deep
-Blending as they are published.
+"""Reader of COLMAP's sparse models, text and binary.
+
+MipNeRF-360, Tanks&Temples and Deep Blending are published in this layout.
 
 https://colmap.github.io/format.html
 """
@@ -17,16 +18,21 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from asysplat.data.bad_frames import BadFrames
+from asysplat.data.capture import Photograph, Points, PosedScene
 from asysplat.data.images import Lens, image_size
-from asysplat.data.photographs import Photograph, Points, PosedScene
-from asysplat.data.readers.folders import folders_with, natural_order
-from asysplat.data.readers.pictures import images_in, scaled
-from asysplat.data.readers.poses import inverted, rigid
+from asysplat.data.readers.common import (
+    folders_with,
+    images_in,
+    inverted,
+    natural_order,
+    rigid,
+    scaled,
+)
 from asysplat.errors import InputError
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 FOLDERS = ("images", "images_undistort", "images_2", "images_4", "images_8", ".")
-PARAMETERS = {  # of the camera models, in COLMAP's order
+PARAMETERS = {  # names of each camera model's parameters, in COLMAP's order
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",
     "SIMPLE_RADIAL": "f cx cy k1",
@@ -35,22 +41,23 @@ PARAMETERS = {  # of the camera models, in COLMAP's order
     "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
 SHOWN = 5  # names in a warning
-SAME_WORLD = 1e-3  # of the cameras' spread, and between rotations
+SAME_WORLD = 1e-3  # greatest difference of rotations, and of positions over the cameras' spread
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Folders with a model in `sparse/0`, `sparse`, `colmap/sparse/0` or their own files."""
+    """Find folders with a model in `sparse/0`, `sparse`, `colmap/sparse/0` or the folder itself."""
     return folders_with(
         root, *(f"{model}/cameras.{kind}" for model in MODELS for kind in ("bin", "txt"))
     )
 
 
 def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """A folder with a model and the images it names, relative to `images`, `images_undistort`,
-    `images_2`, `images_4`, `images_8` or the folder itself: the first of those that holds the most.
+    """Read a folder with a model and the images that it names.
 
-    Frames are the registered images, ordered by the numbers in their names (2 before 10); images
-    that are not registered are told in a warning. Where images are smaller than their cameras say,
+    The names are relative to `images`, `images_undistort`, `images_2`, `images_4`, `images_8` or
+    the folder itself: the first of those that holds the most of them. Frames are the registered
+    images, ordered by the numbers in their names (2 before 10); a warning lists images that are not
+    registered. Where images are smaller than their cameras say,
     the intrinsics are scaled.
 
     Raises:
@@ -78,9 +85,9 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
 
 
 def points_beside(scene: Path, photographs: Sequence[Photograph]) -> Points | None:
-    """Sparse points of a model beside photographs whose poses were read elsewhere.
+    """Read the sparse points of a model beside photographs whose poses were read elsewhere.
 
-    None if there is no model, or if its cameras, known by the images' names, stand elsewhere: then
+    None if there is no model, or if its cameras, found by the images' names, have other poses: then
     its world is another one.
 
     Raises:
@@ -144,7 +151,7 @@ def _read(model: Path) -> pycolmap.Reconstruction:
 
 
 def _check_lengths(file: Path) -> None:
-    """COLMAP loops for ever where it is told of more than the file holds."""
+    """Check that the file is as long as it says, as COLMAP would loop for ever if it is not."""
     stored = file.read_bytes()
     try:
         (count,) = struct.unpack_from("<Q", stored)
@@ -166,7 +173,7 @@ def _check_lengths(file: Path) -> None:
 
 
 def _check_cameras(file: Path, cameras: Iterable[pycolmap.Camera]) -> None:
-    """COLMAP makes cameras up beyond the file's end."""
+    """Check the file's length, since COLMAP invents cameras beyond its end."""
     expected = 8 + sum(24 + 8 * len(camera.params) for camera in cameras)
     if file.stat().st_size != expected:
         raise InputError(
@@ -176,7 +183,7 @@ def _check_cameras(file: Path, cameras: Iterable[pycolmap.Camera]) -> None:
 
 
 def _check_count(file: Path, found: int) -> None:
-    """COLMAP takes what lines there are; its own files say in a comment how many were written."""
+    """Check the number of entries against the file's header; COLMAP accepts any number of lines."""
     with file.open(encoding="utf-8", errors="replace") as lines:
         header = "".join(line for _, line in zip(range(4), lines, strict=False))
     stated = re.search(r"^# Number of \w+: (\d+)", header, re.MULTILINE)

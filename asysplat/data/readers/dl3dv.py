@@ -10,29 +10,28 @@ https://huggingface.co/datasets/DL3DV/DL3DV-Benchmark
 from pathlib import Path
 
 from asysplat.data.bad_frames import BadFrames
-from asysplat.data.photographs import PosedScene
-from asysplat.data.readers.folders import folders_with
+from asysplat.data.capture import PosedScene
+from asysplat.data.readers.common import folders_with
 from asysplat.data.readers.transforms import read_frames, read_photographs
 from asysplat.errors import InputError
 
 TRANSFORMS = "transforms.json"
 BENCHMARK = "nerfstudio"  # the folder in a benchmark scene
-IMAGES = ("images_4", "images_8", "images_2")  # 960P first: the paper's
+IMAGES = ("images_4", "images_8", "images_2")  # 960P first, as the paper uses
 HASH_LENGTH = 64
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Folders of scenes, named by their hash.
+    """Find folders of scenes: named by a hash, or with downsized images but no `images`.
 
-    Of another name they are known by having downsized images but no `images`, which nerfstudio
-    writes for everyone else.
+    Scenes that users made with nerfstudio have a folder `images`.
     """
     folders = folders_with(root, TRANSFORMS, f"{BENCHMARK}/{TRANSFORMS}")
     return [folder for folder in folders if _is_scene(folder)]
 
 
 def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """A scene's folder, or the `nerfstudio` in it: at 960P, or else at the size that is there.
+    """Read a scene's folder, or the `nerfstudio` in it: at 960P, else at the size that is there.
 
     The intrinsics are for the video's size (w x h in the file) and are scaled to the images'.
 
@@ -53,7 +52,7 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
 
 
 def _content(scene: Path) -> Path:
-    """Where a scene's files lie."""
+    """Return the folder in which a scene's files lie."""
     inner = scene / BENCHMARK
     return inner if (inner / TRANSFORMS).is_file() else scene
 
@@ -73,7 +72,7 @@ def _is_hash(name: str) -> bool:
 
 
 def _in_folder(entry: object, images: str) -> object:
-    """A frame whose image lies in the folder `images`, whatever folder the file names."""
+    """Return the frame with its image in the folder `images`, whatever folder the file names."""
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         return entry
     return {**entry, "file_path": f"{images}/{Path(entry['file_path']).name}"}

@@ -11,32 +11,30 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from asysplat.data.bad_frames import BadFrames
+from asysplat.data.capture import Photograph, PosedScene
 from asysplat.data.images import Lens, image_size
-from asysplat.data.photographs import Photograph, PosedScene
 from asysplat.data.readers.colmap import points_beside
-from asysplat.data.readers.folders import folders_with
-from asysplat.data.readers.pictures import images_in, scaled
-from asysplat.data.readers.poses import rigid
+from asysplat.data.readers.common import folders_with, images_in, rigid, scaled
 from asysplat.errors import InputError
 
 POSES = "poses_bounds.npy"
 FOLDERS = ("images", "images_2", "images_4", "images_8")  # the largest images first
-COLUMNS = 17  # 3x5 matrix, and the nearest and farthest depth
+COLUMNS = 17  # a 3x5 matrix, the nearest and the farthest depth
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Folders with a `poses_bounds.npy`."""
+    """Find folders with a `poses_bounds.npy`."""
     return folders_with(root, POSES)
 
 
 def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """A folder with a `poses_bounds.npy` and images.
+    """Read a folder with a `poses_bounds.npy` and images.
 
     Row i of the array belongs to the i-th image in sorted order: a row-major 3x5 matrix, whose
     first four columns are camera-to-world with axes down, right, backward and whose fifth is
     height, width and focal length of the full-size image, then the nearest and farthest depth. The
-    principal point is the centre. Images are those of the first of `images`, `images_2`, `images_4`
-    and `images_8` that holds as many as there are rows: the largest that are all there.
+    principal point is the centre. Images are taken from the first of `images`, `images_2`,
+    `images_4` and `images_8` that holds one a row: the largest that are all there.
 
     Raises:
         InputError: an array that cannot be used, or no folder with an image a row.

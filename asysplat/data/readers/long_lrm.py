@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from asysplat.data.bad_frames import BadFrames
+from asysplat.data.capture import Photograph, PosedScene
 from asysplat.data.images import Lens, image_size
-from asysplat.data.photographs import Photograph, PosedScene
 from asysplat.data.readers.colmap import points_beside
-from asysplat.data.readers.folders import folders_with
-from asysplat.data.readers.pictures import scaled
-from asysplat.data.readers.poses import inverted, rigid
+from asysplat.data.readers.common import folders_with, inverted, rigid, scaled
 from asysplat.data.readers.transforms import read_frames
 from asysplat.errors import InputError
 
@@ -21,8 +19,11 @@ CAMERAS = "opencv_cameras.json"
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Folders with an `opencv_cameras.json`; the json file itself, whatever its name; or those that
-    a text file names, one a line, relative to itself."""
+    """Find folders with an `opencv_cameras.json`.
+
+    `root` may also be such a json file, whatever its name, or a text file that names json files,
+    one a line, relative to itself.
+    """
     if not root.is_file():
         return folders_with(root, CAMERAS)
     if root.suffix == ".txt":
@@ -33,7 +34,7 @@ def find_scenes(root: Path) -> list[Path]:
 
 
 def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """A folder with an `opencv_cameras.json`, or the json file itself.
+    """Read a folder with an `opencv_cameras.json`, or the json file itself.
 
     Every frame has `w2c` (world-to-camera, OpenCV axes), `fx fy cx cy` in pixels of an image of
     `w` x `h`, and `file_path`, relative to the json file. Frames are in the file's order.

@@ -1,4 +1,4 @@
-"""Reader of photographs with `K.txt` and `poses.txt`, as of deep-video-mvs.
+"""Reader of photographs with `K.txt` and `poses.txt`, the format of deep-video-mvs.
 
 https://github.com/ardaduz/deep-video-mvs/tree/master/sample-data
 """
@@ -11,26 +11,22 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from asysplat.data.bad_frames import BadFrames
+from asysplat.data.capture import Photograph, PosedScene
 from asysplat.data.images import Lens, image_size
-from asysplat.data.photographs import Photograph, PosedScene
-from asysplat.data.readers.beside import beside
 from asysplat.data.readers.colmap import points_beside
-from asysplat.data.readers.folders import folders_with
-from asysplat.data.readers.pictures import images_in, scaled
-from asysplat.data.readers.poses import rigid
-from asysplat.data.readers.transforms import MILLIMETRES
+from asysplat.data.readers.common import MILLIMETRES, beside, folders_with, images_in, rigid, scaled
 from asysplat.errors import InputError
 
-POSES = ("poses_refined.txt", "poses.txt")  # the first that is there
+POSES = ("poses_refined.txt", "poses.txt")  # the first that is there is read
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Folders with a `K.txt`."""
+    """Find folders with a `K.txt`."""
     return folders_with(root, "K.txt")
 
 
 def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """A folder with `K.txt`, `poses.txt`, `images/` and, perhaps, `depth/`.
+    """Read a folder with `K.txt`, `poses.txt`, `images/` and, perhaps, `depth/`.
 
     `K.txt` is the 3x3 pinhole matrix for the images as they are. Line i of `poses.txt` belongs to
     the i-th image in sorted order: camera-to-world 4x4, row-major, OpenCV axes, metres;
@@ -86,7 +82,7 @@ def _read_matrix(file: Path) -> Float[ndarray, "3 3"]:
 def _read_numbers(file: Path, columns: int) -> Float[ndarray, "rows columns"]:
     try:
         lines = [line.split() for line in file.read_text(encoding="utf-8").splitlines()]
-        rows = [[float(word) for word in words] for words in lines if words]
+        rows = [[float(number) for number in line] for line in lines if line]
     except (OSError, ValueError) as error:
         raise InputError(f"{file} cannot be read as numbers ({error}): write it again.") from error
     for index, row in enumerate(rows):

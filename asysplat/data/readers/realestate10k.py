@@ -22,18 +22,17 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.data.bad_frames import BadFrames
+from asysplat.data.capture import Photograph, PosedScene
 from asysplat.data.images import EncodedImage, Lens, image_size
-from asysplat.data.photographs import Photograph, PosedScene
-from asysplat.data.readers.json_file import read_json
-from asysplat.data.readers.poses import inverted, rigid
+from asysplat.data.readers.common import inverted, read_json, rigid
 from asysplat.errors import InputError
 
 CHUNK = ".torch"
-NUMBERS = 18  # of one camera
+NUMBERS = 18  # for one camera
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Scenes as chunk.torch/key, of one chunk, of a folder of chunks, or of its train and test."""
+    """Find scenes, as chunk.torch/key: of a chunk, a folder of chunks, or its train and test."""
     if any(parent.suffix == CHUNK for parent in root.parents):
         return [root]
     if root.suffix == CHUNK:
@@ -45,7 +44,7 @@ def find_scenes(root: Path) -> list[Path]:
 
 
 def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """One scene, as chunk.torch/key. Its images' bytes stay in the file until they are decoded.
+    """Read one scene, named chunk.torch/key; its images stay in the file until decoded.
 
     Raises:
         InputError: a chunk that cannot be used, or without this scene.
@@ -88,7 +87,7 @@ def _in_chunk(chunk: Path) -> list[Path]:
 
 
 def _load(chunk: Path) -> dict[str, dict[str, Any]]:
-    """A chunk's scenes by key."""
+    """Load a chunk's scenes, by key."""
     if not chunk.is_file():
         raise InputError(f"{chunk} does not exist: copy it there, or name another chunk.")
     return _load_once(chunk, chunk.stat().st_mtime_ns)
@@ -97,7 +96,7 @@ def _load(chunk: Path) -> dict[str, dict[str, Any]]:
 @lru_cache(maxsize=1)  # scenes are mostly opened one chunk after the other
 def _load_once(chunk: Path, modified: int) -> dict[str, dict[str, Any]]:
     try:
-        # The form that torch wrote before its files were zips cannot be mapped.
+        # The form that torch wrote before it wrote zip files cannot be mapped.
         scenes = torch.load(
             chunk, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(chunk)
         )
@@ -118,7 +117,7 @@ def _load_once(chunk: Path, modified: int) -> dict[str, dict[str, Any]]:
 
 
 def _checked(entry: dict[str, Any], scene: Path) -> tuple[Float[ndarray, "V 18"], list[Any]]:
-    """A scene's cameras and images, as many of both."""
+    """Return a scene's cameras and images, checked to be equally many."""
     cameras, images = entry.get("cameras"), entry.get("images")
     if not isinstance(cameras, Tensor) or cameras.ndim != 2 or cameras.shape[1] != NUMBERS:
         found = tuple(cameras.shape) if isinstance(cameras, Tensor) else type(cameras).__name__

@@ -1,4 +1,4 @@
-"""Reader of Replica as NICE-SLAM rendered it: colours, depths and a trajectory for each room.
+"""Reader of Replica as published with NICE-SLAM: images, depths and a trajectory of each room.
 
 root/cam_params.json           intrinsics, image size, and depth steps a metre (6553.5)
 root/<scene>/traj.txt          row i: 16 numbers, camera-to-world of frame i, row-major, OpenCV axes
@@ -10,13 +10,9 @@ https://github.com/cvg/nice-slam (scripts/download_replica.sh, src/utils/dataset
 from pathlib import Path
 
 from asysplat.data.bad_frames import BadFrames
+from asysplat.data.capture import Photograph, PosedScene
 from asysplat.data.images import Lens, image_size
-from asysplat.data.photographs import Photograph, PosedScene
-from asysplat.data.readers.beside import beside
-from asysplat.data.readers.folders import folders_with
-from asysplat.data.readers.json_file import read_json
-from asysplat.data.readers.poses import rigid
-from asysplat.data.readers.transforms import number
+from asysplat.data.readers.common import beside, folders_with, number, read_json, rigid
 from asysplat.errors import InputError
 
 TRAJECTORY = "traj.txt"
@@ -25,14 +21,15 @@ HALF_A_PIXEL = 0.5  # cx is 599.5 of 1200: these files put the first pixel's cen
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Folders with a `traj.txt` and `results`."""
+    """Find folders with a `traj.txt` and `results`."""
     return [folder for folder in folders_with(root, TRAJECTORY) if (folder / "results").is_dir()]
 
 
 def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """A room's folder. `cam_params.json` lies above it, or in it where a room stands alone.
+    """Read a room's folder.
 
-    Every row of `traj.txt` must have its frame, and, if there is any depth map, its depth.
+    `cam_params.json` lies above it, or in it if there is one room alone. Every row of `traj.txt`
+    must have its image, and, if there is any depth map, its depth map.
 
     Raises:
         InputError: unusable parameters, or frames without a row.
@@ -81,7 +78,7 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
 
 
 def _camera(file: Path) -> tuple[Lens, float]:
-    """The lens of all frames, and metres a depth step."""
+    """Read the lens of all frames, and metres a depth step."""
     content = read_json(file)
     camera = content.get("camera") if isinstance(content, dict) else None
     if not isinstance(camera, dict):

@@ -1,6 +1,6 @@
 """Reader of ScanNet++: photographs of a reflex camera (DSLR), or of an iPhone with its LiDAR.
 
-Each of these files of poses is a scene's address, first the one that its folder stands for:
+A scene is named by one of these files of poses; a folder stands for the first that it has:
 
 <scene>/dslr/nerfstudio/transforms_undistorted.json  resized_undistorted_images, .._masks
 <scene>/dslr/nerfstudio/transforms.json              fisheye: resized_images, resized_anon_masks,
@@ -25,13 +25,10 @@ from typing import Any
 import numpy as np
 
 from asysplat.data.bad_frames import BadFrames
+from asysplat.data.capture import Photograph, Points, PosedScene
 from asysplat.data.images import Lens, image_size
-from asysplat.data.photographs import Photograph, Points, PosedScene
-from asysplat.data.readers.beside import beside
-from asysplat.data.readers.folders import folders_with
-from asysplat.data.readers.json_file import read_json
-from asysplat.data.readers.poses import rigid
-from asysplat.data.readers.transforms import MILLIMETRES, read_frames, read_photographs
+from asysplat.data.readers.common import MILLIMETRES, beside, folders_with, read_json, rigid
+from asysplat.data.readers.transforms import read_frames, read_photographs
 from asysplat.errors import InputError
 
 
@@ -40,7 +37,7 @@ class Part:
     """The folders that belong to a file of poses, within its camera's folder.
 
     Args:
-        get: what to do where the images are not there.
+        get: how to get the images, for messages.
     """
 
     images: str
@@ -71,15 +68,15 @@ PARTS = {
     ARKIT: Part("rgb", "rgb_masks", "depth", EXTRACT),
 }
 CAMERAS = ("dslr", "iphone")
-# The transforms files' world from the scan's, and back.
+# From the scan's world to that of the transforms files, and back.
 TURN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """The file of poses that each scene's folder stands for, or the named one.
+    """Find the file of poses that each scene's folder stands for, or the named one.
 
-    Of a scene that is the first in the list above whose images are there; of <scene>/dslr or
-    <scene>/iphone the first of this camera.
+    A scene's folder stands for the first file in the list above whose images are there;
+    <scene>/dslr and <scene>/iphone stand for the first of that camera.
     """
     if root.is_file():
         return [root] if _key(root) else []
@@ -89,7 +86,7 @@ def find_scenes(root: Path) -> list[Path]:
 
 
 def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """One camera's photographs, named <scene>-dslr or <scene>-iphone, and COLMAP's sparse points.
+    """Read one camera's photographs and COLMAP's points; the name is <scene>-dslr or -iphone.
 
     The benchmark's test frames are among them where their images were published. Frames that the
     file marks `is_bad` are left out, with a warning.
@@ -119,12 +116,12 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
 
 
 def _key(file: Path) -> str:
-    """`file` from its scene's folder on; nothing for other files."""
+    """Return the path of `file` from its scene's folder on; "" for other files."""
     return next((key for key in PARTS if file.as_posix().endswith(f"/{key}")), "")
 
 
 def _first(scene: Path, camera: str = "") -> list[Path]:
-    """The file of poses that counts, one with images before one without."""
+    """Return the file of poses that the scene stands for; one with images before one without."""
     keys = [key for key in PARTS if key.startswith(camera) and (scene / key).is_file()]
     keys.sort(key=lambda key: not (scene / key.split("/")[0] / PARTS[key].images).is_dir())
     return [scene / key for key in keys[:1]]
@@ -148,10 +145,10 @@ def _transforms(file: Path, folder: Path, part: Part, bad: BadFrames) -> list[Ph
 
 
 def _good_frames(content: dict[str, Any], file: Path, images: Path) -> list[Any]:
-    """Training and published test frames that are not marked as bad."""
+    """Return training and published test frames that are not marked as bad."""
     test = [entry for entry in content.get("test_frames", []) if isinstance(entry, dict)]
     if not any((images / str(entry.get("file_path"))).is_file() for entry in test):
-        test = []  # hidden ones, and the DSLR's in the iPhone's file
+        test = []  # hidden ones, or the DSLR's in the iPhone's file
     frames = content["frames"] + test
     good = [entry for entry in frames if not (isinstance(entry, dict) and entry.get("is_bad"))]
     if len(good) < len(frames):
@@ -164,7 +161,7 @@ def _good_frames(content: dict[str, Any], file: Path, images: Path) -> list[Any]
 
 
 def _with_paths(entry: Any, images: str, masks: str | None, depths: str | None) -> Any:
-    """A frame that names its image, mask and depth from the camera's folder on."""
+    """Return the frame with paths of its image, mask and depth from the camera's folder on."""
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         return entry
     name = f"{Path(entry['file_path']).stem}.png"
@@ -177,7 +174,7 @@ def _with_paths(entry: Any, images: str, masks: str | None, depths: str | None) 
 
 
 def _arkit(file: Path, folder: Path, part: Part, bad: BadFrames) -> list[Photograph]:
-    """By name: camera-to-world with OpenCV axes, in the scan's world, and intrinsics in pixels."""
+    """Read ARKit's poses: by frame, camera-to-world with OpenCV axes and intrinsics in pixels."""
     content = read_json(file)
     if not isinstance(content, dict):
         raise InputError(f"{file} is no object of frames by name: download it again.")
@@ -217,7 +214,10 @@ def _pinhole(stored: Any, size: tuple[int, int], where: str) -> Lens:
 
 
 def _points(file: Path) -> Points | None:
-    """Columns 2 to 4 of COLMAP's text: https://colmap.github.io/format.html#points3d-txt"""
+    """Read columns 2 to 4 of COLMAP's points3D.txt.
+
+    https://colmap.github.io/format.html#points3d-txt
+    """
     if not file.is_file():
         return None
     with file.open(encoding="utf-8", errors="replace") as lines:

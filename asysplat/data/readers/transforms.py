@@ -11,31 +11,36 @@ from pathlib import Path
 from typing import Any
 
 from asysplat.data.bad_frames import BadFrames
+from asysplat.data.capture import Photograph, PosedScene
 from asysplat.data.images import Lens, image_size
-from asysplat.data.photographs import Photograph, PosedScene
-from asysplat.data.readers.beside import beside
 from asysplat.data.readers.colmap import points_beside
-from asysplat.data.readers.folders import folders_with, natural_order
-from asysplat.data.readers.json_file import read_json
-from asysplat.data.readers.pictures import scaled
-from asysplat.data.readers.poses import opencv_from_opengl, rigid
+from asysplat.data.readers.common import (
+    MILLIMETRES,
+    beside,
+    folders_with,
+    natural_order,
+    number,
+    opencv_from_opengl,
+    read_json,
+    rigid,
+    scaled,
+)
 from asysplat.errors import InputError
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-MILLIMETRES = 0.001  # nerfstudio's default unit of stored depths
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Folders with a `transforms.json`, or the json file itself."""
+    """Find folders with a `transforms.json`; `root` may be the json file itself."""
     return [root] if root.suffix == ".json" else folders_with(root, "transforms.json")
 
 
 def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """A folder with a `transforms.json`, or the json file itself.
+    """Read a folder with a `transforms.json`, or the json file itself.
 
-    Reads the file and the images' headers. Frames are ordered by the numbers in their file names (2
-    before 10), or, where a name has no number, as in the file. Paths in the file are relative to
-    its folder.
+    Of the images, only the headers are read. Frames are ordered by the numbers in their names (2
+    before 10), or, if a name has no number, as in the file. Paths in the file are relative to its
+    folder.
 
     Raises:
         InputError: anything in the file that cannot be used.
@@ -47,7 +52,7 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
 
 
 def read_frames(file: Path) -> dict[str, Any]:
-    """The file's content, with a list "frames".
+    """Read the file's content, which has a list "frames".
 
     Raises:
         InputError: it has none.
@@ -65,13 +70,15 @@ def read_photographs(
     folder: Path | None = None,
     resized: bool = False,
 ) -> list[Photograph]:
-    """The frames of a `transforms.json`, or of what another layout says in its words.
+    """Return the photographs of a `transforms.json`, or of a layout that uses its fields.
 
     Args:
-        content: with a list "frames".
-        file: where it stands, for messages.
-        folder: that its paths are relative to; without it, the file's own.
-        resized: the images may be smaller or larger than w x h, for which the intrinsics hold.
+        content: the file's, with a list "frames".
+        file: where it was read, for messages.
+        bad: notes the frames that cannot be used.
+        folder: what its paths are relative to; None: the file's own folder.
+        resized: whether the images may have another size than w x h, to which the intrinsics
+            belong.
     """
     folder = folder or file.parent
     photographs = []
@@ -114,7 +121,7 @@ def _photograph(
 
 
 def _lens(settings: dict[str, Any], size: tuple[int, int], resized: bool, where: str) -> Lens:
-    """For an image of (width, height) `size`."""
+    """Return the lens of an image of (width, height) `size`."""
     stated = (settings.get("w", size[0]), settings.get("h", size[1]))
     if stated == size:
         return _stated_lens(settings, *size, where)
@@ -135,7 +142,7 @@ def _stated_lens(settings: dict[str, Any], width: int, height: int, where: str) 
             f"{where}: camera_model is {model!r}: undistort the images to PINHOLE, or use one of "
             f"{', '.join(PERSPECTIVE_MODELS)}, OPENCV_FISHEYE."
         )
-    # The formats disagree on what a perspective k4 means.
+    # The formats disagree about what k4 means for perspective cameras.
     if not fisheye and number(settings, "k4", where, default=0.0) != 0:
         raise InputError(f"{where}: k4 is only known for OPENCV_FISHEYE: undistort the images.")
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
@@ -153,7 +160,7 @@ def _stated_lens(settings: dict[str, Any], width: int, height: int, where: str) 
 
 
 def _focal(settings: dict[str, Any], width: int, height: int, where: str) -> tuple[float, float]:
-    """fx and fy in pixels, from lengths, else from fields of view; one stands for both."""
+    """Return fx and fy in pixels, from focal lengths or fields of view; one stands for both."""
     found = {}
     for axis, pixels in (("x", width), ("y", height)):
         if f"fl_{axis}" in settings:
@@ -173,20 +180,8 @@ def _focal(settings: dict[str, Any], width: int, height: int, where: str) -> tup
     return fx, fy
 
 
-def number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """A setting, or `default` where there is none.
-
-    Raises:
-        InputError: it is not a finite number.
-    """
-    value = settings.get(key, default)
-    if not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: {key} is {value!r}: give a finite number.")
-    return float(value)
-
-
 def _find_image(path: Path) -> Path:
-    """`path`, or the file it means when the extension was left out."""
+    """Return `path`, or the image it means if the extension was left out."""
     if path.is_file():
         return path
     candidates = (path.with_name(path.name + suffix) for suffix in (".png", ".jpg"))
@@ -196,7 +191,7 @@ def _find_image(path: Path) -> Path:
 def _beside(
     folder: Path, settings: dict[str, Any], key: str, size: tuple[int, int], where: str
 ) -> Path | None:
-    """The depth map or mask that `key` names, of any size that shows the whole photograph."""
+    """Return the depth map or mask that `key` names; None where there is none."""
     name = settings.get(key)
     if name is None:
         return None

@@ -1,55 +1,55 @@
-"""Which frames of a scene the network is given, and which it must predict: pure, and seeded."""
+"""Selections: which frames of a scene the network is given, and which it must predict."""
 
-from asysplat.data.selection.kmeans import kmeans_split
-from asysplat.data.selection.splits import (
+from asysplat.data.selection.frames import (
+    Selection,
     Split,
-    Stage,
-    evaluation_split,
-    first_96_split,
+    every_8th_selection,
+    first_96_selection,
     held_out,
-    held_out_split,
     spread,
     trained,
-    training_split,
+    training_selection,
+    uniform_selection,
 )
+from asysplat.data.selection.kmeans import kmeans_selection
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
 
 __all__ = [
     "SELECTIONS",
+    "Selection",
     "Split",
-    "Stage",
-    "evaluation_split",
-    "first_96_split",
+    "every_8th_selection",
+    "first_96_selection",
     "held_out",
-    "held_out_split",
-    "kmeans_split",
-    "selected_split",
+    "kmeans_selection",
+    "named_selection",
     "spread",
     "trained",
-    "training_split",
+    "training_selection",
+    "uniform_selection",
 ]
 
 SELECTIONS = ("every_8th", "kmeans", "first_96", "uniform")
 
 
-def selected_split(
-    selection: str, cameras: Cameras, num_inputs: int, num_targets: int, stage: Stage
-) -> Split:
-    """The split of one of SELECTIONS, for a scene with these cameras.
+def named_selection(
+    selection: str, cameras: Cameras, num_inputs: int, num_targets: int, split: Split
+) -> Selection:
+    """Select frames of a scene with these cameras in one of the ways named in SELECTIONS.
 
     Raises:
         InputError: an unknown name, or too few frames.
     """
     frames = cameras.num_views
     if selection == "every_8th":
-        return held_out_split(frames, num_inputs, num_targets, stage)
+        return every_8th_selection(frames, num_inputs, num_targets, split)
     if selection == "kmeans":
-        return kmeans_split(cameras, num_inputs, num_targets, stage)
+        return kmeans_selection(cameras, num_inputs, num_targets, split)
     if selection == "first_96":
-        return first_96_split(frames, num_inputs, num_targets, stage)
+        return first_96_selection(frames, num_inputs, num_targets, split)
     if selection == "uniform":
-        return evaluation_split(frames, num_inputs, num_targets)
+        return uniform_selection(frames, num_inputs, num_targets)
     raise InputError(
         f"data.selection is {selection!r}: expected one of {', '.join(SELECTIONS)}, index."
     )

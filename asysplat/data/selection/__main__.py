@@ -1,4 +1,4 @@
-"""Write an index of the frames that an evaluation uses:
+"""Write an index of the frames that an evaluation uses.
 
 python -m asysplat.data.selection path/to/scenes index.json --selection kmeans --inputs 32
 """
@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from asysplat.data.readers import find_scenes, open_scene
-from asysplat.data.selection import SELECTIONS, selected_split
+from asysplat.data.selection import SELECTIONS, named_selection
 from asysplat.data.selection.index import Entry, camera_hash, write_index
 from asysplat.errors import InputError
 
@@ -37,10 +37,10 @@ def main(arguments: list[str] | None = None) -> None:
 def index_entries(
     root: Path, layout: str, selection: str, num_inputs: int, num_targets: int
 ) -> dict[str, Entry]:
-    """The test split of every scene that `root` is or holds.
+    """Select the test frames of every scene that `root` is or holds.
 
     Raises:
-        InputError: a scene that cannot be read or split, or two of one name.
+        InputError: a scene that cannot be read, that is too short, or two of one name.
     """
     layout, scenes = find_scenes(root, layout)
     entries: dict[str, Entry] = {}
@@ -48,8 +48,8 @@ def index_entries(
         capture = open_scene(scene, 1, 1, layout)  # cameras alone: no pixel is read
         if capture.name in entries:
             raise InputError(f"{root} holds two scenes called {capture.name}: rename one.")
-        split = selected_split(selection, capture.cameras, num_inputs, num_targets, "test")
-        entries[capture.name] = Entry(split, camera_hash(capture.cameras))
+        chosen = named_selection(selection, capture.cameras, num_inputs, num_targets, "test")
+        entries[capture.name] = Entry(chosen, camera_hash(capture.cameras))
     return entries
 
 

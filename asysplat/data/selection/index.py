@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from asysplat.data.readers.folders import folders_with
-from asysplat.data.readers.json_file import read_json
+from asysplat.data.readers.common import folders_with, read_json
+from asysplat.data.selection.frames import Selection
 from asysplat.data.selection.kmeans import DECIMALS, pose_features
-from asysplat.data.selection.splits import Split
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
 
@@ -33,28 +32,28 @@ class Entry:
         cameras: the hash of the scene's cameras, where the index has one.
     """
 
-    split: Split
+    selection: Selection
     cameras: str | None = None
 
 
 @dataclass(frozen=True)
 class ViewIndex:
-    """The splits of the scenes that an index file names.
+    """The selections of the scenes that an index file names.
 
     Args:
-        path: the file, for messages.
+        path: the index file, for messages.
         entries: by the name of the scene.
     """
 
     path: Path
     entries: Mapping[str, Entry]
 
-    def split(self, scene: str, cameras: Cameras, num_inputs: int) -> Split:
-        """Of a scene that the index names.
+    def selection(self, scene: str, cameras: Cameras, num_inputs: int) -> Selection:
+        """Return the selection of a scene that the index names.
 
         Raises:
-            InputError: it was made for other cameras or another number of inputs, or names a frame
-                that the scene lacks.
+            InputError: the index was made for other cameras or another number of inputs, or names a
+                frame that the scene lacks.
         """
         entry = self.entries[scene]
         where = f"{self.path}, scene {scene}"
@@ -62,27 +61,28 @@ class ViewIndex:
             raise InputError(
                 f"{where}: the index was made for other cameras: write it again for these files."
             )
-        if len(entry.split.inputs) != num_inputs:
+        inputs, targets = entry.selection.inputs, entry.selection.targets
+        if len(inputs) != num_inputs:
             raise InputError(
-                f"{where} has {len(entry.split.inputs)} inputs and data.inputs is {num_inputs}: "
-                "set one to the other."
+                f"{where} has {len(inputs)} inputs and data.inputs is {num_inputs}: set one to the "
+                "other."
             )
-        last = max(entry.split.inputs + entry.split.targets)
+        last = max(inputs + targets)
         if last >= cameras.num_views:
             raise InputError(
                 f"{where} names frame {last}, and the scene has {cameras.num_views} frames: it "
                 "belongs to another version of the scene; write the index again for this one."
             )
-        return entry.split
+        return entry.selection
 
 
 def read_index(path: Path | str, num_inputs: int) -> ViewIndex:
-    """An index of any of the three forms.
+    """Read an index of any of the three forms.
 
-    pixelSplat's: {scene: {"context": [...], "target": [...]} or null}; what is null is left out,
-    and a target may be an input. Long-LRM's: a scene's own opencv_cameras.json with a list
-    `fold_8_kmeans_32_input`, every 8th frame being a target; for many scenes, their folder. Ours:
-    as `write_index` writes it.
+    pixelSplat's: {scene: {"context": [...], "target": [...]} or null}; scenes that are null are
+    left out, and a target may be an input. Long-LRM's: a scene's own opencv_cameras.json with a
+    list `fold_8_kmeans_32_input`, every 8th frame being a target; for many scenes, their folder.
+    Ours: as `write_index` writes it.
 
     Raises:
         InputError: none of these, a list for another number of inputs, or an index of ours that
@@ -113,7 +113,7 @@ def read_index(path: Path | str, num_inputs: int) -> ViewIndex:
 
 
 def write_index(path: Path, selection: str, entries: Mapping[str, Entry]) -> None:
-    """Write an index of our own; a hash over all of it shows later changes.
+    """Write an index in our own form; its hash over all of it shows later changes.
 
     Raises:
         InputError: the file exists.
@@ -122,8 +122,8 @@ def write_index(path: Path, selection: str, entries: Mapping[str, Entry]) -> Non
         raise InputError(f"{path} exists: name a new file, nothing is overwritten.")
     scenes = {
         name: {
-            "context": entry.split.inputs,
-            "target": entry.split.targets,
+            "context": entry.selection.inputs,
+            "target": entry.selection.targets,
             "cameras": entry.cameras,
         }
         for name, entry in entries.items()
@@ -133,7 +133,7 @@ def write_index(path: Path, selection: str, entries: Mapping[str, Entry]) -> Non
 
 
 def camera_hash(cameras: Cameras) -> str:
-    """Of where a scene's cameras stand and look, whatever its frame's origin and unit."""
+    """Hash where a scene's cameras stand and look, whatever the origin and the unit are."""
     steps = (pose_features(cameras) * 10**DECIMALS).round().astype("<i8")
     return _digest(np.ascontiguousarray(steps).tobytes())
 
@@ -155,11 +155,11 @@ def _digest(data: bytes) -> str:
 
 def _entry(where: str, stored: Any) -> Entry:
     entry = stored if isinstance(stored, dict) else {}
-    split = Split(
+    selection = Selection(
         _frames(f"{where}, context", entry.get("context")),
         _frames(f"{where}, target", entry.get("target")),
     )
-    return Entry(split, entry.get("cameras"))
+    return Entry(selection, entry.get("cameras"))
 
 
 def _long_lrm_entry(file: Path, content: Any, num_inputs: int) -> tuple[str, Entry]:
@@ -171,8 +171,8 @@ def _long_lrm_entry(file: Path, content: Any, num_inputs: int) -> tuple[str, Ent
         fold, count = map(int, match.groups())
         if count == num_inputs and fold > 0:
             inputs = _frames(f"{file}, {name}", content[name])
-            split = Split(inputs, list(range(0, len(frames), fold)))
-            return str(content.get("scene_name", file.parent.name)), Entry(split)
+            selection = Selection(inputs, list(range(0, len(frames), fold)))
+            return str(content.get("scene_name", file.parent.name)), Entry(selection)
     there = ", ".join(lists) or "none"
     raise InputError(
         f"{file} has no list fold_8_kmeans_{num_inputs}_input (there: {there}): set data.inputs to "

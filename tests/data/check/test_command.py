@@ -33,8 +33,8 @@ def check(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.chdir(tmp_path)
 
-    def run(*words) -> tuple[int, str, str]:
-        code = main([str(word) for word in words])
+    def run(*arguments) -> tuple[int, str, str]:
+        code = main([str(argument) for argument in arguments])
         return code, *capsys.readouterr()
 
     return run
@@ -136,7 +136,7 @@ def test_one_of_many_scenes(check, scene):
 
 
 @pytest.mark.parametrize(
-    "words, message",
+    "arguments, message",
     [
         (("nowhere",), "nowhere does not exist"),
         (("data/walk", "--out", "data/walk/check"), "lies in the data set"),
@@ -144,7 +144,7 @@ def test_one_of_many_scenes(check, scene):
         (("data", "--layout", "transforms", "--out", "data"), "lies in the data set"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(check, scene, words, message):
-    code, _, err = check(*words)
+def test_what_cannot_be_done_is_one_line(check, scene, arguments, message):
+    code, _, err = check(*arguments)
     assert code == 2 and message in err
     assert err.startswith("error: ") and err.count("\n") == 1

@@ -5,9 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from asysplat.data.check.epipolar import epipolar_distances, epipolar_lines, triangulate
-from asysplat.data.check.matching import Matches
-from asysplat.data.check.path import count_points, measure_path
+from asysplat.data.check.matches import Matches, epipolar_distances, epipolar_lines, triangulate
+from asysplat.data.check.measurements import count_points, measure_path
 from asysplat.scene import Cameras
 
 HEIGHT, WIDTH = 120, 160

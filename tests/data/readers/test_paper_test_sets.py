@@ -8,12 +8,12 @@ from hydra.utils import instantiate
 from layouts import colmap, dl3dv, realestate10k, replica, scannetpp
 
 TINY = ["data.inputs=4", "data.targets=2", "data.window=[8,12]", "data.val_scenes=1"]
-TINY += ["data.height=16", "data.width=16", "data.cache.folder=null", "data.workers=0"]
+TINY += ["data.height=16", "data.width=16", "data.cache.folder=null", "data.num_workers=0"]
 
 
 @pytest.fixture(scope="module")
 def published(views, tmp_path_factory):
-    """Words that say where each data set is."""
+    """Overrides that say where each data set is."""
     root = tmp_path_factory.mktemp("published")
     for letter in "abc":
         dl3dv.write_scene(views, root / "DL3DV" / "1K" / (letter * 64))
@@ -28,17 +28,17 @@ def published(views, tmp_path_factory):
     for name in ("tanks_and_temples", "mipnerf360", "deep_blending"):
         colmap.write(views, root / name / "place")
         places[name] = name
-    words = [f"paths.{name}={root / place}" for name, place in places.items()]
-    return [f"data.root={root / 'DL3DV'}", f"data.test_root={root / 'Benchmark'}", *words]
+    overrides = [f"paths.{name}={root / place}" for name, place in places.items()]
+    return [f"data.root={root / 'DL3DV'}", f"data.test_root={root / 'Benchmark'}", *overrides]
 
 
 @pytest.fixture
 def tests_of(repository, published):
-    """Name -> its first scene, as a command's words have them."""
+    """Name -> its first scene, as a command's overrides have them."""
 
-    def make(*words):
+    def make(*overrides):
         with initialize_config_dir(str(repository / "conf"), version_base=None):
-            config = compose("train", ["data=dl3dv", *TINY, *published, *words])
+            config = compose("train", ["data=dl3dv", *TINY, *published, *overrides])
         data = instantiate(config.data)
         data.setup()
         return {name: tasks[0] for name, tasks in data.tests.items()}

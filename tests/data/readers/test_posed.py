@@ -71,7 +71,7 @@ def test_poses_and_images_that_differ_in_number_are_refused(scene):
 
 TEXTS = {
     "cut": ("poses.txt", lambda text: text[:-200], r"poses\.txt, row 11 holds \d+ numbers"),
-    "words": ("poses.txt", lambda text: text.replace("e", "x", 1), "cannot be read as numbers"),
+    "letters": ("poses.txt", lambda text: text.replace("e", "x", 1), "cannot be read as numbers"),
     "bytes": ("poses.txt", lambda text: text + "\0", "cannot be read as numbers"),
     "nothing": ("poses.txt", lambda text: "", "has 0 poses"),
     "two rows": ("K.txt", lambda text: text[: len(text) * 2 // 3], r"K\.txt holds \[\["),

@@ -282,8 +282,8 @@ def epipolar_error(views) -> float:
     """The median symmetric epipolar distance of SIFT matches between two views, in pixels."""
     images = (views.images * 255).byte().permute(0, 2, 3, 1).numpy()
     sift = cv2.SIFT_create(1500)
-    keys, words = zip(*(sift.detectAndCompute(image, None) for image in images), strict=True)
-    pairs = cv2.BFMatcher().knnMatch(*words, k=2)
+    keys, descriptors = zip(*(sift.detectAndCompute(image, None) for image in images), strict=True)
+    pairs = cv2.BFMatcher().knnMatch(*descriptors, k=2)
     good = [first for first, second in pairs if first.distance < 0.7 * second.distance]
     assert len(good) > 100
     # SIFT, as all of OpenCV, puts the first pixel's centre at 0.

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from asysplat.data.bad_frames import BadFrames
-from asysplat.data.check.matching import find_matches
-from asysplat.data.check.verdict import LIMIT, judge, measure_fit
-from asysplat.data.photographs import PhotographCapture
+from asysplat.data.capture import PhotographCapture
+from asysplat.data.check.matches import find_matches
+from asysplat.data.check.report import LIMIT, judge, measure_fit
 from asysplat.data.readers import llff, long_lrm, posed, transforms
 
 LAYOUTS = {"fern": llff, "fox": transforms, "mydesk": long_lrm, "hololens-000": posed}

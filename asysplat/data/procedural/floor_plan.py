@@ -1,4 +1,4 @@
-"""What stands where: furnishes a room, or a place outdoors, around a walk.
+"""Floor plans: what stands where in a room, or in a place outdoors, around a walk.
 
 All in metres, z up, the floor at about 0, the walk around the origin.
 """
@@ -12,14 +12,14 @@ from jaxtyping import Bool, Float
 from asysplat.data.procedural import textures
 from asysplat.data.procedural.textures import Material
 
-CLEARANCE = 0.45  # kept between the walk and what stands on the ground, seen from above
+CLEARANCE = 0.45  # distance, seen from above, between the walk and what stands on the ground
 SKY_RADIUS = 60.0
 TERRAIN_SAMPLES = 121
-TRIES = 64
+TRIES = 64  # spots tried for each thing
 
 
 @dataclass
-class Layout:
+class FloorPlan:
     """Everything solid, in plain numbers, and the light.
 
     Args:
@@ -30,15 +30,16 @@ class Layout:
         shell: materials of the walls at +-x, +-y, ceiling and floor; outdoors that of the ground.
         heights: [N, N] of the terrain; None in a room.
         light: position of the lamp or sun, [3].
-        light_colour: what it sheds on a near surface that faces it, linear RGB [3].
-        reach: distance over which it halves.
+        light_colour: of a white surface that faces it from near by, linear RGB [3].
+        falloff: distance at which the light is half as strong.
         ambient: light from everywhere, linear RGB [3].
+        taken: (spot, radius) of what stands on the ground.
     """
 
     walk: Float[np.ndarray, "T 2"]
     light: np.ndarray
     light_colour: np.ndarray
-    reach: float
+    falloff: float
     ambient: np.ndarray
     shell: list[Material]
     room: tuple[np.ndarray, np.ndarray] | None = None
@@ -54,7 +55,7 @@ class Layout:
         self.spheres.append((np.array(center, float), radius, material))
 
     def free(self, spots: Float[np.ndarray, "K 2"], radius: float) -> Bool[np.ndarray, " K"]:
-        """Which spots have room for a disc, clear of the walk and of what stands there already."""
+        """Tell which spots have room for a disc, clear of the walk and of what stands there."""
         to_walk = np.linalg.norm(spots[:, None] - self.walk, axis=-1).min(1)
         good = to_walk > radius + CLEARANCE
         for place, other in self.taken:
@@ -62,7 +63,7 @@ class Layout:
         return good
 
     def claim(self, spots: Float[np.ndarray, "K 2"], radius: float) -> np.ndarray | None:
-        """The first free spot, now taken; None if there is none."""
+        """Take the first free spot; None if there is none."""
         good = np.flatnonzero(self.free(spots, radius))
         if len(good) == 0:
             return None
@@ -75,79 +76,79 @@ def any_material(rng: np.random.Generator) -> Material:
     return kinds[rng.integers(len(kinds))](rng)
 
 
-def table(layout: Layout, rng: np.random.Generator, x: float, y: float, size: float) -> None:
-    """A top on two panels, with something on it."""
+def table(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+    """Add a top on two panels, with a ball on it."""
     height, yaw, wood = rng.uniform(0.5, 0.8), rng.uniform(0, np.pi), textures.planks(rng)
     along = np.array([np.cos(yaw), np.sin(yaw)])
-    layout.add_box((x, y, height - 0.03), (0.8 * size, 0.5 * size, 0.03), yaw, wood)
+    plan.add_box((x, y, height - 0.03), (0.8 * size, 0.5 * size, 0.03), yaw, wood)
     for side in (-0.65, 0.65):
         leg = np.array([x, y]) + side * size * along
-        layout.add_box((*leg, height / 2 - 0.03), (0.03, 0.45 * size, height / 2 - 0.03), yaw, wood)
+        plan.add_box((*leg, height / 2 - 0.03), (0.03, 0.45 * size, height / 2 - 0.03), yaw, wood)
     radius = rng.uniform(0.1, 0.2)
-    layout.add_sphere((x, y, height + radius), radius, any_material(rng))
+    plan.add_sphere((x, y, height + radius), radius, any_material(rng))
 
 
-def stack(layout: Layout, rng: np.random.Generator, x: float, y: float, size: float) -> None:
-    """A crate with a smaller one on it."""
+def stack(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+    """Add a crate with a smaller one on it."""
     half, yaw = np.array([0.75, 0.6, 0.6]) * size * rng.uniform(0.7, 1.0), rng.uniform(0, np.pi)
-    layout.add_box((x, y, half[2]), half, yaw, any_material(rng))
+    plan.add_box((x, y, half[2]), half, yaw, any_material(rng))
     small = half * rng.uniform(0.35, 0.7)
     top = 2 * half[2] + small[2]
-    layout.add_box((x, y, top), small, yaw + rng.uniform(-0.6, 0.6), any_material(rng))
+    plan.add_box((x, y, top), small, yaw + rng.uniform(-0.6, 0.6), any_material(rng))
 
 
-def sofa(layout: Layout, rng: np.random.Generator, x: float, y: float, size: float) -> None:
-    """A seat with a back."""
+def sofa(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+    """Add a seat with a back."""
     yaw, fabric = rng.integers(4) * np.pi / 2 + rng.uniform(-0.15, 0.15), textures.cloth(rng)
     back = np.array([x, y]) + 0.42 * size * np.array([-np.sin(yaw), np.cos(yaw)])
-    layout.add_box((x, y, 0.22), (0.85 * size, 0.5 * size, 0.22), yaw, fabric)
-    layout.add_box((*back, 0.62), (0.85 * size, 0.1 * size, 0.2), yaw, fabric)
+    plan.add_box((x, y, 0.22), (0.85 * size, 0.5 * size, 0.22), yaw, fabric)
+    plan.add_box((*back, 0.62), (0.85 * size, 0.1 * size, 0.2), yaw, fabric)
 
 
-def ball(layout: Layout, rng: np.random.Generator, x: float, y: float, size: float) -> None:
-    layout.add_sphere((x, y, 0.7 * size), 0.7 * size, any_material(rng))
+def ball(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+    plan.add_sphere((x, y, 0.7 * size), 0.7 * size, any_material(rng))
 
 
-def tree(layout: Layout, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def tree(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
     height, crown = rng.uniform(1.5, 2.8), rng.uniform(0.8, 1.5)
     bark = textures.planks(rng)
-    layout.add_box((x, y, height / 2 - 0.5), (0.12, 0.12, height / 2 + 0.5), rng.uniform(), bark)
-    layout.add_sphere((x, y, height + 0.6 * crown), crown, textures.leaves(rng))
+    plan.add_box((x, y, height / 2 - 0.5), (0.12, 0.12, height / 2 + 0.5), rng.uniform(), bark)
+    plan.add_sphere((x, y, height + 0.6 * crown), crown, textures.leaves(rng))
 
 
-def boulder(layout: Layout, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def boulder(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
     kind = textures.stone if rng.random() < 0.6 else textures.leaves
-    layout.add_sphere((x, y, rng.uniform(-0.1, 0.4) * size), size, kind(rng))
+    plan.add_sphere((x, y, rng.uniform(-0.1, 0.4) * size), size, kind(rng))
 
 
-def house(layout: Layout, rng: np.random.Generator, x: float, y: float, size: float) -> None:
-    """A block with a flat roof that juts out, and a dark door."""
+def house(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+    """Add a block with a flat roof that juts out, and a dark door."""
     half = np.array([0.8, 0.6, rng.uniform(0.5, 1.0)]) * size
     yaw = rng.uniform(0, np.pi)
     wall = (textures.bricks, textures.plaster, textures.planks)[rng.integers(3)](rng)
-    layout.add_box((x, y, half[2] - 0.5), half, yaw, wall)
+    plan.add_box((x, y, half[2] - 0.5), half, yaw, wall)
     eaves = (half[0] + 0.25, half[1] + 0.25, 0.12)
-    layout.add_box((x, y, 2 * half[2] - 0.4), eaves, yaw, textures.stone(rng))
+    plan.add_box((x, y, 2 * half[2] - 0.4), eaves, yaw, textures.stone(rng))
     door = half * np.array([0.3, 1.01, 0.6])
-    layout.add_box((x, y, door[2] - 0.3), door, yaw, textures.cloth(rng))
+    plan.add_box((x, y, door[2] - 0.3), door, yaw, textures.cloth(rng))
 
 
 def scatter(
-    layout: Layout,
+    plan: FloorPlan,
     rng: np.random.Generator,
     kinds: list[tuple[Callable, float, float]],
     spots: Callable[[], Float[np.ndarray, "K 2"]],
 ) -> None:
-    """One thing of each (kind, smallest size, largest size), where there is a free spot."""
+    """Add one thing of each (kind, smallest size, largest size), if there is a free spot."""
     for kind, smallest, largest in kinds:
         size = rng.uniform(smallest, largest)
-        spot = layout.claim(spots(), size)
+        spot = plan.claim(spots(), size)
         if spot is not None:
-            kind(layout, rng, *spot, size)
+            kind(plan, rng, *spot, size)
 
 
-def hang_pictures(layout: Layout, rng: np.random.Generator, half: np.ndarray) -> None:
-    """Pictures, doors and cupboards along the walls."""
+def hang_pictures(plan: FloorPlan, rng: np.random.Generator, half: np.ndarray) -> None:
+    """Add pictures and cupboards along the walls."""
     for wall in range(4):
         axis, side = wall % 2, 1 if wall < 2 else -1
         for place in (-0.5, 0.5) if rng.random() < 0.5 else (rng.uniform(-0.5, 0.5),):
@@ -159,40 +160,40 @@ def hang_pictures(layout: Layout, rng: np.random.Generator, half: np.ndarray) ->
             size[1 - axis] = rng.uniform(0.35, 0.7)
             size[2] = rng.uniform(0.4, 1.1) if deep else rng.uniform(0.3, 0.6)
             center[2] = size[2] if deep else rng.uniform(1.4, 1.7)
-            layout.add_box(center, size, 0.0, any_material(rng))
+            plan.add_box(center, size, 0.0, any_material(rng))
 
 
 def furnished_room(
     rng: np.random.Generator, walk: Float[np.ndarray, "T 2"], half: np.ndarray
-) -> Layout:
-    """A room of the given half sizes, around the origin, with its floor at 0."""
+) -> FloorPlan:
+    """Furnish a room of the given half sizes, around the origin, with its floor at 0."""
     height = 2 * half[2]
     wall = (textures.plaster, textures.bricks, textures.planks, textures.plaster)[rng.integers(4)]
     wallpaper = wall(rng)
     other = textures.cloth(rng) if rng.random() < 0.4 else textures.plaster(rng)
     floor = (textures.planks, textures.tiles)[rng.integers(2)](rng)
     lamp = np.array([*rng.uniform(-0.5, 0.5, 2) * half[:2], height - 0.5])
-    layout = Layout(
+    plan = FloorPlan(
         walk=walk,
         light=lamp,
         light_colour=np.array([1.0, 0.9, 0.78]),
-        reach=rng.uniform(1.5, 3.0),
+        falloff=rng.uniform(1.5, 3.0),
         ambient=rng.uniform(0.15, 0.3) * np.array([0.9, 0.95, 1.0]),
         shell=[wallpaper, other, wallpaper, wallpaper, textures.plaster(rng), floor],
         room=(np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], height])),
     )
-    hang_pictures(layout, rng, half)
-    layout.add_sphere(lamp + np.array([0, 0, 0.4]), 0.15, textures.plaster(rng))
+    hang_pictures(plan, rng, half)
+    plan.add_sphere(lamp + np.array([0, 0, 0.4]), 0.15, textures.plaster(rng))
     rug = textures.cloth(rng)
-    layout.add_box((0, 0, 0), (*rng.uniform(0.6, 1.2, 2), 0.015), rng.uniform(0, np.pi), rug)
+    plan.add_box((0, 0, 0), (*rng.uniform(0.6, 1.2, 2), 0.015), rng.uniform(0, np.pi), rug)
     kinds = [(table, 0.5, 0.75), (stack, 0.35, 0.6), (sofa, 0.6, 0.9), (ball, 0.2, 0.4)]
     kinds += [(stack, 0.3, 0.5), (ball, 0.15, 0.4)]
-    scatter(layout, rng, kinds, lambda: rng.uniform(-0.85, 0.85, (TRIES, 2)) * half[:2])
-    return layout
+    scatter(plan, rng, kinds, lambda: rng.uniform(-0.85, 0.85, (TRIES, 2)) * half[:2])
+    return plan
 
 
 def hills(rng: np.random.Generator) -> Float[np.ndarray, "N N"]:
-    """Heights that are gentle near the origin and rise towards the horizon."""
+    """Draw heights that are gentle near the origin and rise towards the horizon."""
     axis = np.linspace(-SKY_RADIUS, SKY_RADIUS, TERRAIN_SAMPLES)
     distance = np.hypot(axis[:, None], axis)
     height = np.zeros_like(distance)
@@ -205,15 +206,15 @@ def hills(rng: np.random.Generator) -> Float[np.ndarray, "N N"]:
     return height * (0.06 + rng.uniform(1.0, 3.0) * rise) + rng.uniform(0, 4) * rise
 
 
-def outdoor_place(rng: np.random.Generator, walk: Float[np.ndarray, "T 2"]) -> Layout:
-    """Houses, trees, boulders and crates on hills, under a sun."""
+def outdoor_place(rng: np.random.Generator, walk: Float[np.ndarray, "T 2"]) -> FloorPlan:
+    """Put houses, trees, boulders and crates on hills, under a sun."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(20, 60))
     sun = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
-    layout = Layout(
+    plan = FloorPlan(
         walk=walk,
         light=1e3 * sun,
         light_colour=np.array([1.0, 0.92, 0.8]),
-        reach=1e6,
+        falloff=1e6,
         ambient=rng.uniform(0.2, 0.4) * np.array([0.8, 0.9, 1.0]),
         shell=[(textures.grass, textures.grass, textures.stone)[rng.integers(3)](rng)],
         heights=hills(rng),
@@ -225,9 +226,9 @@ def outdoor_place(rng: np.random.Generator, walk: Float[np.ndarray, "T 2"]) -> L
         return np.stack((radius * np.cos(angle), radius * np.sin(angle)), 1)
 
     near = [(stack, 0.4, 0.7), (boulder, 0.3, 0.7), (boulder, 0.3, 0.6), (stack, 0.4, 0.6)]
-    scatter(layout, rng, near, lambda: ring(0.0, 4.0))
-    layout.add_sphere((*ring(12.0, 20.0)[0], 0), rng.uniform(1.5, 3), textures.leaves(rng))
+    scatter(plan, rng, near, lambda: ring(0.0, 4.0))
+    plan.add_sphere((*ring(12.0, 20.0)[0], 0), rng.uniform(1.5, 3), textures.leaves(rng))
     far = [(house, 2.0, 3.5), (house, 2.0, 3.5), (tree, 1.2, 1.2), (tree, 1.2, 1.2)]
     far += [(tree, 1.2, 1.2), (boulder, 0.6, 1.2), (house, 2.0, 3.0)]
-    scatter(layout, rng, far, lambda: ring(4.5, 11.0))
-    return layout
+    scatter(plan, rng, far, lambda: ring(4.5, 11.0))
+    return plan

@@ -1,4 +1,4 @@
-"""Splits that follow from the number of frames alone."""
+"""Selections that need only the number of frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,21 +13,21 @@ HELD_OUT_STEP = 8
 HELD_OUT_START = {"test": 0, "val": 4}
 ABLATION_FRAMES = 96
 
-Stage = Literal["val", "test"]
+Split = Literal["val", "test"]
 
 
 @dataclass(frozen=True)
-class Split:
-    """Frame numbers; where it is not said otherwise, no frame is both an input and a target."""
+class Selection:
+    """Frame numbers of inputs and targets; unless stated, no frame is both."""
 
     inputs: list[int]
     targets: list[int]
 
 
-def evaluation_split(num_frames: int, num_inputs: int, num_targets: int) -> Split:
-    """Inputs evenly over the whole sequence, targets midway between neighbouring inputs.
+def uniform_selection(num_frames: int, num_inputs: int, num_targets: int) -> Selection:
+    """Select inputs evenly over the whole sequence, targets midway between neighbouring inputs.
 
-    Deterministic. Where fewer gaps than targets exist, the targets are spread over all frames that
+    Deterministic. If there are fewer gaps than targets, the targets are spread over all frames that
     are not inputs.
 
     Raises:
@@ -41,23 +41,23 @@ def evaluation_split(num_frames: int, num_inputs: int, num_targets: int) -> Spli
         candidates = sorted(set(range(num_frames)) - set(inputs))
     # The middles of equal parts, so that neither end of the sequence is favoured.
     chosen = [(2 * i + 1) * len(candidates) // (2 * num_targets) for i in range(num_targets)]
-    return Split(inputs, [candidates[index] for index in chosen])
+    return Selection(inputs, [candidates[index] for index in chosen])
 
 
-def training_split(
+def training_selection(
     num_frames: int,
     num_inputs: int,
     num_targets: int,
     window: tuple[int, int],
     rng: np.random.Generator,
     targets_may_be_inputs: bool = False,
-) -> Split:
-    """Inputs evenly over a random window, random targets within it.
+) -> Selection:
+    """Select inputs evenly over a random window, random targets within it.
 
     Args:
         window: the least and the greatest number of frames to draw from, both included; clipped
             to the sequence.
-        targets_may_be_inputs: draw the targets from all frames of the window.
+        targets_may_be_inputs: whether targets are drawn from all frames of the window.
 
     Raises:
         InputError: the sequence or the window is too short.
@@ -74,70 +74,80 @@ def training_split(
     frames = range(start, start + length)
     inputs = spread(frames, num_inputs)
     candidates = frames if targets_may_be_inputs else sorted(set(frames) - set(inputs))
-    return Split(inputs, sorted(rng.choice(candidates, num_targets, replace=False).tolist()))
+    return Selection(inputs, sorted(rng.choice(candidates, num_targets, replace=False).tolist()))
 
 
-def held_out(num_frames: int, stage: Stage) -> list[int]:
-    """Every 8th frame: from the first on for the test (paper, Suppl. A), from the fifth for
-    validation."""
-    return list(range(HELD_OUT_START[stage], num_frames, HELD_OUT_STEP))
+def held_out(num_frames: int, split: Split) -> list[int]:
+    """Return every 8th frame, from the first on for test (paper, Suppl. A), the fifth for val."""
+    return list(range(HELD_OUT_START[split], num_frames, HELD_OUT_STEP))
 
 
 def trained(num_frames: int) -> list[int]:
-    """The frames that no stage holds out."""
+    """Return the frames that neither validation nor test holds out."""
     out = held_out(num_frames, "val") + held_out(num_frames, "test")
     return sorted(set(range(num_frames)) - set(out))
 
 
-def held_out_split(num_frames: int, num_inputs: int, num_targets: int, stage: Stage) -> Split:
-    """Inputs evenly over the trained frames, at most `num_targets` targets evenly over those held
-    out. Deterministic.
+def every_8th_selection(
+    num_frames: int, num_inputs: int, num_targets: int, split: Split
+) -> Selection:
+    """Select inputs evenly over the trained frames, targets evenly over those held out.
+
+    Deterministic; there are at most `num_targets` targets.
 
     Raises:
         InputError: the sequence is too short.
     """
-    inputs, targets = trained(num_frames), held_out(num_frames, stage)
-    check_held_out(num_frames, len(inputs), num_inputs, stage)
-    return Split(spread(inputs, num_inputs), spread(targets, min(num_targets, len(targets))))
+    inputs, targets = trained(num_frames), held_out(num_frames, split)
+    check_held_out(num_frames, len(inputs), num_inputs, split)
+    return Selection(spread(inputs, num_inputs), spread(targets, min(num_targets, len(targets))))
 
 
-def first_96_split(num_frames: int, num_inputs: int, num_targets: int, stage: Stage) -> Split:
-    """The paper's ablations (Suppl. A): of the first 96 frames every 8th is a target, and inputs
-    lie evenly over the others. Deterministic.
+def first_96_selection(
+    num_frames: int, num_inputs: int, num_targets: int, split: Split
+) -> Selection:
+    """Select as the paper's ablations do (Suppl. A).
+
+    Of the first 96 frames every 8th is a target, and inputs lie evenly over the others.
+    Deterministic.
 
     Raises:
         InputError: the sequence is too short.
     """
-    inputs, targets = paper_frames(min(num_frames, ABLATION_FRAMES), num_targets, stage)
-    check_held_out(num_frames, len(inputs), num_inputs, stage)
-    return Split(spread(inputs, num_inputs), targets)
+    inputs, targets = paper_frames(min(num_frames, ABLATION_FRAMES), num_targets, split)
+    check_held_out(num_frames, len(inputs), num_inputs, split)
+    return Selection(spread(inputs, num_inputs), targets)
 
 
-def paper_frames(num_frames: int, num_targets: int, stage: Stage) -> tuple[list[int], list[int]]:
-    """The frames that inputs are chosen from, and the targets.
+def paper_frames(num_frames: int, num_targets: int, split: Split) -> tuple[list[int], list[int]]:
+    """Return the frames that inputs are chosen from, and the targets.
 
-    The test has every 8th frame as a target, and all others to choose from. Validation looks at no
-    frame of the test: it has at most `num_targets` targets, and the trained frames to choose from.
+    For test, every 8th frame is a target, and inputs are chosen from all others. For val, no frame
+    of the test is used: there are at most `num_targets` targets, and inputs are chosen from the
+    trained frames.
     """
-    targets = held_out(num_frames, stage)
-    if stage == "val":
+    targets = held_out(num_frames, split)
+    if split == "val":
         return trained(num_frames), spread(targets, min(num_targets, len(targets)))
     return sorted(set(range(num_frames)) - set(targets)), targets
 
 
 def spread(frames: Sequence[int], count: int) -> list[int]:
-    """`count` different frames at even distances, the first and the last among them."""
+    """Choose `count` different frames at even distances, the first and the last among them."""
     positions = np.linspace(0, len(frames) - 1, count)
     return [frames[int(position + 0.5)] for position in positions]
 
 
-def check_held_out(num_frames: int, left: int, num_inputs: int, stage: Stage) -> None:
-    """Raise InputError if fewer frames are `left` to choose from than inputs, or none is held
-    out."""
-    if left < num_inputs or not held_out(num_frames, stage):
+def check_held_out(num_frames: int, left: int, num_inputs: int, split: Split) -> None:
+    """Check that there are targets, and enough frames `left` to choose the inputs from.
+
+    Raises:
+        InputError: there are not.
+    """
+    if left < num_inputs or not held_out(num_frames, split):
         raise InputError(
             f"The sequence has {num_frames} frames, of which {left} are not held out for "
-            f"{stage}: set data.inputs to at most that, or give a longer sequence."
+            f"{split}: set data.inputs to at most that, or give a longer sequence."
         )
 
 

@@ -1,4 +1,4 @@
-"""Scenes on disk, of which only those in use are open."""
+"""The scenes in a folder, of which only those in use are open."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -6,21 +6,23 @@ from pathlib import Path
 
 from asysplat.data.bad_frames import Policy
 from asysplat.data.cache import ImageCache
-from asysplat.data.photographs import PhotographCapture
+from asysplat.data.capture import PhotographCapture
 from asysplat.data.readers import find_scenes, open_scene
 
 MOST_OPEN = 64
 
 
-class Scenes(Sequence):
-    """The scenes that a folder is or holds, each opened when asked for; the last used stay open.
+class SceneFolder(Sequence):
+    """The scenes that a folder is or holds, each opened when first used.
+
+    The MOST_OPEN last used stay open.
 
     Args:
         root: one scene, or a folder of scenes.
         height, width, layout, on_bad_frame, cache: as `open_scene` takes them.
 
     Raises:
-        InputError: no scene; when a scene is asked for, one that cannot be used.
+        InputError: no scene; and, when a scene is opened, files that cannot be used.
     """
 
     def __init__(
@@ -34,9 +36,12 @@ class Scenes(Sequence):
     ):
         self.root = Path(root).absolute()
         self.layout, self.paths = find_scenes(root, layout)
-        self._reading = {
-            **{"height": height, "width": width, "layout": self.layout},
-            **{"on_bad_frame": on_bad_frame, "cache": cache},
+        self._options = {
+            "height": height,
+            "width": width,
+            "layout": self.layout,
+            "on_bad_frame": on_bad_frame,
+            "cache": cache,
         }
         self._open: OrderedDict[int, PhotographCapture] = OrderedDict()
 
@@ -45,13 +50,13 @@ class Scenes(Sequence):
 
     def __getitem__(self, index: int) -> PhotographCapture:
         if index not in self._open:
-            self._open[index] = open_scene(self.paths[index], **self._reading)
+            self._open[index] = open_scene(self.paths[index], **self._options)
         self._open.move_to_end(index)
         while len(self._open) > MOST_OPEN:
             self._open.popitem(last=False)
         return self._open[index]
 
     def folders(self, index: int) -> set[str]:
-        """The names that lead to a scene from the root, its own among them; it stays closed."""
+        """Return the folder names between the root and a scene, and its own; it stays closed."""
         path = self.paths[index]
         return {*path.parts} - {*self.root.parts} | {path.name}

@@ -1,4 +1,4 @@
-"""What `conf/data` names: a source and the data module that draws from it."""
+"""Build what `conf/data` names: a source of tasks, and the data module that draws from it."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -23,15 +23,22 @@ def procedural_data(
     test_sets: Mapping[str, Any] | None = None,
     **options,
 ) -> SceneDataModule:
-    """Made-up scenes; arguments are those of ProceduralSource and `scene_data`."""
+    """Build a data module of synthetic scenes.
 
-    def source(height: int, width: int, num_frames: int, **others) -> ProceduralSource:
-        return ProceduralSource(height, width, num_frames, window, val_scenes, **others)
+    The arguments are those of ProceduralSource and `scene_data`.
+    """
 
-    own = {"height": height, "width": width, "num_frames": num_frames}
-    own |= {"test_scenes": test_scenes, "places": places}
+    make_source = partial(ProceduralSource, window=window, val_scenes=val_scenes)
+    changeable = {
+        "height": height,
+        "width": width,
+        "num_frames": num_frames,
+        "test_scenes": test_scenes,
+        "places": places,
+    }
     tested = tested_sets(test_sets, options["name"], on_disk=False)
-    return scene_data(source(**own), source, own, test_sets=tested, **options)
+    source = make_source(**changeable)
+    return scene_data(source, make_source, changeable, test_sets=tested, **options)
 
 
 def files_data(
@@ -50,53 +57,57 @@ def files_data(
     test_sets: Mapping[str, Any] | None = None,
     **options,
 ) -> SceneDataModule:
-    """Scenes on disk; arguments are those of FilesSource and `scene_data`.
+    """Build a data module of scenes on disk.
 
-    A further test set may differ in the root of what it tests, layout, selection, index and size.
-    One whose root is null is left out, with a warning.
+    The arguments are those of FilesSource and `scene_data`. A further test set may have its own
+    root, layout, selection, index and size; one whose root is null is left out, with a warning.
     """
 
-    def source(root: str, height: int, width: int, **others) -> FilesSource:
-        reading = {"on_bad_frame": on_bad_frame, "cache": cache, **others}
-        return FilesSource(root, height, width, window, **reading)
-
-    own = {"height": height, "width": width}
-    own |= {"layout": layout, "selection": selection, "index": index}
-    main = source(
-        root,
+    make_source = partial(FilesSource, window=window, on_bad_frame=on_bad_frame, cache=cache)
+    changeable = {
+        "height": height,
+        "width": width,
+        "layout": layout,
+        "selection": selection,
+        "index": index,
+    }
+    source = make_source(
+        root=root,
         test_root=test_root,
         val_scenes=val_scenes,
         targets_may_be_inputs=targets_may_be_inputs,
-        **own,
+        **changeable,
     )
-    own["root"] = test_root or root
+    changeable["root"] = test_root or root
     _warn_of_untested(test_sets or {}, options["name"])
     tested = tested_sets(test_sets, options["name"], on_disk=True)
-    return scene_data(main, source, own, test_sets=tested, **options)
+    return scene_data(source, make_source, changeable, test_sets=tested, **options)
 
 
 def scene_data(
     source: Source,
     make_source: Callable[..., Source],
-    own: dict[str, Any],
+    changeable: dict[str, Any],
     name: str,
     inputs: int,
     targets: int,
     test_sets: Mapping[str, Any] | None = None,
     **options,
 ) -> SceneDataModule:
-    """A data module that is tested on further sets as well.
+    """Build a data module that is tested on further sets as well.
 
     Args:
-        source: of the data set itself.
-        make_source: of a test set, from the options `own`, in which test sets may differ.
-        test_sets: name -> the options that differ: any of `own`, inputs and targets.
-        name, inputs, targets, options: those of SceneDataModule; the size is among `own`.
+        source: the data set itself.
+        make_source: makes the source of a test set from options like `changeable`.
+        changeable: the options in which test sets may differ from the data set, with the data
+            set's values; height and width are among them.
+        test_sets: name -> the options that differ: any of `changeable`, inputs and targets.
+        name, inputs, targets, options: those of SceneDataModule.
 
     Raises:
-        InputError: a test set that is called as the data set, or with an unknown option.
+        InputError: a test set with the name of the data set, or with an unknown option.
     """
-    main = {"inputs": inputs, "targets": targets, **own}
+    main = {"inputs": inputs, "targets": targets, **changeable}
     sets = {}
     for other, changes in (test_sets or {}).items():
         _check_test_set(other, changes, name, main)
@@ -106,22 +117,24 @@ def scene_data(
         source=source,
         inputs=inputs,
         targets=targets,
-        height=own["height"],
-        width=own["width"],
+        height=changeable["height"],
+        width=changeable["width"],
         test_sets=sets,
         **options,
     )
 
 
 def tested_sets(test_sets: Mapping[str, Any] | None, name: str, on_disk: bool) -> dict[str, Any]:
-    """Of the further test sets of a configuration, those that a run tests.
+    """Choose the further test sets of a configuration that a run tests.
 
-    Of those that have a root of their own, made-up data tests none: made-up scenes stand for them.
-    Data on disk tests those whose root is given, but for one that is called as the data itself.
+    A set without a root of its own is always tested. One with a root is tested only by data on
+    disk, if the root is given and the set has another name than the data; synthetic data tests
+    synthetic scenes alone.
 
     Args:
         test_sets: name -> the options in which it differs from the data set.
-        name, on_disk: of the data set.
+        name: the data set's.
+        on_disk: whether the data set is read from disk.
     """
     return {
         other: options
@@ -149,9 +162,9 @@ def _warn_of_untested(test_sets: Mapping[str, Any], name: str) -> None:
 
 
 def _test_tasks(
-    make_source: Callable[..., Source], inputs: int, targets: int, **own: Any
+    make_source: Callable[..., Source], inputs: int, targets: int, **options: Any
 ) -> list[Task]:
-    return make_source(**own).evaluation("test", inputs, targets)
+    return make_source(**options).evaluation("test", inputs, targets)
 
 
 def _check_test_set(other: str, changes: Any, name: str, main: Mapping[str, Any]) -> None:

@@ -1,5 +1,8 @@
-"""Points that two frames share, found in their pixels alone: no pose is looked at, so that wrong
-poses cannot choose the matches that judge them."""
+"""Points that two frames share, and how they lie to the cameras.
+
+They are found in the pixels alone: no pose is looked at, so that wrong poses cannot choose the
+matches that judge them.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,15 +16,16 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.data.capture import Capture
+from asysplat.scene import Cameras
 
-PLACES = 12  # of the sequence, from each of which one pair starts
-FIRST_GAP = 4  # frames
+PLACES = 12  # in the sequence, at each of which one pair of frames starts
+FIRST_GAP = 4  # frames between the two of a pair, at first
 ENOUGH = 80  # matches of two frames that show the same place
-KEPT = 200  # matches of a pair, so that none outweighs the others
-KEYPOINTS = 2500  # a frame
-RATIO = 0.8  # of the distances to the best and to the second-best match
+KEPT = 200  # matches of a pair at most, so that none outweighs the others
+KEYPOINTS = 2500  # in a frame, at most
+RATIO = 0.8  # of the distance to the second-best match: the best must be nearer (Lowe, 2004)
 CORRIDOR = 1.5  # pixels beside the epipolar lines of the pair's own fundamental matrix
-PARALLAX = 2.0  # pixels beside the best homography, of the tenth that fits it worst
+PARALLAX = 2.0  # pixels: where a camera moved, a tenth of the points is farther off a homography
 
 
 @dataclass(frozen=True)
@@ -52,21 +56,21 @@ class Matches:
 
 @dataclass(frozen=True)
 class Keypoints:
-    """SIFT of one image: where, and what it looks like there."""
+    """SIFT keypoints of one image, x and y in pixels, and their descriptors."""
 
     points: Float32[ndarray, "K 2"]
-    words: Float32[ndarray, "K 128"]
+    descriptors: Float32[ndarray, "K 128"]
 
 
 def find_matches(capture: Capture, step: Callable[[], None] = lambda: None) -> Matches:
-    """Matches of up to PLACES pairs, evenly over the sequence.
+    """Match up to PLACES pairs of frames, evenly over the sequence.
 
-    How far apart the frames of a pair are follows the sequence: twice as far as long as enough is
-    matched, half as far where it is not. Pairs between which the camera only turned tell nothing
-    of its position, and are left out if they are few.
+    The gap between the frames of a pair is doubled as long as enough points are matched, and halved
+    where too few are. Pairs between which the camera only turned say nothing about its position,
+    and are left out if they are few.
 
     Args:
-        step: called after each of PLACES.
+        step: called after each place.
     """
     keypoints = cache(partial(_keypoints, capture))
 
@@ -95,7 +99,7 @@ def find_matches(capture: Capture, step: Callable[[], None] = lambda: None) -> M
 
 
 def _joined(pairs: list[Matches]) -> Matches:
-    """At most KEPT of each pair, spread over its keypoints."""
+    """Join the pairs, at most KEPT matches of each, spread over its keypoints."""
     kept = [pair.select(slice(None, None, -(-len(pair) // KEPT))) for pair in pairs]
     return Matches(
         torch.cat([torch.empty(0, 2, dtype=torch.int64), *(pair.frames for pair in kept)]),
@@ -104,7 +108,7 @@ def _joined(pairs: list[Matches]) -> Matches:
 
 
 def _has_moved(pair: Matches) -> bool:
-    """A camera that only turned, or that saw only a plane, leaves all points to one homography."""
+    """Tell whether the camera moved: if not, or if it saw only a plane, a homography fits all."""
     first, second = pair.points.unbind(1)
     homography, _ = cv2.findHomography(first.numpy(), second.numpy(), cv2.RANSAC, 2 * CORRIDOR)
     if homography is None:
@@ -121,20 +125,20 @@ def _keypoints(capture: Capture, frame: int) -> Keypoints:
     low, high = np.quantile(grey, (0.01, 0.99))
     grey = np.clip((grey - low) / max(high - low, 1e-3) * 255, 0, 255).astype(np.uint8)
     mask = None if views.masks is None else views.masks[0].numpy().astype(np.uint8)
-    points, words = cv2.SIFT_create(KEYPOINTS).detectAndCompute(grey, mask)
+    points, descriptors = cv2.SIFT_create(KEYPOINTS).detectAndCompute(grey, mask)
     if not points:
         return Keypoints(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32))
     # OpenCV puts the first pixel's centre at 0.
-    return Keypoints(cv2.KeyPoint_convert(points) + np.float32(0.5), words)
+    return Keypoints(cv2.KeyPoint_convert(points) + np.float32(0.5), descriptors)
 
 
 def _match(first: Keypoints, second: Keypoints) -> Float[ndarray, "M 2 2"]:
-    """Mutually best matches that lie beside the epipolar lines of one fundamental matrix."""
+    """Find mutually best matches that lie near the epipolar lines of one fundamental matrix."""
     nothing = np.empty((0, 2, 2))
     if min(len(first.points), len(second.points)) < ENOUGH:
         return nothing
-    there = cv2.BFMatcher().knnMatch(first.words, second.words, k=2)
-    back = cv2.BFMatcher().match(second.words, first.words)
+    there = cv2.BFMatcher().knnMatch(first.descriptors, second.descriptors, k=2)
+    back = cv2.BFMatcher().match(second.descriptors, first.descriptors)
     best = [
         (nearest.queryIdx, nearest.trainIdx)
         for nearest, other in there
@@ -147,3 +151,58 @@ def _match(first: Keypoints, second: Keypoints) -> Float[ndarray, "M 2 2"]:
     points = np.stack((first.points[here], second.points[beyond]), 1).astype(np.float64)
     _, inside = cv2.findFundamentalMat(*points.swapaxes(0, 1), cv2.FM_RANSAC, CORRIDOR, 0.9999)
     return nothing if inside is None else points[inside[:, 0] > 0]
+
+
+def epipolar_lines(cameras: Cameras, matches: Matches) -> Float[Tensor, "M 2 3"]:
+    """Compute the epipolar line of each match's point in either view, from the other view's point.
+
+    Returns:
+        a, b, c of each line: a x + b y + c is the distance of (x, y) in pixels. NaN where both
+        views were taken from one place.
+    """
+    rotations = cameras.cam_to_world[..., :3, :3]
+    centers = cameras.centers[matches.frames]
+    baseline = centers[:, 1] - centers[:, 0]
+    # The plane through a ray of one view and the centre of the other is a line in the other view.
+    normals = torch.linalg.cross(baseline[:, None].expand(-1, 2, -1), _rays(cameras, matches))
+    to_pixels = torch.linalg.inv(cameras.intrinsics).mT @ rotations.mT
+    lines = (to_pixels[matches.frames] @ normals.flip(1)[..., None])[..., 0]
+    return lines / lines[..., :2].norm(dim=-1, keepdim=True)
+
+
+def epipolar_distances(cameras: Cameras, matches: Matches) -> Float[Tensor, " M"]:
+    """Measure the distances in pixels from points to their epipolar lines, the mean of both views.
+
+    Infinite where both views were taken from one place.
+    """
+    lines = epipolar_lines(cameras, matches)
+    residuals = (lines[..., :2] * matches.points).sum(-1) + lines[..., 2]
+    return residuals.abs().mean(-1).nan_to_num(nan=torch.inf)
+
+
+def triangulate(
+    cameras: Cameras, matches: Matches
+) -> tuple[Float[Tensor, "M 2"], Float[Tensor, " M"]]:
+    """Find where the two rays of each match pass nearest to each other.
+
+    Returns:
+        Depths along the z axes of both cameras, in scene units, and the angle between the rays, in
+        degrees.
+    """
+    rays = _rays(cameras, matches)
+    centers = cameras.centers[matches.frames]
+    baseline = centers[:, 1] - centers[:, 0]
+    # Normal equations of |x first - y second - baseline|.
+    first, second = rays.unbind(1)
+    aa, bb, ab = (first**2).sum(-1), (second**2).sum(-1), (first * second).sum(-1)
+    ac, bc = (first * baseline).sum(-1), (second * baseline).sum(-1)
+    cross = torch.linalg.cross(first, second).norm(dim=-1)
+    depths = torch.stack((bb * ac - ab * bc, ab * ac - aa * bc), -1) / cross[:, None] ** 2
+    return depths, torch.rad2deg(torch.atan2(cross, ab))
+
+
+def _rays(cameras: Cameras, matches: Matches) -> Float[Tensor, "M 2 3"]:
+    """Return the world-space directions through the points, with z = 1 in the camera."""
+    points = torch.nn.functional.pad(matches.points, (0, 1), value=1.0)
+    to_world = cameras.cam_to_world[..., :3, :3] @ torch.linalg.inv(cameras.intrinsics)
+    return (to_world[matches.frames] @ points[..., None])[..., 0]
