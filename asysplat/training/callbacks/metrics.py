@@ -1,4 +1,4 @@
-"""Measures every validation and test image, beside what one gets for nothing."""
+"""Measure every validation and test image, and the baselines that need no training."""
 
 import csv
 import warnings
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from asysplat.evaluation import baselines
 from asysplat.evaluation.lpips import load_lpips
-from asysplat.evaluation.measured import Measured
+from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.evaluation.protocol import BACKBONES, Protocol
 from asysplat.scene import Views
 from asysplat.training.outcome import Outcome
@@ -23,21 +23,21 @@ Measure = Callable[[Tensor, Views], dict[str, Tensor]]
 
 
 class Metrics(lightning.Callback):
-    """PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image: to the logger, metrics.csv.
+    """Measures PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image, for the logger and a CSV.
 
-    `results` has the means of every test set, the protocol's sentences, and what measuring a test
-    scene and its baselines took: cost/metrics_seconds, cost/metrics_gb, see `Measured`.
+    `results` holds the means of every test set, the protocol's sentences, and the cost of measuring
+    a test scene and its baselines: cost/metrics_seconds and cost/metrics_gb, see `CostMeter`.
 
     Args:
-        protocol: by which all is measured.
+        protocol: how everything is measured.
         folder: of the run; metrics.csv is written there after the test.
-        weights: folder that may hold LPIPS' backbone; without it that column is missing.
-        download: the backbone where it is missing.
+        backbone_dir: folder that may hold LPIPS' backbone; without it that column is missing.
+        download: whether to fetch the backbone if it is missing.
     """
 
-    def __init__(self, protocol: Protocol, folder: str, weights: str, download: bool = False):
+    def __init__(self, protocol: Protocol, folder: str, backbone_dir: str, download: bool = False):
         self.protocol, self.folder = protocol, Path(folder)
-        self.weights, self.download = Path(weights), download
+        self.backbone_dir, self.download = Path(backbone_dir), download
         self.rows: list[Row] = []
         sentences = protocol.sentences()
         self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in sentences.items()}
@@ -47,7 +47,7 @@ class Metrics(lightning.Callback):
     ) -> None:
         if hasattr(self, "lpips"):
             return
-        self.lpips = load_lpips(self.protocol.lpips_net, self.weights, self.download)
+        self.lpips = load_lpips(self.protocol.lpips_net, self.backbone_dir, self.download)
         if self.lpips is None and trainer.is_global_zero:
             warnings.warn(
                 f"{BACKBONES[self.protocol.lpips_net]} is neither in torch's hub cache nor in "
@@ -56,7 +56,7 @@ class Metrics(lightning.Callback):
             )
 
     def measure(self, rendered: Tensor, targets: Views) -> dict[str, Tensor]:
-        """Image metrics, [B, V] each."""
+        """Compute the image metrics, each [B, V]."""
         network = None if self.lpips is None else self.lpips.to(targets.images.device)
         return self.protocol.image_metrics(rendered, targets, network)
 
@@ -81,13 +81,13 @@ class Metrics(lightning.Callback):
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
         self.rows = []
-        self.work = Measured(module.device)
+        self.work = CostMeter(module.device)
 
     def on_validation_batch_end(
         self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
     ) -> None:
         def measure_free(image: Tensor, to: Views) -> dict[str, Tensor]:
-            """The curve shows the baselines' PSNR alone."""
+            """Measure PSNR alone: the learning curve shows no other metric of the baselines."""
             return {"psnr": self.protocol.psnr(image, to)}
 
         self._add(trainer.datamodule.name, batch, outputs, measure_free)
@@ -128,19 +128,23 @@ class Metrics(lightning.Callback):
 
 
 def gather(trainer: lightning.Trainer, rows: list[Row]) -> list[Row]:
-    """The rows of all processes; every process takes part."""
+    """Collect the rows of all processes; every process must call this."""
     if trainer.world_size == 1:
         return rows
     per_process: list[list[Row]] = [[] for _ in range(trainer.world_size)]
     torch.distributed.all_gather_object(per_process, rows)
-    # Scenes that were dealt out twice, to give every process equally many, count once.
+    # Scenes given to two processes, so that all have equally many, count once.
     images = {tuple(row[key] for key in IMAGE): row for part in per_process for row in part}
     return list(images.values())
 
 
 def average(rows: Sequence[Row], over: Literal["images", "scenes"]) -> dict[str, float]:
-    """The mean of every numeric column over the images that have it, or over each scene's such
-    images and then over the scenes; NaN is left out."""
+    """Average every numeric column over the images that have it; NaN is left out.
+
+    Args:
+        rows: of one test set.
+        over: "images": all alike, or "scenes": each scene's images first, then the scenes.
+    """
     if over == "scenes":
         scenes: dict[str | float, list[Row]] = {}
         for row in rows:
@@ -155,7 +159,7 @@ def average(rows: Sequence[Row], over: Literal["images", "scenes"]) -> dict[str,
 
 
 def write_csv(path: Path, rows: list[Row]) -> None:
-    """A line an image; a scene without depths leaves those columns empty."""
+    """Write a line for each image; a scene without depths leaves those columns empty."""
     with path.open("w", newline="") as file:
         columns = dict.fromkeys(name for row in rows for name in row)
         writer = csv.DictWriter(file, fieldnames=list(columns))
