@@ -1,4 +1,4 @@
-"""Seconds and peak memory, measured on work that is repeated."""
+"""Measure the seconds and the peak memory of repeated work."""
 
 import statistics
 import time

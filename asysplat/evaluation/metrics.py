@@ -45,7 +45,7 @@ def ssim(
     Args:
         window: "gaussian": 11x11, sigma 1.5, or "uniform": 7x7.
         covariance: weighted sum of the products of deviations within a window ("biased"), or that
-            times n / (n - 1) for its n pixels ("sample"), as scikit-image has it.
+            times n / (n - 1) for its n pixels ("sample"), as scikit-image computes it.
 
     Raises:
         InputError: an image is smaller than the window.
@@ -53,7 +53,7 @@ def ssim(
     height, width = rendered.shape[-2:]
     check_ssim_size(height, width, window)
     size = SSIM_WINDOWS[window]
-    # Variances times n / (n - 1) throughout are the same as their constant, k2 squared, over it.
+    # Scaling all variances by n / (n - 1) is the same as dividing their constant, k2^2, by it.
     k2 = SSIM_K2 if covariance == "biased" else SSIM_K2 * math.sqrt(1 - 1 / size**2)
     with without_autocast(rendered):
         _, similarity = structural_similarity_index_measure(

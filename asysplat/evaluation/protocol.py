@@ -29,7 +29,7 @@ BACKBONES = {"alex": "AlexNet", "vgg": "VGG16"}
 
 @dataclass(frozen=True)
 class Protocol:
-    """How renderings are measured; PSNR differs by whole dB between protocols.
+    """How renderings are measured; numbers of different protocols cannot be compared.
 
     Pixels that a view's mask excludes are taken from the photograph in every image metric and left
     out of every depth metric.

@@ -24,7 +24,7 @@ MIN_DEPTH = 1e-2  # smaller depths are raised to it, as in Long-LRM
 class RenderedDisparity:
     """Compares the depth rendered at the target cameras with the targets' depths.
 
-    So says the paper's formula, a mean over target views.
+    This is the paper's formula, a mean over target views.
     """
 
     renders_depth = True
@@ -42,10 +42,10 @@ class RenderedDisparity:
 
 
 class InputDisparity:
-    """Compares each Gaussian's depth in the input view it is aligned with with that view's depth.
+    """Compares Gaussians, in the input views they are aligned with, with those views' depths.
 
-    So does Long-LRM's public code (model/llrm.py), and the paper's sentence "the scene geometry is
-    modeled by pixel-aligned prediction" fits it.
+    This is what Long-LRM's public code does (model/llrm.py). It also fits the paper's sentence
+    "the scene geometry is modeled by pixel-aligned prediction".
     """
 
     renders_depth = False

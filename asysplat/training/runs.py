@@ -47,11 +47,11 @@ class Run:
     results: dict[str, Any]
 
     def agrees(self, data: Mapping[str, str]) -> bool:
-        """Whether it read the same data, as far as it and `data` (see `data_of`) name any."""
+        """Return whether it read `data` (see `data_of`), as far as both name what they read."""
         return all(self.results.get(key, value) == value for key, value in data.items())
 
     def covers(self, data: Mapping[str, str]) -> bool:
-        """Whether it read all of `data` (see `data_of`); it may have been tested on more."""
+        """Return whether it read all of `data` (see `data_of`), and perhaps more test sets."""
         return all(self.results.get(key) == value for key, value in data.items())
 
 

@@ -8,7 +8,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 
 class Checkpoints(ModelCheckpoint):
-    """Lightning's, which keeps the best, and besides a last.ckpt.
+    """Keeps the best checkpoint, as Lightning does, and a last.ckpt.
 
     last.ckpt is written after every epoch, each of which ends with a validation, and when training
     ends. If no callback measures what is monitored, there is no best.

@@ -17,8 +17,8 @@ from asysplat.evaluation.protocol import BACKBONES, Protocol
 from asysplat.scene import Views
 from asysplat.training.outcome import Outcome
 
-Row = dict[str, str | float]
-IMAGE = ("set", "scene", "view")  # which image a row is of
+ImageRow = dict[str, str | float]
+IMAGE = ("set", "scene", "view")  # the columns that say which image a row is of
 Measure = Callable[[Tensor, Views], dict[str, Tensor]]
 
 
@@ -38,7 +38,7 @@ class Metrics(lightning.Callback):
     def __init__(self, protocol: Protocol, folder: str, backbone_dir: str, download: bool = False):
         self.protocol, self.folder = protocol, Path(folder)
         self.backbone_dir, self.download = Path(backbone_dir), download
-        self.rows: list[Row] = []
+        self.rows: list[ImageRow] = []
         sentences = protocol.sentences()
         self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in sentences.items()}
 
@@ -61,14 +61,14 @@ class Metrics(lightning.Callback):
         return self.protocol.image_metrics(rendered, targets, network)
 
     def _add(
-        self, test_set: str, batch: dict[str, Any], outcome: Outcome, measure_free: Measure
+        self, test_set: str, batch: dict[str, Any], outcome: Outcome, measure_baseline: Measure
     ) -> None:
         inputs, targets = batch["inputs"], batch["targets"]
         values = self.measure(outcome.rendering.image, targets)
         values |= self.protocol.depth_metrics(outcome.rendering.depth, targets)
         for name in ("mean_colour", "nearest_view"):
-            free = measure_free(getattr(baselines, name)(inputs, targets), targets)
-            values.update({f"{name}/{metric}": value for metric, value in free.items()})
+            found = measure_baseline(getattr(baselines, name)(inputs, targets), targets)
+            values.update({f"{name}/{metric}": value for metric, value in found.items()})
         for index, scene in enumerate(batch["scene"]):
             for view in range(targets.num_views):
                 numbers = {name: value[index, view].item() for name, value in values.items()}
@@ -86,11 +86,11 @@ class Metrics(lightning.Callback):
     def on_validation_batch_end(
         self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
     ) -> None:
-        def measure_free(image: Tensor, to: Views) -> dict[str, Tensor]:
+        def measure_baseline(image: Tensor, to: Views) -> dict[str, Tensor]:
             """Measure PSNR alone: the learning curve shows no other metric of the baselines."""
             return {"psnr": self.protocol.psnr(image, to)}
 
-        self._add(trainer.datamodule.name, batch, outputs, measure_free)
+        self._add(trainer.datamodule.name, batch, outputs, measure_baseline)
 
     def on_test_batch_end(
         self,
@@ -127,18 +127,18 @@ class Metrics(lightning.Callback):
             write_csv(self.folder / "metrics.csv", rows)
 
 
-def gather(trainer: lightning.Trainer, rows: list[Row]) -> list[Row]:
+def gather(trainer: lightning.Trainer, rows: list[ImageRow]) -> list[ImageRow]:
     """Collect the rows of all processes; every process must call this."""
     if trainer.world_size == 1:
         return rows
-    per_process: list[list[Row]] = [[] for _ in range(trainer.world_size)]
+    per_process: list[list[ImageRow]] = [[] for _ in range(trainer.world_size)]
     torch.distributed.all_gather_object(per_process, rows)
     # Scenes given to two processes, so that all have equally many, count once.
     images = {tuple(row[key] for key in IMAGE): row for part in per_process for row in part}
     return list(images.values())
 
 
-def average(rows: Sequence[Row], over: Literal["images", "scenes"]) -> dict[str, float]:
+def average(rows: Sequence[ImageRow], over: Literal["images", "scenes"]) -> dict[str, float]:
     """Average every numeric column over the images that have it; NaN is left out.
 
     Args:
@@ -146,7 +146,7 @@ def average(rows: Sequence[Row], over: Literal["images", "scenes"]) -> dict[str,
         over: "images": all alike, or "scenes": each scene's images first, then the scenes.
     """
     if over == "scenes":
-        scenes: dict[str | float, list[Row]] = {}
+        scenes: dict[str | float, list[ImageRow]] = {}
         for row in rows:
             scenes.setdefault(row["scene"], []).append(row)
         rows = [average(images, "images") for images in scenes.values()]
@@ -158,7 +158,7 @@ def average(rows: Sequence[Row], over: Literal["images", "scenes"]) -> dict[str,
     return {name: torch.tensor(values).nanmean().item() for name, values in columns.items()}
 
 
-def write_csv(path: Path, rows: list[Row]) -> None:
+def write_csv(path: Path, rows: list[ImageRow]) -> None:
     """Write a line for each image; a scene without depths leaves those columns empty."""
     with path.open("w", newline="") as file:
         columns = dict.fromkeys(name for row in rows for name in row)
