@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from asysplat.evaluation.measured import SECONDS
+from asysplat.evaluation.measured_cost import SECONDS
 
 Results = dict[str, float | int | str]  # flat, as in metrics.json
 
