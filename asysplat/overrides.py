@@ -3,7 +3,7 @@
 import contextlib
 import difflib
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import hydra
@@ -146,7 +146,7 @@ def _paths(config: DictConfig) -> Iterator[str]:
     return below(OmegaConf.to_container(config), "")
 
 
-def _hint(key: str, known: Iterable[str], script: str) -> str:
+def _hint(key: str, known: Collection[str], script: str) -> str:
     nearest = _nearest(key, known)
     if nearest:
         return f"did you mean {nearest}?"
@@ -158,8 +158,11 @@ def _hint(key: str, known: Iterable[str], script: str) -> str:
     return f"python {script}.py --cfg job shows all."
 
 
-def _nearest(key: str, known: Iterable[str]) -> str | None:
+def _nearest(key: str, known: Collection[str]) -> str | None:
     """Return the known path that is spelled like `key`, in whole or from one of its dots on."""
+    name = key.rpartition(".")[2]
+    if name in known:  # at the top: steps for trainer.steps
+        return name
     ends: dict[str, str] = {}
     for path in sorted(known, key=lambda path: (path.count("."), path)):
         parts = path.split(".")

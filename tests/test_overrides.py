@@ -39,6 +39,8 @@ def test_tables_are_found_from_any_folder(tmp_path, monkeypatch):
 UNKNOWN = {
     "widht=0.5": "widht is unknown: did you mean width?",
     "data.inptus=4": "data.inptus is unknown: did you mean data.inputs?",
+    "training.learning_rate=1e-3": "did you mean learning_rate?",
+    "trainer.steps=5": "did you mean steps?",
     "learning_rte=1e-3": "did you mean learning_rate?",
     "weight_decay=0": "did you mean training.optimizer.weight_decay?",
     "stage=stage4": "stage=stage4 is unknown: choose stage1, stage2, stage3 or ablation.",
