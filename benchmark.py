@@ -11,7 +11,7 @@ from rich.console import Console
 from asysplat.benchmark.machine import describe_machine
 from asysplat.benchmark.suites import find_suite
 from asysplat.errors import InputError
-from asysplat.words import exit_at_unknown_words
+from asysplat.overrides import exit_at_unknown_overrides
 
 
 @hydra.main(config_path="conf", config_name="benchmark", version_base="1.3")
@@ -38,5 +38,5 @@ def benchmark(options: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    exit_at_unknown_words("benchmark")
+    exit_at_unknown_overrides("benchmark")
     main()

@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.progress import track
 
 from asysplat.errors import InputError
+from asysplat.overrides import check_overrides, exit_at_unknown_overrides
 from asysplat.report.fill import fill_table, finished_runs, with_costs
 from asysplat.report.html import render_html
 from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import find_tables
 from asysplat.report.terminal import render_terminal
-from asysplat.words import check_words, exit_at_unknown_words
 
 OWN_WORDS = ("table", "costs", "overrides", "logs", "output")
 
@@ -33,7 +33,7 @@ def report(options: DictConfig) -> None:
     """Fill the tables, print them, write report.md and report.html."""
     tables = find_tables(options.table)
     words = [*sweep_words(HydraConfig.get().overrides.task), *options.overrides]
-    check_words(words)
+    check_overrides(words)
     runs = finished_runs(Path(options.logs))
     filled = [fill_table(table, words, compose_train, runs) for table in tables]
     if options.costs:
@@ -58,5 +58,5 @@ def compose_train(overrides: Sequence[str]) -> DictConfig:
 
 
 if __name__ == "__main__":
-    exit_at_unknown_words("report")
+    exit_at_unknown_overrides("report")
     main()

@@ -1,4 +1,7 @@
-"""Fit, then test, one configuration: python train.py model=asysplat_4m4s scale=laptop"""
+"""Fit, then test, one configuration.
+
+python train.py model=asysplat_4m4s scale=laptop
+"""
 
 import logging
 import os
@@ -17,13 +20,13 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError, input_error_behind
+from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.training.checkpoints import check_checkpoint, find_checkpoint, load_weights
 from asysplat.training.ranges import check_ranges
 from asysplat.training.revision import revision
 from asysplat.training.runs import Run, describe_run, find_run
 from asysplat.training.summary import print_summary, write_json
 from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
-from asysplat.words import exit_at_unknown_words
 
 
 @hydra.main(config_path="conf", config_name="train", version_base="1.3")
@@ -33,7 +36,7 @@ def main(config: DictConfig) -> float | None:
     try:
         return train(config)
     except KeyboardInterrupt:
-        sys.exit("stopped.")  # before the training or after the test
+        sys.exit("stopped.")  # before training or after the test; in between, Checkpoints prints it
     except Exception as error:
         mistake = input_error_behind(error)
         if mistake is None:
@@ -42,8 +45,11 @@ def main(config: DictConfig) -> float | None:
 
 
 def train_in_sweep(config: DictConfig) -> float | None:
-    """Train unless it was done before; with `rerun`, by this revision of the code. A failure is
-    named at once and the other jobs go on; Hydra ends the sweep with it."""
+    """Train one job of a sweep, unless a finished run has its results.
+
+    With `rerun`, only a run of this revision of the code counts. A failure is printed at once, the
+    other jobs go on, and Hydra reports it again at the end of the sweep.
+    """
     job = HydraConfig.get().job
     try:
         finished = find_run(Path(config.paths.logs), config)
@@ -62,27 +68,26 @@ def train_in_sweep(config: DictConfig) -> float | None:
 
 
 def finished_text(run: Run) -> str:
-    """What a sweep says of a run that it does not start again."""
+    """Write what a sweep prints about a run that it does not repeat."""
     other = f" by {run.revision}, while this is {revision()}; to run it again: rerun=true"
     return f"finished already{other if run.revision != revision() else ''}\nrun: {run.folder}"
 
 
 def quiet_lightning() -> None:
-    """Lightning's tips and deprecations speak to its developers, not to who runs this; of other
-    warnings the sentence is shown, not the line of code."""
+    """Hide Lightning's tips and deprecations; show other warnings without their line of code."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning")
     warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
 
 
 def train(config: DictConfig) -> float | None:
-    """Train and test; returns the test PSNR, which a sweep may optimise."""
+    """Train and test; return the test PSNR, which a sweep may optimise."""
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
     check_ranges(config)
     quiet_lightning()
     folder = Path(config.paths.run)
-    described = describe_run(config)  # before anybody changes a file
+    described = describe_run(config)  # now, since files may be edited while this trains
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     checkpoint = find_checkpoint(config.ckpt_path, Path(config.paths.logs) / config.name)
     data = instantiate(config.data)
@@ -119,17 +124,17 @@ def train(config: DictConfig) -> float | None:
 def make_trainer(
     config: DictConfig, callbacks: dict[str, lightning.Callback], logger: Logger
 ) -> lightning.Trainer:
-    """Lightning's.
+    """Build Lightning's trainer.
 
     Raises:
-        InputError: options that it refuses, or a device that is not there.
+        InputError: it refuses an option, or a device does not exist.
     """
     try:
         return instantiate(
             config.trainer,
             callbacks=list(callbacks.values()),
             logger=logger,
-            # Lightning has its own in place of those that are left out.
+            # Otherwise Lightning adds its own in place of those that are left out.
             enable_checkpointing="checkpoints" in callbacks,
             enable_progress_bar="progress" in callbacks,
         )
@@ -139,5 +144,5 @@ def make_trainer(
 
 if __name__ == "__main__":
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
-    exit_at_unknown_words("train")
+    exit_at_unknown_overrides("train")
     main()

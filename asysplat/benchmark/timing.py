@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
-from asysplat.evaluation.measured import wait_for
+from asysplat.evaluation.measured_cost import wait_for
 
 Run = Callable[[], object]
 Timer = Callable[[], Mapping[Hashable, float]]

@@ -1,6 +1,6 @@
-"""ImageNet features for LPIPS and for a perceptual loss, from files that are already here.
+"""ImageNet features for LPIPS and the perceptual loss, from files already on this machine.
 
-Nothing is downloaded unasked: a machine without the files runs without these measures.
+Nothing is downloaded unasked: without the files, runs go on without LPIPS and that loss.
 """
 
 import pickle
@@ -25,19 +25,22 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def find_backbone(
-    name: Literal["alexnet", "vgg16", "vgg19"], weights: Path | None, download: bool = False
+    name: Literal["alexnet", "vgg16", "vgg19"], backbone_dir: Path | None, download: bool = False
 ) -> dict[str, Tensor] | None:
-    """torchvision's ImageNet weights of the convolutions: `features.N.weight` and `.bias`, fp32.
+    """Load torchvision's ImageNet weights of a network's convolutions.
 
-    Looks in torch's hub cache, then for `<name>_features_fp16.pth` in the folder `weights`; where
-    neither has them they are downloaded into the cache, if `download` allows it. Else None.
+    Looks in torch's hub cache, then for `<name>_features_fp16.pth` in `backbone_dir`; where neither
+    has them, they are downloaded into the cache if `download` allows it.
+
+    Returns:
+        `features.N.weight` and `features.N.bias` in fp32, or None if the weights were not found.
 
     Raises:
         InputError: the file found cannot be read or holds something else, or the download failed.
     """
     candidates = sorted(_hub_cache().glob(HUB_FILES[name]))
-    if weights is not None:
-        candidates.append(weights / f"{name}_features_fp16.pth")
+    if backbone_dir is not None:
+        candidates.append(backbone_dir / f"{name}_features_fp16.pth")
     path = next((candidate for candidate in candidates if candidate.is_file()), None)
     if path is not None:
         return _features(name, _read(name, path), path)
@@ -89,9 +92,9 @@ class VGGFeatures(nn.Module):
     Args:
         name: of the network.
         weights: what `find_backbone(name, ...)` returned.
-        taps: layers of torchvision's `features`, ascending, whose outputs are given.
-        std: what images, less ImageNet's mean colour, are divided by, RGB.
-        mean_pooling: in place of maximum pooling.
+        taps: indices of the layers of torchvision's `features` whose outputs are returned.
+        std: RGB; images, less ImageNet's mean colour, are divided by it.
+        mean_pooling: whether to pool by the mean in place of the maximum.
     """
 
     def __init__(
@@ -117,8 +120,10 @@ class VGGFeatures(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
-        """The activations of `images` in [0, 1]; those after the n-th pooling have 1 / 2^n of the
-        size."""
+        """Compute the activations at `taps` of images in [0, 1].
+
+        Activations after the n-th pooling have 1 / 2^n of the height and width.
+        """
         x = (images - self.mean) / self.std
         activations = []
         for index, layer in enumerate(self.features):

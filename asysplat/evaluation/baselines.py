@@ -1,4 +1,4 @@
-"""What one gets for nothing: read every PSNR beside these."""
+"""Baselines without any training: read every PSNR beside theirs."""
 
 import torch
 from jaxtyping import Float
@@ -8,16 +8,17 @@ from asysplat.scene import Cameras, Views
 
 
 def mean_colour(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
-    """For every target, one flat image: the mean colour of all input pixels of its scene."""
+    """Fill every target with one colour: the mean of all input pixels of its scene."""
     colour = inputs.images.mean((-4, -2, -1))
     return colour[..., None, :, None, None].expand_as(targets.images)
 
 
 def nearest_view(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
-    """For every target, a copy of the input view nearest to it; images of one size.
+    """Copy for every target the input view nearest to it; all images have one size.
 
-    Nearest has the smallest distance / spread + angle / pi: distance between the camera centres,
-    spread = largest distance between two input centres, angle between the viewing directions.
+    The nearest has the smallest distance / spread + angle / pi: the distance between the camera
+    centres, the spread (the largest distance between two input centres), and the angle between the
+    viewing directions.
     Where all inputs share one centre, the angle alone decides.
     """
     nearest = _dissimilarity(targets.cameras, inputs.cameras).argmin(-1)

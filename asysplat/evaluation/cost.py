@@ -1,4 +1,4 @@
-"""Parameters, FLOPs and memory."""
+"""Count parameters and FLOPs, read peak memory."""
 
 import math
 import re
@@ -17,12 +17,12 @@ NORMS = (nn.LayerNorm, nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
 
 
 def count_parameters(module: nn.Module) -> int:
-    """Number of scalars among the module's parameters, frozen ones included."""
+    """Count the scalars among the module's parameters, frozen ones included."""
     return sum(parameter.numel() for parameter in module.parameters())
 
 
 def module_flops(net: nn.Module, run: Callable[[], object]) -> int:
-    """FLOPs of one `run()`, which calls `net`, as the paper counts them.
+    """Count the FLOPs of one `run()`, which calls `net`, as the paper counts them.
 
     2 x multiply-adds of Linear, Conv1d and Conv2d modules, 4 operations an element for LayerNorm
     and BatchNorm. Not counted, as a profiler of modules does not see them: attention products,
@@ -46,7 +46,7 @@ def module_flops(net: nn.Module, run: Callable[[], object]) -> int:
 
 
 def _flops_per_output(module: nn.Module) -> int:
-    """What `module_flops` counts for one element of the module's output."""
+    """Return what `module_flops` counts for one element of the module's output."""
     if isinstance(module, NORMS):
         return 4
     if isinstance(module, nn.Linear):
@@ -59,7 +59,7 @@ def _flops_per_output(module: nn.Module) -> int:
 
 
 def true_flops(run: Callable[[], object]) -> int:
-    """FLOPs of one `run()` with every matrix product, einsum and attention included.
+    """Count the FLOPs of one `run()` with every matrix product, einsum and attention.
 
     Run it on the meta device, which needs no memory: elsewhere the kernel that torch picks may be
     unknown to its counter (some releases count attention on a CPU as 0). Scans count with their
@@ -71,10 +71,10 @@ def true_flops(run: Callable[[], object]) -> int:
 
 
 def reset_peak_memory(device: torch.device | str) -> bool:
-    """Let `peak_memory_gb` start anew from what is held now.
+    """Reset the peak that `peak_memory_gb` reads to the memory in use now.
 
     Returns:
-        Whether it does: on CUDA, and on Linux where /proc is writable.
+        Whether that is possible: on CUDA, and on Linux where /proc is writable.
     """
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -87,10 +87,10 @@ def reset_peak_memory(device: torch.device | str) -> bool:
 
 
 def peak_memory_gb(device: torch.device | str) -> float:
-    """Peak memory in units of 1e9 bytes, since the last `reset_peak_memory` or the process began.
+    """Read the peak memory in 1e9 bytes since `reset_peak_memory` or the process's start.
 
-    On CUDA what tensors held; elsewhere the resident set of the whole process, with its libraries,
-    its data, and what was freed but not given back to the system.
+    On CUDA that of the tensors; elsewhere the resident set of the whole process, with its
+    libraries, its data, and memory that was freed but not given back to the system.
     """
     if torch.device(device).type == "cuda":
         return torch.cuda.max_memory_allocated(device) / GB

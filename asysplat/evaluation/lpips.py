@@ -14,14 +14,18 @@ from asysplat.ops.precision import without_autocast
 
 
 def load_lpips(
-    net: Literal["alex", "vgg"], weights: Path | None, download: bool = False
+    net: Literal["alex", "vgg"], backbone_dir: Path | None, download: bool = False
 ) -> lpips.LPIPS | None:
-    """The frozen LPIPS network, or None where its backbone is not on this machine.
+    """Build the frozen LPIPS network, or return None if its backbone is not on this machine.
 
-    Build it once and keep it. `weights` is a folder that may hold the backbone, and `download`
-    lets it be fetched (see `find_backbone`); the linear heads come with the lpips package.
+    Build it once and keep it; the linear heads come with the lpips package.
+
+    Args:
+        net: the backbone, AlexNet or VGG16.
+        backbone_dir: folder that may hold the backbone's weights, see `find_backbone`.
+        download: whether to fetch them if they are missing.
     """
-    backbone = find_backbone("alexnet" if net == "alex" else "vgg16", weights, download)
+    backbone = find_backbone("alexnet" if net == "alex" else "vgg16", backbone_dir, download)
     if backbone is None:
         return None
     # On meta, because the package would fill a whole torchvision model at random, 0.55 GB for VGG;
@@ -45,7 +49,7 @@ def lpips_distance(
     rendered: Float[Tensor, "*batch V 3 H W"],
     target: Float[Tensor, "*batch V 3 H W"],
 ) -> Float[Tensor, "*batch V"]:
-    """LPIPS of each image; images in [0, 1] (`rendered` is clamped), at least 32x32 pixels.
+    """Compute LPIPS of each image in [0, 1] (`rendered` is clamped), at least 32x32 pixels.
 
     One image at a time: VGG needs 1.5 GB for a pair of 540x960, AlexNet 0.2 GB.
     """

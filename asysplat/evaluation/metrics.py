@@ -1,4 +1,4 @@
-"""Image and depth metrics, one number a view, always in fp32; `Protocol` says how each is taken."""
+"""Image and depth metrics: one number for each view, in fp32; `Protocol` sets their options."""
 
 import math
 from typing import Literal
@@ -12,7 +12,7 @@ from asysplat.errors import InputError
 from asysplat.ops.precision import without_autocast
 
 MSE_FLOOR = 1e-10  # PSNR of identical images is 100 dB, not infinity
-SSIM_WINDOWS = {"gaussian": 11, "uniform": 7}  # pixels a side
+SSIM_WINDOWS = {"gaussian": 11, "uniform": 7}  # pixels on a side
 SSIM_SIGMA = 1.5  # of the Gaussian window
 SSIM_K2 = 0.03
 DELTA = 1.25
@@ -26,7 +26,7 @@ PerView = Float[Tensor, "*batch V"]
 
 
 def psnr(rendered: Images, target: Images) -> PerView:
-    """Peak signal-to-noise ratio in dB of each image in [0, 1]; `rendered` is clamped."""
+    """Compute the PSNR in dB of each image in [0, 1]; `rendered` is clamped."""
     difference = rendered.float().clamp(0, 1) - target.float()
     mse = difference.square().mean((-3, -2, -1))
     return -10 * mse.clamp_min(MSE_FLOOR).log10()
@@ -38,14 +38,14 @@ def ssim(
     window: Window = "gaussian",
     covariance: Covariance = "biased",
 ) -> PerView:
-    """Structural similarity of each image in [0, 1] (Wang et al. 2004), mean over the channels.
+    """Compute the SSIM of each image in [0, 1] (Wang et al. 2004), mean over the channels.
 
     `rendered` is clamped, the data range is 1, and only windows wholly inside the image count.
 
     Args:
         window: "gaussian": 11x11, sigma 1.5, or "uniform": 7x7.
         covariance: weighted sum of the products of deviations within a window ("biased"), or that
-            times n / (n - 1) for its n pixels ("sample"), as scikit-image has it.
+            times n / (n - 1) for its n pixels ("sample"), as scikit-image computes it.
 
     Raises:
         InputError: an image is smaller than the window.
@@ -53,7 +53,7 @@ def ssim(
     height, width = rendered.shape[-2:]
     check_ssim_size(height, width, window)
     size = SSIM_WINDOWS[window]
-    # Variances times n / (n - 1) throughout are the same as their constant, k2 squared, over it.
+    # Scaling all variances by n / (n - 1) is the same as dividing their constant, k2^2, by it.
     k2 = SSIM_K2 if covariance == "biased" else SSIM_K2 * math.sqrt(1 - 1 / size**2)
     with without_autocast(rendered):
         _, similarity = structural_similarity_index_measure(
@@ -67,14 +67,14 @@ def ssim(
             k2=k2,
             return_full_image=True,
         )
-    # torchmetrics mirrors the image at its border; those windows are left out, as the field does.
+    # torchmetrics mirrors the image at its border; like scikit-image, leave those windows out.
     border = size // 2
     inside = similarity[..., border : height - border, border : width - border]
     return inside.mean((-3, -2, -1)).reshape(rendered.shape[:-3])
 
 
 def check_ssim_size(height: int, width: int, window: Window) -> None:
-    """Raise InputError for images smaller than the window."""
+    """Raise InputError if images are smaller than the window."""
     size = SSIM_WINDOWS[window]
     if min(height, width) < size:
         raise InputError(
@@ -84,13 +84,13 @@ def check_ssim_size(height: int, width: int, window: Window) -> None:
 
 
 def abs_rel(depth: Depths, target_depth: Depths, alignment: Alignment = "none") -> PerView:
-    """Mean of |depth - target| / target over the pixels with target > 0.
+    """Compute the mean of |depth - target| / target over the pixels with target > 0.
 
     Args:
         depth, target_depth: along the camera's z axis; a target of 0 is unknown.
         alignment: "median" first scales each view's depth so that the medians agree
-            (of an even number of pixels, the lower of the two middle ones); a view without depth
-            in its middle is left as it is.
+            (the lower of the two middle values of an even number of pixels); a view whose scale
+            would not be finite is left as it is.
 
     Returns:
         NaN for a view without a known depth.
@@ -100,9 +100,9 @@ def abs_rel(depth: Depths, target_depth: Depths, alignment: Alignment = "none") 
 
 
 def delta1(depth: Depths, target_depth: Depths, alignment: Alignment = "none") -> PerView:
-    """Share of the pixels with target > 0 where max(depth / target, target / depth) < 1.25.
+    """Compute the share of pixels with max(depth / target, target / depth) < 1.25.
 
-    Arguments and NaN as in `abs_rel`.
+    Only pixels with target > 0 count. Arguments and NaN as in `abs_rel`.
     """
     depth, target, known = _prepare(depth, target_depth, alignment)
     # Without a division, a depth <= 0 is simply wrong.

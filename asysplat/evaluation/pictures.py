@@ -1,4 +1,4 @@
-"""What a number hides: input, target, rendered, error and depth beside each other."""
+"""Figures of a run: input, target, rendering, error and depth side by side; learning curve."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,15 +12,15 @@ from asysplat.evaluation.metrics import psnr
 from asysplat.rendering import Rendering
 from asysplat.scene import Views
 
-ERROR_RANGE = 0.5  # an error of this much is shown white
+ERROR_RANGE = 0.5  # the error that is shown brightest
 
 
 def comparison(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
-    """A row for each target view of one scene, without batch dimension.
+    """Draw a row of images for each target view of one scene; no field has a batch dimension.
 
     Columns: the nearest input, the target, the rendering with its PSNR, the absolute error, the
-    rendered inverse depth and, where the data has it, the true one on the same scale. Where a mask
-    leaves pixels out, the last three are blank.
+    rendered inverse depth and, if the data has depths, the true one on the same scale. Pixels that
+    a mask excludes are blank in the last three.
     """
     nearest = nearest_view(inputs, targets)
     quality = psnr(targets.masked(rendering.image), targets.images)
@@ -57,15 +57,16 @@ def comparison(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
 
 
 def disparity(depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-    """1 / depth, and 0, as for the farthest, where there is none."""
+    """Compute 1 / depth; 0, as at infinity, where the depth is unknown."""
     return torch.where(depth > 0, 1 / depth.where(depth > 0, 1), 0)
 
 
 def learning_curve(rows: Sequence[Mapping[str, float | int]]) -> Figure:
-    """Validation PSNR over training, above the two baselines that need none.
+    """Draw the validation PSNR over training, and that of two baselines without training.
 
     Args:
-        rows: one a validation, with minutes, step, psnr, nearest_view/psnr and mean_colour/psnr.
+        rows: one for each validation, with minutes, step, psnr, nearest_view/psnr and
+            mean_colour/psnr.
     """
     figure = Figure(figsize=(6, 3.6), layout="constrained")
     axis = figure.subplots()

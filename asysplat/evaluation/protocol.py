@@ -1,4 +1,4 @@
-"""Protocols: the settings that a metric's number depends on, under a name."""
+"""Protocols: named settings of the metrics, on which their numbers depend."""
 
 from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_type_hints
@@ -29,21 +29,21 @@ BACKBONES = {"alex": "AlexNet", "vgg": "VGG16"}
 
 @dataclass(frozen=True)
 class Protocol:
-    """How renderings are measured: the same images differ by dB and hundredths between protocols.
+    """How renderings are measured; numbers of different protocols cannot be compared.
 
-    Pixels that a view's mask excludes are as in the photograph for every image metric, and count
-    for no depth metric.
+    Pixels that a view's mask excludes are taken from the photograph in every image metric and left
+    out of every depth metric.
 
     Args:
-        name: stands beside the numbers.
-        eight_bit: renderings are first cut to 8 bits a channel, as in an image file.
+        name: shown beside the numbers.
+        eight_bit: whether renderings are first cut to 8 bits a channel, as in an image file.
         ssim_window, ssim_covariance: see `metrics.ssim`.
         lpips_net: LPIPS' backbone, "alex" or "vgg".
-        mean_over: every "images" alike, or every "scenes": the mean of each scene's images first.
+        mean_over: "images": all images alike, or "scenes": first the mean of each scene's images.
         depth_alignment: see `metrics.abs_rel`; for data without metric depth "median".
 
     Raises:
-        InputError: a setting that is none of the choices.
+        InputError: a setting is none of its choices.
     """
 
     name: str
@@ -65,20 +65,20 @@ class Protocol:
                 )
 
     def check_size(self, height: int, width: int) -> None:
-        """Raise InputError for images that cannot be measured."""
+        """Raise InputError if images of this size cannot be measured."""
         check_ssim_size(height, width, self.ssim_window)
 
     def psnr(self, rendered: Images, targets: Views) -> PerView:
-        """PSNR of each image in dB."""
+        """Compute the PSNR of each image in dB."""
         return psnr(self._shown(rendered, targets), targets.images)
 
     def image_metrics(
         self, rendered: Images, targets: Views, lpips: LPIPS | None
     ) -> dict[str, PerView]:
-        """PSNR, SSIM and LPIPS of each image.
+        """Compute PSNR, SSIM and LPIPS of each image.
 
         Args:
-            lpips: a network with the backbone `lpips_net`, see `load_lpips`; None: no LPIPS.
+            lpips: network with the backbone `lpips_net`, see `load_lpips`; None for no LPIPS.
         """
         shown, target = self._shown(rendered, targets), targets.images
         values = {
@@ -90,12 +90,12 @@ class Protocol:
         return values
 
     def _shown(self, rendered: Images, targets: Views) -> Images:
-        """In [0, 1] and, where so set, cut to 8 bits; the photograph where pixels do not count."""
+        """Clamp to [0, 1], cut to 8 bits if set, and fill in the photograph at excluded pixels."""
         rendered = rendered.float().clamp(0, 1)
         return targets.masked((rendered * 255).floor() / 255 if self.eight_bit else rendered)
 
     def depth_metrics(self, depth: Depths, targets: Views) -> dict[str, PerView]:
-        """AbsRel and delta < 1.25 of each view; none where the data has no depths."""
+        """Compute AbsRel and delta < 1.25 of each view; nothing if the data has no depths."""
         if targets.depths is None:
             return {}
         known = targets.depths if targets.masks is None else targets.depths.where(targets.masks, 0)
@@ -105,7 +105,7 @@ class Protocol:
         }
 
     def sentences(self) -> dict[str, str]:
-        """The protocol's name, and what was computed for each metric."""
+        """Return the protocol's name and, for each metric, a sentence on what is computed."""
         size = SSIM_WINDOWS[self.ssim_window]
         window = f"{self.ssim_window} window {size}x{size}"
         if self.ssim_window == "gaussian":

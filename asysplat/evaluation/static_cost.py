@@ -1,4 +1,4 @@
-"""What a forward pass costs, known without data, without memory and without running it."""
+"""Costs of a forward pass, counted without data and without running it."""
 
 import copy
 
@@ -13,22 +13,22 @@ GIGA = 1e9
 
 
 def blank_views(num_views: int, height: int, width: int) -> Views:
-    """One scene's views without content, on the device that new tensors go to."""
+    """Make one scene's views with uninitialised content, on torch's default device."""
     intrinsics, poses = torch.empty(1, num_views, 3, 3), torch.empty(1, num_views, 4, 4)
     images = torch.empty(1, num_views, 3, height, width)
     return Views(Cameras(intrinsics, poses, height, width), images)
 
 
 def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dict[str, float | int]:
-    """Costs of the forward pass of one scene.
+    """Count the costs of the forward pass of one scene.
 
     Args:
         net: on any device; a copy on the meta device is measured.
         num_views, height, width: of the input.
 
     Returns:
-        parameters; geometry_share, of 1; gflops, as the paper counts (`module_flops`) and
-        gflops_true, all of it (`true_flops`); gaussians; activation_gb (`activation_gb`).
+        parameters; geometry_share, of 1; gflops as the paper counts them (`module_flops`) and
+        gflops_true (`true_flops`), in 1e9; gaussians, their number; activation_gb (the function).
     """
     on_meta = copy.deepcopy(net).to("meta")
     with torch.device("meta"):
@@ -56,10 +56,10 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
 
 
 def activation_gb(net: nn.Module, num_views: int, height: int, width: int) -> float:
-    """Memory that one scene's forward pass keeps for its backward, in units of 1e9 bytes.
+    """Count the memory that one scene's forward pass keeps for its backward, in 1e9 bytes.
 
     In fp32, without gradient checkpointing, without the parameters, with attention that keeps no
-    scores. Counted on tensors without content that a CPU would have.
+    scores. Counted on fake tensors of the CPU, which have no content.
     """
     kept: dict[int, torch.UntypedStorage] = {}
     with FakeTensorMode():

@@ -12,11 +12,11 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.report.filled import Costs, FilledRow, FilledTable, Number
 from asysplat.report.paper import Row, Table, our_sets
-from asysplat.training.runs import Run, data_of, find_runs, identity
+from asysplat.training.runs import Run, config_hash, data_of, find_runs
 
 # Overrides of train.py -> its configuration, the node `hydra` included.
 Compose = Callable[[Sequence[str]], DictConfig]
-Runs = dict[str, list[Run]]  # by identity, oldest first
+Runs = dict[str, list[Run]]  # by config_hash, oldest first
 
 BASELINES = ("mean_colour", "nearest_view")
 # Columns that every run measures in passing, as it calls them, without and with post-optimisation.
@@ -34,7 +34,7 @@ def finished_runs(logs: Path) -> Runs:
     """All of them."""
     runs: Runs = {}
     for run in find_runs(logs):
-        runs.setdefault(run.identity, []).append(run)
+        runs.setdefault(run.config_hash, []).append(run)
     return runs
 
 
@@ -107,7 +107,7 @@ def _costs(compose: Compose, run: tuple[str, ...], views: int, size: tuple[int, 
 def _runs_of(config: DictConfig, runs: Runs) -> dict[int, Run]:
     """By seed: of several the newest, those that were tested on all that is asked for first."""
     data = data_of(config)
-    same = [run for run in runs.get(identity(config), []) if run.agrees(data)]
+    same = [run for run in runs.get(config_hash(config), []) if run.agrees(data)]
     return {run.seed: run for run in sorted(same, key=lambda run: run.covers(data))}
 
 

@@ -1,4 +1,4 @@
-"""Which checkpoint a run goes on from, and whether it fits."""
+"""Find the checkpoint to resume or to start from, and check that it fits the model."""
 
 from pathlib import Path
 
@@ -9,13 +9,14 @@ from asysplat.errors import InputError
 
 
 def find_checkpoint(asked: str | None, runs: Path) -> Path | None:
-    """The checkpoint that `ckpt_path` names.
+    """Find the checkpoint that `ckpt_path` names.
 
     Args:
-        asked: None, a file, or "last": the newest `last.ckpt` below `runs`.
+        asked: None, a file, or "last" for the newest `last.ckpt` below `runs`.
+        runs: folder of all runs of one name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such file.
     """
     if asked is None:
         return None
@@ -34,10 +35,10 @@ def find_checkpoint(asked: str | None, runs: Path) -> Path | None:
 
 
 def check_checkpoint(path: Path | None, module: nn.Module) -> None:
-    """Compare names and shapes, so that a mistake shows before training.
+    """Check the names and shapes of the weights before training.
 
     Raises:
-        InputError: the file cannot be read, or was written by another model.
+        InputError: the file cannot be read, or holds the weights of another model.
     """
     if path is None:
         return
@@ -59,10 +60,10 @@ def check_checkpoint(path: Path | None, module: nn.Module) -> None:
 
 
 def load_weights(path: str | None, module: nn.Module) -> None:
-    """Start from the weights of `path`, where there is one; optimizer and schedule start anew.
+    """Load the weights of the checkpoint `path`, if given, but neither optimizer nor schedule.
 
     Raises:
-        InputError: no such file, or one that does not fit.
+        InputError: there is no such file, or it does not fit.
     """
     if path is None:
         return

@@ -1,5 +1,8 @@
-"""The depth term in its two readings (paper, Suppl. A): what the paper calls its predicted
-disparity is either rendered at the targets or that of the Gaussians in their own input views."""
+"""The depth term of the loss (paper, Suppl. A), in two readings.
+
+The paper's "predicted disparity" is either rendered at the target views, or that of the Gaussians
+in the input views they are aligned with.
+"""
 
 import math
 from typing import Any
@@ -13,19 +16,21 @@ from asysplat.errors import InputError
 from asysplat.scene import Gaussians, Views
 from asysplat.training.outcome import Outcome
 
-STRIDE = 2  # p_c / p_f of the paper: both maps are downsampled by it
-SEEN = 0.5  # where Gaussians cover less than this, their depth says nothing
-NEAREST = 1e-2  # a smaller depth counts as this, as in Long-LRM
+STRIDE = 2  # p_c / p_f of the paper, by which both maps are downsampled
+MIN_ALPHA = 0.5  # below it, too little of the pixel is covered for its depth to count
+MIN_DEPTH = 1e-2  # smaller depths are raised to it, as in Long-LRM
 
 
 class RenderedDisparity:
-    """Of the depth rendered at the target cameras against the targets' depths, as the paper's
-    formula has it, a mean over target views."""
+    """Compares the depth rendered at the target cameras with the targets' depths.
+
+    This is the paper's formula, a mean over target views.
+    """
 
     renders_depth = True
 
     def __call__(self, outcome: Outcome, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
-        """The term, or None where the targets have no depths."""
+        """Compute the term; None if the targets have no depths."""
         rendering, targets = outcome.rendering, batch["targets"]
         if targets.depths is None:
             return None
@@ -33,21 +38,23 @@ class RenderedDisparity:
             maps[..., ::STRIDE, ::STRIDE]
             for maps in (rendering.depth, rendering.alpha, targets.depths)
         )
-        return disparity_distance(depth, target, (target > 0) & (alpha > SEEN) & (depth > 0))
+        return disparity_distance(depth, target, (target > 0) & (alpha > MIN_ALPHA) & (depth > 0))
 
 
 class InputDisparity:
-    """Of each Gaussian's depth in the input view that it is aligned with against that view's depth,
-    as Long-LRM's public code has it (model/llrm.py), and the paper where it says that "the scene
-    geometry is modeled by pixel-aligned prediction"."""
+    """Compares Gaussians, in the input views they are aligned with, with those views' depths.
+
+    This is what Long-LRM's public code does (model/llrm.py). It also fits the paper's sentence
+    "the scene geometry is modeled by pixel-aligned prediction".
+    """
 
     renders_depth = False
 
     def __call__(self, outcome: Outcome, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
-        """The term, or None where the inputs have no depths.
+        """Compute the term; None if the inputs have no depths.
 
         Raises:
-            InputError: the Gaussians are no map of the input views.
+            InputError: the Gaussians are not a map for each input view, see `own_depths`.
         """
         inputs = batch["inputs"]
         if inputs.depths is None:
@@ -58,14 +65,14 @@ class InputDisparity:
         valid = target > 0
         if inputs.masks is not None:
             valid = valid & inputs.masks[..., ::stride, ::stride]
-        return disparity_distance(depth.clamp_min(NEAREST), target, valid)
+        return disparity_distance(depth.clamp_min(MIN_DEPTH), target, valid)
 
 
 def own_depths(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "*batch V h w"]:
-    """Depth along the axis of the input view that each Gaussian is aligned with.
+    """Compute each Gaussian's depth in the input view it is aligned with.
 
     Raises:
-        InputError: the Gaussians are not V h w, with the views' sides over h and w one number.
+        InputError: there are not V h w Gaussians, with height / h = width / w a whole number.
     """
     cameras, count = inputs.cameras, gaussians.num_gaussians
     stride = max(1, math.isqrt(inputs.num_views * cameras.height * cameras.width // count))
@@ -78,7 +85,7 @@ def own_depths(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "*batch V h
         )
     means = gaussians.means.unflatten(-2, (inputs.num_views, height, width))
     away = means - cameras.centers[..., None, None, :]
-    # Not a matrix product: autocast would round that to half precision.
+    # A matrix product would be rounded to half precision by autocast.
     return (away * cameras.cam_to_world[..., None, None, :3, 2]).sum(-1)
 
 
@@ -87,7 +94,7 @@ def disparity_distance(
     target: Float[Tensor, "*batch V H W"],
     valid: Bool[Tensor, "*batch V H W"],
 ) -> Float[Tensor, ""]:
-    """SmoothL1 between normalised disparities, over the valid pixels."""
+    """Compute the mean SmoothL1 between normalised disparities over the valid pixels."""
     depth, target, valid = (maps.flatten(0, -3) for maps in (depth, target, valid))
     found, expected = (normalised_disparity(maps, valid) for maps in (depth, target))
     error = F.smooth_l1_loss(found, expected, reduction="none")
@@ -97,7 +104,10 @@ def disparity_distance(
 def normalised_disparity(
     depth: Float[Tensor, "V H W"], valid: Bool[Tensor, "V H W"]
 ) -> Float[Tensor, "V H W"]:
-    """1 / depth, less its median and over its mean absolute deviation, per view; 0 elsewhere."""
+    """Compute 1 / depth less its median, over its mean absolute deviation; 0 if not valid.
+
+    The median and the deviation are those of each view's valid pixels.
+    """
     disparity = torch.where(valid, 1 / torch.where(valid, depth, 1), torch.nan).flatten(1)
     median = disparity.nanmedian(dim=1, keepdim=True).values
     centered = torch.where(valid.flatten(1), disparity - median.nan_to_num(), 0)

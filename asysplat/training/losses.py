@@ -1,4 +1,4 @@
-"""The training objective (paper, Suppl. A, Eq. 5). A term that is off costs nothing."""
+"""The training loss (paper, Suppl. A, Eq. 5). A term that is off costs nothing."""
 
 import warnings
 from collections.abc import Callable
@@ -18,12 +18,12 @@ class ReconstructionLoss(nn.Module):
 
     Args:
         mse, perceptual, depth: weights of the terms; 0 turns a term off. The perceptual term is
-            also off where its network is not on this machine, the depth term where the data has no
-            depths: either is said once.
-        perceptual_term, depth_term: components, built where their weight is not 0.
+            also off if its network is not on this machine, the depth term if the data has no
+            depths; a warning says so once.
+        perceptual_term, depth_term: constructors, called if the term's weight is not 0.
 
     Raises:
-        InputError: no term is on.
+        InputError: all terms are off.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class ReconstructionLoss(nn.Module):
         super().__init__()
         self.mse, self.perceptual, self.depth = mse, perceptual, depth
         distance = perceptual_term() if perceptual else None
-        # In a list, so that the frozen network stays out of the checkpoints.
+        # A list hides the frozen network from checkpoints.
         self._perceptual_term = [] if distance is None else [distance]
         self._depth_term = depth_term() if depth else None
         if not (mse or self._perceptual_term or depth):
@@ -45,7 +45,7 @@ class ReconstructionLoss(nn.Module):
                 "training.loss has no term that is on: give mse, perceptual or depth a weight "
                 "above 0, and for perceptual alone its network (paths.download=true fetches it)."
             )
-        self._said_no_depth = False
+        self._warned_of_depth = False
 
     @property
     def needs_depth(self) -> bool:
@@ -53,10 +53,10 @@ class ReconstructionLoss(nn.Module):
         return self._depth_term is not None and self._depth_term.renders_depth
 
     def forward(self, outcome: Outcome, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """The weighted sum under "loss", and each term that is on, unweighted.
+        """Compute the weighted sum, as "loss", and each term that is on, unweighted.
 
         Args:
-            outcome: with rendered depth where `needs_depth`.
+            outcome: with rendered depth if `needs_depth`.
             batch: inputs and targets, both Views.
         """
         targets = batch["targets"]
@@ -69,8 +69,8 @@ class ReconstructionLoss(nn.Module):
             depth = self._depth_term(outcome, batch)
             if depth is not None:
                 terms["depth"] = depth
-            elif not self._said_no_depth:
-                self._said_no_depth = True
+            elif not self._warned_of_depth:
+                self._warned_of_depth = True
                 warnings.warn(
                     "the data has no depths: training goes on without the depth term.",
                     stacklevel=2,

@@ -1,4 +1,4 @@
-"""What a network made of a batch: losses compare it, callbacks measure and draw it."""
+"""The outcome of a batch, for the losses to compare and the callbacks to measure and draw."""
 
 from dataclasses import dataclass
 
@@ -8,10 +8,11 @@ from asysplat.scene import Gaussians
 
 @dataclass(frozen=True)
 class Outcome:
-    """
+    """What the network and the renderer made of a batch.
+
     Args:
-        gaussians: of the input views.
-        rendering: of them, at the target cameras.
+        gaussians: predicted from the input views.
+        rendering: of these Gaussians, at the target cameras.
     """
 
     gaussians: Gaussians

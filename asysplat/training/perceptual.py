@@ -1,4 +1,4 @@
-"""Perceptual distances of images, by frozen networks that are looked for on this machine."""
+"""Perceptual distances of images, by frozen networks found on this machine."""
 
 import warnings
 from collections.abc import Sequence
@@ -18,8 +18,8 @@ class PerceptualDistance(nn.Module):
 
     Args:
         features: frozen; images [B, 3, H, W] in [0, 1] -> activations.
-        weights: one an activation.
-        image_weight: of the mean absolute difference of the images themselves.
+        weights: one for each activation.
+        image_weight: weight of the mean absolute difference of the images themselves.
     """
 
     def __init__(self, features: VGGFeatures, weights: Sequence[float], image_weight: float):
@@ -39,18 +39,19 @@ class PerceptualDistance(nn.Module):
             return distance
 
 
-def vgg16(weights: str | None = None, download: bool = False) -> PerceptualDistance | None:
-    """The mean over VGG16's ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016), on images as
-    ImageNet's are normalised.
+def vgg16(backbone_dir: str | None = None, download: bool = False) -> PerceptualDistance | None:
+    """Build the mean over VGG16's ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016).
+
+    Images are normalised as ImageNet's are.
 
     Args:
-        weights: folder that may hold the network's.
-        download: them where they are missing.
+        backbone_dir: folder that may hold the network's weights.
+        download: whether to fetch the weights if they are missing.
 
     Returns:
-        None, with a warning, where the weights are not on this machine.
+        None, with a warning, if the weights are not on this machine.
     """
-    backbone = _backbone("vgg16", weights, download)
+    backbone = _backbone("vgg16", backbone_dir, download)
     if backbone is None:
         return None
     features = VGGFeatures("vgg16", backbone, taps=(3, 8, 15, 22, 29), std=IMAGENET_STD)
@@ -61,24 +62,25 @@ LONG_LRM_WEIGHTS = (0.3846, 0.2083, 0.2703, 0.1786, 6.6667)  # 1/2.6, 1/4.8, 1/3
 LONG_LRM_SCALE = 255.0
 
 
-def longlrm(weights: str | None = None, download: bool = False) -> PerceptualDistance | None:
-    """Long-LRM's: VGG19's ReLU 1_2, 2_2, 3_2, 4_2 and 5_2 with mean pooling in place of maximum
-    pooling, and the images, in the weights of Chen and Koltun 2017 (Long-LRM's public code,
-    model/loss.py and configs/7m1t_tm.yaml).
+def longlrm(backbone_dir: str | None = None, download: bool = False) -> PerceptualDistance | None:
+    """Build Long-LRM's distance (its public code's model/loss.py and configs/7m1t_tm.yaml).
 
-    Images are given in units of 1/255 less ImageNet's mean, and distances divided by 255. What is
-    published are weights converted from MatConvNet, for which those units are. torchvision's, which
-    are looked for, stand in for them, as in that code's own default; the published ones, as
-    vgg19_features_fp16.pth in `weights`, are taken where torch's hub cache has no VGG19.
+    The weighted sum of Chen and Koltun 2017 over the images and VGG19's ReLU 1_2, 2_2, 3_2, 4_2 and
+    5_2, with mean pooling in place of maximum pooling. Images, less ImageNet's mean, are scaled to
+    [0, 255], and distances divided by 255.
+
+    Long-LRM publishes weights converted from MatConvNet, made for these units. Like its code's
+    default, this takes torchvision's in their place. The published ones are read if they are
+    vgg19_features_fp16.pth in `backbone_dir` and torch's hub cache has no VGG19.
 
     Args:
-        weights: folder that may hold the network's.
-        download: them where they are missing.
+        backbone_dir: folder that may hold the network's weights.
+        download: whether to fetch the weights if they are missing.
 
     Returns:
-        None, with a warning, where the weights are not on this machine.
+        None, with a warning, if the weights are not on this machine.
     """
-    backbone = _backbone("vgg19", weights, download)
+    backbone = _backbone("vgg19", backbone_dir, download)
     if backbone is None:
         return None
     features = VGGFeatures(
@@ -92,8 +94,8 @@ def longlrm(weights: str | None = None, download: bool = False) -> PerceptualDis
     return PerceptualDistance(features, scaled, image_weight=1.0)
 
 
-def _backbone(name: str, weights: str | None, download: bool) -> dict[str, Tensor] | None:
-    backbone = find_backbone(name, None if weights is None else Path(weights), download)
+def _backbone(name: str, backbone_dir: str | None, download: bool) -> dict[str, Tensor] | None:
+    backbone = find_backbone(name, None if backbone_dir is None else Path(backbone_dir), download)
     if backbone is None:
         warnings.warn(
             f"{name.upper()} is neither in torch's hub cache nor in paths.weights: "

@@ -1,4 +1,4 @@
-"""What the options that are set most may be, checked before any work starts."""
+"""Check the values of the options that are set most, before any work starts."""
 
 import math
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from asysplat.errors import InputError
 
-SEEDS = 2**32  # that NumPy takes
+SEEDS = 2**32  # NumPy takes seeds below it
 
 
 def is_whole(value: object) -> bool:
@@ -22,7 +22,7 @@ def is_window(value: object) -> bool:
     return isinstance(value, ListConfig) and list(map(is_whole, value)) == [True, True]
 
 
-# What to give, whether a value is that, and the options it holds for.
+# What a value has to be, the test of that, and the options it holds for.
 RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
     (
         "a whole number of at least 1",
@@ -36,7 +36,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
     (
         "a whole number of at least 0",
         lambda value: is_whole(value) and value >= 0,
-        ("data.num_workers", "training.warmup_steps", "callbacks.pictures.scenes"),
+        ("data.num_workers", "training.schedule.warmup_steps", "callbacks.pictures.scenes"),
     ),
     (
         f"a whole number from 0 to {SEEDS - 1}",
@@ -46,13 +46,13 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
     (
         "a number above 0",
         lambda value: is_number(value) and value > 0,
-        ("width", "parameter_budget", "training.learning_rate"),
+        ("width", "parameter_budget", "learning_rate"),
     ),
     (
         "a number of at least 0",
         lambda value: is_number(value) and value >= 0,
         (
-            "training.weight_decay",
+            "training.optimizer.weight_decay",
             *("training.loss.mse", "training.loss.perceptual", "training.loss.depth"),
         ),
     ),
@@ -66,10 +66,10 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
 
 
 def check_ranges(config: DictConfig) -> None:
-    """Check the options of `RANGES` that a configuration has.
+    """Check those options of `RANGES` that the configuration has.
 
     Raises:
-        InputError: a value of another type, or out of range; the first in the order above.
+        InputError: a value has another type or is out of range; names the first of them.
     """
     absent = object()
     for expected, fits, keys in RANGES:

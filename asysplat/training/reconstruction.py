@@ -1,13 +1,14 @@
 """The LightningModule: it wires a network, the renderer and the losses, and nothing else."""
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Any
 
 import lightning
 import torch
 from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
 
 from asysplat.evaluation.metrics import psnr
 from asysplat.evaluation.static_cost import blank_views
@@ -23,11 +24,9 @@ class Reconstruction(lightning.LightningModule):
     Args:
         net: views -> Gaussians; see `freeze_unread`.
         loss: of an outcome against its batch.
-        learning_rate: its peak; linear warm-up, then a cosine to zero at `total_steps`.
-        weight_decay: see `decaying`.
-        betas: of AdamW.
-        warmup_steps, total_steps: in optimizer steps.
-        background: RGB behind the Gaussians.
+        optimizer: parameter groups -> optimizer; its weight decay is for `decaying` alone.
+        schedule: optimizer -> its learning rates, one for each step.
+        background: RGB in [0, 1] behind the Gaussians.
         checkpoint_layers: compute each layer again in the backward pass, to save memory.
     """
 
@@ -35,11 +34,8 @@ class Reconstruction(lightning.LightningModule):
         self,
         net: Network,
         loss: ReconstructionLoss,
-        learning_rate: float,
-        weight_decay: float,
-        betas: Sequence[float],
-        warmup_steps: int,
-        total_steps: int,
+        optimizer: Callable[[list[dict[str, Any]]], Optimizer],
+        schedule: Callable[[Optimizer], LRScheduler],
         background: Sequence[float],
         checkpoint_layers: bool = False,
     ):
@@ -47,12 +43,16 @@ class Reconstruction(lightning.LightningModule):
         freeze_unread(net)
         net.checkpoint_layers(checkpoint_layers)
         self.net, self.loss = net, loss
-        self.learning_rate, self.weight_decay, self.betas = learning_rate, weight_decay, betas
-        self.warmup_steps, self.total_steps = warmup_steps, total_steps
+        self.optimizer, self.schedule = optimizer, schedule
         self.register_buffer("background", torch.tensor(background), persistent=False)
 
     def reconstruct(self, batch: dict[str, Any], depth: bool) -> Outcome:
-        """Gaussians of the inputs and their rendering at the target cameras."""
+        """Predict the Gaussians of the inputs and render them at the target cameras.
+
+        Args:
+            batch: `inputs` and `targets`, both Views.
+            depth: whether to render depth too.
+        """
         gaussians = self.net(batch["inputs"])
         targets = batch["targets"]
         rendering = render(
@@ -80,60 +80,49 @@ class Reconstruction(lightning.LightningModule):
     def configure_optimizers(self) -> dict[str, Any]:
         decay = set(decaying(self.net))
         trained = [p for p in self.parameters() if p.requires_grad]
-        optimizer = torch.optim.AdamW(
+        optimizer = self.optimizer(
             [
-                {
-                    "params": [p for p in trained if p in decay],
-                    "weight_decay": self.weight_decay,
-                },
+                {"params": [p for p in trained if p in decay]},
                 {"params": [p for p in trained if p not in decay], "weight_decay": 0.0},
-            ],
-            lr=self.learning_rate,
-            betas=tuple(self.betas),
-            fused=True,
+            ]
         )
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self.learning_rate_factor)
         return {
             "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": schedule, "interval": "step"},
+            "lr_scheduler": {"scheduler": self.schedule(optimizer), "interval": "step"},
         }
 
     def configure_gradient_clipping(
         self,
-        optimizer: torch.optim.Optimizer,
+        optimizer: Optimizer,
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """By norm. Lightning's own refuses a fused optimizer under autocast, for the sake of
-        fp16's loss scaling, which bf16 does without."""
+        """Clip by the norm of all gradients.
+
+        Lightning's own refuses a fused optimizer under autocast, for the sake of fp16's loss
+        scaling, which bf16 does without.
+        """
         if gradient_clip_val:
             torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val)
-
-    def learning_rate_factor(self, step: int) -> float:
-        """Linear warm-up to 1, then half a cosine to 0."""
-        if step < self.warmup_steps:
-            return (step + 1) / self.warmup_steps
-        progress = (step - self.warmup_steps) / max(1, self.total_steps - self.warmup_steps)
-        return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
 
 
 WEIGHTED = (nn.Linear, nn.Conv1d, nn.Conv2d)
 
 
 def decaying(net: nn.Module) -> list[nn.Parameter]:
-    """The parameters that weight decay pulls to zero: the weights of products and convolutions.
+    """List the parameters that weight decay applies to: weights of Linear and Conv layers.
 
-    What is learned otherwise has a meaning away from zero: norms, biases, A, dt and D of the scans
-    whatever their shape, tokens.
+    All others have a meaning away from zero: norms, biases, learned tokens, and A, dt and D of the
+    scans, whatever their shape.
     """
     return [module.weight for module in net.modules() if isinstance(module, WEIGHTED)]
 
 
 def freeze_unread(net: Network) -> None:
-    """Let parameters on which no Gaussian depends take no gradient.
+    """Turn off the gradients of parameters on which no Gaussian depends.
 
-    Nothing would ever change them, but processes that train together wait for their gradients.
-    They are there because the paper counts them: a link whose reader is not predicted from.
+    Processes that train together would wait for those gradients forever. The parameters exist
+    because the paper counts them, as a link into a branch from which nothing is predicted.
     """
     with torch.device("meta"):
         views = blank_views(2, net.size_multiple, net.size_multiple)

@@ -1,4 +1,4 @@
-"""Which code a run was made with."""
+"""The revision of the code that a run was made with."""
 
 import hashlib
 import subprocess
@@ -12,10 +12,12 @@ CODE = ("asysplat", "conf", "sweeps", "train.py")
 
 @cache
 def revision() -> str:
-    """The git commit of the code that this process runs, and where files of CODE that git knows
-    differ from it, "+" and a hash of the differences. Outside of a repository of its own, the
-    package's version."""
-    # A package that is installed below somebody else's repository is no part of it.
+    """Return the git commit of the code that this process runs.
+
+    If tracked files of CODE differ from the commit, "+" and a hash of the differences follow. A
+    package outside a repository of its own gives its version instead.
+    """
+    # A package installed below somebody else's repository is not part of it.
     if _git("rev-parse", "--show-cdup") != b"\n":
         return _version()
     commit = _git("rev-parse", "--short=12", "HEAD")
@@ -26,10 +28,10 @@ def revision() -> str:
     return commit.decode().strip() + mark
 
 
-def _git(*words: str) -> bytes | None:
-    """What git prints; None where it fails or is not installed."""
+def _git(*arguments: str) -> bytes | None:
+    """Return what git prints; None if it fails or is not installed."""
     try:
-        return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, check=True).stdout
+        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, check=True).stdout
     except (OSError, subprocess.CalledProcessError):
         return None
 

@@ -1,4 +1,4 @@
-"""Finished runs on disk, and whether a configuration is among them."""
+"""Find finished runs on disk, and the one that a configuration describes."""
 
 import hashlib
 import json
@@ -18,14 +18,13 @@ from asysplat.data.build import tested_sets
 from asysplat.training.revision import revision
 
 RESULTS = "metrics.json"
-EVALUATION = "evaluation.json"  # what evaluate.py adds to a run
-# Names, places on disk, what watches a run, and what other keys have already taken their values
-# from.
-BESIDE_THE_POINT = (
+EVALUATION = "evaluation.json"  # added to a run by evaluate.py
+# Names, places on disk, callbacks, and keys that only other keys take their values from.
+NOT_HASHED = (
     *("name", "ckpt_path", "rerun", "paths", "callbacks"),
     *("stage", "stages", "selections", "more_inputs", "replica_size"),
     *("data.root", "data.index", "data.cache", "data.test_sets"),
-    *(f"training.loss.perceptual_term.{name}" for name in ("weights", "download")),
+    *(f"training.loss.perceptual_term.{name}" for name in ("backbone_dir", "download")),
 )
 
 
@@ -34,38 +33,39 @@ class Run:
     """A finished run.
 
     Args:
-        folder: where it is.
-        identity: of its configuration, see `identity`.
-        seed: its own.
+        folder: where its files are.
+        config_hash: see the function `config_hash`.
+        seed: of its random numbers.
         revision: of the code that made it, see `revision`.
-        results: the flat numbers and words of metrics.json and, where there is one,
-            evaluation.json.
+        results: the flat content of metrics.json and, if there is one, evaluation.json.
     """
 
     folder: Path
-    identity: str
+    config_hash: str
     seed: int
     revision: str
     results: dict[str, Any]
 
     def agrees(self, data: Mapping[str, str]) -> bool:
-        """Whether it read what `data` names, as far as both know; `data` as `data_of` has it."""
+        """Return whether it read `data` (see `data_of`), as far as both name what they read."""
         return all(self.results.get(key, value) == value for key, value in data.items())
 
     def covers(self, data: Mapping[str, str]) -> bool:
-        """Whether it read all of `data`; it may have been tested on more."""
+        """Return whether it read all of `data` (see `data_of`), and perhaps more test sets."""
         return all(self.results.get(key) == value for key, value in data.items())
 
 
-def identity(config: DictConfig) -> str:
-    """A hash of all that the configuration resolves to, but for
+def config_hash(config: DictConfig) -> str:
+    """Hash the resolved configuration, without the keys that change no number.
 
-    - the seed, and what changes no number: callbacks, loader workers, the cache;
-    - places on disk: of a test root and of a checkpoint to start from it counts only whether there
-      is one, and `data_of` says which;
-    - further test sets, which change no number of the others; `data_of` has them too.
+    Left out are:
 
-    Runs of one identity, seed and data agree. A value that is not given (`???`) is no obstacle.
+    - the seed, callbacks, the number of loader processes and the cache;
+    - places on disk: for the test root and a checkpoint to start from, only whether they are given
+      counts; `data_of` names them;
+    - further test sets, which do not change the numbers of the others; `data_of` names them too.
+
+    Runs of one hash, seed and data have the same numbers. Missing values (`???`) are allowed.
     """
     config = config.copy()
     with open_dict(config):
@@ -74,18 +74,18 @@ def identity(config: DictConfig) -> str:
     resolved = OmegaConf.to_container(config, resolve=True)
     resolved["init_path"] = resolved["init_path"] is not None
     resolved["data"]["test_root"] = resolved["data"].get("test_root") is not None
-    for key in BESIDE_THE_POINT:
+    for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)
     return _hash(resolved)
 
 
 def data_of(config: DictConfig) -> dict[str, str]:
-    """What a run of the configuration reads, wherever it lies, as metrics.json has it.
+    """Describe the data that a run reads, wherever it is on disk, as in metrics.json.
 
-    run/data/root and run/data/test_root are the names of those folders; run/data/index and
-    run/init_path hashes of what these files hold; run/test_sets/<name> a hash of the options of a
-    further test set, its own root and index likewise. What is not given is left out.
+    run/data/root and run/data/test_root are the names of those folders. run/data/index and
+    run/init_path are hashes of these files' content. run/test_sets/<name> is a hash of a further
+    test set's options, with its root by name and its index by content. Absent options are left out.
     """
     data = OmegaConf.to_container(config.data, resolve=True)
     places = {
@@ -103,12 +103,12 @@ def data_of(config: DictConfig) -> dict[str, str]:
 
 
 def _name(path: str | None) -> str | None:
-    """Of a folder; None for what is not given."""
+    """Return the name of a folder; None if it is not given."""
     return None if path in (None, MISSING) else Path(os.path.abspath(path)).name
 
 
 def _content(path: str | None) -> str | None:
-    """A hash of the file; the name of what cannot be read as one."""
+    """Hash a file's content; return the path's name if it cannot be read as a file."""
     if path in (None, MISSING):
         return None
     try:
@@ -123,12 +123,15 @@ def _hash(values: Any) -> str:
 
 
 def describe_run(config: DictConfig) -> dict[str, str | int]:
-    """What metrics.json says of the run itself: run/identity, run/seed, run/revision (see
-    `revision`), run/machine, and what `data_of` says."""
+    """Describe a run for metrics.json.
+
+    Returns:
+        run/config_hash, run/seed, run/revision (see `revision`), run/machine, and `data_of`.
+    """
     gpus = torch.cuda.device_count()
     machine = f"{gpus} x {torch.cuda.get_device_name()}" if gpus else f"{os.cpu_count()} CPU cores"
     return {
-        "run/identity": identity(config),
+        "run/config_hash": config_hash(config),
         "run/seed": config.seed,
         "run/revision": revision(),
         "run/machine": f"{machine}, torch {torch.__version__}",
@@ -137,13 +140,16 @@ def describe_run(config: DictConfig) -> dict[str, str | int]:
 
 
 def find_runs(logs: Path) -> Iterator[Run]:
-    """Every finished run below `logs`, oldest first; a results file that cannot be read, which a
-    run that was cut off may leave, is no result and is named in a warning."""
+    """Yield every finished run below `logs`, oldest first.
+
+    A results file that cannot be read, as a run that was cut off may leave, is skipped with a
+    warning.
+    """
     found = sorted(logs.rglob(RESULTS), key=lambda path: (path.stat().st_mtime, path))
     for path in found:
         try:
             results = json.loads(path.read_text())
-            keys = ("run/identity", "run/seed", "run/revision")
+            keys = ("run/config_hash", "run/seed", "run/revision")
             run = Run(path.parent, *(results[key] for key in keys), results)
             extra = path.with_name(EVALUATION)
             if extra.exists():
@@ -157,9 +163,11 @@ def find_runs(logs: Path) -> Iterator[Run]:
 
 
 def find_run(logs: Path, config: DictConfig) -> Run | None:
-    """The newest finished run of this configuration, seed and data; one of this revision of the
-    code comes before those of others."""
-    wanted, data = (identity(config), config.seed), data_of(config)
-    same = [run for run in find_runs(logs) if (run.identity, run.seed) == wanted]
+    """Find the newest finished run of this configuration, seed and data.
+
+    Runs of this revision of the code come before runs of others.
+    """
+    wanted, data = (config_hash(config), config.seed), data_of(config)
+    same = [run for run in find_runs(logs) if (run.config_hash, run.seed) == wanted]
     same = [run for run in same if run.covers(data)]
     return max(reversed(same), key=lambda run: run.revision == revision(), default=None)

@@ -1,4 +1,4 @@
-"""What a run leaves: metrics.json, and a table on the terminal."""
+"""The results of a run: metrics.json, and tables on the terminal."""
 
 import json
 import math
@@ -7,9 +7,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from asysplat.evaluation.measured import SECONDS
+from asysplat.evaluation.measured_cost import SECONDS
 
-Results = dict[str, float | int | str]  # as metrics.json has them
+Results = dict[str, float | int | str]  # flat, as in metrics.json
 
 METRICS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "absrel": "AbsRel"}
 METRICS["delta1"] = "delta<1.25"
@@ -21,7 +21,10 @@ SOURCES = {
 
 
 def write_json(path: Path, results: Results) -> None:
-    """Flat and sorted, NaN as null, beside them how seconds are taken; complete or not there."""
+    """Write results sorted, NaN as null, with a sentence on how seconds are measured.
+
+    The file appears complete or not at all.
+    """
     finite = {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in results.items()
@@ -33,13 +36,13 @@ def write_json(path: Path, results: Results) -> None:
 
 
 def test_sets(results: Results) -> list[str]:
-    """The test sets that were measured, in order."""
+    """List the test sets that were measured, in order."""
     keys = (key.split("/") for key in results)
     return [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
 
 
 def quality_table(results: Results, data: str) -> Table:
-    """Every metric of a test set, a row each source of images; the title names the protocol."""
+    """Make the table of one test set: a column for each metric, a row for each image source."""
     shown = [name for name in METRICS if f"test/{data}/{name}" in results]
     title = f"test scenes: {data}, metrics: {results['protocol/name']}"
     table = Table("", *(METRICS[name] for name in shown), title=title)
@@ -50,7 +53,7 @@ def quality_table(results: Results, data: str) -> Table:
 
 
 def psnr_table(results: Results, names: list[str]) -> Table:
-    """A row a test set, PSNR of each source of images."""
+    """Make the table of several test sets: a row for each, PSNR of each image source."""
     table = Table("", *SOURCES, title="other test sets, PSNR (dB)")
     for name in names:
         values = [results[f"{prefix.format(name)}/psnr"] for prefix in SOURCES.values()]
@@ -59,7 +62,7 @@ def psnr_table(results: Results, names: list[str]) -> Table:
 
 
 def cost_sentence(results: Results) -> str:
-    """The costs that were measured; nothing where none were."""
+    """Write the measured costs as a sentence; empty if none were measured."""
     costs = []
     if "cost/parameters" in results:
         costs += [
@@ -77,13 +80,11 @@ def cost_sentence(results: Results) -> str:
 
 
 def print_summary(results: Results, data: str, folder: Path) -> None:
-    """The test beside what one gets for nothing, the costs, the pictures; the folder last.
-
-    What was not measured is left out.
+    """Print the test and its baselines, the costs, the pictures and, last, the run's folder.
 
     Args:
-        results: of a run.
-        data: the test set to show in full; of others PSNR alone is shown.
+        results: of a run; what was not measured is left out.
+        data: the test set to show in full; for others only PSNR is shown.
         folder: of the run.
     """
     console = Console()

@@ -1,4 +1,4 @@
-"""TensorBoard: readable first page, filled hparams tab."""
+"""TensorBoard: a first page of quality and training, and the hparams tab."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +13,7 @@ CHOICES = (
     "state_size",
     "geometry_ratio",
     "steps",
+    "learning_rate",
     "model.layers",
     "data.name",
     "data.inputs",
@@ -20,13 +21,12 @@ CHOICES = (
     "data.width",
     "data.batch_size",
     "metrics.name",
-    "training.learning_rate",
     "training.loss.perceptual",
     "training.loss.depth",
 )
 HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
 
-LAYOUT = {
+PAGE = {
     "quality": {
         "PSNR (dB)": ["Multiline", ["train/psnr", "val/psnr", "val/nearest_view/psnr"]],
         "SSIM": ["Multiline", ["val/ssim"]],
@@ -42,20 +42,20 @@ LAYOUT = {
 
 
 def make_logger(folder: Path) -> TensorBoardLogger:
-    """A logger whose "custom scalars" page shows quality first."""
+    """Make a logger whose "custom scalars" page shows quality first."""
     logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
-    logger.experiment.add_custom_scalars(LAYOUT)
+    logger.experiment.add_custom_scalars(PAGE)
     return logger
 
 
 def log_choices(logger: TensorBoardLogger, config: DictConfig) -> None:
-    """The hparams tab; its metrics must be named before they are known."""
+    """Fill the hparams tab with options; its metrics must be named before they are known."""
     choices = {key: OmegaConf.select(config, key) for key in CHOICES}
     logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in HPARAMS_METRICS})
 
 
 def log_outcome(logger: TensorBoardLogger, results: Mapping[str, float], data: str) -> None:
-    """The test's numbers to the hparams tab."""
+    """Fill the hparams tab with the test's numbers."""
     found = {f"hp/{name}": results.get(f"test/{data}/{name}") for name in HPARAMS_METRICS}
     logger.log_metrics({name: value for name, value in found.items() if value is not None})
     logger.save()

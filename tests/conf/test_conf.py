@@ -23,6 +23,8 @@ PARTS = {("model", "asysplat"), ("model", "blocks"), ("model", "one_branch")}
 PARTS |= {("data", "views"), ("data", "disk")}
 TRAINED = [(group, name) for group, name in GROUPS if group in ("model", "experiment")]
 TRAINED += [("sweeps", path.stem) for path in sorted(SWEEPS.glob("*.yaml"))]
+STAGES = ("stage1", "stage2", "stage3", "ablation")
+TRAINED += [("stage", stage) for stage in STAGES]
 TINY = ["width=0.125", "state_size=8", "data.num_workers=0", "data.num_frames=32"]
 TINY += ["data.inputs=2", "data.targets=1", "data.window=[12,32]"]
 TINY += ["data.val_scenes=1", "data.test_scenes=1", "data.test_sets=null"]
@@ -34,7 +36,7 @@ def compose_train(*overrides):
 
 
 def first_rows(config) -> list[str]:
-    """The first choice of every word that a sweep varies."""
+    """List the first choice of every key that a sweep varies."""
     return [f"{k}={str(v).split(',')[0]}" for k, v in config.hydra.sweeper.params.items()]
 
 
@@ -54,9 +56,9 @@ def test_every_row_of_a_sweep_builds_its_model(path):
     choices = dict(config.hydra.sweeper.params)
     choices.pop("seed", None)
     assert choices
-    for word, values in choices.items():
+    for key, values in choices.items():
         for value in values.split(","):
-            row = compose_train(f"sweeps={path.stem}", f"{word}={value}")
+            row = compose_train(f"sweeps={path.stem}", f"{key}={value}")
             with torch.device("meta"):
                 instantiate(row.model)
 
@@ -91,6 +93,32 @@ def test_first_comment_is_the_command(path):
     scripts = {"report": "report.py", "benchmark": "benchmark.py"}
     script = scripts.get(path.stem, "train.py")
     assert any(f"python {script}" in comment for comment in comments)
+
+
+@pytest.mark.parametrize("scale", ["laptop", "gpu", "paper"])
+def test_a_stage_sets_what_its_scale_says(scale):
+    for stage in STAGES:
+        config = compose_train(f"scale={scale}", f"stage={stage}")
+        assert set(config.stages) == set(STAGES)
+        expected = config.stages[stage]
+        data, training = config.data, config.training
+        assert (data.height, data.width) == (expected.height, expected.width)
+        assert (data.batch_size, config.steps) == (expected.batch_size, expected.steps)
+        assert training.optimizer.lr == config.learning_rate == expected.learning_rate
+        assert training.schedule.warmup_steps == expected.warmup_steps
+        assert training.schedule.total_steps == expected.steps
+    assert compose_train(f"scale={scale}").stage == "stage1"
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted(CONF.rglob("*.yaml")) + sorted(SWEEPS.glob("*.yaml")),
+    ids=lambda path: path.stem,
+)
+def test_keys_of_its_own_have_a_place_among_the_defaults(path):
+    keys = set(OmegaConf.load(path))
+    if "defaults" in keys and len(keys) > 1:
+        assert "_self_" in OmegaConf.load(path).defaults
 
 
 def test_every_table_has_its_sweep():

@@ -8,8 +8,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
+from asysplat.overrides import check_overrides
 from asysplat.report.paper import load_paper
-from asysplat.words import check_words
 
 ROOT = Path(__file__).parents[2]
 PLACES = ["data.root=train", "data.test_root=test"]
@@ -45,8 +45,8 @@ HOW = {
 
 @pytest.fixture
 def compose_train():
-    def run(*words):
-        return compose("train", list(words), return_hydra_config=True)
+    def run(*overrides):
+        return compose("train", list(overrides), return_hydra_config=True)
 
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
         yield run
@@ -86,8 +86,8 @@ def test_every_set_that_a_table_prints_is_tested(sweep):
 
 
 def test_table_5_takes_the_frames_of_an_index(compose_train):
-    words = ["sweeps=two_views", "scale=paper", "data=realestate10k", *PLACES]
-    config = compose_train(*words, "data.index=index.json")
+    overrides = ["sweeps=two_views", "scale=paper", "data=realestate10k", *PLACES]
+    config = compose_train(*overrides, "data.index=index.json")
     assert (config.metrics.name, config.data.inputs) == ("pixelsplat", 2)
     assert (config.data.selection, config.data.index) == ("index", "index.json")
     assert (config.data.height, config.data.width) == (256, 256)
@@ -112,16 +112,16 @@ def test_the_command_for_a_cluster(compose_train):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     readme = (ROOT / "README.md").read_text().splitlines()
     (line,) = (line for line in readme if "hydra/launcher=submitit_slurm" in line)
-    words = line.split("#")[0].removeprefix("python train.py ").split()
-    config = compose_train(*words)
+    overrides = line.split("#")[0].removeprefix("python train.py ").split()
+    config = compose_train(*overrides)
     assert config.hydra.runtime.choices["hydra/launcher"] == "submitit_slurm"
     assert config.hydra.mode.name == "MULTIRUN"
     varied = config.hydra.sweeper.params
     jobs = list(product(*(str(values).split(",") for values in varied.values())))
     assert len(jobs) == 3 * 6
     for job in jobs:
-        chosen = [f"{word}={value}" for word, value in zip(varied, job, strict=True)]
-        row = compose_train(*words, *chosen)
+        chosen = [f"{key}={value}" for key, value in zip(varied, job, strict=True)]
+        row = compose_train(*overrides, *chosen)
         assert (row.data.name, row.metrics.name, row.data.inputs) == ("dl3dv", "longlrm", 32)
         assert (row.data.height, row.data.width, row.steps) == (256, 256, 10000)
         assert row.data.selection == "first_96" and f"seed={row.seed}" in chosen
@@ -129,6 +129,6 @@ def test_the_command_for_a_cluster(compose_train):
 
 
 def test_a_test_set_that_is_none_is_named():
-    check_words(["test_sets=[mipnerf360,replica]", "test_sets=[]"])
+    check_overrides(["test_sets=[mipnerf360,replica]", "test_sets=[]"])
     with pytest.raises(InputError, match=r"test_sets=mipnerf is unknown: did you mean mipnerf360"):
-        check_words(["test_sets=[replica,mipnerf]"])
+        check_overrides(["test_sets=[replica,mipnerf]"])

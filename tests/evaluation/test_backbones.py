@@ -48,13 +48,13 @@ def test_a_folder_s_file_needs_no_download(network, tmp_path):
     assert len(network) == 1
 
 
-def test_the_option_reaches_all_that_looks_for_weights(repository):
+def test_the_option_reaches_everything_that_looks_for_backbones(repository):
     with initialize_config_dir(str(repository / "conf"), version_base=None):
         config = compose("train", ["paths.download=true", "paths.run=unused"])
 
     def looking(node):
         if isinstance(node, dict):
-            if "_target_" in node and "weights" in node:
+            if "_target_" in node and "backbone_dir" in node:
                 yield node
             for value in node.values():
                 yield from looking(value)

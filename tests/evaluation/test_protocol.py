@@ -32,7 +32,7 @@ def views(images, depths=None, masks=None):
     return Views(cameras, images, depths, masks)
 
 
-def made_up():
+def synthetic():
     """Smooth pictures, between the 8-bit values."""
     coarse = torch.rand(2, 3, 9, 12)
     return torch.nn.functional.interpolate(coarse, (54, 72), mode="bilinear")
@@ -46,11 +46,11 @@ def photographs(shared):
     return torch.from_numpy(np.stack(small)).permute(0, 3, 1, 2) / 255
 
 
-@pytest.fixture(params=["made up", "photographs"])
+@pytest.fixture(params=["synthetic", "photographs"])
 def pictures(request):
     """Renderings, that leave [0, 1] here and there, and what they should have been."""
-    if request.param == "made up":
-        target = made_up()
+    if request.param == "synthetic":
+        target = synthetic()
     else:
         target = photographs(request.getfixturevalue("shared"))
     return target + 0.1 * torch.randn_like(target), target
@@ -96,7 +96,7 @@ def test_default_is_torchmetrics_gaussian(protocols, pictures):
 
 
 def test_the_protocols_differ_on_the_same_pictures(protocols):
-    target = 0.5 + 0.1 * made_up()
+    target = 0.5 + 0.1 * synthetic()
     rendered = target + 0.02 * torch.randn_like(target)
     ssim = {
         name: protocol.image_metrics(rendered, views(target), None)["ssim"].mean().item()
@@ -172,7 +172,7 @@ def test_a_view_that_is_masked_as_a_whole_has_no_depth_metric(protocols):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_masked_pixels_are_those_of_the_photograph(protocols, name):
-    target, masks = made_up(), torch.rand(2, 54, 72) < 0.5
+    target, masks = synthetic(), torch.rand(2, 54, 72) < 0.5
     rendered = target + 0.1 * torch.randn_like(target)
     found, worse = (
         protocols[name].image_metrics(image, views(target, masks=masks), None)

@@ -1,4 +1,4 @@
-"""train.py as a user runs it, on tiny made-up scenes."""
+"""train.py as a user runs it, on tiny synthetic scenes."""
 
 import os
 import subprocess
@@ -22,19 +22,19 @@ def train(tmp_path, repository, monkeypatch):
     """Runs train.py with overrides; logs go below tmp_path."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
 
-    def words(*overrides):
-        made_up = not any(word.startswith("data=") for word in overrides)
-        scenes = TINY_SCENES if made_up else []
-        tiny = [word for word in TINY if word.split("=")[0] not in str(overrides)]
+    def complete(*overrides):
+        synthetic = not any(override.startswith("data=") for override in overrides)
+        scenes = TINY_SCENES if synthetic else []
+        tiny = [option for option in TINY if option.split("=")[0] not in str(overrides)]
         return [*overrides, f"paths.logs={tmp_path}", *scenes, *tiny]
 
     def run(*overrides):
-        command = [sys.executable, "train.py", *words(*overrides)]
+        command = [sys.executable, "train.py", *complete(*overrides)]
         return subprocess.run(
             command, cwd=repository, env=environment, capture_output=True, text=True
         )
 
-    run.words = words
+    run.complete = complete
     run.command = [sys.executable, "train.py", f"paths.logs={tmp_path}", *TINY, *TINY_SCENES]
     run.environment = environment
     return run

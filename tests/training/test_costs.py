@@ -8,9 +8,9 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader
 
-from asysplat.evaluation import measured
+from asysplat.evaluation import measured_cost
 from asysplat.evaluation.cost import reset_peak_memory
-from asysplat.evaluation.measured import Measured
+from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.training.callbacks import Costs
 
 MB = 1_000_000
@@ -91,14 +91,14 @@ def test_each_test_set_has_costs_of_its_own():
 def test_seconds_leave_the_longest_out(monkeypatch):
     # Of each scene: predicting starts, ends, rendering starts, ends.
     clock = iter([0.0, 1.0, 1.0, 2.0, 10.0, 40.0, 40.0, 44.0, 50.0, 53.0, 53.0, 59.0])
-    monkeypatch.setattr(measured, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr(measured_cost, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     found = measure({"main": [1, 1, 1]})
     assert (found["inference_seconds"], found["render_seconds"]) == (2.0, 2.5)
 
 
 def test_seconds_of_steps_leave_the_longest_out(monkeypatch):
     costs = Costs()
-    costs.step = Measured(torch.device("cpu"))
+    costs.step = CostMeter(torch.device("cpu"))
     costs.step.seconds = [30.0, 1.0, 3.0]
     monkeypatch.setattr(costs, "_render_seconds", lambda *_: 0.5)
     trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)

@@ -19,7 +19,7 @@ CONF = Path(__file__).parents[2] / "conf"
 PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
 MODELS = sorted(p.stem for p in (CONF / "model").glob("*.yaml") if p.stem not in PARTS)
 # The depth term's mean is over the known pixels of a batch, not over its scenes.
-WORDS = ["width=0.125", "state_size=8", "training.loss.depth=0", "training.loss.perceptual=0"]
+OVERRIDES = ["width=0.125", "state_size=8", "training.loss.depth=0", "training.loss.perceptual=0"]
 SIZE, INPUTS, TARGETS, PROCESSES = 32, 2, 1, 2
 
 
@@ -50,7 +50,7 @@ class Loss(nn.Module):
 def make_loss(model):
     """The same weights in every process."""
     with initialize_config_dir(str(CONF), version_base=None):
-        config = compose("train", [f"model={model}", *WORDS])
+        config = compose("train", [f"model={model}", *OVERRIDES])
     torch.manual_seed(0)
     return Loss(instantiate(config.training, net=instantiate(config.model)))
 

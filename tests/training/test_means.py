@@ -6,7 +6,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from asysplat.training.callbacks.metrics import average
-from asysplat.training.runs import identity
+from asysplat.training.runs import config_hash
 
 
 def rows(scenes, **columns):
@@ -42,7 +42,7 @@ def test_a_scene_without_a_column_has_no_say_in_it():
 
 
 def test_runs_of_two_protocols_are_two(repository):
-    words = ([], ["metrics=longlrm"], ["metrics.depth_alignment=median"], ["metrics=default"])
+    choices = ([], ["metrics=longlrm"], ["metrics.depth_alignment=median"], ["metrics=default"])
     with initialize_config_dir(str(repository / "conf"), version_base=None):
-        found = [identity(compose("train", [*choice, "paths.run=unused"])) for choice in words]
+        found = [config_hash(compose("train", [*choice, "paths.run=unused"])) for choice in choices]
     assert len(set(found)) == 3 and found[0] == found[3]

@@ -1,5 +1,7 @@
 """The whole chain can learn: network, renderer, loss and optimizer on one scene."""
 
+from functools import partial
+
 import torch
 
 from asysplat.data.datamodule import collate, load
@@ -8,6 +10,7 @@ from asysplat.data.selection import uniform_selection
 from asysplat.data.sources import Task
 from asysplat.evaluation.metrics import psnr
 from asysplat.training import Reconstruction, ReconstructionLoss
+from asysplat.training.schedule import cosine
 
 STEPS = 250
 
@@ -18,11 +21,10 @@ def test_one_scene_overfitted_passes_30_db(build):
     module = Reconstruction(
         net=build("width=0.25", "state_size=32", "model.layers=1m1s"),
         loss=ReconstructionLoss(mse=1.0, perceptual=0.0, depth=0.0),
-        learning_rate=1e-3,
-        weight_decay=0.0,
-        betas=(0.9, 0.95),
-        warmup_steps=10,
-        total_steps=STEPS,
+        optimizer=partial(
+            torch.optim.AdamW, lr=1e-3, betas=(0.9, 0.95), weight_decay=0.0, fused=True
+        ),
+        schedule=partial(cosine, warmup_steps=10, total_steps=STEPS),
         background=(0.5, 0.5, 0.5),
     )
     options = module.configure_optimizers()

@@ -10,7 +10,7 @@ from asysplat.training.ranges import RANGES, check_ranges
 @pytest.fixture(scope="module")
 def composed(repository):
     with initialize_config_dir(str(repository / "conf"), version_base=None):
-        yield lambda *words: compose("train", list(words))
+        yield lambda *overrides: compose("train", list(overrides))
 
 
 REFUSED = {
@@ -25,7 +25,9 @@ REFUSED = {
     "width=wide": "width=wide: give a number above 0.",
     "data.num_workers=-1": "data.num_workers=-1: give a whole number of at least 0.",
     "data.height=abc": "data.height=abc: give a whole number of at least 1.",
-    "training.learning_rate=nan": "training.learning_rate=nan: give a number above 0.",
+    "learning_rate=nan": "learning_rate=nan: give a number above 0.",
+    "training.optimizer.weight_decay=-1": "training.optimizer.weight_decay=-1: give a number",
+    "training.schedule.warmup_steps=2.5": "training.schedule.warmup_steps=2.5: give a whole number",
     "training.loss.depth=-1": "training.loss.depth=-1: give a number of at least 0.",
     "data.val_scenes=0": "data.val_scenes=0: give a whole number of at least 1.",
     "data.window=12": "data.window=12: give two whole numbers, such as [64,96].",
@@ -35,11 +37,11 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("word", REFUSED)
-def test_out_of_range(composed, word):
+@pytest.mark.parametrize("override", REFUSED)
+def test_out_of_range(composed, override):
     with pytest.raises(InputError) as raised:
-        check_ranges(composed(word))
-    assert str(raised.value).startswith(REFUSED[word])
+        check_ranges(composed(override))
+    assert str(raised.value).startswith(REFUSED[override])
 
 
 @pytest.mark.parametrize("scale", ["laptop", "gpu", "paper"])
@@ -55,4 +57,4 @@ def test_every_scale_is_within_and_has_every_option(composed, scale):
 
 
 def test_an_option_that_is_left_out_is_not_missed(composed):
-    check_ranges(composed("~callbacks", "~training.warmup_steps", "geometry_ratio=0.7"))
+    check_ranges(composed("~callbacks", "~training.schedule.warmup_steps", "geometry_ratio=0.7"))

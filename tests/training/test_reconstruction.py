@@ -1,11 +1,13 @@
-"""What the optimiser is given: which parameters decay, and which are not trained at all."""
+"""What the optimizer is given: which parameters decay, and which are not trained at all."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 
 from asysplat.training import Reconstruction, ReconstructionLoss
+from asysplat.training.schedule import cosine
 
 PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
 FOLDER = Path(__file__).parents[2] / "conf" / "model"
@@ -16,11 +18,8 @@ def make_module(net):
     return Reconstruction(
         net=net,
         loss=ReconstructionLoss(mse=1.0, perceptual=0.0, depth=0.0),
-        learning_rate=1e-3,
-        weight_decay=0.05,
-        betas=(0.9, 0.95),
-        warmup_steps=1,
-        total_steps=2,
+        optimizer=partial(torch.optim.AdamW, lr=1e-3, weight_decay=0.05, fused=True),
+        schedule=partial(cosine, warmup_steps=1, total_steps=2),
         background=(0.5, 0.5, 0.5),
     )
 

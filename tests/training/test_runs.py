@@ -7,7 +7,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from asysplat.training import revision as revisions
-from asysplat.training.runs import data_of, describe_run, find_run, find_runs, identity
+from asysplat.training.runs import config_hash, data_of, describe_run, find_run, find_runs
 
 DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
 
@@ -15,7 +15,7 @@ DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
 @pytest.fixture
 def composed(repository):
     with initialize_config_dir(str(repository / "conf"), version_base=None):
-        yield lambda *words: compose("train", list(words))
+        yield lambda *overrides: compose("train", list(overrides))
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def write_run(tmp_path):
 SAME = {
     "moved data": ["data.root=/b/DL3DV", "data.test_root=/b/c/Benchmark/"],
     "another cache": ["data.cache.folder=/b/cache", "data.cache.memory_gb=2"],
-    "moved weights": ["paths.weights=/b/weights", "training.loss.perceptual_term.weights=/c"],
+    "moved weights": ["paths.weights=/b/weights", "training.loss.perceptual_term.backbone_dir=/c"],
     "another test set": ["test_sets=[mipnerf360]", "paths.mipnerf360=/b/360_v2"],
     "other names": ["name=other", "paths.logs=/b/logs", "rerun=true"],
     "other processes": ["data.num_workers=3", "callbacks.pictures.scenes=0"],
@@ -55,18 +55,18 @@ OTHER = {
 @pytest.mark.parametrize("case", SAME)
 def test_what_changes_no_number_makes_no_other_run(composed, case):
     plain, changed = composed(*DL3DV), composed(*DL3DV, *SAME[case])
-    assert identity(changed) == identity(plain)
+    assert config_hash(changed) == config_hash(plain)
     places = {key: value for key, value in data_of(changed).items() if "test_sets" not in key}
     assert places == data_of(plain)
 
 
 @pytest.mark.parametrize("case", OTHER)
 def test_what_changes_numbers_makes_another_run(composed, case):
-    assert identity(composed(*DL3DV, *OTHER[case])) != identity(composed(*DL3DV))
+    assert config_hash(composed(*DL3DV, *OTHER[case])) != config_hash(composed(*DL3DV))
 
 
 def test_paths_may_be_left_out(composed):
-    assert identity(composed("data=dl3dv")) == identity(composed(*DL3DV))
+    assert config_hash(composed("data=dl3dv")) == config_hash(composed(*DL3DV))
     assert data_of(composed("data=dl3dv")) == {}
     assert data_of(composed(*DL3DV)) == {
         "run/data/root": "DL3DV",
@@ -75,9 +75,9 @@ def test_paths_may_be_left_out(composed):
 
 
 def test_other_data_makes_another_run(composed, write_run, tmp_path):
-    words = ["data=files", "data.root=/a/garden"]
-    folder = write_run("one", composed(*words))
-    assert find_run(tmp_path, composed(*words)).folder == folder
+    overrides = ["data=files", "data.root=/a/garden"]
+    folder = write_run("one", composed(*overrides))
+    assert find_run(tmp_path, composed(*overrides)).folder == folder
     assert find_run(tmp_path, composed("data=files", "data.root=/b/garden")).folder == folder
     assert find_run(tmp_path, composed("data=files", "data.root=/a/bicycle")) is None
 
@@ -87,9 +87,9 @@ def test_a_file_is_what_it_holds(composed, write_run, tmp_path, option):
     paths = [tmp_path / f"{number}.json" for number in range(3)]
     for path, text in zip(paths, ("[1]", "[1]", "[2]"), strict=True):
         path.write_text(text)
-    words = ["data=realestate10k", "data.root=/a/train", "data.test_root=/a/test"]
-    words += ["data.selection=index"] * (option == "data.index")
-    first, moved, other = (composed(*words, f"{option}={path}") for path in paths)
+    overrides = ["data=realestate10k", "data.root=/a/train", "data.test_root=/a/test"]
+    overrides += ["data.selection=index"] * (option == "data.index")
+    first, moved, other = (composed(*overrides, f"{option}={path}") for path in paths)
     write_run("run", first)
     assert find_run(tmp_path, moved) is not None
     assert find_run(tmp_path, other) is None
@@ -120,9 +120,9 @@ def test_the_run_of_this_revision_comes_first(composed, write_run, tmp_path):
 def checkout(tmp_path, monkeypatch):
     """A repository with one commit, in the place of this one."""
 
-    def git(*words):
+    def git(*arguments):
         name = ["-c", "user.name=a", "-c", "user.email=a@b"]
-        subprocess.run(["git", *name, *words], cwd=tmp_path, check=True, capture_output=True)
+        subprocess.run(["git", *name, *arguments], cwd=tmp_path, check=True, capture_output=True)
 
     git("init")
     (tmp_path / "train.py").write_text("1")

@@ -40,7 +40,7 @@ def test_an_interrupted_sweep_runs_only_what_is_missing(train, repository, tmp_p
     assert finished_seeds(tmp_path) == [0, 1, 2]
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
-    other = train(*SWEEP, "seed=2", "training.learning_rate=1e-4")
+    other = train(*SWEEP, "seed=2", "learning_rate=1e-4")
     assert "finished already" not in other.stdout
     assert finished_seeds(tmp_path) == [0, 1, 2, 2]
 
@@ -48,10 +48,10 @@ def test_an_interrupted_sweep_runs_only_what_is_missing(train, repository, tmp_p
 def test_what_another_revision_finished_is_told_and_run_again_where_asked(
     train, repository, tmp_path
 ):
-    words = [*train.command[2:], *SWEEP]
+    overrides = [*train.command[2:], *SWEEP]
     for seed, changes in enumerate(({"run/revision": "0123456789ab"}, {})):
         with initialize_config_dir(str(repository / "conf"), version_base=None):
-            config = compose("train", [*words, f"seed={seed}"])
+            config = compose("train", [*overrides, f"seed={seed}"])
         (tmp_path / str(seed)).mkdir()
         described = json.dumps(describe_run(config) | changes)
         (tmp_path / str(seed) / "metrics.json").write_text(described)
@@ -80,9 +80,9 @@ def test_a_failure_is_named_and_the_others_go_on(train, tmp_path):
 def test_launchers(train, tmp_path, launcher):
     plugin = launcher.partition("_")[0]
     pytest.importorskip(f"hydra_plugins.hydra_{plugin}_launcher")
-    words = [f"hydra/launcher={launcher}", "data.num_workers=1"]
-    result = train(*SWEEP, "seed=0,1", *words)
+    overrides = [f"hydra/launcher={launcher}", "data.num_workers=1"]
+    result = train(*SWEEP, "seed=0,1", *overrides)
     assert result.returncode == 0, result.stderr
     assert finished_seeds(tmp_path) == [0, 1]
-    assert train(*SWEEP, "seed=0,1", *words).returncode == 0
+    assert train(*SWEEP, "seed=0,1", *overrides).returncode == 0
     assert finished_seeds(tmp_path) == [0, 1]

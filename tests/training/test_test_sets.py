@@ -36,7 +36,7 @@ def measure(repository, tmp_path_factory):
         folder = tmp_path_factory.mktemp("run")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            metrics = Metrics(instantiate(config.metrics), str(folder), weights=str(folder))
+            metrics = Metrics(instantiate(config.metrics), str(folder), backbone_dir=str(folder))
             costs = Costs()
             measured_costs[folder] = costs.values
             trainer = lightning.Trainer(

@@ -1,4 +1,4 @@
-"""The script: fit, resume, measure, and what it refuses, on tiny made-up scenes."""
+"""The script: fit, resume, measure, and what it refuses, on tiny synthetic scenes."""
 
 import contextlib
 import csv
@@ -104,11 +104,11 @@ LEFT_OUT = [
 ]
 
 
-@pytest.mark.parametrize("words", LEFT_OUT, ids=" ".join)
-def test_without_some_callbacks_the_rest_is_there(train, words, tmp_path):
+@pytest.mark.parametrize("overrides", LEFT_OUT, ids=" ".join)
+def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path):
     train.environment |= {"TORCH_HOME": str(tmp_path), "ASYSPLAT_SHARED": str(tmp_path)}
-    names = [word.partition(".")[2].removesuffix("=null") for word in words]
-    result = train(*words)
+    names = [key.partition(".")[2].removesuffix("=null") for key in overrides]
+    result = train(*overrides)
     folder = run_folder(result)
     numbers = metrics(folder)
     left = {
@@ -261,10 +261,10 @@ IN_THE_SCRIPT = (
 
 @pytest.mark.parametrize("case", IN_THE_SCRIPT)
 def test_mistakes_are_one_clear_sentence(train, case, tmp_path):
-    overrides, words = REFUSED[case]
+    overrides, message = REFUSED[case]
     result = train(*overrides)
     assert result.returncode != 0
-    assert words in result.stderr
+    assert message in result.stderr
     assert "Traceback" not in result.stderr
     assert not list(tmp_path.rglob("checkpoints"))
 
@@ -279,14 +279,14 @@ def script(repository):
 def test_mistakes_are_refused_before_work_starts(
     train, script, repository, case, tmp_path, monkeypatch
 ):
-    overrides, words = REFUSED[case]
+    overrides, message = REFUSED[case]
     monkeypatch.chdir(repository)
-    given = [f"paths.run={tmp_path}", *train.words(*overrides)]
+    given = [f"paths.run={tmp_path}", *train.complete(*overrides)]
     with initialize_config_dir(str(repository / "conf"), version_base=None):
         config = compose("train", given)
     with pytest.raises(Exception) as raised:
         script["train"](config)
-    assert words in f"error: {input_error_behind(raised.value)}\n"
+    assert message in f"error: {input_error_behind(raised.value)}\n"
     assert not list(tmp_path.rglob("checkpoints"))
 
 

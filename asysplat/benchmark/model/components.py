@@ -14,7 +14,7 @@ from asysplat import models
 from asysplat.benchmark.model.task import Task
 from asysplat.benchmark.products import Product, RecordProducts
 from asysplat.benchmark.timing import seconds_of
-from asysplat.evaluation.measured import wait_for
+from asysplat.evaluation.measured_cost import wait_for
 from asysplat.models.tokenizer import Tokenizer
 
 COMPONENTS = {  # none within another

@@ -13,8 +13,8 @@ from asysplat.benchmark.scenes import on_an_arc, random_scene
 from asysplat.evaluation.cost import GB, count_parameters
 from asysplat.evaluation.static_cost import activation_gb
 from asysplat.models.network import Network
+from asysplat.overrides import check_overrides
 from asysplat.scene import Gaussians, Views
-from asysplat.words import check_words
 
 FILLED = 0.75  # of the memory, at most: a step also needs what it does not keep
 
@@ -84,7 +84,7 @@ def make_net(name: str, words: Mapping[str, object], device: torch.device) -> tu
         InputError: an unknown model, or an unknown choice among the words.
     """
     overrides = [f"model={name}", *(f"{key}={value}" for key, value in words.items())]
-    check_words(overrides)
+    check_overrides(overrides)
     config = hydra.compose("train", overrides)
     torch.manual_seed(0)
     with device:

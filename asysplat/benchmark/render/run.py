@@ -10,7 +10,7 @@ from torch import Tensor
 from asysplat.benchmark.render.backends import Backend
 from asysplat.benchmark.render.cases import Scene
 from asysplat.benchmark.timing import rise_gb
-from asysplat.evaluation.measured import wait_for
+from asysplat.evaluation.measured_cost import wait_for
 from asysplat.rendering import Convention, Skips, render
 from asysplat.scene import Cameras, Gaussians
 

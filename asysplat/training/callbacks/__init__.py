@@ -1,4 +1,4 @@
-"""What watches a run: metrics, pictures, learning curve, costs, non-finite steps, progress."""
+"""Callbacks: metrics, pictures, learning curve, costs, non-finite steps, checkpoints, progress."""
 
 from asysplat.training.callbacks.checkpoints import Checkpoints
 from asysplat.training.callbacks.costs import Costs

@@ -1,4 +1,4 @@
-"""What a run can be gone on from, and its best weights."""
+"""A run's checkpoints: the last, to resume from, and the best."""
 
 from pathlib import Path
 from typing import Any
@@ -8,9 +8,11 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 
 class Checkpoints(ModelCheckpoint):
-    """Lightning's, with a last.ckpt after every epoch, which ends with a validation, and when
-    training ends, whether it is the best or not. Where nothing measures what is monitored, there is
-    no best."""
+    """Keeps the best checkpoint, as Lightning does, and a last.ckpt.
+
+    last.ckpt is written after every epoch, each of which ends with a validation, and when training
+    ends. If no callback measures what is monitored, there is no best.
+    """
 
     @property
     def last(self) -> Path:

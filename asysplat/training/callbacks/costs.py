@@ -1,4 +1,4 @@
-"""What a run costs: parameters, FLOPs, Gaussians, seconds, memory."""
+"""Costs of a run: parameters, FLOPs, Gaussians, seconds, memory."""
 
 from typing import Any
 
@@ -7,32 +7,31 @@ import torch
 
 from asysplat.data.datamodule import collate
 from asysplat.evaluation.cost import GB, peak_memory_gb, reset_peak_memory
-from asysplat.evaluation.measured import Measured, mean_but_longest
-from asysplat.evaluation.render_time import render_seconds
+from asysplat.evaluation.measured_cost import CostMeter, mean_but_longest, render_seconds
 from asysplat.evaluation.static_cost import static_costs
 
 
 class Costs(lightning.Callback):
-    """Writes `values`, "cost/..." -> number; what needs no running is known before the first step.
+    """Fills `values`, "cost/..." -> number.
 
-    Of one scene at the run's views and resolution: see `static_costs`. Measured, as `Measured` does
-    it, seconds in the mean of all but the longest and memory at its peak:
+    Before the first step: the `static_costs` of one scene at the run's views and resolution.
+    Measured by `CostMeter`, seconds as the mean of all but the longest, memory as the peak:
 
-    - a training step: seconds_per_step, peak_gb; what the peak is beyond what there was before the
-      first step, for each token of the largest patch in a batch: peak_bytes_per_token; what a step
-      renders, with its gradients: render_seconds_per_step.
-    - the network's forward pass alone, over the test's scenes: inference_seconds, inference_gb; the
-      rest of their test step, which renders the targets with depth: render_seconds, render_gb. Of
-      a further test set they stand under its name: cost/<set>/inference_seconds.
+    - a training step: seconds_per_step, peak_gb, and peak_bytes_per_token: the rise of the peak
+      over the memory before the first step, for each token of the largest patch in a batch.
+    - the rendering of a step's targets, with its gradients: render_seconds_per_step.
+    - the network's forward pass over the test's scenes: inference_seconds, inference_gb.
+    - the rest of the test step, which renders the targets with depth: render_seconds, render_gb.
 
-    Comes before callbacks that work when a test step has ended, or that would count as rendering.
+    The last two are under cost/<set>/ for further test sets. Place this callback before those that
+    work at the end of a test step: their work would count as rendering.
     """
 
     def __init__(self):
         self.values: dict[str, float | int] = {}
 
     def on_fit_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        self.step = Measured(module.device)
+        self.step = CostMeter(module.device)
         reset_peak_memory(module.device)
         self.gb_before = peak_memory_gb(module.device)
         scene = trainer.datamodule.evaluation["val"][0]["inputs"]
@@ -63,12 +62,12 @@ class Costs(lightning.Callback):
 
     @staticmethod
     def _render_seconds(trainer: lightning.Trainer, module: lightning.LightningModule) -> float:
-        """Of a batch of training, taken to be as many scenes of validation."""
+        """Measure rendering a training batch, with copies of a validation scene in its place."""
         data = trainer.datamodule
         scene = collate([data.evaluation["val"][0]] * data.batch_size)
         inputs, targets = scene["inputs"].to(module.device), scene["targets"].to(module.device)
         was_training = module.net.training
-        module.net.eval()  # or the running means of the batch norms would move
+        module.net.eval()  # keeps the running means of batch norms as they are
         with torch.no_grad():
             gaussians = module.net(inputs)
         module.net.train(was_training)
@@ -78,7 +77,7 @@ class Costs(lightning.Callback):
 
     def on_test_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         self.tests = [
-            {work: Measured(module.device) for work in ("inference", "render")}
+            {work: CostMeter(module.device) for work in ("inference", "render")}
             for _ in trainer.datamodule.tests
         ]
         self.hooks = [

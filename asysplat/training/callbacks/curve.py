@@ -13,7 +13,7 @@ COLUMNS = ("psnr", "nearest_view/psnr", "mean_colour/psnr", "ssim", "lpips", "ab
 
 
 class Curve(lightning.Callback):
-    """Keeps a row each validation that was measured and draws them when training ends.
+    """Keeps a row for each validation that was measured; writes and draws them after training.
 
     Args:
         folder: of the run.
@@ -37,7 +37,7 @@ class Curve(lightning.Callback):
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
         found = trainer.callback_metrics
-        if "val/psnr" not in found:  # nothing measures
+        if "val/psnr" not in found:  # no callback measures
             return
         row = {"step": trainer.global_step, "minutes": (time.monotonic() - self.started) / 60}
         row |= {name: found[f"val/{name}"].item() for name in COLUMNS if f"val/{name}" in found}
@@ -49,7 +49,7 @@ class Curve(lightning.Callback):
 
 
 def write_curve(folder: Path, rows: list[dict[str, float | int]]) -> None:
-    """curve.csv and pictures/curve.png of validations, oldest first."""
+    """Write curve.csv and pictures/curve.png of validations, oldest first."""
     with (folder / "curve.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[-1]))
         writer.writeheader()

@@ -1,4 +1,4 @@
-"""A non-finite step is skipped, counted and reported; the run goes on."""
+"""Skip, count and report steps with non-finite gradients."""
 
 from typing import Any
 
@@ -10,13 +10,13 @@ from asysplat.errors import InputError
 
 
 class SkipNonFiniteSteps(lightning.Callback):
-    """Drop the gradients of a step in which any is NaN or infinite.
+    """Drops the gradients of a step in which any is NaN or infinite.
 
     Args:
-        budget: so many skipped steps in a row end the run.
+        budget: how many skipped steps in a row end the run.
 
     Raises:
-        InputError: the budget is spent; names a parameter and the scenes.
+        InputError: the budget is spent; the message names a parameter.
     """
 
     def __init__(self, budget: int = 10):
@@ -55,7 +55,7 @@ class SkipNonFiniteSteps(lightning.Callback):
         if self.in_a_row >= self.budget:
             raise InputError(
                 f"{self.in_a_row} steps in a row had a non-finite gradient (first in {bad}): "
-                "lower training.learning_rate or set trainer.precision=32-true."
+                "lower learning_rate or set trainer.precision=32-true."
             )
 
     def on_train_epoch_end(

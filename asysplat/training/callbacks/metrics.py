@@ -1,4 +1,4 @@
-"""Measures every validation and test image, beside what one gets for nothing."""
+"""Measure every validation and test image, and the baselines that need no training."""
 
 import csv
 import warnings
@@ -12,33 +12,33 @@ from torch import Tensor
 
 from asysplat.evaluation import baselines
 from asysplat.evaluation.lpips import load_lpips
-from asysplat.evaluation.measured import Measured
+from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.evaluation.protocol import BACKBONES, Protocol
 from asysplat.scene import Views
 from asysplat.training.outcome import Outcome
 
-Row = dict[str, str | float]
-IMAGE = ("set", "scene", "view")  # which image a row is of
+ImageRow = dict[str, str | float]
+IMAGE = ("set", "scene", "view")  # the columns that say which image a row is of
 Measure = Callable[[Tensor, Views], dict[str, Tensor]]
 
 
 class Metrics(lightning.Callback):
-    """PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image: to the logger, metrics.csv.
+    """Measures PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image, for the logger and a CSV.
 
-    `results` has the means of every test set, the protocol's sentences, and what measuring a test
-    scene and its baselines took: cost/metrics_seconds, cost/metrics_gb, see `Measured`.
+    `results` holds the means of every test set, the protocol's sentences, and the cost of measuring
+    a test scene and its baselines: cost/metrics_seconds and cost/metrics_gb, see `CostMeter`.
 
     Args:
-        protocol: by which all is measured.
+        protocol: how everything is measured.
         folder: of the run; metrics.csv is written there after the test.
-        weights: folder that may hold LPIPS' backbone; without it that column is missing.
-        download: the backbone where it is missing.
+        backbone_dir: folder that may hold LPIPS' backbone; without it that column is missing.
+        download: whether to fetch the backbone if it is missing.
     """
 
-    def __init__(self, protocol: Protocol, folder: str, weights: str, download: bool = False):
+    def __init__(self, protocol: Protocol, folder: str, backbone_dir: str, download: bool = False):
         self.protocol, self.folder = protocol, Path(folder)
-        self.weights, self.download = Path(weights), download
-        self.rows: list[Row] = []
+        self.backbone_dir, self.download = Path(backbone_dir), download
+        self.rows: list[ImageRow] = []
         sentences = protocol.sentences()
         self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in sentences.items()}
 
@@ -47,7 +47,7 @@ class Metrics(lightning.Callback):
     ) -> None:
         if hasattr(self, "lpips"):
             return
-        self.lpips = load_lpips(self.protocol.lpips_net, self.weights, self.download)
+        self.lpips = load_lpips(self.protocol.lpips_net, self.backbone_dir, self.download)
         if self.lpips is None and trainer.is_global_zero:
             warnings.warn(
                 f"{BACKBONES[self.protocol.lpips_net]} is neither in torch's hub cache nor in "
@@ -56,19 +56,19 @@ class Metrics(lightning.Callback):
             )
 
     def measure(self, rendered: Tensor, targets: Views) -> dict[str, Tensor]:
-        """Image metrics, [B, V] each."""
+        """Compute the image metrics, each [B, V]."""
         network = None if self.lpips is None else self.lpips.to(targets.images.device)
         return self.protocol.image_metrics(rendered, targets, network)
 
     def _add(
-        self, test_set: str, batch: dict[str, Any], outcome: Outcome, measure_free: Measure
+        self, test_set: str, batch: dict[str, Any], outcome: Outcome, measure_baseline: Measure
     ) -> None:
         inputs, targets = batch["inputs"], batch["targets"]
         values = self.measure(outcome.rendering.image, targets)
         values |= self.protocol.depth_metrics(outcome.rendering.depth, targets)
         for name in ("mean_colour", "nearest_view"):
-            free = measure_free(getattr(baselines, name)(inputs, targets), targets)
-            values.update({f"{name}/{metric}": value for metric, value in free.items()})
+            found = measure_baseline(getattr(baselines, name)(inputs, targets), targets)
+            values.update({f"{name}/{metric}": value for metric, value in found.items()})
         for index, scene in enumerate(batch["scene"]):
             for view in range(targets.num_views):
                 numbers = {name: value[index, view].item() for name, value in values.items()}
@@ -81,16 +81,16 @@ class Metrics(lightning.Callback):
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
         self.rows = []
-        self.work = Measured(module.device)
+        self.work = CostMeter(module.device)
 
     def on_validation_batch_end(
         self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
     ) -> None:
-        def measure_free(image: Tensor, to: Views) -> dict[str, Tensor]:
-            """The curve shows the baselines' PSNR alone."""
+        def measure_baseline(image: Tensor, to: Views) -> dict[str, Tensor]:
+            """Measure PSNR alone: the learning curve shows no other metric of the baselines."""
             return {"psnr": self.protocol.psnr(image, to)}
 
-        self._add(trainer.datamodule.name, batch, outputs, measure_free)
+        self._add(trainer.datamodule.name, batch, outputs, measure_baseline)
 
     def on_test_batch_end(
         self,
@@ -127,22 +127,26 @@ class Metrics(lightning.Callback):
             write_csv(self.folder / "metrics.csv", rows)
 
 
-def gather(trainer: lightning.Trainer, rows: list[Row]) -> list[Row]:
-    """The rows of all processes; every process takes part."""
+def gather(trainer: lightning.Trainer, rows: list[ImageRow]) -> list[ImageRow]:
+    """Collect the rows of all processes; every process must call this."""
     if trainer.world_size == 1:
         return rows
-    per_process: list[list[Row]] = [[] for _ in range(trainer.world_size)]
+    per_process: list[list[ImageRow]] = [[] for _ in range(trainer.world_size)]
     torch.distributed.all_gather_object(per_process, rows)
-    # Scenes that were dealt out twice, to give every process equally many, count once.
+    # Scenes given to two processes, so that all have equally many, count once.
     images = {tuple(row[key] for key in IMAGE): row for part in per_process for row in part}
     return list(images.values())
 
 
-def average(rows: Sequence[Row], over: Literal["images", "scenes"]) -> dict[str, float]:
-    """The mean of every numeric column over the images that have it, or over each scene's such
-    images and then over the scenes; NaN is left out."""
+def average(rows: Sequence[ImageRow], over: Literal["images", "scenes"]) -> dict[str, float]:
+    """Average every numeric column over the images that have it; NaN is left out.
+
+    Args:
+        rows: of one test set.
+        over: "images": all alike, or "scenes": each scene's images first, then the scenes.
+    """
     if over == "scenes":
-        scenes: dict[str | float, list[Row]] = {}
+        scenes: dict[str | float, list[ImageRow]] = {}
         for row in rows:
             scenes.setdefault(row["scene"], []).append(row)
         rows = [average(images, "images") for images in scenes.values()]
@@ -154,8 +158,8 @@ def average(rows: Sequence[Row], over: Literal["images", "scenes"]) -> dict[str,
     return {name: torch.tensor(values).nanmean().item() for name, values in columns.items()}
 
 
-def write_csv(path: Path, rows: list[Row]) -> None:
-    """A line an image; a scene without depths leaves those columns empty."""
+def write_csv(path: Path, rows: list[ImageRow]) -> None:
+    """Write a line for each image; a scene without depths leaves those columns empty."""
     with path.open("w", newline="") as file:
         columns = dict.fromkeys(name for row in rows for name in row)
         writer = csv.DictWriter(file, fieldnames=list(columns))

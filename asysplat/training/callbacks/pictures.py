@@ -1,4 +1,4 @@
-"""Pictures of every validation and of the test: to TensorBoard and as PNG beside the metrics."""
+"""Pictures of every validation and of the test: in TensorBoard and as PNG files."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from asysplat.training.outcome import Outcome
 
 
 class Pictures(lightning.Callback):
-    """One comparison of the first scenes of each validation and of the first test set.
+    """Draws the first scenes of each validation and of the first test set, see `comparison`.
 
     Args:
         folder: of the run; pictures go to its sub-folder `pictures`.
@@ -45,7 +45,7 @@ class Pictures(lightning.Callback):
             self._draw(trainer, "test", outputs, batch, index)
 
     def _draw(
-        self, trainer: lightning.Trainer, stage: str, outcome: Outcome, batch: Any, index: int
+        self, trainer: lightning.Trainer, split: str, outcome: Outcome, batch: Any, index: int
     ) -> None:
         if index >= self.scenes or not trainer.is_global_zero:
             return
@@ -55,9 +55,9 @@ class Pictures(lightning.Callback):
         )
         figure = comparison(*first)
         self.folder.mkdir(parents=True, exist_ok=True)
-        step = "" if stage == "test" else f"-{trainer.global_step:06d}"
-        figure.savefig(self.folder / f"{stage}-{index}{step}.png", dpi=100)
+        step = "" if split == "test" else f"-{trainer.global_step:06d}"
+        figure.savefig(self.folder / f"{split}-{index}{step}.png", dpi=100)
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
-                name = f"{stage}/{batch['scene'][0] if stage == 'test' else index}"
+                name = f"{split}/{batch['scene'][0] if split == 'test' else index}"
                 logger.experiment.add_figure(name, figure, trainer.global_step)

@@ -1,4 +1,4 @@
-"""How far a run is: bars on a terminal, a line now and then elsewhere."""
+"""The progress of a run: bars on a terminal, elsewhere a line now and then."""
 
 import time
 from datetime import timedelta
@@ -11,15 +11,15 @@ from rich import progress
 from rich.console import Console
 
 REFRESH_SECONDS = 0.2
-SPEED_SECONDS = 3600  # of training that the time left is estimated from
-LINE_SECONDS, LINE_SHARE = 60, 0.01  # between two lines, besides those of validations
+SPEED_SECONDS = 3600  # of training, from which the time left is estimated
+LINE_SECONDS, LINE_SHARE = 60, 0.01  # least time and share of the steps between two lines
 
 
 class Progress(ProgressBar):
-    """The whole training by its steps, with its PSNR; validation and test in bars of their own.
+    """Shows the steps of the whole training with their PSNR; bars for validation and test.
 
-    Where there is no terminal, or several runs share one: a line after each validation, and in
-    between at most one a minute and a hundredth of the training.
+    Without a terminal, or when several runs share one, it prints a line after each validation, and
+    between two validations at most one each minute and each hundredth of the training.
     """
 
     def __init__(self):
@@ -100,7 +100,7 @@ class Progress(ProgressBar):
             progress.TimeRemainingColumn(),
             progress.TextColumn("left  {task.fields[quality]}"),
             console=console,
-            auto_refresh=False,  # a thread that draws would be cut in half in loaders' processes
+            auto_refresh=False,  # a thread that draws would break in the loaders' forks
             speed_estimate_period=SPEED_SECONDS,
             disable=not (self.shown and self.on_terminal),
         )
@@ -137,7 +137,7 @@ class Progress(ProgressBar):
 
 
 def quality(trainer: lightning.Trainer) -> str:
-    """PSNR in dB of the last step and of the last validation, those that were measured."""
+    """Format the PSNR in dB of the last step and of the last validation, as far as measured."""
     found = trainer.callback_metrics
     names = {"train/psnr": "PSNR {:.1f}", "val/psnr": "validation {:.1f}"}
     return ", ".join(text.format(found[name]) for name, text in names.items() if name in found)

@@ -1,9 +1,9 @@
-"""The words of a command, checked before Hydra reads them: what they name must be there."""
+"""Check the overrides of a command before Hydra reads them: what they name must exist."""
 
 import contextlib
 import difflib
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import hydra
@@ -20,50 +20,58 @@ CONF = Path(__file__).parents[1] / "conf"
 ALIKE = 0.8  # difflib's ratio of widht and width
 
 
-def check_words(words: Iterable[str], script: str = "train") -> None:
-    """Check that each word sets an option that there is, or chooses a file of its group.
+def check_overrides(overrides: Iterable[str], script: str = "train") -> None:
+    """Check that each override sets an existing option, or chooses an existing file of a group.
 
     Args:
-        words: `key=value` as Hydra takes them; those of Hydra's own options are left to Hydra.
-        script: the file of conf/ that names the options.
+        overrides: `key=value` as Hydra takes them; those of Hydra's own options are left to Hydra.
+        script: name of the file in conf/ that lists the options.
 
     Raises:
-        InputError: a word that cannot be read, or that names what is not there; gives the nearest.
+        InputError: an override cannot be read, or names something that does not exist; the message
+            suggests the nearest names.
     """
-    overrides = [_parse(word) for word in words]
-    ours = [override for override in overrides if not override.key_or_group.startswith("hydra")]
+    parsed = [_parse(override) for override in overrides]
+    ours = [override for override in parsed if not override.key_or_group.startswith("hydra")]
     for override in ours:
         _check_choices(override)
     composed = [override for override in ours if _folder(override) or _adds(override)]
     settings = [override for override in ours if override not in composed]
-    known = set(_paths(_compose(script, composed))) if settings else set()
+    if not settings:
+        return
+    config = _compose(script, composed)
+    known = set(_paths(config))
     for override in settings:
         key = override.key_or_group
         if key not in known:
             raise InputError(f"{key} is unknown: {_hint(key, known, script)}")
+        if key == "stage":
+            _check_stage(override, config)
 
 
-def exit_at_unknown_words(script: str) -> None:
-    """`check_words` of this process's command line; a mistake ends the process."""
+def exit_at_unknown_overrides(script: str) -> None:
+    """Run `check_overrides` on this process's command line; exit with the message of an error."""
     given = get_args_parser().parse_args()
     if given.config_dir or given.config_name or given.config_path or given.shell_completion:
-        return  # other files than ours, or no run
+        return  # other files than those in conf/, or no run
     try:
-        check_words(given.overrides, script)
+        check_overrides(given.overrides, script)
     except InputError as error:
         sys.exit(f"error: {error}")
 
 
-def _parse(word: str) -> Override:
-    key, equals, _ = word.partition("=")
-    if not (key and equals) and not word.startswith("~"):
-        raise InputError(f"{word} sets nothing: write {word}=value, or ~{word} to leave it out.")
+def _parse(override: str) -> Override:
+    key, equals, _ = override.partition("=")
+    if not (key and equals) and not override.startswith("~"):
+        raise InputError(
+            f"{override} sets nothing: write {override}=value, or ~{override} to leave it out."
+        )
     try:
-        return OverridesParser.create().parse_override(word)
+        return OverridesParser.create().parse_override(override)
     except HydraException:
         raise InputError(
-            f"{word} cannot be read: a value that holds brackets, quotes or = needs quotes of its "
-            """own within those of the shell, as in 'data.root="my (scene)"'."""
+            f"{override} cannot be read: a value that holds brackets, quotes or = needs quotes of "
+            """its own within those of the shell, as in 'data.root="my (scene)"'."""
         ) from None
 
 
@@ -86,26 +94,34 @@ def _check_choices(override: Override) -> None:
             )
 
 
+def _check_stage(override: Override, config: DictConfig) -> None:
+    """Check that the scale has the training stages, for which other keys look values up."""
+    for stage in _values(override):
+        if stage not in config.stages:
+            *others, last = config.stages
+            raise InputError(f"stage={stage} is unknown: choose {', '.join(others)} or {last}.")
+
+
 def _folder(override: Override) -> Path | None:
-    """Where the choices of a group are; None for what is no group of ours."""
+    """Return the folder with the choices of a group; None if the key is not a group in conf/."""
     folder = CONF / override.key_or_group
     return folder if folder.is_dir() else None
 
 
 def _values(override: Override) -> list[str]:
-    """As they were typed; of a sweep each, where it names them."""
+    """Return the values as they were typed; each value of a sweep, if the sweep lists them."""
     if not override.is_sweep_override():
         return [override.get_value_element_as_str()]
-    named = isinstance(override.value(), ChoiceSweep | RangeSweep)
-    return list(override.sweep_string_iterator()) if named else []
+    listed = isinstance(override.value(), ChoiceSweep | RangeSweep)
+    return list(override.sweep_string_iterator()) if listed else []
 
 
 def _compose(script: str, overrides: Sequence[Override]) -> DictConfig:
-    """The options that there are with these words; of a sweep with its first values."""
-    words = [override.input_line for override in overrides if override.is_delete()]
+    """Compose the configuration with these overrides, taking the first value of each sweep."""
+    given = [override.input_line for override in overrides if override.is_delete()]
     for override in overrides:
         if not override.is_delete():
-            words += [f"{override.get_key_element()}={value}" for value in _values(override)[:1]]
+            given += [f"{override.get_key_element()}={value}" for value in _values(override)[:1]]
     ready = GlobalHydra.instance().is_initialized()
     with (
         contextlib.nullcontext()
@@ -113,13 +129,13 @@ def _compose(script: str, overrides: Sequence[Override]) -> DictConfig:
         else hydra.initialize_config_dir(str(CONF), version_base="1.3")
     ):
         try:
-            return hydra.compose(script, words)
+            return hydra.compose(script, given)
         except HydraException as error:
-            raise InputError(f"{' '.join(words)}: {str(error).splitlines()[0]}") from error
+            raise InputError(f"{' '.join(given)}: {str(error).splitlines()[0]}") from error
 
 
 def _paths(config: DictConfig) -> Iterator[str]:
-    """Every option, data.cache.folder for one, and every node above one."""
+    """Yield the dotted path of every option, such as data.cache.folder, and of its parents."""
 
     def below(node: dict, prefix: str) -> Iterator[str]:
         for key, value in node.items():
@@ -130,7 +146,7 @@ def _paths(config: DictConfig) -> Iterator[str]:
     return below(OmegaConf.to_container(config), "")
 
 
-def _hint(key: str, known: Iterable[str], script: str) -> str:
+def _hint(key: str, known: Collection[str], script: str) -> str:
     nearest = _nearest(key, known)
     if nearest:
         return f"did you mean {nearest}?"
@@ -142,8 +158,11 @@ def _hint(key: str, known: Iterable[str], script: str) -> str:
     return f"python {script}.py --cfg job shows all."
 
 
-def _nearest(key: str, known: Iterable[str]) -> str | None:
-    """The known option that is spelled alike, in whole or from any of its dots on."""
+def _nearest(key: str, known: Collection[str]) -> str | None:
+    """Return the known path that is spelled like `key`, in whole or from one of its dots on."""
+    name = key.rpartition(".")[2]
+    if name in known:  # at the top: steps for trainer.steps
+        return name
     ends: dict[str, str] = {}
     for path in sorted(known, key=lambda path: (path.count("."), path)):
         parts = path.split(".")

@@ -1,4 +1,4 @@
-"""What the words of a command name must be there; else the nearest that is, in one sentence."""
+"""An override must name what exists; otherwise one sentence names the nearest that does."""
 
 import re
 import shlex
@@ -9,12 +9,14 @@ import pytest
 from hydra._internal.utils import get_args_parser
 
 from asysplat.errors import InputError
-from asysplat.words import check_words
+from asysplat.overrides import check_overrides
 
 KNOWN = [
     [],
     ["model=asysplat_4m4s", "scale=paper", "steps=5", "model.layers=7m1t"],
-    ["model=longlrm,asysplat_4m4s", "seed=0,1,2", "training.learning_rate=choice(1e-3,1e-4)"],
+    ["model=longlrm,asysplat_4m4s", "seed=0,1,2", "learning_rate=choice(1e-3,1e-4)"],
+    ["stage=stage2", "scale=gpu"],
+    ["stage=stage1,stage2,stage3", "experiment=two_views"],
     ["sweeps=layers", "hydra/launcher=joblib", "hydra.run.dir=x", "model=asysplat_7m1s"],
     ["data=files", "data.root=my scenes/one", "data.cache.folder=null"],
     ["model/links=both", "~callbacks.costs", "trainer=cpu", "trainer.devices=2"],
@@ -24,21 +26,26 @@ KNOWN = [
 ]
 
 
-@pytest.mark.parametrize("words", KNOWN, ids=" ".join)
-def test_words_that_are_known(words):
-    check_words(words)
+@pytest.mark.parametrize("overrides", KNOWN, ids=" ".join)
+def test_known_overrides(overrides):
+    check_overrides(overrides)
 
 
 def test_tables_are_found_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    check_words(["sweeps=layers", "steps=1"])
+    check_overrides(["sweeps=layers", "steps=1"])
 
 
 UNKNOWN = {
     "widht=0.5": "widht is unknown: did you mean width?",
     "data.inptus=4": "data.inptus is unknown: did you mean data.inputs?",
-    "training.learning_rte=1e-3": "did you mean training.learning_rate?",
-    "learning_rate=1e-3": "did you mean training.learning_rate?",
+    "training.learning_rate=1e-3": "did you mean learning_rate?",
+    "trainer.steps=5": "did you mean steps?",
+    "learning_rte=1e-3": "did you mean learning_rate?",
+    "weight_decay=0": "did you mean training.optimizer.weight_decay?",
+    "stage=stage4": "stage=stage4 is unknown: choose stage1, stage2, stage3 or ablation.",
+    "stage=stage1,stage4": "stage=stage4 is unknown: choose stage1, stage2, stage3 or ablation.",
+    "experiment=stage1": "experiment=stage1 is unknown: did you mean",
     "batch_sizes=2,4": "did you mean data.batch_size?",
     "callbacks.pictres.scenes=1": "did you mean callbacks.pictures.scenes?",
     "~callbacks.cots": "callbacks.cots is unknown: did you mean callbacks.costs?",
@@ -52,21 +59,21 @@ UNKNOWN = {
 }
 
 
-@pytest.mark.parametrize("word", UNKNOWN)
-def test_words_that_are_not(word):
+@pytest.mark.parametrize("override", UNKNOWN)
+def test_unknown_overrides(override):
     with pytest.raises(InputError) as raised:
-        check_words([word])
-    assert UNKNOWN[word] in str(raised.value)
+        check_overrides([override])
+    assert UNKNOWN[override] in str(raised.value)
     assert "\n" not in str(raised.value)
 
 
 def test_options_of_the_other_scripts():
-    check_words(["table=[layers,geometry_ratio]", "costs=true", "logs=elsewhere"], "report")
-    check_words(["suite=ops", "ops.ssd.length=512", "model.names=[longlrm]"], "benchmark")
+    check_overrides(["table=[layers,geometry_ratio]", "costs=true", "logs=elsewhere"], "report")
+    check_overrides(["suite=ops", "ops.ssd.length=512", "model.names=[longlrm]"], "benchmark")
     with pytest.raises(InputError, match="did you mean costs"):
-        check_words(["cots=true"], "report")
+        check_overrides(["cots=true"], "report")
     with pytest.raises(InputError, match="did you mean repeats"):
-        check_words(["repeat=3"], "benchmark")
+        check_overrides(["repeat=3"], "benchmark")
 
 
 def test_a_script_says_it_from_any_folder(repository, tmp_path):
@@ -81,9 +88,9 @@ IN_A_TABLE = re.compile(r"\| `([\w./]+=[^`]+)`")
 
 
 def printed_commands(repository) -> list[tuple[str, str]]:
-    """Scripts and words, as the READMEs and the comments under conf/ and sweeps/ have them."""
+    """List scripts and overrides in the READMEs and the comments under conf/ and sweeps/."""
     texts = [(repository / name).read_text() for name in ("README.md", "data/README.md")]
-    found = {("train", words) for words in IN_A_TABLE.findall(texts[0])}
+    found = {("train", overrides) for overrides in IN_A_TABLE.findall(texts[0])}
     for folder in ("conf", "sweeps"):
         for path in (repository / folder).rglob("*.yaml"):
             texts += [line for line in path.read_text().splitlines() if line.startswith("# ")]
@@ -95,5 +102,5 @@ def printed_commands(repository) -> list[tuple[str, str]]:
 def test_every_printed_command_names_what_is_there(repository):
     printed = printed_commands(repository)
     assert len(printed) > 100
-    for script, words in printed:
-        check_words(get_args_parser().parse_args(shlex.split(words)).overrides, script)
+    for script, overrides in printed:
+        check_overrides(get_args_parser().parse_args(shlex.split(overrides)).overrides, script)

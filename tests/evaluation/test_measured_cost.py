@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from asysplat.evaluation import measured
+from asysplat.evaluation import measured_cost
 from asysplat.evaluation.cost import reset_peak_memory
-from asysplat.evaluation.measured import Measured, mean_but_longest
+from asysplat.evaluation.measured_cost import CostMeter, mean_but_longest
 
 CPU = torch.device("cpu")
 
@@ -22,8 +22,8 @@ def test_the_longest_is_left_out_once(seconds, expected):
 
 def test_work_is_timed_from_start_to_stop(monkeypatch):
     clock = iter([10.0, 11.0, 20.0, 25.0, 30.0, 32.0])
-    monkeypatch.setattr(measured, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    work = Measured(CPU)
+    monkeypatch.setattr(measured_cost, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    work = CostMeter(CPU)
     assert work.costs("cost/a") == {}
     for _ in range(3):
         work.start()
@@ -37,7 +37,7 @@ def test_memory_is_that_of_the_work_alone():
     def hold(numbers):
         torch.ones(numbers)  # 4 bytes each, given back to the system when freed
 
-    small, large = Measured(CPU), Measured(CPU)
+    small, large = CostMeter(CPU), CostMeter(CPU)
     for work, numbers in ((small, 1000), (large, 50_000_000), (large, 1000), (small, 1000)):
         work.start()
         hold(numbers)
@@ -47,8 +47,8 @@ def test_memory_is_that_of_the_work_alone():
 
 
 def test_no_memory_where_the_peak_cannot_start_anew(monkeypatch):
-    monkeypatch.setattr(measured, "reset_peak_memory", lambda device: False)
-    work = Measured(CPU)
+    monkeypatch.setattr(measured_cost, "reset_peak_memory", lambda device: False)
+    work = CostMeter(CPU)
     work.start()
     work.stop()
     assert set(work.costs("a")) == {"a_seconds"}

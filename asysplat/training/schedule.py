@@ -1,0 +1,23 @@
+"""How the learning rate changes over the steps of a training."""
+
+import math
+
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+
+def cosine(optimizer: Optimizer, warmup_steps: int, total_steps: int) -> LambdaLR:
+    """Return the schedule of a linear warm-up to the optimizer's rate, then a cosine to 0.
+
+    Args:
+        optimizer: its own learning rate is the highest.
+        warmup_steps, total_steps: in optimizer steps; the warm-up is part of the total.
+    """
+
+    def factor(step: int) -> float:
+        if step < warmup_steps:
+            return (step + 1) / warmup_steps
+        progress = (step - warmup_steps) / max(1, total_steps - warmup_steps)
+        return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+
+    return LambdaLR(optimizer, factor)
