@@ -19,7 +19,7 @@ def make_views(batch=(2,), views=3, height=32, width=64):
     return Views(cameras, torch.rand(*batch, views, 3, height, width))
 
 
-# Every model of architecture.md and its parameters in this layout, in units of 1e6.
+# Every model of architecture.md and its parameters as built here, in units of 1e6.
 PARAMETERS = {
     "asysplat_4m4s": 98.11,
     "asysplat_7m1s": 86.84,
