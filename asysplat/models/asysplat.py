@@ -6,12 +6,12 @@ import torch
 from torch import nn
 
 from asysplat.errors import InputError
+from asysplat.models.geometry_ratio import solve_widths
 from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.stage import Component, Stage
 from asysplat.models.tokenizer import Tokenizer, pixel_features
-from asysplat.models.widths import solve_widths
 from asysplat.scene import Gaussians, Views
 
 APPEARANCE_MLP_RATIO = 4
@@ -24,8 +24,8 @@ class AsySplat(Network):
 
     Args:
         widths: of both branches.
-        stage_ratios: r_s, one a stage.
-        layers: the layer mix of a stage, letters of `blocks`.
+        stage_ratios: r_s, one a network stage.
+        layers: the layer mix of every stage, such as "4m4s": counts and letters of `blocks`.
         blocks: letter -> component built from a StageShape.
         appearance_block: component built from the appearance branch's StageShape.
         appearance_layers: N_v.
@@ -66,10 +66,10 @@ class AsySplat(Network):
             )
         self.appearance_layers = appearance_layers
         shapes = [
-            StageShape(width, widths.head, ratio)
+            StageShape(width, widths.head_dim, ratio)
             for width, ratio in zip(widths.stages, stage_ratios, strict=True)
         ]
-        fine = StageShape(widths.fine, widths.head, APPEARANCE_MLP_RATIO)
+        fine = StageShape(widths.fine, widths.head_dim, APPEARANCE_MLP_RATIO)
         self.geometry = nn.ModuleDict(
             {
                 "tokenizer": Tokenizer(patch_coarse, widths.stages[0]),
@@ -94,7 +94,7 @@ class AsySplat(Network):
         self.head = head(widths.stages[-1], patch_coarse, patch_fine)
 
     def predict(self, views: Views) -> Gaussians:
-        """Views [B, V] -> Gaussians [B, N], N = V H W (p_f / p_c)^2."""
+        """Predict Gaussians [B, N] from views [B, V]; N = V H W (p_f / p_c)^2."""
         pixels = pixel_features(views)
         coarse = self.geometry["tokenizer"](pixels)
         fine = self.appearance["tokenizer"](pixels)
@@ -112,12 +112,12 @@ class AsySplat(Network):
         return self.head(self.source(coarse, fine), views)
 
     def geometry_share(self) -> float:
-        """Parameters outside the appearance branch over all parameters (paper: about 0.9)."""
+        """Return the share of parameters outside the appearance branch (paper: about 0.9)."""
         appearance = sum(p.numel() for p in self.appearance.parameters())
         return 1 - appearance / sum(p.numel() for p in self.parameters())
 
     def describe(self) -> str:
-        """The sizes and what they come to, in a line."""
+        """Return the sizes and what they come to, in a line."""
         return (
             f"{super().describe()}, appearance {self.widths.fine} wide in "
             f"{self.appearance_layers} layers a stage"
@@ -127,18 +127,20 @@ class AsySplat(Network):
 def build_asysplat(
     stage_widths: Sequence[int] = (192, 512, 896),
     fine_width: int = 256,
-    head_width: int = 64,
+    head_dim: int = 64,
     appearance_layers: int = 2,
     width: float = 1.0,
     geometry_ratio: float | None = None,
     parameter_budget: float = 1.0,
     **components,
 ) -> AsySplat:
-    """An AsySplat of the given widths times `width`; with `geometry_ratio`, of the widths that
-    give the geometry branch that share of the same total.
+    """Build an AsySplat of the given widths times `width`.
+
+    With a `geometry_ratio`, it has the widths that give the geometry branch that share of the
+    parameters, at the same total.
 
     Args:
-        stage_widths, fine_width, head_width: d_s, d_f and the head width at width 1.
+        stage_widths, fine_width, head_dim: d_s, d_f and the head_dim at width 1.
         appearance_layers: N_v.
         width: multiplies the widths.
         geometry_ratio: between 0 and 1, or None for the given widths.
@@ -153,7 +155,7 @@ def build_asysplat(
             f"parameter_budget={parameter_budget} without a geometry_ratio: give both, or change "
             "width."
         )
-    widths = Widths(tuple(stage_widths), fine_width, head_width).scaled(width)
+    widths = Widths(tuple(stage_widths), fine_width, head_dim).scaled(width)
 
     def build(widths: Widths, layers: int) -> AsySplat:
         return AsySplat(widths, appearance_layers=layers, **components)

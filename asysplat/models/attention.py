@@ -14,6 +14,8 @@ from asysplat.ops import grid_attention
 
 
 class MLP(nn.Sequential):
+    """Linear, GELU, Linear; the hidden layer is `ratio` times as wide."""
+
     def __init__(self, width: int, ratio: int, bias: bool = False):
         super().__init__(
             nn.Linear(width, ratio * width, bias=bias),
@@ -25,30 +27,30 @@ class MLP(nn.Sequential):
 class QueryKeyNorm(nn.Module):
     """RMSNorm of queries and keys, shared by the heads."""
 
-    def __init__(self, head_width: int):
+    def __init__(self, head_dim: int):
         super().__init__()
-        self.query = RMSNorm(head_width)
-        self.key = RMSNorm(head_width)
+        self.query = RMSNorm(head_dim)
+        self.key = RMSNorm(head_dim)
 
     def forward(self, q: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
         return self.query(q), self.key(k)
 
 
 class SelfAttention(nn.Module):
-    """x + o(attn(qkv(LN x))), then x + MLP(LN x), over the tokens that share a grid place."""
+    """x + o(attn(qkv(LN x))), then x + MLP(LN x), over the tokens of the same grid place."""
 
     def __init__(self, shape: StageShape, grid: int = 1):
         super().__init__()
-        self.grid, self.head_width = grid, shape.head_width
+        self.grid, self.head_dim = grid, shape.head_dim
         self.norm = nn.LayerNorm(shape.width, bias=False)
         self.qkv = nn.Linear(shape.width, 3 * shape.width, bias=False)
-        self.qk_norm = QueryKeyNorm(shape.head_width)
+        self.qk_norm = QueryKeyNorm(shape.head_dim)
         self.out = nn.Linear(shape.width, shape.width, bias=False)
         self.mlp_norm = nn.LayerNorm(shape.width, bias=False)
         self.mlp = MLP(shape.width, shape.mlp_ratio)
 
     def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
-        q, k, v = self.qkv(self.norm(tokens)).unflatten(-1, (3, -1, self.head_width)).unbind(-3)
+        q, k, v = self.qkv(self.norm(tokens)).unflatten(-1, (3, -1, self.head_dim)).unbind(-3)
         q, k = self.qk_norm(q, k)
         tokens = tokens + self.out(grid_attention(q, k, v, self.grid).flatten(-2))
         return tokens + self.mlp(self.mlp_norm(tokens))
@@ -66,16 +68,16 @@ class SparseAttention(nn.Module):
 
     Args:
         grid: p_g.
-        conv_blocks: the two conv blocks that repair what the grid takes apart.
-        group_width: channels of one group of the convolutions at the paper's head width of 64;
-            it shrinks with the heads.
+        conv_blocks: whether to have the two conv blocks, which connect the grid places of a frame.
+        group_width: channels of one group of the convolutions at the paper's head_dim of 64; it
+            shrinks with the head_dim.
     """
 
     def __init__(
         self, shape: StageShape, grid: int = 2, conv_blocks: bool = True, group_width: int = 32
     ):
         super().__init__()
-        group_width = max(1, group_width * shape.head_width // 64)
+        group_width = max(1, group_width * shape.head_dim // 64)
         self.convs = ConvBlocks(shape.width, group_width) if conv_blocks else nn.Identity()
         self.attention = SelfAttention(shape, grid)
 
@@ -105,19 +107,19 @@ class CrossAttention(nn.Module):
     """x + o(attn(q(LN x), kv(LN context))), then x + MLP(LN x), within each frame.
 
     Args:
-        shape: of the tokens that read.
-        context_width: of the tokens that are read.
-        inner_width: of queries, keys and values.
+        shape: of the tokens that attend.
+        context_width: width of the tokens they attend to.
+        inner_width: width of queries, keys and values.
     """
 
     def __init__(self, shape: StageShape, context_width: int, inner_width: int):
         super().__init__()
-        self.head_width = shape.head_width
+        self.head_dim = shape.head_dim
         self.norm = nn.LayerNorm(shape.width, bias=False)
         self.context_norm = nn.LayerNorm(context_width, bias=False)
         self.query = nn.Linear(shape.width, inner_width, bias=False)
         self.key_value = nn.Linear(context_width, 2 * inner_width, bias=False)
-        self.qk_norm = QueryKeyNorm(shape.head_width)
+        self.qk_norm = QueryKeyNorm(shape.head_dim)
         self.out = nn.Linear(inner_width, shape.width, bias=False)
         self.mlp_norm = nn.LayerNorm(shape.width, bias=False)
         self.mlp = MLP(shape.width, shape.mlp_ratio)
@@ -133,4 +135,4 @@ class CrossAttention(nn.Module):
         return tokens + self.mlp(self.mlp_norm(tokens))
 
     def _heads(self, x: Tensor) -> Tensor:
-        return rearrange(x, "b v h w (H p) -> (b v) H (h w) p", p=self.head_width)
+        return rearrange(x, "b v h w (H p) -> (b v) H (h w) p", p=self.head_dim)

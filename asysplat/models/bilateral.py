@@ -26,12 +26,12 @@ class FineReadsCoarse(nn.Module):
         self, fine: Float[Tensor, "B V h w d"], coarse: Float[Tensor, "B V h2 w2 c"]
     ) -> Float[Tensor, "B V h w d"]:
         read = self.cross(fine, coarse)
-        # A frame by itself: views move into the batch.
+        # Views move into the batch: each frame attends to itself alone.
         return self.attention(read.flatten(0, 1)[:, None]).view_as(read)
 
 
 class NoLink(nn.Module):
-    """The link removed: its branch goes on with what it has."""
+    """No link: the branch goes on with its own tokens."""
 
     def __init__(self, coarse: StageShape, fine: StageShape):
         super().__init__()

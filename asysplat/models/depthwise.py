@@ -15,9 +15,9 @@ def depthwise_conv(
     bias: Float[Tensor, " C"] | None,
     before: int,
 ) -> Float[Tensor, "B L C"]:
-    """Each token sees itself, the `before` tokens ahead of it and the K - 1 - before behind it.
+    """Convolve in the tokens' type.
 
-    Computed in the tokens' type.
+    Each token sees itself, the `before` tokens before it and the K - 1 - before after it.
     """
     with without_autocast(tokens):
         bias = None if bias is None else bias.to(tokens.dtype)
@@ -25,7 +25,7 @@ def depthwise_conv(
 
 
 class _DepthwiseConv(torch.autograd.Function):
-    """With a backward pass of its own: on a CPU torch takes long for the weights' gradient."""
+    """Has its own backward pass: torch's takes long for the weights' gradient on a CPU."""
 
     @staticmethod
     def forward(ctx, tokens, weight, bias, before):
@@ -35,21 +35,24 @@ class _DepthwiseConv(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad):
+    def backward(ctx, grad_output):
         tokens, weight = ctx.saved_tensors
         length, size, before = tokens.shape[1], weight.shape[-1], ctx.before
-        grad_tokens = _convolve(grad, weight.flip(-1), None, size - 1 - before)
+        grad_tokens = _convolve(grad_output, weight.flip(-1), None, size - 1 - before)
         padded = _pad(tokens, size, before)
-        pull = grad.to(torch.promote_types(grad.dtype, torch.float32))
-        taps = [(padded[:, k : k + length] * pull).sum((0, 1)) for k in range(size)]
+        grad_output = grad_output.to(torch.promote_types(grad_output.dtype, torch.float32))
+        taps = [(padded[:, k : k + length] * grad_output).sum((0, 1)) for k in range(size)]
         grad_weight = torch.stack(taps, -1)[:, None].to(weight.dtype)
-        grad_bias = pull.sum((0, 1)).to(weight.dtype) if ctx.has_bias else None
+        grad_bias = grad_output.sum((0, 1)).to(weight.dtype) if ctx.has_bias else None
         return grad_tokens, grad_weight, grad_bias, None
 
 
 def _convolve(tokens: Tensor, weight: Tensor, bias: Tensor | None, before: int) -> Tensor:
-    """To torch, an image one pixel high whose channels are innermost: as a sequence, they would be
-    copied outermost and back."""
+    """Convolve the tokens as an image one pixel high.
+
+    The channels of such an image may be innermost; those of a sequence torch would copy outermost
+    and back.
+    """
     image = _pad(tokens, weight.shape[-1], before).mT.unsqueeze(-2)
     return F.conv2d(image, weight.unsqueeze(-2), bias, groups=len(weight)).squeeze(-2).mT
 

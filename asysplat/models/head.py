@@ -18,27 +18,29 @@ SH_C0 = 0.28209479177387814  # Y_0, so that colour = 0.5 + SH_C0 * sh_0
 
 
 class GaussianHead(nn.Module, ABC):
-    """LayerNorm and Linear: each token gives p_f x p_f Gaussians, one a pixel of the image
-    downsampled by p_c / p_f, on the ray through that pixel's centre.
+    """LayerNorm and Linear: each token gives p_f x p_f Gaussians.
+
+    There is one for each pixel of the image downsampled by p_c / p_f, on the ray through that
+    pixel's centre.
 
     Args:
         width: d_3.
         patch_coarse, patch_fine: p_c, p_f.
         sh_degree: 0 to 3.
-        std: of the untrained weights.
+        std: standard deviation of the untrained weights.
     """
 
     def __init__(self, width: int, patch_coarse: int, patch_fine: int, sh_degree: int, std: float):
         super().__init__()
         self.patch, self.stride = patch_fine, patch_coarse // patch_fine
-        # position, quaternion, scale, opacity, spherical harmonics
+        # position, quaternion, scale, opacity, SH
         self.splits = (3, 4, 3, 1, 3 * (sh_degree + 1) ** 2)
         self.norm = nn.LayerNorm(width, bias=False)
         self.decode = nn.Linear(width, patch_fine**2 * sum(self.splits), bias=False)
         nn.init.normal_(self.decode.weight, std=std)
 
     def forward(self, features: Float[Tensor, "B V h w d"], views: Views) -> Gaussians:
-        """Gaussians [B, V h p_f w p_f], row by row of view after view."""
+        """Decode Gaussians [B, V h p_f w p_f], row by row of view after view."""
         raw = rearrange(
             self.decode(self.norm(features)),
             "b v h w (p q z) -> b v (h p) (w q) z",
@@ -49,38 +51,37 @@ class GaussianHead(nn.Module, ABC):
             raw = raw.to(views.images.dtype)
             position, quats, scales, opacities, sh = raw.split(self.splits, dim=-1)
             # The mean of three outputs, as in Long-LRM.
-            reach = position.mean(-1, keepdim=True).sigmoid()
+            depth_fraction = position.mean(-1, keepdim=True).sigmoid()
             sh = sh.unflatten(-1, (-1, 3))
-            return self.activate(reach, quats, scales, opacities[..., 0], sh, views).map(
+            return self.activate(depth_fraction, quats, scales, opacities[..., 0], sh, views).map(
                 lambda field: field.flatten(1, 3)
             )
 
     @abstractmethod
     def activate(
         self,
-        reach: Float[Tensor, "B V h w 1"],
+        depth_fraction: Float[Tensor, "B V h w 1"],
         quats: Float[Tensor, "B V h w 4"],
         scales: Float[Tensor, "B V h w 3"],
         opacities: Float[Tensor, "B V h w"],
         sh: Float[Tensor, "B V h w K 3"],
         views: Views,
     ) -> Gaussians:
-        """Gaussians [B, V, h, w] from what was decoded.
+        """Turn what was decoded into Gaussians [B, V, h, w].
 
         Args:
-            reach: in [0, 1], where in the head's range of distances.
+            depth_fraction: in [0, 1], where in the head's range of distances.
             quats, scales, opacities, sh: any numbers.
             views: what the tokens were made of.
         """
 
 
 class PhotographHead(GaussianHead):
-    """Ours: an untrained model draws its input photographs at a middle distance, so that training
-    starts from pictures.
+    """Our own head: an untrained model draws its input photographs at a middle distance.
 
-    Colours are residuals to the downsampled photograph, sizes are in units of the pixel's
-    footprint, distances logarithmic. The photograph reaches the Gaussians past both branches: what
-    the appearance branch adds is less than with colours of its own.
+    Training therefore starts from pictures. Colours are residuals to the downsampled photograph,
+    sizes are in units of the pixel's footprint, distances logarithmic. The photograph bypasses both
+    branches: what the appearance branch adds is less than with colours of its own.
 
     Args:
         width, patch_coarse, patch_fine, sh_degree: of GaussianHead.
@@ -106,7 +107,7 @@ class PhotographHead(GaussianHead):
 
     def activate(
         self,
-        reach: Float[Tensor, "B V h w 1"],
+        depth_fraction: Float[Tensor, "B V h w 1"],
         quats: Float[Tensor, "B V h w 4"],
         scales: Float[Tensor, "B V h w 3"],
         opacities: Float[Tensor, "B V h w"],
@@ -115,7 +116,7 @@ class PhotographHead(GaussianHead):
     ) -> Gaussians:
         cameras = views.cameras.resized(*opacities.shape[2:])
         origins, directions = cameras.rays()
-        distance = self.near * (self.far / self.near) ** reach
+        distance = self.near * (self.far / self.near) ** depth_fraction
         identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
         return Gaussians(
             means=origins + distance * directions,
@@ -126,7 +127,7 @@ class PhotographHead(GaussianHead):
         )
 
     def _photograph(self, views: Views) -> Float[Tensor, "B V h w 1 3"]:
-        """The downsampled photographs as spherical harmonics of degree 0."""
+        """Return the downsampled photographs as SH of degree 0."""
         small = F.avg_pool2d(views.images.flatten(0, 1), self.stride).unflatten(
             0, views.images.shape[:2]
         )
@@ -134,7 +135,7 @@ class PhotographHead(GaussianHead):
 
 
 class LongLRMHead(GaussianHead):
-    """Long-LRM's (Ziwen et al. 2025; the values of its public code's configs/7m1t_tm.yaml).
+    """The head of Long-LRM (Ziwen et al. 2025), with the values of its configs/7m1t_tm.yaml.
 
     Colours and sizes are direct, sizes in units of the scene and at most e^largest; the distance
     along the ray is linear from 0 to `farthest`. Those units are the normalised scene's: Long-LRM
@@ -167,7 +168,7 @@ class LongLRMHead(GaussianHead):
 
     def activate(
         self,
-        reach: Float[Tensor, "B V h w 1"],
+        depth_fraction: Float[Tensor, "B V h w 1"],
         quats: Float[Tensor, "B V h w 4"],
         scales: Float[Tensor, "B V h w 3"],
         opacities: Float[Tensor, "B V h w"],
@@ -177,9 +178,9 @@ class LongLRMHead(GaussianHead):
         origins, directions = views.cameras.resized(*opacities.shape[2:]).rays()
         sizes = (scales + self.scale_bias).clamp(max=self.largest).exp()
         return Gaussians(
-            means=origins + self.farthest * reach * directions,
+            means=origins + self.farthest * depth_fraction * directions,
             quats=quats,
-            # Not published: a size is above 0 also where the exponential is not.
+            # Ours: a size stays above 0 where the exponential underflows.
             scales=sizes.clamp_min(torch.finfo(sizes.dtype).tiny),
             opacities=(opacities + self.opacity_bias).sigmoid(),
             sh=sh,
@@ -187,5 +188,5 @@ class LongLRMHead(GaussianHead):
 
 
 def footprint(cameras: Cameras) -> Float[Tensor, "B V 1 1 1"]:
-    """Width of a pixel at distance 1."""
+    """Return the width of a pixel at distance 1, in scene units."""
     return (1 / cameras.intrinsics[..., 0, 0])[..., None, None, None]

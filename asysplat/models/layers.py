@@ -1,4 +1,4 @@
-"""Layers one after the other, kept in memory or computed again."""
+"""Layers one after the other; the backward pass keeps what they compute, or computes it again."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -10,8 +10,11 @@ from torch.utils.checkpoint import checkpoint
 
 
 class Layers(nn.Sequential):
-    """With `checkpointing`, the backward pass computes each layer again, so that only what passes
-    between them is kept (Chen et al. 2016)."""
+    """Layers one after the other.
+
+    With `checkpointing`, the backward pass computes each layer again, so that only the tokens
+    between layers are kept (Chen et al. 2016).
+    """
 
     checkpointing = False
 
@@ -29,7 +32,7 @@ class Layers(nn.Sequential):
 
 @contextmanager
 def _without_running_means(layer: nn.Module) -> Iterator[None]:
-    """A layer that is computed twice has seen its batch once."""
+    """Leave the running means of BatchNorm alone: the layer has counted this batch already."""
     norms = [m for m in layer.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)]
     momenta = [norm.momentum for norm in norms]
     for norm in norms:

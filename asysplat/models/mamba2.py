@@ -26,7 +26,7 @@ class BiMamba2(nn.Module):
     def __init__(self, shape: StageShape, state_size: int = 256):
         super().__init__()
         inner = EXPAND * shape.width
-        heads = inner // shape.head_width
+        heads = inner // shape.head_dim
         self.norm = RMSNorm(shape.width)
         self.project = nn.Linear(shape.width, 2 * inner + 2 * state_size + heads, bias=False)
         self.directions = nn.ModuleList(
@@ -41,7 +41,7 @@ class BiMamba2(nn.Module):
 
 
 class Mamba2Direction(nn.Module):
-    """What each direction has of its own: convolution, scan parameters and gated RMSNorm."""
+    """One direction, with its own convolution, scan parameters and gated RMSNorm."""
 
     def __init__(self, inner: int, heads: int, state_size: int, reverse: bool):
         super().__init__()
@@ -64,16 +64,17 @@ class Mamba2Direction(nn.Module):
         return self.norm(y * F.silu(z))
 
     def _causal_conv(self, x: Tensor) -> Tensor:
-        """Each token sees the CONV_KERNEL - 1 before it in the direction of the scan."""
+        """Let each token see the CONV_KERNEL - 1 before it in the direction of the scan."""
         if self.reverse:
             return depthwise_conv(x, self.conv.weight.flip(-1), self.conv.bias, before=0)
         return depthwise_conv(x, self.conv.weight, self.conv.bias, before=CONV_KERNEL - 1)
 
 
 def log_uniform(count: int, low: float, high: float) -> Float[Tensor, " count"]:
+    """Draw numbers from low to high whose logarithms are uniform."""
     return torch.empty(count).uniform_(math.log(low), math.log(high)).exp()
 
 
 def inverse_softplus(x: Float[Tensor, " count"]) -> Float[Tensor, " count"]:
-    """The value whose softplus is x > 0."""
+    """Return the value whose softplus is x > 0."""
     return x + torch.log(-torch.expm1(-x))

@@ -23,7 +23,11 @@ class Network(nn.Module, ABC):
         self.widths, self.patch = widths, patch
 
     def forward(self, views: Views) -> Gaussians:
-        """Views [..., V] with sides that are multiples of `size_multiple` -> Gaussians [..., N]."""
+        """Predict Gaussians [..., N] from views [..., V].
+
+        Raises:
+            InputError: image sides that are no multiples of `size_multiple`.
+        """
         self.check_size(views.cameras.height, views.cameras.width)
         batch = views.images.shape[:-4]
         gaussians = self.predict(with_one_batch_dimension(views))
@@ -31,30 +35,30 @@ class Network(nn.Module, ABC):
 
     @abstractmethod
     def predict(self, views: Views) -> Gaussians:
-        """Views [B, V] -> Gaussians [B, N]."""
+        """Predict Gaussians [B, N] from views [B, V]."""
 
     @abstractmethod
     def geometry_share(self) -> float:
-        """Parameters outside an appearance branch over all parameters."""
+        """Return the share of parameters outside an appearance branch."""
 
     def describe(self) -> str:
-        """The sizes and what they come to, in a line."""
+        """Return the sizes and what they come to, in a line."""
         total = sum(p.numel() for p in self.parameters())
         stages = "/".join(map(str, self.widths.stages))
         return (
             f"{total / 1e6:.2f}M parameters, {self.geometry_share():.1%} of them for geometry; "
-            f"stages {stages} wide, heads {self.widths.head}"
+            f"stages {stages} wide, heads {self.widths.head_dim}"
         )
 
     def checkpoint_layers(self, checkpointing: bool) -> None:
-        """Whether the backward pass computes each layer again, to save memory; see `Layers`."""
+        """Choose whether the backward pass computes each layer again; see `Layers`."""
         for module in self.modules():
             if isinstance(module, Layers):
                 module.checkpointing = checkpointing
 
     @property
     def size_multiple(self) -> int:
-        """Image sides must be multiples of this: the largest patch."""
+        """The number that image sides must be multiples of: the largest patch."""
         return self.patch
 
     def check_size(self, height: int, width: int) -> None:
@@ -69,7 +73,7 @@ class Network(nn.Module, ABC):
 
 
 def with_one_batch_dimension(views: Views) -> Views:
-    """[..., V, ...] -> [B, V, ...]."""
+    """Flatten all leading batch dimensions into one: [..., V, ...] to [B, V, ...]."""
     dims = views.images.ndim - 4  # leading batch dimensions
     if dims == 1:
         return views

@@ -7,9 +7,9 @@ from asysplat.ops.precision import without_autocast
 
 
 class RMSNorm(nn.RMSNorm):
-    """In the type of its weights, fp32, whatever the input's; the output has the input's.
+    """RMSNorm computed in the type of its weights, fp32, and returned in the input's.
 
-    With weights and inputs of two types torch would not take its fused kernel.
+    With weights and inputs of two types torch would not use its fused kernel.
 
     Args:
         width: of the last dimension.

@@ -1,20 +1,20 @@
-"""The sizes of a model: the widths of its stages and what follows from them."""
+"""The sizes of a model: the widths of its network stages and what follows from them."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class StageShape:
-    """What every block of one geometry stage is built from.
+    """What every block of one network stage is built from.
 
     Args:
-        width: d_s.
-        head_width: of attention and Mamba2 heads; divides every width.
+        width: d_s, or d_f in the appearance branch.
+        head_dim: channels of one attention or Mamba2 head; divides every width.
         mlp_ratio: r_s, hidden over outer width of the stage's MLPs.
     """
 
     width: int
-    head_width: int
+    head_dim: int
     mlp_ratio: int
 
 
@@ -25,16 +25,15 @@ class Widths:
     Args:
         stages: (d_1, d_2, d_3) of the geometry branch.
         fine: d_f of the appearance branch.
-        head: width of one attention or Mamba2 head; divides all others.
+        head_dim: channels of one attention or Mamba2 head; divides all others.
     """
 
     stages: tuple[int, ...]
     fine: int
-    head: int
+    head_dim: int
 
     def scaled(self, factor: float) -> "Widths":
-        """The widths times `factor`, the same number of heads; a head is at least 4 wide."""
-        head = max(4, round(self.head * factor / 4) * 4)
-        return Widths(
-            tuple(w // self.head * head for w in self.stages), self.fine // self.head * head, head
-        )
+        """Multiply the widths by `factor`, with as many heads, each of at least 4 channels."""
+        head_dim = max(4, round(self.head_dim * factor / 4) * 4)
+        stages = tuple(width // self.head_dim * head_dim for width in self.stages)
+        return Widths(stages, self.fine // self.head_dim * head_dim, head_dim)

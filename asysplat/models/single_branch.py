@@ -1,4 +1,4 @@
-"""One branch for everything: the paper's single-branch ablation, and Long-LRM, its baseline."""
+"""Models of one branch: the paper's single-branch ablation, and Long-LRM, its baseline."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from asysplat.errors import InputError
 from asysplat.models.attention import SparseAttention
 from asysplat.models.network import Network
 from asysplat.models.shapes import StageShape, Widths
-from asysplat.models.stage import Component, stage_layers, to_width
+from asysplat.models.stage import Component, build_layers, to_width
 from asysplat.models.tokenizer import Tokenizer, pixel_features
 from asysplat.scene import Gaussians, Views
 
@@ -21,14 +21,14 @@ class SingleBranch(Network):
     """Tokens of one patch size through all stages; every pixel gives a Gaussian.
 
     Args:
-        widths: of the stages; `widths.fine` is not used.
+        widths: of the network stages; `widths.fine` is not used.
         stage_ratios: MLP ratio of each stage.
-        stage_layers: layer mix of each stage, letters of `blocks`.
+        stage_layers: layer mix of each stage, counts and letters of `blocks`.
         merges: whether 2 x 2 tokens become one before the stage.
         blocks: letter -> component built from a StageShape.
         head: component that decodes Gaussians.
         patch: side of a token's patch before any merge.
-        global_tokens: learned tokens ahead of the others, that belong to no place.
+        global_tokens: number of learned tokens that come before the others and have no place.
 
     Raises:
         InputError: lists of unequal length, an unusable layer mix, or global tokens with sparse
@@ -56,7 +56,7 @@ class SingleBranch(Network):
                 )
         self.tokenizer = Tokenizer(patch, widths.stages[0])
         shapes = [
-            StageShape(width, widths.head, ratio)
+            StageShape(width, widths.head_dim, ratio)
             for width, ratio in zip(widths.stages, stage_ratios, strict=True)
         ]
         self.stages = nn.ModuleList(
@@ -78,7 +78,7 @@ class SingleBranch(Network):
         self.head = head(widths.stages[-1], self.patch, self.patch)
 
     def predict(self, views: Views) -> Gaussians:
-        """Views [B, V] -> Gaussians [B, N], N = V H W."""
+        """Predict Gaussians [B, N] from views [B, V]; N = V H W."""
         tokens = self.tokenizer(pixel_features(views))
         extra = None
         if self.global_tokens is not None:
@@ -88,13 +88,14 @@ class SingleBranch(Network):
         return self.head(tokens, views)
 
     def geometry_share(self) -> float:
-        """There is no appearance branch: 1."""
+        """Return 1: there is no appearance branch."""
         return 1.0
 
 
 class MergingStage(nn.Module):
-    """Bring the tokens to the stage's width, merged or projected, then apply the layer mix to them
-    and the global tokens as one sequence.
+    """A network stage that merges or projects its tokens, then applies the layer mix.
+
+    The layers see the global tokens and the others as one sequence.
 
     Args:
         previous_width: of the tokens that come in.
@@ -116,10 +117,10 @@ class MergingStage(nn.Module):
     ):
         super().__init__()
         self.merge = TokenMerge(previous_width, shape.width) if merge else None
-        # A merge has the new width already: it leaves the projection to global tokens.
+        # After a merge only the global tokens are left to project.
         needed = has_global or not merge
         self.project = to_width(previous_width, shape.width) if needed else None
-        self.layers = stage_layers(shape, layers, blocks)
+        self.layers = build_layers(shape, layers, blocks)
 
     def forward(
         self, tokens: Float[Tensor, "B V h w d"], extra: Float[Tensor, "B G d"] | None
@@ -135,11 +136,10 @@ class MergingStage(nn.Module):
 
 
 class TokenMerge(nn.Module):
-    """2 x 2 neighbouring tokens of a frame become one: a convolution of stride 2 that brings them
-    to the new width (Long-LRM, Ziwen et al. 2025).
+    """A convolution of stride 2 that turns 2 x 2 tokens of a frame into one of the new width.
 
-    Each of the old channels makes as many new ones, as published; where the new width is no
-    multiple of the old, the least groups of channels that divide both.
+    As in Long-LRM (Ziwen et al. 2025), each old channel makes the same number of new ones. Where
+    the new width is no multiple of the old, the smallest groups of channels that divide both do.
     """
 
     def __init__(self, width: int, new_width: int):
@@ -154,16 +154,16 @@ class TokenMerge(nn.Module):
 
 def build_single_branch(
     stage_widths: Sequence[int],
-    head_width: int = 64,
+    head_dim: int = 64,
     width: float = 1.0,
     geometry_ratio: float | None = None,
     parameter_budget: float = 1.0,
     **components,
 ) -> SingleBranch:
-    """A SingleBranch of the given widths times `width`.
+    """Build a SingleBranch of the given widths times `width`.
 
     Args:
-        stage_widths, head_width: at width 1.
+        stage_widths, head_dim: at width 1.
         width: multiplies the widths.
         geometry_ratio, parameter_budget: must be None and 1: there is nothing to share.
         components: the other arguments of SingleBranch.
@@ -176,5 +176,5 @@ def build_single_branch(
             f"geometry_ratio={geometry_ratio} and parameter_budget={parameter_budget} have no "
             "meaning for a model of one branch: leave them out, or take an asysplat_* model."
         )
-    widths = Widths(tuple(stage_widths), head_width, head_width).scaled(width)
+    widths = Widths(tuple(stage_widths), head_dim, head_dim).scaled(width)
     return SingleBranch(widths, **components)

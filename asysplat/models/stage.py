@@ -1,38 +1,25 @@
-"""One stage of tokens: to its width, then its layers (paper, Eq. 1)."""
+"""One network stage: tokens to its width, then its layer mix (paper, Eq. 1 and Table 6b)."""
 
+import re
 from collections.abc import Callable, Mapping
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from asysplat.models.layer_mix import parse_layer_mix
+from asysplat.errors import InputError
 from asysplat.models.layers import Layers
 from asysplat.models.shapes import StageShape
 
 Component = Callable[..., nn.Module]
 
 
-def stage_layers(shape: StageShape, layers: str, blocks: Mapping[str, Component]) -> Layers:
-    """The layer mix of a stage, letters of `blocks`.
-
-    Raises:
-        InputError: an unusable layer mix.
-    """
-    return Layers(*(blocks[letter](shape) for letter in parse_layer_mix(layers, set(blocks))))
-
-
-def to_width(previous_width: int, width: int) -> nn.Module:
-    """A projection where widths differ."""
-    return nn.Identity() if previous_width == width else nn.Linear(previous_width, width)
-
-
 class Stage(nn.Module):
-    """Project the tokens to d_s, then apply the layer mix.
+    """A network stage: project the tokens to d_s, then apply the layer mix.
 
     Args:
         previous_width: of the tokens that come in.
         shape: of this stage.
-        layers: the layer mix, letters of `blocks`.
+        layers: the layer mix, counts and letters of `blocks`.
         blocks: letter -> component built from a StageShape.
 
     Raises:
@@ -48,7 +35,42 @@ class Stage(nn.Module):
     ):
         super().__init__()
         self.project = to_width(previous_width, shape.width)
-        self.layers = stage_layers(shape, layers, blocks)
+        self.layers = build_layers(shape, layers, blocks)
 
     def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w e"]:
         return self.layers(self.project(tokens))
+
+
+def to_width(previous_width: int, width: int) -> nn.Module:
+    """Build a projection, or nothing where both widths are the same."""
+    return nn.Identity() if previous_width == width else nn.Linear(previous_width, width)
+
+
+def build_layers(shape: StageShape, layers: str, blocks: Mapping[str, Component]) -> Layers:
+    """Build the layer mix of a network stage, counts and letters of `blocks`.
+
+    Raises:
+        InputError: an unusable layer mix.
+    """
+    return Layers(*(blocks[letter](shape) for letter in parse_layer_mix(layers, set(blocks))))
+
+
+def parse_layer_mix(mix: str, letters: set[str]) -> list[str]:
+    """Return one letter for each layer: "4m4s" (or "4m+4s") gives m m m m s s s s.
+
+    Args:
+        mix: counts and letters.
+        letters: the letters that name a block.
+
+    Raises:
+        InputError: anything else, or no layer at all.
+    """
+    terms = re.findall(r"(\d+)([a-z])", mix)
+    layers = [letter for count, letter in terms for _ in range(int(count))]
+    well_formed = "".join(f"{count}{letter}" for count, letter in terms) == mix.replace("+", "")
+    if not well_formed or not layers or not letters.issuperset(layers):
+        raise InputError(
+            f"model.layers={mix!r}: expected counts and letters of {sorted(letters)}, "
+            "such as 4m4s or 7m1t."
+        )
+    return layers

@@ -11,7 +11,7 @@ PIXEL_CHANNELS = 9
 
 
 def pixel_features(views: Views) -> Float[Tensor, "B V H W 9"]:
-    """RGB in [-1, 1], ray moment o x d and unit direction d of every pixel."""
+    """Return RGB in [-1, 1], ray moment o x d and unit direction d of every pixel."""
     origins, directions = views.cameras.rays()
     colours = rearrange(views.images, "b v c h w -> b v h w c") * 2 - 1
     return torch.cat((colours, torch.linalg.cross(origins, directions), directions), dim=-1)

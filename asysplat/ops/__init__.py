@@ -1,7 +1,9 @@
 """The operators that a reconstruction spends its time in.
 
 Each is a folder: `reference.py` reads like the formula and takes float64, the other files are
-faster forms that are tested against it.
+faster forms that are tested against it. Those of the scans: `chunked.py` in torch, and the kernels
+in cpu/ and cuda/, where `scan.py` runs both passes, `forward.py` and `backward.py` hold the kernels
+of each, and `chunk.py` what these share.
 """
 
 from asysplat.ops.grid_attention import grid_attention

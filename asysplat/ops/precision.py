@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def without_autocast(tensor: Tensor) -> AbstractContextManager:
-    """Autocast off on the tensor's device; the meta device has none to turn off."""
+    """Switch autocast off on the tensor's device; the meta device has none."""
     if tensor.device.type == "meta":
         return nullcontext()
     return torch.autocast(tensor.device.type, enabled=False)

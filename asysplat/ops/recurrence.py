@@ -13,9 +13,9 @@ from torch.utils.flop_counter import register_flop_formula
 def linear_recurrence(
     decay: Float[Tensor, "L *state"], inputs: Float[Tensor, "L *state"]
 ) -> Float[Tensor, "L *state"]:
-    """h_t = decay_t h_{t-1} + inputs_t with h_{-1} = 0; time is the first dimension.
+    """Return all h_t = decay_t h_{t-1} + inputs_t with h_{-1} = 0; time is the first dimension.
 
-    One fused multiply-add a step, and a backward that is the same recurrence run from the end.
+    A step is one fused multiply-add; the backward pass is the same recurrence run from the end.
     """
     return _forward(decay, inputs)
 
@@ -70,11 +70,11 @@ _forward.register_autograd(_gradients, setup_context=_save)
 
 @register_flop_formula(torch.ops.asysplat.linear_recurrence)
 def _flops(decay_shape, inputs_shape, *_, **__) -> int:
-    """One multiplication and one addition an element."""
+    """Count one multiplication and one addition for each element."""
     return 2 * torch.Size(inputs_shape).numel()
 
 
 @register_flop_formula(torch.ops.asysplat.linear_recurrence_backward)
 def _backward_flops(decay_shape, states_shape, *_, **__) -> int:
-    """The recurrence once more, and the gradient of the decay."""
+    """Count the recurrence once more, and the gradient of the decay."""
     return 3 * torch.Size(states_shape).numel()

@@ -5,7 +5,7 @@ import torch
 from hydra.errors import InstantiationException
 
 from asysplat.errors import InputError, input_error_behind
-from asysplat.models.layer_mix import parse_layer_mix
+from asysplat.models.stage import parse_layer_mix
 from asysplat.scene import Cameras, Views
 
 TINY = ["width=0.125", "model.blocks.m.state_size=8", "model.layers=1m1s"]
@@ -19,7 +19,7 @@ def make_views(batch=(2,), views=3, height=32, width=64):
     return Views(cameras, torch.rand(*batch, views, 3, height, width))
 
 
-# Every model of architecture.md and its parameters in this layout, in units of 1e6.
+# Every model of architecture.md and its parameters as built here, in units of 1e6.
 PARAMETERS = {
     "asysplat_4m4s": 98.11,
     "asysplat_7m1s": 86.84,
@@ -66,7 +66,7 @@ def test_geometry_ratio(build, ratio, width):
     total, expected = (sum(p.numel() for p in n.parameters()) for n in (net, base))
     assert abs(net.geometry_share() - ratio) <= 0.015
     assert abs(total / expected - 1) < 0.01
-    assert all(width % net.widths.head == 0 for width in (*net.widths.stages, net.widths.fine))
+    assert all(width % net.widths.head_dim == 0 for width in (*net.widths.stages, net.widths.fine))
     stages = "/".join(map(str, net.widths.stages))
     assert f"stages {stages} wide" in net.describe() and f"{net.widths.fine} wide" in net.describe()
 
@@ -208,16 +208,16 @@ def test_token_maps_that_the_grid_does_not_divide(build, model):
 
 
 @pytest.mark.parametrize(
-    ("word", "layers"), [("4m4s", "mmmmssss"), ("7m+1t", "mmmmmmmt"), ("1s2m", "smm")]
+    ("mix", "layers"), [("4m4s", "mmmmssss"), ("7m+1t", "mmmmmmmt"), ("1s2m", "smm")]
 )
-def test_layer_mix(word, layers):
-    assert "".join(parse_layer_mix(word, {"m", "s", "t"})) == layers
+def test_layer_mix(mix, layers):
+    assert "".join(parse_layer_mix(mix, {"m", "s", "t"})) == layers
 
 
-@pytest.mark.parametrize("word", ["", "4x4s", "m4", "0m", "4m-4s"])
-def test_layer_mix_that_cannot_be_read(word):
+@pytest.mark.parametrize("mix", ["", "4x4s", "m4", "0m", "4m-4s"])
+def test_layer_mix_that_cannot_be_read(mix):
     with pytest.raises(InputError, match="such as 4m4s"):
-        parse_layer_mix(word, {"m", "s", "t"})
+        parse_layer_mix(mix, {"m", "s", "t"})
 
 
 @pytest.mark.gpu

@@ -35,12 +35,12 @@ def test_tokens_in_half_precision():
     """As autocast gives them; the weights stay fp32, and so do their gradients."""
     leaves = inputs(4, torch.float32, length=200)
     half = [leaves[0].bfloat16().detach().requires_grad_(), *leaves[1:]]
-    pull = torch.randn(2, 200, 6, generator=torch.Generator().manual_seed(1))
+    grad_output = torch.randn(2, 200, 6, generator=torch.Generator().manual_seed(1))
     with torch.autocast("cpu", torch.bfloat16):
         y = depthwise_conv(*half, 3)
-    grads = torch.autograd.grad(y, half, pull.bfloat16())
+    grads = torch.autograd.grad(y, half, grad_output.bfloat16())
     expected = as_sequences(*leaves, 3)
-    exact = torch.autograd.grad(expected, leaves, pull)
+    exact = torch.autograd.grad(expected, leaves, grad_output)
     assert y.dtype == grads[0].dtype == torch.bfloat16 and grads[1].dtype == torch.float32
     for found, value in zip((y, *grads), (expected, *exact), strict=True):
         assert (found.float() - value).norm() <= 1e-2 * value.norm()

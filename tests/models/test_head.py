@@ -73,8 +73,8 @@ def test_longlrm_by_hand():
     views = make_views()
     numbers = torch.arange(59.0) / 10 - 2
     gaussians, _ = decode("longlrm", numbers, views)
-    reach = 500 * torch.sigmoid(numbers[:3].mean())
-    torch.testing.assert_close(distances(gaussians, views), reach.expand(2, 64))
+    distance = 500 * torch.sigmoid(numbers[:3].mean())
+    torch.testing.assert_close(distances(gaussians, views), distance.expand(2, 64))
     assert (gaussians.quats == numbers[3:7]).all()
     torch.testing.assert_close(gaussians.scales[0, 0], (numbers[7:10] - 6.9).exp())
     torch.testing.assert_close(gaussians.opacities[0, 0], (numbers[10] - 2).sigmoid())

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.lanes import LANES
 from asysplat.ops.cpu.products import ROWS, add_product, add_triangle, transpose
+from asysplat.ops.cpu.vectors import LANES
 
 SIDE = 4 * ROWS
 

@@ -26,9 +26,9 @@ def kernel(test):
     return test if INTERPRETED else pytest.mark.gpu(test)
 
 
-def arguments(name, length, batch=2, channels=3, width=16, state=16, dtype=torch.float32):
-    """x, dt, A, B, C, D; `channels` heads of `width`, or channels."""
-    heads = (channels, width) if name == "ssd" else (channels,)
+def arguments(name, length, batch=2, channels=3, head_dim=16, state=16, dtype=torch.float32):
+    """x, dt, A, B, C, D; `channels` heads of `head_dim`, or channels."""
+    heads = (channels, head_dim) if name == "ssd" else (channels,)
     rates = (channels,) if name == "ssd" else (channels, state)
     return [
         torch.randn(batch, length, *heads).to(dtype),
@@ -79,7 +79,7 @@ def test_output_and_gradients_are_those_of_the_reference(name, chunks, more, rev
 @pytest.mark.parametrize("name", SCANS)
 def test_wide_heads_and_states(name):
     channels = 2 if name == "ssd" else 18  # more than a program has
-    check(name, arguments(name, 17, batch=1, channels=channels, width=64, state=64))
+    check(name, arguments(name, 17, batch=1, channels=channels, head_dim=64, state=64))
     if name == "ssd":  # of more than a program's columns
         check(name, arguments(name, 17, batch=1, channels=1, state=128))
 
@@ -135,7 +135,7 @@ def test_a_state_may_be_larger_than_half_precision_holds(name):
     "name, sizes, message",
     [
         ("ssd", {"state": 24}, "state size of 24: expected a power of two from 16 to 256"),
-        ("ssd", {"width": 8}, "head width of 8: expected a power of two from 16 to 128"),
+        ("ssd", {"head_dim": 8}, "head_dim of 8: expected a power of two from 16 to 128"),
         ("selective_scan", {"state": 8}, "state size of 8: expected a power of two from 16 to 256"),
     ],
 )
@@ -149,7 +149,7 @@ def test_sizes_that_kernels_cannot_take(name, sizes, message):
 @pytest.mark.parametrize("name", SCANS)
 @pytest.mark.parametrize("reverse", [False, True])
 def test_long_sequences_are_those_of_the_chunked_form_and_the_same_every_time(name, reverse):
-    tensors = arguments(name, 10_007, channels=28, width=64, state=256 if name == "ssd" else 16)
+    tensors = arguments(name, 10_007, channels=28, head_dim=64, state=256 if name == "ssd" else 16)
     check(name, tensors, reverse, backend="chunked")
     check(
         name,

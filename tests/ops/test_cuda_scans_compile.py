@@ -14,25 +14,28 @@ TYPES = {torch.bfloat16: "bf16", torch.float32: "fp32"}
 SCANS = {"ssd": ssd, "selective_scan": selective_scan}
 KERNELS = {
     "ssd": {
-        *("sum_decays", "pass_on", "multiply_vectors", "output_chunk", "head_gradients"),
-        *("score_gradients", "vector_gradients"),
+        *("sum_decays", "pass_states", "score_chunk", "forward_chunk"),
+        *("head_gradients", "score_gradients", "projection_gradients"),
     },
-    "selective_scan": {"add_up", "pass_on", "scan_chunk", "scan_chunk_backward"},
+    "selective_scan": {"sum_chunk", "pass_states", "forward_chunk", "backward_chunk"},
 }
 
 
-def compiled(kernel, arguments, constants, architecture):
+def compiled(kernel, arguments, architecture):
+    """The kernel for these arguments, constants and options of a launch, all by name."""
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
-    names = kernel.arg_names
-    options = {name: constants.pop(name) for name in list(constants) if name not in names}
-    signature = {
-        name: "*" + TYPES[value.dtype] if isinstance(value, torch.Tensor) else "i32"
-        for name, value in zip(names, arguments, strict=False)
-    }
-    signature |= dict.fromkeys(constants, "constexpr")
-    source = ASTSource(kernel, {name: signature[name] for name in names}, constants)
+    signature, constants = {}, {}
+    for parameter in kernel.params:
+        name, value = parameter.name, arguments.pop(parameter.name)
+        if parameter.is_constexpr:
+            signature[name], constants[name] = "constexpr", value
+        else:
+            is_array = isinstance(value, torch.Tensor)
+            signature[name] = "*" + TYPES[value.dtype] if is_array else "i32"
+    source = ASTSource(kernel, signature, constants)
+    options = arguments
     return triton.compile(source, GPUTarget("cuda", architecture, 32), options)
 
 
@@ -45,27 +48,27 @@ def compiled(kernel, arguments, constants, architecture):
 def test_all_kernels_compile(monkeypatch, name, architecture, dtype):
     from triton.runtime.jit import JITFunction
 
-    stages = import_module("asysplat.ops.selective_scan.cuda.stages")
+    scan = import_module("asysplat.ops.selective_scan.cuda.scan")
     kernels = {}
 
-    def run(kernel, *arguments, grid, warmup, **constants):
+    def run(kernel, *arguments, grid, warmup, **others):
         name = kernel.fn.__name__
-        variant = (name, constants.get("GRADIENT", constants.get("OF_B")))
+        arguments = dict(zip(kernel.arg_names, arguments, strict=False)) | others
+        variant = (name, arguments.get("GRADIENT", arguments.get("OF_B")))
         if variant not in kernels:
-            kernels[variant] = compiled(kernel, arguments, constants, architecture)
+            kernels[variant] = compiled(kernel, arguments, architecture)
 
     monkeypatch.setattr(JITFunction, "run", run)
     monkeypatch.setattr("asysplat.ops.dispatch._interpreted", lambda backend: True)
     # As few unrolled tokens as show all: the compiler takes seconds for each.
-    monkeypatch.setattr(stages, "FORWARD_CHUNK", 2)
-    monkeypatch.setattr(stages, "BACKWARD_CHUNK", 2)
+    monkeypatch.setattr(scan, "FORWARD_CHUNK", 2)
+    monkeypatch.setattr(scan, "BACKWARD_CHUNK", 2)
     heads, state = ((2, 16), 128) if name == "ssd" else ((2,), 16)
     x = torch.zeros(1, 70, *heads, dtype=dtype, requires_grad=True)
-    vectors = torch.zeros(1, 70, state, dtype=dtype)
+    projection = torch.zeros(1, 70, state, dtype=dtype)
     rates = torch.zeros(2) if name == "ssd" else torch.zeros(2, state)
-    y = SCANS[name](
-        x, torch.zeros(1, 70, 2), rates, vectors, vectors, torch.zeros(2), backend="cuda"
-    )
+    dt, skip = torch.zeros(1, 70, 2), torch.zeros(2)
+    y = SCANS[name](x, dt, rates, projection, projection, skip, backend="cuda")
     y.sum().backward()
     assert {kernel for kernel, _ in kernels} == KERNELS[name]
     assert all(kernel.asm["cubin"] for kernel in kernels.values())

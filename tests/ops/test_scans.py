@@ -8,9 +8,9 @@ from asysplat.errors import InputError
 from asysplat.ops import selective_scan, ssd
 
 
-def ssd_arguments(batch=2, length=7, heads=3, head_width=4, state=5, dtype=torch.float64):
+def ssd_arguments(batch=2, length=7, heads=3, head_dim=4, state=5, dtype=torch.float64):
     return (
-        torch.randn(batch, length, heads, head_width, dtype=dtype),
+        torch.randn(batch, length, heads, head_dim, dtype=dtype),
         torch.rand(batch, length, heads, dtype=dtype),
         -torch.rand(heads, dtype=dtype) - 0.1,
         torch.randn(batch, length, state, dtype=dtype),
@@ -127,9 +127,9 @@ def test_nothing_is_kept_where_no_gradient_is_asked_for(name):
     scan, make, _ = SCANS[name]
     arguments = make(length=70, dtype=torch.float32)
     operator = getattr(torch.ops.asysplat, name).default
-    y, carried = operator("cpu", *arguments, False, True)
+    y, saved_state = operator("cpu", *arguments, False, True)
     without, nothing = operator("cpu", *arguments, False, False)
-    assert torch.equal(without, y) and carried.numel() > 0 and nothing.numel() == 0
+    assert torch.equal(without, y) and saved_state.numel() > 0 and nothing.numel() == 0
     assert torch.equal(scan(*arguments), y)
 
 

@@ -1,4 +1,4 @@
-"""How every function here is compiled: once, kept on disk, and without Python's lock."""
+"""How every kernel for CPUs is compiled: once, kept on disk, and without Python's lock."""
 
 import hashlib
 import inspect
@@ -15,7 +15,7 @@ PACKAGE = HERE.parent.parent
 
 
 def kernel(function: Callable) -> Callable:
-    """Compile what threads run. NUMBA_BOUNDSCHECK=1 has every index checked, for tests."""
+    """Compile what threads run; with NUMBA_BOUNDSCHECK=1 every index is checked, for tests."""
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = _cache_folder(before)
     try:
@@ -25,19 +25,22 @@ def kernel(function: Callable) -> Callable:
 
 
 def inline(function: Callable) -> Callable:
-    """A part of kernels, compiled into each of them."""
+    """Compile a function into each kernel that calls it."""
     return njit(inline="always", error_model="numpy")(_bare(function))
 
 
 def _bare(function: Callable) -> Callable:
-    """Without what a type checker has put around it, which cannot be compiled."""
+    """Take off what a type checker has put around a function, which cannot be compiled."""
     return inspect.unwrap(function)
 
 
 @cache
 def _cache_folder(asked: str) -> str:
-    """Another one for every version of the sources, and for kernels with checks: Numba looks at a
-    kernel's own file alone, and would keep one whose parts, in other files, have changed."""
+    """Return the folder for this version of the sources, checked kernels in one of their own.
+
+    Numba itself looks only at a kernel's own file: it would go on using a compiled kernel whose
+    parts, in other files, have changed.
+    """
     paths = [path for folder in ("ops", "rendering") for path in (PACKAGE / folder).rglob("*.py")]
     sources = b"".join(path.read_bytes() for path in sorted(paths))
     beside = HERE / "__pycache__"

@@ -1,4 +1,4 @@
-"""Products of small matrices inside kernels: their factors are near the processor already.
+"""Products of small matrices inside kernels, whose factors are in the cache already.
 
 A tile of ROWS x LANES sums stays in registers, and every sum is taken in the order of its terms,
 rounded once a term: how the matrices are cut changes no bit.
@@ -22,7 +22,7 @@ BYTES = 4  # of a float32
 
 @inline
 def add_product(out, a, b, keep):
-    """out = keep out + a b; `keep` = 0 forgets what stood there, were it not a number.
+    """Compute out = keep out + a b; with `keep` = 0, NaN in `out` is overwritten too.
 
     Args:
         out: [rows, columns], columns in whole vectors of LANES, one after the other.
@@ -40,7 +40,7 @@ def add_product(out, a, b, keep):
 
 @inline
 def add_triangle(out, a, b, upper):
-    """out += a b, where square `a` has zeros below its diagonal (`upper`) or above it.
+    """Compute out += a b, where square `a` has zeros below its diagonal (`upper`) or above it.
 
     Its side is a multiple of ROWS; beside the squares of ROWS on the diagonal, no zero is read.
     """
@@ -67,7 +67,7 @@ def transpose(matrix, out):
 
 @intrinsic
 def transpose_tile(typing_context, matrix, out, row, column):
-    """Of LANES x LANES numbers from that row and column on."""
+    """Write the transpose of LANES x LANES numbers, from `row` and `column` of `matrix` on."""
 
     def generate(context, builder, signature, args):
         source, target = (_Matrix(context, builder, signature.args[i], args[i]) for i in range(2))
@@ -97,13 +97,16 @@ def transpose_tile(typing_context, matrix, out, row, column):
 
 
 def _interleaved(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, first: int) -> ir.Value:
-    """Half of both, from the number `first` on."""
+    """Interleave LANES / 2 numbers of both vectors, from the number `first` on."""
     order = [i for k in range(first, first + LANES // 2) for i in (k, LANES + k)]
     return builder.shuffle_vector(a, b, ir.Constant(INTEGERS, order))
 
 
 def _tile(rows: int):
-    """out[row : row + rows, column : column + LANES] = keep out + a b, terms first to last."""
+    """Make the intrinsic that computes keep out + a b for rows x LANES numbers of `out`.
+
+    They begin at `row` and `column`; the terms summed are `first` to `last`.
+    """
 
     @intrinsic
     def add(typing_context, out, a, b, row, column, first, last, keep):
@@ -143,7 +146,7 @@ def _generate_tile(builder, rows, matrices, row, column, first, last, keep):
 
 
 class _Matrix:
-    """A float32 array in the code that is written, of any strides."""
+    """A float32 array of any strides, in the code that is generated."""
 
     def __init__(self, context: BaseContext, builder: ir.IRBuilder, kind: types.Array, value):
         array = context.make_array(kind)(context, builder, value)
@@ -153,19 +156,19 @@ class _Matrix:
         self.strides = [builder.extract_value(array.strides, axis) for axis in range(2)]
 
     def check(self, row, rows, column, columns) -> None:
-        """See `check_range`; counts are int or values."""
+        """Check both ranges by `check_range`; counts are int or values of the generated code."""
         for first, count, length in zip((row, column), (rows, columns), self.shape, strict=True):
             count = first.type(count) if isinstance(count, int) else count
             check_range(self.context, self.builder, first, count, length)
 
     def element(self, row: ir.Value, column: ir.Value) -> ir.Value:
-        """Pointer to it."""
+        """Return a pointer to an element."""
         offsets = map(self.builder.mul, (row, column), self.strides)
         byte = self.builder.gep(self.data, [self.builder.add(*offsets)])
         return self.builder.bitcast(byte, ir.FloatType().as_pointer())
 
     def vector(self, row: ir.Value, column: ir.Value) -> ir.Value:
-        """Pointer to LANES elements from this one on."""
+        """Return a pointer to LANES elements from this one on."""
         return self.builder.bitcast(self.element(row, column), FLOATS.as_pointer())
 
 

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 Result = TypeVar("Result")
-PER_THREAD = 4  # portions of the work, so that an uneven one is made up for
+PER_THREAD = 4  # portions of the work: other threads take more of them while one is slow
 
 
 def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:
-    """Run `kernel(start, stop, *args)` for neighbouring numbers of `bounds`, in any order; the
-    results in that of `bounds`.
+    """Run `kernel(start, stop, *args)` for neighbouring numbers of `bounds`, in any order.
 
+    The results are returned in the order of `bounds`.
     What a kernel writes must depend on its range alone: then the number of threads changes no bit.
     """
     threads = torch.get_num_threads()
@@ -30,12 +30,12 @@ def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object)
 
 
 def even_bounds(count: int) -> np.ndarray:
-    """Portions of `count` blocks of equal cost."""
+    """Cut `count` blocks of equal cost into portions."""
     return np.linspace(0, count, min(count, _portions()) + 1).astype(np.int64)
 
 
 def weighted_bounds(ends: np.ndarray) -> np.ndarray:
-    """Portions of blocks whose costs sum to `ends`, [0, ..., total]."""
+    """Cut blocks whose costs add up to `ends`, [0, ..., total], into portions."""
     targets = np.linspace(ends[0], ends[-1], _portions() + 1)
     bounds = np.searchsorted(ends, targets)
     bounds[0], bounds[-1] = 0, len(ends) - 1
@@ -52,5 +52,5 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="asysplat")
 
 
-# A forked process has none of its parent's threads.
+# A forked process starts without its parent's threads.
 os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -1,4 +1,4 @@
-"""Sixteen float32 as one value of Numba's: what a loop carries stays in a register.
+"""Sixteen float32 as one value of Numba's, which a loop keeps in a register.
 
 A float32 stands for sixteen equal ones wherever a vector is asked for.
 """
@@ -38,7 +38,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def splat(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
-    """A vector of equal numbers."""
+    """Return a vector of equal numbers."""
     undefined = ir.Constant(ir.VectorType(value.type, LANES), ir.Undefined)
     one = builder.insert_element(undefined, value, ir.IntType(32)(0))
     return builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
@@ -50,7 +50,7 @@ def _splat(context, builder, from_type, to_type, value):
 
 
 def emit_fma(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
-    """a * b + c, rounded once where the processor can do that; of vectors or of float32."""
+    """Return a * b + c of vectors or float32, rounded once where the processor can do that."""
     if not HAS_FMA:
         return builder.fadd(builder.fmul(a, b), c)
     if a.type != FLOATS:
@@ -61,8 +61,10 @@ def emit_fma(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir
 
 
 def check_range(context, builder, first, count, length) -> None:
-    """Let the kernel raise IndexError unless `count` elements from `first` on are among `length`,
-    as Numba does for single ones; nothing without NUMBA_BOUNDSCHECK=1."""
+    """With NUMBA_BOUNDSCHECK=1, let the kernel raise IndexError for a range outside an array.
+
+    It does unless `count` elements from `first` on are among `length`, as Numba does for one index.
+    """
     if not numba.config.BOUNDSCHECK:
         return
     with builder.if_then(builder.icmp_signed(">", count, count.type(0))):
@@ -73,7 +75,7 @@ def check_range(context, builder, first, count, length) -> None:
 
 @intrinsic
 def fma(typing_context, a, b, c):
-    """a * b + c, rounded once where the processor can do that; of vectors or of float32."""
+    """Return a * b + c of vectors or float32, rounded once where the processor can do that."""
     kind = VECTOR if VECTOR in (a, b, c) else a
 
     def generate(context, builder, signature, args):
@@ -84,7 +86,7 @@ def fma(typing_context, a, b, c):
 
 @intrinsic
 def load(typing_context, rows, row):
-    """Row `row` of a contiguous array [rows, LANES]."""
+    """Load row `row` of a contiguous array [rows, LANES]."""
 
     def generate(context, builder, signature, args):
         return builder.load(vector_at(context, builder, signature, args), align=4)
@@ -105,7 +107,7 @@ def store(typing_context, rows, row, value):
 
 @intrinsic
 def load_some(typing_context, numbers, first, count):
-    """Up to LANES numbers from `first` on of a contiguous array, and zeros behind `count`."""
+    """Load `count` numbers of a contiguous array from `first` on, and zeros up to LANES."""
 
     def generate(context, builder, signature, args):
         pointer, mask = _some(context, builder, signature, args)
@@ -120,7 +122,7 @@ def load_some(typing_context, numbers, first, count):
 
 @intrinsic
 def store_some(typing_context, numbers, first, count, value):
-    """Write the first `count` of a vector's numbers to `first` and on of a contiguous array."""
+    """Write the first `count` of a vector's numbers to a contiguous array, from `first` on."""
 
     def generate(context, builder, signature, args):
         pointer, mask = _some(context, builder, signature, args)
@@ -135,7 +137,7 @@ def store_some(typing_context, numbers, first, count, value):
 
 @intrinsic
 def zeros(typing_context):
-    """A vector of them."""
+    """Return a vector of zeros."""
 
     def generate(context, builder, signature, args):
         return ir.Constant(FLOATS, [0.0] * LANES)
@@ -145,7 +147,7 @@ def zeros(typing_context):
 
 @intrinsic
 def total(typing_context, value):
-    """The sum of a vector's numbers."""
+    """Return the sum of a vector's numbers."""
 
     def generate(context, builder, signature, args):
         return sum_of(builder, args[0])
@@ -154,16 +156,19 @@ def total(typing_context, value):
 
 
 def sum_of(builder: ir.IRBuilder, vector: ir.Value) -> ir.Value:
+    """Return the sum of a vector's numbers."""
     kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), FLOATS])
     name = f"llvm.vector.reduce.fadd.v{LANES}f32"
     function = cgutils.get_or_insert_function(builder.module, kind, name)
-    # Without an order to keep, it is the tree that the processor does best.
+    # "reassoc" frees the compiler to add in the order that is fastest on the processor.
     return builder.call(function, [ir.FloatType()(-0.0), vector], fastmath=("reassoc",))
 
 
 def vector_at(context, builder, signature, args, step=LANES):
-    """Pointer to LANES elements of a contiguous array, args[0], from the element args[1] x `step`
-    on."""
+    """Return a pointer to LANES elements of the contiguous array args[0].
+
+    They begin at the element args[1] x `step`.
+    """
     array = context.make_array(signature.args[0])(context, builder, args[0])
     index = context.cast(builder, args[1], signature.args[1], types.intp)
     first = builder.mul(index, index.type(step))
@@ -172,7 +177,7 @@ def vector_at(context, builder, signature, args, step=LANES):
 
 
 def _some(context, builder, signature, args):
-    """Pointer to the number args[1] of an array, and which of LANES are among args[2]."""
+    """Return a pointer to element args[1] of args[0], and a mask of the first args[2] lanes."""
     array = context.make_array(signature.args[0])(context, builder, args[0])
     first = context.cast(builder, args[1], signature.args[1], types.intp)
     count = context.cast(builder, args[2], signature.args[2], types.intp)
@@ -184,7 +189,7 @@ def _some(context, builder, signature, args):
 
 
 def _arithmetic(symbol: Callable, instruction: str) -> None:
-    """Let `symbol` take vectors."""
+    """Overload `symbol` for vectors."""
 
     @intrinsic
     def compute(typing_context, a, b):

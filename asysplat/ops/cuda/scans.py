@@ -15,14 +15,14 @@ FUSED = {"enable_fp_fusion": True}  # nothing here decides between two results
 
 @kernel
 def tokens_at(position, length, REVERSE: tl.constexpr):
-    """Indices (int64) of the tokens at these positions, and whether they are there."""
+    """Return the indices (int64) of the tokens at these positions, and which of them exist."""
     position = tl.cast(position, tl.int64)
     token = length - 1 - position if REVERSE else position
     return token, position < length
 
 
 def check_size(operator: str, name: str, size: int, most: int) -> None:
-    """Raises InputError unless `size` is a power of two from 16 to `most`."""
+    """Raise InputError unless `size` is a power of two from 16 to `most`."""
     if size < 16 or size > most or size & (size - 1):
         raise InputError(
             f"{operator}'s backend 'cuda' got a {name} of {size}: expected a power of two from 16 "

@@ -22,10 +22,10 @@ def grid_attention(
     grid: int,
     backend: str = "auto",
 ) -> Float[Tensor, "B V h w H P"]:
-    """Token (i, j) of every view attends to the tokens (i + a p_g, j + b p_g) of all views.
+    """Let token (i, j) of every view attend to tokens (i + a p_g, j + b p_g) of all views.
 
     Args:
-        q, k, v: token maps of V views, H heads of width P.
+        q, k, v: token maps of V views and H heads, P the head_dim.
         grid: p_g; 1 is full attention.
 
     Raises:

@@ -11,7 +11,7 @@ def grid_attention_reference(
     v: Float[Tensor, "B V h w H P"],
     grid: int,
 ) -> Float[Tensor, "B V h w H P"]:
-    """See `asysplat.ops.grid_attention`."""
+    """Attend by a masked softmax; see `asysplat.ops.grid_attention`."""
     views, height, width = q.shape[1:4]
     rows = torch.arange(height, device=q.device)[:, None] % grid
     columns = torch.arange(width, device=q.device) % grid

@@ -13,7 +13,7 @@ def grid_attention_sdpa(
     v: Float[Tensor, "B V h w H P"],
     grid: int,
 ) -> Float[Tensor, "B V h w H P"]:
-    """See `asysplat.ops.grid_attention`."""
+    """Attend by torch's fused attention; see `asysplat.ops.grid_attention`."""
     views, height, width = q.shape[1:4]
     below, right = -height % grid, -width % grid
     mask = None
@@ -33,7 +33,7 @@ def grid_attention_sdpa(
 def _real_tokens(
     height: int, width: int, grid: int, padded: Float[Tensor, "B V h w H P"]
 ) -> Bool[Tensor, "place 1 1 key"]:
-    """Which keys of a grid place are no padding; all where there is nothing else to see."""
+    """Return which keys of a grid place are no padding; all where it has nothing else to see."""
     batch, views, rows, columns = padded.shape[:4]
     real = torch.zeros(rows, columns, dtype=torch.bool, device=padded.device)
     real[:height, :width] = True

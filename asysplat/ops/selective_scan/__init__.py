@@ -1,23 +1,41 @@
 """Selective scan of Mamba (Gu and Dao 2023, Eq. 2), as MambaVision uses it within a frame."""
 
+from types import ModuleType
+
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.dispatch import run_scan
-from asysplat.ops.scan_operator import scan_operator
+from asysplat.ops.scan import Scan, ScanInputs
 from asysplat.ops.selective_scan.chunked import selective_scan_chunked
 from asysplat.ops.selective_scan.reference import selective_scan_reference
 
 
 def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int, int]:
-    """A multiplication and an addition for each new state, and for each that is read; then the
-    states again, and four gradients."""
+    """Count a multiplication and an addition for each new state, and for each that is read.
+
+    The backward pass computes the states again, and four gradients.
+    """
     states = x_shape[0] * x_shape[1] * x_shape[2] * B_shape[-1]
     return 4 * states, 10 * states
 
 
-_FORMS = {"chunked": selective_scan_chunked, "reference": selective_scan_reference}
-_OPERATOR = scan_operator("selective_scan", count_flops)
+def _load_kernels(backend: str) -> ModuleType:
+    if backend == "cpu":
+        from asysplat.ops.selective_scan import cpu
+
+        return cpu
+    from asysplat.ops.selective_scan import cuda
+
+    return cuda
+
+
+_SCAN = Scan(
+    "selective_scan",
+    axes={"x": "B L D", "dt": "B L D", "A": "D N", "B": "B L N", "C": "B L N", "D": "D"},
+    forms={"chunked": selective_scan_chunked, "reference": selective_scan_reference},
+    load_kernels=_load_kernels,
+    count_flops=count_flops,
+)
 
 
 def selective_scan(
@@ -30,13 +48,13 @@ def selective_scan(
     backend: str = "auto",
     reverse: bool = False,
 ) -> Float[Tensor, "B L D"]:
-    """h_t = exp(dt_t A) h_{t-1} + dt_t B_t x_t and y_t = C_t . h_t + D x_t, per channel.
+    """Scan h_t = exp(dt_t A) h_{t-1} + dt_t B_t x_t, y_t = C_t . h_t + D x_t, per channel.
 
     Args:
         x: inputs; half precision is computed in fp32 and returned as it came.
         dt: step sizes > 0, after the softplus.
         A: < 0, so that no exponent is positive.
-        B, C: input and output vectors, shared by the channels.
+        B, C: input and output projections, shared by the channels.
         D: skip weight of each channel.
         backend: "cpu" or "cuda", "chunked" (torch, any device and float type), "reference", or
             "auto", which is the fast one for the device, and "chunked" for float64.
@@ -46,4 +64,4 @@ def selective_scan(
         InputError: an unknown backend, or one that cannot take these tensors; shapes or devices
             that do not go together; integers; no token.
     """
-    return run_scan("selective_scan", _FORMS, _OPERATOR, backend, (x, dt, A, B, C, D), reverse)
+    return _SCAN(ScanInputs(x, dt, A, B, C, D), backend, reverse)

@@ -11,7 +11,7 @@ from torch.utils.checkpoint import checkpoint
 
 from asysplat.ops.recurrence import linear_recurrence
 
-CHUNK = 256
+CHECKPOINT_CHUNK = 256  # tokens whose states are in memory at once
 
 
 def selective_scan_chunked(
@@ -22,10 +22,12 @@ def selective_scan_chunked(
     C: Float[Tensor, "B L N"],
     D: Float[Tensor, "D"],
 ) -> Float[Tensor, "B L D"]:
-    """See `asysplat.ops.selective_scan`."""
+    """Scan in torch; see `asysplat.ops.selective_scan`."""
     state = x.new_zeros(x.shape[0], *A.shape)
     outputs = []
-    for chunk in zip(*(tensor.split(CHUNK, dim=1) for tensor in (x, dt, B, C)), strict=True):
+    for chunk in zip(
+        *(tensor.split(CHECKPOINT_CHUNK, dim=1) for tensor in (x, dt, B, C)), strict=True
+    ):
         y, state = checkpoint(_chunk, *chunk, A, D, state, use_reentrant=False)
         outputs.append(y)
     return torch.cat(outputs, 1)
@@ -34,7 +36,7 @@ def selective_scan_chunked(
 def _chunk(
     x: Tensor, dt: Tensor, B: Tensor, C: Tensor, A: Tensor, D: Tensor, state: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """y of the chunk, and the state behind it."""
+    """Return y of the chunk, and the state after it."""
     # Time comes first, so that each step of the recurrence reads contiguous memory.
     xs, dts, Bs, Cs = (tensor.transpose(0, 1) for tensor in (x, dt, B, C))
     decay = torch.exp(dts[..., None] * A)

@@ -13,7 +13,7 @@ def selective_scan_reference(
     C: Float[Tensor, "B L N"],
     D: Float[Tensor, "D"],
 ) -> Float[Tensor, "B L D"]:
-    """See `asysplat.ops.selective_scan`."""
+    """Scan by the formula; see `asysplat.ops.selective_scan`."""
     state = x.new_zeros(x.shape[0], *A.shape)
     outputs = []
     for t in range(x.shape[1]):

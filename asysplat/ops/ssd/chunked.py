@@ -11,7 +11,7 @@ from torch import Tensor
 
 from asysplat.ops.recurrence import linear_recurrence
 
-CHUNK = 64
+CHUNK = 64  # tokens, of every form; FLOPs and the benchmark's lower bounds are those of this size
 
 
 def ssd_chunked(
@@ -22,7 +22,7 @@ def ssd_chunked(
     C: Float[Tensor, "B L N"],
     D: Float[Tensor, "H"],
 ) -> Float[Tensor, "B L H P"]:
-    """See `asysplat.ops.ssd`."""
+    """Scan in torch; see `asysplat.ops.ssd`."""
     length = x.shape[1]
     skip = D[:, None] * x
     # Padded tokens have dt = 0: they neither decay the state nor add to it.
@@ -40,13 +40,13 @@ def ssd_chunked(
         decay = rearrange(torch.exp(log_decay[:, :, -1]), "b c h -> c b h 1 1")
         states = linear_recurrence(decay.expand_as(added), added)
         before = F.pad(states[:-1], (0, 0, 0, 0, 0, 0, 0, 0, 1, 0))
-        carried = torch.einsum("bctn,cbhpn->bcthp", C, before)
-        y = y + carried * torch.exp(log_decay)[..., None]
+        from_before = torch.einsum("bctn,cbhpn->bcthp", C, before)
+        y = y + from_before * torch.exp(log_decay)[..., None]
     return rearrange(y, "b c q h p -> b (c q) h p")[:, :length] + skip
 
 
 def _into_chunks(tensor: Tensor) -> Tensor:
-    """[b L ...] -> [b c CHUNK ...], padded with zeros at the end."""
+    """Cut [b L ...] into [b c CHUNK ...], padded with zeros at the end."""
     missing = -tensor.shape[1] % CHUNK
     if missing:
         tensor = F.pad(tensor, (0, 0) * (tensor.ndim - 2) + (0, missing))
@@ -54,10 +54,10 @@ def _into_chunks(tensor: Tensor) -> Tensor:
 
 
 def _decay_between(exponents: Float[Tensor, "b c q h"]) -> Float[Tensor, "b c q q h"]:
-    """exp of the sum of exponents from token s (without) to token t >= s; 0 where s is later.
+    """Return exp of the sum of exponents from token s (without) to token t >= s; 0 for later s.
 
-    Sums, not differences of sums from the chunk's start: a token that forgets everything would
-    leave its rounding in all decays behind it.
+    They are sums, not differences of sums from the chunk's start: a token that forgets everything
+    would leave its rounding in all decays after it.
     """
     q = exponents.shape[2]
     ones = torch.ones(q, q, dtype=torch.bool, device=exponents.device)

@@ -13,9 +13,9 @@ def ssd_reference(
     C: Float[Tensor, "B L N"],
     D: Float[Tensor, "H"],
 ) -> Float[Tensor, "B L H P"]:
-    """See `asysplat.ops.ssd`."""
-    batch, length, heads, head_width = x.shape
-    state = x.new_zeros(batch, heads, head_width, B.shape[-1])
+    """Scan by the formula; see `asysplat.ops.ssd`."""
+    batch, length, heads, head_dim = x.shape
+    state = x.new_zeros(batch, heads, head_dim, B.shape[-1])
     outputs = []
     for t in range(length):
         decay = torch.exp(dt[:, t] * A)[..., None, None]

@@ -43,7 +43,7 @@ def make_arguments(
     rates: str = "1",
     batch: int = 2,
     channels: int = 3,
-    width: int = 4,
+    head_dim: int = 4,
     state: int = 5,
     dtype: torch.dtype = torch.float32,
     seed: int = 0,
@@ -53,7 +53,7 @@ def make_arguments(
     Args:
         steps, rates: dt and -A: a number, within a half of which they lie, or a name of STEPS or
             RATES.
-        channels: heads, for ssd.
+        channels: heads, for ssd; each of `head_dim`.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -64,7 +64,7 @@ def make_arguments(
         uniform = torch.rand(shape, generator=generator)
         return low * (high / low) ** uniform if kind == "spread" else float(kind) * (0.5 + uniform)
 
-    tail = (channels, width) if name == "ssd" else (channels,)
+    tail = (channels, head_dim) if name == "ssd" else (channels,)
     x, B, C = normal(batch, length, *tail), *normal(2, batch, length, state)
     dt = sizes("1e-8" if steps == "mixed" else steps, 1e-8, 1e3, batch, length, channels)
     if steps == "mixed":
@@ -74,7 +74,7 @@ def make_arguments(
     return x.to(dtype), dt, A, B.to(dtype), C.to(dtype), normal(channels)
 
 
-def random_pull(x: Tensor) -> Tensor:
+def random_grad_output(x: Tensor) -> Tensor:
     """A gradient of y, the same every time."""
     return torch.randn(x.shape, generator=torch.Generator().manual_seed(9)).to(x.dtype)
 
@@ -82,27 +82,27 @@ def random_pull(x: Tensor) -> Tensor:
 def both_ways(
     path: tuple[str, str],
     arguments: tuple[Tensor, ...],
-    grad_y: Tensor | None = None,
+    grad_output: Tensor | None = None,
     reverse: bool = False,
 ) -> Result:
-    """What a back end gives, forward and backward from `grad_y`; a random one unless told."""
+    """What a back end gives, forward and backward from `grad_output`; a random one unless told."""
     name, backend = path
     leaves = [argument.detach().clone().requires_grad_() for argument in arguments]
     y = SCANS[name](*leaves, backend=backend, reverse=reverse)
-    grad_y = random_pull(arguments[0]) if grad_y is None else grad_y
-    return Result(y.detach(), torch.autograd.grad(y, leaves, grad_y))
+    grad_output = random_grad_output(arguments[0]) if grad_output is None else grad_output
+    return Result(y.detach(), torch.autograd.grad(y, leaves, grad_output))
 
 
 def by_loop(
     path: tuple[str, str],
     arguments: tuple[Tensor, ...],
-    grad_y: Tensor | None = None,
+    grad_output: Tensor | None = None,
     reverse: bool = False,
     dtype: torch.dtype = torch.float64,
 ) -> Result:
     """The same by the loop over the tokens: exact unless in float32."""
-    grad_y = random_pull(arguments[0]) if grad_y is None else grad_y
-    return Result(*scan_loop(path[0], arguments, grad_y, reverse, dtype))
+    grad_output = random_grad_output(arguments[0]) if grad_output is None else grad_output
+    return Result(*scan_loop(path[0], arguments, grad_output, reverse, dtype))
 
 
 def relative_error(value: Tensor, exact: Tensor) -> float:
@@ -127,7 +127,7 @@ def sum_error(grad: Tensor, whole: Tensor) -> float:
 def assert_exact(
     path: tuple[str, str],
     arguments: tuple[Tensor, ...],
-    grad_y: Tensor | None = None,
+    grad_output: Tensor | None = None,
     reverse: bool = False,
     slack: float = 0,
 ) -> None:
@@ -137,13 +137,13 @@ def assert_exact(
         slack: for a case that is badly conditioned: an error that is larger than allowed, but not
             than so many times that of the loop over the tokens in float32, passes too.
     """
-    result = both_ways(path, arguments, grad_y, reverse)
+    result = both_ways(path, arguments, grad_output, reverse)
     for name, value in result.named().items():
         assert value.isfinite().all(), name
-    exact = by_loop(path, arguments, grad_y, reverse)
+    exact = by_loop(path, arguments, grad_output, reverse)
     allowed = dict.fromkeys(result.named(), ERROR[arguments[0].dtype])
     if slack:
-        single = errors(by_loop(path, arguments, grad_y, reverse, torch.float32), exact)
+        single = errors(by_loop(path, arguments, grad_output, reverse, torch.float32), exact)
         allowed = {name: max(bound, slack * single[name]) for name, bound in allowed.items()}
     for name, error in errors(result, exact).items():
         assert error <= allowed[name], name

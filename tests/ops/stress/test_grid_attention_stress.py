@@ -19,8 +19,8 @@ per_backend = pytest.mark.parametrize("backend", BACKENDS)
 per_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 
 
-def make_qkv(batch=2, views=3, height=4, width=6, heads=2, head_width=8, dtype=torch.float32):
-    shape = (batch, views, height, width, heads, head_width)
+def make_qkv(batch=2, views=3, height=4, width=6, heads=2, head_dim=8, dtype=torch.float32):
+    shape = (batch, views, height, width, heads, head_dim)
     return [tensor.to(dtype) for tensor in torch.randn(3, *shape)]
 
 
@@ -37,17 +37,17 @@ def by_formula(q, k, v, grid):
     return output
 
 
-def both_ways(attention, qkv, pull):
+def both_ways(attention, qkv, grad_output):
     leaves = [tensor.detach().clone().requires_grad_() for tensor in qkv]
     output = attention(*leaves)
-    return [output.detach(), *torch.autograd.grad(output, leaves, pull)]
+    return [output.detach(), *torch.autograd.grad(output, leaves, grad_output)]
 
 
 def assert_exact(backend, qkv, grid):
-    pull = torch.randn_like(qkv[2])
-    results = both_ways(lambda *t: grid_attention(*t, grid, backend=backend), qkv, pull)
+    grad_output = torch.randn_like(qkv[2])
+    results = both_ways(lambda *t: grid_attention(*t, grid, backend=backend), qkv, grad_output)
     double = [tensor.double() for tensor in qkv]
-    exact = both_ways(lambda *t: by_formula(*t, grid), double, pull.double())
+    exact = both_ways(lambda *t: by_formula(*t, grid), double, grad_output.double())
     for name, value, right in zip("oqkv", results, exact, strict=True):
         assert value.dtype == qkv[0].dtype, name
         assert value.isfinite().all(), name
@@ -72,9 +72,9 @@ def test_maps_that_the_grid_does_not_divide(backend, dtype, height, width, grid)
 
 
 @per_backend
-@pytest.mark.parametrize("heads, head_width", [(1, 1), (1, 64), (5, 3)])
-def test_every_width(backend, heads, head_width):
-    assert_exact(backend, make_qkv(heads=heads, head_width=head_width), 2)
+@pytest.mark.parametrize("heads, head_dim", [(1, 1), (1, 64), (5, 3)])
+def test_every_width(backend, heads, head_dim):
+    assert_exact(backend, make_qkv(heads=heads, head_dim=head_dim), 2)
 
 
 @per_backend
@@ -98,10 +98,10 @@ def test_large_scores(backend):
     """A probability is the exponential of a score, which is rounded in proportion to its size."""
     q, k, v = make_qkv()
     q, k = 10 * q, 10 * k
-    pull = torch.randn_like(v)
-    results = both_ways(lambda *t: grid_attention(*t, 2, backend=backend), (q, k, v), pull)
+    grad_output = torch.randn_like(v)
+    results = both_ways(lambda *t: grid_attention(*t, 2, backend=backend), (q, k, v), grad_output)
     double = [tensor.double() for tensor in (q, k, v)]
-    exact = both_ways(lambda *t: by_formula(*t, 2), double, pull.double())
+    exact = both_ways(lambda *t: by_formula(*t, 2), double, grad_output.double())
     largest = (q.norm(dim=-1).max() * k.norm(dim=-1).max()) / q.shape[-1] ** 0.5
     for name, value, right in zip("oqkv", results, exact, strict=True):
         error = relative_error(value, right)
@@ -120,10 +120,10 @@ def test_huge_scores(backend):
 
 @per_backend
 def test_constants(backend):
-    """Each token has the mean of the others, and scores that all move together pull on nothing."""
+    """Each token has the mean of the others; scores that all move together have gradient 0."""
     ones = [torch.ones_like(t) for t in make_qkv()]
-    pull = torch.ones_like(ones[0])
-    results = both_ways(lambda *t: grid_attention(*t, 2, backend=backend), ones, pull)
+    grad_output = torch.ones_like(ones[0])
+    results = both_ways(lambda *t: grid_attention(*t, 2, backend=backend), ones, grad_output)
     for value, right in zip(results, (1, 0, 0, 1), strict=True):
         assert (value - right).abs().max() <= ERROR[torch.float32]
 
@@ -149,10 +149,10 @@ def test_strided_and_expanded_inputs(backend):
 @pytest.mark.parametrize("name", range(3), ids="qkv".__getitem__)
 def test_one_input_alone_needs_a_gradient(backend, name):
     qkv = make_qkv()
-    pull = torch.ones_like(qkv[0])
-    grads = both_ways(lambda *t: grid_attention(*t, 2, backend=backend), qkv, pull)[1:]
+    grad_output = torch.ones_like(qkv[0])
+    grads = both_ways(lambda *t: grid_attention(*t, 2, backend=backend), qkv, grad_output)[1:]
     leaf = qkv[name].requires_grad_()
-    grid_attention(*qkv, 2, backend=backend).backward(pull)
+    grid_attention(*qkv, 2, backend=backend).backward(grad_output)
     assert relative_error(leaf.grad, grads[name]) <= ERROR[torch.float32]
 
 

@@ -13,7 +13,7 @@ def assert_same_bits(one: Result, other: Result) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 def test_any_number_of_threads_gives_the_same_bits(path, threads, dtype, reverse):
-    arguments = make_arguments(path[0], 131, channels=4, width=16, state=16, dtype=dtype)
+    arguments = make_arguments(path[0], 131, channels=4, head_dim=16, state=16, dtype=dtype)
 
     def run(count):
         threads(count)

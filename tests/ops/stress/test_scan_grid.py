@@ -1,4 +1,4 @@
-"""Scans over the whole range of steps and rates, and all lengths and widths, against the loop."""
+"""Scans over the whole range of steps and rates, and all lengths and sizes, against the loop."""
 
 import pytest
 import torch
@@ -49,11 +49,11 @@ def test_half_precision(path, reverse):
 
 @pytest.mark.parametrize("batch", [1, 3])
 @pytest.mark.parametrize(
-    "channels, width, state", [(1, 1, 1), (1, 1, 7), (1, 5, 1), (9, 1, 1), (2, 33, 19)]
+    "channels, head_dim, state", [(1, 1, 1), (1, 1, 7), (1, 5, 1), (9, 1, 1), (2, 33, 19)]
 )
-def test_every_width(path, batch, channels, width, state, reverse):
+def test_every_size(path, batch, channels, head_dim, state, reverse):
     arguments = make_arguments(
-        path[0], 67, batch=batch, channels=channels, width=width, state=state
+        path[0], 67, batch=batch, channels=channels, head_dim=head_dim, state=state
     )
     # A gradient of A that is one number may be a sum in which nearly all cancels.
     assert_exact(path, arguments, reverse=reverse, slack=2)

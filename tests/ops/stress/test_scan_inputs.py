@@ -9,7 +9,7 @@ from scans import (
     both_ways,
     by_loop,
     make_arguments,
-    random_pull,
+    random_grad_output,
     relative_error,
     sum_error,
 )
@@ -33,13 +33,13 @@ def test_strided_inputs_and_gradient(path, reverse):
     leaves = [spread_out(argument).requires_grad_() for argument in arguments]
     y = run(path, [back(leaf) for leaf in leaves], reverse)
     assert relative_error(y, exact.y) <= ERROR[torch.float32]
-    grads = torch.autograd.grad(y, leaves, back(spread_out(random_pull(y))))
+    grads = torch.autograd.grad(y, leaves, back(spread_out(random_grad_output(y))))
     for name, grad, right in zip(NAMES, grads, exact.grads, strict=True):
         assert relative_error(back(grad), right) <= ERROR[torch.float32], name
 
 
 def test_expanded_inputs_and_gradient(path, reverse):
-    """One token for all, one batch entry for all, one rate for all; y.sum() pulls all alike."""
+    """One token, one batch entry and one rate for all, and one gradient for all of y."""
     x, dt, A, B, C, D = make_arguments(path[0], 67)
     leaves = [x[:, :1], dt[..., :1], A[:1], B[:1], C[:, :, :1], D[:1]]
     leaves = [leaf.clone().requires_grad_() for leaf in leaves]
@@ -89,6 +89,6 @@ def test_autocast_changes_nothing(path):
     with torch.autocast("cpu", dtype=torch.bfloat16):
         y = run(path, leaves)
     assert torch.equal(y, plain.y)
-    grads = torch.autograd.grad(y, leaves, random_pull(y))
+    grads = torch.autograd.grad(y, leaves, random_grad_output(y))
     for name, grad, right in zip(NAMES, grads, plain.grads, strict=True):
         assert torch.equal(grad, right), name

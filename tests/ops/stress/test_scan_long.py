@@ -5,12 +5,12 @@ import torch
 from scans import assert_exact, make_arguments
 
 # Where a state is the sum of 10,000 tokens and more, each addition is rounded, and a float32 decay
-# next to 1 holds only the first digits of what is lost: no form reaches 2e-6.
+# next to 1 holds only the first digits of what is lost: no form comes within 2e-6.
 SLACK = 3
 
 
 def long_arguments(path, length, steps, rates="1"):
-    return make_arguments(path[0], length, steps, rates, batch=1, channels=2, width=1, state=2)
+    return make_arguments(path[0], length, steps, rates, batch=1, channels=2, head_dim=1, state=2)
 
 
 def test_long_sequences(path, reverse):

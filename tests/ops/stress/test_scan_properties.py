@@ -4,7 +4,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scans import ERROR, PATHS, RATES, STEPS, both_ways, make_arguments, random_pull
+from scans import ERROR, PATHS, RATES, STEPS, both_ways, make_arguments, random_grad_output
 
 BOUND = ERROR[torch.float32]
 few = settings(max_examples=5, derandomize=True, deadline=None)
@@ -31,7 +31,7 @@ def assert_same(one: dict, other: dict) -> None:
 @given(case=cases, a=st.floats(-3, 3), b=st.floats(-3, 3))
 def test_linearity_in_x(path, case, a, b):
     x, *others = make_arguments(path[0], **case)
-    z = random_pull(x)
+    z = random_grad_output(x)
     y, y_x, y_z = (both_ways(path, (t, *others)).y for t in (a * x + b * z, x, z))
     parts = abs(a) * y_x.norm() + abs(b) * y_z.norm()
     assert (y - a * y_x - b * y_z).norm() <= BOUND * (y.norm() + parts)
@@ -42,10 +42,10 @@ def test_linearity_in_x(path, case, a, b):
 @given(case=cases, order=st.permutations(range(4)), reverse=st.booleans())
 def test_permuting_the_channels(path, case, order, reverse):
     x, dt, A, B, C, D = make_arguments(path[0], channels=4, **case)
-    pull = random_pull(x)
-    plain = both_ways(path, (x, dt, A, B, C, D), pull, reverse).named()
+    grad_output = random_grad_output(x)
+    plain = both_ways(path, (x, dt, A, B, C, D), grad_output, reverse).named()
     permuted = (x[:, :, order], dt[:, :, order], A[order], B, C, D[order])
-    result = both_ways(path, permuted, pull[:, :, order], reverse).named()
+    result = both_ways(path, permuted, grad_output[:, :, order], reverse).named()
     plain |= {name: plain[name][:, :, order] for name in ("y", "x", "dt")}
     plain |= {name: plain[name][order] for name in ("A", "D")}
     assert_same(result, plain)
@@ -56,10 +56,10 @@ def test_permuting_the_channels(path, case, order, reverse):
 @given(case=cases)
 def test_backwards_is_forwards_on_the_flipped_sequence(path, case):
     x, dt, A, B, C, D = arguments = make_arguments(path[0], **case)
-    pull = random_pull(x)
-    backwards = both_ways(path, arguments, pull, reverse=True).named()
+    grad_output = random_grad_output(x)
+    backwards = both_ways(path, arguments, grad_output, reverse=True).named()
     flipped = (x.flip(1), dt.flip(1), A, B.flip(1), C.flip(1), D)
-    forwards = both_ways(path, flipped, pull.flip(1)).named()
+    forwards = both_ways(path, flipped, grad_output.flip(1)).named()
     forwards |= {name: forwards[name].flip(1) for name in ("y", "x", "dt", "B", "C")}
     assert_same(backwards, forwards)
 
@@ -69,10 +69,10 @@ def test_backwards_is_forwards_on_the_flipped_sequence(path, case):
 @given(case=cases, batch=st.integers(2, 3), reverse=st.booleans())
 def test_splitting_the_batch(path, case, batch, reverse):
     x, dt, A, B, C, D = arguments = make_arguments(path[0], batch=batch, **case)
-    pull = random_pull(x)
-    together = both_ways(path, arguments, pull, reverse).named()
+    grad_output = random_grad_output(x)
+    together = both_ways(path, arguments, grad_output, reverse).named()
     entries = [
-        both_ways(path, (x[i], dt[i], A, B[i], C[i], D), pull[i], reverse).named()
+        both_ways(path, (x[i], dt[i], A, B[i], C[i], D), grad_output[i], reverse).named()
         for i in torch.arange(batch).split(1)
     ]
     for name, value in together.items():

@@ -9,7 +9,7 @@ from scans import (
     both_ways,
     by_loop,
     make_arguments,
-    random_pull,
+    random_grad_output,
     relative_error,
 )
 
@@ -21,11 +21,11 @@ PER_TOKEN = ("y", "x", "dt", "B", "C")
 @pytest.mark.parametrize("zero", [*NAMES, "y", NAMES])
 def test_zeros(path, zero, reverse):
     arguments = make_arguments(path[0], 70)
-    pull = random_pull(arguments[0])
-    for name, tensor in zip((*NAMES, "y"), (*arguments, pull), strict=True):
+    grad_output = random_grad_output(arguments[0])
+    for name, tensor in zip((*NAMES, "y"), (*arguments, grad_output), strict=True):
         if name in zero:
             tensor.zero_()
-    assert_exact(path, arguments, pull, reverse)
+    assert_exact(path, arguments, grad_output, reverse)
 
 
 @pytest.mark.parametrize("steps", [1e-8, 1e-4, 0.1, 1e3])
@@ -38,13 +38,13 @@ def test_constants(path, steps, reverse):
 def test_huge_numbers(path, huge, reverse):
     """Two factors of 1e18 at once, as much as float32 can hold."""
     arguments = make_arguments(path[0], 131)
-    pull = random_pull(arguments[0])
-    for name, tensor in zip((*NAMES, "y"), (*arguments, pull), strict=True):
+    grad_output = random_grad_output(arguments[0])
+    for name, tensor in zip((*NAMES, "y"), (*arguments, grad_output), strict=True):
         if name in huge:
             tensor.mul_(HUGE)
-    exact = by_loop(path, arguments, pull, reverse).named()
+    exact = by_loop(path, arguments, grad_output, reverse).named()
     assert max(value.abs().max() for value in exact.values()) < MAX / 4
-    assert_exact(path, arguments, pull, reverse)
+    assert_exact(path, arguments, grad_output, reverse)
 
 
 def test_huge_tokens_that_are_forgotten(path, reverse):
@@ -82,9 +82,9 @@ def test_tokens_of_no_duration_change_nothing(path, where, reverse):
         "after": torch.arange(length),
     }[where]
     x, dt, B, C = (with_idle_tokens(t, places, 177, t is dt) for t in (x, dt, B, C))
-    pull = torch.zeros_like(x)
-    pull[:, places] = random_pull(arguments[0])
-    padded = both_ways(path, (x, dt, A, B, C, D), pull, reverse).named()
+    grad_output = torch.zeros_like(x)
+    grad_output[:, places] = random_grad_output(arguments[0])
+    padded = both_ways(path, (x, dt, A, B, C, D), grad_output, reverse).named()
     kept = {name: t[:, places] if name in PER_TOKEN else t for name, t in padded.items()}
     exact = by_loop(path, arguments, reverse=reverse).named()
     for name, value in kept.items():

@@ -4,6 +4,6 @@ What each chunk adds to the state is found first, then passed on from chunk to c
 state before it, a chunk is on its own. The backward pass does the same from the other end.
 """
 
-from asysplat.ops.selective_scan.cuda.stages import backward, carried_shape, forward
+from asysplat.ops.selective_scan.cuda.scan import backward, forward, saved_state_shape
 
-__all__ = ["backward", "carried_shape", "forward"]
+__all__ = ["backward", "forward", "saved_state_shape"]

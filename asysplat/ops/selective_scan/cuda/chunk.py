@@ -1,47 +1,36 @@
-"""One chunk: its output from the state before it."""
+"""What a program works on: a chunk of a sequence, and a block of its channels."""
 
 import triton.language as tl
 
 from asysplat.ops.cuda.kernel import kernel
-from asysplat.ops.selective_scan.cuda.tile import load_channels, load_vector, place, row_at
+from asysplat.ops.cuda.scans import tokens_at
 
 
 @kernel
-def scan_chunk(
-    x,
-    dt,
-    A,
-    B,
-    C,
-    D,
-    states,
-    y,
-    length,
-    channels,
-    REVERSE: tl.constexpr,
-    STATE: tl.constexpr,
-    BLOCK: tl.constexpr,
-    CHUNK: tl.constexpr,
-):
-    """Write y [B, L, D].
+def place(channels, STATE: tl.constexpr, BLOCK: tl.constexpr):
+    """Return batch entry, chunk, channels, which of them exist, and where [D, N] has them."""
+    chunk = tl.program_id(0)
+    channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
+    batch = tl.program_id(2).to(tl.int64)
+    entry = channel[:, None] * STATE + tl.arange(0, STATE)[None, :]
+    return batch, chunk, channel, channel < channels, entry
 
-    Args:
-        x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
-        states: [B, chunks, D, N] before each chunk.
-    """
-    batch, chunk, channel, there, entry = place(channels, STATE, BLOCK)
-    rate = tl.load(A + entry, mask=there[:, None], other=0.0)
-    skip = tl.load(D + channel, mask=there, other=0.0)
-    row = (batch * tl.num_programs(0) + chunk) * channels
-    state = tl.load(states + row * STATE + entry, mask=there[:, None], other=0.0)
-    for k in tl.static_range(CHUNK):
-        position = chunk * CHUNK + k
-        token, limit = row_at(batch, position, length, channels, REVERSE)
-        step = load_channels(dt, token, limit, channel)
-        value = load_channels(x, token, limit, channel)
-        state = tl.exp(step[:, None] * rate) * state + (step * value)[:, None] * load_vector(
-            B, batch, position, length, STATE, REVERSE
-        )
-        out = tl.sum(state * load_vector(C, batch, position, length, STATE, REVERSE), 1)
-        out = (out + skip * value).to(y.dtype.element_ty)
-        tl.store(y + token + channel, out, mask=channel < limit)
+
+@kernel
+def row_at(batch, position, length, size, REVERSE: tl.constexpr):
+    """Return where [B, L, size] has a token's row, and its length, 0 where there is no token."""
+    token, there = tokens_at(position, length, REVERSE)
+    return (batch * length + token) * size, tl.where(there, size, 0)
+
+
+@kernel
+def load_channels(array, row, limit, channel):
+    """Return fp32 [BLOCK] of a row, 0 from `limit` on."""
+    return tl.load(array + row + channel, mask=channel < limit, other=0.0).to(tl.float32)
+
+
+@kernel
+def load_projection(array, batch, position, length, STATE: tl.constexpr, REVERSE: tl.constexpr):
+    """Return fp32 [1, STATE] of an array [B, L, N], 0 where there is no token."""
+    row, limit = row_at(batch, position, length, STATE, REVERSE)
+    return load_channels(array, row, limit, tl.arange(0, STATE))[None, :]

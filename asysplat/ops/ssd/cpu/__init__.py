@@ -5,6 +5,6 @@ passes between the products stay in a core's own cache. Nothing is stored betwee
 state before each segment.
 """
 
-from asysplat.ops.ssd.cpu.stages import backward, carried_shape, forward
+from asysplat.ops.ssd.cpu.scan import backward, forward, saved_state_shape
 
-__all__ = ["backward", "carried_shape", "forward"]
+__all__ = ["backward", "forward", "saved_state_shape"]

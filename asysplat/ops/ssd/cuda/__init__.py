@@ -4,6 +4,6 @@ Dao and Gu 2024, Section 6. Decays are fp32 differences of sums that start with 
 kept to 48 bits; every exponent is <= 0. The backward pass is handed nothing but the inputs.
 """
 
-from asysplat.ops.ssd.cuda.stages import backward, carried_shape, forward
+from asysplat.ops.ssd.cuda.scan import backward, forward, saved_state_shape
 
-__all__ = ["backward", "carried_shape", "forward"]
+__all__ = ["backward", "forward", "saved_state_shape"]

@@ -1,13 +1,13 @@
-"""The stages of the scan and of its gradients, one after the other."""
+"""Both passes: which kernels run, one after the other, and on what."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.ops.cuda.scans import FUSED, INTERPRETED, check_size
-from asysplat.ops.selective_scan.cuda.chunk import scan_chunk
-from asysplat.ops.selective_scan.cuda.chunk_backward import scan_chunk_backward
-from asysplat.ops.selective_scan.cuda.states import add_up, pass_on
+from asysplat.ops.scan import ScanInputs
+from asysplat.ops.selective_scan.cuda.backward import backward_chunk
+from asysplat.ops.selective_scan.cuda.forward import forward_chunk, pass_states, sum_chunk
 
 # Tokens of a chunk; the backward pass keeps all their states in registers.
 FORWARD_CHUNK, BACKWARD_CHUNK = (4, 4) if INTERPRETED else (16, 8)
@@ -16,94 +16,99 @@ PASSED = 128  # of it, where it goes from chunk to chunk
 WARP = {"num_warps": 1, **FUSED}  # no sum leaves it
 
 
-def carried_shape(x: Float[Tensor, "B L D"], B: Float[Tensor, "B L N"]) -> tuple[int]:
-    """Nothing but the inputs."""
+def saved_state_shape(x: Float[Tensor, "B L D"], B: Float[Tensor, "B L N"]) -> tuple[int]:
+    """Return (0,): the backward pass needs nothing but the inputs."""
     return (0,)
 
 
 def forward(
-    x: Float[Tensor, "B L D"],
-    dt: Float[Tensor, "B L D"],
-    A: Float[Tensor, "D N"],
-    B: Float[Tensor, "B L N"],
-    C: Float[Tensor, "B L N"],
-    D: Float[Tensor, "D"],
-    reverse: bool,
-    keep: bool,
+    inputs: ScanInputs, reverse: bool, keep: bool
 ) -> tuple[Float[Tensor, "B L D"], Float[Tensor, "0"]]:
-    """y, and an empty tensor, which is all there is to keep; see `asysplat.ops.selective_scan`.
+    """Return y and an empty saved state; see `asysplat.ops.scan.Kernels`.
 
     Raises:
         InputError: a state size that is no power of two from 16 to 256.
     """
-    check_size("selective_scan", "state size", B.shape[-1], TILE)
-    x, dt, A, B, C, D = (tensor.contiguous() for tensor in (x, dt, A, B, C, D))
+    check_size("selective_scan", "state size", inputs.B.shape[-1], TILE)
+    x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     y = torch.empty_like(x)
     with torch.cuda.device_of(x):
         states = _states(x, dt, A, B, FORWARD_CHUNK, reverse, gradient=False)
-        scan_chunk[_grid(states)](
-            *(x, dt, A, B, C, D, states, y),
-            *x.shape[1:],
+        forward_chunk[_grid(states)](
+            *(x, dt, A, B, C, D),
+            states=states,
+            y=y,
+            length=x.shape[1],
+            channels=x.shape[2],
             CHUNK=FORWARD_CHUNK,
             **_tile(states, reverse),
         )
-    return y, dt.new_empty(carried_shape(x, B))
+    return y, dt.new_empty(saved_state_shape(x, B))
 
 
 def backward(
-    grad_y: Float[Tensor, "B L D"],
-    x: Float[Tensor, "B L D"],
-    dt: Float[Tensor, "B L D"],
-    A: Float[Tensor, "D N"],
-    B: Float[Tensor, "B L N"],
-    C: Float[Tensor, "B L N"],
-    D: Float[Tensor, "D"],
-    carried: Float[Tensor, "0"],
+    grad_output: Float[Tensor, "B L D"],
+    inputs: ScanInputs,
+    saved_state: Float[Tensor, "0"],
     reverse: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of x, dt, A, B, C and D."""
-    inputs = (grad_y, x, dt, A, B, C, D)
-    grad_y, x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
+) -> ScanInputs:
+    """Return the gradients of the inputs; see `asysplat.ops.scan.Kernels`."""
+    x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
+    grad_output = grad_output.contiguous()
     grad_x, grad_dt = torch.empty_like(x), torch.empty_like(dt)
     with torch.cuda.device_of(x):
         states = _states(x, dt, A, B, BACKWARD_CHUNK, reverse, gradient=False)
-        grad_states = _states(grad_y, dt, A, C, BACKWARD_CHUNK, reverse, gradient=True)
+        grad_states = _states(grad_output, dt, A, C, BACKWARD_CHUNK, reverse, gradient=True)
         grad_A, grad_D = torch.empty_like(states), states.new_empty(states.shape[:3])
         grid = _grid(states)
         parts = (*x.shape[:2], grid[1], B.shape[2])
         grad_B, grad_C = states.new_empty(parts), states.new_empty(parts)
-        scan_chunk_backward[grid](
-            *(grad_y, x, dt, A, B, C, D, states, grad_states),
-            *(grad_x, grad_dt, grad_A, grad_B, grad_C, grad_D),
-            *x.shape[1:],
+        backward_chunk[grid](
+            *(grad_output, x, dt, A, B, C, D),
+            states=states,
+            grad_states=grad_states,
+            grad_x=grad_x,
+            grad_dt=grad_dt,
+            grad_A=grad_A,
+            grad_B=grad_B,
+            grad_C=grad_C,
+            grad_D=grad_D,
+            length=x.shape[1],
+            channels=x.shape[2],
             CHUNK=BACKWARD_CHUNK,
             **_tile(states, reverse),
         )
-    grad_B, grad_C = (part.sum(2).to(x.dtype) for part in (grad_B, grad_C))
-    return grad_x, grad_dt, grad_A.sum((0, 1)), grad_B, grad_C, grad_D.sum((0, 1))
+    return ScanInputs(
+        x=grad_x,
+        dt=grad_dt,
+        A=grad_A.sum((0, 1)),
+        B=grad_B.sum(2).to(x.dtype),
+        C=grad_C.sum(2).to(x.dtype),
+        D=grad_D.sum((0, 1)),
+    )
 
 
 def _states(
     values: Tensor,
     dt: Tensor,
     A: Tensor,
-    vectors: Tensor,
+    projections: Tensor,
     chunk: int,
     reverse: bool,
     gradient: bool,
 ) -> Float[Tensor, "B chunks D N"]:
-    """Before each chunk, or with `gradient` the gradient of the state after it."""
+    """Return the state before each chunk, or with `gradient` the gradient of that after it."""
     (batch, length, channels), state = values.shape, A.shape[1]
     chunks = -(-length // chunk)
     states = dt.new_empty(batch, chunks, channels, state)
     steps = dt.new_empty(batch, chunks, channels)
-    add_up[_grid(states)](
-        *(values, dt, A, vectors, states, steps, length, channels),
+    sum_chunk[_grid(states)](
+        *(values, dt, A, projections, states, steps, length, channels),
         GRADIENT=gradient,
         CHUNK=chunk,
         **_tile(states, reverse),
     )
-    pass_on[(-(-channels * state // PASSED), batch)](
+    pass_states[(-(-channels * state // PASSED), batch)](
         *(A, steps, states, chunks, channels),
         GRADIENT=gradient,
         STATE=state,

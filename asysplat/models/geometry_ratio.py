@@ -1,4 +1,4 @@
-"""Widths that give a share of the parameters to the geometry branch, at an unchanged total."""
+"""How a geometry_ratio is met: widths that give the geometry branch its share of parameters."""
 
 from collections.abc import Callable
 from itertools import combinations_with_replacement
@@ -19,29 +19,29 @@ Build = Callable[[Widths, int], nn.Module]
 def solve_widths(
     build: Build, base: Widths, layers: int, ratio: float, budget: float = 1.0
 ) -> tuple[Widths, int]:
-    """Widths and appearance layers whose model meets the budget and has the asked share.
+    """Find widths and appearance layers whose model meets the budget and has the asked share.
 
-    The number of layers changes only where the widths alone, multiples of the head width, do not
-    reach the ratio. Parameter counts are quadratic polynomials in the widths: a few models on the
-    meta device determine them, and the search is then free.
+    The number of layers changes only where the widths alone, multiples of the head_dim, cannot give
+    the ratio. Parameter counts are quadratic polynomials in the widths: a few models on the meta
+    device determine the coefficients, and the search then builds no more of them.
 
     Args:
         build: widths, appearance layers -> model with a `geometry_share()`.
-        base: the widths that set the total, together with
+        base: the widths that set the total, together with `layers`.
         layers: N_v, the layers of an appearance stage.
         ratio: parameters of the geometry branch over all.
-        budget: the total to meet, over that of `base` and `layers`.
+        budget: the total to meet, as a multiple of that of `base` and `layers`.
 
     Raises:
-        InputError: nothing comes within 0.015 of the ratio and 1 % of the total; says what comes
-            closest.
+        InputError: nothing comes within 0.015 of the ratio and 1 % of the total; the message says
+            what comes closest.
     """
     if not 0 < ratio < 1:
         raise InputError(f"geometry_ratio={ratio}: give a share between 0 and 1, such as 0.9.")
     wanted = budget * _count(build(base, layers))[0]
     candidates = _candidates(base)
-    terms = _quadratic_terms(candidates / base.head)
-    # Among the widths that fit, those that keep the proportions of the stages.
+    terms = _quadratic_terms(candidates / base.head_dim)
+    # Among the widths that fit, those are best that keep the proportions of the stages.
     shape_error = np.log(candidates[:, :-1] / np.array(base.stages)).std(axis=1)
 
     def errors(total: np.ndarray | int, geometry: np.ndarray | float) -> np.ndarray | float:
@@ -55,12 +55,12 @@ def solve_widths(
         error = errors(*(terms @ coefficients).T)
         rank = np.where(error < 1, error / 2 + shape_error, 1e3 + error)
         order = np.argsort(rank, kind="stable")  # the same widths on every machine
-        # The polynomial knows neither rounding nor stages of equal width: the model is counted.
-        # Where nothing fits, the closest alone, so that it can be named.
+        # The polynomial ignores rounding and stages of equal width, so the models are counted.
+        # Where nothing fits, only the closest is, for the message.
         attempts = ATTEMPTS if error[order[0]] < 1 else 1
         for row in candidates[order[:attempts]]:
             *stages, fine = (int(width) for width in row)
-            widths = Widths(tuple(stages), fine, base.head)
+            widths = Widths(tuple(stages), fine, base.head_dim)
             total, geometry = _count(build(widths, count))
             found = float(errors(total, geometry))
             if found < 1:
@@ -73,44 +73,46 @@ def solve_widths(
                 )
     raise InputError(
         f"geometry_ratio={ratio} cannot be met within {SHARE_TOLERANCE} at "
-        f"{wanted / 1e6:.2f}M parameters with heads {base.head} wide: closest come {description}; "
-        "ask for that share, or for another width."
+        f"{wanted / 1e6:.2f}M parameters with head_dim {base.head_dim}: closest come "
+        f"{description}; ask for that share, or for another width."
     )
 
 
 def _candidates(base: Widths) -> np.ndarray:
-    """[n, stages + 1] multiples of the head width around the base."""
-    limits = [int(1.8 * width / base.head) + 1 for width in base.stages]
+    """Return [n, stages + 1] multiples of the head_dim around the base."""
+    limits = [int(1.8 * width / base.head_dim) + 1 for width in base.stages]
     stages = np.stack(np.meshgrid(*(np.arange(1, m + 1) for m in limits), indexing="ij"), -1)
     stages = stages.reshape(-1, len(base.stages))
     stages = stages[(np.diff(stages, axis=1) >= 0).all(axis=1)]
-    fine = np.arange(1, 4 * base.fine // base.head + 1)
+    fine = np.arange(1, 4 * base.fine // base.head_dim + 1)
     rows = np.repeat(stages, len(fine), axis=0)
-    return np.column_stack((rows, np.tile(fine, len(stages)))) * base.head
+    return np.column_stack((rows, np.tile(fine, len(stages)))) * base.head_dim
 
 
 def _quadratic_terms(widths: np.ndarray) -> np.ndarray:
-    """All products of at most two of the columns, and 1."""
+    """Return all products of at most two of the columns, and 1."""
     padded = np.column_stack((np.ones(len(widths)), widths))
     pairs = combinations_with_replacement(range(padded.shape[1]), 2)
     return np.stack([padded[:, i] * padded[:, j] for i, j in pairs], axis=1)
 
 
 def _fit_counts(build: Callable[[Widths], nn.Module], base: Widths) -> np.ndarray:
-    """Coefficients [terms, 2] of the total and of the geometry branch."""
+    """Return the coefficients [terms, 2] of the total and of the geometry branch."""
     samples = _samples(len(base.stages) + 1)
     counts = []
     for row in samples:
-        *stages, fine = (int(value) * base.head for value in row)
-        counts.append(_count(build(Widths(tuple(stages), fine, base.head))))
+        *stages, fine = (int(value) * base.head_dim for value in row)
+        counts.append(_count(build(Widths(tuple(stages), fine, base.head_dim))))
     return np.linalg.solve(_quadratic_terms(samples), np.array(counts, dtype=np.float64))
 
 
 def _samples(columns: int) -> np.ndarray:
-    """As many points as a quadratic has coefficients, in general position: the base, one step and
-    two steps along each axis, and one step along each pair. Even numbers of heads, so that halves
-    and sixteenths of a width are whole; no two stages are ever equally wide, where the projection
-    between them would vanish."""
+    """Return as many points as a quadratic has coefficients, in general position.
+
+    They are the base, one and two steps along each axis, and one step along each pair of axes.
+    Numbers of heads are even, so that halves and sixteenths of a width are whole; no two stages are
+    equally wide, where the projection between them would vanish.
+    """
     base = 4.0 + 8 * np.arange(columns)
     axes = 2 * np.eye(columns)
     single = [base + step * axis for axis in axes for step in (1, 2)]
@@ -119,5 +121,6 @@ def _samples(columns: int) -> np.ndarray:
 
 
 def _count(model: nn.Module) -> tuple[int, float]:
+    """Return the parameters of the model and of its geometry branch."""
     total = sum(p.numel() for p in model.parameters())
     return total, total * model.geometry_share()

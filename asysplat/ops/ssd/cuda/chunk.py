@@ -1,16 +1,50 @@
-"""The log decays of every chunk, once for all kernels that need them."""
+"""What the kernels know of a chunk: where arrays have its tokens, their decays, and products."""
 
 import triton.language as tl
 
 from asysplat.ops.cuda.kernel import kernel
-from asysplat.ops.cuda.scans import tokens_at
+from asysplat.ops.cuda.scans import INTERPRETED, tokens_at
 
+IN_INTERPRETER = tl.constexpr(INTERPRETED)
 # What a token needs, rows of [B, H, ROWS, positions], fp32: log decay since the chunk's start,
 # with the token's own (<= 0), and what float32 leaves of it; log decay to the chunk's end; dt.
 SINCE, REST, TO_END, STEP = (tl.constexpr(row) for row in range(4))
 ROWS = tl.constexpr(4)
 # exp of it is 0 in float32: a token that forgets more does not make the sums after it coarser.
 LEAST = tl.constexpr(-128.0)
+
+
+@kernel
+def rows_of_head(batch, chunk, head, length, heads, HEAD_DIM, REVERSE, CHUNK):
+    """Return where [B, L, H, P] has a chunk's tokens, [CHUNK, P], and which of them exist."""
+    token, inside = tokens_at(chunk * CHUNK + tl.arange(0, CHUNK), length, REVERSE)
+    row = (batch * length + token) * heads + head
+    return row[:, None] * HEAD_DIM + tl.arange(0, HEAD_DIM)[None, :], inside[:, None]
+
+
+@kernel
+def rows_of_state(batch, chunk, first, length, STATE, BLOCK, REVERSE, CHUNK):
+    """Return where [B, L, N] has BLOCK columns of a chunk's tokens, and which of them exist."""
+    token, inside = tokens_at(chunk * CHUNK + tl.arange(0, CHUNK), length, REVERSE)
+    row = (batch * length + token)[:, None] * STATE
+    return row + first + tl.arange(0, BLOCK)[None, :], inside[:, None]
+
+
+@kernel
+def state_at(part, first, HEAD_DIM, STATE, BLOCK):
+    """Return where states [B, chunks, H, P, N] have BLOCK columns of the state `part`, [P, BLOCK].
+
+    `part` counts all [B, chunks, H].
+    """
+    row = part * HEAD_DIM + tl.arange(0, HEAD_DIM)
+    return row[:, None] * STATE + first + tl.arange(0, BLOCK)[None, :]
+
+
+@kernel
+def square_at(batch, chunk, chunks, CHUNK):
+    """Return where an array [B, chunks, CHUNK, CHUNK] has a chunk's square."""
+    lane = tl.arange(0, CHUNK)
+    return ((batch * chunks + chunk) * CHUNK + lane)[:, None] * CHUNK + lane[None, :]
 
 
 @kernel
@@ -22,15 +56,16 @@ def sum_decays(
     heads,
     REVERSE: tl.constexpr,
     CHUNK: tl.constexpr,
-    BLOCK: tl.constexpr,
+    HEADS: tl.constexpr,
 ):
-    """Write `decays` for a chunk and BLOCK heads; a position without a token has dt = 0.
+    """Write `decays` for a chunk and HEADS heads; a position without a token has dt = 0.
 
     Args:
         dt, A: [B, L, H] and [H].
+        decays: [B, H, ROWS, positions].
     """
     chunk = tl.program_id(0)
-    head = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
+    head = tl.program_id(1) * HEADS + tl.arange(0, HEADS)
     batch = tl.program_id(2).to(tl.int64)
     position = chunk * CHUNK + tl.arange(0, CHUNK)
     token, inside = tokens_at(position, length, REVERSE)
@@ -54,17 +89,26 @@ def sum_decays(
 
 @kernel
 def decays_of(decays, batch, head, heads, chunk, chunks, CHUNK: tl.constexpr):
-    """Where a head's rows have their first position of a chunk, and the length of a row."""
+    """Return where a head's rows have a chunk's first position, and the length of a row."""
     positions = tl.cast(chunks, tl.int64) * CHUNK
     return decays + (batch * heads + head) * ROWS * positions + chunk * CHUNK, positions
 
 
 @kernel
 def decay_between(row, positions, CHUNK: tl.constexpr):
-    """exp of the decay from position s to position t >= s, [t, s]; 0 where s is later than t."""
+    """Return [t, s] the decay from position s to position t >= s; 0 where s is later than t."""
     lane = tl.arange(0, CHUNK)
     since = tl.load(row + SINCE * positions + lane)
     rest = tl.load(row + REST * positions + lane)
     exponent = (since[:, None] - since[None, :]) + (rest[:, None] - rest[None, :])
     decay = tl.exp(tl.minimum(exponent, 0.0))
     return tl.where(lane[:, None] >= lane[None, :], decay, 0.0)
+
+
+@kernel
+def product(a, b, DOT: tl.constexpr, PRECISION: tl.constexpr):
+    """Return a @ b, the factors as DOT, summed in fp32."""
+    a, b = a.to(DOT), b.to(DOT)
+    if IN_INTERPRETER:  # whose products take bfloat16 for integers
+        a, b = a.to(tl.float32), b.to(tl.float32)
+    return tl.dot(a, b, input_precision=PRECISION)

@@ -1,14 +1,14 @@
-"""One chunk: its gradients from the state before it and the gradient of the state after it."""
+"""The gradients of each chunk, from the state before it and the gradient of that after it."""
 
 import triton.language as tl
 
 from asysplat.ops.cuda.kernel import kernel
-from asysplat.ops.selective_scan.cuda.tile import load_channels, load_vector, place, row_at
+from asysplat.ops.selective_scan.cuda.chunk import load_channels, load_projection, place, row_at
 
 
 @kernel
-def scan_chunk_backward(
-    grad_y,
+def backward_chunk(
+    grad_output,
     x,
     dt,
     A,
@@ -30,11 +30,14 @@ def scan_chunk_backward(
     BLOCK: tl.constexpr,
     CHUNK: tl.constexpr,
 ):
-    """Sums that leave the program are left as parts.
+    """Write the gradients for a chunk and a block of channels.
+
+    Sums over chunks, or over blocks, are left to be finished by the caller.
 
     Args:
-        grad_y, x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
-        states, grad_states: [B, chunks, D, N] before, and of what is after, each chunk.
+        grad_output, x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
+        states: [B, chunks, D, N] before each chunk.
+        grad_states: [B, chunks, D, N], the gradients of those after each chunk.
         grad_x, grad_dt: [B, L, D].
         grad_A, grad_D: [B, chunks, D, N] and [B, chunks, D].
         grad_B, grad_C: [B, L, blocks, N].
@@ -50,8 +53,8 @@ def scan_chunk_backward(
         token, limit = row_at(batch, position, length, channels, REVERSE)
         step = load_channels(dt, token, limit, channel)
         value = load_channels(x, token, limit, channel)
-        vector = load_vector(B, batch, position, length, STATE, REVERSE)
-        state = tl.exp(step[:, None] * rate) * state + (step * value)[:, None] * vector
+        projection = load_projection(B, batch, position, length, STATE, REVERSE)
+        state = tl.exp(step[:, None] * rate) * state + (step * value)[:, None] * projection
         before = before + (state,)
 
     grad_state = tl.load(grad_states + row * STATE + entry, mask=there[:, None], other=0.0)
@@ -62,14 +65,14 @@ def scan_chunk_backward(
         token, limit = row_at(batch, position, length, channels, REVERSE)
         step = load_channels(dt, token, limit, channel)
         value = load_channels(x, token, limit, channel)
-        out = load_channels(grad_y, token, limit, channel)
-        vector = load_vector(B, batch, position, length, STATE, REVERSE)
+        out = load_channels(grad_output, token, limit, channel)
+        projection = load_projection(B, batch, position, length, STATE, REVERSE)
         decay = tl.exp(step[:, None] * rate)
         decayed = decay * before[CHUNK - 1 - k]
-        state = decayed + (step * value)[:, None] * vector
-        grad_state += out[:, None] * load_vector(C, batch, position, length, STATE, REVERSE)
+        state = decayed + (step * value)[:, None] * projection
+        grad_state += out[:, None] * load_projection(C, batch, position, length, STATE, REVERSE)
         grad_exponent = grad_state * decayed
-        grad_input = tl.sum(grad_state * vector, 1)
+        grad_input = tl.sum(grad_state * projection, 1)
         total_A += step[:, None] * grad_exponent
         total_D += value * out
 
@@ -80,10 +83,10 @@ def scan_chunk_backward(
         parts = tl.num_programs(1) * STATE
         part, limit = row_at(batch, position, length, parts, REVERSE)
         entries = tl.program_id(1) * STATE + tl.arange(0, STATE)
-        vector = tl.sum(grad_state * (step * value)[:, None], 0)
-        tl.store(grad_B + part + entries, vector, mask=entries < limit)
-        vector = tl.sum(state * out[:, None], 0)
-        tl.store(grad_C + part + entries, vector, mask=entries < limit)
+        projection = tl.sum(grad_state * (step * value)[:, None], 0)
+        tl.store(grad_B + part + entries, projection, mask=entries < limit)
+        projection = tl.sum(state * out[:, None], 0)
+        tl.store(grad_C + part + entries, projection, mask=entries < limit)
         grad_state *= decay
     tl.store(grad_A + row * STATE + entry, total_A, mask=there[:, None])
     tl.store(grad_D + row + channel, total_D, mask=there)

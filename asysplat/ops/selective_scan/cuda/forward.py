@@ -1,4 +1,4 @@
-"""The state, or its gradient, before each chunk.
+"""The state before each chunk, and the output of each from its own tokens and that state.
 
 With GRADIENT a chunk is gone through from its end, and what is passed on is the gradient of the
 state before a token.
@@ -7,17 +7,17 @@ state before a token.
 import triton.language as tl
 
 from asysplat.ops.cuda.kernel import kernel
-from asysplat.ops.selective_scan.cuda.tile import load_channels, load_vector, place, row_at
+from asysplat.ops.selective_scan.cuda.chunk import load_channels, load_projection, place, row_at
 
 AHEAD = tl.constexpr(8)  # chunks
 
 
 @kernel
-def add_up(
+def sum_chunk(
     values,
     dt,
     A,
-    vectors,
+    projections,
     states,
     steps,
     length,
@@ -28,12 +28,12 @@ def add_up(
     BLOCK: tl.constexpr,
     CHUNK: tl.constexpr,
 ):
-    """What a chunk's own tokens leave in the state.
+    """Write what a chunk's own tokens leave in the state, and how far they make it decay.
 
     Args:
-        values, vectors: x [B, L, D] and B [B, L, N]; with GRADIENT, grad_y and C.
-        states: [B, chunks, D, N] is set to it.
-        steps: [B, chunks, D] is set to the sum of dt.
+        values, projections: x [B, L, D] and B [B, L, N]; with GRADIENT, grad_output and C.
+        states: [B, chunks, D, N], what the tokens leave.
+        steps: [B, chunks, D], the sum of dt.
     """
     batch, chunk, channel, there, entry = place(channels, STATE, BLOCK)
     rate = tl.load(A + entry, mask=there[:, None], other=0.0)
@@ -44,12 +44,12 @@ def add_up(
         token, limit = row_at(batch, position, length, channels, REVERSE)
         step = load_channels(dt, token, limit, channel)
         value = load_channels(values, token, limit, channel)
-        vector = load_vector(vectors, batch, position, length, STATE, REVERSE)
+        projection = load_projection(projections, batch, position, length, STATE, REVERSE)
         decay = tl.exp(step[:, None] * rate)
         if GRADIENT:
-            state = decay * (state + value[:, None] * vector)
+            state = decay * (state + value[:, None] * projection)
         else:
-            state = decay * state + (step * value)[:, None] * vector
+            state = decay * state + (step * value)[:, None] * projection
         total += step
     row = (batch * tl.num_programs(0) + chunk) * channels
     tl.store(states + row * STATE + entry, state, mask=there[:, None])
@@ -57,7 +57,7 @@ def add_up(
 
 
 @kernel
-def pass_on(
+def pass_states(
     A,
     steps,
     states,
@@ -67,8 +67,10 @@ def pass_on(
     STATE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Replace what each chunk adds by the state before it, or with GRADIENT by the gradient of the
-    state after it; see `add_up`."""
+    """Replace what each chunk adds by the state before it; see `sum_chunk`.
+
+    With GRADIENT, replace it by the gradient of the state after the chunk.
+    """
     entry = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     batch = tl.program_id(1).to(tl.int64)
     size = channels * STATE
@@ -86,3 +88,44 @@ def pass_on(
             row, limit = row_at(batch, start + k, chunks, size, GRADIENT)
             tl.store(states + row + entry, state, mask=entry < limit)
             state = tl.exp(totals[k] * rate) * state + added[k]
+
+
+@kernel
+def forward_chunk(
+    x,
+    dt,
+    A,
+    B,
+    C,
+    D,
+    states,
+    y,
+    length,
+    channels,
+    REVERSE: tl.constexpr,
+    STATE: tl.constexpr,
+    BLOCK: tl.constexpr,
+    CHUNK: tl.constexpr,
+):
+    """Write y [B, L, D].
+
+    Args:
+        x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
+        states: [B, chunks, D, N] before each chunk.
+    """
+    batch, chunk, channel, there, entry = place(channels, STATE, BLOCK)
+    rate = tl.load(A + entry, mask=there[:, None], other=0.0)
+    skip = tl.load(D + channel, mask=there, other=0.0)
+    row = (batch * tl.num_programs(0) + chunk) * channels
+    state = tl.load(states + row * STATE + entry, mask=there[:, None], other=0.0)
+    for k in tl.static_range(CHUNK):
+        position = chunk * CHUNK + k
+        token, limit = row_at(batch, position, length, channels, REVERSE)
+        step = load_channels(dt, token, limit, channel)
+        value = load_channels(x, token, limit, channel)
+        state = tl.exp(step[:, None] * rate) * state + (step * value)[:, None] * load_projection(
+            B, batch, position, length, STATE, REVERSE
+        )
+        out = tl.sum(state * load_projection(C, batch, position, length, STATE, REVERSE), 1)
+        out = (out + skip * value).to(y.dtype.element_ty)
+        tl.store(y + token + channel, out, mask=channel < limit)

@@ -1,0 +1,100 @@
+"""Both passes over all sequences: the arrays of the kernels, and what becomes of them."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.ops.cpu.threads import even_bounds, run_blocks
+from asysplat.ops.cpu.vectors import LANES
+from asysplat.ops.scan import ScanInputs
+from asysplat.ops.selective_scan.cpu.backward import backward_blocks
+from asysplat.ops.selective_scan.cpu.chunk import (
+    CACHE_CHUNK,
+    BlockedGradients,
+    BlockedInputs,
+    by_block,
+    by_channel,
+)
+from asysplat.ops.selective_scan.cpu.forward import forward_blocks
+
+LOG2_E = 1 / math.log(2)
+
+
+def saved_state_shape(x: Float[Tensor, "B L D"], B: Float[Tensor, "B L N"]) -> tuple:
+    """Return that of the states at the beginning of chunks, [B, blocks, chunks, N, LANES]."""
+    batch, length, channels = x.shape
+    return batch, -(-channels // LANES), -(-length // CACHE_CHUNK), B.shape[-1], LANES
+
+
+def forward(
+    inputs: ScanInputs, reverse: bool, keep: bool
+) -> tuple[Float[Tensor, "B L D"], Float[Tensor, "_ _ _ _ _"]]:
+    """Return y and the states at the beginning of chunks; see `asysplat.ops.scan.Kernels`."""
+    x = inputs.x
+    y = torch.empty(x.shape, dtype=torch.float32)
+    shape = saved_state_shape(x, inputs.B)
+    saved_state = torch.empty(shape if keep else (0,) * len(shape))
+    run_blocks(
+        forward_blocks,
+        even_bounds(shape[0] * shape[1]),
+        _blocked(inputs, reverse),
+        y.numpy(),
+        saved_state.numpy(),
+    )
+    return y.to(x.dtype), saved_state
+
+
+def backward(
+    grad_output: Float[Tensor, "B L D"], inputs: ScanInputs, saved_state: Tensor, reverse: bool
+) -> ScanInputs:
+    """Return the gradients of the inputs; see `asysplat.ops.scan.Kernels`."""
+    x, _, _, B, C, _ = inputs
+    batch, length, channels = x.shape
+    blocks, state_size = saved_state.shape[1], B.shape[-1]
+    grad_x, grad_dt = (torch.empty(x.shape, dtype=torch.float32) for _ in range(2))
+    # Each block of channels has a place of its own for what is summed over channels.
+    part_B, part_C = (torch.empty(blocks, batch, length, state_size) for _ in range(2))
+    grad_A = torch.empty(batch, blocks, state_size, LANES)
+    grad_D = torch.empty(batch, blocks, 1, LANES)
+    run_blocks(
+        backward_blocks,
+        even_bounds(batch * blocks),
+        _blocked(inputs, reverse),
+        saved_state.numpy(),
+        _float32(grad_output).numpy(),
+        BlockedGradients(
+            x=grad_x.numpy(),
+            dt=grad_dt.numpy(),
+            A=grad_A.numpy(),
+            B=part_B.numpy(),
+            C=part_C.numpy(),
+            D=grad_D.numpy(),
+        ),
+    )
+    return ScanInputs(
+        x=grad_x.to(x.dtype),
+        dt=grad_dt,
+        A=by_channel(grad_A.sum(0))[:channels],
+        B=part_B.sum(0).to(B.dtype),
+        C=part_C.sum(0).to(C.dtype),
+        D=by_channel(grad_D.sum(0))[:channels, 0],
+    )
+
+
+def _blocked(inputs: ScanInputs, reverse: bool) -> BlockedInputs:
+    x, dt, B, C = map(_float32, (inputs.x, inputs.dt, inputs.B, inputs.C))
+    return BlockedInputs(
+        x=x.numpy(),
+        dt=dt.numpy(),
+        A=by_block(inputs.A * LOG2_E).numpy(),
+        B=B.numpy(),
+        C=C.numpy(),
+        D=by_block(inputs.D[:, None]).numpy(),
+        reverse=reverse,
+    )
+
+
+def _float32(tensor: Tensor) -> Tensor:
+    return tensor.float().contiguous()

@@ -1,0 +1,156 @@
+"""What the kernels know of a chunk: its inputs, the rows of a head's tokens, and their decays.
+
+Decays between the tokens of a chunk turn scores into weights.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.ops.cpu.kernel import inline
+from asysplat.ops.cpu.lanes import ONE, ZERO, decay2
+from asysplat.ops.cpu.vectors import LANES, fma, load, total, zeros
+
+
+class Decays(NamedTuple):
+    """The decays of c chunks of q tokens, for h heads; float32.
+
+    Args:
+        high, low: [c, h, q] log2 of the decay since the scan entered the chunk, in two numbers: a
+            token that forgets everything leaves no rounding in the decays behind it.
+        from_start: [c, h, q] from where the scan enters the chunk to a token.
+        to_end: [c, h, q] from a token to where the scan leaves the chunk.
+        across: [c, h] of the whole chunk.
+    """
+
+    high: np.ndarray
+    low: np.ndarray
+    from_start: np.ndarray
+    to_end: np.ndarray
+    across: np.ndarray
+
+
+class Segment(NamedTuple):
+    """The inputs of a scan for c chunks of q tokens, l in all; float32.
+
+    Args:
+        x: [l, h, p].
+        dt: [l, h].
+        A, D: [h].
+        B, C: [c, q, N].
+        scores: [c, q, q] C B^T, of token t (row) and s.
+        decays: between the tokens.
+        reverse: the scan goes from the last token to the first.
+    """
+
+    x: np.ndarray
+    dt: np.ndarray
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    scores: np.ndarray
+    decays: Decays
+    reverse: bool
+
+
+@inline
+def take_rows(tensor, begin, head, rows):
+    """Copy a head's values for a chunk's tokens, from token `begin` of [l, h, p] on."""
+    for t in range(len(rows)):
+        for i in range(tensor.shape[2]):
+            rows[t, i] = tensor[begin + t, head, i]
+
+
+@inline
+def scale_rows(rows, factors):
+    """Multiply each row by a factor of its own."""
+    for t in range(len(rows)):
+        for i in range(rows.shape[1]):
+            rows[t, i] *= factors[t]
+
+
+@inline
+def dot_rows(a, b, t):
+    """Return the product of row t of both, which are contiguous and in whole vectors."""
+    vectors = a.shape[1] // LANES
+    value = zeros()
+    for i in range(t * vectors, (t + 1) * vectors):
+        value = fma(load(a, i), load(b, i), value)
+    return float(total(value))
+
+
+def sum_decays(dt: Float[Tensor, "c q h"], A: Float[Tensor, "h"], reverse: bool) -> Decays:
+    """Sum the log decays in float64 along the scan, from the start of each chunk."""
+    logs = (dt.double() * A.double() / math.log(2)).transpose(1, 2)
+    logs = logs.flip(-1).cumsum(-1).flip(-1) if reverse else logs.cumsum(-1)
+    total = logs[..., :1] if reverse else logs[..., -1:]
+    high = logs.float()
+    decays = (high, logs - high, logs.exp2(), (total - logs).exp2(), total.squeeze(-1).exp2())
+    return Decays(*(part.float().contiguous().numpy() for part in decays))
+
+
+@inline
+def decay_between(high, low, t, s, reverse):
+    """Return the decay from token s to token t, 0 where s comes later; high, low: `Decays`."""
+    before = s >= t if reverse else s <= t
+    exponent = (high[t] - high[s]) + (low[t] - low[s])
+    return decay2(min(exponent, ZERO)) * (ONE if before else ZERO)
+
+
+@inline
+def seen_from(t, size, reverse):
+    """Return the range of tokens that token t sees, widened to whole vectors."""
+    if reverse:
+        return t // LANES * LANES, size
+    return 0, (t // LANES + 1) * LANES
+
+
+@inline
+def weigh_scores(scores, high, low, reverse, weights):
+    """Write `weights`, scores times decays, where a token sees another (`seen_from`).
+
+    Args:
+        scores, weights: [q, q] of token t (row) and s.
+        high, low: [q], see `Decays`.
+        reverse: tokens see those after them.
+    """
+    size = len(scores)
+    for t in range(size):
+        first, last = seen_from(t, size, reverse)
+        for base in range(first, last, LANES):
+            for i in range(LANES):
+                decay = decay_between(high, low, t, base + i, reverse)
+                weights[t, base + i] = scores[t, base + i] * decay
+
+
+@inline
+def weigh_scores_backward(grad_weights, scores, high, low, reverse, grad_scores, grad_logs):
+    """Differentiate `weigh_scores` with respect to the scores and the log decays.
+
+    Args:
+        grad_weights, scores: [q, q].
+        grad_scores: [q, q], added to.
+        grad_logs: [q] float64, written: the gradient of each token's dt A.
+    """
+    size = len(scores)
+    grads = np.empty(LANES, np.float32)
+    column = np.zeros(size)
+    for k in range(size):
+        t = k if reverse else size - 1 - k  # from the last that the scan comes to
+        first, last = seen_from(t, size, reverse)
+        for base in range(first, last, LANES):
+            for i in range(LANES):
+                decay = decay_between(high, low, t, base + i, reverse)
+                grads[i] = decay * grad_weights[t, base + i]
+                grad_scores[t, base + i] += grads[i]
+            for i in range(LANES):
+                column[base + i] += float(grads[i] * scores[t, base + i])
+        # The decay of t lies between all tokens before it and itself or those behind it.
+        total = 0.0
+        for s in range(t + 1 if reverse else 0, size if reverse else t):
+            total += column[s]
+        grad_logs[t] = total

@@ -1,0 +1,154 @@
+"""Both passes over a sequence: one segment of chunks after the other, its heads in parallel."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.ops.cpu.threads import run_blocks
+from asysplat.ops.cpu.vectors import LANES
+from asysplat.ops.scan import ScanInputs
+from asysplat.ops.ssd.chunked import CHUNK
+from asysplat.ops.ssd.cpu.backward import GroupGradients, HeadGradients, backward_heads
+from asysplat.ops.ssd.cpu.chunk import Segment, sum_decays
+from asysplat.ops.ssd.cpu.forward import forward_heads
+
+SEGMENT = 16 * CHUNK  # tokens; a head's states before these chunks are 1 MB at paper scale
+GROUP = 2  # heads whose gradients of B and C are summed before they leave a core
+
+
+def saved_state_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) -> tuple:
+    """Return that of the states before each segment, [B, segments, H, N, P in whole vectors]."""
+    batch, length, heads, head_dim = x.shape
+    return batch, -(-length // SEGMENT), heads, B.shape[-1], _whole_vectors(head_dim)
+
+
+def forward(
+    inputs: ScanInputs, reverse: bool, keep: bool
+) -> tuple[Float[Tensor, "B L H P"], Float[Tensor, "_ _ _ _ _"]]:
+    """Return y and the states before each segment; see `asysplat.ops.scan.Kernels`."""
+    y = torch.empty_like(inputs.x)
+    shape = saved_state_shape(inputs.x, inputs.B)
+    saved_state = torch.empty(shape if keep else (0,) * len(shape))
+    for batch in range(len(y)):
+        states = torch.zeros(shape[2:])
+        for index, tokens in _segments(y.shape[1], reverse):
+            if keep:
+                saved_state[batch, index] = states
+            segment = _segment(inputs, batch, tokens, reverse)
+            with _whole_target(y[batch, tokens], len(segment.x)) as out:
+                run_blocks(forward_heads, _one_each(len(states)), segment, states.numpy(), out)
+    return y, saved_state
+
+
+def backward(
+    grad_output: Float[Tensor, "B L H P"], inputs: ScanInputs, saved_state: Tensor, reverse: bool
+) -> ScanInputs:
+    """Return the gradients of the inputs; see `asysplat.ops.scan.Kernels`."""
+    x, dt, A, B, C, D = inputs
+    state_size = B.shape[-1]
+    grads = ScanInputs(
+        x=torch.empty_like(x),
+        dt=torch.empty_like(dt),
+        A=torch.zeros_like(A, dtype=torch.float64),
+        B=torch.empty_like(B),
+        C=torch.empty_like(C),
+        D=torch.zeros_like(D, dtype=torch.float64),
+    )
+    groups, chunks = -(-len(A) // GROUP), SEGMENT // CHUNK
+    group_grads = [
+        torch.empty(chunks, groups, CHUNK, columns)
+        for columns in (_whole_vectors(state_size), _whole_vectors(state_size), CHUNK)
+    ]
+    for batch in range(len(grad_output)):
+        grad_states = torch.zeros(saved_state.shape[2:])
+        for index, tokens in reversed(list(_segments(grad_output.shape[1], reverse))):
+            segment = _segment(inputs, batch, tokens, reverse)
+            length, parts = len(segment.x), [part[: len(segment.B)] for part in group_grads]
+            with (
+                _whole_target(grads.x[batch, tokens], length) as grad_x,
+                _whole_target(grads.dt[batch, tokens], length) as grad_dt,
+            ):
+                run_blocks(
+                    backward_heads,
+                    _one_each(groups),
+                    segment,
+                    saved_state[batch, index].numpy(),
+                    _whole_chunks(grad_output[batch, tokens]).numpy(),
+                    grad_states.numpy(),
+                    HeadGradients(grad_x, grad_dt, grads.A.numpy(), grads.D.numpy()),
+                    GroupGradients(*(part.numpy() for part in parts)),
+                )
+            grad_B, grad_C, grad_scores = (part.sum(1) for part in parts)
+            from_scores_B = grad_scores.mT @ torch.from_numpy(segment.C)
+            from_scores_C = grad_scores @ torch.from_numpy(segment.B)
+            _write(grads.B[batch, tokens], grad_B[..., :state_size] + from_scores_B)
+            _write(grads.C[batch, tokens], grad_C[..., :state_size] + from_scores_C)
+    return grads._replace(A=grads.A.float(), D=grads.D.float())
+
+
+def _segments(length: int, reverse: bool) -> Iterator[tuple[int, slice]]:
+    """Yield each segment's index and tokens, in the direction of the scan."""
+    indices = range(-(-length // SEGMENT))
+    for index in reversed(indices) if reverse else indices:
+        yield index, slice(index * SEGMENT, min((index + 1) * SEGMENT, length))
+
+
+def _segment(inputs: ScanInputs, batch: int, tokens: slice, reverse: bool) -> Segment:
+    """Cut a segment out of one sequence, in whole chunks.
+
+    Tokens that fill the last chunk have dt = 0: they neither decay the state nor add to it.
+    """
+    x, dt, B, C = (
+        _whole_chunks(tensor[batch, tokens]) for tensor in (inputs.x, inputs.dt, inputs.B, inputs.C)
+    )
+    B, C = B.unflatten(0, (-1, CHUNK)), C.unflatten(0, (-1, CHUNK))
+    return Segment(
+        x=x.numpy(),
+        dt=dt.numpy(),
+        A=inputs.A.numpy(),
+        B=B.numpy(),
+        C=C.numpy(),
+        D=inputs.D.numpy(),
+        scores=(C @ B.mT).numpy(),
+        decays=sum_decays(dt.unflatten(0, (-1, CHUNK)), inputs.A, reverse),
+        reverse=reverse,
+    )
+
+
+def _whole_chunks(tokens: Tensor) -> Tensor:
+    """Return [l ...] in fp32, filled with zeros to whole chunks."""
+    missing = -len(tokens) % CHUNK
+    if missing:
+        tokens = F.pad(tokens, (0, 0) * (tokens.ndim - 1) + (0, missing))
+    return tokens.float().contiguous()
+
+
+def _whole_vectors(count: int | torch.SymInt) -> int | torch.SymInt:
+    """Round a number of columns up to whole vectors."""
+    return -(-count // LANES) * LANES
+
+
+@contextmanager
+def _whole_target(target: Tensor, length: int) -> Iterator[np.ndarray]:
+    """Give an fp32 array of `length` tokens, and copy to `target` what is written there."""
+    if len(target) == length and target.dtype == torch.float32:
+        yield target.numpy()
+        return
+    whole = torch.empty(length, *target.shape[1:])
+    yield whole.numpy()
+    target.copy_(whole[: len(target)])
+
+
+def _write(target: Tensor, chunks: Tensor) -> None:
+    """Copy the tokens of [c, q, N] to `target`, without those that fill the last chunk."""
+    target.copy_(chunks.flatten(0, 1)[: len(target)])
+
+
+def _one_each(count: int) -> np.ndarray:
+    """Return bounds that give each task one head or group: it takes long enough."""
+    return np.arange(count + 1)

@@ -1,0 +1,181 @@
+"""Both passes: which kernels run, one after the other, and on what."""
+
+from typing import Any, NamedTuple
+
+import torch
+import triton.language as tl
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.ops.cuda.scans import FUSED, INTERPRETED, check_size
+from asysplat.ops.scan import ScanInputs
+from asysplat.ops.ssd.chunked import CHUNK
+from asysplat.ops.ssd.cuda.backward import head_gradients, projection_gradients, score_gradients
+from asysplat.ops.ssd.cuda.chunk import ROWS, sum_decays
+from asysplat.ops.ssd.cuda.forward import forward_chunk, pass_states, score_chunk
+
+INTERPRETED_CHUNK = 16  # tokens: tests see several chunks, although the interpreter is slow
+TOKENS = INTERPRETED_CHUNK if INTERPRETED else CHUNK  # of a chunk
+BLOCK = 64  # columns of a state in a program
+HEADS = 8  # in a program that sums decays
+LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}  # with fewer warps, fp32 products spill
+MOST_HEAD_DIM, MOST_STATE = 128, 256
+# As what a product's factors are rounded: fp16 has not the range of a state, TF32 has all its bits.
+PRODUCTS = {
+    torch.float32: {"DOT": tl.float32, "PRECISION": "ieee"},
+    torch.bfloat16: {"DOT": tl.bfloat16, "PRECISION": "ieee"},
+    torch.float16: {"DOT": tl.float32, "PRECISION": "tf32"},
+}
+
+
+def saved_state_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) -> tuple[int]:
+    """Return (0,): the backward pass needs nothing but the inputs."""
+    return (0,)
+
+
+def forward(
+    inputs: ScanInputs, reverse: bool, keep: bool
+) -> tuple[Float[Tensor, "B L H P"], Float[Tensor, "0"]]:
+    """Return y and an empty saved state; see `asysplat.ops.scan.Kernels`.
+
+    Raises:
+        InputError: a head_dim or a state size that is no power of two from 16 to 128 or 256.
+    """
+    check_size("ssd", "head_dim", inputs.x.shape[-1], MOST_HEAD_DIM)
+    check_size("ssd", "state size", inputs.B.shape[-1], MOST_STATE)
+    x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
+    y = torch.empty_like(x)
+    with torch.cuda.device_of(x):
+        sizes = _Sizes.of(x, B, reverse)
+        decays = _decays(sizes, dt, A)
+        scores = _scores(sizes, B, C)
+        states = _states(sizes, x, B, decays, gradient=False)
+        forward_chunk[(sizes.chunks * sizes.heads, sizes.batch)](
+            x, C, D, decays, scores, states, y, **sizes.told(forward_chunk)
+        )
+    return y, dt.new_empty(saved_state_shape(x, B))
+
+
+def backward(
+    grad_output: Float[Tensor, "B L H P"],
+    inputs: ScanInputs,
+    saved_state: Float[Tensor, "0"],
+    reverse: bool,
+) -> ScanInputs:
+    """Return the gradients of the inputs; see `asysplat.ops.scan.Kernels`."""
+    x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
+    grad_output = grad_output.contiguous()
+    with torch.cuda.device_of(x):
+        sizes = _Sizes.of(x, B, reverse)
+        parts = (sizes.batch, sizes.chunks, sizes.heads)
+        grads = ScanInputs(
+            x=torch.empty_like(x),
+            dt=torch.empty_like(dt),
+            A=dt.new_empty(parts),
+            B=torch.empty_like(B),
+            C=torch.empty_like(C),
+            D=dt.new_empty(parts),
+        )
+        decays = _decays(sizes, dt, A)
+        states = _states(sizes, x, B, decays, gradient=False)
+        grad_states = _states(sizes, grad_output, C, decays, gradient=True)
+        head_gradients[(sizes.chunks * sizes.heads, sizes.batch)](
+            *(grad_output, x, A, B, C, D),
+            decays=decays,
+            scores=_scores(sizes, B, C),
+            states=states,
+            grad_states=grad_states,
+            grad_x=grads.x,
+            grad_dt=grads.dt,
+            grad_A=grads.A,
+            grad_D=grads.D,
+            **sizes.told(head_gradients),
+        )
+        grad_scores = dt.new_empty(sizes.squares)
+        score_gradients[(sizes.chunks, sizes.batch)](
+            grad_output, x, decays, grad_scores, **sizes.told(score_gradients)
+        )
+        gradients_of = projection_gradients[(sizes.blocks, sizes.chunks, sizes.batch)]
+        told = sizes.told(projection_gradients)
+        gradients_of(x, C, decays, grad_scores, grad_states, grads.B, OF_B=True, **told)
+        gradients_of(grad_output, B, decays, grad_scores, states, grads.C, OF_B=False, **told)
+    return grads._replace(A=grads.A.sum((0, 1)), D=grads.D.sum((0, 1)))
+
+
+class _Sizes(NamedTuple):
+    """The sizes of a scan, as its kernels are told them."""
+
+    batch: int
+    length: int
+    heads: int
+    head_dim: int
+    state: int
+    dtype: torch.dtype
+    reverse: bool
+
+    @classmethod
+    def of(cls, x: Tensor, B: Tensor, reverse: bool) -> "_Sizes":
+        return cls(*x.shape, B.shape[-1], x.dtype, reverse)
+
+    @property
+    def chunks(self) -> int:
+        return -(-self.length // TOKENS)
+
+    @property
+    def squares(self) -> tuple[int, int, int, int]:
+        return self.batch, self.chunks, TOKENS, TOKENS
+
+    @property
+    def block(self) -> int:
+        return min(BLOCK, self.state)
+
+    @property
+    def blocks(self) -> int:
+        return self.state // self.block
+
+    def told(self, kernel: Any) -> dict[str, Any]:
+        """Return what a launch tells a kernel besides its arrays: the sizes it has names for."""
+        sizes = {
+            "length": self.length,
+            "heads": self.heads,
+            "chunks": self.chunks,
+            "REVERSE": self.reverse,
+            "HEAD_DIM": self.head_dim,
+            "STATE": self.state,
+            "BLOCK": self.block,
+            "CHUNK": TOKENS,
+            **PRODUCTS[self.dtype],
+        }
+        return {name: size for name, size in sizes.items() if name in kernel.arg_names} | LAUNCH
+
+
+def _decays(sizes: _Sizes, dt: Tensor, A: Tensor) -> Float[Tensor, "B H rows positions"]:
+    """Return what `sum_decays` writes."""
+    decays = dt.new_empty(sizes.batch, sizes.heads, ROWS.value, sizes.chunks * TOKENS)
+    sum_decays[(sizes.chunks, -(-sizes.heads // HEADS), sizes.batch)](
+        *(dt, A, decays, sizes.length, sizes.heads),
+        REVERSE=sizes.reverse,
+        CHUNK=TOKENS,
+        HEADS=HEADS,
+        **FUSED,
+    )
+    return decays
+
+
+def _states(
+    sizes: _Sizes, values: Tensor, projections: Tensor, decays: Tensor, gradient: bool
+) -> Float[Tensor, "B chunks H P N"]:
+    """Return the state before each chunk, or with `gradient` the gradient of that after it."""
+    shape = (sizes.batch, sizes.chunks, sizes.heads, sizes.head_dim, sizes.state)
+    states = decays.new_empty(shape)
+    pass_states[(sizes.blocks, sizes.heads, sizes.batch)](
+        values, projections, decays, states, GRADIENT=gradient, **sizes.told(pass_states)
+    )
+    return states
+
+
+def _scores(sizes: _Sizes, B: Tensor, C: Tensor) -> Float[Tensor, "B chunks t s"]:
+    """Return what `score_chunk` writes."""
+    scores = torch.empty(sizes.squares, dtype=torch.float32, device=B.device)
+    score_chunk[(sizes.chunks, sizes.batch)](B, C, scores, **sizes.told(score_chunk))
+    return scores
