@@ -11,7 +11,7 @@ from band import boundary_band
 from torch import Tensor
 
 from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
-from asysplat.rendering.settings import Settings
+from asysplat.rendering.interface import Settings
 
 OTHERS = tuple(name for name in INPUTS if name not in FIELDS)
 SCENES = {

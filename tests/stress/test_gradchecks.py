@@ -9,8 +9,8 @@ from backends import BACKGROUND, EXACT, FIELDS, assert_close, both_ways, random_
 from soft import FLOOR, MODES, soft_scene
 
 from asysplat.rendering import INRIA, render
-from asysplat.rendering.reference.projection import project
-from asysplat.rendering.settings import Settings
+from asysplat.rendering.interface import Settings
+from asysplat.rendering.reference.project import project
 from asysplat.scene import Gaussians
 
 

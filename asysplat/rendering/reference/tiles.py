@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.rendering.limits import check_pairs
-from asysplat.rendering.reference.projection import Splats
+from asysplat.rendering.interface import check_pairs
+from asysplat.rendering.reference.project import Splats
 
 
 @dataclass(frozen=True)
@@ -29,21 +29,21 @@ class TileLists:
     lengths: Int[Tensor, "T"]
 
     def origins(self, tiles: Int[Tensor, "t"]) -> Int[Tensor, "t 2"]:
-        """Pixel (x, y) at the upper left corner of the given tiles."""
+        """Return the pixel (x, y) at the upper left corner of the given tiles."""
         column, row = tiles % self.columns, tiles // self.columns % self.rows
         return torch.stack((column, row), -1) * self.size
 
     def untile(
         self, values: Float[Tensor, "T C P"], height: int, width: int
     ) -> Float[Tensor, "images C {height} {width}"]:
-        """Values of all tiles' pixels to images."""
+        """Arrange the values of all tiles' pixels as images."""
         grid = values.unflatten(0, (self.images, self.rows, self.columns))
         grid = grid.unflatten(-1, (self.size, self.size))
         return grid.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)[..., :height, :width]
 
 
 @torch.no_grad()
-def assign_tiles(splats: Splats, images: int, height: int, width: int, size: int) -> TileLists:
+def list_tiles(splats: Splats, images: int, height: int, width: int, size: int) -> TileLists:
     """Sort the splats of `images` images into tiles of size x size pixels."""
     rows, columns = -(-height // size), -(-width // size)
     first, last = splats.first // size, splats.last // size
