@@ -26,7 +26,7 @@ PIXEL_MARGIN = 1e-3
 
 FARTHEST = 2.0**30  # pixels; a centre farther outside the image is kept as an offset from here
 
-# Factors of the spherical harmonics, by degree and order.
+# Factors of the spherical harmonics (SH), by degree and order.
 Y0 = 0.5 / math.sqrt(math.pi)
 Y1 = math.sqrt(3 / (4 * math.pi))
 Y2 = 0.5 * math.sqrt(15 / math.pi)

@@ -1,4 +1,4 @@
-"""Arithmetic of the renderer's kernels: cameras and ellipses, spherical harmonics, bits of floats.
+"""Arithmetic of the renderer's kernels: cameras, ellipses, spherical harmonics (SH), bits.
 
 All that the two projection passes share is here, in float64.
 """
@@ -177,7 +177,7 @@ def compensation(det0, det, floor):
 
 @inline
 def sh_basis(x, y, z, count, out):
-    """Write the first `count` (1, 4, 9 or 16) spherical harmonics at a unit direction.
+    """Write the first `count` (1, 4, 9 or 16) SH functions at a unit direction.
 
     Signs are those of INRIA's code.
     """

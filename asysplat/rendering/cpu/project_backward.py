@@ -65,7 +65,7 @@ class Needs(NamedTuple):
 class _Scratch(NamedTuple):
     """Room for one Gaussian.
 
-    sums [58] its gradient over all views, see MEAN; functions [16] the spherical harmonics at its
+    sums [58] its gradient over all views, see MEAN; functions [16] the SH functions at its
     direction, and g_functions [16] their gradients.
     """
 

@@ -1,6 +1,6 @@
-"""Arithmetic of the renderer's kernels: cameras and ellipses in float64, harmonics in float32.
+"""Arithmetic of the renderer's kernels: cameras, ellipses, spherical harmonics (SH).
 
-All that the two projection passes share is here.
+All that the two projection passes share is here: SH in float32, the rest in float64.
 """
 
 import inspect
@@ -150,7 +150,7 @@ def direction(offset):
 
 @kernel
 def sh_basis(x, y, z, COUNT: tl.constexpr):
-    """Return the first COUNT (1, 4, 9 or 16) spherical harmonics at unit directions.
+    """Return the first COUNT (1, 4, 9 or 16) SH functions at unit directions.
 
     Signs are those of INRIA's code.
     """

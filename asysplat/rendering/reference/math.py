@@ -1,4 +1,4 @@
-"""Arithmetic of the reference: rotations, ellipses, and colours from real spherical harmonics."""
+"""Arithmetic of the reference: rotations, ellipses, and colours from spherical harmonics (SH)."""
 
 import math
 
