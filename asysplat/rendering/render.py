@@ -78,24 +78,24 @@ def render(
         gaussians: [..., N].
         cameras: [..., V], with the batch dimensions of `gaussians`. Skew is ignored.
         background: RGB [3], or [..., V, 3] one a view; None is black.
-        backend: "reference", "cpu", "cuda" or "auto", which is the fast one for the device, and the
-            reference for float64 and where that needs a package which is not there.
+        backend: "reference", "cpu", "cuda" or "auto": the fast one for the device, the reference
+            for float64, and on a GPU without Triton.
         depth: True or "expected": sum_i w_i z_i / alpha. "accumulated": not divided by alpha.
             "median": z of the Gaussian that takes the transmittance to half or below. False: none.
         antialiased: lower opacities by what the dilation adds to a splat's area (Yu et al. 2024).
         sh_degree: leave SH of higher degrees out.
         convention: cut-offs of alpha compositing; see `CONVENTIONS`.
         skips: exact skips, each of which can be switched off.
-        masks: True where a pixel counts; the others show the background, and tiles of them cost
-            nothing.
-        views_at_once: draw so many views of each scene at a time, keep nothing but the inputs, and
-            draw them again in the backward pass (deferred backpropagation, Zhang et al. 2022): the
-            same gradient, in the memory of so many views. None draws all at once.
-        validate: look at every number of both arguments first.
+        masks: True where a pixel counts; the others show the background, and tiles without a pixel
+            that counts cost nothing.
+        views_at_once: draw this many views of each scene at a time, keep nothing but the inputs,
+            and draw again in the backward pass (deferred backpropagation, Zhang et al. 2022): the
+            same gradient, in the memory that these views take. None draws all at once.
+        validate: check every number of `gaussians` and `cameras` first.
 
     Raises:
         InputError: an unknown backend or depth, shapes, devices or types that do not fit together,
-            more pairs of Gaussian and tile than can be numbered; with `validate`, what
+            more pairs of Gaussian and tile than a list can number; with `validate`, what
             `Gaussians.validate` and `Cameras.validate` refuse.
     """
     if sh_degree not in (None, 0, 1, 2, 3):

@@ -1,6 +1,7 @@
 """The CPU renderer, one pass after the other, as one operation to torch."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -83,7 +84,7 @@ class _Draw(torch.autograd.Function):
         lists = _list_tiles(frame, *_project(frame, inputs), masks, stats)
         images, saved, beside_depth = _rasterize(frame, lists, settings.depth, stats)
         _, _, transmittance, _, origins = images
-        ctx.save_for_backward(*tensors, transmittance)
+        ctx.save_for_backward(*tensors, transmittance)  # an output must be saved here
         ctx.settings, ctx.size, ctx.frame, ctx.lists = settings, size, frame, lists
         ctx.saved, ctx.beside_depth = saved._replace(transmittance=None), beside_depth
         ctx.set_materialize_grads(False)
@@ -117,7 +118,7 @@ class _Draw(torch.autograd.Function):
         return (None,) * 4 + _project_backward(frame, inputs, needs, pairs, tensors)
 
 
-def _frame(tensors: tuple[Tensor, ...], size: tuple[int, int], settings: Settings) -> Frame:
+def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: Settings) -> Frame:
     """Gather what the kernels are told."""
     means, intrinsics = tensors[0], tensors[-1]
     (scenes, num), views = means.shape[:2], intrinsics.shape[1]
@@ -157,7 +158,7 @@ def _frame(tensors: tuple[Tensor, ...], size: tuple[int, int], settings: Setting
     )
 
 
-def _inputs(tensors: tuple[Tensor, ...], size: tuple[int, int], settings: Settings) -> Inputs:
+def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: Settings) -> Inputs:
     """Turn the fields of Gaussians, poses and intrinsics into arrays."""
     *fields, cam_to_world, intrinsics = tensors
     cameras = camera_rows(cam_to_world, intrinsics, size, settings.convention)
@@ -246,7 +247,7 @@ def _rasterize(
 
 
 def _project_backward(
-    frame: Frame, inputs: Inputs, needs: Needs, pairs: Pairs, tensors: list[Tensor]
+    frame: Frame, inputs: Inputs, needs: Needs, pairs: Pairs, tensors: Sequence[Tensor]
 ) -> tuple[Tensor | None, ...]:
     """Return the gradients of `tensors`: the fields of Gaussians, poses and intrinsics."""
     *fields, cam_to_world, intrinsics = tensors

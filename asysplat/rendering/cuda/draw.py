@@ -1,6 +1,7 @@
 """The GPU renderer, one pass after the other, as one operation to torch."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -149,7 +150,7 @@ class _Draw(torch.autograd.Function):
         return (None,) * 4 + (*fields, *poses)
 
 
-def _frame(tensors: tuple[Tensor, ...], size: tuple[int, int]) -> Frame:
+def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
     """Gather the sizes."""
     sh, intrinsics = tensors[4], tensors[-1]
     (scenes, num, sh_count), views = sh.shape[:3], intrinsics.shape[1]
@@ -167,7 +168,7 @@ def _frame(tensors: tuple[Tensor, ...], size: tuple[int, int]) -> Frame:
     )
 
 
-def _inputs(tensors: tuple[Tensor, ...], size: tuple[int, int], settings: Settings) -> Inputs:
+def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: Settings) -> Inputs:
     """Lay out the fields of Gaussians, poses and intrinsics for the kernels."""
     *fields, cam_to_world, intrinsics = tensors
     cameras = camera_rows(cam_to_world, intrinsics, size, settings.convention)

@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from asysplat.rendering.interface import Convention
 from asysplat.rendering.reference.project import Splats
-from asysplat.rendering.reference.tiles import TileLists
+from asysplat.rendering.reference.tiles import Lists
 
 TILE = 4  # pixels a side
 GROUP_ELEMENTS = 1 << 17  # (splat, pixel) pairs of one group: temporaries of 512 KiB
@@ -23,7 +23,7 @@ GROUP_ELEMENTS = 1 << 17  # (splat, pixel) pairs of one group: temporaries of 51
 def rasterize(
     splats: Splats,
     values: Float[Tensor, "M C"],
-    lists: TileLists,
+    lists: Lists,
     convention: Convention,
     median: bool = False,
 ) -> Float[Tensor, "T C P"]:
@@ -47,9 +47,7 @@ def rasterize(
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, packed: Tensor, lists: TileLists, convention: Convention, median: bool
-    ) -> Tensor:
+    def forward(ctx, packed: Tensor, lists: Lists, convention: Convention, median: bool) -> Tensor:
         ctx.save_for_backward(packed)
         ctx.lists, ctx.options = lists, (convention, median)
         pixels = lists.size**2
@@ -73,7 +71,7 @@ class _Rasterize(torch.autograd.Function):
         return grad, None, None, None
 
 
-def _groups(lists: TileLists, padding: int) -> Iterator[tuple[Tensor, Tensor]]:
+def _groups(lists: Lists, padding: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield tiles [t] and their splats [t, K], about GROUP_ELEMENTS (splat, pixel) pairs at a time.
 
     Covers all tiles that have splats, longest list first; shorter ones end in `padding`.
