@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from asysplat.rendering.reference.sh import sh_basis
+from asysplat.rendering.reference.math import sh_basis
 from asysplat.scene import Gaussians
 
 

@@ -1,4 +1,4 @@
-"""Rendering a few views at a time, in the memory of so many."""
+"""Render a few views at a time, in the memory that these take."""
 
 import dataclasses
 import warnings
@@ -9,13 +9,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
-from asysplat.rendering.layers import Layers
-from asysplat.rendering.settings import Settings
+from asysplat.rendering.interface import RenderOutputs, Settings
 from asysplat.scene import Cameras, Gaussians
 
-Draw = Callable[[Gaussians, Cameras, Settings, Tensor | None], Layers]
-OF_VIEWS = ("cam_to_world", "intrinsics")
-NAMES = (*(field.name for field in dataclasses.fields(Gaussians)), *OF_VIEWS)
+Draw = Callable[[Gaussians, Cameras, Settings, Tensor | None], RenderOutputs]
+PER_VIEW = ("cam_to_world", "intrinsics")
+NAMES = (*(field.name for field in dataclasses.fields(Gaussians)), *PER_VIEW)
 SAME_IN_ALL = ("tile_size",)  # statistics that do not add up
 
 
@@ -26,10 +25,10 @@ def draw_in_chunks(
     settings: Settings,
     masks: Tensor | None,
     views_at_once: int | None,
-) -> Layers:
-    """`draw`, with all views at once, or with `views_at_once` of every scene.
+) -> RenderOutputs:
+    """Draw all views at once, or `views_at_once` of every scene at a time.
 
-    Where memory does not hold them, half as many are tried, and a warning says so.
+    Where memory does not hold that many, half as many are tried, and a warning says so.
 
     Raises:
         InputError: views_at_once below 1.
@@ -58,19 +57,19 @@ def _draw(
     settings: Settings,
     masks: Tensor | None,
     views_at_once: int,
-) -> Layers:
+) -> RenderOutputs:
     if views_at_once >= cameras.num_views:
         return draw(gaussians, cameras, settings, masks)
     stats: dict[str, int] = {}
     job = _Job(draw, settings, masks, cameras.height, cameras.width, views_at_once, stats)
-    fields = [getattr(gaussians, name) for name in NAMES if name not in OF_VIEWS]
-    *layers, origin = _Deferred.apply(job, *fields, cameras.cam_to_world, cameras.intrinsics)
-    return Layers(*layers, stats, origin)
+    fields = [getattr(gaussians, name) for name in NAMES if name not in PER_VIEW]
+    *images, origins = _Deferred.apply(job, *fields, cameras.cam_to_world, cameras.intrinsics)
+    return RenderOutputs(*images, stats, origins)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Job:
-    """How to draw some of the views; `stats` is filled in passing."""
+    """How to draw some of the views; `stats` is filled on the way."""
 
     draw: Draw
     settings: Settings
@@ -81,24 +80,26 @@ class _Job:
     stats: dict[str, int]
 
     def chunks(self, num_views: int) -> list[slice]:
+        """Divide the views."""
         starts = range(0, num_views, self.views_at_once)
         return [slice(start, start + self.views_at_once) for start in starts]
 
     def part(self, tensors: Sequence[Tensor], views: slice) -> list[Tensor]:
-        """Those of some views."""
+        """Take what belongs to some views from all tensors."""
         *fields, poses, intrinsics = tensors
         return [*fields, poses[:, views], intrinsics[:, views]]
 
-    def layers(self, part: Sequence[Tensor], views: slice) -> tuple[Layers, list[Tensor | None]]:
-        """Of Gaussian fields, and poses and intrinsics of `views`; also as [B, views, ...]."""
+    def draw_part(
+        self, part: Sequence[Tensor], views: slice
+    ) -> tuple[list[Tensor | None], dict[str, int]]:
+        """Draw the `part` of `views`; return images as [B, views, ...], and statistics."""
         *fields, poses, intrinsics = part
         cameras = Cameras(intrinsics, poses, self.height, self.width)
         masks = None if self.masks is None else self.masks[:, views]
-        layers = self.draw(Gaussians(*fields), cameras, self.settings, masks)
+        out = self.draw(Gaussians(*fields), cameras, self.settings, masks)
         shape = poses.shape[:2]
-        images = [layers.image, layers.alpha, layers.transmittance, layers.depth]
-        images.append(layers.depth_origin)
-        return layers, [None if image is None else image.unflatten(0, shape) for image in images]
+        images = (out.image, out.alpha, out.transmittance, out.depth, out.depth_origin)
+        return [None if image is None else image.unflatten(0, shape) for image in images], out.stats
 
 
 class _Deferred(torch.autograd.Function):
@@ -111,9 +112,9 @@ class _Deferred(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         parts = []
         for views in job.chunks(tensors[-1].shape[1]):
-            layers, images = job.layers(job.part(tensors, views), views)
+            images, stats = job.draw_part(job.part(tensors, views), views)
             parts.append(images)
-            for name, count in layers.stats.items():
+            for name, count in stats.items():
                 job.stats[name] = count + (0 if name in SAME_IN_ALL else job.stats.get(name, 0))
         return tuple(
             None if images[0] is None else torch.cat(images, 1).flatten(0, 1)
@@ -135,7 +136,7 @@ class _Deferred(torch.autograd.Function):
                 for tensor, need in zip(job.part(ctx.saved_tensors, views), needed, strict=True)
             ]
             with torch.enable_grad():
-                _, images = job.layers(part, views)
+                images, _ = job.draw_part(part, views)
             seen = [
                 (image, grad.unflatten(0, shape)[:, views])
                 for image, grad in zip(images, grads, strict=True)
@@ -144,5 +145,5 @@ class _Deferred(torch.autograd.Function):
             torch.autograd.backward(*map(list, zip(*seen, strict=True)))
             for name, total, tensor in zip(NAMES, totals, part, strict=True):
                 if total is not None and tensor.grad is not None:
-                    (total[:, views] if name in OF_VIEWS else total).add_(tensor.grad)
+                    (total[:, views] if name in PER_VIEW else total).add_(tensor.grad)
         return (None, *totals)

@@ -11,16 +11,27 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.ops.dispatch import pick_backend
 from asysplat.ops.precision import without_autocast
-from asysplat.rendering import cpu, cuda, reference
+from asysplat.rendering import cpu, reference
 from asysplat.rendering.chunks import draw_in_chunks
-from asysplat.rendering.convention import INRIA, Convention
-from asysplat.rendering.layers import Layers
-from asysplat.rendering.settings import Settings, Skips
+from asysplat.rendering.interface import INRIA, Convention, RenderOutputs, Settings, Skips
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
-BACKENDS = {"reference": reference.draw, "cpu": cpu.draw, "cuda": cuda.draw}
 DEPTH_SWITCH = {True: "expected", False: None}  # what depth=True and depth=False stand for
 ALPHA_TINY = 1e-6  # an alpha below 1/255 is exactly 0, so any value between will do
+
+
+def _draw_by_cuda(
+    gaussians: Gaussians, cameras: Cameras, settings: Settings, masks: Tensor | None = None
+) -> RenderOutputs:
+    """Import Triton at the first call only: a machine without a GPU may lack it."""
+    try:
+        from asysplat.rendering.cuda.draw import draw
+    except ImportError as error:
+        raise InputError("render's backend 'cuda' needs triton: pip install triton.") from error
+    return draw(gaussians, cameras, settings, masks)
+
+
+BACKENDS = {"reference": reference.draw, "cpu": cpu.draw, "cuda": _draw_by_cuda}
 
 
 @dataclass(frozen=True)
@@ -59,7 +70,7 @@ def render(
     """Render every view, by alpha compositing in depth order (Kerbl et al. 2023).
 
     Differentiable in all fields of `gaussians` and `cameras`, and in `background`; a Gaussian that
-    is culled (see `reference.projection.project`) has gradient 0. Half-precision inputs are
+    is culled (see `reference.project.project`) has gradient 0. Half-precision inputs are
     computed in float32, also under autocast. The same inputs give the same bits on one device, on a
     CPU on any number of threads.
 
@@ -67,24 +78,24 @@ def render(
         gaussians: [..., N].
         cameras: [..., V], with the batch dimensions of `gaussians`. Skew is ignored.
         background: RGB [3], or [..., V, 3] one a view; None is black.
-        backend: "reference", "cpu", "cuda" or "auto", which is the fast one for the device, and the
-            reference for float64 and where that needs a package which is not there.
+        backend: "reference", "cpu", "cuda" or "auto": the fast one for the device, the reference
+            for float64, and on a GPU without Triton.
         depth: True or "expected": sum_i w_i z_i / alpha. "accumulated": not divided by alpha.
             "median": z of the Gaussian that takes the transmittance to half or below. False: none.
         antialiased: lower opacities by what the dilation adds to a splat's area (Yu et al. 2024).
-        sh_degree: leave higher harmonics out.
+        sh_degree: leave SH of higher degrees out.
         convention: cut-offs of alpha compositing; see `CONVENTIONS`.
         skips: exact skips, each of which can be switched off.
-        masks: True where a pixel counts; the others show the background, and tiles of them cost
-            nothing.
-        views_at_once: draw so many views of each scene at a time, keep nothing but the inputs, and
-            draw them again in the backward pass (deferred backpropagation, Zhang et al. 2022): the
-            same gradient, in the memory of so many views. None draws all at once.
-        validate: look at every number of both arguments first.
+        masks: True where a pixel counts; the others show the background, and tiles without a pixel
+            that counts cost nothing.
+        views_at_once: draw this many views of each scene at a time, keep nothing but the inputs,
+            and draw again in the backward pass (deferred backpropagation, Zhang et al. 2022): the
+            same gradient, in the memory that these views take. None draws all at once.
+        validate: check every number of `gaussians` and `cameras` first.
 
     Raises:
         InputError: an unknown backend or depth, shapes, devices or types that do not fit together,
-            more pairs of Gaussian and tile than can be numbered; with `validate`, what
+            more pairs of Gaussian and tile than a list can number; with `validate`, what
             `Gaussians.validate` and `Cameras.validate` refuse.
     """
     if sh_degree not in (None, 0, 1, 2, 3):
@@ -104,14 +115,13 @@ def render(
         auto = BACKENDS[_fast_backend(gaussians.means.device, dtype)]
         draw = pick_backend("render", {"auto": auto, **BACKENDS}, backend)
         counts = None if masks is None else _one_batch(masks, batch)
-        layers = draw_in_chunks(draw, scenes, views, settings, counts, views_at_once)
+        out = draw_in_chunks(draw, scenes, views, settings, counts, views_at_once)
 
         def shaped(images: Tensor) -> Tensor:
             return images.to(dtype).unflatten(0, (*batch, cameras.num_views))
 
-        image, alpha = shaped(layers.image), shaped(layers.alpha)
-        transmittance = shaped(layers.transmittance)
-        distance = None if layers.depth is None else _depth(layers, settings).to(dtype)
+        image, alpha, transmittance = map(shaped, (out.image, out.alpha, out.transmittance))
+        distance = None if out.depth is None else _depth(out, settings).to(dtype)
         distance = None if distance is None else distance.unflatten(0, alpha.shape[:-2])
         if masks is not None:
             image = image.where(masks[..., None, :, :], 0)
@@ -119,21 +129,21 @@ def render(
             distance = None if distance is None else distance.where(masks, 0)
         if background is not None:
             image = image + transmittance[..., None, :, :] * background.to(dtype)[..., None, None]
-        return Rendering(image, alpha, distance, layers.stats)
+        return Rendering(image, alpha, distance, out.stats)
 
 
-def _depth(layers: Layers, settings: Settings) -> Tensor:
-    """[I, H, W] of the kind that was asked for."""
+def _depth(out: RenderOutputs, settings: Settings) -> Tensor:
+    """Compute the depth [I, H, W] of the kind that was asked for."""
     if settings.depth == "median":
-        return layers.depth
-    origin = 0 if layers.depth_origin is None else layers.depth_origin
+        return out.depth
+    origin = 0 if out.depth_origin is None else out.depth_origin
     if settings.depth == "accumulated":
-        return layers.depth + origin * layers.alpha
-    return layers.depth / layers.alpha.clamp_min(ALPHA_TINY) + origin * (layers.alpha > 0)
+        return out.depth + origin * out.alpha
+    return out.depth / out.alpha.clamp_min(ALPHA_TINY) + origin * (out.alpha > 0)
 
 
 def _fast_backend(device: torch.device, dtype: torch.dtype) -> str:
-    """The fastest for the device, that keeps what float64 asks for."""
+    """Name the fastest backend for the device that computes in `dtype`."""
     if dtype == torch.float32 and device.type == "cpu":
         return "cpu"
     if dtype == torch.float32 and device.type == "cuda" and find_spec("triton"):
@@ -142,14 +152,14 @@ def _fast_backend(device: torch.device, dtype: torch.dtype) -> str:
 
 
 def _one_batch(tensor: Tensor, batch: tuple[int, ...]) -> Tensor:
-    """All batch dimensions as one, which is 1 where there were none."""
+    """Flatten the batch dimensions into one, of length 1 where there are none."""
     return tensor.reshape(math.prod(batch), *tensor.shape[len(batch) :])
 
 
 def _check(
     gaussians: Gaussians, cameras: Cameras, background: Tensor | None, masks: Tensor | None
 ) -> tuple[int, ...]:
-    """The shared batch dimensions, of tensors that go together."""
+    """Check that all tensors go together; return their batch dimensions."""
     batch, views = tuple(gaussians.opacities.shape[:-1]), tuple(cameras.intrinsics.shape[:-2])
     if batch != views[:-1]:
         raise InputError(

@@ -14,7 +14,7 @@ PLAIN = """
 import torch
 from asysplat.benchmark.scenes import random_scene
 from asysplat.rendering import render
-from asysplat.rendering.cpu.forward import rasterize
+from asysplat.rendering.cpu.rasterize import rasterize
 
 gaussians, cameras = random_scene(300, 40, 50)
 leaves = gaussians.map(lambda t: t.requires_grad_())

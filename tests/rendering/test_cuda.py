@@ -12,12 +12,14 @@ import pytest
 import torch
 
 from asysplat.errors import InputError
-from asysplat.rendering import GSPLAT_1_5, Skips, cpu, cuda, reference
-from asysplat.rendering.settings import Settings
+from asysplat.rendering import GSPLAT_1_5, Skips, cpu, reference
+from asysplat.rendering.interface import Settings
+from asysplat.rendering.render import BACKENDS
 from asysplat.scene import Cameras, Gaussians
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 DEVICE = "cpu" if INTERPRETED else "cuda"
+draw_by_cuda = BACKENDS["cuda"]
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -33,23 +35,25 @@ def weighted_sum(image):
 
 
 def run(draw, gaussians, cameras, settings, masks=None):
-    """Layers, and the gradients of every input; of one image where there are `masks`, [1, 1, H, W],
-    0 where a pixel does not count."""
+    """Return images, gradients of every input, and statistics.
+
+    Where there are `masks`, [1, 1, H, W], images are 0 where a pixel does not count.
+    """
     leaves = [getattr(gaussians, name) for name in FIELDS]
     leaves = [
         t.detach().requires_grad_() for t in (*leaves, cameras.cam_to_world, cameras.intrinsics)
     ]
     *fields, cam_to_world, intrinsics = leaves
     views = Cameras(intrinsics, cam_to_world, cameras.height, cameras.width)
-    layers = draw(Gaussians(*fields), views, settings, masks)
-    images = [layers.image, layers.alpha]
-    if layers.depth is not None:
-        origin = 0 if layers.depth_origin is None else layers.depth_origin
-        images.append(layers.depth + origin * layers.alpha)
+    out = draw(Gaussians(*fields), views, settings, masks)
+    images = [out.image, out.alpha]
+    if out.depth is not None:
+        origin = 0 if out.depth_origin is None else out.depth_origin
+        images.append(out.depth + origin * out.alpha)
     if masks is not None:
         images = [image.where(masks[0], 0) for image in images]
     grads = torch.autograd.grad(sum(map(weighted_sum, images)), leaves)
-    return [image.detach() for image in images], grads, layers.stats
+    return [image.detach() for image in images], grads, out.stats
 
 
 def make_batch(make_scene, scenes=1, opaque=False, device="cpu", **options):
@@ -84,7 +88,7 @@ def test_images_and_gradients_are_those_of_the_reference(make_scene, name):
     options, settings = CASES[name]
     scene = make_batch(make_scene, device=DEVICE, **options)
     exact = run(reference.draw, *(part.to(torch.float64) for part in scene), settings)
-    got = run(cuda.draw, *scene, settings)
+    got = run(draw_by_cuda, *scene, settings)
     assert exact[0][1].max() > (0.999 if "opaque" in options else 0.3)
     assert len(exact[0]) == (2 if settings.depth is None else 3)
     images, grads = errors(got, exact)
@@ -114,10 +118,10 @@ def test_skips_leave_the_bits(make_scene):
     gaussians.opacities[:, 6:8] = 0.9999
     masks = torch.ones(1, 1, cameras.height, cameras.width, dtype=torch.bool, device=DEVICE)
     masks[..., :9, :9] = False
-    images, grads, stats = run(cuda.draw, gaussians, cameras, Settings(), masks)
+    images, grads, stats = run(draw_by_cuda, gaussians, cameras, Settings(), masks)
     for name, gain in GAINS.items():
         settings = Settings(skips=Skips().without(name))
-        other = run(cuda.draw, gaussians, cameras, settings, masks)
+        other = run(draw_by_cuda, gaussians, cameras, settings, masks)
         assert all(map(torch.equal, [*images, *grads], [*other[0], *other[1]])), name
         assert other[2][gain] != stats[gain], name
 
@@ -127,7 +131,7 @@ def test_skips_leave_the_bits(make_scene):
 def test_nothing_to_see(make_scene, count):
     gaussians, cameras = make_batch(make_scene, scenes=2, views=2, count=count, device=DEVICE)
     gaussians.means[..., 2] -= 20
-    images, grads, stats = run(cuda.draw, gaussians, cameras, Settings())
+    images, grads, stats = run(draw_by_cuda, gaussians, cameras, Settings())
     assert all((tensor == 0).all() for tensor in (*images, *grads))
     assert stats["visible"] == 0 and stats["pairs"] == 0
 
@@ -136,7 +140,7 @@ def test_nothing_to_see(make_scene, count):
 def test_float64_is_projected_as_it_is_and_drawn_in_float32(make_scene):
     scene = make_batch(make_scene, count=3, height=8, width=8, device=DEVICE)
     scene = [part.to(torch.float64) for part in scene]
-    images, grads, _ = run(cuda.draw, *scene, Settings())
+    images, grads, _ = run(draw_by_cuda, *scene, Settings())
     assert {image.dtype for image in images} == {torch.float32}
     assert {grad.dtype for grad in grads} == {torch.float64}
     exact = run(reference.draw, *scene, Settings())
@@ -148,8 +152,8 @@ def test_float64_is_projected_as_it_is_and_drawn_in_float32(make_scene):
 def test_a_large_scene_is_the_same_every_time_and_that_of_the_cpu(make_scene):
     scene = make_batch(make_scene, views=3, count=20_000, height=256, width=240, device=DEVICE)
     scene[0].scales.mul_(0.1)
-    first = run(cuda.draw, *scene, Settings())
-    again = run(cuda.draw, *scene, Settings())
+    first = run(draw_by_cuda, *scene, Settings())
+    again = run(draw_by_cuda, *scene, Settings())
     assert all(map(torch.equal, [*first[0], *first[1]], [*again[0], *again[1]]))
     images, grads, _ = run(cpu.draw, *(part.to("cpu") for part in scene), Settings())
     for got, image in zip(first[0], images, strict=True):
@@ -170,19 +174,20 @@ def needles(scene):
 @kernel
 @pytest.mark.parametrize("change", [lambda scene: scene, needles], ids=["blobs", "needles"])
 def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch, change):
-    from asysplat.rendering.cuda import stages
+    from asysplat.rendering.cuda import draw as module
 
     found = []
 
-    def keep(splats, depths, *args):
-        found.append((splats, depths, sort_into_tiles(splats, depths, *args)))
+    def keep(frame, splats, depths, *args):
+        found.append((depths, list_tiles(frame, splats, depths, *args)))
         return found[-1][-1]
 
-    sort_into_tiles = stages.sort_into_tiles
-    monkeypatch.setattr(stages, "sort_into_tiles", keep)
+    list_tiles = module._list_tiles
+    monkeypatch.setattr(module, "_list_tiles", keep)
     scene = change(make_batch(make_scene, views=2, count=60, height=45, width=50))
-    stats = cuda.draw(*(part.to(DEVICE) for part in scene), Settings()).stats
-    ((splats, depths, (lists, _, _)),) = found
+    stats = draw_by_cuda(*(part.to(DEVICE) for part in scene), Settings()).stats
+    ((depths, (lists, _)),) = found
+    splats = lists.splats
     rows, columns, size = 6, 7, 8
     tiles = rows * columns
     pairs = lists.first_entry.diff()
@@ -220,16 +225,16 @@ def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch
 @kernel
 def test_too_many_pairs_are_an_error(make_scene, monkeypatch):
     scene = make_batch(make_scene, device=DEVICE)
-    monkeypatch.setattr("asysplat.rendering.limits.MOST_PAIRS", 3)
+    monkeypatch.setattr("asysplat.rendering.interface.MOST_PAIRS", 3)
     with pytest.raises(InputError, match=r"\d+ pairs.* 3: set views_at_once"):
-        cuda.draw(*scene, Settings())
+        draw_by_cuda(*scene, Settings())
 
 
 @pytest.mark.skipif(INTERPRETED, reason="a CPU will do there")
 def test_tensors_on_a_cpu_are_an_error(make_scene):
     pytest.importorskip("triton")
     with pytest.raises(InputError, match=r"'cuda'.* cpu: choose 'auto'.*to\('cuda'\)"):
-        cuda.draw(*make_batch(make_scene), Settings())
+        draw_by_cuda(*make_batch(make_scene), Settings())
 
 
 def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
@@ -238,7 +243,7 @@ def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "triton", None)
     with pytest.raises(InputError, match="'cuda' needs triton: pip install triton"):
-        cuda.draw(*make_batch(make_scene), Settings())
+        draw_by_cuda(*make_batch(make_scene), Settings())
 
 
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")

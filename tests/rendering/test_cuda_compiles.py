@@ -13,30 +13,29 @@ TYPES |= {torch.int64: "i64", torch.bool: "i1"}
 KERNELS = {
     "project",
     "list_tiles",
-    "draw_tile",
-    "draw_tile_backward",
+    "rasterize",
+    "rasterize_backward",
     "sum_pairs",
     "project_backward",
 }
 
 
-def compiled(kernel, arguments, constants, architecture):
+def compiled(kernel, arguments, architecture):
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
-    names = kernel.arg_names
-    options = {name: constants.pop(name) for name in list(constants) if name not in names}
-    signature = {}
-    for name, value in zip(names, arguments, strict=False):
-        if value is None:
-            constants[name] = None
+    signature, constants = {}, {}
+    for parameter in kernel.params:
+        value = arguments.pop(parameter.name)
+        if parameter.is_constexpr or value is None:
+            constants[parameter.name] = value
+            signature[parameter.name] = "constexpr"
         elif isinstance(value, torch.Tensor):
-            signature[name] = "*" + TYPES[value.dtype]
+            signature[parameter.name] = "*" + TYPES[value.dtype]
         else:
-            signature[name] = "fp32" if isinstance(value, float) else "i32"
-    signature |= dict.fromkeys(constants, "constexpr")
-    source = ASTSource(kernel, {name: signature[name] for name in names}, constants)
-    return triton.compile(source, GPUTarget("cuda", architecture, 32), options)
+            signature[parameter.name] = "fp32" if isinstance(value, float) else "i32"
+    source = ASTSource(kernel, signature, constants)
+    return triton.compile(source, GPUTarget("cuda", architecture, 32), arguments)
 
 
 @pytest.fixture(params=[80, 90], ids="sm_{}".format)
@@ -46,17 +45,16 @@ def launched(request, monkeypatch):
 
     kernels = {}
 
-    def run(kernel, *arguments, grid, warmup, **constants):
-        name = kernel.fn.__name__
-        kernels[name] = compiled(kernel, arguments, constants, request.param)
-        for argument, tensor in zip(kernel.arg_names, arguments, strict=False):
-            if argument in ("depths", "counts"):
-                tensor.fill_(1)
-            elif isinstance(tensor, torch.Tensor) and not tensor.is_floating_point():
-                tensor.fill_(0)
+    def run(kernel, *, grid, warmup, **arguments):
+        kernels[kernel.fn.__name__] = compiled(kernel, dict(arguments), request.param)
+        for name, value in arguments.items():
+            if name in ("depths", "counts"):
+                value.fill_(1)
+            elif isinstance(value, torch.Tensor) and not value.is_floating_point():
+                value.fill_(0)
 
     monkeypatch.setattr(JITFunction, "run", run)
-    monkeypatch.setattr("asysplat.rendering.cuda.stages.INTERPRETED", True)
+    monkeypatch.setattr("asysplat.rendering.cuda.draw.INTERPRETED", True)
     return kernels
 
 

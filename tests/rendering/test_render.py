@@ -8,7 +8,7 @@ import torch
 
 from asysplat.errors import InputError
 from asysplat.rendering import INRIA, render
-from asysplat.rendering.reference import compositing
+from asysplat.rendering.reference import rasterize
 from asysplat.scene import Cameras, Gaussians
 
 
@@ -149,9 +149,9 @@ def test_any_tiles_and_groups_give_the_same_image(make_scene, monkeypatch):
         return out.image, *torch.autograd.grad(out.image.square().sum(), means)
 
     before = run()
-    monkeypatch.setattr(compositing, "GROUP_ELEMENTS", 1)
+    monkeypatch.setattr(rasterize, "GROUP_ELEMENTS", 1)
     torch.testing.assert_close(run(), before)
-    monkeypatch.setattr(compositing, "TILE_SIZE", 7)
+    monkeypatch.setattr(rasterize, "TILE", 7)
     torch.testing.assert_close(run(), before)
 
 

@@ -18,7 +18,7 @@ BACKGROUND = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
 @dataclass(frozen=True)
 class Backend:
     """Args:
-    name: as `render` calls it.
+    name: as `render` takes it.
     dtype: what its inputs are given in.
     image_error: largest difference to the float64 reference, of values near 1.
     gradient_error: the same of a gradient, relative, L2.
@@ -50,26 +50,26 @@ if INTERPRETED:
 
 @dataclass(frozen=True)
 class Result:
-    """A rendering, and the gradients of INPUTS that one pull on its layers gives."""
+    """A rendering, and the gradients of INPUTS from one gradient of its outputs."""
 
-    layers: dict[str, Tensor]
+    outputs: dict[str, Tensor]
     grads: dict[str, Tensor]
     stats: dict[str, int]
 
     @property
     def image(self) -> Tensor:
-        return self.layers["image"]
+        return self.outputs["image"]
 
     @property
     def alpha(self) -> Tensor:
-        return self.layers["alpha"]
+        return self.outputs["alpha"]
 
     @property
     def depth(self) -> Tensor:
-        return self.layers["depth"]
+        return self.outputs["depth"]
 
     def is_finite(self) -> bool:
-        return all(t.isfinite().all() for t in (*self.layers.values(), *self.grads.values()))
+        return all(t.isfinite().all() for t in (*self.outputs.values(), *self.grads.values()))
 
 
 def both_ways(
@@ -77,13 +77,13 @@ def both_ways(
     gaussians: Gaussians,
     cameras: Cameras,
     background: Tensor = BACKGROUND,
-    pull: Callable[[str, Tensor], Tensor] | None = None,
+    grad_output: Callable[[str, Tensor], Tensor] | None = None,
     **options,
 ) -> Result:
     """Render in the backend's float type, forward and backward.
 
-    `pull` gives the gradient of a layer from its name and value; a random one of its shape, the
-    same every time, unless told.
+    `grad_output` gives the gradient of an output from its name and value; unless told a random one,
+    the same every time.
     """
     leaves = {name: getattr(gaussians, name) for name in FIELDS}
     leaves |= {"cam_to_world": cameras.cam_to_world, "intrinsics": cameras.intrinsics}
@@ -96,23 +96,25 @@ def both_ways(
         backend=backend.name,
         **options,
     )
-    layers = {"image": out.image, "alpha": out.alpha, "depth": out.depth}
-    layers = {name: layer for name, layer in layers.items() if layer is not None}
-    pulls = [(pull or random_pull)(name, layer.detach()) for name, layer in layers.items()]
-    pulls = [grad.to(backend.dtype) for grad in pulls]
-    grads = torch.autograd.grad(list(layers.values()), list(leaves.values()), pulls)
-    detached = {name: layer.detach() for name, layer in layers.items()}
+    outputs = {"image": out.image, "alpha": out.alpha, "depth": out.depth}
+    outputs = {name: output for name, output in outputs.items() if output is not None}
+    grad_outputs = [
+        (grad_output or random_gradient)(name, output.detach()) for name, output in outputs.items()
+    ]
+    grad_outputs = [grad.to(backend.dtype) for grad in grad_outputs]
+    grads = torch.autograd.grad(list(outputs.values()), list(leaves.values()), grad_outputs)
+    detached = {name: output.detach() for name, output in outputs.items()}
     return Result(detached, dict(zip(INPUTS, grads, strict=True)), out.stats)
 
 
-def random_pull(name: str, layer: Tensor) -> Tensor:
+def random_gradient(name: str, output: Tensor) -> Tensor:
     generator = torch.Generator().manual_seed(len(name))
-    return torch.randn(layer.shape, generator=generator, dtype=torch.float64)
+    return torch.randn(output.shape, generator=generator, dtype=torch.float64)
 
 
 def assert_same_bits(one: Result, other: Result) -> None:
-    for name, layer in one.layers.items():
-        assert torch.equal(layer, other.layers[name]), name
+    for name, output in one.outputs.items():
+        assert torch.equal(output, other.outputs[name]), name
     for name, grad in one.grads.items():
         assert torch.equal(grad, other.grads[name]), name
 
@@ -120,10 +122,10 @@ def assert_same_bits(one: Result, other: Result) -> None:
 def assert_close(
     backend: Backend, result: Result, exact: Result, slack: float = 1, names: tuple = INPUTS
 ) -> None:
-    """Layers to the backend's image_error, the named gradients to its gradient_error."""
-    for name, layer in exact.layers.items():
-        bound = slack * backend.image_error * max(1, float(layer.abs().amax()))
-        assert max_error(result.layers[name], layer) <= bound, name
+    """Outputs to the backend's image_error, the named gradients to its gradient_error."""
+    for name, output in exact.outputs.items():
+        bound = slack * backend.image_error * max(1, float(output.abs().amax()))
+        assert max_error(result.outputs[name], output) <= bound, name
     for name in names:
         error = relative_error(result.grads[name], exact.grads[name])
         assert error <= slack * backend.gradient_error, name
@@ -141,12 +143,12 @@ def relative_error(value: Tensor, exact: Tensor) -> float:
 
 def assert_as_without(result: Result, clean: Result, gone: int) -> None:
     """Gaussian `gone` left no trace: the others have the bits that they have without it."""
-    for name, layer in clean.layers.items():
-        assert torch.equal(result.layers[name], layer), name
+    for name, output in clean.outputs.items():
+        assert torch.equal(result.outputs[name], output), name
     for name, grad in clean.grads.items():
         if name in FIELDS:
             # Gaussians first, whether there is a batch or not.
-            lead = result.layers["alpha"].ndim - 3
+            lead = result.outputs["alpha"].ndim - 3
             per_gaussian = result.grads[name].movedim(lead, 0)
             others = torch.arange(len(per_gaussian)) != gone
             assert (per_gaussian[gone] == 0).all(), name

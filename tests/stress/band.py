@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from asysplat.rendering.reference.projection import project
-from asysplat.rendering.settings import Settings
+from asysplat.rendering.interface import Settings
+from asysplat.rendering.reference.project import project
 from asysplat.scene import Cameras, Gaussians
 
 ALPHA_ROUNDING = 1e-5  # of itself; float32 leaves a tenth of it

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from asysplat.ops import selective_scan, ssd
 from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.lanes import take_sum
 from asysplat.ops.cpu.vectors import load, load_some, store
 from asysplat.rendering import Skips
+from asysplat.rendering.cpu.math import take_sum
 from asysplat.scene import Cameras, Gaussians
 
 CPU = next(backend for backend in FAST if backend.name == "cpu")

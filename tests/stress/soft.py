@@ -12,7 +12,7 @@ from asysplat.scene import Cameras, Gaussians
 class Mode:
     """Args:
     options: of `render`.
-    degree: of the harmonics.
+    degree: of SH.
     scale: of the Gaussians, beside `make_scene`'s.
     """
 

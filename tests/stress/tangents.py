@@ -6,16 +6,17 @@ import torch
 
 from asysplat.benchmark.scenes import random_scene
 from asysplat.rendering import INRIA
-from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.reference.projection import find_footprint
-from asysplat.rendering.settings import Settings
+from asysplat.rendering.cpu.splat import TILE
+from asysplat.rendering.formulas import EXPONENT_MARGIN, PIXEL_MARGIN
+from asysplat.rendering.interface import Settings
+from asysplat.rendering.reference.project import find_footprint
 from asysplat.scene import Cameras, Gaussians
 
 BAND = 2e-5  # pixels
 
 
 def tangent_scene(
-    count: int, height: int, width: int, seed: int = 0, tile: int = col.TILE
+    count: int, height: int, width: int, seed: int = 0, tile: int = TILE
 ) -> tuple[Gaussians, Cameras]:
     """Gaussians [N] of sigma 1 to 10 pixels and one camera. A quarter of their boxes touch a tile's
     edge at the right, left, bottom or top each, give or take BAND, one in eight of them in both
@@ -41,11 +42,11 @@ def tangent_scene(
             gaussians.means, gaussians.quats, gaussians.scales, pose, pinhole, (width, height),
             Settings(),
         )  # fmt: skip
-        room = (gaussians.opacities / INRIA.alpha_min).log2() + col.EXPONENT_MARGIN
-        reach = (2 * math.log(2) * room).sqrt()[:, None] * footprint.deviations
-        # First and last pixel centre in reach: where one is a whole number, its tile may change.
-        last = footprint.xy + reach - 0.5 + col.PIXEL_MARGIN
-        first = footprint.xy - reach - 0.5 - col.PIXEL_MARGIN
+        room = (gaussians.opacities / INRIA.alpha_min).log2() + EXPONENT_MARGIN
+        extent = (2 * math.log(2) * room).sqrt()[:, None] * footprint.deviations
+        # First and last pixel centre of its extent: where one is whole, its tile may change.
+        last = footprint.xy + extent - 0.5 + PIXEL_MARGIN
+        first = footprint.xy - extent - 0.5 - PIXEL_MARGIN
         to_last = (last / tile).round() * tile - last
         to_first = ((first + 1) / tile).round() * tile - 1 - first
         shift = torch.where((side % 2 == 0)[:, None], to_last, to_first)

@@ -23,7 +23,7 @@ def test_shapes_of_gaussians(make_scene, name, shape):
         gaussians.__post_init__()
 
 
-def test_number_of_harmonics(make_scene):
+def test_number_of_sh_coefficients(make_scene):
     gaussians, _ = make_scene()
     with pytest.raises(InputError, match="sh has 5 coefficients: give 1, 4, 9 or 16"):
         replace(gaussians, sh=torch.ones(12, 5, 3))

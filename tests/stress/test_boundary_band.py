@@ -6,19 +6,19 @@ from functools import cache
 
 import pytest
 import torch
-from backends import EXACT, FIELDS, INPUTS, Backend, both_ways, random_pull, relative_error
+from backends import EXACT, FIELDS, INPUTS, Backend, both_ways, random_gradient, relative_error
 from band import boundary_band
 from torch import Tensor
 
 from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
-from asysplat.rendering.settings import Settings
+from asysplat.rendering.interface import Settings
 
 OTHERS = tuple(name for name in INPUTS if name not in FIELDS)
 SCENES = {
     "random": lambda count: random_scene(count, 96, 128),
     "pixel-aligned": lambda count: pixel_aligned_scene(int((count / 2) ** 0.5), 96, 128),
 }
-# Layers that are pulled at, and options of `render`.
+# Outputs that have a gradient, and options of `render`.
 MODES = {
     "image": (("image",), {"depth": False}),
     "image, antialiased": (("image",), {"depth": False, "antialiased": True}),
@@ -38,20 +38,20 @@ class Comparison:
 @cache
 def compare(backend: Backend, scene: str, mode: str) -> Comparison:
     gaussians, cameras = SCENES[scene](backend.many)
-    layers, options = MODES[mode]
+    outputs, options = MODES[mode]
     settings = Settings(antialiased=options.get("antialiased", False))
     band = boundary_band(gaussians, cameras, settings)
 
-    def pull(name, layer):
+    def grad_output(name, output):
         at_band = band[:, None] if name == "image" else band
-        return random_pull(name, layer) * ~at_band * float(name in layers)
+        return random_gradient(name, output) * ~at_band * float(name in outputs)
 
-    result = both_ways(backend, gaussians, cameras, pull=pull, **options)
-    exact = both_ways(EXACT, gaussians, cameras, pull=pull, **options)
+    result = both_ways(backend, gaussians, cameras, grad_output=grad_output, **options)
+    exact = both_ways(EXACT, gaussians, cameras, grad_output=grad_output, **options)
     difference = [(result.image.double() - exact.image).abs().amax(1)]
     difference += [
-        (result.layers[name].double() - exact.layers[name]).abs() / exact.layers[name].max()
-        for name in exact.layers
+        (result.outputs[name].double() - exact.outputs[name]).abs() / exact.outputs[name].max()
+        for name in exact.outputs
         if name != "image"
     ]
     return Comparison(

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from backends import BACKGROUND, EXACT, FIELDS, assert_close, both_ways, random_pull
+from backends import BACKGROUND, EXACT, FIELDS, assert_close, both_ways, random_gradient
 from soft import FLOOR, MODES, soft_scene
 
 from asysplat.rendering import INRIA, render
-from asysplat.rendering.reference.projection import project
-from asysplat.rendering.settings import Settings
+from asysplat.rendering.interface import Settings
+from asysplat.rendering.reference.project import project
 from asysplat.scene import Gaussians
 
 
@@ -50,8 +50,8 @@ def test_case_25_every_gradient_equals_finite_differences(make_scene, mode):
         *fields, poses, intrinsics, background = leaves
         views = replace(cameras, cam_to_world=poses, intrinsics=intrinsics)
         out = render(Gaussians(*fields), views, background, **mode.options)
-        layers = {"image": out.image, "alpha": out.alpha, "depth": out.depth}
-        return tuple((t * random_pull(name, t)).sum((-1, -2)) for name, t in layers.items())
+        outputs = {"image": out.image, "alpha": out.alpha, "depth": out.depth}
+        return tuple((t * random_gradient(name, t)).sum((-1, -2)) for name, t in outputs.items())
 
     assert torch.autograd.gradcheck(outputs, leaves, atol=1e-7, fast_mode=True)
 
@@ -74,11 +74,11 @@ def test_case_04_the_floor_of_the_compensation(backend, make_scene, scale):
     cameras.cam_to_world[:] = torch.eye(4)
     cameras.intrinsics[:] = torch.tensor([[17.0, 0, 8.5], [0, 17, 6.5], [0, 0, 1]])
 
-    def pull(name, layer):  # all gradients of one sign, so that none cancel
-        return torch.full_like(layer, float(name == "alpha"))
+    def grad_output(name, output):  # all gradients of one sign, so that none cancel
+        return torch.full_like(output, float(name == "alpha"))
 
-    result = both_ways(backend, gaussians, cameras, pull=pull, antialiased=True)
+    result = both_ways(backend, gaussians, cameras, grad_output=grad_output, antialiased=True)
     share = max(scale**4 / (scale**2 + INRIA.eps2d) ** 2, INRIA.compensation_min)
     assert float(result.alpha[0, 6, 8]) == pytest.approx(share**0.5, rel=1e-5)
-    exact = both_ways(EXACT, gaussians, cameras, pull=pull, antialiased=True)
+    exact = both_ways(EXACT, gaussians, cameras, grad_output=grad_output, antialiased=True)
     assert_close(backend, result, exact, names=("scales", "opacities"))

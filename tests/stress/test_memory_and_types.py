@@ -52,7 +52,9 @@ def test_case_28_types(backend, make_scene, dtype, autocast):
     at_least = torch.promote_types(dtype, torch.float32)
     assert out.image.dtype == out.alpha.dtype == out.depth.dtype == at_least
     plain = replace(backend, dtype=at_least)
-    result = both_ways(plain, gaussians, cameras, background, pull=lambda _, t: torch.ones_like(t))
+    result = both_ways(
+        plain, gaussians, cameras, background, grad_output=lambda _, t: torch.ones_like(t)
+    )
     assert torch.equal(out.image, result.image)
     (out.image.sum() + out.alpha.sum() + out.depth.sum()).backward()
     for name, leaf in zip(INPUTS, leaves, strict=True):
@@ -65,7 +67,7 @@ def test_case_30_strided_and_expanded_inputs_and_gradients(backend, make_scene):
     gaussians.sh[:] = gaussians.sh[:1]
     gaussians.opacities[:] = 0.5
     cameras.intrinsics[:] = cameras.intrinsics[:1]
-    plain = both_ways(backend, gaussians, cameras, pull=lambda _, t: torch.ones_like(t))
+    plain = both_ways(backend, gaussians, cameras, grad_output=lambda _, t: torch.ones_like(t))
 
     def strided(tensor):
         return torch.stack((tensor, tensor), -1)[..., 0]
@@ -96,9 +98,13 @@ def test_case_30_strided_and_expanded_inputs_and_gradients(backend, make_scene):
     out = render(scene, views, leaves["background"].to(backend.dtype).expand(3, 3), backend.name)
     torch.testing.assert_close(out.image, plain.image, rtol=0, atol=1e-6)
     # Strides of an image that lies [W, H, 3] in memory, and of numbers that are all the same.
-    pulls = [torch.ones_like(out.image.mT.contiguous()).mT]
-    pulls += [torch.ones(()).to(backend.dtype).expand_as(layer) for layer in (out.alpha, out.depth)]
-    grads = torch.autograd.grad([out.image, out.alpha, out.depth], list(leaves.values()), pulls)
+    grad_outputs = [torch.ones_like(out.image.mT.contiguous()).mT]
+    grad_outputs += [
+        torch.ones(()).to(backend.dtype).expand_as(output) for output in (out.alpha, out.depth)
+    ]
+    grads = torch.autograd.grad(
+        [out.image, out.alpha, out.depth], list(leaves.values()), grad_outputs
+    )
     expected = dict(plain.grads)
     expected["quats"] = expected["quats"].flip(0)
     expected["scales"] = expected["scales"].mT
@@ -114,13 +120,13 @@ def test_case_30_strided_and_expanded_inputs_and_gradients(backend, make_scene):
 @pytest.mark.parametrize("depth", ["expected", "median", "accumulated"])
 @pytest.mark.parametrize("used", ["image", "alpha", "depth"])
 def test_case_30_unused_outputs(backend, make_scene, used, depth):
-    """The gradient of one layer is that of all with zeros for the others."""
+    """The gradient of one output is that of all with zeros for the others."""
     gaussians, cameras = make_scene(views=2, dtype=torch.float32)
 
-    def pull(name, layer):
-        return torch.full_like(layer, float(name == used))
+    def grad_output(name, output):
+        return torch.full_like(output, float(name == used))
 
-    expected = both_ways(backend, gaussians, cameras, pull=pull, depth=depth)
+    expected = both_ways(backend, gaussians, cameras, grad_output=grad_output, depth=depth)
     gaussians = gaussians.map(lambda t: t.to(backend.dtype).requires_grad_())
     background = BACKGROUND.to(backend.dtype)
     out = render(gaussians, cameras.to(backend.dtype), background, backend.name, depth)
@@ -135,7 +141,7 @@ def test_case_30_unused_outputs(backend, make_scene, used, depth):
 @pytest.mark.parametrize("name", INPUTS)
 def test_case_30_one_input_alone_needs_a_gradient(backend, make_scene, name):
     gaussians, cameras = make_scene(views=2, dtype=torch.float32)
-    expected = both_ways(backend, gaussians, cameras, pull=lambda _, t: torch.ones_like(t))
+    expected = both_ways(backend, gaussians, cameras, grad_output=lambda _, t: torch.ones_like(t))
     gaussians, cameras = gaussians.to(backend.dtype), cameras.to(backend.dtype)
     background = BACKGROUND.to(backend.dtype, copy=True)
     record = next((r for r in (gaussians, cameras) if hasattr(r, name)), None)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from backends import EXACT, assert_close, both_ways, random_pull
+from backends import EXACT, assert_close, both_ways, random_gradient
 
 from asysplat.benchmark.scenes import random_scene
 from asysplat.errors import InputError
@@ -43,12 +43,12 @@ def test_case_20_stacks_of_opaque_splats(backend, count, opacity, convention):
     assert_close(backend, result, exact, slack=50)  # rounding, times 1 / (1 - alpha) < 100
     assert result.alpha.max() <= 1 - convention.transmittance_min * (1 - 1e-3)
 
-    def centre(_, layer):
-        grad = torch.zeros_like(layer)
+    def centre(_, output):
+        grad = torch.zeros_like(output)
         grad[..., CENTRE[0], CENTRE[1]] = 1
         return grad
 
-    result = both_ways(backend, gaussians, cameras, pull=centre, convention=convention)
+    result = both_ways(backend, gaussians, cameras, grad_output=centre, convention=convention)
     assert (result.grads["sh"][0] != 0).all()
     assert (result.grads["sh"][10:] == 0).all() and (result.grads["opacities"][10:] == 0).all()
 
@@ -88,20 +88,20 @@ def test_case_22_opacity_at_the_cut_off_is_exact(backend):
 
 
 def test_case_23_both_passes_take_identical_decisions(backend):
-    """Where colours are not clamped, an image is linear in them: its pull on the colours, times the
-    colours, is its pull on the image. A pixel that one pass draws and the other does not adds more
-    than 1/255 to the difference."""
+    """Where colours are not clamped, an image is linear in them: gradient times colours is gradient
+    times image. A pixel that one pass draws and the other does not adds more than 1/255 to the
+    difference."""
     gaussians, cameras = random_scene(backend.many, 96, 128)
     gaussians = replace(gaussians, sh=gaussians.sh.abs())
     edges = torch.linspace(0.9999 / 255, 1.0001 / 255, backend.many // 3)
     gaussians.opacities[::3][: len(edges)] = edges  # many at a cut-off
 
-    def pull(name, layer):
-        signs = random_pull(name, layer).sign()
-        return signs if name == "image" else torch.zeros_like(layer)
+    def grad_output(name, output):
+        signs = random_gradient(name, output).sign()
+        return signs if name == "image" else torch.zeros_like(output)
 
-    result = both_ways(backend, gaussians, cameras, torch.zeros(3), pull, depth=False)
+    result = both_ways(backend, gaussians, cameras, torch.zeros(3), grad_output, depth=False)
     dc = 0.5 / math.sqrt(math.pi)
     by_colors = (result.grads["sh"].double() * (gaussians.sh.double() + 0.5 / dc)).sum()
-    by_image = (result.image.double() * pull("image", result.image)).sum()
+    by_image = (result.image.double() * grad_output("image", result.image)).sum()
     assert abs(float(by_colors - by_image)) < 0.1 / 255

@@ -7,7 +7,7 @@ import torch
 from backends import EXACT, assert_close, both_ways, facing, relative_error
 
 from asysplat.rendering import INRIA
-from asysplat.rendering.reference.sh import sh_basis
+from asysplat.rendering.reference.math import sh_basis
 
 
 def test_case_10_no_direction_shows_the_dc_colour(backend, make_scene):
@@ -50,8 +50,8 @@ def test_case_12_far_from_the_origin(backend, make_scene, offset):
     cameras.cam_to_world[..., :3, 3].add_(offset)
     far = both_ways(backend, gaussians, cameras)
     assert (near.alpha > 0.3).any()
-    for name, layer in near.layers.items():
-        assert torch.equal(far.layers[name], layer), name
+    for name, output in near.outputs.items():
+        assert torch.equal(far.outputs[name], output), name
     for name, grad in near.grads.items():
         assert torch.equal(far.grads[name], grad), name
 

@@ -11,7 +11,7 @@ from backends import (
     assert_close,
     both_ways,
     max_error,
-    random_pull,
+    random_gradient,
     relative_error,
 )
 from hypothesis import given, settings
@@ -103,18 +103,20 @@ def test_splitting_batch_and_views(make_scene, backend, seed, batch, views):
     gaussians = Gaussians.stack([scene for scene, _ in scenes])
     cameras = Cameras.stack([cameras for _, cameras in scenes])
     together = both_ways(backend, gaussians, cameras)
-    pulls = {name: random_pull(name, layer) for name, layer in together.layers.items()}
+    grad_outputs = {
+        name: random_gradient(name, output) for name, output in together.outputs.items()
+    }
     for b, (scene, poses) in enumerate(scenes):
         total = dict.fromkeys(FIELDS, 0)
         for v in range(views):
 
-            def pull(name, _, b=b, v=v):
-                return pulls[name][b, v : v + 1]
+            def grad_output(name, _, b=b, v=v):
+                return grad_outputs[name][b, v : v + 1]
 
-            one = both_ways(backend, scene, poses.select([v]), pull=pull)
-            for name, layer in one.layers.items():
-                error = max_error(layer[0], together.layers[name][b, v])
-                assert error <= backend.image_error * max(1, layer.max()), name
+            one = both_ways(backend, scene, poses.select([v]), grad_output=grad_output)
+            for name, output in one.outputs.items():
+                error = max_error(output[0], together.outputs[name][b, v])
+                assert error <= backend.image_error * max(1, output.max()), name
             for name in FIELDS:
                 total[name] = total[name] + one.grads[name]
             for name in ("cam_to_world", "intrinsics"):
@@ -142,19 +144,19 @@ def test_cropping_an_image(make_scene, backend, seed, left, top):
     window.intrinsics[:, 0, 2] -= left
     window.intrinsics[:, 1, 2] -= top
 
-    def cut(layer):
-        return layer[..., top : top + 25, left : left + 25]
+    def cut(output):
+        return output[..., top : top + 25, left : left + 25]
 
-    def pull_window(name, layer):
-        grad = torch.zeros(layer.shape, dtype=torch.float64)
-        cut(grad)[:] = random_pull(name, cut(layer))
+    def window_gradient(name, output):
+        grad = torch.zeros(output.shape, dtype=torch.float64)
+        cut(grad)[:] = random_gradient(name, cut(output))
         return grad
 
-    whole = both_ways(backend, gaussians, cameras, pull=pull_window)
+    whole = both_ways(backend, gaussians, cameras, grad_output=window_gradient)
     part = both_ways(backend, gaussians, window)
-    for name, layer in part.layers.items():
-        error = max_error(layer, cut(whole.layers[name]))
-        assert error <= loosely(backend) * max(1, layer.max()), name
+    for name, output in part.outputs.items():
+        error = max_error(output, cut(whole.outputs[name]))
+        assert error <= loosely(backend) * max(1, output.max()), name
     for name, grad in part.grads.items():
         assert relative_error(grad, whole.grads[name]) <= 10 * loosely(backend), name
 

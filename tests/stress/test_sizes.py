@@ -34,8 +34,8 @@ def test_case_16_more_tiles_than_16_bits_count(backend, make_scene):
     assert result.stats["pairs"] == last.stats["pairs"]
     assert (result.alpha[:-1] == 0).all()
     assert (last.alpha[0, 16360:] > 0.1).any()
-    for name, layer in last.layers.items():
-        assert torch.equal(result.layers[name][64:], layer), name
+    for name, output in last.outputs.items():
+        assert torch.equal(result.outputs[name][64:], output), name
 
 
 def test_case_17_pairs_that_no_list_can_number_are_refused():

@@ -39,8 +39,8 @@ def test_a_thousand_steps_of_all_fields(shared, repository, scene, checked):
 
 @both_ways
 def test_training_for_three_hundred_steps(shared, repository, tmp_path, checked):
-    words = ["data=files", f"data.root={shared / 'data' / 'mydesk'}", "data.cache.folder=null"]
-    command = ["train.py", *words, "steps=300", "validate_every=100", f"paths.logs={tmp_path}"]
+    overrides = ["data=files", f"data.root={shared / 'data' / 'mydesk'}", "data.cache.folder=null"]
+    command = ["train.py", *overrides, "steps=300", "validate_every=100", f"paths.logs={tmp_path}"]
     folder = run(command, repository, CHECKS | POISON if checked else {}).removeprefix("run: ")
     numbers = json.loads((Path(folder) / "metrics.json").read_text())
     assert numbers["test/files/psnr"] > numbers["baseline/files/mean_colour/psnr"] + 1

@@ -80,8 +80,8 @@ def test_case_27_the_order_of_the_input_changes_nothing_else(backend, make_scene
         order = (2 * order[:, None] + torch.arange(2)).flatten()
     result = both_ways(backend, gaussians.map(lambda t: t[order]), cameras)
     plain = both_ways(backend, gaussians, cameras)
-    for name, layer in plain.layers.items():
-        assert max_error(result.layers[name], layer) <= backend.image_error, name
+    for name, output in plain.outputs.items():
+        assert max_error(result.outputs[name], output) <= backend.image_error, name
     for name in FIELDS:
         torch.testing.assert_close(
             result.grads[name], plain.grads[name][order], rtol=1e-4, atol=1e-4, msg=name

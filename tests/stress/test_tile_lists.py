@@ -9,11 +9,12 @@ import torch
 from tangents import tangent_scene
 
 from asysplat.rendering import Skips, render
-from asysplat.rendering.cpu import layout as col
+from asysplat.rendering.cpu import splat as col
+from asysplat.rendering.cpu.splat import TILE, Frame, ProjectSettings, load_ellipse
 from asysplat.rendering.cpu.tiles import find_box, list_tiles, place
+from asysplat.rendering.formulas import PIXEL_MARGIN
 from asysplat.scene import Cameras
 
-TILE, MARGIN = col.TILE, col.PIXEL_MARGIN
 SLACK = 1e-6  # pixels, of the margins themselves
 COUNT = 2**17
 
@@ -22,13 +23,13 @@ COUNT = 2**17
 def lists_of(monkeypatch):
     """Renders with the cpu backend and returns what it listed."""
     module = import_module("asysplat.rendering.cpu.draw")
-    make_lists, kept = module._make_lists, []
+    list_tiles, kept = module._list_tiles, []
 
     def keep(*args):
-        kept.append(make_lists(*args))
+        kept.append(list_tiles(*args))
         return kept[-1]
 
-    monkeypatch.setattr(module, "_make_lists", keep)
+    monkeypatch.setattr(module, "_list_tiles", keep)
 
     def run(gaussians, cameras, **options):
         with torch.no_grad():
@@ -46,9 +47,9 @@ class Ellipses:
         self.x, self.y = (base + splats[:, [col.X, col.Y]].astype(np.float64)).T
         s = splats.astype(np.float64).T
         self.a, self.b, self.c = s[col.A] + s[col.A_REST], s[col.B] + s[col.B_REST], s[col.C]
-        self.limit = (self.c * s[col.REACH_Y]) ** 2
-        self.reach_x = s[col.REACH_Y] * np.hypot(self.b, self.c) / self.a
-        self.reach_y = s[col.REACH_Y]
+        self.limit = (self.c * s[col.EXTENT_Y]) ** 2
+        self.extent_x = s[col.EXTENT_Y] * np.hypot(self.b, self.c) / self.a
+        self.extent_y = s[col.EXTENT_Y]
 
     def at(self, dx, dy):
         return (self.a * dx + self.b * dy) ** 2 + (self.c * dy) ** 2
@@ -90,9 +91,9 @@ def check_lists(lists, height: int, width: int) -> int:
     left, top = tile % tiles % columns * TILE + 0.5, tile % tiles // columns * TILE + 0.5
     right = np.minimum(left + TILE - 1, width - 0.5)
     bottom = np.minimum(top + TILE - 1, height - 0.5)
-    room = MARGIN + SLACK
-    assert (np.abs((left + right) / 2 - ellipses.x) <= ellipses.reach_x + TILE / 2 + room).all()
-    assert (np.abs((top + bottom) / 2 - ellipses.y) <= ellipses.reach_y + TILE / 2 + room).all()
+    room = PIXEL_MARGIN + SLACK
+    assert (np.abs((left + right) / 2 - ellipses.x) <= ellipses.extent_x + TILE / 2 + room).all()
+    assert (np.abs((top + bottom) / 2 - ellipses.y) <= ellipses.extent_y + TILE / 2 + room).all()
     least = ellipses.least_over(left - room, right + room, top - room, bottom + room)
     # A box of one row or column is listed whole.
     row, column = tile % tiles // columns, tile % tiles % columns
@@ -141,7 +142,7 @@ def test_boxes_and_several_views(lists_of):
     assert (np.bincount(boxes.entries[:, 1]) == 1).all()
 
 
-def test_a_splat_whose_rows_reach_past_its_box():
+def test_a_splat_whose_rows_end_past_its_box():
     """The box ends where a tile does: rounding put one row past it while another row fell short,
     and tiles that were listed were not those that had been counted."""
     splats = np.zeros((1, col.SPLAT), np.float32)
@@ -150,18 +151,21 @@ def test_a_splat_whose_rows_reach_past_its_box():
     splats[0, [col.X, col.Y]] = 0.31234, 0.40988
     splats[0, [col.A, col.B, col.C]] = 0.29677019, -0.024766434, 0.29569972
     splats[0, [col.A_REST, col.B_REST]] = 1.3566894e-08, -4.2892007e-10
-    splats[0, [col.LOG_OPACITY, col.REACH_Y]] = -0.61427963, 9.1877527
-    size, box = (256, 256, 16), np.zeros(4, np.int32)
-    reach_x = Ellipses(splats).reach_x[0]
+    splats[0, [col.LOG_OPACITY, col.EXTENT_Y]] = -0.61427963, 9.1877527
+    any_settings = dict.fromkeys(ProjectSettings._fields, 0.0) | {"exact": True}
+    sizes = dict.fromkeys(Frame._fields, 1) | {"height": 256, "width": 256, "columns": 16}
+    frame = Frame(**sizes | {"project": ProjectSettings(**any_settings)})
+    ellipse, box = load_ellipse(splats, bases, 0), np.zeros(4, np.int32)
+    extent_x = Ellipses(splats).extent_x[0]
     for nudge in (-2e-6, -1e-6, -1e-7, 0, 1e-7, 1e-6, 2e-6):
-        room = find_box(splats, bases, 0, reach_x * (1 + nudge), size, box)
+        room = find_box(ellipse, extent_x * (1 + nudge), frame, box)
         histogram, tiles = np.zeros(256, np.int32), np.full(room, -1, np.int32)
-        count = list_tiles(splats, bases, 0, box, size, True, histogram, tiles, 0)
+        count = list_tiles(ellipse, box, frame, histogram, tiles, 0)
         assert sorted(set(tiles[:count]) - {35}) == [33, 34, 50]
         assert (tiles[count:] == -1).all()
         assert (np.flatnonzero(histogram) == np.sort(tiles[:count])).all()
         starts = (np.cumsum(histogram) - histogram).astype(np.int64).reshape(1, 1, -1)
         entries = np.full((count, 2), -1, np.int32)
-        place(0, 1, tiles[:count], np.array([0, count]), starts, 1, 1, entries)
+        place(0, 1, tiles[:count], np.array([0, count]), starts, frame, entries)
         assert (entries[:, 0] == 0).all()
         assert (np.sort(entries[:, 1]) == np.arange(count)).all()

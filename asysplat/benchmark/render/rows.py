@@ -4,63 +4,71 @@ nothing around it, which no renderer of this kind can be faster than."""
 import numpy as np
 
 from asysplat.ops.cpu.kernel import inline, kernel
-from asysplat.ops.cpu.lanes import LANES
-from asysplat.rendering.cpu import backward, forward
-from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.backward import draw_row_backward
-from asysplat.rendering.cpu.forward import draw_row
-from asysplat.rendering.cpu.tile import PLANE, aligned, row_of
-
-FORWARD_STATE = forward.PLANES * PLANE
-BACKWARD_STATE = backward.PLANES * PLANE + backward.SUMS * LANES
+from asysplat.rendering.cpu import splat as col
+from asysplat.rendering.cpu.rasterize import (
+    BACKWARD_STATE,
+    STATE,
+    aligned,
+    draw_row,
+    draw_row_backward,
+)
+from asysplat.rendering.cpu.splat import TileSplat, in_row
 
 
 @inline
-def row_again(splat, offset, drawn):
-    """`row_of` of the rows of a tile in turn."""
+def tile_splat(splat, offset):
+    """The splat as the tile sees it."""
     x, y = offset
     b = float(splat[col.B])
-    u0 = float(splat[col.A]) * x + b * y
-    return row_of(drawn & (col.TILE - 1), y, u0, b, splat[col.C], splat[col.LOG_OPACITY])
+    return TileSplat(
+        x=x,
+        y=y,
+        u=float(splat[col.A]) * x + b * y,
+        b=b,
+        a=splat[col.A],
+        c=splat[col.C],
+        log_opacity=splat[col.LOG_OPACITY],
+        red=splat[col.RED],
+        green=splat[col.GREEN],
+        blue=splat[col.BLUE],
+        z=splat[col.DEPTH],
+        z_rest=splat[col.DEPTH],
+    )
 
 
 @kernel
-def forward_rows(start, stop, splat, offset, times, convention, states):
+def forward_rows(start, stop, splat, offset, times, settings, states):
     """Draw a splat `times` times into each of the tiles start to stop.
 
     Args:
-        splat: [16], see `layout`.
+        splat: [16], see `asysplat.rendering.cpu.splat`.
         offset: from its centre to the middle of the tile's first row, in pixels.
-        convention: alpha_min, alpha_max, transmittance_min, float32.
-        states: [tiles, FORWARD_STATE], what the tile begins with and ends with.
+        settings: `RasterSettings`.
+        states: [tiles, STATE], what the tile begins with and ends with.
     """
-    a, color = splat[col.A], (splat[col.RED], splat[col.GREEN], splat[col.BLUE])
-    z = splat[col.DEPTH]
-    state = aligned(FORWARD_STATE)
+    seen = tile_splat(splat, offset)
+    state = aligned(STATE)
     for tile in range(start, stop):
-        state[:FORWARD_STATE] = states[tile]
+        state[:STATE] = states[tile]
         for drawn in range(times * col.TILE):
-            base, _, exponent, middle = row_again(splat, offset, drawn)
+            row = in_row(seen, drawn & (col.TILE - 1))
             rank = np.float32(drawn // col.TILE)
-            draw_row(state, base, rank, a, middle, exponent, color, z, z, convention, None, None)
-        states[tile] = state[:FORWARD_STATE]
+            draw_row(state, row, rank, seen, settings, None, None)
+        states[tile] = state[:STATE]
 
 
 @kernel
-def backward_rows(start, stop, splat, offset, times, convention, states):
+def backward_rows(start, stop, splat, offset, times, settings, states):
     """Take the gradients of a splat `times` times in each of the tiles start to stop.
 
     Arguments as for `forward_rows`, but that states are [tiles, BACKWARD_STATE].
     """
-    a, color = splat[col.A], (splat[col.RED], splat[col.GREEN], splat[col.BLUE])
-    z = splat[col.DEPTH]
+    seen = tile_splat(splat, offset)
     state = aligned(BACKWARD_STATE)
     for tile in range(start, stop):
         state[:BACKWARD_STATE] = states[tile]
         for drawn in range(times * col.TILE):
-            base, dy, exponent, middle = row_again(splat, offset, drawn)
+            row = in_row(seen, drawn & (col.TILE - 1))
             rank = np.float32(times - 1 - drawn // col.TILE)
-            draw_row_backward(
-                state, base, rank, dy, a, middle, exponent, color, z, z, convention, None, None
-            )
+            draw_row_backward(state, row, rank, seen, settings, None, None)
         states[tile] = state[:BACKWARD_STATE]

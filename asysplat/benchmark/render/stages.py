@@ -11,13 +11,14 @@ import torch
 
 from asysplat.benchmark.render.rows import (
     BACKWARD_STATE,
-    FORWARD_STATE,
+    STATE,
     backward_rows,
     forward_rows,
 )
 from asysplat.ops.cpu.threads import even_bounds, run_blocks
 from asysplat.rendering import INRIA
-from asysplat.rendering.cpu import layout as col
+from asysplat.rendering.cpu import splat as col
+from asysplat.rendering.cpu.splat import RasterSettings
 from asysplat.rendering.formulas import WHITEN_TO_LOG2
 
 STAGES = ("project", "start_positions", "place", "rasterize")
@@ -49,9 +50,9 @@ def row_seconds() -> dict[str, float]:
     """Seconds of one row in a hot loop, forward and backward, on one of the cores while all of
     torch's threads are busy so."""
     convention = (INRIA.alpha_min, INRIA.alpha_max, INRIA.transmittance_min)
-    cutoffs = tuple(map(np.float32, convention))
+    settings = RasterSettings(*map(np.float32, convention), skip_rows=False, skip_opaque=False)
     kernels = {
-        "forward": (forward_rows, FORWARD_STATE),
+        "forward": (forward_rows, STATE),
         "backward": (backward_rows, BACKWARD_STATE),
     }
     splat = middle_splat(OPACITY)
@@ -61,7 +62,7 @@ def row_seconds() -> dict[str, float]:
         for _ in range(REPEATS):
             states = np.ones((TILES, size), np.float32)
             start = time.perf_counter()
-            run_blocks(kernel, even_bounds(TILES), splat, CENTER, TIMES, cutoffs, states)
+            run_blocks(kernel, even_bounds(TILES), splat, CENTER, TIMES, settings, states)
             walls.append(time.perf_counter() - start)
         seconds[direction] = min(walls) * torch.get_num_threads() / (TILES * TIMES * col.TILE)
     return seconds

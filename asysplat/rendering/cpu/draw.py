@@ -1,7 +1,7 @@
-"""The stages of the CPU renderer, one after the other, as one operation to torch."""
+"""The CPU renderer, one pass after the other, as one operation to torch."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,19 +11,35 @@ from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
 from asysplat.ops.cpu.threads import even_bounds, run_blocks, weighted_bounds
-from asysplat.rendering.camera_rows import CAMERA_GRADIENT, camera_gradients, camera_rows
-from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.backward import rasterize_backward
-from asysplat.rendering.cpu.forward import rasterize
-from asysplat.rendering.cpu.project import project
-from asysplat.rendering.cpu.project_backward import project_backward
-from asysplat.rendering.cpu.tiles import place, start_positions
-from asysplat.rendering.layers import Layers
-from asysplat.rendering.limits import check_pairs
-from asysplat.rendering.settings import Settings
+from asysplat.rendering.cpu import project as projection
+from asysplat.rendering.cpu import rasterize as raster
+from asysplat.rendering.cpu.project import Projected, project
+from asysplat.rendering.cpu.project_backward import Needs, Pairs, project_backward
+from asysplat.rendering.cpu.rasterize import (
+    BlendedDepth,
+    Gradients,
+    Images,
+    MedianDepth,
+    Saved,
+    rasterize,
+    rasterize_backward,
+)
+from asysplat.rendering.cpu.splat import (
+    GRADIENT,
+    SPLAT,
+    TILE,
+    Frame,
+    ProjectSettings,
+    RasterSettings,
+)
+from asysplat.rendering.cpu.tiles import Lists, place, start_positions
+from asysplat.rendering.formulas import CAMERA_GRADIENT, Inputs, camera_gradients, camera_rows
+from asysplat.rendering.interface import RenderOutputs, Settings, check_pairs
 from asysplat.scene import Cameras, Gaussians
 
 MOST_SPLATS = 2**25  # in memory at a time: 2 GiB
+BLOCK = 2048  # Gaussians of a piece of work; more, where an image would have over MOST_BLOCKS
+MOST_BLOCKS = 64
 
 
 def draw(
@@ -31,8 +47,8 @@ def draw(
     cameras: Cameras,
     settings: Settings,
     masks: Bool[Tensor, "B V H W"] | None = None,
-) -> Layers:
-    """Gaussians [B, N] and cameras [B, V] to layers of B V images, float32.
+) -> RenderOutputs:
+    """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
 
     What it draws where `masks` is False has no meaning.
 
@@ -49,285 +65,243 @@ def draw(
     images = cameras.intrinsics.shape[:2].numel()
     if images * gaussians.num_gaussians > MOST_SPLATS and cameras.num_views > 1:
         raise MemoryError(f"{images} images of {gaussians.num_gaussians} Gaussians")
+    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    poses = (cameras.cam_to_world, cameras.intrinsics)
+    size = (cameras.height, cameras.width)
     stats: dict[str, int] = {}
-    layers = _Draw.apply(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        cameras.cam_to_world,
-        cameras.intrinsics,
-        (cameras.height, cameras.width),
-        settings,
-        masks if settings.skips.masks else None,
-        stats,
-    )
-    *layers, origin = layers
-    return Layers(*layers, stats, origin)
-
-
-class _Lists(NamedTuple):
-    """Splats [images * N, 16] and which tiles they touch, sorted by tile, then by Gaussian."""
-
-    splats: np.ndarray
-    first_pair: np.ndarray  # [images * N + 1]
-    first_entry: np.ndarray  # [tiles + 1]
-    entries: np.ndarray  # [pairs, 2]
-
-
-class _Frame(NamedTuple):
-    """What the kernels are told of all images."""
-
-    images: int
-    views: int
-    num: int  # Gaussians of an image
-    blocks: int  # of an image
-    block_size: int
-    height: int
-    width: int
-    columns: int  # of tiles
-    tiles: int  # of an image
-    settings: Settings
-
-    @property
-    def size(self) -> tuple[int, int, int]:
-        return self.height, self.width, self.columns
-
-    @property
-    def grid(self) -> tuple[int, int, int, int]:
-        return self.columns, self.tiles, self.height, self.width
-
-    @property
-    def projection(self) -> tuple[float, ...]:
-        c = self.settings.convention
-        log_alpha_min = math.log2(c.alpha_min)
-        return c.alpha_min, log_alpha_min, c.eps2d, c.near, c.compensation_min
-
-    @property
-    def cutoffs(self) -> tuple[np.float32, ...]:
-        c = self.settings.convention
-        return tuple(map(np.float32, (c.alpha_min, c.alpha_max, c.transmittance_min)))
+    masks = masks if settings.skips.masks else None
+    *images, origins = _Draw.apply(settings, size, masks, stats, *fields, *poses)
+    return RenderOutputs(*images, stats, origins)
 
 
 class _Draw(torch.autograd.Function):
+    """The passes, forward and backward; `stats` is filled on the way."""
+
     @staticmethod
-    def forward(ctx, *args):
-        *tensors, (height, width), settings, masks, stats = args
-        means, _, _, _, _, cam_to_world, intrinsics = tensors
-        batch, num = means.shape[:2]
-        views = intrinsics.shape[1]
-        blocks = max(1, min(-(-num // col.BLOCK), col.MOST_BLOCKS))
-        columns = -(-width // col.TILE)
-        frame = _Frame(
-            images=batch * views,
-            views=views,
-            num=num,
-            blocks=blocks,
-            block_size=-(-num // blocks),
-            height=height,
-            width=width,
-            columns=columns,
-            tiles=-(-height // col.TILE) * columns,
-            settings=settings,
-        )
-        fields = [_array(tensor) for tensor in tensors[:5]]
-        cameras = _camera_rows(frame, cam_to_world, intrinsics)
-        lists = _make_lists(frame, fields, cameras, stats)
-        image = torch.empty(frame.images, 3, height, width)
-        alpha = torch.empty(frame.images, height, width)
-        transmittance = torch.empty_like(alpha)
-        depth = torch.empty(frame.images, height, width) if settings.depth else None
-        last_entry = np.empty(frame.images * frame.tiles, np.int64)
-        wanted = _wanted_tiles(frame, masks)
-        stops = np.empty(alpha.shape, np.float32)
-        halved = np.empty(alpha.shape, np.float32) if settings.depth == "median" else None
-        origins = torch.empty_like(alpha) if settings.depth not in (None, "median") else None
-        counters = np.empty((frame.images * frame.tiles, col.COUNTERS), np.int64)
-        run_blocks(
-            rasterize,
-            weighted_bounds(lists.first_entry),
-            lists.splats,
-            lists.first_entry,
-            last_entry,
-            lists.entries,
-            wanted,
-            frame.grid,
-            frame.cutoffs,
-            (settings.skips.rows, settings.skips.opaque),
-            image.numpy(),
-            alpha.numpy(),
-            transmittance.numpy(),
-            *_by_kind(depth, settings),
-            stops,
-            halved,
-            None if origins is None else origins.numpy(),
-            counters,
-        )
-        rows, in_reach = counters.sum(0).tolist()
-        drawn = int((last_entry - lists.first_entry[:-1]).sum())
-        masked = int(np.diff(lists.first_entry)[~wanted].sum())
-        stats["pairs_masked"] = masked
-        stats["pairs_behind_opaque"] = stats["pairs"] - masked - drawn
-        stats["rows"] = rows
-        stats["rows_out_of_reach"] = drawn * col.TILE - in_reach
-        stats["rows_opaque"] = in_reach - rows
-        ctx.save_for_backward(*tensors, transmittance)
-        ctx.frame, ctx.lists, ctx.last_entry = frame, lists, last_entry
-        ctx.seen = stops, halved, None if origins is None else origins.numpy()
+    def forward(ctx, settings, size, masks, stats, *tensors):
+        frame = _frame(tensors, size, settings)
+        inputs = _inputs(tensors, size, settings)
+        lists = _list_tiles(frame, *_project(frame, inputs), masks, stats)
+        images, saved, beside_depth = _rasterize(frame, lists, settings.depth, stats)
+        _, _, transmittance, _, origins = images
+        ctx.save_for_backward(*tensors, transmittance)  # an output must be saved here
+        ctx.settings, ctx.size, ctx.frame, ctx.lists = settings, size, frame, lists
+        ctx.saved, ctx.beside_depth = saved._replace(transmittance=None), beside_depth
         ctx.set_materialize_grads(False)
         if origins is not None:
             ctx.mark_non_differentiable(origins)
-        return image, alpha, transmittance, depth, origins
+        return images
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth, _):
         *tensors, transmittance = ctx.saved_tensors
-        frame, lists, settings = ctx.frame, ctx.lists, ctx.frame.settings
+        frame, lists = ctx.frame, ctx.lists
         if grad_image is None:
             grad_image = torch.zeros(frame.images, 3, frame.height, frame.width)
         if grad_transmittance is None:
             grad_transmittance = torch.zeros_like(transmittance)
         if grad_alpha is not None:
             grad_transmittance = grad_transmittance - grad_alpha
-        pair_grads = np.empty((len(lists.entries), col.GRADIENT), np.float32)
-        run_blocks(
-            rasterize_backward,
-            weighted_bounds(lists.first_entry),
-            lists.splats,
-            lists.first_entry,
-            ctx.last_entry,
-            lists.entries,
-            frame.grid,
-            frame.cutoffs,
-            (settings.skips.rows, settings.skips.opaque),
-            transmittance.numpy(),
-            *ctx.seen,
-            grad_image.contiguous().numpy(),
-            grad_transmittance.contiguous().numpy(),
-            *_by_kind(grad_depth, settings),
-            pair_grads,
+        grads = Gradients(
+            image=grad_image.contiguous().numpy(),
+            transmittance=grad_transmittance.contiguous().numpy(),
+            pairs=np.empty((len(lists.entries), GRADIENT), np.float32),
         )
-        fields = [_array(tensor) for tensor in tensors[:5]]
-        cameras = _camera_rows(frame, *tensors[5:])
-        sh_needed, cameras_needed = ctx.needs_input_grad[4], any(ctx.needs_input_grad[5:7])
-        field_grads = [_empty_like(tensor) for tensor in tensors[:4]]
-        field_grads.append(_empty_like(tensors[4] if sh_needed else tensors[4][:0]))
-        camera_grads = np.empty((frame.images, frame.blocks, CAMERA_GRADIENT))
-        run_blocks(
-            project_backward,
-            even_bounds(frame.images // frame.views * frame.blocks),
-            fields[0],
-            fields[1].reshape(-1),
-            fields[2].reshape(-1),
-            *fields[3:],
-            cameras,
-            frame.views,
-            frame.block_size,
-            frame.projection,
-            settings.antialiased,
-            (sh_needed, cameras_needed),
-            lists.first_pair,
-            pair_grads,
-            *(_array(grad) for grad in field_grads),
-            camera_grads,
-        )
-        if not sh_needed:
-            field_grads[-1] = None
-        poses = (
-            camera_gradients(torch.from_numpy(camera_grads.sum(1)), *tensors[5:])
-            if cameras_needed
-            else (None,) * 2
-        )
-        return (*field_grads, *poses, *(None,) * 4)
+        saved = ctx.saved._replace(transmittance=transmittance.numpy())
+        depths = _depths(ctx.settings.depth, grad_depth, ctx.beside_depth)
+        tiles = weighted_bounds(lists.first_entry)
+        run_blocks(rasterize_backward, tiles, lists, frame, saved, grads, *depths)
+        inputs = _inputs(tensors, ctx.size, ctx.settings)
+        needs = Needs(sh=ctx.needs_input_grad[8], cameras=any(ctx.needs_input_grad[9:]))
+        pairs = Pairs(lists.first_pair, grads.pairs)
+        return (None,) * 4 + _project_backward(frame, inputs, needs, pairs, tensors)
 
 
-def _make_lists(
-    frame: _Frame, fields: list[np.ndarray], cameras: np.ndarray, stats: dict[str, int]
-) -> _Lists:
-    """Project, and sort into tiles."""
-    skips = frame.settings.skips
-    splats = np.empty((frame.images * frame.num, col.SPLAT), np.float32)
-    counts = np.empty(frame.images * frame.num, np.int32)
-    counters = np.empty((frame.images, frame.blocks, col.PROJECT_COUNTERS), np.int64)
-    histograms = np.empty((frame.images, frame.blocks, frame.tiles), np.int32)
-    pieces = even_bounds(frame.images * frame.blocks)
-    tiles = run_blocks(
-        project,
-        pieces,
-        *fields,
-        cameras,
-        frame.views,
-        frame.block_size,
-        frame.size,
-        frame.projection,
-        frame.settings.antialiased,
-        (skips.opacity, skips.frustum, skips.extent, skips.ellipse),
-        splats,
-        counts,
-        counters,
-        histograms,
+def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: Settings) -> Frame:
+    """Gather what the kernels are told."""
+    means, intrinsics = tensors[0], tensors[-1]
+    (scenes, num), views = means.shape[:2], intrinsics.shape[1]
+    height, width = size
+    blocks = max(1, min(-(-num // BLOCK), MOST_BLOCKS))
+    columns = -(-width // TILE)
+    convention, skips = settings.convention, settings.skips
+    return Frame(
+        images=scenes * views,
+        views=views,
+        num=num,
+        blocks=blocks,
+        block_size=-(-num // blocks),
+        height=height,
+        width=width,
+        columns=columns,
+        tiles=-(-height // TILE) * columns,
+        project=ProjectSettings(
+            alpha_min=convention.alpha_min,
+            log_alpha_min=math.log2(convention.alpha_min),
+            eps2d=convention.eps2d,
+            near=convention.near,
+            compensation_min=convention.compensation_min,
+            antialiased=settings.antialiased,
+            skip_opacity=skips.opacity,
+            skip_frustum=skips.frustum,
+            own_extent=skips.extent,
+            exact=skips.ellipse,
+        ),
+        raster=RasterSettings(
+            alpha_min=np.float32(convention.alpha_min),
+            alpha_max=np.float32(convention.alpha_max),
+            transmittance_min=np.float32(convention.transmittance_min),
+            skip_rows=skips.rows,
+            skip_opaque=skips.opaque,
+        ),
     )
+
+
+def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: Settings) -> Inputs:
+    """Turn the fields of Gaussians, poses and intrinsics into arrays."""
+    *fields, cam_to_world, intrinsics = tensors
+    cameras = camera_rows(cam_to_world, intrinsics, size, settings.convention)
+    return Inputs(*(_array(field) for field in fields), cameras=cameras.numpy())
+
+
+def _project(frame: Frame, inputs: Inputs) -> tuple[Projected, list[np.ndarray]]:
+    """Find the splats, and the tile of each of their pairs, in pieces."""
+    projected = Projected(
+        splats=np.empty((frame.images * frame.num, SPLAT), np.float32),
+        counts=np.empty(frame.images * frame.num, np.int32),
+        counters=np.empty((frame.images, frame.blocks, projection.COUNTERS), np.int64),
+        histograms=np.empty((frame.images, frame.blocks, frame.tiles), np.int32),
+    )
+    blocks = even_bounds(frame.images * frame.blocks)
+    return projected, run_blocks(project, blocks, inputs, frame, projected)
+
+
+def _list_tiles(
+    frame: Frame,
+    projected: Projected,
+    tiles: list[np.ndarray],
+    masks: Tensor | None,
+    stats: dict[str, int],
+) -> Lists:
+    """Sort the pairs by tile."""
+    histograms = projected.histograms
     first_entry = _starts(histograms.sum(1, dtype=np.int64).reshape(-1))
-    first_pair = _starts(counts)
+    lengths = np.diff(first_entry)
     pairs = int(first_entry[-1])
-    check_pairs(pairs, int(np.diff(first_entry).max()))
-    stats["visible"] = int(np.count_nonzero(counts))
-    boxes, stats["culled_by_opacity"], stats["culled_by_frustum"] = counters.sum((0, 1)).tolist()
+    check_pairs(pairs, int(lengths.max()))
+    lists = Lists(
+        splats=projected.splats,
+        first_pair=_starts(projected.counts),
+        first_entry=first_entry,
+        entries=np.empty((pairs, 2), np.int32),
+        wanted=_wanted_tiles(frame, masks),
+    )
+    boxes, faint, outside = projected.counters.sum((0, 1)).tolist()
+    stats["visible"] = int(np.count_nonzero(projected.counts))
+    stats["culled_by_opacity"], stats["culled_by_frustum"] = faint, outside
     stats["pairs"] = pairs
-    stats["pairs_off_ellipse"] = boxes - pairs if skips.ellipse else 0
-    stats["tile_size"] = col.TILE
+    stats["pairs_off_ellipse"] = boxes - pairs if frame.project.exact else 0
+    stats["pairs_masked"] = int(lengths[~lists.wanted].sum())
+    stats["tile_size"] = TILE
     positions = np.empty(histograms.shape, np.int64)
     run_blocks(start_positions, even_bounds(frame.images), histograms, first_entry, positions)
-    entries = np.empty((pairs, 2), np.int32)
-    run_blocks(
-        place,
-        pieces,
-        np.concatenate(tiles),
-        first_pair,
-        positions,
-        frame.num,
-        frame.block_size,
-        entries,
+    blocks = even_bounds(frame.images * frame.blocks)
+    tile_of = np.concatenate(tiles)
+    run_blocks(place, blocks, tile_of, lists.first_pair, positions, frame, lists.entries)
+    return lists
+
+
+def _rasterize(
+    frame: Frame, lists: Lists, depth: str | None, stats: dict[str, int]
+) -> tuple[tuple[Tensor | None, ...], Saved, np.ndarray | None]:
+    """Draw image, alpha, transmittance, depth and its origins; also what backward needs.
+
+    That is `Saved`, and what stands beside the depth, see `_depths`.
+    """
+    image = torch.empty(frame.images, 3, frame.height, frame.width)
+    alpha = torch.empty(frame.images, frame.height, frame.width)
+    transmittance = torch.empty_like(alpha)
+    drawn_depth = torch.empty_like(alpha) if depth else None
+    origins = torch.empty_like(alpha) if depth not in (None, "median") else None
+    beside_depth = None if origins is None else origins.numpy()
+    if depth == "median":
+        beside_depth = np.empty(alpha.shape, np.float32)
+    saved = Saved(
+        transmittance=transmittance.numpy(),
+        stops=np.empty(alpha.shape, np.float32),
+        last_entry=np.empty(frame.images * frame.tiles, np.int64),
+        counters=np.empty((frame.images * frame.tiles, raster.COUNTERS), np.int64),
     )
-    return _Lists(splats, first_pair, first_entry, entries)
+    images = Images(image.numpy(), alpha.numpy())
+    depths = _depths(depth, drawn_depth, beside_depth)
+    tiles = weighted_bounds(lists.first_entry)
+    run_blocks(rasterize, tiles, lists, frame, images, saved, *depths)
+    rows, in_extent = saved.counters.sum(0).tolist()
+    drawn = int((saved.last_entry - lists.first_entry[:-1]).sum())
+    stats["pairs_behind_opaque"] = stats["pairs"] - stats["pairs_masked"] - drawn
+    stats["rows"] = rows
+    stats["rows_out_of_reach"] = drawn * TILE - in_extent
+    stats["rows_opaque"] = in_extent - rows
+    return (image, alpha, transmittance, drawn_depth, origins), saved, beside_depth
 
 
-def _wanted_tiles(frame: _Frame, masks: Tensor | None) -> np.ndarray:
-    """[images * tiles] whether any pixel counts."""
+def _project_backward(
+    frame: Frame, inputs: Inputs, needs: Needs, pairs: Pairs, tensors: Sequence[Tensor]
+) -> tuple[Tensor | None, ...]:
+    """Return the gradients of `tensors`: the fields of Gaussians, poses and intrinsics."""
+    *fields, cam_to_world, intrinsics = tensors
+    field_grads = [_empty_like(field) for field in fields[:4]]
+    field_grads.append(_empty_like(fields[4] if needs.sh else fields[4][:0]))
+    camera_grads = np.empty((frame.images, frame.blocks, CAMERA_GRADIENT))
+    grads = Inputs(*(_array(grad) for grad in field_grads), cameras=camera_grads)
+    flat = inputs._replace(quats=inputs.quats.reshape(-1), scales=inputs.scales.reshape(-1))
+    blocks = even_bounds(frame.images // frame.views * frame.blocks)
+    run_blocks(project_backward, blocks, flat, frame, needs, pairs, grads)
+    if not needs.sh:
+        field_grads[-1] = None
+    poses = (None, None)
+    if needs.cameras:
+        rows = torch.from_numpy(camera_grads.sum(1))
+        poses = camera_gradients(rows, cam_to_world, intrinsics)
+    return (*field_grads, *poses)
+
+
+def _wanted_tiles(frame: Frame, masks: Tensor | None) -> np.ndarray:
+    """Say for each of [images * tiles] whether any pixel of it counts."""
     if masks is None:
         return np.ones(frame.images * frame.tiles, np.bool_)
     counts = masks.flatten(0, 1).to(torch.float32)
-    return torch.nn.functional.max_pool2d(counts, col.TILE, ceil_mode=True).flatten().numpy() > 0
+    return torch.nn.functional.max_pool2d(counts, TILE, ceil_mode=True).flatten().numpy() > 0
 
 
-def _by_kind(depth: Tensor | None, settings: Settings) -> tuple[np.ndarray | None, ...]:
-    """As the accumulated depth and as the median: one of them at most is asked for."""
+def _depths(
+    kind: str | None, depth: Tensor | None, beside: np.ndarray | None
+) -> tuple[BlendedDepth | None, MedianDepth | None]:
+    """Return a depth, or its gradient, as the kind that was asked for, and None as the other.
+
+    Beside it stand the origins of a blended depth, or the ranks of a median one.
+    """
     if depth is None:
         return None, None
     array = depth.contiguous().numpy()
-    return (None, array) if settings.depth == "median" else (array, None)
+    if kind == "median":
+        return None, MedianDepth(array, beside)
+    return BlendedDepth(array, beside), None
 
 
 def _empty_like(tensor: Tensor) -> Tensor:
-    """In NumPy's memory, whose first touch of large arrays is several times faster than torch's."""
+    """Allocate by NumPy, whose first touch of large arrays is several times faster than torch's."""
     return torch.from_numpy(np.empty_like(tensor.detach().numpy(), order="C"))
 
 
 def _starts(counts: np.ndarray) -> np.ndarray:
-    """[0, c_0, c_0 + c_1, ...]"""
+    """Return [0, c_0, c_0 + c_1, ...]."""
     starts = np.zeros(len(counts) + 1, np.int64)
     np.cumsum(counts, out=starts[1:])
     return starts
 
 
 def _array(tensor: Tensor) -> np.ndarray:
-    """[B, N, ...] as [B * N, ...], without a copy where memory allows it."""
+    """Turn [B, N, ...] into an array [B * N, ...], without a copy where memory allows it."""
     return tensor.detach().contiguous().flatten(0, 1).numpy()
-
-
-def _camera_rows(frame: _Frame, cam_to_world: Tensor, intrinsics: Tensor) -> np.ndarray:
-    """[images, 20] float64, see `camera_rows`."""
-    size = (frame.height, frame.width)
-    return camera_rows(cam_to_world, intrinsics, size, frame.settings.convention).numpy()

@@ -1,171 +1,186 @@
 """Gradients of the Gaussians and the cameras from those of their splats, in float64."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from asysplat.ops.cpu.kernel import inline, kernel
-from asysplat.rendering import camera_rows as cam
-from asysplat.rendering.cpu import layout as col
-from asysplat.rendering.cpu.geometry import (
-    clamp,
+from asysplat.rendering.cpu.math import (
     covariance,
-    ellipse_rows,
-    jacobian_row,
-    whitening,
-)
-from asysplat.rendering.cpu.project import TINY
-from asysplat.rendering.cpu.sh import basis, basis_gradient
-from asysplat.rendering.cpu.vectors import (
     cross,
     dot,
+    ellipse_rows,
+    in_camera,
+    load_camera,
     plus,
     rotation_columns,
     rotation_gradient,
     row3,
     scaled,
+    sh_basis,
+    sh_basis_gradient,
     times,
     unit_quaternion,
+    whitening,
 )
-from asysplat.rendering.formulas import WHITEN_TO_LOG2
+from asysplat.rendering.cpu.splat import (
+    G_A,
+    G_B,
+    G_C,
+    G_DEPTH,
+    G_LOG_OPACITY,
+    G_RED,
+    G_X,
+    G_Y,
+    GRADIENT,
+)
+from asysplat.rendering.formulas import CENTER, CX, CY, DOWN, FORWARD, FX, FY, RIGHT, WHITEN_TO_LOG2
+from asysplat.rendering.interface import TINY
 
 LOG_2 = math.log(2)
+# Where the gradients of a Gaussian's mean, quaternion, scale and SH begin among its sums.
+MEAN, QUAT, SCALE, SH = 0, 3, 7, 10
+SUMS = SH + 3 * 16
+
+
+class Pairs(NamedTuple):
+    """Gradients of all pairs of splat and tile.
+
+    first [images * N + 1] the number of each splat's first pair, and of all pairs; grads [pairs,
+    10], see `splat`.
+    """
+
+    first: np.ndarray
+    grads: np.ndarray
+
+
+class Needs(NamedTuple):
+    """Whether the gradients of SH and of the cameras are asked for."""
+
+    sh: bool
+    cameras: bool
+
+
+class _Scratch(NamedTuple):
+    """Room for one Gaussian.
+
+    sums [58] its gradient over all views, see MEAN; functions [16] the SH functions at its
+    direction, and g_functions [16] their gradients.
+    """
+
+    sums: np.ndarray
+    functions: np.ndarray
+    g_functions: np.ndarray
 
 
 @kernel
-def project_backward(
-    start,
-    stop,
-    means,
-    quats,
-    scales,
-    opacities,
-    sh,
-    cameras,
-    views,
-    block_size,
-    convention,
-    antialiased,
-    needs,
-    first_pair,
-    grads,
-    grad_means,
-    grad_quats,
-    grad_scales,
-    grad_opacities,
-    grad_sh,
-    grad_cameras,
-):
-    """Gradients of blocks start to stop of the scenes' Gaussians.
+def project_backward(start, stop, inputs, frame, needs, pairs, grads):
+    """Compute the gradients of blocks start to stop of the scenes' Gaussians.
 
     Args:
-        needs: whether the harmonics' and the cameras' gradients are asked for.
-        first_pair: [images * N + 1].
-        grads: [pairs, 10].
-        grad_means, grad_quats, grad_scales, grad_opacities, grad_sh: [B * N, ...], float32 or
-            float64, every element written.
-        grad_cameras: [B * V, blocks, 16] float64, each block's part.
-        quats, scales: flat. Others: as for `project`.
+        start, stop: blocks, numbered scene by scene.
+        inputs: `Inputs`, as for `project`, but with quats and scales flat.
+        frame: sizes and settings.
+        needs: what is asked for beside the Gaussians' other fields.
+        pairs: gradients of the pairs of splat and tile.
+        grads: `Inputs` to write, float32 or float64: every element of the fields, those of SH if
+            they are needed; of cameras [images, blocks, 16] float64, each block's part.
     """
-    blocks = grad_cameras.shape[1]
-    num = means.shape[0] * views // cameras.shape[0]
-    count = sh.shape[1]
-    functions, g_functions, pixel = np.empty(16), np.zeros(16), np.empty(col.GRADIENT)
-    g_mean, g_quat, g_scale = np.empty(3), np.empty(4), np.empty(3)
-    g_sh = np.empty((count, 3))
-    sh_needed, _ = needs
+    blocks, num = frame.blocks, frame.num
+    count = inputs.sh.shape[1]
+    splat_grads = np.empty(GRADIENT)
+    first_pair, pair_grads = pairs
+    grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, grad_cameras = grads
+    scratch = _Scratch(np.empty(SUMS), np.empty(16), np.empty(16))
+    sums = scratch.sums
     for index in range(start, stop):
         scene, block = index // blocks, index % blocks
-        for view in range(views):
-            grad_cameras[scene * views + view, block] = 0
-        for n in range(block * block_size, min((block + 1) * block_size, num)):
+        for view in range(frame.views):
+            grad_cameras[scene * frame.views + view, block] = 0
+        for n in range(block * frame.block_size, min((block + 1) * frame.block_size, num)):
             g = scene * num + n
-            _clear(g_mean)
-            _clear(g_quat)
-            _clear(g_scale)
-            if sh_needed:
-                for k in range(count):
-                    _clear(g_sh[k])
+            _clear(sums)
             g_opacity = 0.0
-            for view in range(views):
-                image = scene * views + view
+            for view in range(frame.views):
+                image = scene * frame.views + view
                 d = image * num + n
                 if first_pair[d] == first_pair[d + 1]:
                     continue
-                _clear(pixel)
+                _clear(splat_grads)
                 for pair in range(first_pair[d], first_pair[d + 1]):
-                    for k in range(col.GRADIENT):
-                        pixel[k] += grads[pair, k]
-                g_opacity += _splat_backward(
-                    g, means, quats, scales, opacities, sh, cameras, image, convention,
-                    antialiased, needs, functions, g_functions, pixel, g_mean, g_quat, g_scale,
-                    g_sh, grad_cameras[image, block],
-                )  # fmt: skip
+                    for k in range(GRADIENT):
+                        splat_grads[k] += pair_grads[pair, k]
+                g_camera = grad_cameras[image, block]
+                g_opacity += _add_splat(
+                    g, image, inputs, frame.project, needs, splat_grads, scratch, g_camera
+                )
             grad_opacities[g] = g_opacity
             for k in range(3):
-                grad_means[g, k], grad_scales[g, k] = g_mean[k], g_scale[k]
+                grad_means[g, k], grad_scales[g, k] = sums[MEAN + k], sums[SCALE + k]
             for k in range(4):
-                grad_quats[g, k] = g_quat[k]
-            if sh_needed:
+                grad_quats[g, k] = sums[QUAT + k]
+            if needs.sh:
                 for k in range(count):
                     for channel in range(3):
-                        grad_sh[g, k, channel] = g_sh[k, channel]
+                        grad_sh[g, k, channel] = sums[SH + 3 * k + channel]
 
 
 @inline
-def _clear(vector):
-    for k in range(len(vector)):
-        vector[k] = 0.0
+def _clear(array):
+    """Set all numbers to 0."""
+    for k in range(len(array)):
+        array[k] = 0.0
 
 
 @inline
 def _add3(out, start, factor, values):
+    """Add factor values to out[start : start + 3]."""
     out[start] += factor * values[0]
     out[start + 1] += factor * values[1]
     out[start + 2] += factor * values[2]
 
 
 @inline
-def _splat_backward(
-    g, means, quats, scales, opacities, sh, cameras, image, convention, antialiased,
-    needs, functions, g_functions, pixel, g_mean, g_quat, g_scale, g_sh, g_camera,
-):  # fmt: skip
-    """Add one splat's part to the gradients; returns that of the opacity."""
-    _, _, eps, _, compensation_min = convention
-    sh_needed, cameras_needed = needs
-    right, down = row3(cameras, image, cam.RIGHT), row3(cameras, image, cam.DOWN)
-    forward = row3(cameras, image, cam.FORWARD)
-    fx, fy = cameras[image, cam.FX], cameras[image, cam.FY]
+def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera):
+    """Add one splat's part to the sums and the camera's gradient; return that of the opacity.
+
+    Args:
+        g: the Gaussian.
+        image: in which it is this splat.
+        inputs: with quats and scales flat.
+        settings: of the projection.
+        needs: what is asked for.
+        splat_grads: [10] of the splat.
+        scratch: room, with the sums to add to.
+        g_camera: [16].
+    """
+    eps = settings.eps2d
+    sums, functions, g_functions = scratch
+    camera = load_camera(inputs.cameras, image)
+    right, down, forward, fx, fy = camera.right, camera.down, camera.forward, camera.fx, camera.fy
 
     # What `project` computed.
-    offset = plus(row3(means, g), -1.0, row3(cameras, image, cam.CENTER))
-    z = dot(forward, offset)
-    inverse_z = 1 / z
-    tangent_x, tangent_y = dot(right, offset) * inverse_z, dot(down, offset) * inverse_z
-    inside_x = clamp(tangent_x, cameras[image, cam.LOW_X], cameras[image, cam.HIGH_X])
-    inside_y = clamp(tangent_y, cameras[image, cam.LOW_Y], cameras[image, cam.HIGH_Y])
-    row_x = jacobian_row(right, forward, fx, inverse_z, inside_x)
-    row_y = jacobian_row(down, forward, fy, inverse_z, inside_y)
-    mx, my, turned_x, turned_y, scale = ellipse_rows(quats, scales, g, row_x, row_y)
+    mean = in_camera(camera, row3(inputs.means, g))
+    offset, inverse_z, row_x, row_y = mean.offset, mean.inverse_z, mean.row_x, mean.row_y
+    tangent_x, tangent_y = mean.tangent_x, mean.tangent_y
+    inside_x, inside_y = mean.inside_x, mean.inside_y
+    mx, my, turned_x, turned_y, scale = ellipse_rows(inputs.quats, inputs.scales, g, row_x, row_y)
     _, xy, yy, minors, det0, det = covariance(mx, my, eps)
     var_y = yy + eps
     a, b, c = whitening(xy, var_y, det)
 
     # Opacity, and antialiasing.
-    opacity = float(opacities[g])
+    opacity = float(inputs.opacities[g])
     g_det0 = g_det = 0.0
-    g_opacity = pixel[col.G_LOG_OPACITY] / opacity
-    if antialiased and det0 > compensation_min * det:
-        half = 0.5 * pixel[col.G_LOG_OPACITY]  # log compensation = (log det0 - log det) / 2
+    g_opacity = splat_grads[G_LOG_OPACITY] / opacity
+    if settings.antialiased and det0 > settings.compensation_min * det:
+        half = 0.5 * splat_grads[G_LOG_OPACITY]  # log compensation = (log det0 - log det) / 2
         g_det0, g_det = half / det0, -half / det
 
     # Whitening to rows of M.
     factor = LOG_2 * WHITEN_TO_LOG2
-    g_a, g_b, g_c = (
-        factor * pixel[col.G_A],
-        factor * pixel[col.G_B],
-        factor * pixel[col.G_C],
-    )
+    g_a, g_b, g_c = factor * splat_grads[G_A], factor * splat_grads[G_B], factor * splat_grads[G_C]
     g_var_y = (g_a * a - g_b * b - g_c * c) / (2 * var_y)
     g_xy = -g_b * a / var_y
     g_det -= (g_a * a + g_b * b) / (2 * det)
@@ -175,9 +190,9 @@ def _splat_backward(
     g_my = plus(plus(scaled(2 * g_yy, my), g_xy, mx), 2 * g_minors, cross(minors, mx))
 
     # Rows of M to scale, rotation and the Jacobian's rows.
-    _add3(g_scale, 0, 1.0, plus(times(g_mx, turned_x), 1.0, times(g_my, turned_y)))
+    _add3(sums, SCALE, 1.0, plus(times(g_mx, turned_x), 1.0, times(g_my, turned_y)))
     h_x, h_y = times(g_mx, scale), times(g_my, scale)
-    qw, qx, qy, qz, inverse = unit_quaternion(quats, 4 * g)
+    qw, qx, qy, qz, inverse = unit_quaternion(inputs.quats, 4 * g)
     axis0, axis1, axis2 = rotation_columns(qw, qx, qy, qz)
     turn = rotation_gradient(
         qw, qx, qy, qz, inverse,
@@ -186,13 +201,13 @@ def _splat_backward(
         plus(scaled(h_x[2], row_x), h_y[2], row_y),
     )  # fmt: skip
     for k in range(4):
-        g_quat[k] += turn[k]
+        sums[QUAT + k] += turn[k]
     g_row_x = plus(plus(scaled(h_x[0], axis0), h_x[1], axis1), h_x[2], axis2)
     g_row_y = plus(plus(scaled(h_y[0], axis0), h_y[1], axis1), h_y[2], axis2)
 
     # The Jacobian's rows and the centre to the camera and the mean.
-    g_x, g_y = LOG_2 * pixel[col.G_X], LOG_2 * pixel[col.G_Y]
-    g_z = pixel[col.G_DEPTH]
+    g_x, g_y = LOG_2 * splat_grads[G_X], LOG_2 * splat_grads[G_Y]
+    g_z = splat_grads[G_DEPTH]
     g_z -= inverse_z * (dot(row_x, g_row_x) + dot(row_y, g_row_y))
     g_fx = g_x * tangent_x + dot(row_x, g_row_x) / fx
     g_fy = g_y * tangent_y + dot(row_y, g_row_y) / fy
@@ -218,33 +233,34 @@ def _splat_backward(
     square = dot(offset, offset)
     length = math.sqrt(max(square, TINY))
     direction = scaled(1 / length, offset)
+    sh = inputs.sh
     count = sh.shape[1]
-    basis(direction[0], direction[1], direction[2], count, functions)
+    sh_basis(direction[0], direction[1], direction[2], count, functions)
     _clear(g_functions)
     for channel in range(3):
         color = 0.5
         for k in range(count):
             color += functions[k] * float(sh[g, k, channel])
         if color > 0:
-            g_color = pixel[col.G_RED + channel]
+            g_color = splat_grads[G_RED + channel]
             for k in range(count):
-                if sh_needed:
-                    g_sh[k, channel] += functions[k] * g_color
+                if needs.sh:
+                    sums[SH + 3 * k + channel] += functions[k] * g_color
                 g_functions[k] += float(sh[g, k, channel]) * g_color
-    g_direction = basis_gradient(direction[0], direction[1], direction[2], count, g_functions)
+    g_direction = sh_basis_gradient(direction[0], direction[1], direction[2], count, g_functions)
     g_offset = plus(g_offset, 1 / length, g_direction)
     if square > TINY:
         g_offset = plus(g_offset, -dot(direction, g_direction) / length, direction)
 
-    _add3(g_mean, 0, 1.0, g_offset)
-    if cameras_needed:
-        _add3(g_camera, cam.RIGHT, 1.0, plus(scaled(g_u, offset), fx * inverse_z, g_row_x))
-        _add3(g_camera, cam.DOWN, 1.0, plus(scaled(g_v, offset), fy * inverse_z, g_row_y))
+    _add3(sums, MEAN, 1.0, g_offset)
+    if needs.cameras:
+        _add3(g_camera, RIGHT, 1.0, plus(scaled(g_u, offset), fx * inverse_z, g_row_x))
+        _add3(g_camera, DOWN, 1.0, plus(scaled(g_v, offset), fy * inverse_z, g_row_y))
         through_x = plus(scaled(g_z, offset), -fx * inverse_z * inside_x, g_row_x)
-        _add3(g_camera, cam.FORWARD, 1.0, plus(through_x, -fy * inverse_z * inside_y, g_row_y))
-        _add3(g_camera, cam.CENTER, -1.0, g_offset)
-        g_camera[cam.FX] += g_fx
-        g_camera[cam.FY] += g_fy
-        g_camera[cam.CX] += g_cx
-        g_camera[cam.CY] += g_cy
+        _add3(g_camera, FORWARD, 1.0, plus(through_x, -fy * inverse_z * inside_y, g_row_y))
+        _add3(g_camera, CENTER, -1.0, g_offset)
+        g_camera[FX] += g_fx
+        g_camera[FY] += g_fy
+        g_camera[CX] += g_cx
+        g_camera[CY] += g_cy
     return g_opacity

@@ -1,119 +1,116 @@
 """Which tiles a splat touches, and the list of splats of every tile.
 
-Which tiles is asked once, while the splat is in the cache: what is found is kept, and the lists are
-made of that.
+Which tiles a splat touches is asked once, while it is in the cache; the lists are made of the
+answers. A list is sorted by depth by the thread that draws its tile.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from asysplat.ops.cpu.kernel import inline, kernel
-from asysplat.rendering.cpu import layout as col
+from asysplat.rendering.cpu.splat import DEPTH, DEPTH_REST, TILE
+from asysplat.rendering.formulas import PIXEL_MARGIN
+
+SHORT = 32  # lists up to this are sorted by insertion
+RADIX = 256
+DIGITS = 4
+
+
+class Lists(NamedTuple):
+    """The splats of every tile.
+
+    splats [images * N, 16], see `splat`; first_pair [images * N + 1] the number of each splat's
+    first pair of splat and tile, and of all pairs; first_entry [tiles + 1] where each tile's list
+    begins; entries [pairs, 2] splat and number of each pair, sorted by tile, then by Gaussian,
+    until `rasterize` sorts them by depth; wanted [tiles] whether any pixel of the tile counts.
+    """
+
+    splats: np.ndarray
+    first_pair: np.ndarray
+    first_entry: np.ndarray
+    entries: np.ndarray
+    wanted: np.ndarray
 
 
 @inline
 def tile_range(center, start, stop, size):
-    """First and last tile that has a pixel centre from center + start to center + stop, of an
-    image of `size` pixels; the last is before the first where there is none. What is not a number
-    is the image's edge."""
-    first, last = center + start - 0.5 - col.PIXEL_MARGIN, center + stop - 0.5 + col.PIXEL_MARGIN
+    """Return the first and the last tile that has a pixel centre in center + [start, stop].
+
+    The image has `size` pixels; the last tile is before the first where there is none. NaN stands
+    for the image's edge.
+    """
+    first, last = center + start - 0.5 - PIXEL_MARGIN, center + stop - 0.5 + PIXEL_MARGIN
     # Limited as a float: a number beyond int64 has no int.
     first = int(np.ceil(min(first, float(size)))) if first > 0 else 0
     last = int(np.floor(max(last, -1.0))) if last < size - 1 else size - 1
-    return first // col.TILE, last // col.TILE if last >= first else first // col.TILE - 1
+    return first // TILE, last // TILE if last >= first else first // TILE - 1
 
 
 @inline
-def find_box(splats, bases, d, reach_x, size, box):
-    """Set the first and last row, the first and last column of tiles that the box of splat d
-    touches; how many they are."""
-    height, width, _ = size
-    center_x = float(bases[d, col.BASE_X]) + float(splats[d, col.X])
-    center_y = float(bases[d, col.BASE_Y]) + float(splats[d, col.Y])
-    reach_y = float(splats[d, col.REACH_Y])
-    box[0], box[1] = tile_range(center_y, -reach_y, reach_y, height)
-    box[2], box[3] = tile_range(center_x, -reach_x, reach_x, width)
+def find_box(ellipse, extent_x, frame, box):
+    """Set the first and last row, the first and last column of tiles that an ellipse's box touches.
+
+    Return how many tiles these are.
+    """
+    x, y, extent_y = ellipse.x, ellipse.y, ellipse.extent_y
+    box[0], box[1] = tile_range(y, -extent_y, extent_y, frame.height)
+    box[2], box[3] = tile_range(x, -extent_x, extent_x, frame.width)
     return (box[1] - box[0] + 1) * (box[3] - box[2] + 1)
 
 
 @inline
-def row_span(splats, bases, d, row, size):
-    """First and last tile of a row of tiles that the ellipse of splat d touches.
+def row_span(ellipse, row, frame):
+    """Return the first and the last tile of a row of tiles that the ellipse touches.
 
-    It is (A dx + B dy)^2 + (C dy)^2 <= (C REACH_Y)^2. Between the row's outermost pixel centres its
-    right edge is farthest out at its tip, or, where the tip is not among them, at the centre
-    nearest to it; the left edge mirrors it.
+    Between the row's outermost pixel centres its right edge is farthest out at its tip, or, where
+    the tip is not among them, at the centre nearest to it; the left edge mirrors it.
     """
-    height, width, _ = size
-    a = float(splats[d, col.A]) + float(splats[d, col.A_REST])
-    b = float(splats[d, col.B]) + float(splats[d, col.B_REST])
-    c = float(splats[d, col.C])
-    center_x = float(bases[d, col.BASE_X]) + float(splats[d, col.X])
-    center_y = float(bases[d, col.BASE_Y]) + float(splats[d, col.Y])
-    reach = float(splats[d, col.REACH_Y])
-    square = (c * reach) ** 2
+    a, b, c, extent = ellipse.a, ellipse.b, ellipse.c, ellipse.extent_y
+    square = (c * extent) ** 2
     tilt = b / c
-    tip = -tilt / math.sqrt(tilt * tilt + 1) * reach  # dy of the rightmost point
-    low = row * col.TILE + 0.5 - col.PIXEL_MARGIN - center_y
-    high = min((row + 1) * col.TILE, height) - 0.5 + col.PIXEL_MARGIN - center_y
-    low, high = max(low, -reach), min(high, reach)
+    tip = -tilt / math.sqrt(tilt * tilt + 1) * extent  # dy of the rightmost point
+    low = row * TILE + 0.5 - PIXEL_MARGIN - ellipse.y
+    high = min((row + 1) * TILE, frame.height) - 0.5 + PIXEL_MARGIN - ellipse.y
+    low, high = max(low, -extent), min(high, extent)
     right_dy = min(max(tip, low), high)
     left_dy = min(max(-tip, low), high)
     right = (math.sqrt(max(square - (c * right_dy) ** 2, 0.0)) - b * right_dy) / a
     left = (-math.sqrt(max(square - (c * left_dy) ** 2, 0.0)) - b * left_dy) / a
-    return tile_range(center_x, left, right, width)
+    return tile_range(ellipse.x, left, right, frame.width)
 
 
 @inline
-def list_tiles(splats, bases, d, box, size, exact, histogram, tiles, start):
-    """Write the tiles of splat d from tiles[start] on, row by row, and add them to the histogram
-    [tiles of an image]; how many they are.
+def list_tiles(ellipse, box, frame, histogram, tiles, start):
+    """Write the tiles of a splat from tiles[start] on, row by row, and count them in the histogram.
 
     Args:
+        ellipse: the splat's.
         box: see `find_box`.
-        size: height and width in pixels, columns in tiles.
-        exact: leave out the tiles of the box that the ellipse does not touch.
+        frame: says whether to leave out the tiles of the box that the ellipse does not touch.
+        histogram: [tiles of an image] to add to.
         tiles: with room for all of the box.
+        start: where to write.
+
+    Returns:
+        How many tiles these are.
     """
     first_row, last_row, left, right = box[0], box[1], box[2], box[3]
-    columns = size[2]
-    exact = exact and right > left and last_row > first_row  # else it has no corners to miss
+    # A box of one row or one column has no corners to miss.
+    exact = frame.project.exact and right > left and last_row > first_row
     count = 0
     for row in range(first_row, last_row + 1):
         first, last = left, right
         if exact:
-            first, last = row_span(splats, bases, d, row, size)
+            first, last = row_span(ellipse, row, frame)
             first, last = max(first, left), min(last, right)
         for column in range(first, last + 1):
-            tile = row * columns + column
+            tile = row * frame.columns + column
             histogram[tile] += 1
             tiles[start + count] = tile
             count += 1
     return count
-
-
-@kernel
-def place(start, stop, tiles, first_pair, positions, num, block_size, entries):
-    """Write every pair (splat, its number among all pairs) of blocks start to stop into the lists.
-
-    Args:
-        tiles: [pairs] of each pair, within its image.
-        first_pair: [images * N + 1] the number of a splat's first pair, and of all pairs.
-        positions: [images, blocks, tiles] where a block's next pair of a tile goes.
-        num, block_size: Gaussians of an image and of a block.
-        entries: [pairs, 2] sorted by image and tile, then by Gaussian.
-    """
-    blocks = positions.shape[1]
-    for index in range(start, stop):
-        image, block = index // blocks, index % blocks
-        next_entry = positions[image, block]
-        for n in range(block * block_size, min((block + 1) * block_size, num)):
-            d = image * num + n
-            for pair in range(first_pair[d], first_pair[d + 1]):
-                entry = next_entry[tiles[pair]]
-                next_entry[tiles[pair]] = entry + 1
-                entries[entry, 0], entries[entry, 1] = d, pair
 
 
 @kernel
@@ -129,3 +126,91 @@ def start_positions(start, stop, histograms, first_entry, positions):
             for block in range(blocks):
                 positions[image, block, tile] = position
                 position += histograms[image, block, tile]
+
+
+@kernel
+def place(start, stop, tiles, first_pair, positions, frame, entries):
+    """Write every pair of splat and tile of blocks start to stop into the lists.
+
+    Args:
+        start, stop: blocks, numbered image by image.
+        tiles: [pairs] the tile of each pair, within its image.
+        first_pair: [images * N + 1], see `Lists`.
+        positions: [images, blocks, tiles] where a block's next pair of a tile goes.
+        frame: the sizes.
+        entries: [pairs, 2], see `Lists`; written.
+    """
+    for index in range(start, stop):
+        image, block = index // frame.blocks, index % frame.blocks
+        next_entry = positions[image, block]
+        first = block * frame.block_size
+        for n in range(first, min(first + frame.block_size, frame.num)):
+            d = image * frame.num + n
+            for pair in range(first_pair[d], first_pair[d + 1]):
+                entry = next_entry[tiles[pair]]
+                next_entry[tiles[pair]] = entry + 1
+                entries[entry, 0], entries[entry, 1] = d, pair
+
+
+@inline
+def sort_by_depth(lists, start, stop, keys, scratch, counts):
+    """Sort entries[start:stop] by depth to all of its digits, then by Gaussian; stable.
+
+    Args:
+        lists: with the splats, whose depths are positive, so that their bits order as they do.
+        start, stop: the list of one tile.
+        keys, scratch: [2, m] and [2, m, 2], m >= stop - start.
+        counts: [DIGITS, RADIX].
+    """
+    entries, splats = lists.entries, lists.splats
+    length = stop - start
+    if length > SHORT:
+        _radix_sort(lists, start, length, keys, scratch, counts)
+    # Ties of float32 are short runs, broken by what it left of the depths; short lists are one run.
+    for i in range(start + 1, stop):
+        d, pair = entries[i, 0], entries[i, 1]
+        depth, rest = splats[d, DEPTH], splats[d, DEPTH_REST]
+        j = i - 1
+        while j >= start:
+            other = entries[j, 0]
+            if splats[other, DEPTH] < depth:
+                break
+            if splats[other, DEPTH] == depth and splats[other, DEPTH_REST] <= rest:
+                break
+            entries[j + 1, 0], entries[j + 1, 1] = other, entries[j, 1]
+            j -= 1
+        entries[j + 1, 0], entries[j + 1, 1] = d, pair
+
+
+@inline
+def _radix_sort(lists, start, length, keys, scratch, counts):
+    """Sort by the 32 bits of float32's depth, 8 at a time."""
+    entries, bits = lists.entries, lists.splats.view(np.uint32)
+    counts[:] = 0
+    for i in range(length):
+        key = bits[entries[start + i, 0], DEPTH]
+        keys[0, i] = key
+        scratch[0, i, 0], scratch[0, i, 1] = entries[start + i, 0], entries[start + i, 1]
+        for digit in range(DIGITS):
+            counts[digit, (key >> np.uint32(8 * digit)) & np.uint32(RADIX - 1)] += 1
+    now = 0
+    for digit in range(DIGITS):
+        shift = np.uint32(8 * digit)
+        if counts[digit, (keys[now, 0] >> shift) & np.uint32(RADIX - 1)] == length:
+            continue  # all have the same digit
+        position = 0
+        for value in range(RADIX):
+            count = counts[digit, value]
+            counts[digit, value] = position
+            position += count
+        for i in range(length):
+            key = keys[now, i]
+            value = (key >> shift) & np.uint32(RADIX - 1)
+            position = counts[digit, value]
+            counts[digit, value] = position + 1
+            keys[1 - now, position] = key
+            scratch[1 - now, position, 0] = scratch[now, i, 0]
+            scratch[1 - now, position, 1] = scratch[now, i, 1]
+        now = 1 - now
+    for i in range(length):
+        entries[start + i, 0], entries[start + i, 1] = scratch[now, i, 0], scratch[now, i, 1]

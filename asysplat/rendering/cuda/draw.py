@@ -1,32 +1,367 @@
-"""From tensors to layers."""
+"""The GPU renderer, one pass after the other, as one operation to torch."""
 
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import triton
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
-from asysplat.rendering.layers import Layers
-from asysplat.rendering.settings import Settings
+from asysplat.rendering.cuda.project import COUNTERS, project
+from asysplat.rendering.cuda.project_backward import project_backward, sum_pairs
+from asysplat.rendering.cuda.rasterize import rasterize, rasterize_backward
+from asysplat.rendering.cuda.splat import GRADIENT, SPLAT, TILE
+from asysplat.rendering.cuda.tiles import Lists, list_tiles
+from asysplat.rendering.formulas import CAMERA_GRADIENT, Inputs, camera_gradients, camera_rows
+from asysplat.rendering.interface import RenderOutputs, Settings, check_pairs
 from asysplat.scene import Cameras, Gaussians
+
+INTERPRETED = triton.knobs.runtime.interpret  # on a CPU, in NumPy: for tests
+BLOCK = 128  # Gaussians of a program
+BACKWARD_BLOCK = 64
+# Splats of a step. In the interpreter an absent splat takes as long as a present one.
+FORWARD_STEP, BACKWARD_STEP = (2, 2) if INTERPRETED else (8, 4)
+# A tile's 64 pixels are two a lane of one warp: no sum leaves it.
+RASTER_OPTIONS = {"num_warps": 1, "enable_fp_fusion": False}
+PROJECT_OPTIONS = {"enable_fp_fusion": False}
 
 
 def draw(
     gaussians: Gaussians, cameras: Cameras, settings: Settings, masks: Tensor | None = None
-) -> Layers:
-    """Gaussians [B, N] and cameras [B, V] to layers of B V images, float32.
+) -> RenderOutputs:
+    """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
 
-    What it draws where `masks` is False has no meaning. Of `settings.skips` it takes all but rows,
+    What it draws where `masks` is False has no meaning. It uses all of `settings.skips` but rows,
     which its small tiles are not cut into.
 
     Raises:
-        InputError: Triton is missing; tensors elsewhere than on a GPU, unless Triton interprets
-            its kernels (TRITON_INTERPRET=1); more pairs of splat and tile than a list can number.
+        InputError: tensors elsewhere than on a GPU, unless Triton interprets its kernels
+            (TRITON_INTERPRET=1); more pairs of splat and tile than a list can number.
     """
-    try:
-        from asysplat.rendering.cuda.stages import INTERPRETED, run_stages
-    except ImportError as error:
-        raise InputError("render's backend 'cuda' needs triton: pip install triton.") from error
     if not (gaussians.means.is_cuda or INTERPRETED):
         raise InputError(
             f"render's backend is 'cuda' and its Gaussians are on {gaussians.means.device}: choose "
             "'auto', or move them with .to('cuda')."
         )
-    return run_stages(gaussians, cameras, settings, masks)
+    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    poses = (cameras.cam_to_world, cameras.intrinsics)
+    size = (cameras.height, cameras.width)
+    stats: dict[str, int] = {}
+    masks = masks if settings.skips.masks else None
+    *images, origins = _Draw.apply(settings, size, masks, stats, *fields, *poses)
+    return RenderOutputs(*images, stats, origins)
+
+
+class Frame(NamedTuple):
+    """The sizes that the kernels are told."""
+
+    images: int  # views of all scenes
+    views: int  # of a scene
+    num: int  # Gaussians of a scene
+    sh_count: int  # coefficients
+    height: int  # pixels
+    width: int
+    columns: int  # of tiles
+    tiles: int  # of an image
+
+    @property
+    def grid(self) -> dict[str, int]:
+        """Tiles and pixels of an image."""
+        names = ("columns", "tiles", "height", "width")
+        return {name: getattr(self, name) for name in names}
+
+
+class Saved(NamedTuple):
+    """What `rasterize` leaves for `rasterize_backward`; see there."""
+
+    transmittance: Tensor
+    stops: Tensor
+    last_entry: Tensor
+    origins: Tensor | None
+    halved: Tensor | None
+
+
+class _Draw(torch.autograd.Function):
+    """The passes, forward and backward; `stats` is filled on the way."""
+
+    @staticmethod
+    def forward(ctx, settings, size, masks, stats, *tensors):
+        frame = _frame(tensors, size)
+        inputs = _inputs(tensors, size, settings)
+        with torch.cuda.device_of(inputs.means):
+            splats, depths, counters = _project(frame, inputs, settings)
+            lists, boxes = _list_tiles(frame, splats, depths, masks, settings.skips.ellipse)
+            images, saved = _rasterize(frame, lists, settings)
+        _count(stats, lists, saved, counters, boxes, settings.skips.ellipse)
+        ctx.save_for_backward(*tensors, *lists, *saved)
+        ctx.settings, ctx.size, ctx.frame = settings, size, frame
+        ctx.set_materialize_grads(False)
+        if saved.origins is not None:
+            ctx.mark_non_differentiable(saved.origins)
+        return images
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth, _):
+        tensors, rest = ctx.saved_tensors[:7], ctx.saved_tensors[7:]
+        lists, saved = Lists(*rest[: len(Lists._fields)]), Saved(*rest[len(Lists._fields) :])
+        frame, settings = ctx.frame, ctx.settings
+        if grad_image is None:
+            grad_image = saved.transmittance.new_zeros(frame.images, 3, frame.height, frame.width)
+        if grad_transmittance is None:
+            grad_transmittance = torch.zeros_like(saved.transmittance)
+        if grad_alpha is not None:
+            grad_transmittance = grad_transmittance - grad_alpha
+        if grad_depth is None and settings.depth is not None:
+            grad_depth = torch.zeros_like(saved.transmittance)
+        with torch.cuda.device_of(lists.splats):
+            pair_grads = lists.splats.new_empty(len(lists.entries), GRADIENT.value)
+            rasterize_backward[(frame.images * frame.tiles,)](
+                splats=lists.splats,
+                entries=lists.entries,
+                pairs=lists.pairs,
+                first_entry=lists.first_entry,
+                **saved._asdict(),
+                grad_image=grad_image.contiguous(),
+                grad_transmittance=grad_transmittance.contiguous(),
+                grad_depth=None if grad_depth is None else grad_depth.contiguous(),
+                grads=pair_grads,
+                **frame.grid,
+                alpha_min=settings.convention.alpha_min,
+                alpha_max=settings.convention.alpha_max,
+                **_kinds(settings),
+                STEP=BACKWARD_STEP,
+                **RASTER_OPTIONS,
+            )
+            inputs = _inputs(tensors, ctx.size, settings)
+            needs = {
+                "SH_NEEDED": ctx.needs_input_grad[8],
+                "CAMERAS_NEEDED": any(ctx.needs_input_grad[9:]),
+            }
+            grads = _project_backward(frame, inputs, lists, pair_grads, settings, needs)
+        poses = (None, None)
+        if grads.cameras is not None:
+            poses = camera_gradients(grads.cameras.sum(1), *tensors[5:])
+        fields = zip(grads[:5], tensors[:5], strict=True)
+        fields = (None if grad is None else grad.view(field.shape) for grad, field in fields)
+        return (None,) * 4 + (*fields, *poses)
+
+
+def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
+    """Gather the sizes."""
+    sh, intrinsics = tensors[4], tensors[-1]
+    (scenes, num, sh_count), views = sh.shape[:3], intrinsics.shape[1]
+    height, width = size
+    columns = -(-width // TILE.value)
+    return Frame(
+        images=scenes * views,
+        views=views,
+        num=num,
+        sh_count=sh_count,
+        height=height,
+        width=width,
+        columns=columns,
+        tiles=-(-height // TILE.value) * columns,
+    )
+
+
+def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: Settings) -> Inputs:
+    """Lay out the fields of Gaussians, poses and intrinsics for the kernels."""
+    *fields, cam_to_world, intrinsics = tensors
+    cameras = camera_rows(cam_to_world, intrinsics, size, settings.convention)
+    return Inputs(*(t.detach().contiguous().flatten(0, 1) for t in fields), cameras=cameras)
+
+
+def _kinds(settings: Settings) -> dict[str, bool]:
+    """Say which depth is drawn."""
+    depth = settings.depth
+    return {"DEPTH": depth not in (None, "median"), "MEDIAN": depth == "median"}
+
+
+def _project(frame: Frame, inputs: Inputs, settings: Settings) -> tuple[Tensor, Tensor, Tensor]:
+    """Find splats, depths and counters; see `project`."""
+    total, blocks = frame.images * frame.num, -(-frame.num // BLOCK)
+    device, skips, convention = inputs.means.device, settings.skips, settings.convention
+    splats = torch.empty(total, SPLAT.value, dtype=torch.float32, device=device)
+    depths = torch.empty(total, dtype=torch.float32, device=device)
+    counters = torch.empty(blocks * frame.images, COUNTERS, dtype=torch.int32, device=device)
+    if blocks:
+        project[(blocks, frame.images)](
+            **inputs._asdict(),
+            splats=splats,
+            depths=depths,
+            counters=counters,
+            num=frame.num,
+            views=frame.views,
+            height=frame.height,
+            width=frame.width,
+            alpha_min=convention.alpha_min,
+            log_alpha_min=math.log2(convention.alpha_min),
+            eps2d=convention.eps2d,
+            near=convention.near,
+            compensation_min=convention.compensation_min,
+            ANTIALIASED=settings.antialiased,
+            SKIP_OPACITY=skips.opacity,
+            SKIP_FRUSTUM=skips.frustum,
+            OWN_EXTENT=skips.extent,
+            COUNT=frame.sh_count,
+            BLOCK=BLOCK,
+            **PROJECT_OPTIONS,
+        )
+    return splats, depths, counters
+
+
+def _list_tiles(
+    frame: Frame, splats: Tensor, depths: Tensor, masks: Tensor | None, exact: bool
+) -> tuple[Lists, Tensor]:
+    """Sort the pairs by tile and depth; also count the tiles that the splats' boxes would touch.
+
+    Depths [images * N] are 0 where there is no splat. `exact` leaves out the tiles of a box that
+    the ellipse does not touch.
+    """
+    tiles, device = frame.images * frame.tiles, splats.device
+    visible = torch.nonzero(depths)[:, 0]
+    # By depth across all images: the order of tiles, which comes second, parts these again.
+    order = visible[torch.argsort(depths[visible], stable=True)]
+    programs = (-(-len(order) // BLOCK),)
+    counts = torch.zeros(len(depths), dtype=torch.int32, device=device)
+    boxes = torch.zeros(programs, dtype=torch.int32, device=device)
+    first_pair = torch.empty_like(counts)
+    common = {"splats": splats, "order": order, "counts": counts, "num_visible": len(order)}
+    common |= {"num": frame.num, **frame.grid, "EXACT": exact, "BLOCK": BLOCK, **PROJECT_OPTIONS}
+    if len(order):
+        unused = dict.fromkeys(("ends", "tile_of", "owners", "first_pair"))
+        list_tiles[programs](boxes=boxes, **unused, **common, PLACE=False)
+    ends = counts[order].cumsum(0)
+    pairs = int(ends[-1]) if len(order) else 0
+    check_pairs(pairs)
+    # A GPU sorts short keys in fewer passes.
+    key = next(t for t in (torch.int16, torch.int32, torch.int64) if tiles <= torch.iinfo(t).max)
+    tile_of = torch.empty(pairs, dtype=key, device=device)
+    owners = torch.empty(pairs, dtype=torch.int32, device=device)
+    if pairs:
+        places = {"ends": ends, "tile_of": tile_of, "owners": owners, "first_pair": first_pair}
+        list_tiles[programs](boxes=None, **places, **common, PLACE=True)
+    tile_of, numbers = torch.sort(tile_of, stable=True)
+    starts = torch.arange(tiles + 1, dtype=key, device=device)
+    wanted = None
+    if masks is not None:
+        counting = masks.flatten(0, 1).to(torch.float32)
+        wanted = torch.nn.functional.max_pool2d(counting, TILE.value, ceil_mode=True).flatten() > 0
+    lists = Lists(
+        splats=splats,
+        counts=counts,
+        first_pair=first_pair,
+        first_entry=torch.searchsorted(tile_of, starts),
+        entries=owners[numbers],
+        pairs=numbers,
+        wanted=wanted,
+    )
+    return lists, boxes.sum()
+
+
+def _rasterize(
+    frame: Frame, lists: Lists, settings: Settings
+) -> tuple[tuple[Tensor | None, ...], Saved]:
+    """Draw image, alpha, transmittance, depth and its origins; also what backward needs."""
+    kinds, convention, splats = _kinds(settings), settings.convention, lists.splats
+    shape = (frame.images, frame.height, frame.width)
+    image, alpha = splats.new_empty(frame.images, 3, *shape[1:]), splats.new_empty(shape)
+    depth = splats.new_empty(shape) if settings.depth else None
+    saved = Saved(
+        transmittance=splats.new_empty(shape),
+        stops=splats.new_empty(shape, dtype=torch.int32),
+        last_entry=torch.empty_like(lists.first_entry[:-1]),
+        origins=splats.new_empty(shape) if kinds["DEPTH"] else None,
+        halved=splats.new_empty(shape, dtype=torch.int32) if kinds["MEDIAN"] else None,
+    )
+    rasterize[(frame.images * frame.tiles,)](
+        splats=splats,
+        entries=lists.entries,
+        first_entry=lists.first_entry,
+        wanted=lists.wanted,
+        image=image,
+        alpha=alpha,
+        depth=depth,
+        **saved._asdict(),
+        **frame.grid,
+        alpha_min=convention.alpha_min,
+        alpha_max=convention.alpha_max,
+        transmittance_min=convention.transmittance_min,
+        MASKED=lists.wanted is not None,
+        **kinds,
+        SKIP_OPAQUE=settings.skips.opaque,
+        STEP=FORWARD_STEP,
+        **RASTER_OPTIONS,
+    )
+    return (image, alpha, saved.transmittance, depth, saved.origins), saved
+
+
+def _count(
+    stats: dict[str, int], lists: Lists, saved: Saved, counters: Tensor, boxes: Tensor, exact: bool
+) -> None:
+    """Fill the statistics, waiting for the GPU once."""
+    lengths = lists.first_entry.diff()
+    masked = lengths.new_zeros(()) if lists.wanted is None else (lengths * ~lists.wanted).sum()
+    drawn = (saved.last_entry - lists.first_entry[:-1]).sum()
+    counted = (*counters.sum(0), boxes, masked, drawn, lists.counts.count_nonzero())
+    faint, outside, in_boxes, masked, drawn, stats["visible"] = torch.stack(counted).tolist()
+    pairs = len(lists.entries)
+    stats["culled_by_opacity"], stats["culled_by_frustum"] = faint, outside
+    stats["pairs"] = pairs
+    stats["pairs_off_ellipse"] = in_boxes - pairs if exact else 0
+    stats["pairs_masked"] = masked
+    stats["pairs_behind_opaque"] = pairs - masked - drawn
+    stats["tile_size"] = TILE.value
+
+
+def _project_backward(
+    frame: Frame,
+    inputs: Inputs,
+    lists: Lists,
+    pair_grads: Tensor,
+    settings: Settings,
+    needs: dict[str, bool],
+) -> Inputs:
+    """Return the gradients of the inputs from those of the pairs; None where not needed."""
+    has_depth = settings.depth is not None
+    blocks, device = -(-frame.num // BACKWARD_BLOCK), pair_grads.device
+    shape = (frame.images, blocks, CAMERA_GRADIENT)
+    grads = Inputs(
+        *(torch.empty_like(field) for field in inputs[:4]),
+        sh=torch.zeros_like(inputs.sh) if needs["SH_NEEDED"] else None,
+        cameras=torch.zeros(shape, dtype=torch.float64, device=device)
+        if needs["CAMERAS_NEEDED"]
+        else None,
+    )
+    if blocks:
+        sum_pairs[(-(-len(lists.splats) // BLOCK),)](
+            counts=lists.counts,
+            first_pair=lists.first_pair,
+            grads=pair_grads,
+            num_splats=len(lists.splats),
+            CHANNELS=GRADIENT.value - (not has_depth),
+            BLOCK=BLOCK,
+            **PROJECT_OPTIONS,
+        )
+        project_backward[(blocks, frame.images // frame.views)](
+            **inputs._asdict(),
+            counts=lists.counts,
+            first_pair=lists.first_pair,
+            grads=pair_grads,
+            **{f"grad_{name}": grad for name, grad in grads._asdict().items()},
+            num=frame.num,
+            views=frame.views,
+            eps2d=settings.convention.eps2d,
+            compensation_min=settings.convention.compensation_min,
+            ANTIALIASED=settings.antialiased,
+            HAS_DEPTH=has_depth,
+            **needs,
+            COUNT=frame.sh_count,
+            BLOCK=BACKWARD_BLOCK,
+            **PROJECT_OPTIONS,
+        )
+    return grads

@@ -3,27 +3,30 @@
 import triton.language as tl
 
 from asysplat.ops.cuda.kernel import kernel
-from asysplat.rendering import convention, formulas
-from asysplat.rendering.cuda.geometry import (
+from asysplat.rendering import formulas, interface
+from asysplat.rendering.cuda.math import (
     CAMERA,
     CX,
     CY,
     FX,
     FY,
     covariance,
-    direction_of,
+    direction,
     ellipse_rows,
     in_camera,
+    load3,
+    sh_basis,
+    sum_sh,
+    unit_quaternion,
     whitening,
 )
-from asysplat.rendering.cuda.sh import basis, sum_harmonics
 from asysplat.rendering.cuda.splat import store_splat
-from asysplat.rendering.cuda.tiles import PIXEL_MARGIN
-from asysplat.rendering.cuda.vectors import load3, load_unit_quaternion
 
-LARGEST = tl.constexpr(convention.LARGEST)
+LARGEST = tl.constexpr(interface.LARGEST)
 WHITEN_TO_LOG2 = tl.constexpr(formulas.WHITEN_TO_LOG2)
-EXPONENT_MARGIN = tl.constexpr(1e-3)  # of log2 alpha, so that rounding never drops what shows
+EXPONENT_MARGIN = tl.constexpr(formulas.EXPONENT_MARGIN)
+PIXEL_MARGIN = tl.constexpr(formulas.PIXEL_MARGIN)
+COUNTERS = 2  # Gaussians that were culled by their opacity; those that were outside the image
 
 
 @kernel
@@ -43,7 +46,7 @@ def project(
     width,
     alpha_min,
     log_alpha_min,
-    eps,
+    eps2d,
     near,
     compensation_min,
     ANTIALIASED: tl.constexpr,
@@ -53,14 +56,16 @@ def project(
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Splats of BLOCK Gaussians in one image.
+    """Find the splats of BLOCK Gaussians in one image.
 
     Args:
-        means, quats, scales, opacities, sh: [B * num, ...], COUNT harmonics.
-        cameras: [B * views, 20] float64, see `camera_rows`.
-        splats: [B * views * num, 16], written where visible.
-        depths: [B * views * num], 0 where culled.
-        counters: [programs, 2]: Gaussians that were culled by their opacity; outside the image.
+        means, quats, scales, opacities, sh, cameras: see `Inputs`; COUNT coefficients of SH.
+        splats: [images * num, 16], see `splat`; written where visible.
+        depths: [images * num], 0 where culled; written.
+        counters: [programs, COUNTERS]; written.
+        num: Gaussians of a scene.
+        views: of a scene.
+        alpha_min, eps2d, near, compensation_min: see `Convention`; log_alpha_min is to base 2.
     """
     image = tl.program_id(1).to(tl.int64)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -72,12 +77,12 @@ def project(
         there = there & ((opacity >= alpha_min) | (opacity != opacity))
     faint = tl.sum(((n < num) & (there == 0)).to(tl.int32), 0)
     mean, scale = load3(means, g, there), load3(scales, g, there)
-    qw, qx, qy, qz, _ = load_unit_quaternion(quats, g, there)
+    qw, qx, qy, qz, _ = unit_quaternion(quats, g, there)
     camera = cameras + CAMERA * image
     offset, tangent_x, tangent_y, z, _, _, _, row_x, row_y = in_camera(camera, mean)
     mx, my, _, _ = ellipse_rows((qw, qx, qy, qz), scale, row_x, row_y)
-    xx, xy, yy, _, det0, det = covariance(mx, my, eps)
-    a, b, c = whitening(xy, yy + eps, det)
+    xx, xy, yy, _, det0, det = covariance(mx, my, eps2d)
+    a, b, c = whitening(xy, yy + eps2d, det)
     shown = (opacity <= 1) & there
     if ANTIALIASED:
         opacity *= tl.sqrt(tl.maximum(det0 / det, compensation_min))
@@ -87,24 +92,24 @@ def project(
     room = EXPONENT_MARGIN - log_alpha_min
     if OWN_EXTENT:
         room += log_opacity
-    reach = tl.sqrt(tl.maximum(room, 0.0)) / WHITEN_TO_LOG2
-    reach_x, reach_y = reach * tl.sqrt(xx + eps), reach * tl.sqrt(yy + eps)
+    deviations = tl.sqrt(tl.maximum(room, 0.0)) / WHITEN_TO_LOG2
+    extent_x, extent_y = deviations * tl.sqrt(xx + eps2d), deviations * tl.sqrt(yy + eps2d)
     # Every comparison with NaN is false.
     shown = shown & (z > near) & (z < LARGEST) & (opacity >= alpha_min) & (a > 0)
     shown = shown & (tl.abs(x + y + b + c) < float("inf"))
     edge = 0.5 - PIXEL_MARGIN
-    inside = (x + reach_x >= edge) & (x - reach_x <= width - edge)
-    inside = inside & (y + reach_y >= edge) & (y - reach_y <= height - edge)
+    inside = (x + extent_x >= edge) & (x - extent_x <= width - edge)
+    inside = inside & (y + extent_y >= edge) & (y - extent_y <= height - edge)
     outside = 0
     if SKIP_FRUSTUM:
         outside += tl.sum((shown & (inside == 0)).to(tl.int32), 0)
         shown = shown & inside
     d = image * num + n
     if tl.max(shown.to(tl.int32), 0) > 0:
-        red, green, blue, shown = colors(sh, g, offset, shown, COUNT)
+        color, shown = colors(sh, g, offset, shown, COUNT)
         a, b, c = a * WHITEN_TO_LOG2, b * WHITEN_TO_LOG2, c * WHITEN_TO_LOG2
-        reach_y *= 1 + 1e-6
-        store_splat(splats, d, x, y, a, b, c, log_opacity, reach_y, red, green, blue, z, shown)
+        ellipse = (x, y, a, b, c, extent_y * (1 + 1e-6))
+        store_splat(splats, d, ellipse, log_opacity, color, z, shown)
     tl.store(depths + d, tl.where(shown, z, 0.0).to(tl.float32), mask=n < num)
     counter = counters + 2 * (image * tl.num_programs(0) + tl.program_id(0))
     tl.store(counter, faint)
@@ -113,13 +118,13 @@ def project(
 
 @kernel
 def colors(sh, g, offset, shown, COUNT: tl.constexpr):
-    """The three channels seen along `offset`; and `shown` less what has unusable harmonics."""
-    _, _, x, y, z = direction_of(offset)
-    functions = basis(x, y, z, COUNT)
-    red = tl.maximum(sum_harmonics(sh, g, 0, functions, shown, COUNT), 0.0)
-    green = tl.maximum(sum_harmonics(sh, g, 1, functions, shown, COUNT), 0.0)
-    blue = tl.maximum(sum_harmonics(sh, g, 2, functions, shown, COUNT), 0.0)
+    """Return the three channels seen along `offset`, and which of `shown` have a usable SH."""
+    _, _, x, y, z = direction(offset)
+    functions = sh_basis(x, y, z, COUNT)
+    red = tl.maximum(sum_sh(sh, g, 0, functions, shown, COUNT), 0.0)
+    green = tl.maximum(sum_sh(sh, g, 1, functions, shown, COUNT), 0.0)
+    blue = tl.maximum(sum_sh(sh, g, 2, functions, shown, COUNT), 0.0)
     for k in tl.static_range(3 * COUNT):
         coefficient = tl.load(sh + 3 * COUNT * g + k, mask=shown, other=0.0)
         shown = shown & (tl.abs(coefficient) < LARGEST)
-    return red, green, blue, shown
+    return (red, green, blue), shown

@@ -6,7 +6,7 @@ import triton.language as tl
 
 from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering import formulas
-from asysplat.rendering.cuda.geometry import (
+from asysplat.rendering.cuda.math import (
     CAMERA,
     CAMERA_GRADIENT,
     CENTER,
@@ -19,30 +19,58 @@ from asysplat.rendering.cuda.geometry import (
     RIGHT,
     TINY,
     covariance,
-    direction_of,
+    cross,
+    direction,
+    dot,
     ellipse_rows,
     in_camera,
-    whitening,
-)
-from asysplat.rendering.cuda.sh import basis, basis_gradient, sum_harmonics
-from asysplat.rendering.cuda.splat import GRADIENT
-from asysplat.rendering.cuda.vectors import (
-    cross,
-    dot,
     load1,
     load3,
     load_row3,
-    load_unit_quaternion,
     plus,
     rotation_columns,
     rotation_gradient,
     scaled,
+    sh_basis,
+    sh_basis_gradient,
     store3,
+    sum_sh,
     times,
+    unit_quaternion,
+    whitening,
 )
+from asysplat.rendering.cuda.splat import GRADIENT
 
 LOG_2 = tl.constexpr(math.log(2))
 WHITEN_GRADIENT = tl.constexpr(math.log(2) * formulas.WHITEN_TO_LOG2)
+PAIRS = tl.constexpr(8)  # of a splat that are summed at a time
+
+
+@kernel
+def sum_pairs(counts, first_pair, grads, num_splats, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
+    """Sum the gradients of each of BLOCK splats over its tiles, in a fixed order.
+
+    The sum is left in the place of the splat's first pair.
+
+    Args:
+        counts, first_pair: [num_splats].
+        grads: [pairs, 10], of which the first CHANNELS are summed.
+    """
+    d = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    count = tl.load(counts + d, mask=d < num_splats, other=0)
+    several = count > 1
+    most = tl.max(tl.where(several, count, 0), 0)
+    if most > 0:
+        row = grads + GRADIENT * tl.load(first_pair + d, mask=several, other=0).to(tl.int64)
+        step = tl.arange(0, PAIRS)
+        for channel in tl.static_range(CHANNELS):
+            total = tl.zeros((BLOCK,), tl.float64)
+            for start in range(0, most, PAIRS):
+                pair = start + step[None, :]
+                here = several[:, None] & (pair < count[:, None])
+                values = tl.load(row[:, None] + GRADIENT * pair + channel, mask=here, other=0.0)
+                total += tl.sum(values.to(tl.float64), 1)
+            tl.store(row + channel, total.to(tl.float32), mask=several)
 
 
 @kernel
@@ -64,7 +92,7 @@ def project_backward(
     grad_cameras,
     num,
     views,
-    eps,
+    eps2d,
     compensation_min,
     ANTIALIASED: tl.constexpr,
     HAS_DEPTH: tl.constexpr,
@@ -73,10 +101,10 @@ def project_backward(
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Gradients of BLOCK Gaussians of a scene: the sum over its views, one after the other.
+    """Compute the gradients of BLOCK Gaussians of a scene: the sum over its views, in order.
 
     Args:
-        counts, first_pair: [B * views * num].
+        counts, first_pair: [images * num], see `Lists`.
         grads: [pairs, 10], see `splat` and `sum_pairs`; the last column is read only with
             HAS_DEPTH.
         grad_means, grad_quats, grad_scales, grad_opacities: [B * num, ...], every element written.
@@ -99,13 +127,22 @@ def project_backward(
         if tl.max(drawn.to(tl.int32), 0) > 0:
             camera = cameras + CAMERA * image
             first = tl.load(first_pair + d, mask=drawn, other=0).to(tl.int64)
-            pull = load_pull(grads, first, drawn, HAS_DEPTH)
             opacity_part, mean_part, quat_part, scale_part = splat_backward(
-                g, drawn, means, quats, scales, opacities, sh, camera, pull, eps,
-                compensation_min, grad_sh, grad_cameras,
-                (image * tl.num_programs(0) + tl.program_id(0)) * CAMERA_GRADIENT,
-                ANTIALIASED, SH_NEEDED, CAMERAS_NEEDED, COUNT,
-            )  # fmt: skip
+                g,
+                drawn,
+                inputs=(means, quats, scales, opacities, sh),
+                camera=camera,
+                splat_grads=load_splat_grads(grads, first, drawn, HAS_DEPTH),
+                grad_sh=grad_sh,
+                grad_cameras=grad_cameras,
+                place=(image * tl.num_programs(0) + tl.program_id(0)) * CAMERA_GRADIENT,
+                eps2d=eps2d,
+                compensation_min=compensation_min,
+                ANTIALIASED=ANTIALIASED,
+                SH_NEEDED=SH_NEEDED,
+                CAMERAS_NEEDED=CAMERAS_NEEDED,
+                COUNT=COUNT,
+            )
             g_opacity += tl.where(drawn, opacity_part, 0.0)
             g_mean = add_where(g_mean, drawn, mean_part)
             g_scale = add_where(g_scale, drawn, scale_part)
@@ -123,20 +160,21 @@ def project_backward(
 
 
 @kernel
-def load_pull(grads, first, drawn, HAS_DEPTH: tl.constexpr):
-    """The gradient of each splat."""
+def load_splat_grads(grads, first, drawn, HAS_DEPTH: tl.constexpr):
+    """Read the gradients of splats from those of their first pairs, see `sum_pairs`."""
     row = grads + GRADIENT * first
-    pull = (load1(row, 0, drawn), load1(row, 1, drawn), load1(row, 2, drawn), load1(row, 3, drawn))
-    pull = pull + (load1(row, 4, drawn), load1(row, 5, drawn), load1(row, 6, drawn))
-    pull = pull + (load1(row, 7, drawn), load1(row, 8, drawn))
+    out = (load1(row, 0, drawn), load1(row, 1, drawn), load1(row, 2, drawn), load1(row, 3, drawn))
+    out = out + (load1(row, 4, drawn), load1(row, 5, drawn), load1(row, 6, drawn))
+    out = out + (load1(row, 7, drawn), load1(row, 8, drawn))
     if HAS_DEPTH:
-        return pull + (load1(row, 9, drawn),)
+        return out + (load1(row, 9, drawn),)
     else:
-        return pull + (tl.zeros_like(pull[0]),)
+        return out + (tl.zeros_like(out[0]),)
 
 
 @kernel
 def add_where(total, drawn, part):
+    """Add the three numbers of `part` where `drawn`."""
     return (
         total[0] + tl.where(drawn, part[0], 0.0),
         total[1] + tl.where(drawn, part[1], 0.0),
@@ -146,11 +184,13 @@ def add_where(total, drawn, part):
 
 @kernel
 def store_sum(grad_cameras, place, values, drawn):
+    """Store the sum of `values` where `drawn`."""
     tl.store(grad_cameras + place, tl.sum(tl.where(drawn, values, 0.0), 0))
 
 
 @kernel
 def store_sum3(grad_cameras, place, values, drawn):
+    """Store three sums, see `store_sum`."""
     store_sum(grad_cameras, place, values[0], drawn)
     store_sum(grad_cameras, place + 1, values[1], drawn)
     store_sum(grad_cameras, place + 2, values[2], drawn)
@@ -158,17 +198,31 @@ def store_sum3(grad_cameras, place, values, drawn):
 
 @kernel
 def splat_backward(
-    g, drawn, means, quats, scales, opacities, sh, camera, pull, eps,
-    compensation_min, grad_sh, grad_cameras, place,
-    ANTIALIASED: tl.constexpr, SH_NEEDED: tl.constexpr, CAMERAS_NEEDED: tl.constexpr,
+    g,
+    drawn,
+    inputs,
+    camera,
+    splat_grads,
+    grad_sh,
+    grad_cameras,
+    place,
+    eps2d,
+    compensation_min,
+    ANTIALIASED: tl.constexpr,
+    SH_NEEDED: tl.constexpr,
+    CAMERAS_NEEDED: tl.constexpr,
     COUNT: tl.constexpr,
-):  # fmt: skip
-    """What splats of one image, where `drawn`, give to opacity, mean, quaternion and scale; adds to
-    `grad_sh`, and writes the camera's part to its `place`."""
-    g_x, g_y, g_a, g_b, g_c, g_log_opacity, g_red, g_green, g_blue, g_z = pull
+):
+    """Return the gradients of opacity, mean, quaternion and scale from splats of one image.
+
+    Only those that are `drawn` count. Adds to `grad_sh`, and writes the camera's part to its
+    `place`.
+    """
+    means, quats, scales, opacities, sh = inputs
+    g_x, g_y, g_a, g_b, g_c, g_log_opacity, g_red, g_green, g_blue, g_z = splat_grads
     # What `project` computed.
     mean, scale = load3(means, g, drawn), load3(scales, g, drawn)
-    qw, qx, qy, qz, inverse = load_unit_quaternion(quats, g, drawn)
+    qw, qx, qy, qz, inverse = unit_quaternion(quats, g, drawn)
     right, down = load_row3(camera, RIGHT), load_row3(camera, DOWN)
     forward = load_row3(camera, FORWARD)
     fx, fy = tl.load(camera + FX), tl.load(camera + FY)
@@ -176,8 +230,8 @@ def splat_backward(
         camera, mean
     )
     mx, my, turned_x, turned_y = ellipse_rows((qw, qx, qy, qz), scale, row_x, row_y)
-    _, xy, yy, minors, det0, det = covariance(mx, my, eps)
-    var_y = yy + eps
+    _, xy, yy, minors, det0, det = covariance(mx, my, eps2d)
+    var_y = yy + eps2d
     a, b, c = whitening(xy, var_y, det)
 
     # Opacity, and antialiasing.
@@ -196,7 +250,7 @@ def splat_backward(
     g_xy = -g_b * a / var_y
     g_det -= (g_a * a + g_b * b) / (2 * det)
     g_minors += g_det
-    g_xx, g_yy = eps * g_det, g_var_y + eps * g_det
+    g_xx, g_yy = eps2d * g_det, g_var_y + eps2d * g_det
     g_mx = plus(plus(scaled(2 * g_xx, mx), g_xy, my), 2 * g_minors, cross(my, minors))
     g_my = plus(plus(scaled(2 * g_yy, my), g_xy, mx), 2 * g_minors, cross(minors, mx))
 
@@ -231,11 +285,11 @@ def splat_backward(
     g_offset = plus(plus(scaled(g_u, right), g_v, down), g_z, forward)
 
     # Colour.
-    square, length, dx, dy, dz = direction_of(offset)
-    functions = basis(dx, dy, dz, COUNT)
-    g_red = where_lit(sum_harmonics(sh, g, 0, functions, drawn, COUNT), g_red)
-    g_green = where_lit(sum_harmonics(sh, g, 1, functions, drawn, COUNT), g_green)
-    g_blue = where_lit(sum_harmonics(sh, g, 2, functions, drawn, COUNT), g_blue)
+    square, length, dx, dy, dz = direction(offset)
+    functions = sh_basis(dx, dy, dz, COUNT)
+    g_red = where_lit(sum_sh(sh, g, 0, functions, drawn, COUNT), g_red)
+    g_green = where_lit(sum_sh(sh, g, 1, functions, drawn, COUNT), g_green)
+    g_blue = where_lit(sum_sh(sh, g, 2, functions, drawn, COUNT), g_blue)
     if SH_NEEDED:
         for k in tl.static_range(COUNT):
             coefficients = grad_sh + 3 * (COUNT * g + k)
@@ -246,11 +300,11 @@ def splat_backward(
         g_functions = (tl.zeros_like(g_red),)
         for k in tl.static_range(1, COUNT):
             coefficients = sh + 3 * (COUNT * g + k)
-            pull = g_red * tl.load(coefficients, mask=drawn, other=0.0).to(tl.float32)
-            pull += g_green * tl.load(coefficients + 1, mask=drawn, other=0.0).to(tl.float32)
-            pull += g_blue * tl.load(coefficients + 2, mask=drawn, other=0.0).to(tl.float32)
-            g_functions = g_functions + (pull,)
-        g_dx, g_dy, g_dz = basis_gradient(dx, dy, dz, g_functions, COUNT)
+            g_function = g_red * tl.load(coefficients, mask=drawn, other=0.0).to(tl.float32)
+            g_function += g_green * tl.load(coefficients + 1, mask=drawn, other=0.0).to(tl.float32)
+            g_function += g_blue * tl.load(coefficients + 2, mask=drawn, other=0.0).to(tl.float32)
+            g_functions = g_functions + (g_function,)
+        g_dx, g_dy, g_dz = sh_basis_gradient(dx, dy, dz, g_functions, COUNT)
         g_direction = (g_dx.to(tl.float64), g_dy.to(tl.float64), g_dz.to(tl.float64))
         g_offset = plus(g_offset, 1 / length, g_direction)
         radial = dot(offset, g_direction) / (length * length * length)
@@ -274,10 +328,11 @@ def splat_backward(
 
 @kernel
 def where_lit(color, grad):
-    """In float32, 0 where the colour is clamped."""
+    """Return the colour's gradient in float32, 0 where the colour is clamped."""
     return tl.where(color > 0, grad.to(tl.float32), 0.0)
 
 
 @kernel
 def add_to(place, values, there):
+    """Add `values` to what stands at `place`."""
     tl.store(place, tl.load(place, mask=there, other=0.0) + values, mask=there)

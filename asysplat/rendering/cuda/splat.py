@@ -1,36 +1,41 @@
-"""What passes between the stages: splats, and their gradients in one tile."""
+"""Splats: their columns, and how one looks from a tile."""
 
 import triton.language as tl
 
 from asysplat.ops.cuda.kernel import kernel
+from asysplat.rendering import formulas
 
 # A splat [16] float32: alpha = 2^(log_opacity - (a dx + b dy)^2 - (c dy)^2), its centre, rounded
 # down, in columns 0 and 1 as int32, and what that leaves of it in 2 and 3; a, b, c in 4 to 6, and
-# what float32 leaves of a and b in 7 and 8; log_opacity in 9; how far it reaches along y in 10;
+# what float32 leaves of a and b in 7 and 8; log_opacity in 9; its extent along y in 10;
 # colour in 11 to 13; depth in 14, and what float32 leaves of it in 15.
 SPLAT = tl.constexpr(16)
 # Its gradient in a tile [10] float32: of x, y, a, b, c, log_opacity (these less a factor ln 2),
 # colour, depth.
 GRADIENT = tl.constexpr(10)
 
-FARTHEST = tl.constexpr(2.0**30)  # pixels; of a centre farther out, the rest is a large one
+TILE = tl.constexpr(8)  # pixels a side
+HALF_TILE = tl.constexpr(4)
+FARTHEST = tl.constexpr(formulas.FARTHEST)
 
 
 @kernel
 def rounded(value):
-    """To float32, as float64."""
+    """Round to float32, as float64."""
     return value.to(tl.float32).to(tl.float64)
 
 
 @kernel
 def whole_pixels(value):
-    """Rounded down, as float64."""
+    """Round down, as float64."""
     return tl.minimum(tl.maximum(tl.floor(value), -FARTHEST), FARTHEST)
 
 
 @kernel
-def store_splat(splats, d, x, y, a, b, c, log_opacity, reach, red, green, blue, z, there):
-    """Round float64 numbers, and float32 colours, to splats d."""
+def store_splat(splats, d, ellipse, log_opacity, color, z, there):
+    """Round float64 ellipses, opacities and depths, and float32 colours, to splats d."""
+    x, y, a, b, c, extent_y = ellipse
+    red, green, blue = color
     splat = splats + SPLAT * d
     whole = splat.to(tl.pointer_type(tl.int32))
     base_x, base_y = whole_pixels(x), whole_pixels(y)
@@ -44,7 +49,7 @@ def store_splat(splats, d, x, y, a, b, c, log_opacity, reach, red, green, blue, 
     tl.store(splat + 7, (a - rounded(a)).to(tl.float32), mask=there)
     tl.store(splat + 8, (b - rounded(b)).to(tl.float32), mask=there)
     tl.store(splat + 9, log_opacity.to(tl.float32), mask=there)
-    tl.store(splat + 10, tl.minimum(reach, FARTHEST).to(tl.float32), mask=there)
+    tl.store(splat + 10, tl.minimum(extent_y, FARTHEST).to(tl.float32), mask=there)
     tl.store(splat + 11, red, mask=there)
     tl.store(splat + 12, green, mask=there)
     tl.store(splat + 13, blue, mask=there)
@@ -54,7 +59,7 @@ def store_splat(splats, d, x, y, a, b, c, log_opacity, reach, red, green, blue, 
 
 @kernel
 def load_ellipse(splats, d, there):
-    """Centre, a, b, c and reach along y of splats d, in float64; ones where not there."""
+    """Read centre, a, b, c and extent along y of splats d, in float64; ones where not `there`."""
     splat = splats + SPLAT * d
     whole = splat.to(tl.pointer_type(tl.int32))
     x = tl.load(whole, mask=there, other=0).to(tl.float64)
@@ -66,16 +71,41 @@ def load_ellipse(splats, d, there):
     c = tl.load(splat + 6, mask=there, other=1.0).to(tl.float64)
     a += tl.load(splat + 7, mask=there, other=0.0).to(tl.float64)
     b += tl.load(splat + 8, mask=there, other=0.0).to(tl.float64)
-    reach = tl.load(splat + 10, mask=there, other=1.0).to(tl.float64)
-    return x, y, a, b, c, reach
+    extent_y = tl.load(splat + 10, mask=there, other=1.0).to(tl.float64)
+    return x, y, a, b, c, extent_y
 
 
 @kernel
-def load_shape(splats, d, left, top, HALF_TILE: tl.constexpr, there):
-    """How splat d looks from the middle of the tile whose first pixel is (left, top).
+def tile_window(tile, columns, tiles, height, width):
+    """Return the pixels of a tile; tiles are numbered image by image, row by row.
 
-    x and y from its centre to the middle, whole pixels and the rest of each; u = a x + b y there;
-    a, b, c; log_opacity, so low where there is no splat that nothing shows. Far from its centre a
+    These are its image, its first column and row; column and row of the pixels from its middle, and
+    their places in images of one plane; whether they are in the image.
+    """
+    lane = tl.arange(0, TILE * TILE)
+    image, within = tile // tiles, tile % tiles
+    left = (within % columns * TILE).to(tl.int32)
+    top = (within // columns * TILE).to(tl.int32)
+    column, row = lane % TILE, lane // TILE
+    inside = (left + column < width) & (top + row < height)
+    pixel = (image * height + top + row) * width + left + column
+    middle = HALF_TILE - 0.5
+    return image, left, top, column - middle, row - middle, pixel, inside
+
+
+@kernel
+def color_pixels(pixel, image, height, width):
+    """Return where the three planes of an image have the pixels of one plane."""
+    red = pixel + 2 * image * height * width
+    return red, red + height * width, red + 2 * height * width
+
+
+@kernel
+def load_splat(splats, d, left, top, there):
+    """Read splat d as it looks from the middle of the tile whose first pixel is (left, top).
+
+    Return x and y from its centre to the middle, whole pixels and the rest of each; u = a x + b y
+    there; a, b, c; log_opacity, so low where not `there` that nothing shows. Far from its centre a
     needle's two terms nearly cancel: products are taken exactly, as a sum of two numbers.
     """
     splat = splats + SPLAT * d
@@ -100,7 +130,7 @@ def load_shape(splats, d, left, top, HALF_TILE: tl.constexpr, there):
 
 @kernel
 def load_color(splats, d, there):
-    """Red, green, blue."""
+    """Read red, green, blue."""
     splat = splats + SPLAT * d
     red = tl.load(splat + 11, mask=there, other=0.0)
     green = tl.load(splat + 12, mask=there, other=0.0)
@@ -110,6 +140,6 @@ def load_color(splats, d, there):
 
 @kernel
 def load_depth(splats, d, there):
-    """A depth as a sum of two numbers."""
+    """Read a depth as a sum of two numbers."""
     z = tl.load(splats + SPLAT * d + 14, mask=there, other=0.0)
     return z, tl.load(splats + SPLAT * d + 15, mask=there, other=0.0)

@@ -1,4 +1,4 @@
-"""Which splats touch which tile of the image."""
+"""Which tiles a splat touches, and the list of splats of every tile."""
 
 from dataclasses import dataclass
 
@@ -6,48 +6,48 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.rendering.limits import check_pairs
-from asysplat.rendering.reference.projection import Splats
+from asysplat.rendering.interface import check_pairs
+from asysplat.rendering.reference.project import Splats
 
 
 @dataclass(frozen=True)
-class TileLists:
+class Lists:
     """Depth-ordered splats of every tile; tiles are numbered image by image, row by row.
 
     Args:
         size: tiles are size x size pixels.
         images, rows, columns: the grid of tiles.
-        splats: [I] splat of every intersection, sorted by tile, then by depth.
-        lengths: [T] number of intersections of each tile.
+        splats: [pairs] splat of every pair of splat and tile, sorted by tile, then by depth.
+        lengths: [T] number of pairs of each tile.
     """
 
     size: int
     images: int
     rows: int
     columns: int
-    splats: Int[Tensor, "I"]
+    splats: Int[Tensor, "pairs"]
     lengths: Int[Tensor, "T"]
 
     def origins(self, tiles: Int[Tensor, "t"]) -> Int[Tensor, "t 2"]:
-        """Pixel (x, y) at the upper left corner of the given tiles."""
+        """Return the pixel (x, y) at the upper left corner of the given tiles."""
         column, row = tiles % self.columns, tiles // self.columns % self.rows
         return torch.stack((column, row), -1) * self.size
 
     def untile(
         self, values: Float[Tensor, "T C P"], height: int, width: int
     ) -> Float[Tensor, "images C {height} {width}"]:
-        """Values of all tiles' pixels to images."""
+        """Arrange the values of all tiles' pixels as images."""
         grid = values.unflatten(0, (self.images, self.rows, self.columns))
         grid = grid.unflatten(-1, (self.size, self.size))
         return grid.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)[..., :height, :width]
 
 
 @torch.no_grad()
-def assign_tiles(splats: Splats, images: int, height: int, width: int, size: int) -> TileLists:
+def list_tiles(splats: Splats, images: int, height: int, width: int, size: int) -> Lists:
     """Sort the splats of `images` images into tiles of size x size pixels."""
     rows, columns = -(-height // size), -(-width // size)
     first, last = splats.first // size, splats.last // size
-    # A range that rounding emptied since the visibility test gives no intersection.
+    # A range that rounding emptied since the visibility test gives no pair.
     spans = (last - first + 1).clamp_min(0)
     counts = spans.prod(-1)
     check_pairs(int(counts.sum()))
@@ -59,4 +59,4 @@ def assign_tiles(splats: Splats, images: int, height: int, width: int, size: int
     # Splats come in depth order within their image, and a stable sort by tile keeps it.
     order = torch.argsort(tile, stable=True)
     lengths = torch.bincount(tile, minlength=images * rows * columns)
-    return TileLists(size, images, rows, columns, splat[order], lengths)
+    return Lists(size, images, rows, columns, splat[order], lengths)

@@ -12,18 +12,18 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from asysplat.rendering.convention import Convention
-from asysplat.rendering.reference.projection import Splats
-from asysplat.rendering.reference.tiles import TileLists
+from asysplat.rendering.interface import Convention
+from asysplat.rendering.reference.project import Splats
+from asysplat.rendering.reference.tiles import Lists
 
-TILE_SIZE = 4
+TILE = 4  # pixels a side
 GROUP_ELEMENTS = 1 << 17  # (splat, pixel) pairs of one group: temporaries of 512 KiB
 
 
 def rasterize(
     splats: Splats,
     values: Float[Tensor, "M C"],
-    lists: TileLists,
+    lists: Lists,
     convention: Convention,
     median: bool = False,
 ) -> Float[Tensor, "T C P"]:
@@ -32,7 +32,7 @@ def rasterize(
     Args:
         splats: M splats, sorted by depth within their image.
         values: what each splat shows.
-        lists: from `assign_tiles`; P = size * size pixels a tile, row by row.
+        lists: from `list_tiles`; P = size * size pixels a tile, row by row.
         convention: the cut-offs.
         median: of the last value, take that of the splat at which the transmittance falls to half
             or below; 0 where it never does.
@@ -47,9 +47,7 @@ def rasterize(
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, packed: Tensor, lists: TileLists, convention: Convention, median: bool
-    ) -> Tensor:
+    def forward(ctx, packed: Tensor, lists: Lists, convention: Convention, median: bool) -> Tensor:
         ctx.save_for_backward(packed)
         ctx.lists, ctx.options = lists, (convention, median)
         pixels = lists.size**2
@@ -61,20 +59,20 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_out: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx, grad_output: Tensor) -> tuple[Tensor, None, None, None]:
         (packed,) = ctx.saved_tensors
         lists = ctx.lists
         grad = torch.zeros_like(packed)
         for tiles, splats in _groups(lists, len(packed) - 1):
             block = _Block(_rows(packed, splats), lists.origins(tiles), lists.size, *ctx.options)
-            rows = block.backward(grad_out.index_select(0, tiles))
+            rows = block.backward(grad_output.index_select(0, tiles))
             # On a CPU this sums in a fixed order: the same bits every time.
             grad.index_add_(0, splats.flatten(), rows.flatten(0, 1))
         return grad, None, None, None
 
 
-def _groups(lists: TileLists, padding: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Tiles [t] and their splats [t, K], in groups of about GROUP_ELEMENTS (splat, pixel) pairs.
+def _groups(lists: Lists, padding: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield tiles [t] and their splats [t, K], about GROUP_ELEMENTS (splat, pixel) pairs at a time.
 
     Covers all tiles that have splats, longest list first; shorter ones end in `padding`.
     """
@@ -109,7 +107,7 @@ class _Block:
     def __init__(
         self, packed: Tensor, origins: Tensor, size: int, convention: Convention, median: bool
     ):
-        """packed [t, K, 6 + C] and origins [t, 2]; all temporaries are [t, K, P]."""
+        """Take packed [t, K, 6 + C] and origins [t, 2]; all temporaries are [t, K, P]."""
         self.convention, self.median = convention, median
         self.x, self.y, self.a, self.b, self.c, self.opacity = packed[..., :6].unbind(-1)
         self.values = packed[..., 6:]
@@ -130,33 +128,33 @@ class _Block:
         _keep_at_least(self.alpha, self.transmittance, convention.transmittance_min)
 
     def weights(self) -> Tensor:
-        """alpha times the transmittance in front of each splat."""
+        """Return alpha times the transmittance in front of each splat."""
         weights = self.alpha.clone()
         weights[:, 1:] *= self.transmittance[:, :-1]
         return weights
 
     def halving(self) -> Tensor:
-        """1 for the splat that takes the transmittance to half or below, else 0."""
+        """Return 1 for the splat that takes the transmittance to half or below, else 0."""
         before = torch.nn.functional.pad(self.transmittance[:, :-1], (0, 0, 1, 0), value=1.0)
         crosses = (before > 0.5) & (self.transmittance <= 0.5) & (self.alpha > 0)
         return crosses.to(before.dtype)
 
     def forward(self) -> Tensor:
-        """The composited values [t, C, P]."""
+        """Return the composited values [t, C, P]."""
         if not self.median:
             return self.values.mT @ self.weights()
         blended = self.values[..., :-1].mT @ self.weights()
         return torch.cat((blended, self.values[..., -1:].mT @ self.halving()), 1)
 
-    def backward(self, grad_out: Tensor) -> Tensor:
-        """Gradient of `packed`, from the gradient [t, C, P] of the composited values."""
+    def backward(self, grad_output: Tensor) -> Tensor:
+        """Return the gradient of `packed` from that, [t, C, P], of the composited values."""
         weights = self.weights()
-        grad_values = weights @ grad_out.mT
+        grad_values = weights @ grad_output.mT
         values = self.values
         if self.median:
-            grad_values[..., -1:] = self.halving() @ grad_out[:, -1:].mT
-            values, grad_out = values[..., :-1], grad_out[:, :-1]
-        share = weights * (values @ grad_out)  # of each splat in grad . out
+            grad_values[..., -1:] = self.halving() @ grad_output[:, -1:].mT
+            values, grad_output = values[..., :-1], grad_output[:, :-1]
+        share = weights * (values @ grad_output)  # of each splat in grad_output . output
         behind = share.sum(1, keepdim=True) - share.cumsum(1)
         # alpha dL/dalpha; 0 where alpha is clamped.
         grad = share.addcmul_(behind, self.alpha / self.passed, value=-1)

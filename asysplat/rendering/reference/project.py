@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.rendering.convention import LARGEST
-from asysplat.rendering.reference.sh import sh_colors
-from asysplat.rendering.settings import Settings
+from asysplat.rendering.interface import LARGEST, Settings
+from asysplat.rendering.reference.math import rotations, sh_colors, whiten
 from asysplat.scene import Cameras, Gaussians
 
 BOUNDS_MARGIN = 1e-3  # pixels; more than the rounding of an extent
@@ -41,6 +40,8 @@ class Splats:
 
 
 class Footprint(NamedTuple):
+    """Where a Gaussian lies in an image, and how large it is."""
+
     offsets: Tensor  # [..., 3] mean - camera centre, world axes
     depths: Tensor  # [...]
     xy: Tensor  # [..., 2]
@@ -50,15 +51,15 @@ class Footprint(NamedTuple):
 
 
 def project(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Splats:
-    """Splats of every view of every scene.
+    """Find the splats of every view of every scene.
 
     Args:
         gaussians: with one batch dimension, [B, N].
         cameras: [B, V], zero skew; image b * V + v is view v of scene b.
         settings: convention and antialiasing.
 
-    Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel centre in reach, and
-    whatever does not project to finite numbers (NaN, infinity, a zero quaternion).
+    Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel centre within its
+    extent, and whatever does not project to finite numbers (NaN, infinity, a zero quaternion).
     """
     size = (cameras.width, cameras.height)
     images, indices = find_visible(gaussians, cameras, settings)
@@ -92,7 +93,7 @@ def project(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Splat
 def find_visible(
     gaussians: Gaussians, cameras: Cameras, settings: Settings
 ) -> tuple[Tensor, Tensor]:
-    """Image and flat Gaussian index of every visible pair, in the order of `Splats`."""
+    """Return image and flat Gaussian index of every visible pair, in the order of `Splats`."""
     size = (cameras.width, cameras.height)
     footprint = find_footprint(
         gaussians.means[:, None],
@@ -135,7 +136,7 @@ def find_footprint(
     size: tuple[int, int],
     settings: Settings,
 ) -> Footprint:
-    """Project; all arguments broadcast over their leading dimensions."""
+    """Project Gaussians; all arguments broadcast over their leading dimensions."""
     rotation = cam_to_world[..., :3, :3]
     # Relative to the camera first: exact for scenes far from the origin.
     offsets = means - cam_to_world[..., :3, 3]
@@ -153,52 +154,18 @@ def find_footprint(
     jacobian = (focal / z[..., None])[..., None] * (
         rotation.mT[..., :2, :] - clamped[..., None] * rotation.mT[..., 2:, :]
     )
-    rows = jacobian @ _rotations(quats) * scales[..., None, :]
-    ellipse = _whiten(*rows.unbind(-2), settings)
+    rows = jacobian @ rotations(quats) * scales[..., None, :]
+    ellipse = whiten(*rows.unbind(-2), settings)
     return Footprint(offsets, z, tangents * focal + principal, *ellipse)
-
-
-def _whiten(row_x: Tensor, row_y: Tensor, settings: Settings) -> tuple[Tensor, Tensor, Tensor]:
-    """Whitening (a, b, c), standard deviations and the opacity's compensation of the covariance
-    M M^T + eps I, M = (x; y).
-
-    The Cholesky factor of the inverse. The determinant is a sum of squares (Cauchy-Binet), so no
-    needle makes it cancel to zero, and it is divided by Syy early, so no large scale overflows.
-    """
-    eps = settings.convention.eps2d
-    xx, xy, yy = ((p * q).sum(-1) for p, q in ((row_x, row_x), (row_x, row_y), (row_y, row_y)))
-    var_y = yy + eps
-    deviation_y = var_y.sqrt()
-    minors = torch.linalg.cross(row_x, row_y / deviation_y[..., None]).square().sum(-1)
-    det = minors + eps * (1 + xx / var_y)  # over Syy
-    a = det.rsqrt()
-    whitening = torch.stack((a, -a * xy / var_y, 1 / deviation_y), -1)
-    deviations = torch.stack(((xx + eps).sqrt(), deviation_y), -1)
-    if not settings.antialiased:
-        return whitening, deviations, torch.ones_like(a)
-    # sqrt(det(M M^T) / det(M M^T + eps I)), Yu et al. 2024, Eq. 10.
-    share = (minors / det).clamp_min(settings.convention.compensation_min)
-    return whitening, deviations, share.sqrt()
-
-
-def _rotations(quats: Tensor) -> Tensor:
-    """[..., 4] wxyz of any length to [..., 3, 3]."""
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = (
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 @torch.no_grad()
 def _pixel_range(
     footprint: Footprint, opacities: Tensor, size: tuple[int, int], settings: Settings
 ) -> tuple[Tensor, Tensor]:
-    """First and last pixel (x, y) whose centre the box around alpha >= alpha_min holds."""
-    reach = (2 * (opacities / settings.convention.alpha_min).log().clamp_min(0)).sqrt()
-    extent = footprint.deviations * reach[..., None] + BOUNDS_MARGIN
+    """Return first and last pixel (x, y) whose centre is in the box around alpha >= alpha_min."""
+    distance = (2 * (opacities / settings.convention.alpha_min).log().clamp_min(0)).sqrt()
+    extent = footprint.deviations * distance[..., None] + BOUNDS_MARGIN
     size = extent.new_tensor(size)
     zero = torch.zeros_like(size)
     first = (footprint.xy - extent - 0.5).ceil().clamp(zero, size)
