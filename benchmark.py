@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from asysplat.benchmark.machine import describe_machine
-from asysplat.benchmark.suites import find_suite
+from asysplat.benchmark.options import find_suite
 from asysplat.errors import InputError
 from asysplat.overrides import exit_at_unknown_overrides
 

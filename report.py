@@ -18,7 +18,7 @@ from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import find_tables
 from asysplat.report.terminal import render_terminal
 
-OWN_WORDS = ("table", "costs", "overrides", "logs", "output")
+OWN_OPTIONS = ("table", "costs", "overrides", "logs", "output")
 
 
 @hydra.main(config_path="conf", config_name="report", version_base="1.3")
@@ -32,10 +32,10 @@ def main(options: DictConfig) -> None:
 def report(options: DictConfig) -> None:
     """Fill the tables, print them, write report.md and report.html."""
     tables = find_tables(options.table)
-    words = [*sweep_words(HydraConfig.get().overrides.task), *options.overrides]
-    check_overrides(words)
+    overrides = [*sweep_overrides(HydraConfig.get().overrides.task), *options.overrides]
+    check_overrides(overrides)
     runs = finished_runs(Path(options.logs))
-    filled = [fill_table(table, words, compose_train, runs) for table in tables]
+    filled = [fill_table(table, overrides, compose_train, runs) for table in tables]
     if options.costs:
         filled = [with_costs(table, compose_train) for table in track(filled, "counting costs")]
     console = Console()
@@ -47,13 +47,13 @@ def report(options: DictConfig) -> None:
     console.print(f"page: {folder / 'report.html'}", soft_wrap=True)
 
 
-def sweep_words(words: Sequence[str]) -> list[str]:
-    """Of a command's words those that choose the sweeps' data and scale."""
-    return [word for word in words if word.partition("=")[0] not in OWN_WORDS]
+def sweep_overrides(overrides: Sequence[str]) -> list[str]:
+    """Find the overrides of the command that choose the sweeps' data and scale."""
+    return [override for override in overrides if override.partition("=")[0] not in OWN_OPTIONS]
 
 
 def compose_train(overrides: Sequence[str]) -> DictConfig:
-    """The configuration that train.py would run."""
+    """Compose the configuration that train.py would run."""
     return hydra.compose("train", list(overrides), return_hydra_config=True)
 
 

@@ -1,4 +1,4 @@
-"""What makes the code quick to read: how much a file pulls in, how many arguments a call lines up."""
+"""What makes code quick to read: how much a file pulls in, how many arguments a call lines up."""
 
 import ast
 

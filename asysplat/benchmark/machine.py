@@ -14,8 +14,7 @@ PACKAGES = ("torch", "numba", "triton", "gsplat")
 
 
 def describe_machine() -> dict[str, str | int]:
-    """Processor, cores, torch's threads, GPU, and versions of what was timed; what is not there is
-    left out."""
+    """Name the processor, cores, torch's threads, the GPU if any, and versions of PACKAGES."""
     machine = {
         "cpu": _processor(),
         "instructions": llvmlite.binding.get_host_cpu_name(),  # what Numba compiles for
@@ -34,7 +33,7 @@ def describe_machine() -> dict[str, str | int]:
 
 
 def _processor() -> str:
-    """The model's name as the system has it."""
+    """Return the model's name as the system has it."""
     if CPU_INFO.exists():
         found = re.search(r"model name\s*:\s*(.+)", CPU_INFO.read_text())
         if found:

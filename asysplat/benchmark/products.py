@@ -1,6 +1,6 @@
 """Matrix products and convolutions by themselves: the least that a computation made of them takes.
 
-Matrices are contiguous, whatever the layout was in the computation they stand for; images keep
+Matrices are contiguous, whatever their strides were in the computation they stand for; images keep
 their channels innermost where they had them so.
 """
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from asysplat.benchmark.timing import Timer, seconds_of
+from asysplat.benchmark.timing import seconds_of
 from asysplat.evaluation.cost import true_flops
 from asysplat.ops.ssd.chunked import CHUNK
 
@@ -29,22 +29,21 @@ Size = tuple[int, int, int, int]  # [m, k] x [k, n], as often as the first says
 
 @dataclass(frozen=True)
 class Operand:
-    """What a tensor is but for its values."""
+    """All of a tensor but its values."""
 
     shape: tuple[int, ...]
     dtype: torch.dtype
-    channels_last: bool = False
+    memory_format: torch.memory_format = torch.contiguous_format
 
     def make(self, device: torch.device | str) -> Tensor:
         values = torch.randn(self.shape, dtype=self.dtype, device=device)
-        if self.channels_last:
-            return values.contiguous(memory_format=torch.channels_last)
-        return values
+        return values.contiguous(memory_format=self.memory_format)
 
 
 @dataclass(frozen=True)
 class Product:
-    """
+    """One call of torch.
+
     Args:
         function: of torch.ops.aten.
         arguments: its positional ones; lists as tuples.
@@ -60,7 +59,7 @@ class Product:
         return f"{self.function.overloadpacket.__name__} {shapes} {dtype}"
 
     def prepare(self, device: torch.device | str) -> Callable[[], Tensor]:
-        """The call, with operands of its own."""
+        """Make operands; return the call of the function on them."""
         arguments = [
             value.make(device) if isinstance(value, Operand) else value for value in self.arguments
         ]
@@ -70,7 +69,7 @@ class Product:
         return true_flops(self.prepare("meta"))
 
     def seconds(self, count: int, device: torch.device) -> float:
-        """Of one of `count` calls."""
+        """Return the seconds of one of `count` calls."""
         call, calls = self.prepare(device), min(count, MOST_CALLS)
         call()
 
@@ -79,6 +78,9 @@ class Product:
                 call()
 
         return seconds_of(run, device) / calls
+
+
+Counts = Mapping[Product, int]
 
 
 class RecordProducts(TorchDispatchMode):
@@ -94,66 +96,65 @@ class RecordProducts(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def _products_of_call(func: OpOverload, args: tuple) -> Mapping[Product, int]:
-    """Operators that torch takes as one call come apart into the products in them."""
+def _products_of_call(func: OpOverload, args: tuple) -> Counts:
+    """Count the products of a call; an operator that is one call to torch has several."""
     if func in CALLS:
         return {Product(func, tuple(_without_values(value) for value in args)): 1}
-    name = func._schema.name
-    named = {
-        argument.name: value for argument, value in zip(func._schema.arguments, args, strict=False)
-    }
-    if name.startswith("aten::_scaled_dot_product"):
+    if func._schema.name.startswith("aten::_scaled_dot_product"):
         q, k, v = args[:3]
         sizes = attention_sizes(q.shape[:-2].numel(), q.shape[-2], k.shape[-2], q.shape[-1])
         return products(sizes, v.dtype, v.device)
-    if name == "asysplat::ssd":
-        x, B = named["x"], named["B"]
+    if func._schema.name == "asysplat::ssd":
+        names = (argument.name for argument in func._schema.arguments)
+        inputs = dict(zip(names, args, strict=False))
+        x, B = inputs["x"], inputs["B"]
         return products(ssd_sizes(*x.shape, B.shape[-1]), x.dtype, x.device)
-    if name == "asysplat::grid_attention":
-        q = named["q"]
-        return products(grid_attention_sizes(*q.shape, named["grid"]), q.dtype, q.device)
     return {}
 
 
 def _without_values(value: Any) -> Operand | Any:
     if isinstance(value, Tensor):
         innermost = value.ndim == 4 and value.is_contiguous(memory_format=torch.channels_last)
-        return Operand(tuple(value.shape), value.dtype, innermost and not value.is_contiguous())
+        if innermost and not value.is_contiguous():
+            return Operand(tuple(value.shape), value.dtype, torch.channels_last)
+        return Operand(tuple(value.shape), value.dtype)
     return tuple(value) if isinstance(value, list) else value
 
 
-def ssd_sizes(batch: int, length: int, heads: int, head_width: int, state: int) -> list[Size]:
-    """Of the chunked form, the last chunk whole: C B^T, scores x inputs, the state's update and
-    its reading."""
-    chunks, inner = batch * -(-length // CHUNK), heads * head_width
+def ssd_sizes(batch: int, length: int, heads: int, head_dim: int, state: int) -> list[Size]:
+    """List the products of the chunked form, the last chunk whole.
+
+    C B^T, scores x inputs, the state's update and its reading.
+    """
+    chunks, inner = batch * -(-length // CHUNK), heads * head_dim
     return [
         (chunks, CHUNK, state, CHUNK),
-        (chunks * heads, CHUNK, CHUNK, head_width),
+        (chunks * heads, CHUNK, CHUNK, head_dim),
         (chunks, state, CHUNK, inner),
         (chunks, CHUNK, state, inner),
     ]
 
 
-def attention_sizes(heads: int, queries: int, keys: int, head_width: int) -> list[Size]:
-    """Scores, and their product with the values."""
-    return [(heads, queries, head_width, keys), (heads, queries, keys, head_width)]
+def attention_sizes(heads: int, queries: int, keys: int, head_dim: int) -> list[Size]:
+    """List the scores, and their product with the values."""
+    return [(heads, queries, head_dim, keys), (heads, queries, keys, head_dim)]
 
 
 def grid_attention_sizes(
-    batch: int, views: int, height: int, width: int, heads: int, head_width: int, grid: int
+    batch: int, views: int, height: int, width: int, heads: int, head_dim: int, grid: int
 ) -> list[Size]:
-    """Each grid place by itself, maps padded to multiples of the grid."""
+    """List the products of each grid place by itself, maps padded to whole grids."""
     tokens = views * -(-height // grid) * -(-width // grid)
-    return attention_sizes(batch * grid**2 * heads, tokens, tokens, head_width)
+    return attention_sizes(batch * grid**2 * heads, tokens, tokens, head_dim)
 
 
 def with_gradients(sizes: Iterable[Size]) -> list[Size]:
-    """The products, and those that give the gradients of both operands."""
+    """Add to each product those that give the gradients of both its operands."""
     return [size for b, m, k, n in sizes for size in ((b, m, k, n), (b, m, n, k), (b, k, m, n))]
 
 
 def products(sizes: Iterable[Size], dtype: torch.dtype, device: torch.device) -> Counter[Product]:
-    """Calls that do these products, each with operands and a result of at most LARGEST numbers."""
+    """Split products into calls whose operands and results have at most LARGEST numbers each."""
     counts: Counter[Product] = Counter()
     largest = LARGEST[device.type]
     for batch, m, k, n in sizes:
@@ -173,18 +174,12 @@ def _largest_divisor(number: int, most: int) -> int:
     return next(d for d in range(max(1, min(number, most)), 0, -1) if number % d == 0)
 
 
-def sum_of_products(
-    counts: Mapping[Product, int], seconds: Mapping[Hashable, list[float]]
-) -> list[float]:
-    """Seconds of all of them, in each round."""
+def product_seconds(counts: Counts, device: torch.device) -> dict[Product, float]:
+    """Time one call of each product."""
+    return {product: product.seconds(count, device) for product, count in counts.items()}
+
+
+def sum_of_products(counts: Counts, seconds: Mapping[Hashable, list[float]]) -> list[float]:
+    """Return the seconds of all products together, in each round."""
     each = [[count * value for value in seconds[product]] for product, count in counts.items()]
     return [sum(values) for values in zip(*each, strict=True)]
-
-
-def product_timers(counts: Mapping[Product, int], device: torch.device) -> list[Timer]:
-    """Each product's time, under itself."""
-
-    def timer(product: Product, count: int) -> Timer:
-        return lambda: {product: product.seconds(count, device)}
-
-    return [timer(product, count) for product, count in counts.items()]

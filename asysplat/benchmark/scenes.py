@@ -1,4 +1,4 @@
-"""Scenes of known make for measuring renderers: nothing to download, the same on every machine."""
+"""Synthetic scenes to measure renderers on: nothing to download, the same on every machine."""
 
 import torch
 from torch import Tensor
@@ -6,16 +6,18 @@ from torch import Tensor
 from asysplat.scene import Cameras, Gaussians
 
 FOCAL = 0.9  # of the image's width
-DISTANCE = 4.0  # of what networks predict
+DISTANCE = 4.0  # from the camera to what networks predict
 ARC = 0.5  # radians
 
 
 def random_scene(count: int, height: int, width: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
-    """Gaussians anywhere: depth uniform in 2 to 10, positions uniform over the image and 10 %
-    beyond, deviations log-normal (median 2 pixels, 0.6) per axis, opacity uniform in .05 to .95.
+    """Scatter `count` Gaussians over the image and 10 % beyond it, and over depths.
+
+    Positions are uniform, depths uniform in 2 to 10, deviations log-normal (median 2 pixels, 0.6)
+    per axis, opacities uniform in .05 to .95.
 
     Returns:
-        Gaussians [N] of harmonics of degree 0, and one camera; float32.
+        Gaussians [N] of SH degree 0, and one camera; float32.
     """
     generator = torch.Generator().manual_seed(seed)
     depths = 2 + 8 * torch.rand(count, generator=generator, dtype=torch.float64)
@@ -29,12 +31,13 @@ def random_scene(count: int, height: int, width: int, seed: int = 0) -> tuple[Ga
 def pixel_aligned_scene(
     side: int, height: int, width: int, seed: int = 0
 ) -> tuple[Gaussians, Cameras]:
-    """What networks predict: two jittered grids of side x side Gaussians over the image at a smooth
-    depth near 4, deviations log-normal (median 0.8 width / side pixels, 0.4), opacity
-    sigmoid(2 N(0, 1)), in the order of the pixels.
+    """Imitate what networks predict: two jittered grids of side x side Gaussians over the image.
+
+    Depths are smooth and near 4, deviations log-normal (median 0.8 width / side pixels, 0.4),
+    opacities sigmoid(2 N(0, 1)); in the order of the pixels.
 
     Returns:
-        Gaussians [2 side^2] of harmonics of degree 0, and one camera; float32.
+        Gaussians [2 side^2] of SH degree 0, and one camera; float32.
     """
     generator = torch.Generator().manual_seed(seed)
     count = 2 * side * side
@@ -50,8 +53,7 @@ def pixel_aligned_scene(
 
 
 def on_an_arc(camera: Cameras, views: int) -> Cameras:
-    """`views` cameras like the one given, on an arc of ARC radians about what stands DISTANCE in
-    front of it."""
+    """Copy a camera to `views` places on an arc of ARC radians about what is DISTANCE before it."""
     angles = torch.linspace(-ARC / 2, ARC / 2, views)
     turns = torch.zeros(views, 4, 4)
     turns[:, 0, 0] = turns[:, 2, 2] = angles.cos()
@@ -80,7 +82,7 @@ def _scene(
     width: int,
     generator: torch.Generator,
 ) -> tuple[Gaussians, Cameras]:
-    """Gaussians that project to `pixels` with `sigma` pixels, and the camera they do so in."""
+    """Make Gaussians that project to `pixels` with `sigma` pixels, and the camera they do so in."""
     count = len(depths)
     focal = FOCAL * width
     center = torch.tensor([width / 2, height / 2])

@@ -1,4 +1,4 @@
-"""How a suite's numbers are shown on the terminal."""
+"""The tables of all suites on the terminal: a column is a heading and what writes its cells."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -7,40 +7,91 @@ from rich.box import ROUNDED
 from rich.table import Table
 from rich.text import Text
 
-NOTHING = "-"
-Columns = Mapping[str, Callable[[Any], str | Text]]
+from asysplat.benchmark.timing import Result
+
+NOTHING = "-"  # for what was not measured
+Write = Callable[[Result], str | Text]
+Columns = Mapping[str, Write]
 
 
 def make_table(
-    title: str, columns: Columns, rows: Sequence[Any], notes: str | None = None, names: int = 1
+    title: str, columns: Columns, rows: Sequence[Result], notes: str | None = None, names: int = 1
 ) -> Table:
-    """A column for each function of a row, under its heading; the first `names` hold words."""
+    """Make a table with a line for each row; the first `names` columns hold words."""
     table = Table(title=title, caption=notes, box=ROUNDED)
     for number, heading in enumerate(columns):
         table.add_column(heading, justify="left" if number < names else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*(show(row) for show in columns.values()))
+        table.add_row(*(write(row) for write in columns.values()))
     return table
 
 
-def show(value: float | None, pattern: str) -> str:
-    """A dash for what was not measured."""
-    return NOTHING if value is None else pattern.format(value)
+def measured_on(results: Result) -> str:
+    """Write the note that every suite begins with: the machine, and what ± means."""
+    machine = ", ".join(f"{key} {value}" for key, value in results["machine"].items())
+    return f"{machine}\nmedian ± interquartile range"
 
 
-def show_limited(value: float | None, limit: float) -> str | Text:
-    """Red above the limit."""
-    if value is None:
-        return NOTHING
-    return Text(f"{value:.2f}", style="bold red" if value > limit else "")
+def at(row: Result, path: str) -> Any:
+    """Return row["a"]["b"] for the path "a.b"; None where there is no such value."""
+    for key in path.split("."):
+        row = row.get(key) if row else None
+    return row
 
 
-def milliseconds(seconds: Mapping[str, float] | None) -> str:
-    """Median and interquartile range."""
-    if seconds is None:
-        return NOTHING
-    return f"{1000 * seconds['median']:.1f} ± {1000 * seconds['iqr']:.1f}"
+def text(pattern: str) -> Write:
+    """Write the values that a pattern such as "{views} views" names."""
+    return lambda row: pattern.format(**row)
 
 
-def describe_machine_in_words(machine: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key} {value}" for key, value in machine.items())
+def number(path: str, pattern: str, unit: float = 1.0) -> Write:
+    """Write a number, divided by its unit."""
+
+    def write(row: Result) -> str:
+        value = at(row, path)
+        return NOTHING if value is None else pattern.format(value / unit)
+
+    return write
+
+
+def limited(path: str, limit: float) -> Write:
+    """Write a ratio, in red above the limit."""
+
+    def write(row: Result) -> str | Text:
+        value = at(row, path)
+        if value is None:
+            return NOTHING
+        return Text(f"{value:.2f}", style="bold red" if value > limit else "")
+
+    return write
+
+
+def error(path: str) -> Write:
+    """Write an error, with a * where it was measured on a smaller case."""
+
+    def write(row: Result) -> str:
+        if row["error"] is None:
+            return NOTHING
+        sizes, measured_on = row.get("sizes", row), row["error"]["measured_on"]
+        smaller = any(sizes[key] != size for key, size in measured_on.items())
+        return f"{worst(row, path):.1e}{'*' if smaller else ''}"
+
+    return write
+
+
+def worst(row: Result, path: str) -> float:
+    """Return the error at a path; of several, such as those of gradients, the largest."""
+    found = at(row, path)
+    return max(found.values()) if isinstance(found, Mapping) else found
+
+
+def spread(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> Write:
+    """Write median ± interquartile range; seconds in milliseconds."""
+
+    def write(row: Result) -> str:
+        values = at(row, path)
+        if values is None:
+            return NOTHING
+        return " ± ".join(pattern.format(values[name] / unit) for name in ("median", "iqr"))
+
+    return write

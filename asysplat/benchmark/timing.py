@@ -1,10 +1,15 @@
-"""How long a run takes and how much memory: what several suites measure alike."""
+"""Seconds and memory: how every suite measures them."""
 
 import ctypes
 import gc
+import inspect
+import sys
 import time
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,51 +17,114 @@ import torch
 from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
 from asysplat.evaluation.measured_cost import wait_for
 
+Result = dict[str, Any]  # plain values, as JSON has them
 Run = Callable[[], object]
-Timer = Callable[[], Mapping[Hashable, float]]
+Seconds = Mapping[Hashable, float]  # by name
+Name = Callable[[FrameType], str | None]
 
 
-def seconds_of(run: Run, device: torch.device) -> float:
-    """Of one run, until the device has finished it."""
-    wait_for(device)
-    start = time.perf_counter()
-    run()
-    wait_for(device)
-    return time.perf_counter() - start
+@dataclass
+class Measurement:
+    """One row of a suite's results.
 
-
-def run_timer(key: Hashable, run: Run, device: torch.device) -> Timer:
-    """The time of a run, under its key."""
-    return lambda: {key: seconds_of(run, device)}
-
-
-def rounds(timers: Iterable[Timer], repeats: int) -> dict[Hashable, list[float]]:
-    """What the timers find in `repeats` rounds, after one to warm up.
-
-    Every timer runs once a round: whatever else the machine does meets all of them alike.
+    Args:
+        timer: runs everything that is timed of it once; returns seconds by name.
+        found: results besides the times.
+        seconds: those of every round, by name; `time_in_rounds` fills them.
     """
-    timers, found = list(timers), {}
+
+    timer: Callable[[], Seconds]
+    found: Result = field(default_factory=dict)
+    seconds: dict[Hashable, list[float]] = field(default_factory=dict)
+
+    def summary(self, name: Hashable) -> dict[str, float]:
+        """Return median and interquartile range of the seconds of this name."""
+        return summary(self.seconds[name])
+
+
+def time_in_rounds(measurements: Sequence[Measurement], repeats: int) -> None:
+    """Call every timer in each of `repeats` rounds, after a round to warm up.
+
+    In turns, so that whatever else the machine does meets all measurements alike.
+    """
     for number in range(repeats + 1):
-        for timer in timers:
-            for key, value in timer().items():
+        for measurement in measurements:
+            for name, seconds in measurement.timer().items():
                 if number > 0:
-                    found.setdefault(key, []).append(value)
-    return found
+                    measurement.seconds.setdefault(name, []).append(seconds)
 
 
-def summary(seconds: Sequence[float]) -> dict[str, float]:
-    """Median and interquartile range."""
-    low, median, high = np.percentile(seconds, [25, 50, 75]).tolist()
+def summary(values: Sequence[float]) -> dict[str, float]:
+    """Return median and interquartile range."""
+    low, median, high = np.percentile(values, [25, 50, 75]).tolist()
     return {"median": median, "iqr": high - low}
 
 
-def rise_gb(run: Run, device: torch.device) -> float:
-    """What a run takes beyond what there was before it, in 1e9 bytes, after one to warm up.
+def now(device: torch.device) -> float:
+    """Return the clock's seconds at which the device has finished its work."""
+    wait_for(device)
+    return time.perf_counter()
 
-    Too small where a process cannot start its peak anew: on a CPU without Linux.
+
+def seconds_of(run: Run, device: torch.device) -> float:
+    """Return the seconds of one run, until the device has finished it."""
+    start = now(device)
+    run()
+    return now(device) - start
+
+
+@contextmanager
+def time_calls(
+    functions: Mapping[Callable, Name], device: torch.device
+) -> Iterator[dict[str, float]]:
+    """Add up the seconds of every call of some functions, by name; see `watch_calls`."""
+    started: dict[str, float] = {}
+    seconds: dict[str, float] = {}
+
+    def before(name: str) -> None:
+        started[name] = now(device)
+
+    def after(name: str) -> None:
+        seconds[name] = seconds.get(name, 0.0) + now(device) - started[name]
+
+    with watch_calls(functions, before, after):
+        yield seconds
+
+
+@contextmanager
+def watch_calls(
+    functions: Mapping[Callable, Name], before: Callable[[str], None], after: Callable[[str], None]
+) -> Iterator[None]:
+    """Call `before` and `after` around every call of some functions, as Python's profiler does.
+
+    Args:
+        functions: what names a call of each, from its frame; None for a call to leave out.
+        before, after: given that name.
+    """
+    names = {inspect.unwrap(function).__code__: name for function, name in functions.items()}
+
+    def profile(frame: FrameType, event: str, _: object) -> None:
+        if frame.f_code in names and event in ("call", "return"):
+            name = names[frame.f_code](frame)
+            if name is not None:
+                (before if event == "call" else after)(name)
+
+    previous = sys.getprofile()
+    sys.setprofile(profile)
+    try:
+        yield
+    finally:
+        sys.setprofile(previous)
+
+
+def rise_gb(run: Run, device: torch.device) -> float:
+    """Return the peak memory of a run above what was held before it, in 1e9 bytes.
+
+    A first run warms it up. Too small where a process cannot start its peak anew: on a CPU without
+    Linux.
     """
     run()
-    _give_back_memory()
+    _return_freed_memory()
     reset_peak_memory(device)
     before = peak_memory_gb(device)
     run()
@@ -64,8 +132,8 @@ def rise_gb(run: Run, device: torch.device) -> float:
     return peak_memory_gb(device) - before
 
 
-def _give_back_memory() -> None:
-    """To the system what was freed: a run that is given it again would not show as a rise."""
+def _return_freed_memory() -> None:
+    """Return freed memory to the system: a run that gets it again would not show as a rise."""
     gc.collect()
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.report.filled import Costs, FilledRow, FilledTable, Number
-from asysplat.report.paper import Row, Table, our_sets
+from asysplat.report.paper import PaperRow, PaperTable, our_sets
 from asysplat.training.runs import Run, config_hash, data_of, find_runs
 
 # Overrides of train.py -> its configuration, the node `hydra` included.
@@ -19,7 +19,7 @@ Compose = Callable[[Sequence[str]], DictConfig]
 Runs = dict[str, list[Run]]  # by config_hash, oldest first
 
 BASELINES = ("mean_colour", "nearest_view")
-# Columns that every run measures in passing, as it calls them, without and with post-optimisation.
+# Columns that every run measures: their keys in metrics.json, without and with post-optimisation.
 MEASURED = {
     "seconds_per_step": ("cost/seconds_per_step", None),
     "train_gb": ("cost/peak_gb", None),
@@ -31,25 +31,27 @@ SETTINGS = {"batch": "data.batch_size", "train_steps": "steps"}
 
 
 def finished_runs(logs: Path) -> Runs:
-    """All of them."""
+    """Find all finished runs below a folder, by the hash of their configuration."""
     runs: Runs = {}
     for run in find_runs(logs):
         runs.setdefault(run.config_hash, []).append(run)
     return runs
 
 
-def fill_table(table: Table, words: Sequence[str], compose: Compose, runs: Runs) -> FilledTable:
-    """The table with every finished run whose configuration is that of a row of its sweep.
+def fill_table(
+    table: PaperTable, overrides: Sequence[str], compose: Compose, runs: Runs
+) -> FilledTable:
+    """Fill a table with every finished run whose configuration is that of a row of its sweep.
 
     Args:
         table: the paper's.
-        words: of the command that the sweep was started with, but for `sweeps=`. Paths may be left
-            out; one that is given has to have the name of the run's.
-        compose: train.py's configuration.
-        runs: to look among.
+        overrides: of the command that started the sweep, but for `sweeps=`. Paths may be left out;
+            a path that is given must have the name of the run's.
+        compose: gives train.py's configuration.
+        runs: those to look among.
     """
-    words = [f"sweeps={table.key}", *words]
-    config = compose(words)
+    overrides = [f"sweeps={table.key}", *overrides]
+    config = compose(overrides)
     sets = our_sets(table, config.data.name, config.data.test_sets or ())
     seeds = str(config.hydra.sweeper.params.get("seed", config.seed))
     wanted = [int(seed) for seed in seeds.split(",")]
@@ -59,7 +61,7 @@ def fill_table(table: Table, words: Sequence[str], compose: Compose, runs: Runs)
         if row.quoted:
             rows.append(FilledRow(row))
             continue
-        row_config = _task(compose([*words, *row.run]))
+        row_config = _without_hydra(compose([*overrides, *row.run]))
         same = _runs_of(row_config, runs)
         found += same.values()
         rows.append(_measured_row(row, table, row_config, same, wanted, sets))
@@ -67,7 +69,7 @@ def fill_table(table: Table, words: Sequence[str], compose: Compose, runs: Runs)
         table,
         tuple(rows),
         scale=_scale_text(config),
-        command=f"python train.py {' '.join(words)}",
+        command=f"python train.py {' '.join(overrides)}",
         sets=sets,
         protocols=_protocols(found, config.metrics.name),
         baselines=_baselines(sets, found),
@@ -78,18 +80,18 @@ def fill_table(table: Table, words: Sequence[str], compose: Compose, runs: Runs)
 
 
 def with_costs(filled: FilledTable, compose: Compose) -> FilledTable:
-    """The table with every row's costs at the paper's scale, other readings included."""
+    """Add every row's costs at the paper's scale, those of other readings included."""
 
-    def costs(run: tuple[str, ...], row: Row) -> Costs:
+    def costs(run: tuple[str, ...], row: PaperRow) -> Costs:
         return _costs(compose, run, row.views, row.size)
 
     rows = [
         row
-        if row.row.quoted or row.row.post_optimisation
+        if row.paper.quoted or row.paper.post_optimisation
         else replace(
             row,
-            costs=costs(row.row.run, row.row),
-            reading_costs=tuple(costs(reading.run, row.row) for reading in row.row.readings),
+            costs=costs(row.paper.run, row.paper),
+            reading_costs=tuple(costs(reading.run, row.paper) for reading in row.paper.readings),
         )
         for row in filled.rows
     ]
@@ -105,20 +107,20 @@ def _costs(compose: Compose, run: tuple[str, ...], views: int, size: tuple[int, 
 
 
 def _runs_of(config: DictConfig, runs: Runs) -> dict[int, Run]:
-    """By seed: of several the newest, those that were tested on all that is asked for first."""
+    """Find a run for each seed: of several the newest that was tested on all of the data."""
     data = data_of(config)
     same = [run for run in runs.get(config_hash(config), []) if run.agrees(data)]
     return {run.seed: run for run in sorted(same, key=lambda run: run.covers(data))}
 
 
-def _task(config: DictConfig) -> DictConfig:
-    """What the run itself is given."""
+def _without_hydra(config: DictConfig) -> DictConfig:
+    """Return the configuration that the run itself is given."""
     return OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
 
 
 def _measured_row(
-    row: Row,
-    table: Table,
+    row: PaperRow,
+    table: PaperTable,
     config: DictConfig,
     runs: dict[int, Run],
     wanted: Sequence[int],
@@ -144,8 +146,8 @@ def _measured_row(
     )
 
 
-def _result_key(column: str, row: Row, sets: dict[str, str]) -> str | None:
-    """What metrics.json and evaluation.json call the number; None where no run measures it."""
+def _result_key(column: str, row: PaperRow, sets: dict[str, str]) -> str | None:
+    """Return the key of a number in metrics.json or evaluation.json; None where no run has it."""
     steps = row.post_optimisation
     if column in MEASURED:
         plain, optimised = MEASURED[column]
@@ -160,7 +162,7 @@ def _result_key(column: str, row: Row, sets: dict[str, str]) -> str | None:
 
 
 def _note(
-    row: Row, values: dict[str, list[Number]], runs: dict[int, Run], wanted: Sequence[int]
+    row: PaperRow, values: dict[str, list[Number]], runs: dict[int, Run], wanted: Sequence[int]
 ) -> str:
     if row.post_optimisation and not values:
         return "not run: needs post-optimisation of a trained model (evaluate.py)"
@@ -179,7 +181,7 @@ def _scale_text(config: DictConfig) -> str:
 
 
 def _protocols(runs: Sequence[Run], name: str) -> tuple[dict[str, str], ...]:
-    """Those that metrics.json states, each once; without a run the configuration's name alone."""
+    """List the protocols that runs state, each once; without a run the configuration's name."""
     stated: list[dict[str, str]] = []
     for run in runs:
         keys = [key for key in run.results if key.startswith("protocol/")]
@@ -190,7 +192,7 @@ def _protocols(runs: Sequence[Run], name: str) -> tuple[dict[str, str], ...]:
 
 
 def _baselines(sets: dict[str, str], runs: Sequence[Run]) -> dict[str, dict[str, Number]]:
-    """Per test set of ours: the same in every run that was tested on it."""
+    """Find the baselines of each test set, the same in every run that was tested on it."""
     found: dict[str, dict[str, Number]] = {}
     for name in dict.fromkeys(sets.values()):
         for run in runs:
@@ -208,10 +210,10 @@ def _folders(run: Run) -> str:
 def _untested(
     sets: dict[str, str], config: DictConfig, rows: Sequence[FilledRow]
 ) -> tuple[str, ...]:
-    """Test sets of the paper that the sweep names, that have no path, and no numbers in any row."""
+    """Find the paper's test sets that the sweep names but has no path of, and no row numbers of."""
     measured = {key.partition("/")[0] for row in rows for key in row.values}
     data = OmegaConf.to_container(config.data, resolve=True)
-    if "root" not in data:  # made-up data, which tests none on disk
+    if "root" not in data:  # synthetic data, which tests none on disk
         return ()
     lacking = [name for name, how in data["test_sets"].items() if how.get("root", "") is None]
     return tuple(key for key, ours in sets.items() if ours in lacking and key not in measured)

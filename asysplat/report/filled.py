@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import spearmanr
 
-from asysplat.report.paper import Column, Row, Table
+from asysplat.report.paper import Column, PaperRow, PaperTable
 
 Number = int | float
 # Keyed as in metrics.json without "cost/": parameters, geometry_share, gflops (as the paper
 # counts), gflops_true, gaussians, activation_gb.
 Costs = dict[str, Number]
 
-# Columns that need no run: they stand among the costs, at the paper's scale.
+# Columns that need no run: they are shown among the costs, at the paper's scale.
 COMPUTED = ("parameters", "gflops", "gaussians")
 
 # Below this, rows may differ by the luck of their seeds: one table in twenty of six equal rows and
@@ -30,17 +30,17 @@ class FilledRow:
     """One method with what we measured of it.
 
     Args:
-        row: the paper's.
+        paper: the row as the paper has it.
         costs: at the paper's scale; None where not asked for, and for quoted rows.
-        reading_costs: one for each of `row.readings`, or empty where not asked for.
-        values: column key -> measured numbers, one a seed; a column without any was not run.
-        seeds: those measured.
+        reading_costs: one for each of `paper.readings`, or empty where not asked for.
+        values: column key -> measured numbers, one for each seed; a column without any was not run.
+        seeds: that were measured.
         revisions: of the code that measured them, see `asysplat.training.revision`.
-        missing: those still to be run.
+        missing: seeds still to be run.
         note: what a reader should know of this row, such as "needs evaluate.py".
     """
 
-    row: Row
+    paper: PaperRow
     costs: Costs | None = None
     reading_costs: tuple[Costs, ...] = ()
     values: dict[str, list[Number]] = field(default_factory=dict)
@@ -51,7 +51,7 @@ class FilledRow:
 
     @property
     def name(self) -> str:
-        return self.row.name + (" †" if self.row.unverified else "")
+        return self.paper.name + (" †" if self.paper.unverified else "")
 
 
 @dataclass(frozen=True)
@@ -59,20 +59,20 @@ class FilledTable:
     """One table of the paper with our rows beside it.
 
     Args:
-        table: the paper's.
+        paper: the table as the paper has it.
         rows: in the paper's order.
         scale: of our runs, such as "laptop: 8 views of 64x64, 240 steps".
         command: what made our numbers.
         sets: the paper's test set -> ours whose numbers stand beside it.
-        protocols: that our metrics follow: "name", and a sentence a metric where runs state them;
-            several where runs differ.
-        baselines: our test set -> what one gets for nothing -> PSNR.
-        machine: that ours were measured on.
-        folders: that the data of our runs lay in, by name.
-        untested: the paper's test sets that no run was given a path of.
+        protocols: those our metrics follow: "name", and a sentence for each metric that the runs
+            state; several where runs differ.
+        baselines: our test set -> baseline without a network -> PSNR.
+        machine: the one that ours were measured on.
+        folders: names of those that held the data of our runs.
+        untested: the paper's test sets whose path no run was given.
     """
 
-    table: Table
+    paper: PaperTable
     rows: tuple[FilledRow, ...]
     scale: str
     command: str
@@ -85,34 +85,34 @@ class FilledTable:
 
     @property
     def title(self) -> str:
-        return f"Table {self.table.number}: {self.table.title}"
+        return f"Table {self.paper.number}: {self.paper.title}"
 
     @property
     def networks(self) -> list[FilledRow]:
-        """Rows without post-optimisation, which changes no cost of the network."""
-        return [row for row in self.rows if row.row.post_optimisation == 0]
+        """List the rows without post-optimisation, which changes no cost of the network."""
+        return [row for row in self.rows if row.paper.post_optimisation == 0]
 
     def our_title(self, column: Column) -> str:
-        """Of our numbers in this column: a set that stands for the paper's has its own name."""
+        """Return the title of our numbers: a set that stands for the paper's has its own name."""
         ours = self.sets.get(column.test_set, column.test_set)
         return column.title if ours == column.test_set else column.title_of(ours)
 
     @property
     def measured_columns(self) -> list[Column]:
-        """Those that need a run."""
-        return [column for column in self.table.columns if column.key not in COMPUTED]
+        """List the columns that need a run."""
+        return [column for column in self.paper.columns if column.key not in COMPUTED]
 
 
 @dataclass(frozen=True)
 class RankAgreement:
-    """Does our order of the rows follow the paper's?
+    """Whether our order of the rows follows the paper's.
 
     Args:
         rho: Spearman's; None below three rows, and where all rows are equal.
         rows: how many have both numbers.
-        signal: standard deviation between rows over the one that the seeds alone would give to
-            means of as many seeds, the root of the F statistic; about 1 where rows are equal. None
-            without seeds.
+        signal: standard deviation between the rows' means, over the one that such means of equal
+            rows would have by their seeds alone: the root of the F statistic, about 1 where rows
+            are equal. None where every row has a single seed.
     """
 
     rho: float | None
@@ -121,16 +121,16 @@ class RankAgreement:
 
 
 def mean_and_spread(values: Sequence[Number]) -> tuple[float, float | None]:
-    """Mean and sample standard deviation over seeds; None for the latter of a single seed."""
+    """Return mean and sample standard deviation over seeds; None for that of a single seed."""
     spread = float(np.std(values, ddof=1)) if len(values) > 1 else None
     return float(np.mean(values)), spread
 
 
 def rank_agreement(filled: FilledTable, column: str) -> RankAgreement:
-    """Spearman's rho between the paper's numbers and our means in the column of this key."""
-    both = [row for row in filled.rows if column in row.row.paper and row.values.get(column)]
+    """Compare the paper's numbers with our means in the column of this key."""
+    both = [row for row in filled.rows if column in row.paper.numbers and row.values.get(column)]
     ours = np.array([np.mean(row.values[column]) for row in both])
-    paper = np.array([row.row.paper[column] for row in both])
+    paper = np.array([row.paper.numbers[column] for row in both])
     between = float(np.std(ours, ddof=1)) if len(both) > 1 else None
     within = pooled_spread([row.values[column] for row in both])
     signal = None
@@ -141,7 +141,7 @@ def rank_agreement(filled: FilledTable, column: str) -> RankAgreement:
 
 
 def spearman(first: np.ndarray, second: np.ndarray) -> float | None:
-    """Correlation of the ranks, equal values sharing their mean rank.
+    """Return the correlation of the ranks; equal values share their mean rank.
 
     None below three values, and where either side is constant.
     """
@@ -151,7 +151,10 @@ def spearman(first: np.ndarray, second: np.ndarray) -> float | None:
 
 
 def pooled_spread(groups: Sequence[Sequence[Number]]) -> float | None:
-    """Standard deviation within groups, weighted by degrees of freedom; None without any."""
+    """Return the standard deviation within groups; None where each has a single value.
+
+    Groups are weighted by their degrees of freedom.
+    """
     freedom = sum(len(group) - 1 for group in groups)
     if freedom <= 0:
         return None
@@ -159,25 +162,25 @@ def pooled_spread(groups: Sequence[Sequence[Number]]) -> float | None:
     return math.sqrt(squares / freedom)
 
 
-def cost_errors(row: Row, costs: Costs) -> dict[str, float]:
-    """Relative error of each cost that has a limit and that the paper prints."""
-    return {key: costs[key] / row.paper[key] - 1 for key in LIMITS if key in row.paper}
+def cost_errors(row: PaperRow, costs: Costs) -> dict[str, float]:
+    """Return the relative error of each cost that has a limit and that the paper prints."""
+    return {key: costs[key] / row.numbers[key] - 1 for key in LIMITS if key in row.numbers}
 
 
-def fits(row: Row, costs: Costs) -> bool:
-    """Whether every cost is within its limit of the paper's."""
+def fits(row: PaperRow, costs: Costs) -> bool:
+    """Return whether every cost is within its limit of the paper's."""
     return all(abs(error) <= LIMITS[key] for key, error in cost_errors(row, costs).items())
 
 
 def check(filled: FilledRow) -> str:
-    """One word or two on a row's costs: only a row whose layout is known can be "off"."""
-    if filled.row.quoted:
+    """Judge a row's costs in a word; only a row whose architecture is known can be "off"."""
+    if filled.paper.quoted:
         return "quoted"
     if filled.costs is None:
         return "not computed"
-    if not cost_errors(filled.row, filled.costs):
+    if not cost_errors(filled.paper, filled.costs):
         return "not printed"
-    fit = fits(filled.row, filled.costs)
-    if filled.row.unverified:
+    fit = fits(filled.paper, filled.costs)
+    if filled.paper.unverified:
         return "unverified, fits" if fit else "unverified, no fit"
     return "fits" if fit else "off"

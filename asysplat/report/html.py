@@ -1,15 +1,19 @@
 """Filled tables as one HTML page that needs nothing else: no network, no script."""
 
+import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import matplotlib
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
+from asysplat.report.cells import INTRODUCTION, TITLE, make_overview, make_sheet
 from asysplat.report.filled import FilledTable
-from asysplat.report.layout import INTRODUCTION, TITLE, make_overview, make_sheet
 from asysplat.report.plots import make_plots
-from asysplat.report.svg import inline_svg
+from asysplat.report.style import FAINT, INK, OURS, PAPER, STYLE
 
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent),
@@ -20,8 +24,12 @@ TEMPLATES = Environment(
 )
 
 
+# In a page the colours are the page's variables, so that a dark page has light ink.
+VARIABLES = {INK: "--ink", FAINT: "--faint", OURS: "--ours", PAPER: "--paper"}
+
+
 def render_html(tables: Sequence[FilledTable]) -> str:
-    """The page: an overview that links to a section for each table, with its plots inside."""
+    """Write the page: an overview that links to a section for each table, with its plots."""
     sections = [(make_sheet(filled), _plots(filled)) for filled in tables]
     return TEMPLATES.get_template("page.html.jinja").render(
         title=TITLE,
@@ -32,8 +40,26 @@ def render_html(tables: Sequence[FilledTable]) -> str:
 
 
 def _plots(filled: FilledTable) -> list[tuple[str, Markup]]:
-    """Caption and drawing of each plot."""
+    """Draw each plot; return its caption and its SVG."""
     return [
-        (caption, Markup(inline_svg(figure, f"{filled.table.key}-{number}")))
+        (caption, Markup(inline_svg(figure, f"{filled.paper.key}-{number}")))
         for number, (caption, figure) in enumerate(make_plots(filled))
     ]
+
+
+def inline_svg(figure: Figure, salt: str) -> str:
+    """Draw a figure as an `<svg>` element that needs nothing else; `salt` makes its ids unique."""
+    buffer = io.StringIO()
+    with matplotlib.rc_context({**STYLE, "svg.hashsalt": salt}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    # The page declares the name spaces, and sets the font and the size.
+    text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
+    text = re.sub(r'<svg width="[^"]*" height="[^"]*"', "<svg", text)
+    text = re.sub(r"font-family: [^;\"]*;", "", text)
+    text = re.sub(r'<g id="[^"]*"', "<g", text)
+    for colour, variable in VARIABLES.items():
+        text = text.replace(colour, f"var({variable})")
+    return text

@@ -3,13 +3,13 @@
 import re
 from collections.abc import Sequence
 
+from asysplat.report.cells import INTRODUCTION, TITLE, make_overview, make_sheet
 from asysplat.report.filled import FilledTable
-from asysplat.report.layout import INTRODUCTION, TITLE, make_overview, make_sheet
 from asysplat.report.sheet import Cell, Grid, Heading, Note
 
 
 def render_markdown(tables: Sequence[FilledTable]) -> str:
-    """A page: what to know, an overview, and a section for each table."""
+    """Write the page: an introduction, an overview, and a section for each table."""
     parts = [f"# {TITLE}", escape(INTRODUCTION)]
     if len(tables) > 1:
         parts.append(_grid(make_overview(tables)))
@@ -22,7 +22,7 @@ def render_markdown(tables: Sequence[FilledTable]) -> str:
 
 
 def escape(text: str) -> str:
-    """Text that Markdown leaves as it is."""
+    """Escape what Markdown would interpret."""
     return re.sub(r"([\\`*_|<>#~\[\]])", r"\\\1", text)
 
 

@@ -1,4 +1,4 @@
-"""What stands under a table: how both sides were measured, and how far to trust the order."""
+"""The notes of a table: how both sides were measured, and how far to trust the order."""
 
 from asysplat.report.filled import CLEAR_SIGNAL, FilledTable, RankAgreement, rank_agreement
 from asysplat.report.paper import kind_titles, set_titles
@@ -8,9 +8,9 @@ BASELINES = {"mean_colour": "mean colour", "nearest_view": "nearest view, copied
 
 
 def notes(filled: FilledTable) -> list[Note]:
-    """From what is compared to the command that made it."""
+    """Write the notes below a table, from what is compared to the command that made it."""
     lines = [
-        Note("Paper", filled.table.protocol),
+        Note("Paper", filled.paper.protocol),
         Note("Ours", filled.scale),
         Note("Stand-ins", _stand_ins(filled)),
         Note("Not tested", _untested(filled)),
@@ -27,8 +27,8 @@ def notes(filled: FilledTable) -> list[Note]:
 
 
 def protocol_notes(filled: FilledTable) -> list[Note]:
-    """By what protocol ours were measured; of a protocol that runs state, a sentence a metric."""
-    kinds = {column.key.rpartition("/")[-1] for column in filled.table.columns}
+    """Write the notes above a table: the protocol of our metrics, a sentence for each."""
+    kinds = {column.key.rpartition("/")[-1] for column in filled.paper.columns}
     lines = []
     if len(filled.protocols) > 1:
         lines.append(Note("Metrics", "runs of several protocols are mixed, see below"))
@@ -41,10 +41,10 @@ def protocol_notes(filled: FilledTable) -> list[Note]:
 
 
 def rho_text(filled: FilledTable) -> str:
-    """Spearman's rho of the column that the table is ranked by, in a word."""
-    if filled.table.rank_by is None:
+    """Write Spearman's rho of the column that the table is ranked by."""
+    if filled.paper.rank_by is None:
         return "-"
-    agreement = rank_agreement(filled, filled.table.rank_by)
+    agreement = rank_agreement(filled, filled.paper.rank_by)
     if agreement.rho is None:
         return "-"
     doubt = "?" if agreement.signal is None or agreement.signal < CLEAR_SIGNAL else ""
@@ -68,7 +68,7 @@ def _folders(filled: FilledTable) -> str:
 
 
 def _revisions(filled: FilledTable) -> str:
-    """Of the code; which rows are of which, where there are several."""
+    """Name the revision of the code; where there are several, the rows of each."""
     rows: dict[str, list[str]] = {}
     for row in filled.rows:
         for revision in row.revisions:
@@ -80,7 +80,7 @@ def _revisions(filled: FilledTable) -> str:
 
 
 def _baselines(filled: FilledTable) -> str:
-    """What every PSNR is to be read beside."""
+    """Write the PSNR of baselines without a network, to read every other beside."""
     sets = []
     for name, entry in filled.baselines.items():
         numbers = [f"{BASELINES.get(key, key)} {psnr:.2f} dB" for key, psnr in entry.items()]
@@ -98,10 +98,10 @@ def _seeds(filled: FilledTable) -> str:
 
 
 def _order(filled: FilledTable) -> str:
-    if filled.table.rank_by is None:
+    if filled.paper.rank_by is None:
         return ""
-    agreement = rank_agreement(filled, filled.table.rank_by)
-    column = next(c for c in filled.table.columns if c.key == filled.table.rank_by)
+    agreement = rank_agreement(filled, filled.paper.rank_by)
+    column = next(c for c in filled.paper.columns if c.key == filled.paper.rank_by)
     ours = filled.our_title(column)
     if agreement.rho is None:
         return f"cannot be compared by {ours}: rows with both numbers: {agreement.rows}"
@@ -123,15 +123,17 @@ def _trust(agreement: RankAgreement) -> str:
 
 
 def _remarks(filled: FilledTable) -> list[Note]:
-    """What is special of single rows; rows with the same remark share a line."""
+    """Write remarks on single rows; rows with the same remark share a line."""
     names: dict[str, list[str]] = {}
     for row in filled.rows:
-        if row.row.quoted:
+        if row.paper.quoted:
             names.setdefault("quoted", []).append(row.name)
         elif row.note:
             names.setdefault(row.note, []).append(row.name)
     shared = [Note(note[0].upper() + note[1:], "; ".join(rows)) for note, rows in names.items()]
     open_layouts = [
-        Note(f"† {row.row.name}", row.row.unverified) for row in filled.rows if row.row.unverified
+        Note(f"† {row.paper.name}", row.paper.unverified)
+        for row in filled.rows
+        if row.paper.unverified
     ]
     return shared + open_layouts

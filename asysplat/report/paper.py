@@ -33,26 +33,26 @@ class Column:
 
     @property
     def test_set(self) -> str:
-        """Its key; "" where the number is of none."""
+        """Return the key of its test set; "" where the number belongs to none."""
         return self.key.rpartition("/")[0]
 
     @property
     def title(self) -> str:
-        """As the paper prints it."""
+        """Return the title that the paper prints."""
         return self.title_of(set_titles()[self.test_set]) if self.test_set else self.kind
 
     def title_of(self, test_set: str) -> str:
-        """That of the same kind of number, measured on a set of this name."""
+        """Return the title of the same kind of number, measured on a set of this name."""
         return f"{test_set} {self.kind}"
 
     def text(self, value: float) -> str:
-        """`value`, the paper's or ours, as printed."""
+        """Write a number, the paper's or ours, as the paper prints it."""
         return self.format.format(value / self.unit)
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Another layout that the paper's words allow.
+    """Another architecture that the paper's text allows.
 
     Args:
         name: what it changes.
@@ -64,23 +64,24 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Row:
+class PaperRow:
     """One method of a table.
 
     Args:
         name: as the paper prints it, with what sets it apart from the table's other rows.
-        paper: column key -> the paper's number.
+        numbers: column key -> the paper's number.
         run: overrides of train.py that give it; None for a method that is only quoted.
         views, size: input views, height and width that its costs are computed at.
         bounds: column key -> what the paper prints where it gives only a bound: "<1".
         post_optimisation: steps on the Gaussians; such rows need evaluate.py.
         test_set: of the run, in the place of the stand-in; None for the stand-in.
-        unverified: why the layout of this row is not known to be the paper's; None where it is.
-        readings: the other layouts of an unverified row.
+        unverified: why the architecture of this row is not known to be the paper's; None where it
+            is.
+        readings: the other architectures of an unverified row.
     """
 
     name: str
-    paper: dict[str, float]
+    numbers: dict[str, float]
     run: tuple[str, ...] | None
     views: int
     size: tuple[int, int]
@@ -95,14 +96,14 @@ class Row:
         return self.run is None
 
     def text(self, column: Column) -> str:
-        """What the paper prints in `column`; "" where it prints nothing."""
-        if column.key in self.paper:
-            return column.text(self.paper[column.key])
+        """Return what the paper prints in `column`; "" where it prints nothing."""
+        if column.key in self.numbers:
+            return column.text(self.numbers[column.key])
         return self.bounds.get(column.key, "")
 
 
 @dataclass(frozen=True)
-class Table:
+class PaperTable:
     """One table of the paper, and the sweep of the same key that reproduces it.
 
     Args:
@@ -119,45 +120,45 @@ class Table:
     title: str
     protocol: str
     columns: tuple[Column, ...]
-    rows: tuple[Row, ...] = field(repr=False)
+    rows: tuple[PaperRow, ...] = field(repr=False)
     rank_by: str | None = None
 
     @property
     def test_sets(self) -> list[str]:
-        """Those of its columns, in order."""
+        """List the test sets of its columns, in order."""
         return list(dict.fromkeys(c.test_set for c in self.columns if c.test_set))
 
 
 @cache
-def load_paper() -> dict[str, Table]:
-    """Every table by its key, in the paper's order."""
+def load_paper() -> dict[str, PaperTable]:
+    """Read every table; by key, in the paper's order."""
     return {key: _table(key, entry) for key, entry in _raw()["tables"].items()}
 
 
-def find_tables(names: str | Sequence[str]) -> list[Table]:
-    """The tables called `names`: one, several with commas between, or "all".
+def find_tables(names: str | Sequence[str]) -> list[PaperTable]:
+    """Find the tables called `names`: one, several with commas between, or "all".
 
     Raises:
         InputError: a name that no table has, with the nearest ones.
     """
     tables = load_paper()
-    words = names.split(",") if isinstance(names, str) else list(names)
-    if words == ["all"]:
+    names = names.split(",") if isinstance(names, str) else list(names)
+    if names == ["all"]:
         return list(tables.values())
-    for word in words:
-        if word not in tables:
+    for name in names:
+        if name not in tables:
             raise InputError(
-                f"table={word} is unknown: did you mean {_nearest(word, tables)}? "
+                f"table={name} is unknown: did you mean {_nearest(name, tables)}? "
                 "All tables: table=all."
             )
-    return [tables[word] for word in words]
+    return [tables[name] for name in names]
 
 
-def our_sets(table: Table, data: str, test_sets: Collection[str]) -> dict[str, str]:
-    """Each test set of a table -> the one of ours whose numbers stand beside the paper's.
+def our_sets(table: PaperTable, data: str, test_sets: Collection[str]) -> dict[str, str]:
+    """Map each test set of a table to the one of ours whose numbers stand beside the paper's.
 
-    It is the stand-in that this data has for it; else, for the table's first set where the sweep
-    names no other, the data itself; else the set itself.
+    It is the stand-in that this data has for it. Without one, it is the data itself for the table's
+    first set, if the sweep does not name that set; otherwise it is the set itself.
 
     Args:
         data: the data set of the runs, which is tested as well.
@@ -170,12 +171,12 @@ def our_sets(table: Table, data: str, test_sets: Collection[str]) -> dict[str, s
 
 
 def set_titles() -> dict[str, str]:
-    """The paper's test sets, as it prints them."""
+    """Return the paper's test sets, as it prints them, by key."""
     return _raw()["test_sets"]
 
 
 def kind_titles() -> dict[str, str]:
-    """Kinds of numbers, as printed, by the last part of a column's key."""
+    """Return the kinds of numbers, as printed, by the last part of a column's key."""
     return {kind: entry["title"] for kind, entry in _raw()["columns"].items()}
 
 
@@ -184,12 +185,12 @@ def _raw() -> dict:
     return OmegaConf.to_container(OmegaConf.load(PAPER))
 
 
-def _nearest(word: str, known: Iterable[str]) -> str:
-    return ", ".join(difflib.get_close_matches(word, known, n=3, cutoff=0.3) or known)
+def _nearest(name: str, known: Iterable[str]) -> str:
+    return ", ".join(difflib.get_close_matches(name, known, n=3, cutoff=0.3) or known)
 
 
-def _table(key: str, entry: dict) -> Table:
-    return Table(
+def _table(key: str, entry: dict) -> PaperTable:
+    return PaperTable(
         key,
         str(entry["number"]),
         entry["title"],
@@ -201,18 +202,18 @@ def _table(key: str, entry: dict) -> Table:
 
 
 def _column(key: str) -> Column:
-    """What its kind, the last part of its key, says of it."""
+    """Make a column from its key, whose last part is the kind of its numbers."""
     entry = _raw()["columns"][key.rpartition("/")[-1]]
     unit = float(entry.get("unit", 1))
     return Column(key, entry["title"], entry.get("better"), entry["format"], unit)
 
 
-def _row(row: dict, table: dict) -> Row:
-    """A row's views and size are its table's unless it names its own."""
+def _row(row: dict, table: dict) -> PaperRow:
+    """Make a row; its views and size are its table's unless it names its own."""
     printed = dict(zip(table["columns"], row["paper"], strict=True))
-    return Row(
+    return PaperRow(
         name=row["name"],
-        paper={k: float(v) for k, v in printed.items() if isinstance(v, int | float)},
+        numbers={k: float(v) for k, v in printed.items() if isinstance(v, int | float)},
         run=tuple(row["run"]) if "run" in row else None,
         views=row.get("views", table["views"]),
         size=tuple(row.get("size", table["size"])),

@@ -7,36 +7,41 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from asysplat.report.filled import FilledRow, FilledTable, Number, mean_and_spread
-from asysplat.report.layout import ARROWS
+from asysplat.report.cells import ARROWS
+from asysplat.report.filled import COMPUTED, FilledRow, FilledTable, Number, mean_and_spread
 from asysplat.report.paper import Column
-from asysplat.report.pareto import pareto_plot
-from asysplat.report.svg import FAINT, OURS, PAPER, STYLE
+from asysplat.report.style import FAINT, INK, OURS, PAPER, STYLE
 
 # Tables in which one quantity varies: what the first number in a row's name is.
 RATIOS = {
     "geometry_ratio": "parameters in the geometry branch (%)",
     "mamba_ratio": "Mamba layers among the 8 of a stage",
 }
+# The first of these that a table has is what its rows are compared by.
+COSTS = ("gflops", "inference_seconds", "parameters")
+# The dearest row over the cheapest: below it, cost does not tell rows apart.
+LEAST_RANGE = 1.1
+
+Point = tuple[str, float, float]
 
 
 def make_plots(filled: FilledTable) -> list[tuple[str, Figure]]:
-    """Caption and figure of each plot that says more than the table; none below two rows that ran.
+    """Plot what the table does not show; return caption and figure of each plot.
 
     Lines for a table of one ratio; for others a dot for each seed, and quality against cost where
-    the rows' costs differ.
+    the rows' costs differ. There is no plot below two rows that ran.
     """
-    ranked = [column for column in filled.table.columns if column.key == filled.table.rank_by]
+    ranked = [column for column in filled.paper.columns if column.key == filled.paper.rank_by]
     if not ranked or sum(ranked[0].key in row.values for row in filled.rows) < 2:
         return []
     with matplotlib.rc_context(STYLE):
-        if filled.table.key in RATIOS:
+        if filled.paper.key in RATIOS:
             return [_ratio_plot(filled)]
-        return [_seed_plot(filled, ranked[0]), *pareto_plot(filled, ranked[0])]
+        return [_seed_plot(filled, ranked[0]), *_pareto_plot(filled, ranked[0])]
 
 
 def _seed_plot(filled: FilledTable, column: Column) -> tuple[str, Figure]:
-    """A line of the plot for each row of the table, a dot for each seed, a bar at the mean."""
+    """Plot a line for each row of the table: a dot for each seed, a bar at the mean."""
     rows = filled.rows
     figure = Figure(figsize=(9, 1.1 + 0.32 * len(rows)), layout="constrained")
     ours, paper = figure.subplots(1, 2, sharey=True)
@@ -46,9 +51,9 @@ def _seed_plot(filled: FilledTable, column: Column) -> tuple[str, Figure]:
         if values:
             ours.plot(mean_and_spread(values)[0], place, "|", color=OURS, ms=16, mew=2.5)
         else:
-            _say(ours, place, "quoted" if row.row.quoted else "not run")
-        if column.key in row.row.paper:
-            paper.plot(row.row.paper[column.key], place, "|", color=PAPER, ms=16, mew=2.5)
+            _say(ours, place, "quoted" if row.paper.quoted else "not run")
+        if column.key in row.paper.numbers:
+            paper.plot(row.paper.numbers[column.key], place, "|", color=PAPER, ms=16, mew=2.5)
     ours.set_yticks(range(len(rows)), [row.name for row in rows])
     ours.set_ylim(len(rows) - 0.5, -0.5)
     labels = {"ours": filled.our_title(column), "paper": column.title}
@@ -66,14 +71,16 @@ def _say(axes: Axes, place: int, text: str) -> None:
 
 
 def _ratio_plot(filled: FilledTable) -> tuple[str, Figure]:
-    """A line for each test set, in its first metric."""
+    """Plot a line for each test set, in its first metric."""
     columns = _first_metrics(filled)
     figure = Figure(figsize=(9, 0.6 + 2.2 * len(columns)), layout="constrained")
     grid = figure.subplots(len(columns), 2, squeeze=False, sharex=True)
     for (ours, paper), column in zip(grid, columns, strict=True):
         _our_line(ours, filled.rows, column)
         points = {
-            _ratio(r): r.row.paper[column.key] for r in filled.rows if column.key in r.row.paper
+            _ratio(r): r.paper.numbers[column.key]
+            for r in filled.rows
+            if column.key in r.paper.numbers
         }
         paper.plot(points.keys(), points.values(), "o-", color=PAPER)
         ours.set_ylabel(filled.our_title(column) + ARROWS[column.better])
@@ -81,7 +88,7 @@ def _ratio_plot(filled: FilledTable) -> tuple[str, Figure]:
     grid[0, 0].set_title("ours")
     grid[0, 1].set_title("paper")
     for axes in grid[-1]:
-        axes.set_xlabel(RATIOS[filled.table.key])
+        axes.set_xlabel(RATIOS[filled.paper.key])
         axes.set_xticks([_ratio(row) for row in filled.rows])
     return (
         "Against the ratio: pale dots are seeds, the line joins the means ± their spread.",
@@ -105,13 +112,100 @@ def _dots(axes: Axes, x: Sequence[Number], y: Sequence[Number], colour: str) -> 
 
 
 def _first_metrics(filled: FilledTable) -> list[Column]:
-    """The first column of each test set."""
+    """Find the first column of each test set."""
     first: dict[str, Column] = {}
-    for column in filled.table.columns:
+    for column in filled.paper.columns:
         if column.test_set:
             first.setdefault(column.test_set, column)
     return list(first.values())
 
 
 def _ratio(row: FilledRow) -> int:
-    return int(re.search(r"\d+", row.row.name)[0])
+    return int(re.search(r"\d+", row.paper.name)[0])
+
+
+def pareto_front(points: Sequence[Point], better: str) -> list[Point]:
+    """Find the points (name, cost, quality) that no other equals or beats in both.
+
+    The cheapest is first.
+    """
+    sign = 1 if better == "higher" else -1
+    front: list[Point] = []
+    for point in sorted(points, key=lambda point: (point[1], -sign * point[2])):
+        if not front or sign * point[2] > sign * front[-1][2]:
+            front.append(point)
+    return front
+
+
+def _pareto_plot(filled: FilledTable, quality: Column) -> list[tuple[str, Figure]]:
+    """Plot quality against cost; nothing below three rows, or where they cost the same."""
+    costs = {column.key: column for column in filled.paper.columns if column.key in COSTS}
+    if not costs:
+        return []
+    cost = costs[next(key for key in COSTS if key in costs)]
+    ours = [point for row in filled.rows if (point := _our_point(row, cost, quality))]
+    paper = [
+        point for row in filled.rows if (point := _point(row, row.paper.numbers, cost, quality))
+    ]
+    if len(ours) < 3 or _range(ours) < LEAST_RANGE:
+        return []
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _draw_front(left, ours, quality.better, OURS)
+    _draw_front(right, paper, quality.better, PAPER)
+    for axes, title, label in (
+        (left, "ours", filled.our_title(quality)),
+        (right, "paper", quality.title),
+    ):
+        axes.set(title=title, xlabel=cost.title, ylabel=label + ARROWS[quality.better])
+    caption = f"{quality.kind} against {cost.title}: no row beats those on the line in both."
+    return [(caption, figure)]
+
+
+def _our_point(row: FilledRow, cost: Column, quality: Column) -> Point | None:
+    """Find our point of a row: its network's cost at the paper's scale, or a measured one."""
+    numbers = {key: mean_and_spread(values)[0] for key, values in row.values.items() if values}
+    numbers |= {key: number for key, number in (row.costs or {}).items() if key in COMPUTED}
+    return _point(row, numbers, cost, quality)
+
+
+def _point(
+    row: FilledRow, numbers: dict[str, Number], cost: Column, quality: Column
+) -> Point | None:
+    if cost.key not in numbers or quality.key not in numbers:
+        return None
+    return row.name, numbers[cost.key] / cost.unit, float(numbers[quality.key])
+
+
+def _range(points: Sequence[Point]) -> float:
+    costs = [cost for _, cost, _ in points]
+    return max(costs) / min(costs)
+
+
+def _draw_front(axes: Axes, points: Sequence[Point], better: str, colour: str) -> None:
+    front = pareto_front(points, better)
+    axes.plot([p[1] for p in front], [p[2] for p in front], "o-", color=colour, ms=7)
+    rest = [point for point in points if point not in front]
+    axes.plot([p[1] for p in rest], [p[2] for p in rest], "o", color=FAINT, ms=6, alpha=0.7)
+    for point in rest:
+        _label(axes, point, FAINT, "center", "top")
+    for point in front:
+        _label(axes, point, INK, "left" if point == front[-1] else "right", "bottom")
+    axes.margins(x=0.2, y=0.18)
+    axes.locator_params(nbins=5)
+
+
+def _label(axes: Axes, point: Point, colour: str, ha: str, va: str) -> None:
+    """Write a name above the front and away from its end, so that neighbours stay apart."""
+    name, cost, quality = point
+    offset = (0, 6 if va == "bottom" else -6)
+    axes.annotate(
+        name,
+        (cost, quality),
+        offset,
+        textcoords="offset points",
+        ha=ha,
+        va=va,
+        color=colour,
+        fontsize=9,
+    )

@@ -1,4 +1,4 @@
-"""What a reader sees of a table, before it is known where: cells of text, and notes."""
+"""The one model of a printed table, for all writers: grids of cells, and notes."""
 
 import re
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Cell:
-    """Text; `look` is best, muted, alarm or nothing; `link` the anchor of another part."""
+    """A text; `look` is best, muted, alarm or nothing; `link` the anchor of another part."""
 
     text: str
     look: str = ""
@@ -30,7 +30,7 @@ class Grid:
     rows: tuple[tuple[Cell, ...], ...]
 
     def groups(self) -> list[tuple[str, list[int]]]:
-        """Neighbouring columns under one title: the title and their numbers."""
+        """Group neighbouring columns by title: each title and the numbers of its columns."""
         found: list[tuple[str, list[int]]] = []
         for number, heading in enumerate(self.headings):
             if heading.part and found and found[-1][0] == heading.title:
@@ -64,5 +64,5 @@ class Sheet:
 
 
 def anchor(title: str) -> str:
-    """As GitHub makes it from a heading, so that one link serves Markdown and HTML."""
+    """Make the anchor that GitHub gives a heading, so that a link serves Markdown and HTML."""
     return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")

@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from asysplat.report.cells import make_overview, make_sheet
 from asysplat.report.filled import FilledTable
-from asysplat.report.layout import make_overview, make_sheet
 from asysplat.report.sheet import Cell, Grid, Heading, Note
 
 STYLES = {"": "", "best": "bold green", "muted": "dim", "alarm": "bold red"}
@@ -18,7 +18,7 @@ BORDER = 3
 
 
 def render_terminal(tables: Sequence[FilledTable], console: Console) -> None:
-    """The tables one after the other, the overview last, where it is seen."""
+    """Print the tables one after the other, the overview last, where it is seen."""
     for sheet in map(make_sheet, tables):
         console.print(Text(sheet.title, style="bold underline"))
         _print_notes(sheet.above, console)
@@ -36,7 +36,7 @@ def _print_notes(notes: Sequence[Note], console: Console) -> None:
 
 
 def _print_grid(grid: Grid, console: Console) -> None:
-    """A grid wider than the console goes on below, with the names of its rows again."""
+    """Print a grid; one wider than the console goes on below, with the names of its rows again."""
     console.print(Text(grid.caption, style="italic"))
     # Names wrap; what is measured of a row never does.
     widths = [_width(grid, number) for number in range(len(grid.headings))]
@@ -53,7 +53,7 @@ def _print_grid(grid: Grid, console: Console) -> None:
 
 
 def _blocks(grid: Grid, widths: list[int], total: int) -> list[list[int]]:
-    """Columns of each block, less the names: what stands under one title is kept together."""
+    """Split the columns besides the names into blocks; those of one title stay together."""
     blocks: list[list[int]] = [[]]
     for _, columns in grid.groups()[1:]:
         shown = [0, *blocks[-1], *columns]
@@ -69,7 +69,7 @@ def _width(grid: Grid, number: int) -> int:
 
 
 def _title(heading: Heading) -> list[str]:
-    """A line for each word."""
+    """Split a heading into a line for each word."""
     return [word for word in (*heading.title.split(" "), heading.part) if word]
 
 

@@ -7,13 +7,12 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from asysplat.benchmark.data.measure import FIRST, LATER, NO_CACHE
 from asysplat.benchmark.data.photographs import write_photographs
-from asysplat.benchmark.data.tables import tables
+from asysplat.benchmark.data.suite import CACHES, tables
 from asysplat.data import open_scene
 from asysplat.data.images import content_hash
 
-WORDS = {"scale": "laptop", "width": 0.125, "state_size": 8}
+OVERRIDES = {"scale": "laptop", "width": 0.125, "state_size": 8}
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +24,13 @@ def run(repository, tmp_path_factory):
         script = runpy.run_path(str(repository / "benchmark.py"))
         with initialize_config_dir(str(repository / "conf"), version_base=None):
             options = compose("benchmark", ["suite=data", "repeats=2", "device=cpu"])
-            OmegaConf.set_struct(options, False)  # the words are the user's
-            small = {"frames": 24, "photographs": [36, 64], "words": WORDS, "workers": 0}
+            OmegaConf.set_struct(options, False)  # the overrides are the user's
+            small = {
+                "frames": 24,
+                "photographs": [36, 64],
+                "overrides": OVERRIDES,
+                "num_workers": 0,
+            }
             changes = {"data": small | changes, "output": str(folder)}
             script["benchmark"](OmegaConf.merge(options, changes))
         assert (folder / "data.png").stat().st_size > 0
@@ -40,7 +44,7 @@ def test_rows_are_complete_and_consistent(run):
     assert results["scene"]["frames"] == 24
     assert results["scene"]["photographs"] == [36, 64]
     assert results["open"]["median"] > 0
-    assert [row["cache"] for row in results["loading"]] == [NO_CACHE, FIRST, LATER]
+    assert [row["cache"] for row in results["loading"]] == list(CACHES)
     taken = results["network"]["median"]
     for row in results["loading"]:
         assert row["over_network"] == pytest.approx(row["frames_per_second"]["median"] / taken)
@@ -54,7 +58,7 @@ def test_a_scene_of_the_user_s_is_left_as_it_was(run, tmp_path):
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == files
 
 
-def test_made_up_photographs_are_different_files_of_one_walk(tmp_path):
+def test_synthetic_photographs_are_different_files_of_one_walk(tmp_path):
     write_photographs(tmp_path, 20, 36, 64)
     scene = open_scene(tmp_path, 36, 64).scene
     assert len({content_hash(photograph.image) for photograph in scene.photographs}) == 20

@@ -9,16 +9,16 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from asysplat.benchmark.model import task as tasks
+from asysplat.benchmark.model import workload as workloads
 from asysplat.benchmark.model.components import COMPONENTS, OPERATORS, OTHERS, record_products
-from asysplat.benchmark.model.tables import NETWORKS, tables
-from asysplat.benchmark.model.task import Task, make_net, make_views
+from asysplat.benchmark.model.suite import NETWORKS, tables
+from asysplat.benchmark.model.workload import Workload, make_net, make_views
 from asysplat.errors import InputError
 from asysplat.evaluation.cost import true_flops
 from asysplat.evaluation.static_cost import blank_views
 
 CPU = torch.device("cpu")
-WORDS = {"scale": "laptop", "width": 0.125, "state_size": 8}
+OVERRIDES = {"scale": "laptop", "width": 0.125, "state_size": 8}
 NAMES, VIEWS = ["asysplat_4m4t", "asysplat_4m4s"], [4, 8]
 ATTENTION = dict(zip(NAMES, ("full attention", "sparse attention"), strict=True))
 
@@ -38,8 +38,8 @@ def run_suite(conf, repository, tmp_path_factory):
         folder = tmp_path_factory.mktemp("benchmark")
         script = runpy.run_path(str(repository / "benchmark.py"))
         options = compose("benchmark", ["suite=model", "repeats=2", "device=cpu"])
-        OmegaConf.set_struct(options, False)  # the words are the user's
-        tiny = {"words": WORDS, "precisions": ["fp32"], **model}
+        OmegaConf.set_struct(options, False)  # the overrides are the user's
+        tiny = {"overrides": OVERRIDES, "precisions": ["fp32"], **model}
         script["benchmark"](OmegaConf.merge(options, {"model": tiny, "output": str(folder)}))
         return json.loads((folder / "model.json").read_text()), folder
 
@@ -55,10 +55,10 @@ def measured(run_suite):
 
 
 @pytest.fixture
-def task(conf):
+def workload(conf):
     """A network and two views."""
-    net, _ = make_net("asysplat_4m4s", WORDS, CPU)
-    return Task("asysplat_4m4s", net, "bf16", torch.bfloat16, make_views(2, 32, 64, CPU))
+    net, _ = make_net("asysplat_4m4s", OVERRIDES, CPU)
+    return Workload("asysplat_4m4s", net, "bf16", torch.bfloat16, make_views(2, 32, 64, CPU))
 
 
 def test_rows_are_complete_and_consistent(measured):
@@ -116,15 +116,15 @@ def test_products_add_up_to_what_torch_counts(measured, conf):
         listed = sum(entry["count"] * entry["gflops"] for entry in row["products"])
         assert listed == pytest.approx(row["gflops"])
         assert all(math.isfinite(entry["seconds"]) for entry in row["products"])
-        net, size = make_net(name, WORDS, torch.device("meta"))
+        net, size = make_net(name, OVERRIDES, torch.device("meta"))
         with torch.device("meta"), torch.no_grad():
             inputs = blank_views(views, size["height"], size["width"])
             counted = true_flops(lambda net=net, inputs=inputs: net(inputs))
         assert row["gflops"] == pytest.approx(counted / 1e9, rel=0.01)
 
 
-def test_products_have_the_precision_and_the_component_they_run_in(task):
-    counts = record_products(task)
+def test_products_have_the_precision_and_the_component_they_run_in(workload):
+    counts = record_products(workload)
     assert counts.keys() == {*COMPONENTS, OTHERS} - {"full attention"}
     layers = [p for name, part in counts.items() if name != OTHERS for p in part]
     linears = [p for p in layers if p.function is torch.ops.aten.mm.default]
@@ -133,22 +133,22 @@ def test_products_have_the_precision_and_the_component_they_run_in(task):
     assert convolutions == {"Mamba2", "MambaVision", "sparse attention", OTHERS}
 
 
-def test_hooks_and_gradients_are_taken_away_again(task):
-    record_products(task)
-    task.step()
-    assert not any(m._forward_hooks or m._forward_pre_hooks for m in task.net.modules())
-    assert all(parameter.grad is None for parameter in task.net.parameters())
-    assert not task.forward().means.requires_grad
+def test_hooks_and_gradients_are_taken_away_again(workload):
+    record_products(workload)
+    workload.step()
+    assert not any(m._forward_hooks or m._forward_pre_hooks for m in workload.net.modules())
+    assert all(parameter.grad is None for parameter in workload.net.parameters())
+    assert not workload.forward().means.requires_grad
 
 
-def test_a_step_that_does_not_fit_is_left_out(task, monkeypatch):
-    assert task.step_fits and task.step_gb > 0
-    monkeypatch.setattr(tasks, "_memory_gb", lambda device: task.step_gb / 2)
-    assert not task.step_fits
+def test_a_step_that_does_not_fit_is_left_out(workload, monkeypatch):
+    assert workload.step_fits and workload.step_gb > 0
+    monkeypatch.setattr(workloads, "_memory_gb", lambda device: workload.step_gb / 2)
+    assert not workload.step_fits
 
 
-def test_unknown_words_are_named(conf):
+def test_unknown_overrides_are_named(conf):
     with pytest.raises(InputError, match=r"^model=asysplat_4m4x is unknown: .*asysplat_4m4"):
-        make_net("asysplat_4m4x", WORDS, CPU)
+        make_net("asysplat_4m4x", OVERRIDES, CPU)
     with pytest.raises(InputError, match=r"^scale=desk is unknown"):
         make_net("asysplat_4m4s", {"scale": "desk"}, CPU)

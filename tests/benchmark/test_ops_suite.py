@@ -9,11 +9,10 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from asysplat.benchmark.choices import PRECISIONS, check_repeats, find_device, find_precisions
-from asysplat.benchmark.ops.cases import SSD, GridAttention, SelectiveScan
-from asysplat.benchmark.ops.measure import PASSES
-from asysplat.benchmark.ops.rows import make_rows
-from asysplat.benchmark.ops.run import Path
+from asysplat.benchmark.ops.cases import SCANS, Case
+from asysplat.benchmark.ops.paths import Path
+from asysplat.benchmark.ops.suite import PASSES, make_rows
+from asysplat.benchmark.options import PRECISIONS, check_repeats, find_device, find_precisions
 from asysplat.benchmark.products import (
     LARGEST,
     Operand,
@@ -28,7 +27,7 @@ CPU = torch.device("cpu")
 BOUNDS = {"fp32": 2e-6, "bf16": 1e-2}
 LENGTH, LOOP_TOKENS = 150, 50
 TINY = {
-    "ssd": {"batch": 1, "length": LENGTH, "heads": 8, "head_width": 16, "state": 8},
+    "ssd": {"batch": 1, "length": LENGTH, "heads": 8, "head_dim": 16, "state": 8},
     "selective_scan": {"batch": 2, "length": LENGTH, "channels": 16, "state": 4},
     "grid_attention": {
         "batch": 1,
@@ -36,7 +35,7 @@ TINY = {
         "height": 4,
         "width": 6,
         "heads": 2,
-        "head_width": 8,
+        "head_dim": 8,
         "grids": [1, 2],
     },
     "loop_tokens": LOOP_TOKENS,
@@ -46,7 +45,6 @@ TINY = {
         "grid_attention": {"views": 1},
     },
 }
-SCANS = ("ssd", "selective_scan")
 ATTENTION = ("grid_attention/1", "grid_attention/2")
 
 
@@ -116,7 +114,7 @@ def test_ratios_are_those_of_the_times(measured):
 
 
 def test_an_error_is_seen():
-    case = SelectiveScan(batch=1, length=5, channels=3, state=2)
+    case = Case("selective_scan", {"batch": 1, "length": 5, "channels": 3, "state": 2})
     path = Path(case, "reference", torch.float32, CPU)
     output, gradients = path.truth()
     wrong = 2 * output, {name: 4 * grad for name, grad in gradients.items()}
@@ -131,10 +129,9 @@ def flops_of(counts):
     return sum(count * product.flops() for product, count in counts.items())
 
 
-CASES = [
-    (SSD(batch=2, length=256, heads=4, head_width=16, state=32), "chunked"),
-    (GridAttention(batch=1, views=3, height=4, width=8, heads=2, head_width=16, grid=2), "sdpa"),
-]
+MAPS = {"batch": 1, "views": 3, "height": 4, "width": 8, "heads": 2, "head_dim": 16, "grid": 2}
+SEQUENCE = {"batch": 2, "length": 256, "heads": 4, "head_dim": 16, "state": 32}
+CASES = [(Case("ssd", SEQUENCE), "chunked"), (Case("grid_attention", MAPS), "sdpa")]
 
 
 @pytest.mark.parametrize("case, path", CASES, ids=lambda value: getattr(value, "name", None))
@@ -142,10 +139,10 @@ def test_products_are_those_of_the_operator(case, path):
     def forward():
         case.run({name: tensor.to("meta") for name, tensor in case.tensors().items()}, path)
 
-    counts = products(case.sizes(), torch.float32, CPU)
+    counts = products(case.products(), torch.float32, CPU)
     # The rest is the recurrence between the chunks.
     assert flops_of(counts) == pytest.approx(true_flops(forward), rel=0.01)
-    both = products(with_gradients(case.sizes()), torch.float32, CPU)
+    both = products(with_gradients(case.products()), torch.float32, CPU)
     assert flops_of(both) == 3 * flops_of(counts)
     assert counts <= both
 
@@ -182,7 +179,7 @@ def test_calls_are_recorded_under_their_label():
     assert product.seconds(3, CPU) > 0
 
 
-def test_unknown_words_are_named():
+def test_unknown_options_are_named():
     with pytest.raises(InputError, match=r"^ops\.precisions=fp8 is unknown: .*fp32, bf16"):
         find_precisions("ops.precisions", ["fp32", "fp8"])
     with pytest.raises(InputError, match=r"^ops\.precisions=None is unknown"):
@@ -196,6 +193,6 @@ def test_unknown_words_are_named():
 
 
 def test_a_wrong_size_is_not_taken_for_a_path_that_is_not_there():
-    case = GridAttention(batch=1, views=1, height=4, width=6, heads=1, head_width=8, grid=0)
+    case = Case("grid_attention", MAPS | {"grid": 0})
     with pytest.raises(InputError, match="grid=0"):
         make_rows(case, case, PRECISIONS, LOOP_TOKENS, CPU)

@@ -6,19 +6,28 @@ import os
 import runpy
 import subprocess
 import sys
-from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 from omegaconf import OmegaConf
 
-from asysplat.benchmark.render.backends import SKIPS, Backend, find_backends
+from asysplat.benchmark.options import find_suite
 from asysplat.benchmark.render.cases import CASES, Case, find_cases
-from asysplat.benchmark.render.run import FIELDS, errors, flips, peak_gb, prepare, run, truth
-from asysplat.benchmark.render.stages import STAGES
+from asysplat.benchmark.render.passes import COUNT, RASTER, SIDE, hot_scene, run_timed
+from asysplat.benchmark.render.run import (
+    FIELDS,
+    SKIPS,
+    Backend,
+    errors,
+    find_backends,
+    flips,
+    peak_gb,
+    prepare,
+    run,
+    truth,
+)
 from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
-from asysplat.benchmark.suites import find_suite
 from asysplat.errors import InputError
 from asysplat.evaluation.cost import CLEAR_PEAK
 from asysplat.rendering import INRIA, Skips
@@ -66,7 +75,9 @@ def test_json_has_every_backend_and_skip(measured):
         assert row["forward"].keys() == row["backward"].keys() == {"median", "iqr"}
         assert row["faster_than_reference"].keys() == {"forward", "backward"}
         if backend == "cpu":
-            assert row["stages"].keys() == set(STAGES)
+            assert set(RASTER.values()) < row["stages"].keys()
+            whole = row["forward"]["median"] + row["backward"]["median"]
+            assert 0 < sum(kernel["median"] for kernel in row["stages"].values()) < 1.5 * whole
             for direction in ("forward", "backward"):
                 raster = row["raster"][direction]
                 floor = row["stats"]["rows"] * raster["hot_row"] / row["threads"]
@@ -84,6 +95,19 @@ def test_a_skip_leaves_the_error_as_it_is(measured):
         assert by_skip["rows"] > by_skip[None]
 
 
+def test_hot_rows_are_all_rows_of_all_tiles():
+    """What the floor is made of: nothing is skipped, and the kernels take nearly all the time."""
+    (backend,) = [backend for backend in find_backends() if backend.name == "cpu"]
+    outputs, seconds = run_timed(backend, Skips(), hot_scene())
+    tiles = (SIDE // outputs.stats["tile_size"]) ** 2
+    assert outputs.stats["visible"] == COUNT and outputs.stats["pairs"] == COUNT * tiles
+    assert outputs.stats["rows"] == COUNT * tiles * outputs.stats["tile_size"]
+    assert outputs.image.min() > 0
+    taken = sum(seconds[kernel] for kernel in RASTER.values())
+    assert taken > 0.5 * sum(seconds.values())
+    assert sum(seconds.values()) < sum(outputs.seconds.values())
+
+
 def test_errors_are_those_of_image_and_gradients():
     scene = random_scene(200, 20, 20)
     exact = truth(scene, INRIA)
@@ -97,7 +121,7 @@ def test_errors_are_those_of_image_and_gradients():
     image = exact.image.clone()
     image[0, 0, 0, 0] += 1
     gradients = (exact.gradients[0] * 1.5, *exact.gradients[1:])
-    other = replace(exact, image=image, gradients=gradients)
+    other = exact._replace(image=image, gradients=gradients)
     wrong = errors(other, exact, none)
     assert wrong["image_max"] == pytest.approx(1) and wrong["image_p99"] == 0
     assert wrong["gradients"] == pytest.approx({name: 0.5 * (name == "means") for name in FIELDS})
@@ -119,9 +143,9 @@ def test_peak_memory_is_the_rise():
     del kept
 
 
-def test_unknown_words_are_named():
+def test_unknown_options_are_named():
     with pytest.raises(
-        InputError, match=r"^suite=rendr is unknown: choose one of render, ops, model, data\.$"
+        InputError, match=r"^suite=rendr is unknown: choose from render, ops, model, data\.$"
     ):
         find_suite("rendr")
     with pytest.raises(InputError, match=r"^scenes=D is unknown: .*A, B, C, 524k, 4M"):

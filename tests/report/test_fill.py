@@ -13,7 +13,7 @@ from asysplat.report.paper import find_tables, load_paper
 from asysplat.training.revision import revision
 from asysplat.training.runs import describe_run, find_run
 
-WORDS = ["steps=7"]
+OVERRIDES = ["steps=7"]
 
 
 @pytest.fixture
@@ -37,13 +37,13 @@ def write_run(folder: Path, config, numbers: dict, seed: int) -> None:
 def test_costs_of_every_row_are_the_papers_or_flagged(compose, table):
     filled = with_costs(fill_table(load_paper()[table], [], compose, {}), compose)
     for row in filled.networks:
-        if row.row.quoted:
+        if row.paper.quoted:
             continue
-        if row.row.unverified:
+        if row.paper.unverified:
             # Both readings are there, and one of them has the paper's costs.
-            assert len(row.reading_costs) == len(row.row.readings) > 0
+            assert len(row.reading_costs) == len(row.paper.readings) > 0
             assert check(row).startswith("unverified")
-            assert any(fits(row.row, costs) for costs in (row.costs, *row.reading_costs))
+            assert any(fits(row.paper, costs) for costs in (row.costs, *row.reading_costs))
         else:
             assert check(row) in ("fits", "not printed")
 
@@ -51,7 +51,7 @@ def test_costs_of_every_row_are_the_papers_or_flagged(compose, table):
 @pytest.fixture
 def logs(compose, tmp_path):
     for seed, psnr in ((0, 20.0), (2, 21.0)):
-        config = compose(["sweeps=layers", "model=asysplat_7m1t", *WORDS])
+        config = compose(["sweeps=layers", "model=asysplat_7m1t", *OVERRIDES])
         numbers = {"test/procedural/psnr": psnr, "baseline/procedural/mean_colour/psnr": 13.0}
         numbers["baseline/procedural/nearest_view/psnr"] = 16.0
         write_run(tmp_path / "a" / str(seed), config, numbers, seed)
@@ -62,8 +62,8 @@ def logs(compose, tmp_path):
 
 def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
     (table,) = find_tables("layers")
-    filled = fill_table(table, WORDS, compose, finished_runs(logs))
-    rows = {row.row.run: row for row in filled.rows}
+    filled = fill_table(table, OVERRIDES, compose, finished_runs(logs))
+    rows = {row.paper.run: row for row in filled.rows}
     row = rows[("model=asysplat_7m1t",)]
     assert row.values["dl3dv/psnr"] == [20.0, 21.0]
     assert row.seeds == (0, 2) and row.missing == (1,)
@@ -118,8 +118,8 @@ def test_a_run_that_was_tested_on_all_sets_comes_first(compose, tmp_path):
     write_run(tmp_path / "b", compose(["sweeps=layers", *DL3DV]), {"test/dl3dv/psnr": 3.0}, 0)
     runs = finished_runs(tmp_path)
 
-    def first_row(key, *words):
-        return fill_table(load_paper()[key], [*DL3DV, *words], compose, runs).rows[0].values
+    def first_row(key, *more):
+        return fill_table(load_paper()[key], [*DL3DV, *more], compose, runs).rows[0].values
 
     assert first_row("geometry_ratio", *paths) == {"dl3dv/psnr": [1.0], "mipnerf360/psnr": [2.0]}
     assert first_row("layers") == {"dl3dv/psnr": [3.0]}
@@ -130,7 +130,7 @@ def test_a_row_of_a_further_test_set_has_its_costs(compose, tmp_path):
     config = compose(["sweeps=more_views"])
     write_run(tmp_path / "run", config, costs | {"test/more_views/psnr": 18.0}, 0)
     filled = fill_table(load_paper()["more_views"], [], compose, finished_runs(tmp_path))
-    ours = [row.values for row in filled.rows if not row.row.quoted]
+    ours = [row.values for row in filled.rows if not row.paper.quoted]
     assert [values["inference_seconds"] for values in ours] == [[0.5], [0.9]]
     assert [values.get("dl3dv/psnr") for values in ours] == [None, [18.0]]
 
@@ -149,7 +149,7 @@ def test_post_optimisation_is_not_run_until_evaluation_adds_it(compose, tmp_path
 
     def ours():
         filled = fill_table(table, [], compose, finished_runs(tmp_path))
-        return {row.row.post_optimisation: row for row in filled.rows if "AsySplat" in row.name}
+        return {row.paper.post_optimisation: row for row in filled.rows if "AsySplat" in row.name}
 
     assert ours()[0].values["dl3dv/psnr"] == [20.0]
     assert not ours()[10].values and "evaluate.py" in ours()[10].note
@@ -160,7 +160,9 @@ def test_post_optimisation_is_not_run_until_evaluation_adds_it(compose, tmp_path
     assert not ours()[3].values
 
 
-@pytest.mark.parametrize("text", ["", '{"run/identity": "1', "[]", '{"test/procedural/psnr": 1}'])
+@pytest.mark.parametrize(
+    "text", ["", '{"run/config_hash": "1', "[]", '{"test/procedural/psnr": 1}']
+)
 def test_half_written_results_are_no_results(compose, tmp_path, text):
     config = compose(["sweeps=layers"])
     write_run(tmp_path / "run", config, {"test/procedural/psnr": 20.0}, 0)

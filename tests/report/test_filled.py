@@ -15,14 +15,14 @@ from asysplat.report.filled import (
     rank_agreement,
     spearman,
 )
-from asysplat.report.paper import Column, Row, Table
+from asysplat.report.paper import Column, PaperRow, PaperTable
 
 PSNR = Column("dl3dv/psnr", "PSNR", "higher", "{:.2f}")
 
 
-def row(name: str = "row", run: tuple[str, ...] | None = ("model=x",), **paper: float) -> Row:
+def row(name: str = "row", run: tuple[str, ...] | None = ("model=x",), **paper: float) -> PaperRow:
     paper = {"dl3dv/psnr" if key == "psnr" else key: value for key, value in paper.items()}
-    return Row(name, paper, run, 32, (256, 256))
+    return PaperRow(name, paper, run, 32, (256, 256))
 
 
 def filled(paper: list[float], ours: list[list[float]]) -> FilledTable:
@@ -30,7 +30,9 @@ def filled(paper: list[float], ours: list[list[float]]) -> FilledTable:
         FilledRow(row(psnr=number), values={"dl3dv/psnr": values} if values else {})
         for number, values in zip(paper, ours, strict=True)
     )
-    table = Table("t", "1", "title", "protocol", (PSNR,), tuple(r.row for r in rows), "dl3dv/psnr")
+    table = PaperTable(
+        "t", "1", "title", "protocol", (PSNR,), tuple(r.paper for r in rows), "dl3dv/psnr"
+    )
     return FilledTable(table, rows, "laptop", "python train.py")
 
 

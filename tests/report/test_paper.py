@@ -5,7 +5,14 @@ import re
 import pytest
 
 from asysplat.errors import InputError
-from asysplat.report.paper import Row, Table, find_tables, load_paper, our_sets, set_titles
+from asysplat.report.paper import (
+    PaperRow,
+    PaperTable,
+    find_tables,
+    load_paper,
+    our_sets,
+    set_titles,
+)
 
 # What the cells before a row's numbers are, where it is more than the name.
 LEADING = {
@@ -63,13 +70,13 @@ def read_number(cell: str, unit: float) -> tuple[str, float] | None:
     return relation or "=", round(float(digits) * SUFFIXES[suffix] * unit, 6)
 
 
-def recorded(row: Row, key: str) -> tuple[str, float] | None:
-    if key in row.paper:
-        return "=", row.paper[key]
+def recorded(row: PaperRow, key: str) -> tuple[str, float] | None:
+    if key in row.numbers:
+        return "=", row.numbers[key]
     return (row.bounds[key][0], float(row.bounds[key][1:])) if key in row.bounds else None
 
 
-def check_row(table: Table, row: Row, cells: list[str]) -> None:
+def check_row(table: PaperTable, row: PaperRow, cells: list[str]) -> None:
     leading = LEADING.get(table.key, ("name",))
     cell = dict(zip(leading, cells, strict=False))
     assert cell["name"] in row.name
@@ -97,7 +104,7 @@ def test_rows_of_a_table_have_their_own_names_and_runs():
         # What tells two rows of one run apart, beside their sizes, is what is tested.
         tested = {(row.run, row.size, row.post_optimisation, row.test_set) for row in ours}
         assert len(tested) == len(ours)
-        assert table.rank_by is None or all(table.rank_by in row.paper for row in table.rows)
+        assert table.rank_by is None or all(table.rank_by in row.numbers for row in table.rows)
 
 
 def test_methods_that_are_only_quoted():

@@ -11,9 +11,8 @@ from rich.console import Console
 from asysplat.report.filled import FilledRow, FilledTable
 from asysplat.report.html import render_html
 from asysplat.report.markdown import escape, render_markdown
-from asysplat.report.paper import Column, Reading, Row, Table
-from asysplat.report.pareto import pareto_front
-from asysplat.report.plots import make_plots
+from asysplat.report.paper import Column, PaperRow, PaperTable, Reading
+from asysplat.report.plots import make_plots, pareto_front
 from asysplat.report.terminal import render_terminal
 
 COLUMNS = (
@@ -24,12 +23,12 @@ COLUMNS = (
 )
 
 
-def make_row(name: str, run: tuple[str, ...] | None = ("model=x",), **numbers) -> Row:
+def make_row(name: str, run: tuple[str, ...] | None = ("model=x",), **numbers) -> PaperRow:
     keys = {"psnr": "dl3dv/psnr", "lpips": "dl3dv/lpips"}
     extra = {key: numbers.pop(key) for key in ("bounds", "unverified") if key in numbers}
     readings = (Reading("without the links", ("model=y",)),) if "unverified" in extra else ()
     paper = {keys.get(key, key): float(value) for key, value in numbers.items()}
-    return Row(name, paper, run, 32, (256, 256), readings=readings, **extra)
+    return PaperRow(name, paper, run, 32, (256, 256), readings=readings, **extra)
 
 
 def costs(parameters: float) -> dict[str, int | float]:
@@ -80,8 +79,8 @@ def table() -> FilledTable:
         ),
         FilledRow(make_row("Later", parameters=95e6, psnr=17.78), costs(95e6), note="not run"),
     )
-    paper = Table(
-        "layers", "6b", "Layers <of> a stage", "32 views", COLUMNS, tuple(r.row for r in rows),
+    paper = PaperTable(
+        "layers", "6b", "Layers <of> a stage", "32 views", COLUMNS, tuple(r.paper for r in rows),
         "dl3dv/psnr",
     )  # fmt: skip
     return FilledTable(
@@ -89,9 +88,9 @@ def table() -> FilledTable:
         rows,
         "laptop: 8 views of 64x64",
         "python train.py sweeps=layers",
-        {"dl3dv": "made_up"},
+        {"dl3dv": "my_rooms"},
         ({"name": "longlrm", "psnr": "mean of *all* images", "absrel": "of depths"},),
-        {"made_up": {"mean_colour": 13.2, "nearest_view": 14.5}},
+        {"my_rooms": {"mean_colour": 13.2, "nearest_view": 14.5}},
         "2 cores",
     )
 
@@ -103,8 +102,8 @@ def ratios(table) -> FilledTable:
         FilledRow(make_row(f"{share}%", psnr=psnr), values=values(*seeds), seeds=(0, 1))
         for share, psnr, *seeds in [(90, 19.2, 21, 22), (80, 19.1, 21, 20), (70, 19.0, 19, 20)]
     )
-    paper = Table(
-        "geometry_ratio", "A3", "Share", "32 views", COLUMNS[2:3], tuple(r.row for r in rows),
+    paper = PaperTable(
+        "geometry_ratio", "A3", "Share", "32 views", COLUMNS[2:3], tuple(r.paper for r in rows),
         "dl3dv/psnr",
     )  # fmt: skip
     return FilledTable(paper, rows, "laptop", "python train.py sweeps=geometry_ratio")
@@ -175,13 +174,13 @@ def test_notes_under_a_table(table):
     for note in (
         "**Paper**: 32 views",
         "**Ours**: laptop: 8 views of 64x64",
-        "**Stand-ins**: DL3DV-140 by our test set made\\_up",
-        "**For nothing**: made\\_up: mean colour 13.20 dB, nearest view, copied 14.50 dB",
+        "**Stand-ins**: DL3DV-140 by our test set my\\_rooms",
+        "**For nothing**: my\\_rooms: mean colour 13.20 dB, nearest view, copied 14.50 dB",
         "**Seeds**: 0, 1, 2: mean ± sample standard deviation over them",
         # Means 22, 20.6, 21.5: 0.71 between rows; sqrt((2 + 0.02) / 3) = 0.82 between seeds,
         # of which there are two a row on average.
-        "Spearman's rho of our made\\_up PSNR with the paper's DL3DV-140 PSNR is 1.00 over 3 rows; "
-        "rows differ 1.2 x as much as seeds alone make them: the order means little",
+        "Spearman's rho of our my\\_rooms PSNR with the paper's DL3DV-140 PSNR is 1.00 over 3 "
+        "rows; rows differ 1.2 x as much as seeds alone make them: the order means little",
         "**Quoted**: Quoted\\|net",
         "**2 of 3 seeds**: Off",
         "**Not run**: Later",
@@ -193,10 +192,12 @@ def test_notes_under_a_table(table):
 
 
 def test_a_number_of_ours_stands_under_the_name_of_our_test_set(table, ratios):
-    """In every writer: ours under made_up, the paper's under DL3DV-140."""
+    """In every writer: ours under my_rooms, the paper's under DL3DV-140."""
     ratios = replace(ratios, sets=table.sets)
     markdown = render_markdown([table])
-    assert "| DL3DV-140 PSNR ↑ paper | made\\_up PSNR ↑ ours |".replace(" ↑", "\u00a0↑") in markdown
+    assert (
+        "| DL3DV-140 PSNR ↑ paper | my\\_rooms PSNR ↑ ours |".replace(" ↑", "\u00a0↑") in markdown
+    )
     terminal = Console(width=300, file=StringIO())
     render_terminal([table], terminal)
     texts = [markdown, terminal.file.getvalue(), *Page(render_html([table])).cells]
@@ -205,19 +206,19 @@ def test_a_number_of_ours_stands_under_the_name_of_our_test_set(table, ratios):
     assert headings == [
         f"{name} {kind}\u00a0{arrow}"
         for kind, arrow in (("PSNR", "↑"), ("LPIPS", "↓"))
-        for name in ("DL3DV-140", "made_up")
+        for name in ("DL3DV-140", "my_rooms")
     ]
     lines = [line for line in texts[1].splitlines() if "DL3DV-140" in line and "│" in line]
-    assert [word for word in lines[0].split() if word in ("DL3DV-140", "made_up")] == [
-        *("DL3DV-140", "made_up"),
-        *("DL3DV-140", "made_up"),
+    assert [word for word in lines[0].split() if word in ("DL3DV-140", "my_rooms")] == [
+        *("DL3DV-140", "my_rooms"),
+        *("DL3DV-140", "my_rooms"),
     ]
     for filled in (table, ratios):
         for caption, figure in make_plots(filled):
             ours, paper = figure.axes
             labels = [f"{axes.get_xlabel()} {axes.get_ylabel()}" for axes in (ours, paper)]
-            assert "made_up PSNR" in labels[0] and "DL3DV-140 PSNR" in labels[1]
-            assert "DL3DV" not in labels[0] + caption and "made_up" not in labels[1]
+            assert "my_rooms PSNR" in labels[0] and "DL3DV-140 PSNR" in labels[1]
+            assert "DL3DV" not in labels[0] + caption and "my_rooms" not in labels[1]
 
 
 def test_a_set_of_the_papers_has_one_heading(table):

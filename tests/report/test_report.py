@@ -4,9 +4,9 @@ import subprocess
 import sys
 
 
-def run(repository, *words):
+def run(repository, *overrides):
     return subprocess.run(
-        [sys.executable, "report.py", *words], cwd=repository, capture_output=True, text=True
+        [sys.executable, "report.py", *overrides], cwd=repository, capture_output=True, text=True
     )
 
 
@@ -20,9 +20,9 @@ def test_writes_markdown_and_a_page(repository, tmp_path):
     assert "18.78" in (tmp_path / "report" / "report.md").read_text()
 
 
-def test_words_of_the_sweeps_reach_the_configuration(repository, tmp_path):
-    words = ["table=layers", "data=dl3dv", "scale=paper", "data.root=/a/DL3DV", f"logs={tmp_path}"]
-    result = run(repository, *words, 'overrides=["steps=7"]')
+def test_overrides_of_the_sweeps_are_in_the_configuration(repository, tmp_path):
+    given = ["table=layers", "data=dl3dv", "scale=paper", "data.root=/a/DL3DV", f"logs={tmp_path}"]
+    result = run(repository, *given, 'overrides=["steps=7"]')
     assert result.returncode == 0, result.stderr
     text = (tmp_path / "report" / "report.md").read_text()
     assert "dl3dv data, 32 input views of 256x256, 7 steps of batch 8" in text

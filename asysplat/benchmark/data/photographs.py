@@ -1,4 +1,4 @@
-"""A scene on disk, made up for the measurement."""
+"""A synthetic scene on disk."""
 
 import json
 from io import BytesIO
@@ -17,18 +17,18 @@ QUALITY = 90  # of the JPEG
 
 
 def write_photographs(folder: Path, frames: int, height: int, width: int) -> None:
-    """A transforms.json and so many JPEG files, no two of the same bytes."""
+    """Write a transforms.json and `frames` JPEG files, no two of the same bytes."""
     scene = ProceduralScene(seed=0, height=RENDERED[0], width=RENDERED[1], num_frames=frames)
     shown = scene.views([number * frames // PICTURES for number in range(PICTURES)]).images
     pictures = [_enlarged(image.permute(1, 2, 0).numpy(), height, width) for image in shown]
     (folder / "images").mkdir(parents=True)
     entries = []
-    # What turns OpenGL's axes into OpenCV's turns them back as well.
+    # The change of axes from OpenGL to OpenCV is its own inverse.
     poses = [opencv_from_opengl(pose) for pose in scene.cameras.cam_to_world.double().numpy()]
     for number in track(range(frames), "photographs", transient=True):
         name = f"images/{number:05d}.jpg"
         stored = BytesIO()
-        # The comment sets files of one picture apart: what is cached is known by its bytes.
+        # The comment gives each file bytes of its own, by which the cache knows it.
         pictures[number % PICTURES].save(
             stored, "JPEG", quality=QUALITY, comment=f"photograph {number}"
         )
@@ -40,7 +40,7 @@ def write_photographs(folder: Path, frames: int, height: int, width: int) -> Non
 
 
 def _enlarged(image: np.ndarray, height: int, width: int) -> Image.Image:
-    """With grain, as photographs have it: flat areas would decode too soon."""
+    """Enlarge an image, and add grain as photographs have it: flat areas would decode too soon."""
     levels = Image.fromarray((image * 255).astype(np.uint8)).resize((width, height))
     grain = np.random.default_rng(0).normal(0, 4, (height, width, 1))
     return Image.fromarray((np.asarray(levels) + grain).clip(0, 255).astype(np.uint8))

@@ -1,20 +1,12 @@
 """What a forward pass is made of: layers by their kind, and the operators within them."""
 
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from importlib import import_module
-from typing import Any
-from unittest import mock
+from types import FrameType
 
-from torch import nn
-
-from asysplat import models
-from asysplat.benchmark.model.task import Task
+from asysplat import models, ops
+from asysplat.benchmark.model.workload import Workload
 from asysplat.benchmark.products import Product, RecordProducts
-from asysplat.benchmark.timing import seconds_of
-from asysplat.evaluation.measured_cost import wait_for
+from asysplat.benchmark.timing import seconds_of, time_calls, watch_calls
 from asysplat.models.tokenizer import Tokenizer
 
 COMPONENTS = {  # none within another
@@ -27,82 +19,34 @@ COMPONENTS = {  # none within another
     "head": (models.GaussianHead,),
 }
 OTHERS = "others"
-OPERATORS = {  # and the layers' module that calls it
-    "ssd": "asysplat.models.mamba2",
-    "selective_scan": "asysplat.models.mamba_vision",
-    "grid_attention": "asysplat.models.attention",
-}
+OPERATORS = ("ssd", "selective_scan", "grid_attention")
 
 
-def component_seconds(task: Task) -> dict[str, float]:
-    """Seconds that one forward pass spends in each of COMPONENTS, in OTHERS, and, once more, in
-    each of OPERATORS."""
-    watch = _Stopwatch(task.device)
-    with _hooked(task.net, watch.start, watch.stop), ExitStack() as stack:
-        for name, module in OPERATORS.items():
-            stack.enter_context(watch.around(name, module))
-        total = seconds_of(task.forward, task.device)
-    watch.seconds[OTHERS] = total - sum(watch.seconds.get(name, 0) for name in COMPONENTS)
-    return watch.seconds
+def _component(frame: FrameType) -> str | None:
+    """Name the component whose forward pass this is; None for a layer within another."""
+    layer = frame.f_locals["self"]
+    found = (name for name, kinds in COMPONENTS.items() if isinstance(layer, kinds))
+    return next(found, None)
 
 
-def record_products(task: Task) -> dict[str, Counter[Product]]:
-    """The products of one forward pass, by component."""
+LAYERS = {kind.forward: _component for kinds in COMPONENTS.values() for kind in kinds}
+
+
+def component_seconds(workload: Workload) -> dict[str, float]:
+    """Time one forward pass in each of COMPONENTS, in OTHERS, and, again, in each of OPERATORS."""
+    operators = {getattr(ops, name): lambda _, name=name: name for name in OPERATORS}
+    with time_calls(LAYERS | operators, workload.device) as seconds:
+        total = seconds_of(workload.forward, workload.device)
+    return seconds | {OTHERS: total - sum(seconds.get(name, 0) for name in COMPONENTS)}
+
+
+def record_products(workload: Workload) -> dict[str, Counter[Product]]:
+    """Count the products of one forward pass, by component."""
     recorder = RecordProducts(OTHERS)
 
-    def enter(name: str) -> None:
+    def label(name: str) -> None:
         recorder.label = name
 
-    def leave(name: str) -> None:
-        recorder.label = OTHERS
-
-    with _hooked(task.net, enter, leave), recorder:
-        task.forward()
+    with watch_calls(LAYERS, label, lambda _: label(OTHERS)), recorder:
+        workload.forward()
     return recorder.counts
-
-
-class _Stopwatch:
-    def __init__(self, device):
-        self.device = device
-        self.started: dict[str, float] = {}
-        self.seconds: dict[str, float] = {}
-
-    def start(self, name: str) -> None:
-        self.started[name] = self._now()
-
-    def stop(self, name: str) -> None:
-        self.seconds[name] = self.seconds.get(name, 0.0) + self._now() - self.started[name]
-
-    def around(self, name: str, module: str) -> Any:
-        """The function of this name replaced by one that is timed."""
-        function = getattr(import_module(module), name)
-
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            self.start(name)
-            output = function(*args, **kwargs)
-            self.stop(name)
-            return output
-
-        return mock.patch(f"{module}.{name}", timed)
-
-    def _now(self) -> float:
-        wait_for(self.device)
-        return time.perf_counter()
-
-
-@contextmanager
-def _hooked(
-    net: nn.Module, before: Callable[[str], None], after: Callable[[str], None]
-) -> Iterator[None]:
-    """`before` and `after` are called with the name of every component that runs."""
-    hooks = []
-    for module in net.modules():
-        for name, kinds in COMPONENTS.items():
-            if isinstance(module, kinds):
-                hooks.append(module.register_forward_pre_hook(lambda *_, name=name: before(name)))
-                hooks.append(module.register_forward_hook(lambda *_, name=name: after(name)))
-    try:
-        yield
-    finally:
-        for hook in hooks:
-            hook.remove()

@@ -1,27 +1,21 @@
 """The scenes that the renderers are timed on, each with one that float64 can afford."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
+from asysplat.benchmark.options import check_names
 from asysplat.benchmark.scenes import on_an_arc, pixel_aligned_scene, random_scene
-from asysplat.errors import InputError
 from asysplat.scene import Cameras, Gaussians
 
 Scene = tuple[Gaussians, Cameras]
 
 
-@dataclass(frozen=True)
-class Case:
-    """
-    Args:
-        make: the scene that is timed.
-        twin: a smaller one of the same make that errors are measured on; None where they are
-            measured on the scene itself.
-    """
+class Case(NamedTuple):
+    """A scene to time."""
 
     make: Callable[[], Scene]
-    twin: Callable[[], Scene] | None = None
+    twin: Callable[[], Scene] | None = None  # a smaller one, if errors are measured on that
 
 
 def _from_views(views: int) -> Scene:
@@ -43,22 +37,20 @@ CASES = {
 
 
 def find_cases(names: str | Sequence[str]) -> dict[str, Case]:
-    """The scenes called `names`: one, several, or "all".
+    """Find the scenes called `names`: one, several, or "all".
 
     Raises:
         InputError: a name that no scene has, or none.
     """
-    words = [names] if isinstance(names, str) else list(names)
-    if words == ["all"]:
+    names = [names] if isinstance(names, str) else list(names)
+    if names == ["all"]:
         return CASES
-    for word in words or [None]:
-        if word not in CASES:
-            raise InputError(f"scenes={word} is unknown: choose some of {', '.join(CASES)} or all.")
-    return {word: CASES[word] for word in words}
+    check_names("scenes", names, [*CASES, "all"])
+    return {name: CASES[name] for name in names}
 
 
 def describe(scene: Scene) -> dict[str, int]:
-    """How large it is."""
+    """Count its Gaussians, views and pixels."""
     gaussians, cameras = scene
     return {
         "gaussians": gaussians.num_gaussians,

@@ -1,56 +1,110 @@
-"""One forward and one backward pass: how long, how much memory, how wrong."""
+"""The renderers that can run on this machine: one forward and one backward pass of each."""
 
-import time
+import importlib.util
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from asysplat.benchmark.render.backends import Backend
 from asysplat.benchmark.render.cases import Scene
-from asysplat.benchmark.timing import rise_gb
-from asysplat.evaluation.measured_cost import wait_for
-from asysplat.rendering import Convention, Skips, render
+from asysplat.benchmark.timing import now, rise_gb
+from asysplat.rendering import GSPLAT_1_5, INRIA, Convention, Skips, render
 from asysplat.scene import Cameras, Gaussians
 
-FLIP = 1e-4  # a difference that rounding alone does not make; a flip makes up to 1/255
+SKIPS = tuple(field.name for field in fields(Skips))
+SKIPS_OF_CUDA = tuple(name for name in SKIPS if name != "rows")
 FIELDS = tuple(field.name for field in fields(Gaussians))
+FLIP = 1e-4  # a difference that rounding alone does not make; a flip makes up to 1/255
+Drawn = tuple[Tensor, dict[str, int]]  # image [V, 3, H, W] without background, and counts
 
 
 @dataclass(frozen=True)
-class Inputs:
-    """
+class Backend:
+    """A renderer.
+
     Args:
-        gaussians: whose gradients are asked for.
-        cameras: on the same device.
-        weights: [V, 3, H, W] the gradient of the image, from a normal distribution.
+        name: as the tables have it.
+        device: where its tensors are.
+        draw: draws a scene without some of its skips.
+        skips: names of those that it can switch off.
+        convention: its cut-offs.
     """
 
-    gaussians: Gaussians
+    name: str
+    device: str
+    draw: Callable[[Gaussians, Cameras, Skips], Drawn]
+    skips: tuple[str, ...] = ()
+    convention: Convention = INRIA
+
+
+class Inputs(NamedTuple):
+    """A scene on the device of a backend."""
+
+    gaussians: Gaussians  # whose gradients are asked for
     cameras: Cameras
-    weights: Tensor
+    weights: Tensor  # [V, 3, H, W] the gradient of the image, from a normal distribution
 
 
-@dataclass(frozen=True)
-class Pass:
-    """
-    Args:
-        image: [V, 3, H, W].
-        gradients: of each of FIELDS.
-        forward, backward: seconds.
-        stats: counts of what was done.
-    """
+class Outputs(NamedTuple):
+    """The results of both passes."""
 
-    image: Tensor
-    gradients: tuple[Tensor, ...]
-    forward: float
-    backward: float
+    image: Tensor  # [V, 3, H, W]
+    gradients: tuple[Tensor, ...]  # of each of FIELDS
+    seconds: dict[str, float]  # of "forward" and "backward"
     stats: dict[str, int]
 
 
+def find_backends() -> list[Backend]:
+    """List the reference, which every table has, then the fast ones that can run here."""
+    found = [
+        Backend("reference", "cpu", partial(_draw, "reference")),
+        Backend("cpu", "cpu", partial(_draw, "cpu"), SKIPS),
+    ]
+    if torch.cuda.is_available():
+        found.append(Backend("cuda", "cuda", partial(_draw, "cuda"), SKIPS_OF_CUDA))
+        if importlib.util.find_spec("gsplat"):
+            found.append(Backend("gsplat", "cuda", _gsplat, convention=GSPLAT_1_5))
+    return found
+
+
+def _draw(
+    backend: str, gaussians: Gaussians, cameras: Cameras, skips: Skips, **options: Convention
+) -> Drawn:
+    out = render(gaussians, cameras, backend=backend, depth=False, skips=skips, **options)
+    return out.image, out.stats
+
+
+def _gsplat(gaussians: Gaussians, cameras: Cameras, skips: Skips) -> Drawn:
+    """Draw with gsplat 1.5 in its faster form, not the packed one; it has no skips to switch."""
+    from gsplat import rasterization
+
+    images, _, meta = rasterization(
+        means=gaussians.means,
+        quats=gaussians.quats,
+        scales=gaussians.scales,
+        opacities=gaussians.opacities,
+        colors=gaussians.sh,
+        viewmats=torch.linalg.inv(cameras.cam_to_world),
+        Ks=cameras.intrinsics,
+        width=cameras.width,
+        height=cameras.height,
+        sh_degree=math.isqrt(gaussians.sh.shape[-2]) - 1,
+        packed=False,
+    )
+    stats = {"pairs": len(meta["flatten_ids"]), "tile_size": meta["tile_size"]}
+    return images.movedim(-1, -3), stats
+
+
 def prepare(scene: Scene, device: str, ignored: Tensor | None = None) -> Inputs:
-    """The same weights at every call, but for 0 at the pixels `ignored`, [V, H, W]."""
+    """Move a scene to a device.
+
+    The weights are the same at every call, but for 0 at the pixels `ignored`, [V, H, W].
+    """
     gaussians, cameras = (part.to(device) for part in scene)
     size = (cameras.num_views, 3, cameras.height, cameras.width)
     weights = torch.randn(size, generator=torch.Generator().manual_seed(1))
@@ -60,42 +114,40 @@ def prepare(scene: Scene, device: str, ignored: Tensor | None = None) -> Inputs:
     return Inputs(leaves, cameras, weights.to(gaussians.means))
 
 
-def run(backend: Backend, skips: Skips, inputs: Inputs) -> Pass:
+def run(backend: Backend, skips: Skips, inputs: Inputs) -> Outputs:
     """Draw, and take the gradients."""
-    fields = [getattr(inputs.gaussians, name) for name in FIELDS]
+    leaves = [getattr(inputs.gaussians, name) for name in FIELDS]
     device = torch.device(backend.device)
-    start = _now(device)
+    start = now(device)
     image, stats = backend.draw(inputs.gaussians, inputs.cameras, skips)
-    middle = _now(device)
-    gradients = torch.autograd.grad(image, fields, inputs.weights)
-    end = _now(device)
-    return Pass(image.detach(), gradients, middle - start, end - middle, stats)
+    middle = now(device)
+    gradients = torch.autograd.grad(image, leaves, inputs.weights)
+    seconds = {"forward": middle - start, "backward": now(device) - middle}
+    return Outputs(image.detach(), gradients, seconds, stats)
 
 
 def peak_gb(backend: Backend, skips: Skips, inputs: Inputs) -> float:
-    """What a pass takes beyond what there was before it, in 1e9 bytes; see `rise_gb`."""
+    """Measure the memory of both passes, see `rise_gb`."""
     return rise_gb(lambda: run(backend, skips, inputs), torch.device(backend.device))
 
 
-def truth(scene: Scene, convention: Convention, ignored: Tensor | None = None) -> Pass:
-    """The scene in float64."""
-
-    def draw(gaussians, cameras, skips):
-        out = render(gaussians, cameras, backend="reference", depth=False, convention=convention)
-        return out.image, out.stats
-
+def truth(scene: Scene, convention: Convention, ignored: Tensor | None = None) -> Outputs:
+    """Draw the scene in float64."""
     exact = tuple(part.to(torch.float64) for part in scene)
-    return run(Backend("truth", "cpu", draw), Skips(), prepare(exact, "cpu", ignored))
+    reference = Backend("truth", "cpu", partial(_draw, "reference", convention=convention))
+    return run(reference, Skips(), prepare(exact, "cpu", ignored))
 
 
-def flips(found: Pass, exact: Pass) -> Tensor:
-    """[V, H, W] pixels at which rounding decided otherwise at a cut-off."""
+def flips(found: Outputs, exact: Outputs) -> Tensor:
+    """Find the pixels [V, H, W] at which rounding decided otherwise at a cut-off."""
     return ((found.image.cpu().double() - exact.image).abs() > FLIP).any(1)
 
 
-def errors(found: Pass, exact: Pass, ignored: Tensor) -> dict[str, float | dict[str, float]]:
-    """Of the image, the largest and the 99th percentile; of each gradient, relative in L2; outside
-    the pixels `ignored`, whose share is given."""
+def errors(found: Outputs, exact: Outputs, ignored: Tensor) -> dict[str, float | dict[str, float]]:
+    """Compare images and gradients outside the pixels `ignored`, whose share is given.
+
+    Of the image, the largest difference and the 99th percentile; of each gradient, the relative L2.
+    """
     wrong = (found.image.cpu().double() - exact.image).abs() * ~ignored[:, None]
     pairs = zip(FIELDS, found.gradients, exact.gradients, strict=True)
     return {
@@ -107,8 +159,3 @@ def errors(found: Pass, exact: Pass, ignored: Tensor) -> dict[str, float | dict[
             for name, grad, true in pairs
         },
     }
-
-
-def _now(device: torch.device) -> float:
-    wait_for(device)
-    return time.perf_counter()

@@ -20,8 +20,9 @@ FILLED = 0.75  # of the memory, at most: a step also needs what it does not keep
 
 
 @dataclass(frozen=True)
-class Task:
-    """
+class Workload:
+    """What is measured: a network, its input and their precision.
+
     Args:
         name: of the model.
         net: with random weights.
@@ -42,18 +43,18 @@ class Task:
 
     @property
     def tokens(self) -> int:
-        """Of the network's largest patch, those that most layers work on."""
+        """Count the tokens of the network's largest patch, those that most layers work on."""
         cameras = self.views.cameras
         return cameras.num_views * cameras.height * cameras.width // self.net.patch**2
 
     def forward(self) -> Gaussians:
-        """As when it reconstructs."""
+        """Reconstruct the scene."""
         self.net.eval()
         with torch.no_grad(), self._autocast(self.device.type):
             return self.net(self.views)
 
     def step(self) -> None:
-        """A training step without its renderer and optimiser: a mean of the outputs is the loss."""
+        """Run a training step without renderer and optimiser: the loss is a mean of the outputs."""
         self.net.train()
         with self._autocast(self.device.type):
             gaussians = self.net(self.views)
@@ -63,7 +64,7 @@ class Task:
 
     @cached_property
     def step_gb(self) -> float:
-        """What a step keeps, about: activations, parameters and their gradients."""
+        """Estimate the memory of a step: activations, parameters and their gradients."""
         cameras = self.views.cameras
         with self._autocast("cpu"):
             kept = activation_gb(self.net, cameras.num_views, cameras.height, cameras.width)
@@ -77,15 +78,17 @@ class Task:
         return torch.autocast(device, self.dtype, enabled=self.dtype != torch.float32)
 
 
-def make_net(name: str, words: Mapping[str, object], device: torch.device) -> tuple[Network, dict]:
-    """The network that train.py would build, and its inputs' sizes: views, height, width.
+def make_net(
+    name: str, overrides: Mapping[str, object], device: torch.device
+) -> tuple[Network, dict[str, int]]:
+    """Build the network that train.py would; return also its inputs' views, height and width.
 
     Raises:
-        InputError: an unknown model, or an unknown choice among the words.
+        InputError: an unknown model, or an unknown choice among the overrides.
     """
-    overrides = [f"model={name}", *(f"{key}={value}" for key, value in words.items())]
-    check_overrides(overrides)
-    config = hydra.compose("train", overrides)
+    command = [f"model={name}", *(f"{key}={value}" for key, value in overrides.items())]
+    check_overrides(command)
+    config = hydra.compose("train", command)
     torch.manual_seed(0)
     with device:
         net = instantiate(config.model)
@@ -94,14 +97,14 @@ def make_net(name: str, words: Mapping[str, object], device: torch.device) -> tu
 
 
 def make_views(views: int, height: int, width: int, device: torch.device) -> Views:
-    """Noise, seen from an arc."""
+    """Make views of noise, from cameras on an arc."""
     _, camera = random_scene(1, height, width)
     images = torch.rand(views, 3, height, width, generator=torch.Generator().manual_seed(0))
     return Views(on_an_arc(camera, views), images).to(device)
 
 
 def _memory_gb(device: torch.device) -> float:
-    """Of the device."""
+    """Return the memory of the device in 1e9 bytes."""
     if device.type == "cuda":
         return torch.cuda.get_device_properties(device).total_memory / GB
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GB

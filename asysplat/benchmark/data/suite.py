@@ -1,0 +1,153 @@
+"""Photographs on disk: how soon a scene opens, and whether loading keeps ahead of training."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from matplotlib.figure import Figure
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from asysplat.benchmark.data.photographs import write_photographs
+from asysplat.benchmark.model.workload import Workload, make_net, make_views
+from asysplat.benchmark.options import check_repeats, find_device
+from asysplat.benchmark.plot import bars
+from asysplat.benchmark.table import make_table, measured_on, number, spread, text
+from asysplat.benchmark.timing import Measurement, Result, seconds_of, summary, time_in_rounds
+from asysplat.data import ImageCache, SceneDataModule, files_data, open_scene
+
+CPU = torch.device("cpu")  # which reads
+NO_CACHE, FIRST, LATER = CACHES = ("none", "filled meanwhile", "filled")
+MODEL = "asysplat_4m4s"
+
+
+def measure(options: DictConfig, console: Console) -> Result:
+    """Open a scene and draw training tasks from it, `options.repeats` times.
+
+    Returns:
+        "scene": frames, the photographs' and the views' sizes; "open": seconds until a scene has
+        been opened; "loading": frames a second for each state of the cache on disk; "network":
+        frames a second that training would take, without rendering. All with median and
+        interquartile range.
+
+    Raises:
+        InputError: repeats below 1; a scene that cannot be read; an unknown override or device.
+    """
+    check_repeats(options.repeats)
+    device, wanted = find_device(options.device), options.data
+    net, size = make_net(MODEL, wanted.overrides, device)
+    views = make_views(size["views"], size["height"], size["width"], device)
+    workload = Workload(MODEL, net, "fp32", torch.float32, views)
+    with _scene(wanted) as root, TemporaryDirectory() as folder:
+        capture = open_scene(root, size["height"], size["width"])
+        lens = capture.scene.photographs[0].lens
+        frames = size["views"] + wanted.targets  # of a training task
+        count = max(1, capture.num_frames // frames)
+
+        def loading(cache: ImageCache | None) -> float:
+            data = _data(root, size, wanted, cache)
+            return seconds_of(lambda: list(data.tasks(0, count)), CPU) / (count * frames)
+
+        def seconds() -> dict[str, float]:
+            with TemporaryDirectory(dir=folder) as fresh:
+                return {
+                    "open": seconds_of(
+                        lambda: open_scene(root, size["height"], size["width"]), CPU
+                    ),
+                    NO_CACHE: loading(None),
+                    FIRST: loading(ImageCache(fresh)),
+                    LATER: loading(ImageCache(fresh)),
+                    "network": seconds_of(workload.step, device) / frames,
+                }
+
+        scene = Measurement(seconds)
+        with console.status(f"{options.repeats} rounds"):
+            time_in_rounds([scene], options.repeats)
+    rates = {name: summary([1 / s for s in scene.seconds[name]]) for name in (*CACHES, "network")}
+    return {
+        "scene": {
+            "frames": capture.num_frames,
+            "photographs": [lens.height, lens.width],
+            "views": [size["height"], size["width"]],
+            "workers": wanted.num_workers,
+        },
+        "open": scene.summary("open"),
+        "network": rates["network"],
+        "loading": [
+            {
+                "cache": name,
+                "frames_per_second": rates[name],
+                "over_network": rates[name]["median"] / rates["network"]["median"],
+            }
+            for name in CACHES
+        ],
+    }
+
+
+@contextmanager
+def _scene(wanted: DictConfig) -> Iterator[Path]:
+    """Yield the folder of the user's scene, or of a synthetic one that is deleted afterwards."""
+    if wanted.root is not None:
+        yield Path(wanted.root)
+        return
+    with TemporaryDirectory() as folder:
+        write_photographs(Path(folder) / "scene", wanted.frames, *wanted.photographs)
+        yield Path(folder) / "scene"
+
+
+def _data(
+    root: Path, size: dict[str, int], wanted: DictConfig, cache: ImageCache | None
+) -> SceneDataModule:
+    return files_data(
+        root=str(root),
+        height=size["height"],
+        width=size["width"],
+        window=[size["views"] + wanted.targets, 128],
+        cache=cache,
+        name="benchmark",
+        inputs=size["views"],
+        targets=wanted.targets,
+        batch_size=1,
+        workers=wanted.num_workers,
+        seed=0,
+        steps_per_epoch=1,
+    )
+
+
+def tables(results: Result) -> list[Table]:
+    """Show how soon a scene opens, and how fast its frames come."""
+    scene, opened = results["scene"], results["open"]
+    opening = {"frames": scene["frames"], "open": opened}
+    opening["each"] = opened["median"] / scene["frames"]
+    columns = {
+        "frames": text("{frames}"),
+        "ms, no pixel read": spread("open"),
+        "ms / frame": number("each", "{:.2f}", unit=1e-3),
+    }
+    loading_columns = {
+        "cache on disk": text("{cache}"),
+        "frames / s": spread("frames_per_second", "{:.0f}", unit=1.0),
+        "loading\n/ network": number("over_network", "{:.1f}"),
+    }
+    photographs, views = ("x".join(map(str, scene[name])) for name in ("photographs", "views"))
+    network = spread("network", "{:.0f}", unit=1.0)(results)
+    notes = (
+        f"{measured_on(results)}\n"
+        f"photographs of {photographs} for views of {views}, by {scene['workers']} workers\n"
+        f"the network alone takes {network} frames / s in training"
+    )
+    return [
+        make_table("Opening a scene", columns, [opening]),
+        make_table("Loading training tasks", loading_columns, results["loading"], notes),
+    ]
+
+
+def plot(results: Result) -> Figure:
+    """Plot the frames a second of each state of the cache, and those that the network takes."""
+    rates = {row["cache"]: row["frames_per_second"]["median"] for row in results["loading"]}
+    network = [results["network"]["median"]] * len(rates)
+    parts = {"loading, by the cache on disk": list(rates.values())}
+    return bars(list(rates), parts, ("the network takes", network), "frames a second")

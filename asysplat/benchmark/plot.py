@@ -1,0 +1,93 @@
+"""The pictures of all suites: time against error, and bars."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from asysplat.benchmark.table import at, worst
+from asysplat.benchmark.timing import Result
+from asysplat.report.style import FAINT, INK, OURS, PAPER, STYLE
+
+COLOURS = {"cpu": OURS, "cuda": INK, "reference": FAINT, "loop": FAINT}
+COLOURS |= dict.fromkeys(("chunked", "sdpa", "gsplat"), PAPER)
+MARKS = "osD^vPX*"
+
+
+def time_against_error(
+    rows: Sequence[Result],
+    errors: Mapping[str, tuple[str, str]],
+    backend: str,
+    case: str,
+) -> Figure:
+    """Plot a point for each row: its colour is its backend, its mark its case, hollow in bf16.
+
+    Args:
+        errors: for each timed pass, what its error is, and its path in a row.
+        backend, case: keys of a row.
+    """
+    marks = dict(zip(dict.fromkeys(row[case] for row in rows), MARKS, strict=False))
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(9, 4.2), layout="constrained")
+        grid = figure.subplots(1, len(errors), squeeze=False)
+        for axes, (name, (label, path)) in zip(grid[0], errors.items(), strict=True):
+            for row in rows:
+                look = _look(marks[row[case]], COLOURS[row[backend]], _in_bf16(row))
+                axes.plot(1000 * row[name]["median"], worst(row, path), **look)
+            title = name.replace("_", " and ")
+            axes.set(title=title, xlabel="milliseconds", xscale="log", yscale="log", ylabel=label)
+            axes.margins(0.15)
+            # Times may span less than a decade: two ticks in each then, as plain numbers.
+            low, high = axes.get_xlim()
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 3) if high < 100 * low else (1,)))
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_minor_formatter(NullFormatter())
+        keys = {name: _look("o", COLOURS[name]) for name in dict.fromkeys(r[backend] for r in rows)}
+        keys |= {f"{case} {name}": _look(mark, INK) for name, mark in marks.items()}
+        if any(map(_in_bf16, rows)):
+            keys["in bf16"] = _look("o", INK, hollow=True)
+        handles = [Line2D([], [], label=label, **look) for label, look in keys.items()]
+        figure.legend(handles=handles, loc="outside right upper", frameon=False)
+    return figure
+
+
+def bars(
+    names: Sequence[str],
+    parts: Mapping[str, Sequence[float]],
+    limit: tuple[str, Sequence[float]],
+    label: str,
+) -> Figure:
+    """Plot a horizontal bar for each name, made of parts, with a mark where its limit is.
+
+    Args:
+        parts: the lengths of a part in all bars; one that is 0 everywhere is left out.
+        limit: its name, and its value for each bar.
+        label: of the lengths.
+    """
+    colours = matplotlib.colormaps["tab10"].colors
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(9, 1.6 + 0.5 * len(names)), layout="constrained")
+        axes = figure.subplots()
+        starts = [0.0] * len(names)
+        for (part, lengths), colour in zip(parts.items(), colours, strict=False):
+            if any(lengths):
+                axes.barh(names, lengths, left=starts, color=colour, label=part)
+            starts = [start + length for start, length in zip(starts, lengths, strict=True)]
+        axes.plot(limit[1], names, "|", color=INK, ms=18, mew=2, label=limit[0])
+        axes.set_xlabel(label)
+        axes.invert_yaxis()
+        figure.legend(loc="outside right upper", frameon=False)
+    return figure
+
+
+def _in_bf16(row: Result) -> bool:
+    return at(row, "precision") == "bf16"
+
+
+def _look(mark: str, colour: str, hollow: bool = False) -> dict[str, Any]:
+    face = "none" if hollow else colour
+    return {"ls": "", "marker": mark, "color": colour, "mfc": face, "ms": 8, "alpha": 0.8}

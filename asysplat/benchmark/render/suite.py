@@ -1,0 +1,191 @@
+"""Every backend of the renderer, and every skip switched off: seconds, memory, error."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from matplotlib.figure import Figure
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch import Tensor
+
+from asysplat.benchmark.options import check_repeats
+from asysplat.benchmark.plot import time_against_error
+from asysplat.benchmark.render.cases import Case, Scene, describe, find_cases
+from asysplat.benchmark.render.passes import RASTER, row_seconds, run_timed
+from asysplat.benchmark.render.run import (
+    Backend,
+    Inputs,
+    errors,
+    find_backends,
+    flips,
+    peak_gb,
+    prepare,
+    run,
+    truth,
+)
+from asysplat.benchmark.table import error, limited, make_table, measured_on, number, spread, text
+from asysplat.benchmark.timing import Measurement, Result, time_in_rounds
+from asysplat.rendering import Skips
+
+# What is asked of the cpu backend with all its skips.
+MOST_OVER_FLOOR = 2.5
+MOST_WHOLE_OVER_RASTER = 2.0
+HOT_ROWS = {"forward": "hot row", "backward": "hot row backward"}
+
+
+def measure(options: DictConfig, console: Console) -> Result:
+    """Time every backend on the scenes `options.scenes`, `options.repeats` times.
+
+    Returns:
+        "rows": one for each scene, backend and skip that is off, times in seconds.
+
+    Raises:
+        InputError: an unknown scene; repeats below 1.
+    """
+    cases = find_cases(options.scenes)
+    check_repeats(options.repeats)
+    results: list[Result] = []
+    for name, case in track(cases.items(), "scenes", console=console):
+        results += _measure_scene(name, case, options.repeats)
+    return {"rows": results}
+
+
+def _measure_scene(name: str, case: Case, repeats: int) -> list[Result]:
+    backends = find_backends()
+    scene = case.make()
+    small = case.twin() if case.twin else scene
+    ignored = _flips_of_any(backends, small)
+    rows = []
+    for backend in backends:
+        exact = truth(small, backend.convention, ignored)
+        inputs = prepare(scene, backend.device)
+        small_inputs = prepare(small, backend.device, ignored)
+        for off in (None, *backend.skips):
+            skips = Skips().without(off) if off else Skips()
+            found = {"scene": name, "backend": backend.name, "without": off}
+            found |= {**describe(scene), "threads": torch.get_num_threads()}
+            wrong = errors(run(backend, skips, small_inputs), exact, ignored)
+            found["error"] = {"measured_on": describe(small), **wrong}
+            found["peak_gb"] = peak_gb(backend, skips, inputs)
+            rows.append(Measurement(_timer(backend, skips, inputs, found), found))
+    time_in_rounds(rows, repeats)
+    for row in rows:
+        row.found |= {direction: row.summary(direction) for direction in RASTER}
+        row.found["faster_than_reference"] = {
+            direction: rows[0].found[direction]["median"] / row.found[direction]["median"]
+            for direction in RASTER
+        }
+        if row.found["backend"] == "cpu":
+            names = [key for key in row.seconds if key not in (*RASTER, *HOT_ROWS.values())]
+            # The key is that of results which are published.
+            row.found["stages"] = {name: row.summary(name) for name in names}
+            row.found["raster"] = _raster(row)
+    return [row.found for row in rows]
+
+
+def _timer(
+    backend: Backend, skips: Skips, inputs: Inputs, found: Result
+) -> Callable[[], dict[str, float]]:
+    """Time both passes, and of the cpu backend each kernel and the hot rows; counts to `found`."""
+
+    def seconds() -> dict[str, float]:
+        if backend.name != "cpu":
+            outputs = run(backend, skips, inputs)
+            found["stats"] = outputs.stats
+            return outputs.seconds
+        hot = {HOT_ROWS[key]: value for key, value in row_seconds(backend).items()}
+        outputs, kernels = run_timed(backend, skips, inputs)
+        found["stats"] = outputs.stats
+        return outputs.seconds | kernels | hot
+
+    return seconds
+
+
+def _flips_of_any(backends: Sequence[Backend], scene: Scene) -> Tensor:
+    """Find the pixels [V, H, W] where any backend flips: there more than rounding differs."""
+    found = [
+        flips(
+            run(backend, Skips(), prepare(scene, backend.device)), truth(scene, backend.convention)
+        )
+        for backend in backends
+    ]
+    return torch.stack(found).any(0)
+
+
+def _raster(row: Measurement) -> Result:
+    """Compare the raster passes with their floor, and both passes whole with the raster passes.
+
+    The floor is the rows that were evaluated times the cost of a hot one, over the threads.
+    """
+    compared = {}
+    for direction, name in RASTER.items():
+        hot_row = row.summary(HOT_ROWS[direction])["median"]
+        floor = row.found["stats"]["rows"] * hot_row / row.found["threads"]
+        raster = row.summary(name)["median"]
+        compared[direction] = {
+            "hot_row": hot_row,
+            "floor": floor,
+            "over_floor": raster / floor,
+            "whole_over_raster": row.found[direction]["median"] / raster,
+        }
+    return compared
+
+
+def tables(results: Result) -> list[Table]:
+    """Show all rows; what the cpu backend's time goes into; how near that is to the least."""
+    rows = results["rows"]
+    ours = [row for row in rows if row["backend"] == "cpu" and row["without"] is None]
+    notes = (
+        f"{measured_on(results)}; *: errors of a smaller scene of the same make;\n"
+        "errors outside the pixels where some backend's rounding decides otherwise at a cut-off"
+    )
+    columns = {
+        "scene": text("{scene}"),
+        "backend": lambda row: f"  no {row['without']} skip" if row["without"] else row["backend"],
+        "forward\nms": spread("forward"),
+        "backward\nms": spread("backward"),
+        "memory\nMB": number("peak_gb", "{:.0f}", unit=1e-3),
+        "image\np99": error("error.image_p99"),
+        "image\nmax": error("error.image_max"),
+        "flips\n1e-6": number("error.flipped", "{:.0f}", unit=1e-6),
+        "gradients\nworst": error("error.gradients"),
+    }
+    passes = {"scene": text("{scene}")}
+    for name in ours[0]["stages"] if ours else ():
+        passes[name.replace("_", "\n")] = spread(f"stages.{name}")
+    limits = {
+        "scene": text("{scene}"),
+        "pass": text("{pass}"),
+        "rows\nmillions": number("stats.rows", "{:.2f}", unit=1e6),
+        "hot row\nns": number("hot_row", "{:.1f}", unit=1e-9),
+        "floor\nms": number("floor", "{:.1f}", unit=1e-3),
+        "raster\n/ floor": limited("over_floor", MOST_OVER_FLOOR),
+        "whole\n/ raster": limited("whole_over_raster", MOST_WHOLE_OVER_RASTER),
+        "reference\n/ cpu": number("faster", "{:.1f}"),
+    }
+    both = [
+        {**row, **row["raster"][name], "pass": name, "faster": row["faster_than_reference"][name]}
+        for row in ours
+        for name in RASTER
+    ]
+    asked = (
+        f"asked for: raster / floor at most {MOST_OVER_FLOOR}, whole / raster at most "
+        f"{MOST_WHOLE_OVER_RASTER}"
+    )
+    return [
+        make_table("Every backend, and without one of its skips", columns, rows, notes, names=2),
+        make_table("Passes of the cpu backend, ms", passes, ours),
+        make_table("The cpu backend's limits", limits, both, asked, names=2),
+    ]
+
+
+def plot(results: Result) -> Figure:
+    """Plot the forward and the backward pass, of every backend with all its skips."""
+    errors = {
+        "forward": ("image against float64, 99th percentile", "error.image_p99"),
+        "backward": ("worst gradient against float64, relative L2", "error.gradients"),
+    }
+    rows = [row for row in results["rows"] if row["without"] is None]
+    return time_against_error(rows, errors, backend="backend", case="scene")
