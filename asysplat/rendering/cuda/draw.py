@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import triton
@@ -12,8 +11,8 @@ from torch.autograd.function import once_differentiable
 from asysplat.errors import InputError
 from asysplat.rendering.cuda.project import COUNTERS, project
 from asysplat.rendering.cuda.project_backward import project_backward, sum_pairs
-from asysplat.rendering.cuda.rasterize import rasterize, rasterize_backward
-from asysplat.rendering.cuda.splat import GRADIENT, SPLAT, TILE
+from asysplat.rendering.cuda.rasterize import Saved, rasterize, rasterize_backward
+from asysplat.rendering.cuda.splat import GRADIENT, SPLAT, TILE, Frame
 from asysplat.rendering.cuda.tiles import Lists, list_tiles
 from asysplat.rendering.formulas import CAMERA_GRADIENT, Inputs, camera_gradients, camera_rows
 from asysplat.rendering.interface import RenderOutputs, Settings, check_pairs
@@ -53,35 +52,6 @@ def draw(
     masks = masks if settings.skips.masks else None
     *images, origins = _Draw.apply(settings, size, masks, stats, *fields, *poses)
     return RenderOutputs(*images, stats, origins)
-
-
-class Frame(NamedTuple):
-    """The sizes that the kernels are told."""
-
-    images: int  # views of all scenes
-    views: int  # of a scene
-    num: int  # Gaussians of a scene
-    sh_count: int  # coefficients
-    height: int  # pixels
-    width: int
-    columns: int  # of tiles
-    tiles: int  # of an image
-
-    @property
-    def grid(self) -> dict[str, int]:
-        """Tiles and pixels of an image."""
-        names = ("columns", "tiles", "height", "width")
-        return {name: getattr(self, name) for name in names}
-
-
-class Saved(NamedTuple):
-    """What `rasterize` leaves for `rasterize_backward`; see there."""
-
-    transmittance: Tensor
-    stops: Tensor
-    last_entry: Tensor
-    origins: Tensor | None
-    halved: Tensor | None
 
 
 class _Draw(torch.autograd.Function):

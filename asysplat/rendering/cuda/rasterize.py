@@ -7,7 +7,10 @@ saw is what the forward pass saved: where it stopped. Each pair of splat and til
 own for its gradient.
 """
 
+from typing import NamedTuple
+
 import triton.language as tl
+from torch import Tensor
 
 from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering.cuda.splat import (
@@ -21,6 +24,16 @@ from asysplat.rendering.cuda.splat import (
 )
 
 NEVER = tl.constexpr(2**31 - 1)  # more than any rank
+
+
+class Saved(NamedTuple):
+    """What `rasterize` leaves for `rasterize_backward`; see there."""
+
+    transmittance: Tensor
+    stops: Tensor
+    last_entry: Tensor
+    origins: Tensor | None
+    halved: Tensor | None
 
 
 @kernel

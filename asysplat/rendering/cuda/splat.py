@@ -1,4 +1,6 @@
-"""Splats: their columns, and how one looks from a tile."""
+"""Splats: their columns, the frame they are drawn in, and how one looks from a tile."""
+
+from typing import NamedTuple
 
 import triton.language as tl
 
@@ -17,6 +19,25 @@ GRADIENT = tl.constexpr(10)
 TILE = tl.constexpr(8)  # pixels a side
 HALF_TILE = tl.constexpr(4)
 FARTHEST = tl.constexpr(formulas.FARTHEST)
+
+
+class Frame(NamedTuple):
+    """The sizes that the kernels are told."""
+
+    images: int  # views of all scenes
+    views: int  # of a scene
+    num: int  # Gaussians of a scene
+    sh_count: int  # coefficients
+    height: int  # pixels
+    width: int
+    columns: int  # of tiles
+    tiles: int  # of an image
+
+    @property
+    def grid(self) -> dict[str, int]:
+        """Tiles and pixels of an image."""
+        names = ("columns", "tiles", "height", "width")
+        return {name: getattr(self, name) for name in names}
 
 
 @kernel
