@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from asysplat.benchmark.machine import describe_machine
-from asysplat.benchmark.options import find_suite
+from asysplat.benchmark.options import check_repeats, find_suite
 from asysplat.errors import InputError
 from asysplat.words import exit_at_unknown_words
 
@@ -25,6 +25,7 @@ def main(options: DictConfig) -> None:
 def benchmark(options: DictConfig) -> None:
     """Measure, print the tables, write <suite>.json and <suite>.png."""
     suite = find_suite(options.suite)
+    check_repeats(options.repeats)
     console = Console()
     results = {"machine": describe_machine(), **suite.measure(options, console)}
     for table in suite.tables(results):
