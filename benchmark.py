@@ -1,4 +1,7 @@
-"""Time against error, in one process: python benchmark.py suite=render scenes=[A,C]"""
+"""Time against error, in one process.
+
+python benchmark.py suite=render scenes=[A,C]
+"""
 
 import json
 import sys
