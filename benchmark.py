@@ -1,4 +1,7 @@
-"""Time against error, in one process: python benchmark.py suite=render scenes=[A,C]"""
+"""Time against error, in one process.
+
+python benchmark.py suite=render scenes=[A,C]
+"""
 
 import json
 import sys
@@ -9,7 +12,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from asysplat.benchmark.machine import describe_machine
-from asysplat.benchmark.options import find_suite
+from asysplat.benchmark.options import check_repeats, find_suite
 from asysplat.errors import InputError
 from asysplat.overrides import exit_at_unknown_overrides
 
@@ -25,6 +28,7 @@ def main(options: DictConfig) -> None:
 def benchmark(options: DictConfig) -> None:
     """Measure, print the tables, write <suite>.json and <suite>.png."""
     suite = find_suite(options.suite)
+    check_repeats(options.repeats)
     console = Console()
     results = {"machine": describe_machine(), **suite.measure(options, console)}
     for table in suite.tables(results):

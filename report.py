@@ -1,4 +1,7 @@
-"""Finished sweeps beside the paper's tables: python report.py table=layers costs=true"""
+"""Finished sweeps beside the paper's tables.
+
+python report.py table=layers costs=true
+"""
 
 import sys
 from collections.abc import Sequence

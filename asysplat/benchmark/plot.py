@@ -40,10 +40,10 @@ def time_against_error(
             title = name.replace("_", " and ")
             axes.set(title=title, xlabel="milliseconds", xscale="log", yscale="log", ylabel=label)
             axes.margins(0.15)
-            # Times may span less than a decade: two ticks in each then, as plain numbers.
             low, high = axes.get_xlim()
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 3) if high < 100 * low else (1,)))
-            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            if high < 100 * low:  # less than two decades: two ticks in each, as plain numbers
+                axes.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+                axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             for axis in (axes.xaxis, axes.yaxis):
                 axis.set_minor_formatter(NullFormatter())
         keys = {name: _look("o", COLOURS[name]) for name in dict.fromkeys(r[backend] for r in rows)}

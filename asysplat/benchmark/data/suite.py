@@ -13,7 +13,7 @@ from rich.table import Table
 
 from asysplat.benchmark.data.photographs import write_photographs
 from asysplat.benchmark.model.workload import Workload, make_net, make_views
-from asysplat.benchmark.options import check_repeats, find_device
+from asysplat.benchmark.options import find_device
 from asysplat.benchmark.plot import bars
 from asysplat.benchmark.table import make_table, measured_on, number, spread, text
 from asysplat.benchmark.timing import Measurement, Result, seconds_of, summary, time_in_rounds
@@ -34,9 +34,8 @@ def measure(options: DictConfig, console: Console) -> Result:
         interquartile range.
 
     Raises:
-        InputError: repeats below 1; a scene that cannot be read; an unknown override or device.
+        InputError: a scene that cannot be read; an unknown override or device.
     """
-    check_repeats(options.repeats)
     device, wanted = find_device(options.device), options.data
     net, size = make_net(MODEL, wanted.overrides, device)
     views = make_views(size["views"], size["height"], size["width"], device)

@@ -18,7 +18,7 @@ from asysplat.benchmark.model.components import (
     record_products,
 )
 from asysplat.benchmark.model.workload import Workload, make_net, make_views
-from asysplat.benchmark.options import check_repeats, find_device, find_precisions
+from asysplat.benchmark.options import find_device, find_precisions
 from asysplat.benchmark.plot import bars
 from asysplat.benchmark.products import Counts, product_seconds, sum_of_products
 from asysplat.benchmark.table import limited, make_table, measured_on, number, spread, text
@@ -68,10 +68,9 @@ def measure(options: DictConfig, console: Console) -> Result:
         not asked for, or would not fit into memory, is None.
 
     Raises:
-        InputError: repeats below 1; an unknown model, override, precision or device; a resolution
+        InputError: an unknown model, override, precision or device; a resolution
             that a network cannot take.
     """
-    check_repeats(options.repeats)
     device = find_device(options.device)
     wanted = options.model
     precisions = find_precisions("model.precisions", wanted.precisions)

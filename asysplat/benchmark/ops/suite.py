@@ -11,7 +11,7 @@ from rich.table import Table
 
 from asysplat.benchmark.ops.cases import SCANS, Case, find_cases
 from asysplat.benchmark.ops.paths import Path
-from asysplat.benchmark.options import check_repeats, find_device, find_precisions
+from asysplat.benchmark.options import find_device, find_precisions
 from asysplat.benchmark.plot import time_against_error
 from asysplat.benchmark.products import product_seconds, products, with_gradients
 from asysplat.benchmark.table import (
@@ -41,9 +41,8 @@ def measure(options: DictConfig, console: Console) -> Result:
         operator's matrix products by themselves.
 
     Raises:
-        InputError: repeats below 1, an unknown precision or device, sizes an operator cannot take.
+        InputError: an unknown precision or device, sizes an operator cannot take.
     """
-    check_repeats(options.repeats)
     device = find_device(options.device)
     precisions = find_precisions("ops.precisions", options.ops.precisions)
     sizes = OmegaConf.to_container(options.ops, resolve=True)

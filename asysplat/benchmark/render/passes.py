@@ -18,20 +18,22 @@ OPACITY = 0.01  # COUNT of it leave every pixel some transmittance
 
 
 def run_timed(backend: Backend, skips: Skips, inputs: Inputs) -> tuple[Outputs, dict[str, float]]:
-    """Run both passes; return also the seconds that the cpu backend spends in each kernel."""
+    """Run both passes; return also the seconds of each kernel, of the cpu backend."""
+    if backend.name != "cpu":
+        return run(backend, skips, inputs), {}
     kernels = {run_blocks: lambda frame: frame.f_locals["kernel"].__name__}
     with time_calls(kernels, torch.device("cpu")) as seconds:
         return run(backend, skips, inputs), seconds
 
 
-def row_seconds(backend: Backend) -> dict[str, float]:
+def row_seconds(cpu: Backend) -> dict[str, float]:
     """Time a 16-pixel row of a tile in a scene that is nothing but rows, by direction.
 
     It is the time of a core while all threads are busy so.
     """
     best: dict[str, float] = {}
     for _ in range(REPEATS):
-        outputs, seconds = run_timed(backend, Skips(), hot_scene())
+        outputs, seconds = run_timed(cpu, Skips(), hot_scene())
         for direction, kernel in RASTER.items():
             row = seconds[kernel] * torch.get_num_threads() / outputs.stats["rows"]
             best[direction] = min(row, best.get(direction, row))

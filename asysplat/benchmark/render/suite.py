@@ -10,7 +10,6 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from asysplat.benchmark.options import check_repeats
 from asysplat.benchmark.plot import time_against_error
 from asysplat.benchmark.render.cases import Case, Scene, describe, find_cases
 from asysplat.benchmark.render.passes import RASTER, row_seconds, run_timed
@@ -32,7 +31,6 @@ from asysplat.rendering import Skips
 # What is asked of the cpu backend with all its skips.
 MOST_OVER_FLOOR = 2.5
 MOST_WHOLE_OVER_RASTER = 2.0
-HOT_ROWS = {"forward": "hot row", "backward": "hot row backward"}
 
 
 def measure(options: DictConfig, console: Console) -> Result:
@@ -42,10 +40,9 @@ def measure(options: DictConfig, console: Console) -> Result:
         "rows": one for each scene, backend and skip that is off, times in seconds.
 
     Raises:
-        InputError: an unknown scene; repeats below 1.
+        InputError: an unknown scene.
     """
     cases = find_cases(options.scenes)
-    check_repeats(options.repeats)
     results: list[Result] = []
     for name, case in track(cases.items(), "scenes", console=console):
         results += _measure_scene(name, case, options.repeats)
@@ -70,7 +67,9 @@ def _measure_scene(name: str, case: Case, repeats: int) -> list[Result]:
             found["error"] = {"measured_on": describe(small), **wrong}
             found["peak_gb"] = peak_gb(backend, skips, inputs)
             rows.append(Measurement(_timer(backend, skips, inputs, found), found))
-    time_in_rounds(rows, repeats)
+    (cpu,) = [backend for backend in backends if backend.name == "cpu"]
+    hot_rows = Measurement(lambda: row_seconds(cpu))
+    time_in_rounds([*rows, hot_rows], repeats)
     for row in rows:
         row.found |= {direction: row.summary(direction) for direction in RASTER}
         row.found["faster_than_reference"] = {
@@ -78,27 +77,22 @@ def _measure_scene(name: str, case: Case, repeats: int) -> list[Result]:
             for direction in RASTER
         }
         if row.found["backend"] == "cpu":
-            names = [key for key in row.seconds if key not in (*RASTER, *HOT_ROWS.values())]
+            kernels = [name for name in row.seconds if name not in RASTER]
             # The key is that of results which are published.
-            row.found["stages"] = {name: row.summary(name) for name in names}
-            row.found["raster"] = _raster(row)
+            row.found["stages"] = {name: row.summary(name) for name in kernels}
+            row.found["raster"] = _raster(row, hot_rows)
     return [row.found for row in rows]
 
 
 def _timer(
     backend: Backend, skips: Skips, inputs: Inputs, found: Result
 ) -> Callable[[], dict[str, float]]:
-    """Time both passes, and of the cpu backend each kernel and the hot rows; counts to `found`."""
+    """Time both passes and the kernels in them; the counts go to `found`."""
 
     def seconds() -> dict[str, float]:
-        if backend.name != "cpu":
-            outputs = run(backend, skips, inputs)
-            found["stats"] = outputs.stats
-            return outputs.seconds
-        hot = {HOT_ROWS[key]: value for key, value in row_seconds(backend).items()}
         outputs, kernels = run_timed(backend, skips, inputs)
         found["stats"] = outputs.stats
-        return outputs.seconds | kernels | hot
+        return outputs.seconds | kernels
 
     return seconds
 
@@ -114,14 +108,14 @@ def _flips_of_any(backends: Sequence[Backend], scene: Scene) -> Tensor:
     return torch.stack(found).any(0)
 
 
-def _raster(row: Measurement) -> Result:
+def _raster(row: Measurement, hot_rows: Measurement) -> Result:
     """Compare the raster passes with their floor, and both passes whole with the raster passes.
 
     The floor is the rows that were evaluated times the cost of a hot one, over the threads.
     """
     compared = {}
     for direction, name in RASTER.items():
-        hot_row = row.summary(HOT_ROWS[direction])["median"]
+        hot_row = hot_rows.summary(direction)["median"]
         floor = row.found["stats"]["rows"] * hot_row / row.found["threads"]
         raster = row.summary(name)["median"]
         compared[direction] = {
