@@ -12,8 +12,7 @@ from numba.core.base import BaseContext
 from numba.extending import intrinsic
 
 from asysplat.ops.cpu.kernel import inline
-from asysplat.ops.cpu.lanes import ONE
-from asysplat.ops.cpu.vectors import FLOATS, INTEGERS, LANES, check_range, emit_fma, splat
+from asysplat.ops.cpu.vectors import FLOATS, INTEGERS, LANES, ONE, check_range, emit_fma, splat
 
 HAS_32_VECTORS = bool(llvmlite.binding.get_host_cpu_features().get("avx512f", False))
 ROWS = 8 if HAS_32_VECTORS else 4

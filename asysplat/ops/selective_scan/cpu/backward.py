@@ -5,8 +5,18 @@ import math
 import numpy as np
 
 from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.lanes import ZERO, decay2
-from asysplat.ops.cpu.vectors import LANES, fma, load, load_some, store, store_some, total, zeros
+from asysplat.ops.cpu.vectors import (
+    LANES,
+    ZERO,
+    decay2,
+    fma,
+    load,
+    load_some,
+    store,
+    store_some,
+    total,
+    zeros,
+)
 from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
 
 LN_2 = np.float32(math.log(2))

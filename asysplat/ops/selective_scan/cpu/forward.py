@@ -3,8 +3,7 @@
 import numpy as np
 
 from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.lanes import ZERO, decay2
-from asysplat.ops.cpu.vectors import LANES, fma, load, load_some, store, store_some
+from asysplat.ops.cpu.vectors import LANES, ZERO, decay2, fma, load, load_some, store, store_some
 from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
 
 

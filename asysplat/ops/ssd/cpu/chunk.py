@@ -11,8 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.ops.cpu.kernel import inline
-from asysplat.ops.cpu.lanes import ONE, ZERO, decay2
-from asysplat.ops.cpu.vectors import LANES, fma, load, total, zeros
+from asysplat.ops.cpu.vectors import LANES, ONE, ZERO, decay2, fma, load, total, zeros
 
 
 class Decays(NamedTuple):
