@@ -1,4 +1,7 @@
-"""Draw docs/architecture.svg from asysplat's imports and signatures: python docs/architecture.py"""
+"""Draw docs/architecture.svg from asysplat's imports and signatures.
+
+python docs/architecture.py
+"""
 
 import ast
 from collections import Counter

@@ -1,4 +1,5 @@
-"""Predict Gaussians with a network and render views that it was not given, without Lightning:
+"""Predict Gaussians with a network and render views that it was not given, without Lightning.
+
 python examples/predict_scene.py [logs/demo/.../checkpoints/best.ckpt] [picture.png]
 """
 

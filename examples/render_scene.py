@@ -1,4 +1,5 @@
-"""Put a Gaussian on every pixel of three photographs and look at them from between:
+"""Put a Gaussian on every pixel of three photographs and look at them from between.
+
 python examples/render_scene.py [picture.png]
 """
 

@@ -1,4 +1,5 @@
-"""Write a synthetic scene to disk, as a stand-in for photographs of one's own:
+"""Write a synthetic scene to disk, as a stand-in for photographs of one's own.
+
 python examples/write_scene.py my_scene
 """
 

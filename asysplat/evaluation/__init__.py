@@ -1,0 +1,1 @@
+"""Metrics and their protocols, baselines, costs, and pictures of what was rendered."""
