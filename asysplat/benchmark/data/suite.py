@@ -110,7 +110,7 @@ def _data(
         inputs=size["views"],
         targets=wanted.targets,
         batch_size=1,
-        workers=wanted.num_workers,
+        num_workers=wanted.num_workers,
         seed=0,
         steps_per_epoch=1,
     )
