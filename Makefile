@@ -2,7 +2,7 @@
 PYTHON ?= python3
 ENV := .venv/.ready
 
-demo: $(ENV) ## train a small model on made-up scenes, measure it, draw what it sees
+demo: $(ENV) ## train a small model on synthetic scenes, measure it, draw what it sees
 	.venv/bin/python train.py name=demo
 	@echo "to go on with commands of your own: source .venv/bin/activate"
 

@@ -88,8 +88,10 @@ IN_A_TABLE = re.compile(r"\| `([\w./]+=[^`]+)`")
 
 
 def printed_commands(repository) -> list[tuple[str, str]]:
-    """List scripts and overrides in the READMEs and the comments under conf/ and sweeps/."""
-    texts = [(repository / name).read_text() for name in ("README.md", "data/README.md")]
+    """List scripts and overrides in the documents and the comments under conf/ and sweeps/."""
+    folders = (".", "data", "docs", "examples")
+    documents = [path for name in folders for path in sorted((repository / name).glob("*.md"))]
+    texts = [path.read_text() for path in documents]
     found = {("train", overrides) for overrides in IN_A_TABLE.findall(texts[0])}
     for folder in ("conf", "sweeps"):
         for path in (repository / folder).rglob("*.yaml"):
