@@ -92,7 +92,7 @@ def printed_commands(repository) -> list[tuple[str, str]]:
     folders = (".", "data", "docs", "examples")
     documents = [path for name in folders for path in sorted((repository / name).glob("*.md"))]
     texts = [path.read_text() for path in documents]
-    found = {("train", overrides) for overrides in IN_A_TABLE.findall(texts[0])}
+    found = {("train", overrides) for text in texts for overrides in IN_A_TABLE.findall(text)}
     for folder in ("conf", "sweeps"):
         for path in (repository / folder).rglob("*.yaml"):
             texts += [line for line in path.read_text().splitlines() if line.startswith("# ")]
