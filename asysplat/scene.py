@@ -1,4 +1,4 @@
-"""The three values that pass between the rooms: Cameras, Views and Gaussians.
+"""What data, models and rendering give to each other: Cameras, Views and Gaussians.
 
 Shapes are checked when a value is made; `validate()` also looks at the numbers (finite, in range,
 rotations orthonormal) and is called once, where data enters.
@@ -62,7 +62,9 @@ class TensorRecord:
 
 @dataclass(frozen=True)
 class Cameras(TensorRecord):
-    """Pinhole cameras, OpenCV axes: x right, y down, z forward; the first pixel's centre is +0.5.
+    """Pinhole cameras, OpenCV axes: x right, y down, z forward.
+
+    The centre of the top left pixel is (0.5, 0.5).
 
     Args:
         intrinsics: [..., V, 3, 3] in pixels.
@@ -212,7 +214,7 @@ class Views(TensorRecord):
         )
 
     def masked(self, rendered: Float[Tensor, "*batch V 3 H W"]) -> Float[Tensor, "*batch V 3 H W"]:
-        """Replace pixels that do not count by the photographs': no error, no gradient there."""
+        """Copy the photographs into masked-out pixels, so that these add no error or gradient."""
         if self.masks is None:
             return rendered
         return torch.where(self.masks[..., None, :, :], rendered, self.images)

@@ -17,7 +17,7 @@ from asysplat.data.selection import (
     Split,
     named_selection,
     spread,
-    trained,
+    training_frames,
     training_selection,
     uniform_selection,
 )
@@ -154,7 +154,11 @@ class FilesSource:
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         capture = self.scenes[self._trained[rng.integers(len(self._trained))]]
-        frames = range(capture.num_frames) if self.split_by_scenes else trained(capture.num_frames)
+        frames = (
+            range(capture.num_frames)
+            if self.split_by_scenes
+            else training_frames(capture.num_frames)
+        )
         drawn = training_selection(
             len(frames), inputs, targets, self.window, rng, self.targets_may_be_inputs
         )

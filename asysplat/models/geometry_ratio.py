@@ -55,8 +55,8 @@ def solve_widths(
         error = errors(*(terms @ coefficients).T)
         rank = np.where(error < 1, error / 2 + shape_error, 1e3 + error)
         order = np.argsort(rank, kind="stable")  # the same widths on every machine
-        # The polynomial ignores rounding and stages of equal width, so the models are counted.
-        # Where nothing fits, only the closest is, for the message.
+        # The polynomial ignores rounding and stages of equal width, so candidates are built and
+        # counted: the best ten, or, if none fits, only the closest for the message.
         attempts = ATTEMPTS if error[order[0]] < 1 else 1
         for row in candidates[order[:attempts]]:
             *stages, fine = (int(width) for width in row)

@@ -138,9 +138,9 @@ class LongLRMHead(GaussianHead):
     """The head of Long-LRM (Ziwen et al. 2025), with the values of its configs/7m1t_tm.yaml.
 
     Colours and sizes are direct, sizes in units of the scene and at most e^largest; the distance
-    along the ray is linear from 0 to `farthest`. Those units are the normalised scene's: Long-LRM
-    puts the input cameras into the box [-1, 1]^3 about the mean camera, ours stand in the ball of
-    radius 1 (`asysplat.data.normalise`), which is up to sqrt(3) times smaller. It draws with a near
+    along the ray is linear from 0 to `farthest`. Lengths are those of the normalised scene, whose
+    input cameras stand within radius 1 (`asysplat.data.normalise`); Long-LRM's stand in the box
+    [-1, 1]^3, so its scenes are up to sqrt(3) times larger. It draws with a near
     plane at 0.01, as `asysplat.rendering` does, and a far one at 1e6, beyond all that is predicted.
 
     Args:

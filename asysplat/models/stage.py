@@ -19,8 +19,8 @@ class Stage(nn.Module):
     Args:
         previous_width: of the tokens that come in.
         shape: of this stage.
-        layers: the layer mix, counts and letters of `blocks`.
-        blocks: letter -> component built from a StageShape.
+        layers: the layer mix, counts and letters of `blocks`; the same in every stage.
+        blocks: letter -> component built from a StageShape, as conf/model/blocks.yaml has them.
 
     Raises:
         InputError: an unusable layer mix.

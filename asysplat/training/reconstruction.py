@@ -22,9 +22,10 @@ class Reconstruction(lightning.LightningModule):
     """Predict Gaussians from the input views, render the targets, compare.
 
     Args:
-        net: views -> Gaussians; see `freeze_unread`.
+        net: views -> Gaussians; see `freeze_unused`.
         loss: of an outcome against its batch.
-        optimizer: parameter groups -> optimizer; its weight decay is for `decaying` alone.
+        optimizer: parameter groups -> optimizer; weight decay applies to those of `decaying`
+            alone.
         schedule: optimizer -> its learning rates, one for each step.
         background: RGB in [0, 1] behind the Gaussians.
         checkpoint_layers: compute each layer again in the backward pass, to save memory.
@@ -40,7 +41,7 @@ class Reconstruction(lightning.LightningModule):
         checkpoint_layers: bool = False,
     ):
         super().__init__()
-        freeze_unread(net)
+        freeze_unused(net)
         net.checkpoint_layers(checkpoint_layers)
         self.net, self.loss = net, loss
         self.optimizer, self.schedule = optimizer, schedule
@@ -97,12 +98,16 @@ class Reconstruction(lightning.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip by the norm of all gradients.
+        """Clip by the norm of all gradients, or by value.
 
         Lightning's own refuses a fused optimizer under autocast, for the sake of fp16's loss
         scaling, which bf16 does without.
         """
-        if gradient_clip_val:
+        if not gradient_clip_val:
+            return
+        if gradient_clip_algorithm == "value":
+            torch.nn.utils.clip_grad_value_(self.parameters(), gradient_clip_val)
+        else:
             torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val)
 
 
@@ -118,7 +123,7 @@ def decaying(net: nn.Module) -> list[nn.Parameter]:
     return [module.weight for module in net.modules() if isinstance(module, WEIGHTED)]
 
 
-def freeze_unread(net: Network) -> None:
+def freeze_unused(net: Network) -> None:
     """Turn off the gradients of parameters on which no Gaussian depends.
 
     Processes that train together would wait for those gradients forever. The parameters exist

@@ -12,7 +12,7 @@ from asysplat.data.selection import (
     held_out,
     kmeans_selection,
     named_selection,
-    trained,
+    training_frames,
     training_selection,
     uniform_selection,
 )
@@ -127,7 +127,7 @@ def test_targets_of_training_may_be_inputs():
 
 
 def test_frames_of_a_folder_are_tested_or_validated_or_trained():
-    sets = [set(held_out(50, "test")), set(held_out(50, "val")), set(trained(50))]
+    sets = [set(held_out(50, "test")), set(held_out(50, "val")), set(training_frames(50))]
     assert set.union(*sets) == set(range(50))
     assert sum(map(len, sets)) == 50
     selected = every_8th_selection(50, 8, 4, "test")
@@ -155,7 +155,7 @@ def test_validation_sees_no_frame_of_the_test(selection):
     assert not set(selected.inputs + selected.targets) & set(held_out(70, "test"))
     assert set(selected.targets) <= set(held_out(70, "val"))
     tested = named_selection(selection, cameras, 8, 4, "test")
-    assert not set(tested.targets) & set(trained(70))
+    assert not set(tested.targets) & set(training_frames(70))
 
 
 def test_uniform_is_the_evaluation_of_made_up_scenes():

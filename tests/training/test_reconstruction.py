@@ -52,6 +52,19 @@ def test_which_parameters_are_trained_and_which_decay(build, model):
         assert not name.endswith(".weight") or "Norm" in kind, name
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "measure"), [("norm", torch.linalg.vector_norm), ("value", torch.amax)]
+)
+def test_gradients_are_clipped(build, algorithm, measure):
+    module = make_module(build("width=0.125", "state_size=8"))
+    optimizer = module.configure_optimizers()["optimizer"]
+    for parameter in module.parameters():
+        parameter.grad = torch.full_like(parameter, 3.0)
+    module.configure_gradient_clipping(optimizer, 0.5, algorithm)
+    grads = torch.cat([p.grad.flatten() for p in module.parameters()])
+    torch.testing.assert_close(measure(grads), torch.tensor(0.5))
+
+
 def test_the_matrix_a_of_mamba_vision_does_not_decay(build):
     module = make_module(build("width=0.125", "state_size=8", device="meta"))
     matrix = module.net.appearance["stages"][0][0].mixer.A_log

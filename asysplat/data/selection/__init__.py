@@ -7,7 +7,7 @@ from asysplat.data.selection.frames import (
     first_96_selection,
     held_out,
     spread,
-    trained,
+    training_frames,
     training_selection,
     uniform_selection,
 )
@@ -25,7 +25,7 @@ __all__ = [
     "kmeans_selection",
     "named_selection",
     "spread",
-    "trained",
+    "training_frames",
     "training_selection",
     "uniform_selection",
 ]

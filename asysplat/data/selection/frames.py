@@ -78,11 +78,11 @@ def training_selection(
 
 
 def held_out(num_frames: int, split: Split) -> list[int]:
-    """Return every 8th frame, from the first on for test (paper, Suppl. A), the fifth for val."""
+    """Return frames 0, 8, 16, ... for test (paper, Suppl. A), 4, 12, 20, ... for val."""
     return list(range(HELD_OUT_START[split], num_frames, HELD_OUT_STEP))
 
 
-def trained(num_frames: int) -> list[int]:
+def training_frames(num_frames: int) -> list[int]:
     """Return the frames that neither validation nor test holds out."""
     out = held_out(num_frames, "val") + held_out(num_frames, "test")
     return sorted(set(range(num_frames)) - set(out))
@@ -98,7 +98,7 @@ def every_8th_selection(
     Raises:
         InputError: the sequence is too short.
     """
-    inputs, targets = trained(num_frames), held_out(num_frames, split)
+    inputs, targets = training_frames(num_frames), held_out(num_frames, split)
     check_held_out(num_frames, len(inputs), num_inputs, split)
     return Selection(spread(inputs, num_inputs), spread(targets, min(num_targets, len(targets))))
 
@@ -128,7 +128,7 @@ def paper_frames(num_frames: int, num_targets: int, split: Split) -> tuple[list[
     """
     targets = held_out(num_frames, split)
     if split == "val":
-        return trained(num_frames), spread(targets, min(num_targets, len(targets)))
+        return training_frames(num_frames), spread(targets, min(num_targets, len(targets)))
     return sorted(set(range(num_frames)) - set(targets)), targets
 
 

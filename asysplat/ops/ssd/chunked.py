@@ -11,7 +11,7 @@ from torch import Tensor
 
 from asysplat.ops.recurrence import linear_recurrence
 
-CHUNK = 64  # tokens, of every form; FLOPs and the benchmark's lower bounds are those of this size
+CHUNK = 64  # tokens of a chunk on every backend; FLOPs and the benchmark's floors assume it
 
 
 def ssd_chunked(

@@ -13,7 +13,7 @@ from asysplat.ops.cpu.kernel import inline
 from asysplat.ops.cpu.vectors import LANES, fma
 from asysplat.rendering.formulas import FARTHEST, PIXEL_MARGIN
 
-# A splat [16] float32, one cache line; BASE_* hold int32, the REST what float32 leaves over.
+# A splat [16] float32, one cache line; BASE_* hold int32, *_REST the rounding error of the float32.
 # alpha = 2^(LOG_OPACITY - (A dx + B dy)^2 - (C dy)^2), the centre at (BASE_X + X, BASE_Y + Y);
 # it shows nothing beyond EXTENT_Y above and below its centre.
 X, Y, A, B, C, LOG_OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
@@ -55,7 +55,7 @@ class RasterSettings(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What all kernels are told."""
+    """Sizes and settings that every kernel reads."""
 
     images: int  # views of all scenes
     views: int  # of a scene

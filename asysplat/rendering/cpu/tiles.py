@@ -1,7 +1,7 @@
 """Which tiles a splat touches, and the list of splats of every tile.
 
-Which tiles a splat touches is asked once, while it is in the cache; the lists are made of the
-answers. A list is sorted by depth by the thread that draws its tile.
+The tiles of a splat are found once, when it is projected; the lists are built from what was found.
+A list is sorted by depth by the thread that draws its tile.
 """
 
 import math

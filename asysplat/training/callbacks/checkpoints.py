@@ -8,10 +8,11 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 
 class Checkpoints(ModelCheckpoint):
-    """Keeps the best checkpoint, as Lightning does, and a last.ckpt.
+    """Writes the best checkpoint and last.ckpt.
 
-    last.ckpt is written after every epoch, each of which ends with a validation, and when training
-    ends. If no callback measures what is monitored, there is no best.
+    The best is named and chosen by `filename` and `monitor` in conf/callbacks/default.yaml; without
+    a callback that logs what is monitored, it is not written. last.ckpt is written after every
+    validation and when training ends.
     """
 
     @property
