@@ -13,6 +13,8 @@ from asysplat.benchmark.data.tables import tables
 from asysplat.data import open_scene
 from asysplat.data.images import content_hash
 
+pytestmark = pytest.mark.slow
+
 WORDS = {"scale": "laptop", "width": 0.125, "state_size": 8}
 
 

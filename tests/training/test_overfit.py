@@ -1,5 +1,6 @@
 """The whole chain can learn: network, renderer, loss and optimizer on one scene."""
 
+import pytest
 import torch
 
 from asysplat.data.datamodule import collate, load
@@ -12,6 +13,7 @@ from asysplat.training import Reconstruction, ReconstructionLoss
 STEPS = 250
 
 
+@pytest.mark.slow
 def test_one_scene_overfitted_passes_30_db(build):
     scene = ProceduralScene(3, 32, 32)
     batch = collate([load(Task(scene, evaluation_split(96, 4, 2)))])
