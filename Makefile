@@ -1,18 +1,25 @@
-.PHONY: demo test slow format
+.PHONY: demo quick test hours style format
 PYTHON ?= python3
 ENV := .venv/.ready
+# Two tests at a time, a thread each; who is done takes tests of the other.
+PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist worksteal
 
 demo: $(ENV) ## train a small model on synthetic scenes, measure it, draw what it sees
 	.venv/bin/python train.py name=demo
 	@echo "to go on with commands of your own: source .venv/bin/activate"
 
-test: $(ENV) ## style and tests
+quick: style ## style, and the tests that take seconds
+	$(PYTEST) -m "not slow and not hours"
+
+test: style ## style, and all tests but those of hours
+	$(PYTEST)
+
+hours: $(ENV) ## what takes an hour or two: long runs on real scenes, two processes for every model
+	$(PYTEST) -m hours
+
+style: $(ENV)
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
-	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 # two tests at a time, a thread each
-
-slow: $(ENV) ## what takes an hour or two: long runs on real scenes, two processes for every model
-	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 -m slow
 
 format: $(ENV)
 	.venv/bin/ruff check --fix .

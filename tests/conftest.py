@@ -1,8 +1,15 @@
-"""What every test gets: a seed, small scenes, the shared data if it is there, and no GPU test
-without a GPU."""
+"""What every test gets: a seed, small scenes, the scripts, the shared data if it is there, and no
+GPU test without a GPU."""
 
+import io
 import os
+import runpy
+import subprocess
+import sys
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
@@ -39,6 +46,44 @@ def build(repository):
             return instantiate(config.model)
 
     return network
+
+
+@pytest.fixture(scope="session")
+def run_script():
+    """The function below: a script as its own interpreter would run it, without starting one."""
+    return _run_script
+
+
+def _run_script(name: str, *overrides: str) -> subprocess.CompletedProcess:
+    """Run a script of the repository with these overrides, in this process."""
+    script, out, err, status = REPO / name, io.StringIO(), io.StringIO(), None
+
+    def show(message, category, filename, lineno, file=None, line=None):
+        sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
+
+    deterministic = torch.get_deterministic_debug_mode()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        mock.patch.dict(os.environ),
+        warnings.catch_warnings(),
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
+        warnings.resetwarnings()
+        warnings.filterwarnings("ignore", module="beartype")  # of types, when it first reads them
+        patch.setattr(warnings, "formatwarning", warnings.formatwarning)
+        patch.setattr(warnings, "showwarning", show)
+        patch.setattr(sys, "argv", [str(script), *map(str, overrides)])
+        patch.chdir(REPO)
+        try:
+            runpy.run_path(str(script), run_name="__main__")
+        except SystemExit as end:
+            status = end.code
+    torch.set_deterministic_debug_mode(deterministic)
+    if isinstance(status, str):
+        print(status, file=err)
+    code = status if isinstance(status, int) else int(status is not None)
+    return subprocess.CompletedProcess([name, *overrides], code, out.getvalue(), err.getvalue())
 
 
 @pytest.fixture(scope="session")
@@ -80,6 +125,9 @@ def seed():
 
 
 def pytest_collection_modifyitems(items):
+    # Files with slow tests first, so that no process is left with a long test at the end.
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
     if torch.cuda.is_available():
         return
     for item in items:

@@ -76,6 +76,7 @@ def test_options_of_the_other_scripts():
         check_overrides(["repeat=3"], "benchmark")
 
 
+@pytest.mark.slow
 def test_a_script_says_it_from_any_folder(repository, tmp_path):
     command = [sys.executable, repository / "report.py", "cots=true"]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
@@ -101,6 +102,7 @@ def printed_commands(repository) -> list[tuple[str, str]]:
     return sorted(found)
 
 
+@pytest.mark.slow
 def test_every_printed_command_names_what_is_there(repository):
     printed = printed_commands(repository)
     assert len(printed) > 100

@@ -21,9 +21,10 @@ def solve_widths(
 ) -> tuple[Widths, int]:
     """Find widths and appearance layers whose model meets the budget and has the asked share.
 
-    The number of layers changes only where the widths alone, multiples of the head_dim, cannot give
-    the ratio. Parameter counts are quadratic polynomials in the widths: a few models on the meta
-    device determine the coefficients, and the search then builds no more of them.
+    The number of layers changes only where the widths alone, multiples of the head_dim, cannot
+    give the ratio. Parameter counts are quadratic polynomials in the widths, and what another
+    layer adds is one in the fine width: a few models on the meta device determine them, and the
+    search is then free.
 
     Args:
         build: widths, appearance layers -> model with a `geometry_share()`.
@@ -40,19 +41,27 @@ def solve_widths(
         raise InputError(f"geometry_ratio={ratio}: give a share between 0 and 1, such as 0.9.")
     wanted = budget * _count(build(base, layers))[0]
     candidates = _candidates(base)
-    terms = _quadratic_terms(candidates / base.head_dim)
+    heads = candidates / base.head_dim
+    samples = _samples(len(base.stages) + 1)
+    counts = _counts(build, base, layers, samples)
+    predicted = _quadratic_fit(samples, counts, heads)
+    added = None  # by another layer
+    fine_alone = (samples[:, :-1] == samples[0, :-1]).all(axis=1)  # three samples: a quadratic
     # Among the widths that fit, those are best that keep the proportions of the stages.
     shape_error = np.log(candidates[:, :-1] / np.array(base.stages)).std(axis=1)
 
     def errors(total: np.ndarray | int, geometry: np.ndarray | float) -> np.ndarray | float:
-        """At most 1 where both tolerances are kept."""
+        """Return at most 1 where both tolerances are kept."""
         share = np.abs(geometry / total - ratio) / SHARE_TOLERANCE
         return np.maximum(share, np.abs(total / wanted - 1) / TOTAL_TOLERANCE)
 
     closest, description = np.inf, ""
     for count in sorted(range(1, 3 * layers + 1), key=lambda n: (abs(n - layers), -n)):
-        coefficients = _fit_counts(lambda widths, n=count: build(widths, n), base)
-        error = errors(*(terms @ coefficients).T)
+        if count != layers and added is None:
+            more = _counts(build, base, layers + 1, samples[fine_alone]) - counts[fine_alone]
+            added = _quadratic_fit(samples[fine_alone, -1:], more, heads[:, -1:])
+        here = predicted if count == layers else predicted + (count - layers) * added
+        error = errors(*here.T)
         rank = np.where(error < 1, error / 2 + shape_error, 1e3 + error)
         order = np.argsort(rank, kind="stable")  # the same widths on every machine
         # The polynomial ignores rounding and stages of equal width, so candidates are built and
@@ -96,14 +105,16 @@ def _quadratic_terms(widths: np.ndarray) -> np.ndarray:
     return np.stack([padded[:, i] * padded[:, j] for i, j in pairs], axis=1)
 
 
-def _fit_counts(build: Callable[[Widths], nn.Module], base: Widths) -> np.ndarray:
-    """Return the coefficients [terms, 2] of the total and of the geometry branch."""
-    samples = _samples(len(base.stages) + 1)
-    counts = []
-    for row in samples:
-        *stages, fine = (int(value) * base.head_dim for value in row)
-        counts.append(_count(build(Widths(tuple(stages), fine, base.head_dim))))
-    return np.linalg.solve(_quadratic_terms(samples), np.array(counts, dtype=np.float64))
+def _quadratic_fit(samples: np.ndarray, counts: np.ndarray, widths: np.ndarray) -> np.ndarray:
+    """Evaluate the quadratic polynomials through `counts` [samples, 2] at `widths`: [n, 2]."""
+    return _quadratic_terms(widths) @ np.linalg.solve(_quadratic_terms(samples), counts)
+
+
+def _counts(build: Build, base: Widths, layers: int, samples: np.ndarray) -> np.ndarray:
+    """Count the parameters [samples, 2], all and the geometry branch's; widths are in heads."""
+    rows = (tuple(int(width) * base.head_dim for width in sample) for sample in samples)
+    models = (build(Widths((*stages,), fine, base.head_dim), layers) for *stages, fine in rows)
+    return np.array([_count(model) for model in models], dtype=np.float64)
 
 
 def _samples(columns: int) -> np.ndarray:

@@ -54,7 +54,9 @@ def log_choices(logger: TensorBoardLogger, config: DictConfig) -> None:
     logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in HPARAMS_METRICS})
 
 
-def log_outcome(logger: TensorBoardLogger, results: Mapping[str, float], data: str) -> None:
+def log_outcome(
+    logger: TensorBoardLogger, results: Mapping[str, str | int | float], data: str
+) -> None:
     """Fill the hparams tab with the test's numbers."""
     found = {f"hp/{name}": results.get(f"test/{data}/{name}") for name in HPARAMS_METRICS}
     logger.log_metrics({name: value for name, value in found.items() if value is not None})

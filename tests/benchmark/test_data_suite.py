@@ -12,6 +12,8 @@ from asysplat.benchmark.data.suite import CACHES, tables
 from asysplat.data import open_scene
 from asysplat.data.images import content_hash
 
+pytestmark = pytest.mark.slow
+
 OVERRIDES = {"scale": "laptop", "width": 0.125, "state_size": 8}
 
 

@@ -17,6 +17,8 @@ from asysplat.errors import InputError
 from asysplat.evaluation.cost import true_flops
 from asysplat.evaluation.static_cost import blank_views
 
+pytestmark = pytest.mark.slow
+
 CPU = torch.device("cpu")
 OVERRIDES = {"scale": "laptop", "width": 0.125, "state_size": 8}
 NAMES, VIEWS = ["asysplat_4m4t", "asysplat_4m4s"], [4, 8]

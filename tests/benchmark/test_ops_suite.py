@@ -23,6 +23,8 @@ from asysplat.benchmark.products import (
 from asysplat.errors import InputError
 from asysplat.evaluation.cost import true_flops
 
+pytestmark = pytest.mark.slow
+
 CPU = torch.device("cpu")
 BOUNDS = {"fp32": 2e-6, "bf16": 1e-2}
 LENGTH, LOOP_TOKENS = 150, 50

@@ -8,6 +8,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from tiny import SCENES, SIZE, VIEWS
 
 from asysplat.data.datamodule import TrainingTasks, collate
 
@@ -25,9 +26,7 @@ TRAINED = [(group, name) for group, name in GROUPS if group in ("model", "experi
 TRAINED += [("sweeps", path.stem) for path in sorted(SWEEPS.glob("*.yaml"))]
 STAGES = ("stage1", "stage2", "stage3", "ablation")
 TRAINED += [("stage", stage) for stage in STAGES]
-TINY = ["width=0.125", "state_size=8", "data.num_workers=0", "data.num_frames=32"]
-TINY += ["data.inputs=2", "data.targets=1", "data.window=[12,32]"]
-TINY += ["data.val_scenes=1", "data.test_scenes=1", "data.test_sets=null"]
+TINY = [*SIZE, *VIEWS, *SCENES, "data.test_sets=null", "data.batch_size=1"]
 
 
 def compose_train(*overrides):
@@ -48,6 +47,7 @@ def test_composes_and_builds_its_model(group):
     assert sum(p.numel() for p in net.parameters()) > 1e6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(SWEEPS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_row_of_a_sweep_builds_its_model(path):
     config = compose_train(f"sweeps={path.stem}")
@@ -63,12 +63,13 @@ def test_every_row_of_a_sweep_builds_its_model(path):
                 instantiate(row.model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", sorted(set(TRAINED) - PARTS), ids="/".join)
 def test_trains_a_step_at_a_tiny_size(choice):
     overrides = ["=".join(choice), *TINY]
     if choice[0] == "sweeps":
         overrides += first_rows(compose_train(overrides[0]))
-    config = compose_train(*overrides, "data.height=32", "data.width=32", "data.batch_size=1")
+    config = compose_train(*overrides)
     data = instantiate(config.data)
     module = instantiate(config.training, net=instantiate(config.model))
     batch = collate([TrainingTasks(data)[0]])

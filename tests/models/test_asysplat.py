@@ -3,12 +3,11 @@
 import pytest
 import torch
 from hydra.errors import InstantiationException
+from tiny import NETWORK as TINY
 
 from asysplat.errors import InputError, input_error_behind
 from asysplat.models.stage import parse_layer_mix
 from asysplat.scene import Cameras, Views
-
-TINY = ["width=0.125", "model.blocks.m.state_size=8", "model.layers=1m1s"]
 
 
 def make_views(batch=(2,), views=3, height=32, width=64):
@@ -58,6 +57,7 @@ def test_geometry_share_of_the_paper(build):
     assert abs(build("scale=paper", device="meta").geometry_share() - 0.905) < 0.001
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.3, 0.5, 0.7, 0.9, 0.95])
 @pytest.mark.parametrize("width", [0.125, 0.25, 1.0])
 def test_geometry_ratio(build, ratio, width):
@@ -71,6 +71,7 @@ def test_geometry_ratio(build, ratio, width):
     assert f"stages {stages} wide" in net.describe() and f"{net.widths.fine} wide" in net.describe()
 
 
+@pytest.mark.slow
 def test_parameter_budget(build):
     base = build(device="meta")
     net = build("geometry_ratio=0.8", "parameter_budget=0.5", device="meta")
@@ -93,6 +94,7 @@ def test_what_a_model_refuses(build, overrides, complaint):
     assert complaint in str(input_error_behind(caught.value))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ratio", "complaint"), [(1.2, "between 0 and 1"), (0.01, "closest come stages ")]
 )

@@ -2,11 +2,10 @@
 
 import pytest
 import torch
+from tiny import SIZE as TINY
 
 from asysplat.evaluation.static_cost import blank_views
 from asysplat.models.single_branch import TokenMerge
-
-TINY = ["width=0.125", "state_size=8"]
 
 
 @pytest.mark.parametrize(("width", "new_width", "group"), [(2, 6, 1), (4, 6, 2)])

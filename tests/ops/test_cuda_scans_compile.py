@@ -10,6 +10,8 @@ from asysplat.ops import selective_scan, ssd
 
 triton = pytest.importorskip("triton")
 
+pytestmark = pytest.mark.slow
+
 TYPES = {torch.bfloat16: "bf16", torch.float32: "fp32"}
 SCANS = {"ssd": ssd, "selective_scan": selective_scan}
 KERNELS = {

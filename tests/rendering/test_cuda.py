@@ -246,6 +246,7 @@ def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
         draw_by_cuda(*make_batch(make_scene), Settings())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
 def test_kernels_in_the_interpreter():
     pytest.importorskip("triton")

@@ -8,6 +8,8 @@ from asysplat.rendering import render
 
 triton = pytest.importorskip("triton")
 
+pytestmark = pytest.mark.slow
+
 TYPES = {torch.float32: "fp32", torch.float64: "fp64", torch.int16: "i16", torch.int32: "i32"}
 TYPES |= {torch.int64: "i64", torch.bool: "i1"}
 KERNELS = {

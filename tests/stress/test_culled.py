@@ -2,12 +2,14 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 from backends import (
     BACKGROUND,
     FIELDS,
+    INTERPRETED,
     assert_as_without,
     both_ways,
     facing,
@@ -17,6 +19,12 @@ from asysplat.errors import InputError
 from asysplat.rendering import INRIA, render
 
 NAN, INF = math.nan, math.inf
+
+
+@pytest.fixture(scope="session")
+def make_scene(make_scene):
+    """Triton's interpreter takes as long as there are tiles: here an image has two of them."""
+    return partial(make_scene, height=7, width=9) if INTERPRETED else make_scene
 
 
 def spoiled(make_scene, **values):

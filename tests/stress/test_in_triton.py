@@ -29,13 +29,20 @@ SOME = {
 }
 
 
+# Two processes, of which each takes a minute.
+HALVES = [list(SOME)[:3], list(SOME)[3:]]
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
-@pytest.mark.parametrize("name", SOME)
-def test_cases_in_the_interpreter(name):
+@pytest.mark.parametrize("names", HALVES, ids=" ".join)
+def test_cases_in_the_interpreter(names):
     pytest.importorskip("triton")
-    path = Path(__file__).with_name(f"test_{name}.py")
+    paths = [str(Path(__file__).with_name(f"test_{name}.py")) for name in names]
+    some = [f"test_{name}.py and ({SOME[name] or 'test'})" for name in names]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *paths]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", str(path), "-k", SOME[name]],
+        [*command, "-k", " or ".join(some)],
         env={**os.environ, "TRITON_INTERPRET": "1"},
         capture_output=True,
         text=True,

@@ -1,4 +1,4 @@
-"""Long runs on real scenes, as they are, and with bounds checks in poisoned memory: make slow."""
+"""Long runs on real scenes, as they are, and with bounds checks in poisoned memory: make hours."""
 
 import json
 import os
@@ -12,7 +12,7 @@ SCENES = ("fern", "fox", "mydesk", "hololens-000", "splats/plant.splat")
 CHECKS = {"NUMBA_BOUNDSCHECK": "1"}
 POISON = {"GLIBC_TUNABLES": "glibc.malloc.perturb=128"}
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(7200)]
+pytestmark = [pytest.mark.hours, pytest.mark.timeout(7200)]
 both_ways = pytest.mark.parametrize("checked", [False, True], ids=["as it is", "checked"])
 
 

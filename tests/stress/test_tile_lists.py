@@ -121,6 +121,7 @@ def check_lists(lists, height: int, width: int) -> int:
     return pairs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(256, 256), (250, 256), (64, 300), (256, 17)], ids=str)
 def test_a_million_splats_that_end_where_tiles_begin(lists_of, size):
     """Two scenes of each size: 2^20 splats in all."""

@@ -1,40 +1,70 @@
 """train.py as a user runs it, on tiny synthetic scenes."""
 
 import os
+import signal
 import subprocess
 import sys
+import time
+from contextlib import contextmanager
 
 import pytest
+from tiny import NETWORK, SCENES, STEPS, VIEWS
 
-TINY = [
-    *("width=0.125", "state_size=8", "model.layers=1m1s", "steps=4", "validate_every=2"),
-    "trainer.log_every_n_steps=1",
-    *("data.height=32", "data.width=32", "data.inputs=3", "data.targets=2", "data.num_workers=0"),
-]
-TINY_SCENES = [
-    *("data.num_frames=24", "data.window=[12,24]"),
-    *("data.val_scenes=1", "data.test_scenes=2"),
-]
+TINY = [*NETWORK, *STEPS, *VIEWS]
+TINY_SCENES = [*SCENES, "data.test_scenes=2"]
 
 
 @pytest.fixture
-def train(tmp_path, repository, monkeypatch):
+def train(tmp_path, run_script, repository):
     """Runs train.py with overrides; logs go below tmp_path."""
+    return make_train(tmp_path, run_script, repository)
+
+
+def make_train(logs, run_script, repository):
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
 
     def complete(*overrides):
         synthetic = not any(override.startswith("data=") for override in overrides)
         scenes = TINY_SCENES if synthetic else []
-        tiny = [option for option in TINY if option.split("=")[0] not in str(overrides)]
-        return [*overrides, f"paths.logs={tmp_path}", *scenes, *tiny]
+        tiny = [option for option in (*TINY, *scenes) if option.split("=")[0] not in str(overrides)]
+        return [*overrides, f"paths.logs={logs}", *tiny]
 
     def run(*overrides):
+        """In this process, which has all imports behind it."""
+        return run_script("train.py", *complete(*overrides))
+
+    def run_alone(*overrides):
+        """In an interpreter of its own, as a user does."""
         command = [sys.executable, "train.py", *complete(*overrides)]
         return subprocess.run(
             command, cwd=repository, env=environment, capture_output=True, text=True
         )
 
-    run.complete = complete
-    run.command = [sys.executable, "train.py", f"paths.logs={tmp_path}", *TINY, *TINY_SCENES]
-    run.environment = environment
+    @contextmanager
+    def start(*overrides, until, cwd=repository, env=environment):
+        """A process, when the folder of logs has a file of the name `until`; ends with the test.
+
+        It takes SIGINT, also where the shell that started the tests ignores it, as it does for what
+        runs in its background.
+        """
+        process = subprocess.Popen(
+            [sys.executable, repository / "train.py", *complete(*overrides)],
+            cwd=cwd,
+            env=env,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+        deadline = time.monotonic() + 300
+        try:
+            while not list(logs.rglob(until)):
+                assert process.poll() is None and time.monotonic() < deadline
+                time.sleep(0.01)
+            yield process
+        finally:
+            process.kill()
+            process.communicate()
+
+    run.alone, run.start, run.complete, run.environment = run_alone, start, complete, environment
     return run

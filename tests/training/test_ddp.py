@@ -13,7 +13,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from asysplat.scene import Cameras, Views
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.hours, pytest.mark.timeout(1800)]
 
 CONF = Path(__file__).parents[2] / "conf"
 PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
@@ -140,7 +140,7 @@ def test_two_processes_take_the_step_of_one(results, model):
 def first_moments(train, *overrides):
     """Of AdamW after a run's last step: means of its gradients."""
     batches = ["model=asysplat_pred_fine", "model.layers=1m1t", "training.loss.depth=0"]
-    result = train(*batches, *overrides)
+    result = train.alone(*batches, *overrides)
     assert result.returncode == 0, result.stderr
     (line,) = [line for line in result.stdout.splitlines() if line.startswith("run: ")]
     path = Path(line.removeprefix("run: ")) / "checkpoints" / "last.ckpt"

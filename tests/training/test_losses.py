@@ -5,6 +5,7 @@ import warnings
 import pytest
 import torch
 import torch.nn.functional as F
+from tiny import NETWORK
 from torchvision.models import vgg16 as torchvision_vgg16
 from torchvision.models import vgg19 as torchvision_vgg19
 
@@ -131,7 +132,7 @@ def test_input_disparity_by_hand():
 
 def test_input_disparity_of_a_network(build):
     """Its Gaussians are the map that the term takes them to be, in a batch, at half the size."""
-    net = build("width=0.125", "state_size=8", "model.layers=1m1s")
+    net = build(*NETWORK)
     two = cameras(32)
     inputs = Views(two, torch.rand(2, 3, 32, 32), 1 + torch.rand(2, 32, 32))
     inputs = Views.stack([inputs, inputs])

@@ -1,7 +1,6 @@
 """The whole chain can learn: network, renderer, loss and optimizer on one scene."""
 
-from functools import partial
-
+import pytest
 import torch
 
 from asysplat.data.datamodule import collate, load
@@ -15,6 +14,7 @@ from asysplat.training.schedule import cosine
 STEPS = 250
 
 
+@pytest.mark.slow
 def test_one_scene_overfitted_passes_30_db(build):
     scene = ProceduralScene(3, 32, 32)
     batch = collate([load(Task(scene, uniform_selection(96, 4, 2)))])

@@ -2,35 +2,40 @@
 
 import json
 import signal
-import subprocess
-import time
 
 import pytest
 from hydra import compose, initialize_config_dir
 
 from asysplat.training.runs import describe_run
 
+pytestmark = pytest.mark.slow
+
 SWEEP = ["sweeps=layers", "model=asysplat_7m1s", "model.layers=1m1s", "steps=1"]
+SWEEP += ["data.test_sets=null", "callbacks.pictures=null"]
 
 
 def finished_seeds(logs) -> list[int]:
     return sorted(json.loads(path.read_text())["run/seed"] for path in logs.rglob("metrics.json"))
 
 
-def test_an_interrupted_sweep_runs_only_what_is_missing(train, repository, tmp_path):
-    process = subprocess.Popen(
-        [*train.command, *SWEEP, "seed=0,1,2"],
-        cwd=repository,
-        env=train.environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    deadline = time.monotonic() + 300
-    while not finished_seeds(tmp_path):
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+@pytest.fixture
+def finish(train, repository, tmp_path):
+    """Leaves behind what a finished run does, without running it."""
+
+    def write(seed, **changes):
+        with initialize_config_dir(str(repository / "conf"), version_base=None):
+            config = compose("train", [*train.complete(*SWEEP), f"seed={seed}"])
+        (tmp_path / str(seed)).mkdir()
+        described = describe_run(config) | {f"run/{key}": value for key, value in changes.items()}
+        (tmp_path / str(seed) / "metrics.json").write_text(json.dumps(described))
+
+    return write
+
+
+def test_an_interrupted_sweep_runs_only_what_is_missing(train, tmp_path):
+    with train.start(*SWEEP, "seed=0,1,2", until="metrics.json") as process:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("metrics.json")}
     assert len(before) < 3
 
@@ -45,17 +50,9 @@ def test_an_interrupted_sweep_runs_only_what_is_missing(train, repository, tmp_p
     assert finished_seeds(tmp_path) == [0, 1, 2, 2]
 
 
-def test_what_another_revision_finished_is_told_and_run_again_where_asked(
-    train, repository, tmp_path
-):
-    overrides = [*train.command[2:], *SWEEP]
-    for seed, changes in enumerate(({"run/revision": "0123456789ab"}, {})):
-        with initialize_config_dir(str(repository / "conf"), version_base=None):
-            config = compose("train", [*overrides, f"seed={seed}"])
-        (tmp_path / str(seed)).mkdir()
-        described = json.dumps(describe_run(config) | changes)
-        (tmp_path / str(seed) / "metrics.json").write_text(described)
-
+def test_what_another_revision_finished_is_told_and_run_again_where_asked(train, finish, tmp_path):
+    finish(0, revision="0123456789ab")
+    finish(1)
     result = train(*SWEEP, "seed=0,1")
     told = [line for line in result.stdout.splitlines() if "finished already" in line]
     assert told[0].startswith("job 0: finished already by 0123456789ab, while this is")
@@ -77,12 +74,13 @@ def test_a_failure_is_named_and_the_others_go_on(train, tmp_path):
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
-def test_launchers(train, tmp_path, launcher):
+def test_launchers(train, finish, tmp_path, launcher):
+    """Two of three jobs are still to be run."""
     plugin = launcher.partition("_")[0]
     pytest.importorskip(f"hydra_plugins.hydra_{plugin}_launcher")
-    overrides = [f"hydra/launcher={launcher}", "data.num_workers=1"]
-    result = train(*SWEEP, "seed=0,1", *overrides)
+    finish(2)
+    before = (tmp_path / "2" / "metrics.json").stat().st_mtime_ns
+    result = train.alone(*SWEEP, "seed=0,1,2", f"hydra/launcher={launcher}", "data.num_workers=1")
     assert result.returncode == 0, result.stderr
-    assert finished_seeds(tmp_path) == [0, 1]
-    assert train(*SWEEP, "seed=0,1", *overrides).returncode == 0
-    assert finished_seeds(tmp_path) == [0, 1]
+    assert finished_seeds(tmp_path) == [0, 1, 2]
+    assert (tmp_path / "2" / "metrics.json").stat().st_mtime_ns == before

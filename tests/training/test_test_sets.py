@@ -9,16 +9,15 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from tiny import NETWORK, SCENES, VIEWS
 
 from asysplat.training.callbacks import Costs, Metrics, Pictures
 from asysplat.training.callbacks.metrics import gather
 from asysplat.training.summary import print_summary
 
-TINY = [
-    *("width=0.125", "state_size=8", "model.layers=1m1s", "paths.run=unused"),
-    *("data.height=32", "data.width=32", "data.inputs=3", "data.targets=2", "data.num_workers=0"),
-    *("data.num_frames=24", "data.window=[12,24]", "data.val_scenes=1", "data.test_scenes=1"),
-]
+pytestmark = pytest.mark.slow
+
+TINY = [*NETWORK, *VIEWS, *SCENES, "paths.run=unused"]
 
 
 measured_costs: dict[Path, dict] = {}  # by the folder of a run

@@ -4,19 +4,15 @@ import contextlib
 import csv
 import json
 import math
-import runpy
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
-from hydra import compose, initialize_config_dir
+from conftest import make_train
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-from asysplat.errors import input_error_behind
 
 
 def run_folder(result: subprocess.CompletedProcess) -> Path:
@@ -31,8 +27,15 @@ def metrics(folder: Path) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
-def test_a_run_leaves_what_is_promised(train):
-    folder = run_folder(train())
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, run_script, repository) -> Path:
+    """The folder of a finished run of 6 steps."""
+    train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
+    return run_folder(train("name=whole", "steps=6"))
+
+
+def test_a_run_leaves_what_is_promised(whole):
+    folder = whole
     numbers = metrics(folder)
     for name in ("psnr", "ssim", "absrel", "delta1"):
         assert isinstance(numbers[f"test/procedural/{name}"], float)
@@ -58,11 +61,11 @@ def test_a_run_leaves_what_is_promised(train):
         assert len(values) == 2 * 2
         assert abs(sum(values) / len(values) - numbers[f"test/{name}/psnr"]) < 1e-4
 
-    assert yaml.safe_load((folder / "config.yaml").read_text())["steps"] == 4
+    assert yaml.safe_load((folder / "config.yaml").read_text())["steps"] == 6
     assert {"best.ckpt", "last.ckpt"} <= {p.name for p in (folder / "checkpoints").iterdir()}
     assert (folder / "pictures" / "test-0.png").stat().st_size > 10_000
     with (folder / "curve.csv").open() as file:
-        assert [row["step"] for row in csv.DictReader(file)] == ["2", "4"]
+        assert [row["step"] for row in csv.DictReader(file)] == ["2", "4", "6"]
     assert (folder / "pictures" / "curve.png").stat().st_size > 5_000
     check_tensorboard(folder / "tensorboard", numbers)
 
@@ -88,6 +91,7 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     assert "_hparams_/session_start_info" in plugins
 
 
+@pytest.mark.slow
 def test_a_protocol_by_name(train, shared):
     result = train("metrics=longlrm", "steps=2", f"paths.shared={shared}")
     numbers = metrics(run_folder(result))
@@ -104,9 +108,11 @@ LEFT_OUT = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overrides", LEFT_OUT, ids=" ".join)
-def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path):
-    train.environment |= {"TORCH_HOME": str(tmp_path), "ASYSPLAT_SHARED": str(tmp_path)}
+def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setenv("ASYSPLAT_SHARED", str(tmp_path))
     names = [key.partition(".")[2].removesuffix("=null") for key in overrides]
     result = train(*overrides)
     folder = run_folder(result)
@@ -132,6 +138,7 @@ def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path):
     assert "Epoch" not in result.stdout + result.stderr
 
 
+@pytest.mark.slow
 def test_bfloat16_with_the_perceptual_term(train, shared):
     perceptual = ["training.loss.perceptual=0.5", f"paths.shared={shared}"]
     folder = run_folder(train("trainer.precision=bf16-mixed", "steps=2", *perceptual))
@@ -143,21 +150,11 @@ def test_bfloat16_with_the_perceptual_term(train, shared):
     assert all(tensor.dtype != torch.bfloat16 for tensor in weights.values())
 
 
-def test_killed_and_resumed_ends_with_the_same_bits(train, repository, tmp_path):
-    whole = run_folder(train("name=whole", "steps=6"))
-    process = subprocess.Popen(
-        [*train.command, "name=killed", "steps=6"],
-        cwd=repository,
-        env=train.environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    deadline = time.monotonic() + 300
-    while not list(tmp_path.glob("killed/*/checkpoints/last.ckpt")):
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+@pytest.mark.slow
+def test_killed_and_resumed_ends_with_the_same_bits(train, whole, tmp_path):
+    with train.start("name=killed", "steps=6", until="last.ckpt") as process:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
     assert not list(tmp_path.glob("killed/*/metrics.json"))
     resumed = run_folder(train("name=killed", "steps=6", "ckpt_path=last"))
     weights = [
@@ -169,26 +166,16 @@ def test_killed_and_resumed_ends_with_the_same_bits(train, repository, tmp_path)
         assert torch.equal(tensor, weights[1][name]), name
 
 
+@pytest.mark.slow
 def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repository, tmp_path):
-    command = [train.command[0], repository / "train.py", *train.command[2:], "steps=1000"]
     environment = {k: v for k, v in train.environment.items() if k != "ASYSPLAT_SHARED"}
-    process = subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 300
-    while not list(tmp_path.rglob("last.ckpt")):
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.01)
-    for _ in range(4):  # Python drops an interrupt where it cannot raise it, as in a destructor
-        process.send_signal(signal.SIGINT)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            said, errors = process.communicate(timeout=20)
-            break
+    run = train.start("steps=1000", until="last.ckpt", cwd=tmp_path, env=environment)
+    with run as process:
+        for _ in range(4):  # Python drops an interrupt where it cannot raise it, as in a destructor
+            process.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                said, errors = process.communicate(timeout=20)
+                break
     assert process.returncode != 0 and "Traceback" not in errors
     checkpoint = next(tmp_path.rglob("last.ckpt"))
     assert f"add ckpt_path={checkpoint} to the same command" in said
@@ -196,6 +183,7 @@ def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repositor
     assert paths["shared"] == str(repository.parent / "shared")
 
 
+@pytest.mark.slow
 def test_geometry_ratio_sweep(train, tmp_path):
     result = train("-m", "geometry_ratio=0.5,0.7,0.9", "model.layers=4m4s", "width=0.25", "steps=1")
     assert result.returncode == 0, result.stderr
@@ -207,6 +195,7 @@ def test_geometry_ratio_sweep(train, tmp_path):
     assert max(totals) / min(totals) < 1.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fern", "fox", "mydesk", "hololens-000"])
 def test_a_real_scene(train, shared, name):
     scene = shared / "data" / name
@@ -249,49 +238,31 @@ REFUSED = {
 }
 
 
-# As a user meets them; two of them only there: these types are checked first in tests.
-IN_THE_SCRIPT = (
-    "an unknown option",
-    "one of a sweep",
-    "a missing folder",
-    "an unknown setting of a protocol",
-    "a loss of nothing",
-)
+# Tests check these types before the script does.
+ALONE = ("an unknown setting of a protocol", "a loss of nothing")
 
 
-@pytest.mark.parametrize("case", IN_THE_SCRIPT)
+@pytest.mark.parametrize("case", sorted(REFUSED.keys() - set(ALONE)))
 def test_mistakes_are_one_clear_sentence(train, case, tmp_path):
     overrides, message = REFUSED[case]
-    result = train(*overrides)
+    check_refusal(train(*overrides), message, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ALONE)
+def test_mistakes_are_one_clear_sentence_to_a_user(train, case, tmp_path):
+    overrides, message = REFUSED[case]
+    check_refusal(train.alone(*overrides), message, tmp_path)
+
+
+def check_refusal(result, message, tmp_path):
     assert result.returncode != 0
     assert message in result.stderr
     assert "Traceback" not in result.stderr
     assert not list(tmp_path.rglob("checkpoints"))
 
 
-@pytest.fixture(scope="module")
-def script(repository):
-    """The names of train.py, whose imports take longer than a refusal."""
-    return runpy.run_path(str(repository / "train.py"))
-
-
-@pytest.mark.parametrize("case", sorted(REFUSED.keys() - set(IN_THE_SCRIPT)))
-def test_mistakes_are_refused_before_work_starts(
-    train, script, repository, case, tmp_path, monkeypatch
-):
-    overrides, message = REFUSED[case]
-    monkeypatch.chdir(repository)
-    given = [f"paths.run={tmp_path}", *train.complete(*overrides)]
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        config = compose("train", given)
-    with pytest.raises(Exception) as raised:
-        script["train"](config)
-    assert message in f"error: {input_error_behind(raised.value)}\n"
-    assert not list(tmp_path.rglob("checkpoints"))
-
-
-def test_a_checkpoint_of_another_model(train):
-    folder = run_folder(train("steps=1"))
-    result = train("width=0.25", f"ckpt_path={folder}/checkpoints/last.ckpt")
+def test_a_checkpoint_of_another_model(train, whole):
+    result = train("width=0.25", f"ckpt_path={whole}/checkpoints/last.ckpt")
     assert result.returncode != 0
     assert "does not fit this model" in result.stderr and "Traceback" not in result.stderr
