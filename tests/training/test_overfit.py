@@ -1,5 +1,7 @@
 """The whole chain can learn: network, renderer, loss and optimizer on one scene."""
 
+from functools import partial
+
 import pytest
 import torch
 
