@@ -6,7 +6,7 @@ import runpy
 import pytest
 
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/tables.md"]
-DOCUMENTS += ["docs/benchmarks.md", "examples/README.md", "data/README.md"]
+DOCUMENTS += ["docs/questions.md", "docs/benchmarks.md", "examples/README.md", "data/README.md"]
 PLACES = r"`((?:asysplat|conf|sweeps|tests|docs|examples|data)/[\w./-]*)`"
 
 

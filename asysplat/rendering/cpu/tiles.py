@@ -1,4 +1,4 @@
-"""Which tiles a splat touches, and the list of splats of every tile.
+"""Which tiles of 16x16 pixels a splat touches, and the list of splats of every tile.
 
 The tiles of a splat are found once, when it is projected; the lists are built from what was found.
 A list is sorted by depth by the thread that draws its tile.
