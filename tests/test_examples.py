@@ -19,6 +19,7 @@ def test_it_draws_a_picture(repository, tmp_path, monkeypatch, capsys, name):
     assert str(picture) in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_photographs_are_checked_and_trained_on(repository, tmp_path, monkeypatch):
     scene = tmp_path / "my_scene"
     monkeypatch.setattr("sys.argv", ["write_scene", str(scene)])
