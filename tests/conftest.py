@@ -18,6 +18,9 @@ from hydra.utils import instantiate
 
 from asysplat.scene import Cameras, Gaussians
 
+if os.environ.get("TRITON_INTERPRET") == "1":
+    import interpreter  # noqa: F401
+
 REPO = Path(__file__).resolve().parents[1]
 
 
