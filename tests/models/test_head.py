@@ -36,7 +36,7 @@ def decode(kind, fill, views=None, stride=2):
 
 
 def distances(gaussians, views):
-    """Of the means from the camera that predicts them [V, n]."""
+    """How far the means are from the camera that predicts them, [V, n]."""
     centers = views.cameras.centers.reshape(-1, 1, 3)
     return (gaussians.means.reshape(len(centers), -1, 3) - centers).norm(dim=-1)
 

@@ -228,7 +228,7 @@ def test_a_set_of_the_papers_has_one_heading(table):
 
 
 def test_the_protocol_stands_above_the_numbers(table):
-    """Of the metrics that the table prints."""
+    """It tells how each metric that the table prints was taken."""
     console = Console(width=200, file=StringIO())
     render_terminal([table], console)
     page = Page(render_html([table]))

@@ -30,7 +30,7 @@ class Module(lightning.LightningModule):
 
 
 def steps_kept(folder, steps, measured=True) -> dict[str, int]:
-    """Of a training of two steps an epoch."""
+    """Train with two steps an epoch; return the step of each checkpoint that is left."""
     checkpoints = Checkpoints(
         dirpath=folder,
         filename="best",

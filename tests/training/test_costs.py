@@ -89,7 +89,7 @@ def test_each_test_set_has_costs_of_its_own():
 
 
 def test_seconds_leave_the_longest_out(monkeypatch):
-    # Of each scene: predicting starts, ends, rendering starts, ends.
+    # Four times a scene: predicting starts and ends, rendering starts and ends.
     clock = iter([0.0, 1.0, 1.0, 2.0, 10.0, 40.0, 40.0, 44.0, 50.0, 53.0, 53.0, 59.0])
     monkeypatch.setattr(measured_cost, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     found = measure({"main": [1, 1, 1]})

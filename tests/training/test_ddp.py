@@ -119,7 +119,7 @@ def process(rank, folder):
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """Of both processes, by model; started once for all models."""
+    """What both processes found, by model; started once for all models."""
     folder = str(tmp_path_factory.mktemp("processes"))
     mp.spawn(process, args=(folder,), nprocs=PROCESSES)
     return [torch.load(f"{folder}/{rank}.pt") for rank in range(PROCESSES)]
@@ -138,7 +138,7 @@ def test_two_processes_take_the_step_of_one(results, model):
 
 
 def first_moments(train, *overrides):
-    """Of AdamW after a run's last step: means of its gradients."""
+    """Train; return AdamW's running means of the gradients after the last step."""
     batches = ["model=asysplat_pred_fine", "model.layers=1m1t", "training.loss.depth=0"]
     result = train.alone(*batches, *overrides)
     assert result.returncode == 0, result.stderr

@@ -101,7 +101,7 @@ def placed(depth, camera):
 
 
 def test_input_disparity_by_hand():
-    """Of Gaussians in turned and moved views, each against its own view; and the gradient."""
+    """Gaussians of turned and moved views, each against its own view; and the gradient."""
     camera = cameras(4)
     pose = camera.cam_to_world.clone()
     spin = torch.linalg.matrix_exp(torch.tensor([[0.0, 0.3, -0.9], [-0.3, 0, 0.2], [0.9, -0.2, 0]]))

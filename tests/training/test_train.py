@@ -121,7 +121,7 @@ def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, mo
         "metrics": ("test/procedural/psnr" in numbers, (folder / "metrics.csv").exists()),
         "costs": ("cost/parameters" in numbers, "Gaussians a scene" in result.stdout),
         "pictures": ((folder / "pictures" / "test-0.png").exists(),),
-        # Of what metrics measure.
+        # The curve is drawn from what metrics measure.
         "curve": ((folder / "curve.csv").exists() or "metrics" in names,),
         "checkpoints": (
             (folder / "checkpoints" / "last.ckpt").exists(),

@@ -117,8 +117,8 @@ def errors(result: Result, exact: Result) -> dict[str, float]:
 
 
 def sum_error(grad: Tensor, whole: Tensor) -> float:
-    """Of the gradient of an expanded tensor, against that of its elements; relative to the largest
-    error of a sum of elements that are each as exact as they should be."""
+    """Compare the gradient of an expanded tensor with the sum of its elements' gradients; relative
+    to the largest error of a sum of elements that are each as exact as they should be."""
     right = whole.double().sum_to_size(grad.shape)
     scale = whole.double().norm() * (whole.numel() / grad.numel()) ** 0.5
     return float((grad.double() - right).norm() / scale)

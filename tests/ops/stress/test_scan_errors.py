@@ -26,7 +26,7 @@ def test_sizes_that_do_not_fit(path, name, dimension):
     def longer(tensor):
         return torch.cat((tensor, tensor), min(dimension, tensor.ndim - 1))
 
-    # Of two sizes of a state, either may be the wrong one.
+    # Where two tensors disagree on the size of a state, either may be named.
     blamed = r"\w+" if name in "ABC" and dimension else name
     with pytest.raises(InputError, match=rf"{path[0]}'s {blamed} has shape \(.*\): expected [([]"):
         run(path, with_argument(path, name, longer))
