@@ -60,6 +60,7 @@ def bars(
     parts: Mapping[str, Sequence[float]],
     limit: tuple[str, Sequence[float]],
     label: str,
+    spread: Sequence[float] | None = None,
 ) -> Figure:
     """Plot a horizontal bar for each name, made of parts, with a mark where its limit is.
 
@@ -67,6 +68,7 @@ def bars(
         parts: the lengths of a part in all bars; one that is 0 everywhere is left out.
         limit: its name, and its value for each bar.
         label: of the lengths.
+        spread: the interquartile range of each bar's length, drawn about its end.
     """
     colours = matplotlib.colormaps["tab10"].colors
     with matplotlib.rc_context(STYLE):
@@ -77,6 +79,8 @@ def bars(
             if any(lengths):
                 axes.barh(names, lengths, left=starts, color=colour, label=part)
             starts = [start + length for start, length in zip(starts, lengths, strict=True)]
+        if spread is not None:
+            axes.errorbar(starts, names, xerr=[iqr / 2 for iqr in spread], fmt="none", color=INK)
         axes.plot(limit[1], names, "|", color=INK, ms=18, mew=2, label=limit[0])
         axes.set_xlabel(label)
         axes.invert_yaxis()

@@ -7,6 +7,8 @@ their channels innermost where they had them so.
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from typing import Any
 
 import torch
@@ -174,12 +176,12 @@ def _largest_divisor(number: int, most: int) -> int:
     return next(d for d in range(max(1, min(number, most)), 0, -1) if number % d == 0)
 
 
-def product_seconds(counts: Counts, device: torch.device) -> dict[Product, float]:
-    """Time one call of each product."""
-    return {product: product.seconds(count, device) for product, count in counts.items()}
-
-
-def sum_of_products(counts: Counts, seconds: Mapping[Hashable, list[float]]) -> list[float]:
-    """Return the seconds of all products together, in each round."""
-    each = [[count * value for value in seconds[product]] for product, count in counts.items()]
-    return [sum(values) for values in zip(*each, strict=True)]
+def time_products(groups: Mapping[Hashable, Counts], device: torch.device) -> dict[Hashable, float]:
+    """Time each product once; return the seconds of one call of it, and those of each group."""
+    every = reduce(or_, map(Counter, groups.values()))  # with the greatest count of any group
+    seconds = {product: product.seconds(count, device) for product, count in every.items()}
+    sums = {
+        name: sum(count * seconds[product] for product, count in counts.items())
+        for name, counts in groups.items()
+    }
+    return seconds | sums

@@ -5,7 +5,7 @@ import gc
 import inspect
 import sys
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from types import FrameType
@@ -19,7 +19,7 @@ from asysplat.evaluation.measured_cost import wait_for
 
 Result = dict[str, Any]  # plain values, as JSON has them
 Run = Callable[[], object]
-Seconds = Mapping[Hashable, float]  # by name
+Timer = Callable[[], Mapping[Hashable, float]]  # seconds by name
 Name = Callable[[FrameType], str | None]
 
 
@@ -28,12 +28,12 @@ class Measurement:
     """One row of a suite's results.
 
     Args:
-        timer: runs everything that is timed of it once; returns seconds by name.
+        timer: runs everything that is timed of it once.
         found: results besides the times.
         seconds: those of every round, by name; `time_in_rounds` fills them.
     """
 
-    timer: Callable[[], Seconds]
+    timer: Timer
     found: Result = field(default_factory=dict)
     seconds: dict[Hashable, list[float]] = field(default_factory=dict)
 
@@ -60,6 +60,14 @@ def summary(values: Sequence[float]) -> dict[str, float]:
     return {"median": median, "iqr": high - low}
 
 
+def ratios(one: Result, other: Result, names: Iterable[str]) -> dict[str, float | None]:
+    """Divide medians by those of another result; None for what one of them was not timed for."""
+    return {
+        name: one[name]["median"] / other[name]["median"] if one[name] and other[name] else None
+        for name in names
+    }
+
+
 def now(device: torch.device) -> float:
     """Return the clock's seconds at which the device has finished its work."""
     wait_for(device)
@@ -78,28 +86,24 @@ def time_calls(
     functions: Mapping[Callable, Name], device: torch.device
 ) -> Iterator[dict[str, float]]:
     """Add up the seconds of every call of some functions, by name; see `watch_calls`."""
-    started: dict[str, float] = {}
     seconds: dict[str, float] = {}
 
-    def before(name: str) -> None:
-        started[name] = now(device)
+    def clock(name: str, begins: bool) -> None:
+        seconds[name] = seconds.get(name, 0.0) + (-now(device) if begins else now(device))
 
-    def after(name: str) -> None:
-        seconds[name] = seconds.get(name, 0.0) + now(device) - started[name]
-
-    with watch_calls(functions, before, after):
+    with watch_calls(functions, clock):
         yield seconds
 
 
 @contextmanager
 def watch_calls(
-    functions: Mapping[Callable, Name], before: Callable[[str], None], after: Callable[[str], None]
+    functions: Mapping[Callable, Name], watch: Callable[[str, bool], None]
 ) -> Iterator[None]:
-    """Call `before` and `after` around every call of some functions, as Python's profiler does.
+    """Report every call of some functions to `watch`, as Python's profiler does.
 
     Args:
         functions: what names a call of each, from its frame; None for a call to leave out.
-        before, after: given that name.
+        watch: given that name, and whether the call begins or ends.
     """
     names = {inspect.unwrap(function).__code__: name for function, name in functions.items()}
 
@@ -107,7 +111,7 @@ def watch_calls(
         if frame.f_code in names and event in ("call", "return"):
             name = names[frame.f_code](frame)
             if name is not None:
-                (before if event == "call" else after)(name)
+                watch(name, event == "call")
 
     previous = sys.getprofile()
     sys.setprofile(profile)

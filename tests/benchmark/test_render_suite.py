@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from asysplat.benchmark.options import find_suite
 from asysplat.benchmark.render.cases import CASES, Case, find_cases
-from asysplat.benchmark.render.passes import COUNT, RASTER, SIDE, hot_scene, run_timed
+from asysplat.benchmark.render.floor import COUNT, RASTER, SIDE, hot_scene
 from asysplat.benchmark.render.run import (
     FIELDS,
     SKIPS,
@@ -22,12 +22,12 @@ from asysplat.benchmark.render.run import (
     errors,
     find_backends,
     flips,
-    peak_gb,
     prepare,
     run,
     truth,
 )
 from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
+from asysplat.benchmark.timing import rise_gb
 from asysplat.errors import InputError
 from asysplat.evaluation.cost import CLEAR_PEAK
 from asysplat.rendering import INRIA, Skips
@@ -98,7 +98,8 @@ def test_a_skip_leaves_the_error_as_it_is(measured):
 def test_hot_rows_are_all_rows_of_all_tiles():
     """What the floor is made of: nothing is skipped, and the kernels take nearly all the time."""
     (backend,) = [backend for backend in find_backends() if backend.name == "cpu"]
-    outputs, seconds = run_timed(backend, Skips(), hot_scene())
+    outputs = run(backend, Skips(), hot_scene())
+    seconds = outputs.kernels
     tiles = (SIDE // outputs.stats["tile_size"]) ** 2
     assert outputs.stats["visible"] == COUNT and outputs.stats["pairs"] == COUNT * tiles
     assert outputs.stats["rows"] == COUNT * tiles * outputs.stats["tile_size"]
@@ -139,7 +140,8 @@ def test_peak_memory_is_the_rise():
 
     kept = torch.ones(50_000_000)
     inputs = prepare(random_scene(10, 8, 8), "cpu")
-    assert peak_gb(Backend("", "cpu", draw), Skips(), inputs) == pytest.approx(0.1, abs=0.02)
+    rise = rise_gb(lambda: run(Backend("", "cpu", draw), Skips(), inputs), torch.device("cpu"))
+    assert rise == pytest.approx(0.1, abs=0.02)
     del kept
 
 

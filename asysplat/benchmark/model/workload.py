@@ -9,6 +9,7 @@ import hydra
 import torch
 from hydra.utils import instantiate
 
+from asysplat.benchmark.options import PRECISIONS
 from asysplat.benchmark.scenes import on_an_arc, random_scene
 from asysplat.evaluation.cost import GB, count_parameters
 from asysplat.evaluation.static_cost import activation_gb
@@ -26,15 +27,13 @@ class Workload:
     Args:
         name: of the model.
         net: with random weights.
-        precision: fp32 or bf16.
-        dtype: of autocast; fp32 means none.
+        precision: of PRECISIONS; bf16 by autocast.
         views: one scene's.
     """
 
     name: str
     net: Network
     precision: str
-    dtype: torch.dtype
     views: Views
 
     @property
@@ -75,7 +74,8 @@ class Workload:
         return self.step_gb < FILLED * _memory_gb(self.device)
 
     def _autocast(self, device: str) -> torch.autocast:
-        return torch.autocast(device, self.dtype, enabled=self.dtype != torch.float32)
+        dtype = PRECISIONS[self.precision]
+        return torch.autocast(device, dtype, enabled=dtype != torch.float32)
 
 
 def make_net(

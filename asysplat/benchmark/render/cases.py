@@ -5,10 +5,7 @@ from functools import partial
 from typing import NamedTuple
 
 from asysplat.benchmark.options import check_names
-from asysplat.benchmark.scenes import on_an_arc, pixel_aligned_scene, random_scene
-from asysplat.scene import Cameras, Gaussians
-
-Scene = tuple[Gaussians, Cameras]
+from asysplat.benchmark.scenes import Scene, on_an_arc, pixel_aligned_scene, random_scene
 
 
 class Case(NamedTuple):

@@ -3,6 +3,7 @@
 import importlib.util
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import NamedTuple
@@ -11,14 +12,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from asysplat.benchmark.render.cases import Scene
-from asysplat.benchmark.timing import now, rise_gb
+from asysplat.benchmark.scenes import Scene
+from asysplat.benchmark.timing import now, time_calls
+from asysplat.ops.cpu.threads import run_blocks
 from asysplat.rendering import GSPLAT_1_5, INRIA, Convention, Skips, render
 from asysplat.scene import Cameras, Gaussians
 
 SKIPS = tuple(field.name for field in fields(Skips))
 SKIPS_OF_CUDA = tuple(name for name in SKIPS if name != "rows")
 FIELDS = tuple(field.name for field in fields(Gaussians))
+KERNELS = {run_blocks: lambda frame: frame.f_locals["kernel"].__name__}
 FLIP = 1e-4  # a difference that rounding alone does not make; a flip makes up to 1/255
 Drawn = tuple[Tensor, dict[str, int]]  # image [V, 3, H, W] without background, and counts
 
@@ -56,6 +59,7 @@ class Outputs(NamedTuple):
     image: Tensor  # [V, 3, H, W]
     gradients: tuple[Tensor, ...]  # of each of FIELDS
     seconds: dict[str, float]  # of "forward" and "backward"
+    kernels: dict[str, float]  # seconds of each kernel, of the cpu backend
     stats: dict[str, int]
 
 
@@ -118,17 +122,13 @@ def run(backend: Backend, skips: Skips, inputs: Inputs) -> Outputs:
     """Draw, and take the gradients."""
     leaves = [getattr(inputs.gaussians, name) for name in FIELDS]
     device = torch.device(backend.device)
-    start = now(device)
-    image, stats = backend.draw(inputs.gaussians, inputs.cameras, skips)
-    middle = now(device)
-    gradients = torch.autograd.grad(image, leaves, inputs.weights)
-    seconds = {"forward": middle - start, "backward": now(device) - middle}
-    return Outputs(image.detach(), gradients, seconds, stats)
-
-
-def peak_gb(backend: Backend, skips: Skips, inputs: Inputs) -> float:
-    """Measure the memory of both passes, see `rise_gb`."""
-    return rise_gb(lambda: run(backend, skips, inputs), torch.device(backend.device))
+    with time_calls(KERNELS, device) if backend.name == "cpu" else nullcontext({}) as kernels:
+        start = now(device)
+        image, stats = backend.draw(inputs.gaussians, inputs.cameras, skips)
+        middle = now(device)
+        gradients = torch.autograd.grad(image, leaves, inputs.weights)
+        seconds = {"forward": middle - start, "backward": now(device) - middle}
+    return Outputs(image.detach(), gradients, seconds, kernels, stats)
 
 
 def truth(scene: Scene, convention: Convention, ignored: Tensor | None = None) -> Outputs:
