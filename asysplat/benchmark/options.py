@@ -41,9 +41,7 @@ def find_device(name: str) -> torch.device:
     Raises:
         InputError: another name, or a GPU that is not there.
     """
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
     check_names("device", [name], ("auto", "cpu", "cuda"))
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("device=cuda is not there: torch finds no GPU; take device=cpu.")
-    return torch.device(name)
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")

@@ -1,11 +1,12 @@
 """Synthetic scenes to measure renderers on: nothing to download, the same on every machine."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
 from torch import Tensor
 
+from asysplat.benchmark.options import check_names
 from asysplat.scene import Cameras, Gaussians
 
 Draw = Callable[..., Tensor]
@@ -69,12 +70,13 @@ def on_an_arc(camera: Cameras, views: int) -> Cameras:
     turns[:, 1, 1] = turns[:, 3, 3] = 1
     turns[:, 2, 3] = DISTANCE
     turns[:, :3, 3] -= DISTANCE * turns[:, :3, 2]
-    return Cameras(
-        camera.intrinsics.expand(views, 3, 3),
-        camera.cam_to_world @ turns,
-        camera.height,
-        camera.width,
-    )
+    intrinsics = camera.intrinsics.expand(views, 3, 3)
+    return Cameras(intrinsics, camera.cam_to_world @ turns, camera.height, camera.width)
+
+
+def _scene_on_an_arc(views: int) -> Scene:
+    gaussians, camera = pixel_aligned_scene(256, 256, 256)
+    return gaussians, on_an_arc(camera, views)
 
 
 def _scene(
@@ -102,3 +104,39 @@ def _scene(
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     cameras = Cameras(intrinsics[None], torch.eye(4)[None], height, width)
     return gaussians.to(torch.float32), cameras.to(torch.float32)
+
+
+SCENES = {
+    "A": partial(random_scene, 50_000, 256, 256),
+    "B": partial(random_scene, 50_000, 540, 960),
+    "C": partial(pixel_aligned_scene, 256, 256, 256),
+    "524k": partial(pixel_aligned_scene, 512, 256, 256),
+    "4M": partial(pixel_aligned_scene, 1414, 540, 960),
+    "131kx16": partial(_scene_on_an_arc, 16),
+}
+SMALLER = {  # that float64 can afford: errors are measured on these instead
+    "4M": partial(pixel_aligned_scene, 354, 135, 240),
+    "131kx16": partial(_scene_on_an_arc, 2),
+}
+
+
+def find_scenes(names: str | Sequence[str]) -> list[str]:
+    """Return the names of scenes: one, several, or "all".
+
+    Raises:
+        InputError: a name that no scene has, or none.
+    """
+    names = [names] if isinstance(names, str) else list(names)
+    check_names("scenes", names, [*SCENES, "all"])
+    return list(SCENES) if "all" in names else names
+
+
+def describe(scene: Scene) -> dict[str, int]:
+    """Count its Gaussians, views and pixels."""
+    gaussians, cameras = scene
+    return {
+        "gaussians": gaussians.num_gaussians,
+        "views": cameras.num_views,
+        "height": cameras.height,
+        "width": cameras.width,
+    }

@@ -1,4 +1,4 @@
-"""Seconds and memory: how every suite measures them."""
+"""Seconds, memory and errors: how every suite measures them."""
 
 import ctypes
 import gc
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
 from asysplat.evaluation.measured_cost import wait_for
@@ -25,17 +26,11 @@ Name = Callable[[FrameType], str | None]
 
 @dataclass
 class Measurement:
-    """One row of a suite's results.
+    """One row of a suite's results."""
 
-    Args:
-        timer: runs everything that is timed of it once.
-        found: results besides the times.
-        seconds: those of every round, by name; `time_in_rounds` fills them.
-    """
-
-    timer: Timer
-    found: Result = field(default_factory=dict)
-    seconds: dict[Hashable, list[float]] = field(default_factory=dict)
+    timer: Timer  # runs everything that is timed of it once
+    found: Result = field(default_factory=dict)  # results besides the times
+    seconds: dict[Hashable, list[float]] = field(default_factory=dict)  # by `time_in_rounds`
 
     def summary(self, name: Hashable) -> dict[str, float]:
         """Return median and interquartile range of the seconds of this name."""
@@ -85,38 +80,28 @@ def seconds_of(run: Run, device: torch.device) -> float:
 def time_calls(
     functions: Mapping[Callable, Name], device: torch.device
 ) -> Iterator[dict[str, float]]:
-    """Add up the seconds of every call of some functions, by name; see `watch_calls`."""
-    seconds: dict[str, float] = {}
-
-    def clock(name: str, begins: bool) -> None:
-        seconds[name] = seconds.get(name, 0.0) + (-now(device) if begins else now(device))
-
-    with watch_calls(functions, clock):
-        yield seconds
-
-
-@contextmanager
-def watch_calls(
-    functions: Mapping[Callable, Name], watch: Callable[[str, bool], None]
-) -> Iterator[None]:
-    """Report every call of some functions to `watch`, as Python's profiler does.
+    """Add up the seconds of every call of some functions, as Python's profiler sees them.
 
     Args:
         functions: what names a call of each, from its frame; None for a call to leave out.
-        watch: given that name, and whether the call begins or ends.
+
+    Yields:
+        The seconds by name.
     """
     names = {inspect.unwrap(function).__code__: name for function, name in functions.items()}
+    seconds: dict[str, float] = {}
 
     def profile(frame: FrameType, event: str, _: object) -> None:
         if frame.f_code in names and event in ("call", "return"):
             name = names[frame.f_code](frame)
             if name is not None:
-                watch(name, event == "call")
+                clock = -now(device) if event == "call" else now(device)
+                seconds[name] = seconds.get(name, 0.0) + clock
 
     previous = sys.getprofile()
     sys.setprofile(profile)
     try:
-        yield
+        yield seconds
     finally:
         sys.setprofile(previous)
 
@@ -128,7 +113,9 @@ def rise_gb(run: Run, device: torch.device) -> float:
     Linux.
     """
     run()
-    _return_freed_memory()
+    gc.collect()
+    with suppress(OSError, AttributeError):  # memory that a run gets again would not show as a rise
+        ctypes.CDLL(None).malloc_trim(0)
     reset_peak_memory(device)
     before = peak_memory_gb(device)
     run()
@@ -136,8 +123,6 @@ def rise_gb(run: Run, device: torch.device) -> float:
     return peak_memory_gb(device) - before
 
 
-def _return_freed_memory() -> None:
-    """Return freed memory to the system: a run that gets it again would not show as a rise."""
-    gc.collect()
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
+def relative_l2(found: Tensor, true: Tensor) -> float:
+    """Return the norm of the difference over the norm of what is true, a float64 tensor."""
+    return ((found.cpu().double() - true).norm() / true.norm()).item()

@@ -167,9 +167,10 @@ def test_calls_are_recorded_under_their_label():
         torch.nn.functional.conv2d(maps, kernel, bias, stride=2, padding=1, groups=2)
         torch.nn.functional.scaled_dot_product_attention(a, a, a)
 
-    with torch.no_grad(), RecordProducts("first") as recorder:
+    labels = ["first"]
+    with torch.no_grad(), RecordProducts(lambda: labels[-1]) as recorder:
         forward()
-        recorder.label = "second"
+        labels.append("second")
         a @ a.mT
     assert flops_of(recorder.counts["first"]) == true_flops(forward)
     (product,) = recorder.counts["second"]

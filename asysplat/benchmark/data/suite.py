@@ -1,7 +1,5 @@
 """Photographs on disk: how soon a scene opens, and whether loading keeps ahead of training."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -40,21 +38,21 @@ def measure(options: DictConfig, console: Console) -> Result:
     device, wanted = find_device(options.device), options.data
     net, size = make_net(MODEL, wanted.overrides, device)
     height, width = size["height"], size["width"]
-    views = make_views(size["views"], height, width, device)
-    workload = Workload(MODEL, net, "fp32", views)
-    frames = size["views"] + wanted.targets  # of a training task
-    with _scene(wanted) as root, TemporaryDirectory() as folder:
-        capture = open_scene(root, height, width)
+    workload = Workload(MODEL, net, "fp32", make_views(size["inputs"], height, width, device))
+    frames = size["inputs"] + wanted.targets  # of a training task
+    with TemporaryDirectory() as folder:
+        made = Path(folder) / "scene"
+        root = wanted.root or write_photographs(made, wanted.frames, *wanted.photographs)
+        open_views = partial(open_scene, root, height, width)
+        capture = open_views()
         lens = capture.scene.photographs[0].lens
         count = max(1, capture.num_frames // frames)
         make_data = partial(
             files_data,
+            **size,
             root=str(root),
-            height=height,
-            width=width,
             window=[frames, 128],
             name="benchmark",
-            inputs=size["views"],
             targets=wanted.targets,
             batch_size=1,
             num_workers=wanted.num_workers,
@@ -69,7 +67,7 @@ def measure(options: DictConfig, console: Console) -> Result:
         def seconds() -> dict[str, float]:
             with TemporaryDirectory(dir=folder) as fresh:
                 return {
-                    "open": seconds_of(lambda: open_scene(root, height, width), CPU),
+                    "open": seconds_of(open_views, CPU),
                     NO_CACHE: loading(None),
                     FIRST: loading(ImageCache(fresh)),
                     LATER: loading(ImageCache(fresh)),
@@ -100,22 +98,10 @@ def measure(options: DictConfig, console: Console) -> Result:
     }
 
 
-@contextmanager
-def _scene(wanted: DictConfig) -> Iterator[Path]:
-    """Yield the folder of the user's scene, or of a synthetic one that is deleted afterwards."""
-    if wanted.root is not None:
-        yield Path(wanted.root)
-        return
-    with TemporaryDirectory() as folder:
-        write_photographs(Path(folder) / "scene", wanted.frames, *wanted.photographs)
-        yield Path(folder) / "scene"
-
-
 def tables(results: Result) -> list[Table]:
     """Show how soon a scene opens, and how fast its frames come."""
     scene, opened = results["scene"], results["open"]
-    opening = {"frames": scene["frames"], "open": opened}
-    opening["each"] = opened["median"] / scene["frames"]
+    each = opened["median"] / scene["frames"]
     columns = {
         "frames": text("{frames}"),
         "ms, no pixel read": spread("open"),
@@ -134,7 +120,7 @@ def tables(results: Result) -> list[Table]:
         f"the network alone takes {network} frames / s in training"
     )
     return [
-        make_table("Opening a scene", columns, [opening]),
+        make_table("Opening a scene", columns, [scene | {"open": opened, "each": each}]),
         make_table("Loading training tasks", loading_columns, results["loading"], notes),
     ]
 

@@ -1,14 +1,16 @@
 """What a forward pass is made of: layers by their kind, and the operators within them."""
 
+import sys
 from collections import Counter
 from collections.abc import Callable
+from traceback import walk_stack
 from types import FrameType
 
 import torch
 
 from asysplat import models, ops
 from asysplat.benchmark.products import Product, RecordProducts
-from asysplat.benchmark.timing import seconds_of, time_calls, watch_calls
+from asysplat.benchmark.timing import seconds_of, time_calls
 from asysplat.models.tokenizer import Tokenizer
 
 COMPONENTS = {  # none within another
@@ -26,8 +28,8 @@ OPERATORS = ("ssd", "selective_scan", "grid_attention")
 
 
 def _component(frame: FrameType) -> str | None:
-    """Name the component whose forward pass this is; None for a layer within another."""
-    layer = frame.f_locals["self"]
+    """Name the component that a frame is a method of; None where it is of no component's."""
+    layer = frame.f_locals.get("self")
     return next((name for name, kinds in COMPONENTS.items() if isinstance(layer, kinds)), None)
 
 
@@ -44,11 +46,11 @@ def part_seconds(forward: Callable[[], object], device: torch.device) -> dict[st
 
 def record_products(forward: Callable[[], object]) -> dict[str, Counter[Product]]:
     """Count the products of one forward pass: in each of PARTS that has some; "forward", in all."""
-    recorder = RecordProducts(OTHERS)
 
-    def label(name: str, begins: bool) -> None:
-        recorder.label = name if begins else OTHERS
+    def running() -> str:
+        names = (_component(frame) for frame, _ in walk_stack(sys._getframe()))
+        return next(filter(None, names), OTHERS)
 
-    with watch_calls(LAYERS, label), recorder:
+    with RecordProducts(running) as recorder:
         forward()
     return recorder.counts | {"forward": sum(recorder.counts.values(), Counter())}

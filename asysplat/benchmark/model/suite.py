@@ -28,7 +28,6 @@ from asysplat.evaluation.static_cost import GIGA
 PASSES = ("forward", "step")
 BACKWARD = 2  # products in the backward pass for each of the forward pass
 MOST_OVER_FLOOR = 2.5  # is asked of the forward pass
-NO_FLOOR = {"median": 0.0}  # of a part without products
 NOTES = """\
 floor: the forward pass's matrix products and convolutions by themselves; a step's is \
 three times that
@@ -57,28 +56,23 @@ def measure(options: DictConfig, console: Console) -> Result:
         for name in wanted.names:
             net, size = make_net(name, wanted.overrides, device)
             net.check_size(size["height"], size["width"])
-            for num_views in wanted.views or [size["views"]]:
+            for num_views in wanted.views or [size["inputs"]]:
                 views = make_views(num_views, size["height"], size["width"], device)
                 for precision in wanted.precisions:
                     workload = Workload(name, net, precision, views)
                     counts.append(record_products(workload.forward))
                     rows.append(_prepare(workload, wanted.steps))
-    groups = {(i, part): counts[i][part] for i in range(len(rows)) for part in counts[i]}
+    parts = ("forward", *PARTS)
+    groups = {(i, part): c.get(part, {}) for i, c in enumerate(counts) for part in parts}
     products = Measurement(lambda: time_products(groups, device))
     with console.status(f"{options.repeats} rounds"):
         time_in_rounds([*rows, products], options.repeats)
-    results = []
+    results, first = [], {}
     for i, row in enumerate(rows):
-        floors = {part: products.summary((i, part)) for part in counts[i]}
-        results.append(row.found | _times(row, floors) | _products(counts[i]["forward"], products))
-    first = {
-        (result["views"], result["precision"]): result
-        for result in results
-        if result["model"] == results[0]["model"]
-    }
-    for result in results:
-        other = first.get((result["views"], result["precision"]), dict.fromkeys(PASSES))
-        result["over_first"] = ratios(result, other, PASSES)
+        floors = {part: products.summary((i, part)) for part in parts}
+        result = row.found | _times(row, floors) | _products(counts[i]["forward"], products)
+        same_input = first.setdefault((result["views"], result["precision"]), result)
+        results.append(result | {"over_first": ratios(result, same_input, PASSES)})
     return {"rows": results}
 
 
@@ -123,7 +117,7 @@ def _times(row: Measurement, floors: Mapping[str, Mapping[str, float]]) -> Resul
             "step": step and step["median"] / ((1 + BACKWARD) * floor["median"]),
         },
         "components": {
-            name: {"seconds": times[name], "floor": floors.get(name, NO_FLOOR)["median"]}
+            name: {"seconds": times[name], "floor": floors[name]["median"]}
             for name in PARTS
             if name in times
         },

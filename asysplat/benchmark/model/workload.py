@@ -22,19 +22,12 @@ FILLED = 0.75  # of the memory, at most: a step also needs what it does not keep
 
 @dataclass(frozen=True)
 class Workload:
-    """What is measured: a network, its input and their precision.
+    """What is measured: a network, its input and their precision."""
 
-    Args:
-        name: of the model.
-        net: with random weights.
-        precision: of PRECISIONS; bf16 by autocast.
-        views: one scene's.
-    """
-
-    name: str
-    net: Network
-    precision: str
-    views: Views
+    name: str  # of the model
+    net: Network  # with random weights
+    precision: str  # of PRECISIONS; bf16 by autocast
+    views: Views  # of one scene
 
     @property
     def device(self) -> torch.device:
@@ -81,7 +74,7 @@ class Workload:
 def make_net(
     name: str, overrides: Mapping[str, object], device: torch.device
 ) -> tuple[Network, dict[str, int]]:
-    """Build the network that train.py would; return also its inputs' views, height and width.
+    """Build the network that train.py would; return also its number of inputs, height and width.
 
     Raises:
         InputError: an unknown model, or an unknown choice among the overrides.
@@ -92,8 +85,7 @@ def make_net(
     torch.manual_seed(0)
     with device:
         net = instantiate(config.model)
-    data = config.data
-    return net, {"views": data.inputs, "height": data.height, "width": data.width}
+    return net, {name: config.data[name] for name in ("inputs", "height", "width")}
 
 
 def make_views(views: int, height: int, width: int, device: torch.device) -> Views:

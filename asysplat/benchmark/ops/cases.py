@@ -43,17 +43,11 @@ Tensors = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Case:
-    """An operator at one size.
+    """An operator at one size."""
 
-    Args:
-        operator: of `asysplat.ops`.
-        sizes: of its inputs, as SHAPES names them, and the grid of an attention.
-        exact: the sizes that are others where errors are measured.
-    """
-
-    operator: str
-    sizes: Mapping[str, int]
-    exact: Mapping[str, int] = field(default_factory=dict)
+    operator: str  # of `asysplat.ops`
+    sizes: Mapping[str, int]  # of its inputs, as SHAPES names them, and the grid of an attention
+    exact: Mapping[str, int] = field(default_factory=dict)  # sizes that differ for errors
 
     @property
     def name(self) -> str:
@@ -108,8 +102,8 @@ class Case:
 
 def find_cases(options: Mapping[str, Any]) -> list[Case]:
     """Make each operator at its size; attention with each of its grids."""
-    exact = options["exact"]
     attention = dict(options["grid_attention"])
+    grids = attention.pop("grids")
     sizes = [(scan, options[scan]) for scan in SCANS]
-    sizes += [("grid_attention", {**attention, "grid": grid}) for grid in attention.pop("grids")]
-    return [Case(operator, size, exact[operator]) for operator, size in sizes]
+    sizes += [("grid_attention", attention | {"grid": grid}) for grid in grids]
+    return [Case(operator, size, options["exact"][operator]) for operator, size in sizes]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from asysplat.benchmark.ops.cases import Case, Tensors
-from asysplat.benchmark.timing import Result, rise_gb, seconds_of
+from asysplat.benchmark.timing import Result, relative_l2, rise_gb, seconds_of
 from asysplat.evaluation.cost import GB
 
 KEPT = ("dt", "A", "D")  # inputs that are always fp32
@@ -16,17 +16,12 @@ Gradients = tuple[Tensor, dict[str, Tensor]]  # the output, and the gradient of 
 
 @dataclass(frozen=True)
 class Path:
-    """A backend of an operator.
-
-    Args:
-        inputs: of the operator, whose gradients are asked for.
-        weights: the gradient of the output, from a normal distribution.
-    """
+    """A backend of an operator."""
 
     case: Case
     backend: str
-    inputs: Tensors
-    weights: Tensor
+    inputs: Tensors  # of the operator, whose gradients are asked for
+    weights: Tensor  # the gradient of the output, from a normal distribution
 
     def forward(self) -> Tensor:
         with torch.no_grad():
@@ -58,8 +53,8 @@ class Path:
     def errors(self, exact: Gradients) -> Result:
         """Compare the output and the gradient of each input with the exact ones, relative in L2."""
         output, gradients = self.forward_backward()
-        wrong = {name: _relative(gradients[name], true) for name, true in exact[1].items()}
-        forward = _relative(output, exact[0])
+        wrong = {name: relative_l2(gradients[name], true) for name, true in exact[1].items()}
+        forward = relative_l2(output, exact[0])
         return {"measured_on": dict(self.case.sizes), "forward": forward, "gradients": wrong}
 
 
@@ -73,7 +68,3 @@ def make_path(case: Case, backend: str, dtype: torch.dtype, device: torch.device
     first = next(iter(inputs.values()))
     weights = torch.randn(first.shape, generator=torch.Generator().manual_seed(1))
     return Path(case, backend, inputs, weights.to(first))
-
-
-def _relative(found: Tensor, true: Tensor) -> float:
-    return ((found.cpu().double() - true).norm() / true.norm()).item()

@@ -1,6 +1,8 @@
 """Every path of the operators: time beside the sequential loop and bare matmuls; error; memory."""
 
 from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
 
 import torch
 from matplotlib.figure import Figure
@@ -14,15 +16,7 @@ from asysplat.benchmark.ops.paths import make_path
 from asysplat.benchmark.options import PRECISIONS, check_names, find_device
 from asysplat.benchmark.plot import time_against_error
 from asysplat.benchmark.products import products, time_products, with_gradients
-from asysplat.benchmark.table import (
-    error,
-    limited,
-    make_table,
-    measured_on,
-    number,
-    spread,
-    text,
-)
+from asysplat.benchmark.table import error, limited, make_table, measured_on, number, spread, text
 from asysplat.benchmark.timing import Measurement, Result, Timer, ratios, time_in_rounds
 from asysplat.errors import InputError
 
@@ -82,20 +76,16 @@ def make_rows(
             except InputError:  # the operator has no such backend, or it cannot run here
                 continue
             path = make_path(case, backend, dtype, device)
-            found = {"path": backend, "error": errors, "bytes_per_token": path.bytes_per_token()}
-            rows.append(Measurement(path.seconds, _describe(case, precision) | found))
+            found = {"error": errors, "bytes_per_token": path.bytes_per_token()}
+            rows.append(_row(case, precision, backend, path.seconds, **found))
         if case.products():
-            found = {"path": MATMULS, "error": None, "bytes_per_token": None}
-            timer = _product_timer(case, dtype, device)
-            rows.append(Measurement(timer, _describe(case, precision) | found))
+            sizes = {
+                "forward": case.products(),
+                "forward_backward": with_gradients(case.products()),
+            }
+            groups = {name: products(size, dtype, device) for name, size in sizes.items()}
+            rows.append(_row(case, precision, MATMULS, partial(time_products, groups, device)))
     return [*rows, _loop(case, loop_tokens, device)] if case.operator in SCANS else rows
-
-
-def _product_timer(case: Case, dtype: torch.dtype, device: torch.device) -> Timer:
-    sizes = (case.products(), with_gradients(case.products()))
-    counts = [products(size, dtype, device) for size in sizes]
-    groups = dict(zip(PASSES, counts, strict=True))
-    return lambda: time_products(groups, device)
 
 
 def _loop(case: Case, tokens: int, device: torch.device) -> Measurement:
@@ -104,25 +94,21 @@ def _loop(case: Case, tokens: int, device: torch.device) -> Measurement:
     length = min(tokens, case.sizes["length"])
     path = make_path(case.resized(length=length), "reference", torch.float32, device)
     scale = case.sizes["length"] / length
-    found = {
-        "path": LOOP,
-        "error": small.errors(small.truth()),
-        "bytes_per_token": path.bytes_per_token(),
-        "loop_tokens": length,
-    }
-    return Measurement(
+    return _row(
+        case,
+        "fp32",
+        LOOP,
         lambda: {name: scale * value for name, value in path.seconds().items()},
-        _describe(case, "fp32") | found,
+        error=small.errors(small.truth()),
+        bytes_per_token=path.bytes_per_token(),
+        loop_tokens=length,
     )
 
 
-def _describe(case: Case, precision: str) -> Result:
-    return {
-        "operator": case.name,
-        "sizes": dict(case.sizes),
-        "precision": precision,
-        "threads": torch.get_num_threads(),
-    }
+def _row(case: Case, precision: str, path: str, timer: Timer, **found: Any) -> Measurement:
+    what = {"operator": case.name, "sizes": dict(case.sizes), "precision": precision, "path": path}
+    what |= {"threads": torch.get_num_threads(), "error": None, "bytes_per_token": None}
+    return Measurement(timer, what | found)
 
 
 def tables(results: Result) -> list[Table]:
@@ -153,12 +139,8 @@ def tables(results: Result) -> list[Table]:
 
 def plot(results: Result) -> Figure:
     """Plot the forward pass, and both passes."""
-    errors = {
-        "forward": ("output against float64, relative L2", ERRORS["forward"]),
-        "forward_backward": (
-            "worst gradient against float64, relative L2",
-            ERRORS["forward_backward"],
-        ),
-    }
+    exact = "against float64, relative L2"
+    labels = {"forward": f"output {exact}", "forward_backward": f"worst gradient {exact}"}
+    errors = {name: (label, ERRORS[name]) for name, label in labels.items()}
     rows = [row for row in results["rows"] if row["error"]]
     return time_against_error(rows, errors, backend="path", case="operator")

@@ -12,7 +12,6 @@ from rich.table import Table
 from torch import Tensor
 
 from asysplat.benchmark.plot import time_against_error
-from asysplat.benchmark.render.cases import Case, describe, find_cases
 from asysplat.benchmark.render.floor import RASTER, compare_with_floor, row_seconds
 from asysplat.benchmark.render.run import (
     Backend,
@@ -24,7 +23,7 @@ from asysplat.benchmark.render.run import (
     run,
     truth,
 )
-from asysplat.benchmark.scenes import Scene
+from asysplat.benchmark.scenes import SCENES, SMALLER, Scene, describe, find_scenes
 from asysplat.benchmark.table import error, limited, make_table, measured_on, number, spread, text
 from asysplat.benchmark.timing import Measurement, Result, ratios, rise_gb, time_in_rounds
 from asysplat.rendering import Skips
@@ -43,17 +42,16 @@ def measure(options: DictConfig, console: Console) -> Result:
     Raises:
         InputError: an unknown scene.
     """
-    cases = find_cases(options.scenes)
     results: list[Result] = []
-    for name, case in track(cases.items(), "scenes", console=console):
-        results += _measure_scene(name, case, options.repeats)
+    for name in track(find_scenes(options.scenes), "scenes", console=console):
+        results += _measure_scene(name, options.repeats)
     return {"rows": results}
 
 
-def _measure_scene(name: str, case: Case, repeats: int) -> list[Result]:
+def _measure_scene(name: str, repeats: int) -> list[Result]:
     backends = find_backends()
-    scene = case.make()
-    small = case.twin() if case.twin else scene
+    scene = SCENES[name]()
+    small = SMALLER[name]() if name in SMALLER else scene
     ignored = _flips_of_any(backends, small)
     rows = []
     for backend in backends:
@@ -90,13 +88,10 @@ def _measure_scene(name: str, case: Case, repeats: int) -> list[Result]:
 
 def _flips_of_any(backends: Sequence[Backend], scene: Scene) -> Tensor:
     """Find the pixels [V, H, W] where any backend flips: there more than rounding differs."""
-    found = [
-        flips(
-            run(backend, Skips(), prepare(scene, backend.device)), truth(scene, backend.convention)
-        )
-        for backend in backends
+    pairs = [
+        (run(b, Skips(), prepare(scene, b.device)), truth(scene, b.convention)) for b in backends
     ]
-    return torch.stack(found).any(0)
+    return torch.stack([flips(found, exact) for found, exact in pairs]).any(0)
 
 
 def _seconds(run_whole: Callable[[], Outputs], found: Result) -> dict[str, float]:
