@@ -60,8 +60,8 @@ def measure(options: DictConfig, console: Console) -> Result:
                 views = make_views(num_views, size["height"], size["width"], device)
                 for precision in wanted.precisions:
                     workload = Workload(name, net, precision, views)
-                    counts.append(record_products(workload.forward))
                     rows.append(_prepare(workload, wanted.steps))
+                    counts.append(record_products(workload.forward))
     parts = ("forward", *PARTS)
     groups = {(i, part): c.get(part, {}) for i, c in enumerate(counts) for part in parts}
     products = Measurement(lambda: time_products(groups, device))
@@ -70,7 +70,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     results, first = [], {}
     for i, row in enumerate(rows):
         floors = {part: products.summary((i, part)) for part in parts}
-        result = row.found | _times(row, floors) | _products(counts[i]["forward"], products)
+        result = row.found | _summarise(row, floors, counts[i]["forward"], products)
         same_input = first.setdefault((result["views"], result["precision"]), result)
         results.append(result | {"over_first": ratios(result, same_input, PASSES)})
     return {"rows": results}
@@ -104,8 +104,10 @@ def _prepare(workload: Workload, steps: bool) -> Measurement:
     return Measurement(seconds, found)
 
 
-def _times(row: Measurement, floors: Mapping[str, Mapping[str, float]]) -> Result:
-    """Summarise the rounds."""
+def _summarise(
+    row: Measurement, floors: Mapping[str, Result], counts: Counts, products: Measurement
+) -> Result:
+    """Summarise the rounds of a network, and of the products of its forward pass."""
     times = {name: row.summary(name) for name in row.seconds}
     forward, step, floor = times["forward"], times.get("step"), floors["forward"]
     return {
@@ -122,12 +124,6 @@ def _times(row: Measurement, floors: Mapping[str, Mapping[str, float]]) -> Resul
             if name in times
         },
         "operators": {name: times[name] for name in OPERATORS if name in times},
-    }
-
-
-def _products(counts: Counts, products: Measurement) -> Result:
-    """List the products of a forward pass."""
-    return {
         "gflops": sum(count * product.flops() for product, count in counts.items()) / GIGA,
         "products": [
             {

@@ -58,6 +58,7 @@ class Workload:
     def step_gb(self) -> float:
         """Estimate the memory of a step: activations, parameters and their gradients."""
         cameras = self.views.cameras
+        self.net.train()
         with self._autocast("cpu"):
             kept = activation_gb(self.net, cameras.num_views, cameras.height, cameras.width)
         return kept + 2 * 4 * count_parameters(self.net) / GB
