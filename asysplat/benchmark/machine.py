@@ -3,7 +3,8 @@
 import os
 import platform
 import re
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import llvmlite.binding
@@ -15,8 +16,9 @@ PACKAGES = ("torch", "numba", "triton", "gsplat")
 
 def describe_machine() -> dict[str, str | int]:
     """Name the processor, cores, torch's threads, the GPU if any, and versions of PACKAGES."""
+    found = CPU_INFO.exists() and re.search(r"model name\s*:\s*(.+)", CPU_INFO.read_text())
     machine = {
-        "cpu": _processor(),
+        "cpu": found[1] if found else platform.processor() or platform.machine(),
         "instructions": llvmlite.binding.get_host_cpu_name(),  # what Numba compiles for
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
@@ -24,18 +26,4 @@ def describe_machine() -> dict[str, str | int]:
     }
     if torch.cuda.is_available():
         machine["gpu"] = torch.cuda.get_device_name()
-    for package in PACKAGES:
-        try:
-            machine[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return machine
-
-
-def _processor() -> str:
-    """Return the model's name as the system has it."""
-    if CPU_INFO.exists():
-        found = re.search(r"model name\s*:\s*(.+)", CPU_INFO.read_text())
-        if found:
-            return found[1]
-    return platform.processor() or platform.machine()
+    return machine | {package: version(package) for package in PACKAGES if find_spec(package)}

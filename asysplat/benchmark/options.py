@@ -1,6 +1,6 @@
 """The options that several suites share: they are checked here, a mistake is one sentence."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from importlib import import_module
 from types import ModuleType
 
@@ -41,22 +41,7 @@ def find_device(name: str) -> torch.device:
     Raises:
         InputError: another name, or a GPU that is not there.
     """
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
     check_names("device", [name], ("auto", "cpu", "cuda"))
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("device=cuda is not there: torch finds no GPU; take device=cpu.")
-    return torch.device(name)
-
-
-def find_precisions(option: str, names: Sequence[str]) -> dict[str, torch.dtype]:
-    """Return the types of these names, in the order that was asked for.
-
-    Args:
-        option: the one that the names were given for.
-
-    Raises:
-        InputError: an unknown name, or none.
-    """
-    check_names(option, names, PRECISIONS)
-    return {name: PRECISIONS[name] for name in names}
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from asysplat.benchmark.table import at, worst
+from asysplat.benchmark.table import worst
 from asysplat.benchmark.timing import Result
 from asysplat.report.style import FAINT, INK, OURS, PAPER, STYLE
 
@@ -18,10 +18,7 @@ MARKS = "osD^vPX*"
 
 
 def time_against_error(
-    rows: Sequence[Result],
-    errors: Mapping[str, tuple[str, str]],
-    backend: str,
-    case: str,
+    rows: Sequence[Result], errors: Mapping[str, tuple[str, str]], backend: str, case: str
 ) -> Figure:
     """Plot a point for each row: its colour is its backend, its mark its case, hollow in bf16.
 
@@ -29,13 +26,14 @@ def time_against_error(
         errors: for each timed pass, what its error is, and its path in a row.
         backend, case: keys of a row.
     """
+    in_bf16 = [row.get("precision") == "bf16" for row in rows]
     marks = dict(zip(dict.fromkeys(row[case] for row in rows), MARKS, strict=False))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9, 4.2), layout="constrained")
         grid = figure.subplots(1, len(errors), squeeze=False)
         for axes, (name, (label, path)) in zip(grid[0], errors.items(), strict=True):
-            for row in rows:
-                look = _look(marks[row[case]], COLOURS[row[backend]], _in_bf16(row))
+            for row, hollow in zip(rows, in_bf16, strict=True):
+                look = _look(marks[row[case]], COLOURS[row[backend]], hollow)
                 axes.plot(1000 * row[name]["median"], worst(row, path), **look)
             title = name.replace("_", " and ")
             axes.set(title=title, xlabel="milliseconds", xscale="log", yscale="log", ylabel=label)
@@ -48,7 +46,7 @@ def time_against_error(
                 axis.set_minor_formatter(NullFormatter())
         keys = {name: _look("o", COLOURS[name]) for name in dict.fromkeys(r[backend] for r in rows)}
         keys |= {f"{case} {name}": _look(mark, INK) for name, mark in marks.items()}
-        if any(map(_in_bf16, rows)):
+        if any(in_bf16):
             keys["in bf16"] = _look("o", INK, hollow=True)
         handles = [Line2D([], [], label=label, **look) for label, look in keys.items()]
         figure.legend(handles=handles, loc="outside right upper", frameon=False)
@@ -60,6 +58,7 @@ def bars(
     parts: Mapping[str, Sequence[float]],
     limit: tuple[str, Sequence[float]],
     label: str,
+    spread: Sequence[float] | None = None,
 ) -> Figure:
     """Plot a horizontal bar for each name, made of parts, with a mark where its limit is.
 
@@ -67,6 +66,7 @@ def bars(
         parts: the lengths of a part in all bars; one that is 0 everywhere is left out.
         limit: its name, and its value for each bar.
         label: of the lengths.
+        spread: the interquartile range of each bar's length, drawn about its end.
     """
     colours = matplotlib.colormaps["tab10"].colors
     with matplotlib.rc_context(STYLE):
@@ -77,15 +77,13 @@ def bars(
             if any(lengths):
                 axes.barh(names, lengths, left=starts, color=colour, label=part)
             starts = [start + length for start, length in zip(starts, lengths, strict=True)]
+        if spread is not None:
+            axes.errorbar(starts, names, xerr=[iqr / 2 for iqr in spread], fmt="none", color=INK)
         axes.plot(limit[1], names, "|", color=INK, ms=18, mew=2, label=limit[0])
         axes.set_xlabel(label)
         axes.invert_yaxis()
         figure.legend(loc="outside right upper", frameon=False)
     return figure
-
-
-def _in_bf16(row: Result) -> bool:
-    return at(row, "precision") == "bf16"
 
 
 def _look(mark: str, colour: str, hollow: bool = False) -> dict[str, Any]:

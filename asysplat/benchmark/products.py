@@ -7,6 +7,8 @@ their channels innermost where they had them so.
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from typing import Any
 
 import torch
@@ -42,15 +44,10 @@ class Operand:
 
 @dataclass(frozen=True)
 class Product:
-    """One call of torch.
+    """One call of torch."""
 
-    Args:
-        function: of torch.ops.aten.
-        arguments: its positional ones; lists as tuples.
-    """
-
-    function: OpOverload
-    arguments: tuple[Operand | Any, ...]
+    function: OpOverload  # of torch.ops.aten
+    arguments: tuple[Operand | Any, ...]  # its positional ones; lists as tuples
 
     def __str__(self) -> str:
         operands = [value for value in self.arguments if isinstance(value, Operand)]
@@ -84,15 +81,15 @@ Counts = Mapping[Product, int]
 
 
 class RecordProducts(TorchDispatchMode):
-    """Counts the products of everything that torch is asked for meanwhile, by `label`."""
+    """Counts the products of everything that torch is asked for meanwhile, by `label()`."""
 
-    def __init__(self, label: str):
+    def __init__(self, label: Callable[[], str]):
         super().__init__()
         self.label = label
         self.counts: dict[str, Counter[Product]] = {}
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.counts.setdefault(self.label, Counter()).update(_products_of_call(func, args))
+        self.counts.setdefault(self.label(), Counter()).update(_products_of_call(func, args))
         return func(*args, **(kwargs or {}))
 
 
@@ -105,9 +102,8 @@ def _products_of_call(func: OpOverload, args: tuple) -> Counts:
         sizes = attention_sizes(q.shape[:-2].numel(), q.shape[-2], k.shape[-2], q.shape[-1])
         return products(sizes, v.dtype, v.device)
     if func._schema.name == "asysplat::ssd":
-        names = (argument.name for argument in func._schema.arguments)
-        inputs = dict(zip(names, args, strict=False))
-        x, B = inputs["x"], inputs["B"]
+        names = [argument.name for argument in func._schema.arguments]
+        x, B = (args[names.index(name)] for name in "xB")
         return products(ssd_sizes(*x.shape, B.shape[-1]), x.dtype, x.device)
     return {}
 
@@ -174,12 +170,12 @@ def _largest_divisor(number: int, most: int) -> int:
     return next(d for d in range(max(1, min(number, most)), 0, -1) if number % d == 0)
 
 
-def product_seconds(counts: Counts, device: torch.device) -> dict[Product, float]:
-    """Time one call of each product."""
-    return {product: product.seconds(count, device) for product, count in counts.items()}
-
-
-def sum_of_products(counts: Counts, seconds: Mapping[Hashable, list[float]]) -> list[float]:
-    """Return the seconds of all products together, in each round."""
-    each = [[count * value for value in seconds[product]] for product, count in counts.items()]
-    return [sum(values) for values in zip(*each, strict=True)]
+def time_products(groups: Mapping[Hashable, Counts], device: torch.device) -> dict[Hashable, float]:
+    """Time each product once; return the seconds of one call of it, and those of each group."""
+    every = reduce(or_, map(Counter, groups.values()))  # with the greatest count of any group
+    seconds = {product: product.seconds(count, device) for product, count in every.items()}
+    sums = {
+        name: sum((count * seconds[product] for product, count in counts.items()), 0.0)
+        for name, counts in groups.items()
+    }
+    return seconds | sums

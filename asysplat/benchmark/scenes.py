@@ -1,16 +1,29 @@
 """Synthetic scenes to measure renderers on: nothing to download, the same on every machine."""
 
+from collections.abc import Callable, Sequence
+from functools import partial
+
 import torch
 from torch import Tensor
 
+from asysplat.benchmark.options import check_names
 from asysplat.scene import Cameras, Gaussians
+
+Draw = Callable[..., Tensor]
+Scene = tuple[Gaussians, Cameras]
 
 FOCAL = 0.9  # of the image's width
 DISTANCE = 4.0  # from the camera to what networks predict
 ARC = 0.5  # radians
 
 
-def random_scene(count: int, height: int, width: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
+def random_numbers(seed: int) -> tuple[Draw, Draw]:
+    """Return functions that draw uniform and normal numbers of a shape in float64."""
+    options = {"generator": torch.Generator().manual_seed(seed), "dtype": torch.float64}
+    return partial(torch.rand, **options), partial(torch.randn, **options)
+
+
+def random_scene(count: int, height: int, width: int, seed: int = 0) -> Scene:
     """Scatter `count` Gaussians over the image and 10 % beyond it, and over depths.
 
     Positions are uniform, depths uniform in 2 to 10, deviations log-normal (median 2 pixels, 0.6)
@@ -19,18 +32,15 @@ def random_scene(count: int, height: int, width: int, seed: int = 0) -> tuple[Ga
     Returns:
         Gaussians [N] of SH degree 0, and one camera; float32.
     """
-    generator = torch.Generator().manual_seed(seed)
-    depths = 2 + 8 * torch.rand(count, generator=generator, dtype=torch.float64)
-    place = 1.2 * torch.rand(count, 2, generator=generator, dtype=torch.float64) - 0.1
-    pixels = place * torch.tensor([width, height])
-    sigma = 2 * (0.6 * _normal(count, 3, generator=generator)).exp()
-    opacities = 0.05 + 0.9 * torch.rand(count, generator=generator, dtype=torch.float64)
-    return _scene(pixels, depths, sigma, opacities, height, width, generator)
+    uniform, normal = random_numbers(seed)
+    depths = 2 + 8 * uniform(count)
+    place = 1.2 * uniform(count, 2) - 0.1
+    sigma = 2 * (0.6 * normal(count, 3)).exp()
+    opacities = 0.05 + 0.9 * uniform(count)
+    return _scene(place, depths, sigma, opacities, (height, width), normal)
 
 
-def pixel_aligned_scene(
-    side: int, height: int, width: int, seed: int = 0
-) -> tuple[Gaussians, Cameras]:
+def pixel_aligned_scene(side: int, height: int, width: int, seed: int = 0) -> Scene:
     """Imitate what networks predict: two jittered grids of side x side Gaussians over the image.
 
     Depths are smooth and near 4, deviations log-normal (median 0.8 width / side pixels, 0.4),
@@ -39,17 +49,16 @@ def pixel_aligned_scene(
     Returns:
         Gaussians [2 side^2] of SH degree 0, and one camera; float32.
     """
-    generator = torch.Generator().manual_seed(seed)
+    uniform, normal = random_numbers(seed)
     count = 2 * side * side
     steps = torch.arange(side, dtype=torch.float64)
     grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).flatten(0, 1).repeat(2, 1)
-    place = (grid + torch.rand(count, 2, generator=generator, dtype=torch.float64)) / side
-    pixels = place * torch.tensor([width, height])
+    place = (grid + uniform(count, 2)) / side
     waves = (6 * place[:, 0]).sin() * (5 * place[:, 1]).cos()
-    depths = 4 + 0.5 * waves + 0.01 * _normal(count, generator=generator)
-    sigma = 0.8 * width / side * (0.4 * _normal(count, 3, generator=generator)).exp()
-    opacities = (2 * _normal(count, generator=generator)).sigmoid()
-    return _scene(pixels, depths, sigma, opacities, height, width, generator)
+    depths = 4 + 0.5 * waves + 0.01 * normal(count)
+    sigma = 0.8 * width / side * (0.4 * normal(count, 3)).exp()
+    opacities = (2 * normal(count)).sigmoid()
+    return _scene(place, depths, sigma, opacities, (height, width), normal)
 
 
 def on_an_arc(camera: Cameras, views: int) -> Cameras:
@@ -61,39 +70,73 @@ def on_an_arc(camera: Cameras, views: int) -> Cameras:
     turns[:, 1, 1] = turns[:, 3, 3] = 1
     turns[:, 2, 3] = DISTANCE
     turns[:, :3, 3] -= DISTANCE * turns[:, :3, 2]
-    return Cameras(
-        camera.intrinsics.expand(views, 3, 3),
-        camera.cam_to_world @ turns,
-        camera.height,
-        camera.width,
-    )
+    intrinsics = camera.intrinsics.expand(views, 3, 3)
+    return Cameras(intrinsics, camera.cam_to_world @ turns, camera.height, camera.width)
 
 
-def _normal(*shape: int, generator: torch.Generator) -> Tensor:
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+def _scene_on_an_arc(views: int) -> Scene:
+    gaussians, camera = pixel_aligned_scene(256, 256, 256)
+    return gaussians, on_an_arc(camera, views)
 
 
 def _scene(
-    pixels: Tensor,
+    place: Tensor,
     depths: Tensor,
     sigma: Tensor,
     opacities: Tensor,
-    height: int,
-    width: int,
-    generator: torch.Generator,
-) -> tuple[Gaussians, Cameras]:
-    """Make Gaussians that project to `pixels` with `sigma` pixels, and the camera they do so in."""
-    count = len(depths)
+    size: tuple[int, int],
+    normal: Draw,
+) -> Scene:
+    """Make Gaussians that project to `place`, in parts of the image, and the camera they do so in.
+
+    Their deviations there are `sigma` pixels, the height and width of the image are `size`.
+    """
+    height, width = size
     focal = FOCAL * width
-    center = torch.tensor([width / 2, height / 2])
-    means = torch.cat(((pixels - center) / focal * depths[:, None], depths[:, None]), -1)
+    offsets = place * torch.tensor([width, height]) - torch.tensor([width / 2, height / 2])
     gaussians = Gaussians(
-        means=means,
-        quats=_normal(count, 4, generator=generator),
+        means=torch.cat((offsets / focal * depths[:, None], depths[:, None]), -1),
+        quats=normal(len(depths), 4),
         scales=sigma * depths[:, None] / focal,
         opacities=opacities,
-        sh=_normal(count, 1, 3, generator=generator),
+        sh=normal(len(depths), 1, 3),
     )
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     cameras = Cameras(intrinsics[None], torch.eye(4)[None], height, width)
     return gaussians.to(torch.float32), cameras.to(torch.float32)
+
+
+SCENES = {
+    "A": partial(random_scene, 50_000, 256, 256),
+    "B": partial(random_scene, 50_000, 540, 960),
+    "C": partial(pixel_aligned_scene, 256, 256, 256),
+    "524k": partial(pixel_aligned_scene, 512, 256, 256),
+    "4M": partial(pixel_aligned_scene, 1414, 540, 960),
+    "131kx16": partial(_scene_on_an_arc, 16),
+}
+SMALLER = {  # that float64 can afford: errors are measured on these instead
+    "4M": partial(pixel_aligned_scene, 354, 135, 240),
+    "131kx16": partial(_scene_on_an_arc, 2),
+}
+
+
+def find_scenes(names: str | Sequence[str]) -> list[str]:
+    """Return the names of scenes: one, several, or "all".
+
+    Raises:
+        InputError: a name that no scene has, or none.
+    """
+    names = [names] if isinstance(names, str) else list(names)
+    check_names("scenes", names, [*SCENES, "all"])
+    return list(SCENES) if "all" in names else names
+
+
+def describe(scene: Scene) -> dict[str, int]:
+    """Count its Gaussians, views and pixels."""
+    gaussians, cameras = scene
+    return {
+        "gaussians": gaussians.num_gaussians,
+        "views": cameras.num_views,
+        "height": cameras.height,
+        "width": cameras.width,
+    }

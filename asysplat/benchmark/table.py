@@ -46,24 +46,23 @@ def text(pattern: str) -> Write:
 
 def number(path: str, pattern: str, unit: float = 1.0) -> Write:
     """Write a number, divided by its unit."""
+    return _cell(path, lambda value: pattern.format(value / unit))
 
-    def write(row: Result) -> str:
-        value = at(row, path)
-        return NOTHING if value is None else pattern.format(value / unit)
 
-    return write
+def spread(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> Write:
+    """Write median ± interquartile range; seconds in milliseconds."""
+    names = ("median", "iqr")
+    return _cell(path, lambda value: " ± ".join(pattern.format(value[n] / unit) for n in names))
 
 
 def limited(path: str, limit: float) -> Write:
     """Write a ratio, in red above the limit."""
+    return _cell(path, lambda value: Text(f"{value:.2f}", "bold red" if value > limit else ""))
 
-    def write(row: Result) -> str | Text:
-        value = at(row, path)
-        if value is None:
-            return NOTHING
-        return Text(f"{value:.2f}", style="bold red" if value > limit else "")
 
-    return write
+def _cell(path: str, write: Callable[[Any], str | Text]) -> Write:
+    """Write the value at a path, or NOTHING."""
+    return lambda row: NOTHING if at(row, path) is None else write(at(row, path))
 
 
 def error(path: str) -> Write:
@@ -83,15 +82,3 @@ def worst(row: Result, path: str) -> float:
     """Return the error at a path; of several, such as those of gradients, the largest."""
     found = at(row, path)
     return max(found.values()) if isinstance(found, Mapping) else found
-
-
-def spread(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> Write:
-    """Write median ± interquartile range; seconds in milliseconds."""
-
-    def write(row: Result) -> str:
-        values = at(row, path)
-        if values is None:
-            return NOTHING
-        return " ± ".join(pattern.format(values[name] / unit) for name in ("median", "iqr"))
-
-    return write

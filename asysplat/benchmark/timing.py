@@ -1,11 +1,11 @@
-"""Seconds and memory: how every suite measures them."""
+"""Seconds, memory and errors: how every suite measures them."""
 
 import ctypes
 import gc
 import inspect
 import sys
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from types import FrameType
@@ -13,29 +13,24 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
 from asysplat.evaluation.measured_cost import wait_for
 
 Result = dict[str, Any]  # plain values, as JSON has them
 Run = Callable[[], object]
-Seconds = Mapping[Hashable, float]  # by name
+Timer = Callable[[], Mapping[Hashable, float]]  # seconds by name
 Name = Callable[[FrameType], str | None]
 
 
 @dataclass
 class Measurement:
-    """One row of a suite's results.
+    """One row of a suite's results."""
 
-    Args:
-        timer: runs everything that is timed of it once; returns seconds by name.
-        found: results besides the times.
-        seconds: those of every round, by name; `time_in_rounds` fills them.
-    """
-
-    timer: Callable[[], Seconds]
-    found: Result = field(default_factory=dict)
-    seconds: dict[Hashable, list[float]] = field(default_factory=dict)
+    timer: Timer  # runs everything that is timed of it once
+    found: Result = field(default_factory=dict)  # results besides the times
+    seconds: dict[Hashable, list[float]] = field(default_factory=dict)  # by `time_in_rounds`
 
     def summary(self, name: Hashable) -> dict[str, float]:
         """Return median and interquartile range of the seconds of this name."""
@@ -60,6 +55,14 @@ def summary(values: Sequence[float]) -> dict[str, float]:
     return {"median": median, "iqr": high - low}
 
 
+def ratios(one: Result, other: Result, names: Iterable[str]) -> dict[str, float | None]:
+    """Divide medians by those of another result; None for what one of them was not timed for."""
+    return {
+        name: one[name]["median"] / other[name]["median"] if one[name] and other[name] else None
+        for name in names
+    }
+
+
 def now(device: torch.device) -> float:
     """Return the clock's seconds at which the device has finished its work."""
     wait_for(device)
@@ -77,42 +80,28 @@ def seconds_of(run: Run, device: torch.device) -> float:
 def time_calls(
     functions: Mapping[Callable, Name], device: torch.device
 ) -> Iterator[dict[str, float]]:
-    """Add up the seconds of every call of some functions, by name; see `watch_calls`."""
-    started: dict[str, float] = {}
-    seconds: dict[str, float] = {}
-
-    def before(name: str) -> None:
-        started[name] = now(device)
-
-    def after(name: str) -> None:
-        seconds[name] = seconds.get(name, 0.0) + now(device) - started[name]
-
-    with watch_calls(functions, before, after):
-        yield seconds
-
-
-@contextmanager
-def watch_calls(
-    functions: Mapping[Callable, Name], before: Callable[[str], None], after: Callable[[str], None]
-) -> Iterator[None]:
-    """Call `before` and `after` around every call of some functions, as Python's profiler does.
+    """Add up the seconds of every call of some functions, as Python's profiler sees them.
 
     Args:
         functions: what names a call of each, from its frame; None for a call to leave out.
-        before, after: given that name.
+
+    Yields:
+        The seconds by name.
     """
     names = {inspect.unwrap(function).__code__: name for function, name in functions.items()}
+    seconds: dict[str, float] = {}
 
     def profile(frame: FrameType, event: str, _: object) -> None:
         if frame.f_code in names and event in ("call", "return"):
             name = names[frame.f_code](frame)
             if name is not None:
-                (before if event == "call" else after)(name)
+                clock = -now(device) if event == "call" else now(device)
+                seconds[name] = seconds.get(name, 0.0) + clock
 
     previous = sys.getprofile()
     sys.setprofile(profile)
     try:
-        yield
+        yield seconds
     finally:
         sys.setprofile(previous)
 
@@ -124,7 +113,9 @@ def rise_gb(run: Run, device: torch.device) -> float:
     Linux.
     """
     run()
-    _return_freed_memory()
+    gc.collect()
+    with suppress(OSError, AttributeError):  # memory that a run gets again would not show as a rise
+        ctypes.CDLL(None).malloc_trim(0)
     reset_peak_memory(device)
     before = peak_memory_gb(device)
     run()
@@ -132,8 +123,6 @@ def rise_gb(run: Run, device: torch.device) -> float:
     return peak_memory_gb(device) - before
 
 
-def _return_freed_memory() -> None:
-    """Return freed memory to the system: a run that gets it again would not show as a rise."""
-    gc.collect()
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
+def relative_l2(found: Tensor, true: Tensor) -> float:
+    """Return the norm of the difference over the norm of what is true, a float64 tensor."""
+    return ((found.cpu().double() - true).norm() / true.norm()).item()

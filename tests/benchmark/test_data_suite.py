@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from asysplat.benchmark.data.photographs import write_photographs
-from asysplat.benchmark.data.suite import CACHES, tables
+from asysplat.benchmark.data.suite import CACHES, plot, tables
 from asysplat.data import open_scene
 from asysplat.data.images import content_hash
 
@@ -51,6 +51,17 @@ def test_rows_are_complete_and_consistent(run):
     for row in results["loading"]:
         assert row["over_network"] == pytest.approx(row["frames_per_second"]["median"] / taken)
     assert [len(table.rows) for table in tables(results)] == [1, 3]
+
+
+def test_whiskers_are_the_interquartile_range(repository):
+    results = json.loads((repository / "docs" / "results" / "data.json").read_text())
+    (whiskers,) = plot(results).axes[0].containers[-1].lines[2]
+    for row, ((left, _), (right, _)) in zip(
+        results["loading"], whiskers.get_segments(), strict=True
+    ):
+        rate = row["frames_per_second"]
+        assert (left + right) / 2 == pytest.approx(rate["median"])
+        assert right - left == pytest.approx(rate["iqr"])
 
 
 def test_a_scene_of_the_user_s_is_left_as_it_was(run, tmp_path):

@@ -3,6 +3,8 @@
 import json
 import math
 import runpy
+from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
@@ -60,7 +62,7 @@ def measured(run_suite):
 def workload(conf):
     """A network and two views."""
     net, _ = make_net("asysplat_4m4s", OVERRIDES, CPU)
-    return Workload("asysplat_4m4s", net, "bf16", torch.bfloat16, make_views(2, 32, 64, CPU))
+    return Workload("asysplat_4m4s", net, "bf16", make_views(2, 32, 64, CPU))
 
 
 def test_rows_are_complete_and_consistent(measured):
@@ -126,7 +128,8 @@ def test_products_add_up_to_what_torch_counts(measured, conf):
 
 
 def test_products_have_the_precision_and_the_component_they_run_in(workload):
-    counts = record_products(workload)
+    counts = record_products(workload.forward)
+    assert counts.pop("forward") == sum(counts.values(), Counter())
     assert counts.keys() == {*COMPONENTS, OTHERS} - {"full attention"}
     layers = [p for name, part in counts.items() if name != OTHERS for p in part]
     linears = [p for p in layers if p.function is torch.ops.aten.mm.default]
@@ -136,7 +139,7 @@ def test_products_have_the_precision_and_the_component_they_run_in(workload):
 
 
 def test_hooks_and_gradients_are_taken_away_again(workload):
-    record_products(workload)
+    record_products(workload.forward)
     workload.step()
     assert not any(m._forward_hooks or m._forward_pre_hooks for m in workload.net.modules())
     assert all(parameter.grad is None for parameter in workload.net.parameters())
@@ -145,6 +148,8 @@ def test_hooks_and_gradients_are_taken_away_again(workload):
 
 def test_a_step_that_does_not_fit_is_left_out(workload, monkeypatch):
     assert workload.step_fits and workload.step_gb > 0
+    workload.forward()  # in evaluation mode, in which the network would keep less
+    assert replace(workload).step_gb == workload.step_gb
     monkeypatch.setattr(workloads, "_memory_gb", lambda device: workload.step_gb / 2)
     assert not workload.step_fits
 

@@ -10,9 +10,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from asysplat.benchmark.ops.cases import SCANS, Case
-from asysplat.benchmark.ops.paths import Path
+from asysplat.benchmark.ops.paths import make_path
 from asysplat.benchmark.ops.suite import PASSES, make_rows
-from asysplat.benchmark.options import PRECISIONS, check_repeats, find_device, find_precisions
+from asysplat.benchmark.options import PRECISIONS, check_names, check_repeats, find_device
 from asysplat.benchmark.products import (
     LARGEST,
     Operand,
@@ -117,7 +117,7 @@ def test_ratios_are_those_of_the_times(measured):
 
 def test_an_error_is_seen():
     case = Case("selective_scan", {"batch": 1, "length": 5, "channels": 3, "state": 2})
-    path = Path(case, "reference", torch.float32, CPU)
+    path = make_path(case, "reference", torch.float32, CPU)
     output, gradients = path.truth()
     wrong = 2 * output, {name: 4 * grad for name, grad in gradients.items()}
     found = path.errors(wrong)
@@ -169,9 +169,10 @@ def test_calls_are_recorded_under_their_label():
         torch.nn.functional.conv2d(maps, kernel, bias, stride=2, padding=1, groups=2)
         torch.nn.functional.scaled_dot_product_attention(a, a, a)
 
-    with torch.no_grad(), RecordProducts("first") as recorder:
+    labels = ["first"]
+    with torch.no_grad(), RecordProducts(lambda: labels[-1]) as recorder:
         forward()
-        recorder.label = "second"
+        labels.append("second")
         a @ a.mT
     assert flops_of(recorder.counts["first"]) == true_flops(forward)
     (product,) = recorder.counts["second"]
@@ -183,9 +184,9 @@ def test_calls_are_recorded_under_their_label():
 
 def test_unknown_options_are_named():
     with pytest.raises(InputError, match=r"^ops\.precisions=fp8 is unknown: .*fp32, bf16"):
-        find_precisions("ops.precisions", ["fp32", "fp8"])
+        check_names("ops.precisions", ["fp32", "fp8"], PRECISIONS)
     with pytest.raises(InputError, match=r"^ops\.precisions=None is unknown"):
-        find_precisions("ops.precisions", [])
+        check_names("ops.precisions", [], PRECISIONS)
     with pytest.raises(InputError, match=r"^device=tpu is unknown: .*auto, cpu, cuda"):
         find_device("tpu")
     for repeats in (0, 1.5):
@@ -197,4 +198,4 @@ def test_unknown_options_are_named():
 def test_a_wrong_size_is_not_taken_for_a_path_that_is_not_there():
     case = Case("grid_attention", MAPS | {"grid": 0})
     with pytest.raises(InputError, match="grid=0"):
-        make_rows(case, case, PRECISIONS, LOOP_TOKENS, CPU)
+        make_rows(case, PRECISIONS, LOOP_TOKENS, CPU)

@@ -13,21 +13,25 @@ import torch
 from omegaconf import OmegaConf
 
 from asysplat.benchmark.options import find_suite
-from asysplat.benchmark.render.cases import CASES, Case, find_cases
-from asysplat.benchmark.render.passes import COUNT, RASTER, SIDE, hot_scene, run_timed
+from asysplat.benchmark.render.floor import COUNT, RASTER, SIDE, hot_scene
 from asysplat.benchmark.render.run import (
     FIELDS,
     SKIPS,
-    Backend,
     errors,
     find_backends,
     flips,
-    peak_gb,
     prepare,
     run,
     truth,
 )
-from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
+from asysplat.benchmark.scenes import (
+    SCENES,
+    SMALLER,
+    find_scenes,
+    pixel_aligned_scene,
+    random_scene,
+)
+from asysplat.benchmark.timing import rise_gb
 from asysplat.errors import InputError
 from asysplat.evaluation.cost import CLEAR_PEAK
 from asysplat.rendering import INRIA, Skips
@@ -39,10 +43,10 @@ def measured(repository, tmp_path_factory):
     folder = tmp_path_factory.mktemp("benchmark")
     script = runpy.run_path(str(repository / "benchmark.py"))
     options = {"suite": "render", "scenes": ["tiny", "twin"], "repeats": 2, "output": folder}
-    twin = partial(pixel_aligned_scene, 8, 16, 16)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(CASES, "tiny", Case(partial(random_scene, 500, 24, 40)))
-        patch.setitem(CASES, "twin", Case(partial(pixel_aligned_scene, 16, 32, 32), twin))
+        patch.setitem(SCENES, "tiny", partial(random_scene, 500, 24, 40))
+        patch.setitem(SCENES, "twin", partial(pixel_aligned_scene, 16, 32, 32))
+        patch.setitem(SMALLER, "twin", partial(pixel_aligned_scene, 8, 16, 16))
         script["benchmark"](OmegaConf.create(options))
     return json.loads((folder / "render.json").read_text()), folder
 
@@ -100,7 +104,8 @@ def test_a_skip_leaves_the_error_as_it_is(measured):
 def test_hot_rows_are_all_rows_of_all_tiles():
     """What the floor is made of: nothing is skipped, and the kernels take nearly all the time."""
     (backend,) = [backend for backend in find_backends() if backend.name == "cpu"]
-    outputs, seconds = run_timed(backend, Skips(), hot_scene())
+    outputs = run(backend, Skips(), hot_scene())
+    seconds = outputs.kernels
     tiles = (SIDE // outputs.stats["tile_size"]) ** 2
     assert outputs.stats["visible"] == COUNT and outputs.stats["pairs"] == COUNT * tiles
     assert outputs.stats["rows"] == COUNT * tiles * outputs.stats["tile_size"]
@@ -134,14 +139,9 @@ def test_errors_are_those_of_image_and_gradients():
 
 @pytest.mark.skipif(not os.access(CLEAR_PEAK, os.W_OK), reason="peaks cannot be started anew")
 def test_peak_memory_is_the_rise():
-    def draw(gaussians, cameras, skips):
-        torch.ones(25_000_000)
-        total = sum(getattr(gaussians, name).sum() for name in FIELDS)
-        return total.expand(1, 3, cameras.height, cameras.width), {}
-
     kept = torch.ones(50_000_000)
-    inputs = prepare(random_scene(10, 8, 8), "cpu")
-    assert peak_gb(Backend("", "cpu", draw), Skips(), inputs) == pytest.approx(0.1, abs=0.02)
+    rise = rise_gb(lambda: torch.ones(25_000_000), torch.device("cpu"))
+    assert rise == pytest.approx(0.1, abs=0.02)
     del kept
 
 
@@ -151,11 +151,11 @@ def test_unknown_options_are_named():
     ):
         find_suite("rendr")
     with pytest.raises(InputError, match=r"^scenes=D is unknown: .*A, B, C, 524k, 4M"):
-        find_cases(["A", "D"])
+        find_scenes(["A", "D"])
     with pytest.raises(InputError, match=r"^scenes=.* unknown"):
-        find_cases([])
-    assert find_cases("all").keys() == CASES.keys()
-    assert list(find_cases(["C", "A"])) == ["C", "A"] and list(find_cases("4M")) == ["4M"]
+        find_scenes([])
+    assert find_scenes("all") == list(SCENES)
+    assert find_scenes(["C", "A"]) == ["C", "A"] and find_scenes("4M") == ["4M"]
 
 
 @pytest.mark.slow

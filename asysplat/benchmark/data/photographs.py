@@ -1,7 +1,6 @@
 """A synthetic scene on disk."""
 
 import json
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,8 @@ PICTURES = 8  # that are different to look at
 QUALITY = 90  # of the JPEG
 
 
-def write_photographs(folder: Path, frames: int, height: int, width: int) -> None:
-    """Write a transforms.json and `frames` JPEG files, no two of the same bytes."""
+def write_photographs(folder: Path, frames: int, height: int, width: int) -> Path:
+    """Write a transforms.json and `frames` JPEG files of different bytes; return the folder."""
     scene = ProceduralScene(seed=0, height=RENDERED[0], width=RENDERED[1], num_frames=frames)
     shown = scene.views([number * frames // PICTURES for number in range(PICTURES)]).images
     pictures = [_enlarged(image.permute(1, 2, 0).numpy(), height, width) for image in shown]
@@ -27,16 +26,14 @@ def write_photographs(folder: Path, frames: int, height: int, width: int) -> Non
     poses = [opencv_from_opengl(pose) for pose in scene.cameras.cam_to_world.double().numpy()]
     for number in track(range(frames), "photographs", transient=True):
         name = f"images/{number:05d}.jpg"
-        stored = BytesIO()
         # The comment gives each file bytes of its own, by which the cache knows it.
-        pictures[number % PICTURES].save(
-            stored, "JPEG", quality=QUALITY, comment=f"photograph {number}"
-        )
-        (folder / name).write_bytes(stored.getvalue())
+        comment = f"photograph {number}"
+        pictures[number % PICTURES].save(folder / name, quality=QUALITY, comment=comment)
         entries.append({"file_path": name, "transform_matrix": poses[number].tolist()})
     focal = float(scene.cameras.intrinsics[0, 0, 0]) * width / RENDERED[1]
     content = {"w": width, "h": height, "fl_x": focal, "frames": entries}
     (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
 
 
 def _enlarged(image: np.ndarray, height: int, width: int) -> Image.Image:

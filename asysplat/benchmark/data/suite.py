@@ -1,7 +1,6 @@
 """Photographs on disk: how soon a scene opens, and whether loading keeps ahead of training."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,7 +16,7 @@ from asysplat.benchmark.options import find_device
 from asysplat.benchmark.plot import bars
 from asysplat.benchmark.table import make_table, measured_on, number, spread, text
 from asysplat.benchmark.timing import Measurement, Result, seconds_of, summary, time_in_rounds
-from asysplat.data import ImageCache, SceneDataModule, files_data, open_scene
+from asysplat.data import ImageCache, files_data, open_scene
 
 CPU = torch.device("cpu")  # which reads
 NO_CACHE, FIRST, LATER = CACHES = ("none", "filled meanwhile", "filled")
@@ -38,24 +37,37 @@ def measure(options: DictConfig, console: Console) -> Result:
     """
     device, wanted = find_device(options.device), options.data
     net, size = make_net(MODEL, wanted.overrides, device)
-    views = make_views(size["views"], size["height"], size["width"], device)
-    workload = Workload(MODEL, net, "fp32", torch.float32, views)
-    with _scene(wanted) as root, TemporaryDirectory() as folder:
-        capture = open_scene(root, size["height"], size["width"])
+    height, width = size["height"], size["width"]
+    workload = Workload(MODEL, net, "fp32", make_views(size["inputs"], height, width, device))
+    frames = size["inputs"] + wanted.targets  # of a training task
+    with TemporaryDirectory() as folder:
+        made = Path(folder) / "scene"
+        root = wanted.root or write_photographs(made, wanted.frames, *wanted.photographs)
+        open_views = partial(open_scene, root, height, width)
+        capture = open_views()
         lens = capture.scene.photographs[0].lens
-        frames = size["views"] + wanted.targets  # of a training task
         count = max(1, capture.num_frames // frames)
+        make_data = partial(
+            files_data,
+            **size,
+            root=str(root),
+            window=[frames, 128],
+            name="benchmark",
+            targets=wanted.targets,
+            batch_size=1,
+            num_workers=wanted.num_workers,
+            seed=0,
+            steps_per_epoch=1,
+        )
 
         def loading(cache: ImageCache | None) -> float:
-            data = _data(root, size, wanted, cache)
+            data = make_data(cache=cache)
             return seconds_of(lambda: list(data.tasks(0, count)), CPU) / (count * frames)
 
         def seconds() -> dict[str, float]:
             with TemporaryDirectory(dir=folder) as fresh:
                 return {
-                    "open": seconds_of(
-                        lambda: open_scene(root, size["height"], size["width"]), CPU
-                    ),
+                    "open": seconds_of(open_views, CPU),
                     NO_CACHE: loading(None),
                     FIRST: loading(ImageCache(fresh)),
                     LATER: loading(ImageCache(fresh)),
@@ -70,7 +82,7 @@ def measure(options: DictConfig, console: Console) -> Result:
         "scene": {
             "frames": capture.num_frames,
             "photographs": [lens.height, lens.width],
-            "views": [size["height"], size["width"]],
+            "views": [height, width],
             "workers": wanted.num_workers,
         },
         "open": scene.summary("open"),
@@ -86,41 +98,10 @@ def measure(options: DictConfig, console: Console) -> Result:
     }
 
 
-@contextmanager
-def _scene(wanted: DictConfig) -> Iterator[Path]:
-    """Yield the folder of the user's scene, or of a synthetic one that is deleted afterwards."""
-    if wanted.root is not None:
-        yield Path(wanted.root)
-        return
-    with TemporaryDirectory() as folder:
-        write_photographs(Path(folder) / "scene", wanted.frames, *wanted.photographs)
-        yield Path(folder) / "scene"
-
-
-def _data(
-    root: Path, size: dict[str, int], wanted: DictConfig, cache: ImageCache | None
-) -> SceneDataModule:
-    return files_data(
-        root=str(root),
-        height=size["height"],
-        width=size["width"],
-        window=[size["views"] + wanted.targets, 128],
-        cache=cache,
-        name="benchmark",
-        inputs=size["views"],
-        targets=wanted.targets,
-        batch_size=1,
-        num_workers=wanted.num_workers,
-        seed=0,
-        steps_per_epoch=1,
-    )
-
-
 def tables(results: Result) -> list[Table]:
     """Show how soon a scene opens, and how fast its frames come."""
     scene, opened = results["scene"], results["open"]
-    opening = {"frames": scene["frames"], "open": opened}
-    opening["each"] = opened["median"] / scene["frames"]
+    each = opened["median"] / scene["frames"]
     columns = {
         "frames": text("{frames}"),
         "ms, no pixel read": spread("open"),
@@ -139,14 +120,15 @@ def tables(results: Result) -> list[Table]:
         f"the network alone takes {network} frames / s in training"
     )
     return [
-        make_table("Opening a scene", columns, [opening]),
+        make_table("Opening a scene", columns, [scene | {"open": opened, "each": each}]),
         make_table("Loading training tasks", loading_columns, results["loading"], notes),
     ]
 
 
 def plot(results: Result) -> Figure:
     """Plot the frames a second of each state of the cache, and those that the network takes."""
-    rates = {row["cache"]: row["frames_per_second"]["median"] for row in results["loading"]}
-    network = [results["network"]["median"]] * len(rates)
-    parts = {"loading, by the cache on disk": list(rates.values())}
-    return bars(list(rates), parts, ("the network takes", network), "frames a second")
+    names = [row["cache"] for row in results["loading"]]
+    rates = [row["frames_per_second"] for row in results["loading"]]
+    parts = {"loading, by the cache on disk": [rate["median"] for rate in rates]}
+    network = ("the network takes", [results["network"]["median"]] * len(rates))
+    return bars(names, parts, network, "frames a second", spread=[rate["iqr"] for rate in rates])

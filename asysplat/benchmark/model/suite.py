@@ -1,8 +1,6 @@
 """Whole networks: seconds of a forward pass and of a training step, their parts, their floor."""
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 
 import torch
 from matplotlib.figure import Figure
@@ -10,24 +8,18 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from asysplat.benchmark.model.components import (
-    COMPONENTS,
-    OPERATORS,
-    OTHERS,
-    component_seconds,
-    record_products,
-)
+from asysplat.benchmark.model.components import OPERATORS, PARTS, part_seconds, record_products
 from asysplat.benchmark.model.workload import Workload, make_net, make_views
-from asysplat.benchmark.options import find_device, find_precisions
+from asysplat.benchmark.options import PRECISIONS, check_names, find_device
 from asysplat.benchmark.plot import bars
-from asysplat.benchmark.products import Counts, product_seconds, sum_of_products
+from asysplat.benchmark.products import Counts, time_products
 from asysplat.benchmark.table import limited, make_table, measured_on, number, spread, text
 from asysplat.benchmark.timing import (
     Measurement,
     Result,
+    ratios,
     rise_gb,
     seconds_of,
-    summary,
     time_in_rounds,
 )
 from asysplat.evaluation.cost import GB, count_parameters
@@ -44,21 +36,6 @@ step: forward and backward; -: not asked for, or would not fit into memory
 tokens: those of the largest patch"""
 
 
-@dataclass
-class _Network(Measurement):
-    """The measurement of a network at one precision and number of views.
-
-    Args:
-        counts: of the products of a forward pass, by component.
-    """
-
-    counts: Mapping[str, Counts] = field(default_factory=dict)
-
-    @property
-    def all_counts(self) -> Counts:
-        return sum(map(Counter, self.counts.values()), Counter())
-
-
 def measure(options: DictConfig, console: Console) -> Result:
     """Time every network of `options.model`, `options.repeats` times.
 
@@ -71,31 +48,35 @@ def measure(options: DictConfig, console: Console) -> Result:
         InputError: an unknown model, override, precision or device; a resolution
             that a network cannot take.
     """
-    device = find_device(options.device)
-    wanted = options.model
-    precisions = find_precisions("model.precisions", wanted.precisions)
-    rows = []
+    device, wanted = find_device(options.device), options.model
+    check_names("model.precisions", wanted.precisions, PRECISIONS)
+    rows: list[Measurement] = []
+    counts: list[Mapping[str, Counts]] = []  # of the products of each row, by part
     with console.status("networks, products and memory"):
         for name in wanted.names:
             net, size = make_net(name, wanted.overrides, device)
             net.check_size(size["height"], size["width"])
-            for count in wanted.views or [size["views"]]:
-                views = make_views(count, size["height"], size["width"], device)
-                for precision, dtype in precisions.items():
-                    workload = Workload(name, net, precision, dtype, views)
+            for num_views in wanted.views or [size["inputs"]]:
+                views = make_views(num_views, size["height"], size["width"], device)
+                for precision in wanted.precisions:
+                    workload = Workload(name, net, precision, views)
                     rows.append(_prepare(workload, wanted.steps))
-    every: Counter = Counter()  # each product once, whatever network it belongs to
-    for row in rows:
-        every |= row.all_counts
-    products = Measurement(lambda: product_seconds(every, device))
+                    counts.append(record_products(workload.forward))
+    parts = ("forward", *PARTS)
+    groups = {(i, part): c.get(part, {}) for i, c in enumerate(counts) for part in parts}
+    products = Measurement(lambda: time_products(groups, device))
     with console.status(f"{options.repeats} rounds"):
         time_in_rounds([*rows, products], options.repeats)
-    results = [row.found | _times(row, products) for row in rows]
-    first = [result for result in results if result["model"] == results[0]["model"]]
-    return {"rows": [result | {"over_first": _over_first(result, first)} for result in results]}
+    results, first = [], {}
+    for i, row in enumerate(rows):
+        floors = {part: products.summary((i, part)) for part in parts}
+        result = row.found | _summarise(row, floors, counts[i]["forward"], products)
+        same_input = first.setdefault((result["views"], result["precision"]), result)
+        results.append(result | {"over_first": ratios(result, same_input, PASSES)})
+    return {"rows": results}
 
 
-def _prepare(workload: Workload, steps: bool) -> _Network:
+def _prepare(workload: Workload, steps: bool) -> Measurement:
     """Find what is known before anything is timed."""
     device, cameras = workload.device, workload.views.cameras
     passes = {"forward": workload.forward}
@@ -104,11 +85,10 @@ def _prepare(workload: Workload, steps: bool) -> _Network:
 
     def seconds() -> dict[str, float]:
         taken = {name: seconds_of(run, device) for name, run in passes.items()}
-        return taken | component_seconds(workload)
+        return taken | part_seconds(workload.forward, device)
 
-    row = _Network(seconds, counts=record_products(workload))
     peak_gb = {name: rise_gb(run, device) for name, run in passes.items()}
-    row.found = {
+    found = {
         "model": workload.name,
         "parameters": count_parameters(workload.net),
         "views": cameras.num_views,
@@ -117,18 +97,19 @@ def _prepare(workload: Workload, steps: bool) -> _Network:
         "tokens": workload.tokens,
         "precision": workload.precision,
         "threads": torch.get_num_threads(),
-        "gflops": sum(count * p.flops() for p, count in row.all_counts.items()) / GIGA,
         "step_needs_gb": workload.step_gb,
         "peak_gb": peak_gb,
         "bytes_per_token": {name: GB * gb / workload.tokens for name, gb in peak_gb.items()},
     }
-    return row
+    return Measurement(seconds, found)
 
 
-def _times(row: _Network, products: Measurement) -> Result:
-    """Summarise the rounds."""
-    forward, step = (row.summary(name) if name in row.seconds else None for name in PASSES)
-    floor = summary(sum_of_products(row.all_counts, products.seconds))
+def _summarise(
+    row: Measurement, floors: Mapping[str, Result], counts: Counts, products: Measurement
+) -> Result:
+    """Summarise the rounds of a network, and of the products of its forward pass."""
+    times = {name: row.summary(name) for name in row.seconds}
+    forward, step, floor = times["forward"], times.get("step"), floors["forward"]
     return {
         "forward": forward,
         "step": step,
@@ -138,11 +119,12 @@ def _times(row: _Network, products: Measurement) -> Result:
             "step": step and step["median"] / ((1 + BACKWARD) * floor["median"]),
         },
         "components": {
-            name: {"seconds": row.summary(name), "floor": _floor(row.counts.get(name), products)}
-            for name in (*COMPONENTS, OTHERS)
-            if name in row.seconds
+            name: {"seconds": times[name], "floor": floors[name]["median"]}
+            for name in PARTS
+            if name in times
         },
-        "operators": {name: row.summary(name) for name in OPERATORS if name in row.seconds},
+        "operators": {name: times[name] for name in OPERATORS if name in times},
+        "gflops": sum(count * product.flops() for product, count in counts.items()) / GIGA,
         "products": [
             {
                 "product": str(product),
@@ -150,24 +132,9 @@ def _times(row: _Network, products: Measurement) -> Result:
                 "gflops": product.flops() / GIGA,
                 "seconds": products.summary(product)["median"],
             }
-            for product, count in row.all_counts.items()
+            for product, count in counts.items()
         ],
     }
-
-
-def _floor(counts: Counts | None, products: Measurement) -> float:
-    return summary(sum_of_products(counts, products.seconds))["median"] if counts else 0.0
-
-
-def _over_first(result: Result, first: Sequence[Result]) -> dict[str, float | None]:
-    """Divide by the times of the first model, on the same views at the same precision."""
-    over: dict[str, float | None] = dict.fromkeys(PASSES)
-    for other in first:
-        if all(other[key] == result[key] for key in ("views", "precision")):
-            for name in PASSES:
-                if result[name] and other[name]:
-                    over[name] = result[name]["median"] / other[name]["median"]
-    return over
 
 
 def tables(results: Result) -> list[Table]:
@@ -178,7 +145,7 @@ def tables(results: Result) -> list[Table]:
     parts = [part for row in rows for part in _parts(row)]
     shown = [
         make_table("Networks", NETWORKS, rows, network_notes, names=2),
-        make_table("What a forward pass goes into", PARTS, parts, part_notes, names=3),
+        make_table("What a forward pass goes into", FORWARD, parts, part_notes, names=3),
     ]
     if len({row["views"] for row in rows}) > 1:
         title = "Milliseconds of a forward pass for each view"
@@ -191,7 +158,7 @@ def plot(results: Result) -> Figure:
     rows = [_per_view(row) for row in results["rows"]]
     return bars(
         [f"{row['model']}, {row['views']} views, {row['precision']}" for row in rows],
-        {name: [row.get(name, 0) for row in rows] for name in (*COMPONENTS, OTHERS)},
+        {name: [row.get(name, 0) for row in rows] for name in PARTS},
         ("floor", [row["floor"] for row in rows]),
         "milliseconds of a forward pass for each view",
     )
@@ -199,20 +166,16 @@ def plot(results: Result) -> Figure:
 
 def _parts(row: Result) -> list[Result]:
     """List the components and, below, the operators."""
-    lines = [
-        {"part": name, **part, "over_floor": _over(part["seconds"], part["floor"])}
-        for name, part in row["components"].items()
-    ]
-    lines += [
-        {"part": f"  of which {name}", "seconds": seconds, "floor": None, "over_floor": None}
+    parts = [{"part": name, **part} for name, part in row["components"].items()]
+    parts += [
+        {"part": f"  of which {name}", "seconds": seconds, "floor": None}
         for name, seconds in row["operators"].items()
     ]
-    whole = row["forward"]["median"]
-    return [row | line | {"share": line["seconds"]["median"] / whole} for line in lines]
-
-
-def _over(seconds: Mapping[str, float], floor: float) -> float | None:
-    return seconds["median"] / floor if floor else None
+    for part in parts:
+        seconds, floor = part["seconds"]["median"], part["floor"]
+        part["share"] = seconds / row["forward"]["median"]
+        part["over_floor"] = seconds / floor if floor else None
+    return [row | part for part in parts]
 
 
 def _per_view(row: Result) -> Result:
@@ -237,7 +200,7 @@ NETWORKS = {
     "step\nkB / token": number("bytes_per_token.step", "{:,.0f}", unit=1e3),
     "step\nGB": number("peak_gb.step", "{:.2f}"),
 }
-PARTS = {
+FORWARD = {
     "model": text("{model}"),
     "inputs": text("{views} views, {precision}"),
     "component": text("{part}"),

@@ -9,6 +9,7 @@ import hydra
 import torch
 from hydra.utils import instantiate
 
+from asysplat.benchmark.options import PRECISIONS
 from asysplat.benchmark.scenes import on_an_arc, random_scene
 from asysplat.evaluation.cost import GB, count_parameters
 from asysplat.evaluation.static_cost import activation_gb
@@ -21,21 +22,12 @@ FILLED = 0.75  # of the memory, at most: a step also needs what it does not keep
 
 @dataclass(frozen=True)
 class Workload:
-    """What is measured: a network, its input and their precision.
+    """What is measured: a network, its input and their precision."""
 
-    Args:
-        name: of the model.
-        net: with random weights.
-        precision: fp32 or bf16.
-        dtype: of autocast; fp32 means none.
-        views: one scene's.
-    """
-
-    name: str
-    net: Network
-    precision: str
-    dtype: torch.dtype
-    views: Views
+    name: str  # of the model
+    net: Network  # with random weights
+    precision: str  # of PRECISIONS; bf16 by autocast
+    views: Views  # of one scene
 
     @property
     def device(self) -> torch.device:
@@ -66,6 +58,7 @@ class Workload:
     def step_gb(self) -> float:
         """Estimate the memory of a step: activations, parameters and their gradients."""
         cameras = self.views.cameras
+        self.net.train()
         with self._autocast("cpu"):
             kept = activation_gb(self.net, cameras.num_views, cameras.height, cameras.width)
         return kept + 2 * 4 * count_parameters(self.net) / GB
@@ -75,13 +68,14 @@ class Workload:
         return self.step_gb < FILLED * _memory_gb(self.device)
 
     def _autocast(self, device: str) -> torch.autocast:
-        return torch.autocast(device, self.dtype, enabled=self.dtype != torch.float32)
+        dtype = PRECISIONS[self.precision]
+        return torch.autocast(device, dtype, enabled=dtype != torch.float32)
 
 
 def make_net(
     name: str, overrides: Mapping[str, object], device: torch.device
 ) -> tuple[Network, dict[str, int]]:
-    """Build the network that train.py would; return also its inputs' views, height and width.
+    """Build the network that train.py would; return also its number of inputs, height and width.
 
     Raises:
         InputError: an unknown model, or an unknown choice among the overrides.
@@ -92,8 +86,7 @@ def make_net(
     torch.manual_seed(0)
     with device:
         net = instantiate(config.model)
-    data = config.data
-    return net, {"views": data.inputs, "height": data.height, "width": data.width}
+    return net, {name: config.data[name] for name in ("inputs", "height", "width")}
 
 
 def make_views(views: int, height: int, width: int, device: torch.device) -> Views:

@@ -1,8 +1,8 @@
 """The operators at one size each: their inputs, their call and the matrix products in them."""
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -10,25 +10,44 @@ from torch import Tensor
 
 from asysplat import ops
 from asysplat.benchmark.products import Size, grid_attention_sizes, ssd_sizes
+from asysplat.benchmark.scenes import random_numbers
 
 STEPS = (1e-3, 1e-1)  # dt of an untrained network
 SCANS = ("ssd", "selective_scan")
+TOKENS = ("batch", "length", "views", "height", "width")  # sizes whose product is their number
+# The shape of each input, in the order that they are drawn.
+SHAPES = {
+    "ssd": {  # a Mamba2 layer's scan, of one direction
+        "x": "batch length heads head_dim",
+        "dt": "batch length heads",
+        "A": "heads",
+        "B": "batch length state",
+        "C": "batch length state",
+        "D": "heads",
+    },
+    "selective_scan": {  # a MambaVision layer's scan: each frame a sequence
+        "x": "batch length channels",
+        "dt": "batch length channels",
+        "A": "channels state",
+        "B": "batch length state",
+        "C": "batch length state",
+        "D": "channels",
+    },
+    # One attention layer; grid 1 is full attention.
+    "grid_attention": dict.fromkeys("qkv", "batch views height width heads head_dim"),
+}
+PRODUCTS = {"ssd": ssd_sizes, "grid_attention": grid_attention_sizes}
 
 Tensors = dict[str, Tensor]
-Draw = Callable[..., Tensor]  # of a shape, in float64
 
 
 @dataclass(frozen=True)
 class Case:
-    """An operator at one size.
+    """An operator at one size."""
 
-    Args:
-        operator: of `asysplat.ops`.
-        sizes: of its inputs, as its function in INPUTS names them.
-    """
-
-    operator: str
-    sizes: Mapping[str, int]
+    operator: str  # of `asysplat.ops`
+    sizes: Mapping[str, int]  # of its inputs, as SHAPES names them, and the grid of an attention
+    exact: Mapping[str, int] = field(default_factory=dict)  # sizes that differ for errors
 
     @property
     def name(self) -> str:
@@ -45,25 +64,33 @@ class Case:
 
     @property
     def tokens(self) -> int:
-        sides = (
-            ("batch", "length") if self.operator in SCANS else ("batch", "views", "height", "width")
-        )
-        return math.prod(self.sizes[side] for side in sides)
+        return math.prod(size for side, size in self.sizes.items() if side in TOKENS)
+
+    @property
+    def small(self) -> "Case":
+        """Return the case of its kind that errors are measured on."""
+        return self.resized(**self.exact)
 
     def resized(self, **sizes: int) -> "Case":
-        return Case(self.operator, {**self.sizes, **sizes})
+        return replace(self, sizes={**self.sizes, **sizes})
 
     def tensors(self) -> Tensors:
         """Make inputs in float64; the same numbers at every call."""
-        generator = torch.Generator().manual_seed(0)
-
-        def normal(*shape: int) -> Tensor:
-            return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-        def uniform(*shape: int) -> Tensor:
-            return torch.rand(shape, generator=generator, dtype=torch.float64)
-
-        return INPUTS[self.operator](normal, uniform, **self.sizes)
+        uniform, normal = random_numbers(0)
+        tensors = {}
+        for name, sides in SHAPES[self.operator].items():
+            shape = [self.sizes[side] for side in sides.split()]
+            if name == "dt":  # log-uniform
+                low, high = map(math.log, STEPS)
+                tensors[name] = (low + (high - low) * uniform(shape)).exp()
+            elif name != "A":
+                tensors[name] = normal(shape)
+            elif self.operator == "ssd":
+                tensors[name] = -1 - 15 * uniform(shape)
+            else:
+                states = torch.arange(1.0, self.sizes["state"] + 1, dtype=torch.float64)
+                tensors[name] = -states.repeat(self.sizes["channels"], 1)
+        return tensors
 
     def run(self, tensors: Tensors, backend: str) -> Tensor:
         return getattr(ops, self.operator)(**tensors, **self.options, backend=backend)
@@ -73,56 +100,10 @@ class Case:
         return PRODUCTS[self.operator](**self.sizes) if self.operator in PRODUCTS else []
 
 
-def _ssd(
-    normal: Draw, uniform: Draw, batch: int, length: int, heads: int, head_dim: int, state: int
-) -> Tensors:
-    """Make inputs of a Mamba2 layer's scan, of one direction."""
-    return {
-        "x": normal(batch, length, heads, head_dim),
-        "dt": _steps(uniform(batch, length, heads)),
-        "A": -1 - 15 * uniform(heads),
-        "B": normal(batch, length, state),
-        "C": normal(batch, length, state),
-        "D": normal(heads),
-    }
-
-
-def _selective_scan(
-    normal: Draw, uniform: Draw, batch: int, length: int, channels: int, state: int
-) -> Tensors:
-    """Make inputs of a MambaVision layer's scan: each frame a sequence."""
-    return {
-        "x": normal(batch, length, channels),
-        "dt": _steps(uniform(batch, length, channels)),
-        "A": -torch.arange(1.0, state + 1, dtype=torch.float64).repeat(channels, 1),
-        "B": normal(batch, length, state),
-        "C": normal(batch, length, state),
-        "D": normal(channels),
-    }
-
-
-def _grid_attention(
-    normal: Draw, uniform: Draw, *, heads: int, head_dim: int, **maps: int
-) -> Tensors:
-    """Make inputs of one attention layer; grid 1 is full attention."""
-    shape = (*(maps[side] for side in ("batch", "views", "height", "width")), heads, head_dim)
-    return {name: normal(*shape) for name in ("q", "k", "v")}
-
-
-def _steps(uniform: Tensor) -> Tensor:
-    """Turn uniform numbers into log-uniform ones between STEPS."""
-    low, high = map(math.log, STEPS)
-    return (low + (high - low) * uniform).exp()
-
-
-INPUTS = {"ssd": _ssd, "selective_scan": _selective_scan, "grid_attention": _grid_attention}
-PRODUCTS = {"ssd": ssd_sizes, "grid_attention": grid_attention_sizes}
-
-
-def find_cases(options: Mapping[str, Any]) -> list[tuple[Case, Case]]:
-    """Make each operator at its size, and the smaller one that its errors are measured on."""
-    cases = [Case(scan, options[scan]) for scan in SCANS]
+def find_cases(options: Mapping[str, Any]) -> list[Case]:
+    """Make each operator at its size; attention with each of its grids."""
     attention = dict(options["grid_attention"])
     grids = attention.pop("grids")
-    cases += [Case("grid_attention", {**attention, "grid": grid}) for grid in grids]
-    return [(case, case.resized(**options["exact"][case.operator])) for case in cases]
+    sizes = [(scan, options[scan]) for scan in SCANS]
+    sizes += [("grid_attention", attention | {"grid": grid}) for grid in grids]
+    return [Case(operator, size, options["exact"][operator]) for operator, size in sizes]

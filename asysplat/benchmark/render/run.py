@@ -2,44 +2,34 @@
 
 import importlib.util
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from functools import partial
+from contextlib import nullcontext
+from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from asysplat.benchmark.render.cases import Scene
-from asysplat.benchmark.timing import now, rise_gb
+from asysplat.benchmark.scenes import Scene
+from asysplat.benchmark.timing import now, relative_l2, time_calls
+from asysplat.ops.cpu.threads import run_blocks
 from asysplat.rendering import GSPLAT_1_5, INRIA, Convention, Skips, render
 from asysplat.scene import Cameras, Gaussians
 
 SKIPS = tuple(field.name for field in fields(Skips))
 SKIPS_OF_CUDA = tuple(name for name in SKIPS if name != "rows")
 FIELDS = tuple(field.name for field in fields(Gaussians))
+KERNELS = {run_blocks: lambda frame: frame.f_locals["kernel"].__name__}
 FLIP = 1e-4  # a difference that rounding alone does not make; a flip makes up to 1/255
-Drawn = tuple[Tensor, dict[str, int]]  # image [V, 3, H, W] without background, and counts
 
 
-@dataclass(frozen=True)
-class Backend:
-    """A renderer.
+class Backend(NamedTuple):
+    """A renderer."""
 
-    Args:
-        name: as the tables have it.
-        device: where its tensors are.
-        draw: draws a scene without some of its skips.
-        skips: names of those that it can switch off.
-        convention: its cut-offs.
-    """
-
-    name: str
-    device: str
-    draw: Callable[[Gaussians, Cameras, Skips], Drawn]
-    skips: tuple[str, ...] = ()
-    convention: Convention = INRIA
+    name: str  # as the tables have it
+    device: str  # where its tensors are
+    skips: tuple[str, ...] = ()  # names of those that it can switch off
+    convention: Convention = INRIA  # its cut-offs
 
 
 class Inputs(NamedTuple):
@@ -56,30 +46,31 @@ class Outputs(NamedTuple):
     image: Tensor  # [V, 3, H, W]
     gradients: tuple[Tensor, ...]  # of each of FIELDS
     seconds: dict[str, float]  # of "forward" and "backward"
+    kernels: dict[str, float]  # seconds of each kernel, of the cpu backend
     stats: dict[str, int]
 
 
 def find_backends() -> list[Backend]:
     """List the reference, which every table has, then the fast ones that can run here."""
-    found = [
-        Backend("reference", "cpu", partial(_draw, "reference")),
-        Backend("cpu", "cpu", partial(_draw, "cpu"), SKIPS),
-    ]
+    found = [Backend("reference", "cpu"), Backend("cpu", "cpu", SKIPS)]
     if torch.cuda.is_available():
-        found.append(Backend("cuda", "cuda", partial(_draw, "cuda"), SKIPS_OF_CUDA))
+        found.append(Backend("cuda", "cuda", SKIPS_OF_CUDA))
         if importlib.util.find_spec("gsplat"):
-            found.append(Backend("gsplat", "cuda", _gsplat, convention=GSPLAT_1_5))
+            found.append(Backend("gsplat", "cuda", convention=GSPLAT_1_5))
     return found
 
 
-def _draw(
-    backend: str, gaussians: Gaussians, cameras: Cameras, skips: Skips, **options: Convention
-) -> Drawn:
-    out = render(gaussians, cameras, backend=backend, depth=False, skips=skips, **options)
+def _draw(backend: Backend, skips: Skips, inputs: Inputs) -> tuple[Tensor, dict[str, int]]:
+    """Draw the image [V, 3, H, W] without background; return also counts."""
+    gaussians, cameras, _ = inputs
+    if backend.name == "gsplat":
+        return _draw_by_gsplat(gaussians, cameras)
+    choices = {"backend": backend.name, "skips": skips, "convention": backend.convention}
+    out = render(gaussians, cameras, depth=False, **choices)
     return out.image, out.stats
 
 
-def _gsplat(gaussians: Gaussians, cameras: Cameras, skips: Skips) -> Drawn:
+def _draw_by_gsplat(gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, dict[str, int]]:
     """Draw with gsplat 1.5 in its faster form, not the packed one; it has no skips to switch."""
     from gsplat import rasterization
 
@@ -118,23 +109,19 @@ def run(backend: Backend, skips: Skips, inputs: Inputs) -> Outputs:
     """Draw, and take the gradients."""
     leaves = [getattr(inputs.gaussians, name) for name in FIELDS]
     device = torch.device(backend.device)
-    start = now(device)
-    image, stats = backend.draw(inputs.gaussians, inputs.cameras, skips)
-    middle = now(device)
-    gradients = torch.autograd.grad(image, leaves, inputs.weights)
-    seconds = {"forward": middle - start, "backward": now(device) - middle}
-    return Outputs(image.detach(), gradients, seconds, stats)
-
-
-def peak_gb(backend: Backend, skips: Skips, inputs: Inputs) -> float:
-    """Measure the memory of both passes, see `rise_gb`."""
-    return rise_gb(lambda: run(backend, skips, inputs), torch.device(backend.device))
+    with time_calls(KERNELS, device) if backend.name == "cpu" else nullcontext({}) as kernels:
+        start = now(device)
+        image, stats = _draw(backend, skips, inputs)
+        middle = now(device)
+        gradients = torch.autograd.grad(image, leaves, inputs.weights)
+        seconds = {"forward": middle - start, "backward": now(device) - middle}
+    return Outputs(image.detach(), gradients, seconds, kernels, stats)
 
 
 def truth(scene: Scene, convention: Convention, ignored: Tensor | None = None) -> Outputs:
     """Draw the scene in float64."""
     exact = tuple(part.to(torch.float64) for part in scene)
-    reference = Backend("truth", "cpu", partial(_draw, "reference", convention=convention))
+    reference = Backend("reference", "cpu", convention=convention)
     return run(reference, Skips(), prepare(exact, "cpu", ignored))
 
 
@@ -149,13 +136,10 @@ def errors(found: Outputs, exact: Outputs, ignored: Tensor) -> dict[str, float |
     Of the image, the largest difference and the 99th percentile; of each gradient, the relative L2.
     """
     wrong = (found.image.cpu().double() - exact.image).abs() * ~ignored[:, None]
-    pairs = zip(FIELDS, found.gradients, exact.gradients, strict=True)
+    gradients = map(relative_l2, found.gradients, exact.gradients)
     return {
         "flipped": ignored.double().mean().item(),
         "image_max": wrong.max().item(),
         "image_p99": float(np.percentile(wrong.numpy(), 99)),
-        "gradients": {
-            name: ((grad.cpu().double() - true).norm() / true.norm()).item()
-            for name, grad, true in pairs
-        },
+        "gradients": dict(zip(FIELDS, gradients, strict=True)),
     }

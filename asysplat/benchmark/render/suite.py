@@ -1,6 +1,7 @@
 """Every backend of the renderer, and every skip switched off: seconds, memory, error."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from matplotlib.figure import Figure
@@ -11,21 +12,20 @@ from rich.table import Table
 from torch import Tensor
 
 from asysplat.benchmark.plot import time_against_error
-from asysplat.benchmark.render.cases import Case, Scene, describe, find_cases
-from asysplat.benchmark.render.passes import RASTER, row_seconds, run_timed
+from asysplat.benchmark.render.floor import RASTER, compare_with_floor, row_seconds
 from asysplat.benchmark.render.run import (
     Backend,
-    Inputs,
+    Outputs,
     errors,
     find_backends,
     flips,
-    peak_gb,
     prepare,
     run,
     truth,
 )
+from asysplat.benchmark.scenes import SCENES, SMALLER, Scene, describe, find_scenes
 from asysplat.benchmark.table import error, limited, make_table, measured_on, number, spread, text
-from asysplat.benchmark.timing import Measurement, Result, time_in_rounds
+from asysplat.benchmark.timing import Measurement, Result, ratios, rise_gb, time_in_rounds
 from asysplat.rendering import Skips
 
 # What is asked of the cpu backend with all its skips.
@@ -42,17 +42,16 @@ def measure(options: DictConfig, console: Console) -> Result:
     Raises:
         InputError: an unknown scene.
     """
-    cases = find_cases(options.scenes)
     results: list[Result] = []
-    for name, case in track(cases.items(), "scenes", console=console):
-        results += _measure_scene(name, case, options.repeats)
+    for name in track(find_scenes(options.scenes), "scenes", console=console):
+        results += _measure_scene(name, options.repeats)
     return {"rows": results}
 
 
-def _measure_scene(name: str, case: Case, repeats: int) -> list[Result]:
+def _measure_scene(name: str, repeats: int) -> list[Result]:
     backends = find_backends()
-    scene = case.make()
-    small = case.twin() if case.twin else scene
+    scene = SCENES[name]()
+    small = SMALLER[name]() if name in SMALLER else scene
     ignored = _flips_of_any(backends, small)
     rows = []
     for backend in backends:
@@ -61,70 +60,45 @@ def _measure_scene(name: str, case: Case, repeats: int) -> list[Result]:
         small_inputs = prepare(small, backend.device, ignored)
         for off in (None, *backend.skips):
             skips = Skips().without(off) if off else Skips()
-            found = {"scene": name, "backend": backend.name, "without": off}
-            found |= {**describe(scene), "threads": torch.get_num_threads()}
             wrong = errors(run(backend, skips, small_inputs), exact, ignored)
-            found["error"] = {"measured_on": describe(small), **wrong}
-            found["peak_gb"] = peak_gb(backend, skips, inputs)
-            rows.append(Measurement(_timer(backend, skips, inputs, found), found))
+            run_whole = partial(run, backend, skips, inputs)
+            found = {
+                "scene": name,
+                "backend": backend.name,
+                "without": off,
+                **describe(scene),
+                "threads": torch.get_num_threads(),
+                "error": {"measured_on": describe(small), **wrong},
+                "peak_gb": rise_gb(run_whole, torch.device(backend.device)),
+            }
+            rows.append(Measurement(partial(_seconds, run_whole, found), found))
     (cpu,) = [backend for backend in backends if backend.name == "cpu"]
     hot_rows = Measurement(lambda: row_seconds(cpu))
     time_in_rounds([*rows, hot_rows], repeats)
     for row in rows:
         row.found |= {direction: row.summary(direction) for direction in RASTER}
-        row.found["faster_than_reference"] = {
-            direction: rows[0].found[direction]["median"] / row.found[direction]["median"]
-            for direction in RASTER
-        }
+        row.found["faster_than_reference"] = ratios(rows[0].found, row.found, RASTER)
         if row.found["backend"] == "cpu":
             kernels = [name for name in row.seconds if name not in RASTER]
             # The key is that of results which are published.
             row.found["stages"] = {name: row.summary(name) for name in kernels}
-            row.found["raster"] = _raster(row, hot_rows)
+            row.found["raster"] = compare_with_floor(row, hot_rows)
     return [row.found for row in rows]
-
-
-def _timer(
-    backend: Backend, skips: Skips, inputs: Inputs, found: Result
-) -> Callable[[], dict[str, float]]:
-    """Time both passes and the kernels in them; the counts go to `found`."""
-
-    def seconds() -> dict[str, float]:
-        outputs, kernels = run_timed(backend, skips, inputs)
-        found["stats"] = outputs.stats
-        return outputs.seconds | kernels
-
-    return seconds
 
 
 def _flips_of_any(backends: Sequence[Backend], scene: Scene) -> Tensor:
     """Find the pixels [V, H, W] where any backend flips: there more than rounding differs."""
-    found = [
-        flips(
-            run(backend, Skips(), prepare(scene, backend.device)), truth(scene, backend.convention)
-        )
-        for backend in backends
+    pairs = [
+        (run(b, Skips(), prepare(scene, b.device)), truth(scene, b.convention)) for b in backends
     ]
-    return torch.stack(found).any(0)
+    return torch.stack([flips(found, exact) for found, exact in pairs]).any(0)
 
 
-def _raster(row: Measurement, hot_rows: Measurement) -> Result:
-    """Compare the raster passes with their floor, and both passes whole with the raster passes.
-
-    The floor is the rows that were evaluated times the cost of a hot one, over the threads.
-    """
-    compared = {}
-    for direction, name in RASTER.items():
-        hot_row = hot_rows.summary(direction)["median"]
-        floor = row.found["stats"]["rows"] * hot_row / row.found["threads"]
-        raster = row.summary(name)["median"]
-        compared[direction] = {
-            "hot_row": hot_row,
-            "floor": floor,
-            "over_floor": raster / floor,
-            "whole_over_raster": row.found[direction]["median"] / raster,
-        }
-    return compared
+def _seconds(run_whole: Callable[[], Outputs], found: Result) -> dict[str, float]:
+    """Time both passes and the kernels in them; the counts go to `found`."""
+    outputs = run_whole()
+    found["stats"] = outputs.stats
+    return outputs.seconds | outputs.kernels
 
 
 def tables(results: Result) -> list[Table]:
@@ -146,9 +120,8 @@ def tables(results: Result) -> list[Table]:
         "flips\n1e-6": number("error.flipped", "{:.0f}", unit=1e-6),
         "gradients\nworst": error("error.gradients"),
     }
-    passes = {"scene": text("{scene}")}
-    for name in ours[0]["stages"] if ours else ():
-        passes[name.replace("_", "\n")] = spread(f"stages.{name}")
+    kernels = ours[0]["stages"] if ours else ()
+    passes = {name.replace("_", "\n"): spread(f"stages.{name}") for name in kernels}
     limits = {
         "scene": text("{scene}"),
         "pass": text("{pass}"),
@@ -160,7 +133,7 @@ def tables(results: Result) -> list[Table]:
         "reference\n/ cpu": number("faster", "{:.1f}"),
     }
     both = [
-        {**row, **row["raster"][name], "pass": name, "faster": row["faster_than_reference"][name]}
+        row | row["raster"][name] | {"pass": name, "faster": row["faster_than_reference"][name]}
         for row in ours
         for name in RASTER
     ]
@@ -170,7 +143,7 @@ def tables(results: Result) -> list[Table]:
     )
     return [
         make_table("Every backend, and without one of its skips", columns, rows, notes, names=2),
-        make_table("Passes of the cpu backend, ms", passes, ours),
+        make_table("Passes of the cpu backend, ms", {"scene": text("{scene}"), **passes}, ours),
         make_table("The cpu backend's limits", limits, both, asked, names=2),
     ]
 

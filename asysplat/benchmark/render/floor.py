@@ -1,12 +1,11 @@
-"""Where the cpu backend's time goes, and the least that its raster passes could take."""
+"""The least that the raster passes of the cpu backend could take."""
 
 from functools import cache
 
 import torch
 
-from asysplat.benchmark.render.run import Backend, Inputs, Outputs, prepare, run
-from asysplat.benchmark.timing import time_calls
-from asysplat.ops.cpu.threads import run_blocks
+from asysplat.benchmark.render.run import Backend, Inputs, prepare, run
+from asysplat.benchmark.timing import Measurement, Result
 from asysplat.rendering import Skips
 from asysplat.scene import Cameras, Gaussians
 
@@ -17,27 +16,14 @@ COUNT = 512  # two million rows: tens of milliseconds
 OPACITY = 0.01  # COUNT of it leave every pixel some transmittance
 
 
-def run_timed(backend: Backend, skips: Skips, inputs: Inputs) -> tuple[Outputs, dict[str, float]]:
-    """Run both passes; return also the seconds of each kernel, of the cpu backend."""
-    if backend.name != "cpu":
-        return run(backend, skips, inputs), {}
-    kernels = {run_blocks: lambda frame: frame.f_locals["kernel"].__name__}
-    with time_calls(kernels, torch.device("cpu")) as seconds:
-        return run(backend, skips, inputs), seconds
-
-
 def row_seconds(cpu: Backend) -> dict[str, float]:
     """Time a 16-pixel row of a tile in a scene that is nothing but rows, by direction.
 
     It is the time of a core while all threads are busy so.
     """
-    best: dict[str, float] = {}
-    for _ in range(REPEATS):
-        outputs, seconds = run_timed(cpu, Skips(), hot_scene())
-        for direction, kernel in RASTER.items():
-            row = seconds[kernel] * torch.get_num_threads() / outputs.stats["rows"]
-            best[direction] = min(row, best.get(direction, row))
-    return best
+    runs = [run(cpu, Skips(), hot_scene()) for _ in range(REPEATS)]
+    rows = runs[0].stats["rows"] / torch.get_num_threads()
+    return {name: min(r.kernels[kernel] for r in runs) / rows for name, kernel in RASTER.items()}
 
 
 @cache
@@ -56,3 +42,22 @@ def hot_scene() -> Inputs:
     intrinsics = torch.tensor([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1]])
     cameras = Cameras(intrinsics[None], torch.eye(4)[None], SIDE, SIDE)
     return prepare((gaussians, cameras), "cpu")
+
+
+def compare_with_floor(row: Measurement, hot_rows: Measurement) -> Result:
+    """Compare the raster passes with their floor, and both passes whole with the raster passes.
+
+    The floor is the rows that were evaluated times the cost of a hot one, over the threads.
+    """
+    compared = {}
+    for direction, kernel in RASTER.items():
+        hot_row = hot_rows.summary(direction)["median"]
+        floor = row.found["stats"]["rows"] * hot_row / row.found["threads"]
+        raster = row.summary(kernel)["median"]
+        compared[direction] = {
+            "hot_row": hot_row,
+            "floor": floor,
+            "over_floor": raster / floor,
+            "whole_over_raster": row.found[direction]["median"] / raster,
+        }
+    return compared
