@@ -3,8 +3,8 @@
 import os
 import platform
 import re
-from importlib.metadata import version
-from importlib.util import find_spec
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import llvmlite.binding
@@ -26,4 +26,7 @@ def describe_machine() -> dict[str, str | int]:
     }
     if torch.cuda.is_available():
         machine["gpu"] = torch.cuda.get_device_name()
-    return machine | {package: version(package) for package in PACKAGES if find_spec(package)}
+    for package in PACKAGES:
+        with suppress(PackageNotFoundError):
+            machine[package] = version(package)
+    return machine
