@@ -3,6 +3,8 @@
 import os
 import runpy
 import subprocess
+import sys
+from pathlib import Path
 
 import cv2
 import pytest
@@ -29,7 +31,7 @@ def test_photographs_are_checked_and_trained_on(repository, tmp_path, monkeypatc
     tiny += ["data.cache.folder=null", f"paths.logs={tmp_path}/logs", "'~callbacks.pictures'"]
     said = subprocess.run(
         ["bash", repository / "examples" / "train_on_photographs.sh", scene, *tiny],
-        env=os.environ,
+        env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
         cwd=tmp_path,
         capture_output=True,
         text=True,
