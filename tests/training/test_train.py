@@ -169,6 +169,7 @@ def test_killed_and_resumed_ends_with_the_same_bits(train, whole, tmp_path):
 @pytest.mark.slow
 def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repository, tmp_path):
     environment = {k: v for k, v in train.environment.items() if k != "ASYSPLAT_SHARED"}
+    environment["PYTHONFAULTHANDLER"] = "1"
     run = train.start("steps=1000", until="last.ckpt", cwd=tmp_path, env=environment)
     with run as process:
         for _ in range(4):  # Python drops an interrupt where it cannot raise it, as in a destructor
@@ -176,6 +177,9 @@ def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repositor
             with contextlib.suppress(subprocess.TimeoutExpired):
                 said, errors = process.communicate(timeout=20)
                 break
+        else:
+            process.send_signal(signal.SIGABRT)  # shows where every thread stands
+            pytest.fail(f"it does not stop:\n{process.communicate()[1]}")
     assert process.returncode != 0 and "Traceback" not in errors
     checkpoint = next(tmp_path.rglob("last.ckpt"))
     assert f"add ckpt_path={checkpoint} to the same command" in said
