@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import pytest
+from tiny import NETWORK, VIEWS
 
 from asysplat.data import open_scene
 
@@ -27,8 +28,8 @@ def test_photographs_are_checked_and_trained_on(repository, tmp_path, monkeypatc
     monkeypatch.setattr("sys.argv", ["write_scene", str(scene)])
     runpy.run_path(str(repository / "examples" / "write_scene.py"), run_name="__main__")
     assert open_scene(scene, 64, 64).num_frames == 48
-    tiny = ["width=0.125", "state_size=16", "steps=1", "validate_every=1", "data.inputs=2"]
-    tiny += ["data.cache.folder=null", f"paths.logs={tmp_path}/logs", "'~callbacks.pictures'"]
+    tiny = [*NETWORK, *VIEWS, "steps=1", "validate_every=1", "data.cache.folder=null"]
+    tiny += [f"paths.logs={tmp_path}/logs", "~callbacks.pictures"]
     said = subprocess.run(
         ["bash", repository / "examples" / "train_on_photographs.sh", scene, *tiny],
         env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
