@@ -2,7 +2,6 @@
 
 import importlib.util
 import math
-from contextlib import nullcontext
 from dataclasses import fields
 from typing import NamedTuple
 
@@ -11,15 +10,14 @@ import torch
 from torch import Tensor
 
 from asysplat.benchmark.scenes import Scene
-from asysplat.benchmark.timing import now, relative_l2, time_calls
-from asysplat.ops.cpu.threads import run_blocks
+from asysplat.benchmark.timing import now, relative_l2
+from asysplat.ops.cpu.threads import time_kernels
 from asysplat.rendering import GSPLAT_1_5, INRIA, Convention, Skips, render
 from asysplat.scene import Cameras, Gaussians
 
 SKIPS = tuple(field.name for field in fields(Skips))
 SKIPS_OF_CUDA = tuple(name for name in SKIPS if name != "rows")
 FIELDS = tuple(field.name for field in fields(Gaussians))
-KERNELS = {run_blocks: lambda frame: frame.f_locals["kernel"].__name__}
 FLIP = 1e-4  # a difference that rounding alone does not make; a flip makes up to 1/255
 
 
@@ -109,7 +107,7 @@ def run(backend: Backend, skips: Skips, inputs: Inputs) -> Outputs:
     """Draw, and take the gradients."""
     leaves = [getattr(inputs.gaussians, name) for name in FIELDS]
     device = torch.device(backend.device)
-    with time_calls(KERNELS, device) if backend.name == "cpu" else nullcontext({}) as kernels:
+    with time_kernels() as kernels:
         start = now(device)
         image, stats = _draw(backend, skips, inputs)
         middle = now(device)

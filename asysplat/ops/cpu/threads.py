@@ -1,8 +1,11 @@
 """Blocks of work on as many threads as torch has; the kernels let go of Python's lock."""
 
 import os
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from typing import TypeVar
 
@@ -11,6 +14,7 @@ import torch
 
 Result = TypeVar("Result")
 PER_THREAD = 4  # portions of the work: other threads take more of them while one is slow
+_timed: ContextVar[dict[str, float] | None] = ContextVar("_timed", default=None)
 
 
 def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:
@@ -19,6 +23,16 @@ def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object)
     The results are returned in the order of `bounds`.
     What a kernel writes must depend on its range alone: then the number of threads changes no bit.
     """
+    seconds = _timed.get()
+    if seconds is None:
+        return _run(kernel, bounds, *args)
+    start = time.perf_counter()
+    results = _run(kernel, bounds, *args)
+    seconds[kernel.__name__] = seconds.get(kernel.__name__, 0.0) + time.perf_counter() - start
+    return results
+
+
+def _run(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:
     threads = torch.get_num_threads()
     ranges = [
         (a, b) for a, b in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True) if a < b
@@ -27,6 +41,17 @@ def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object)
         return [kernel(start, stop, *args) for start, stop in ranges]
     jobs = [_pool(threads).submit(kernel, start, stop, *args) for start, stop in ranges]
     return [job.result() for job in jobs]
+
+
+@contextmanager
+def time_kernels() -> Iterator[dict[str, float]]:
+    """Add up the seconds of the kernels that `run_blocks` runs meanwhile, by their names."""
+    seconds: dict[str, float] = {}
+    before = _timed.set(seconds)
+    try:
+        yield seconds
+    finally:
+        _timed.reset(before)
 
 
 def even_bounds(count: int) -> np.ndarray:
