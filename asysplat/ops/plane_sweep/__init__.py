@@ -1,0 +1,138 @@
+"""Depth from posed photographs alone: a plane sweep over each view's neighbours (Collins 1996).
+
+What is swept and how far follows from the cameras (`cameras.py`). Each pixel is compared with its
+neighbours' at every plane (`match`), the costs are smoothed along the image's rows and columns as
+in semi-global matching (`smooth`, Hirschmueller 2008), and what the views say of each other's
+depths gives the confidence (`agreement.py`). `match` and `smooth` are kernels in cpu/ and cuda/.
+"""
+
+from dataclasses import dataclass
+from types import ModuleType
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.errors import InputError
+from asysplat.ops.dispatch import FAST, check_fast_backend, pick_backend
+from asysplat.ops.plane_sweep import reference
+from asysplat.ops.plane_sweep.agreement import Depths, compare, fill
+from asysplat.ops.plane_sweep.cameras import (
+    choose_neighbours,
+    inverse_depth_range,
+    relative_projections,
+)
+from asysplat.scene import Cameras, TensorRecord
+
+PLANES = 64
+NEIGHBOURS = 4
+LUMA = (0.299, 0.587, 0.114)
+
+
+@dataclass(frozen=True)
+class SweptDepth(TensorRecord):
+    """What a plane sweep finds.
+
+    Args:
+        inverse_depth: 1 / depth along the camera's z axis, > 0; 0 where nothing is known.
+        confidence: in [0, 1]; 0 where no neighbour sees the same.
+    """
+
+    inverse_depth: Float[Tensor, "*batch V h w"]
+    confidence: Float[Tensor, "*batch V h w"]
+
+
+@torch.no_grad()
+def plane_sweep(
+    images: Float[Tensor, "B V 3 H W"],
+    cameras: Cameras,
+    stride: int = 1,
+    planes: int = PLANES,
+    neighbours: int = NEIGHBOURS,
+    backend: str = "auto",
+) -> SweptDepth:
+    """Find the depth of every `stride` x `stride` block of pixels; h = H / stride, w = W / stride.
+
+    Args:
+        images: RGB in [0, 1].
+        cameras: of the images, [B, V].
+        stride: divides H and W; costs are compared at every pixel and averaged over blocks.
+        planes: number of inverse depths, at least 4.
+        neighbours: number of views that each is compared with, at most.
+        backend: "reference" (torch, any device and float type), "cpu" or "cuda", or "auto", which
+            is the fast one for the device, and "reference" for float64.
+
+    Raises:
+        InputError: sizes that do not go together, or an unknown backend.
+    """
+    _check(images, cameras, stride, planes, neighbours)
+    form = _load(_auto(images) if backend == "auto" else backend, images)
+    shape = (*images.shape[:2], cameras.height // stride, cameras.width // stride)
+    if images.device.type == "meta":
+        return SweptDepth(images.new_empty(shape), images.new_empty(shape))
+    images = images if images.dtype == torch.float64 else images.float()
+    cameras = cameras.to(images.dtype)
+    chosen = choose_neighbours(cameras, neighbours)
+    ranges = inverse_depth_range(cameras, chosen)
+    projections = relative_projections(cameras, chosen)
+    grey = (images * images.new_tensor(LUMA)[:, None, None]).sum(2)
+    costs = form.match(grey, chosen, projections, ranges, planes, stride)
+    small = cameras.resized(*shape[2:])
+    edges = _edges(images, stride)
+    confidence = torch.ones(shape, dtype=images.dtype, device=images.device)
+    for _ in range(2):  # once with all costs, once with those of what the neighbours agree on
+        plane = form.smooth(costs, confidence, edges)
+        found = Depths.at_planes(plane, ranges, planes)
+        confidence = compare(found, small, chosen)
+    return SweptDepth(fill(found.inverse, confidence), confidence)
+
+
+def _edges(images: Tensor, stride: int) -> Tensor:
+    """Return the mean absolute colour difference to the block on the left and above, [B,V,2,h,w]."""
+    blocks = torch.nn.functional.avg_pool2d(images.flatten(0, 1), stride).unflatten(
+        0, images.shape[:2]
+    )
+    left = torch.zeros_like(blocks[:, :, 0])
+    above = torch.zeros_like(left)
+    left[..., 1:] = blocks.diff(dim=-1).abs().mean(2)
+    above[..., 1:, :] = blocks.diff(dim=-2).abs().mean(2)
+    return torch.stack((left, above), dim=2)
+
+
+def _auto(images: Tensor) -> str:
+    if images.dtype == torch.float64 or images.device.type not in FAST:
+        return "reference"
+    return images.device.type
+
+
+def _load(backend: str, images: Tensor) -> ModuleType:
+    pick_backend("plane_sweep", dict.fromkeys(("auto", "reference", *FAST)), backend)
+    if backend == "reference":
+        return reference
+    check_fast_backend("plane_sweep", backend, images)
+    if backend == "cpu":
+        from asysplat.ops.plane_sweep import cpu
+
+        return cpu
+    from asysplat.ops.plane_sweep import cuda
+
+    return cuda
+
+
+def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbours: int) -> None:
+    expected = (*cameras.intrinsics.shape[:-2], 3, cameras.height, cameras.width)
+    if images.ndim != 5 or tuple(images.shape) != expected:
+        raise InputError(
+            f"plane_sweep's images have shape {tuple(images.shape)}: expected {expected}, as the "
+            "cameras say."
+        )
+    if stride < 1 or cameras.height % stride or cameras.width % stride:
+        raise InputError(
+            f"plane_sweep got stride={stride} for images of {cameras.height}x{cameras.width}: give "
+            "a number that divides both."
+        )
+    if planes < 4 or neighbours < 1:
+        raise InputError(
+            f"plane_sweep got planes={planes} and neighbours={neighbours}: give at least 4 planes "
+            "and one neighbour."
+        )

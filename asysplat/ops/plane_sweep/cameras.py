@@ -1,0 +1,98 @@
+"""What to sweep: which views see the same as a view, and at which depths. Cameras decide alone."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from asysplat.scene import Cameras
+
+SAMPLES = 6  # points along each side of a view that stand for all its pixels
+USEFUL_PARALLAX = 0.1  # in image widths: more adds nothing,
+WIDE_PARALLAX = 0.5  # and from here on two views look too different
+LEAST_SHARE = 0.2  # of a view that a neighbour sees at the nearest plane
+FRONT = 1e-6  # least depth in front of a camera, over the depth in the other
+
+
+def choose_neighbours(cameras: Cameras, count: int) -> Int[Tensor, "B V K"]:
+    """Return the views that see most of what a view sees, from elsewhere; -1 for none.
+
+    Two views are scored by the share of pixels that both see at inverse depths from 0 to many
+    times the inverse of their distance, where the parallax is useful but not too wide. K is at
+    most `count` and V - 1, at least 1.
+    """
+    V = cameras.num_views
+    apart = torch.cdist(cameras.centers, cameras.centers)
+    largest = apart.amax((-1, -2)).clamp_min(1e-12)
+    steps = torch.logspace(-1.5, 1.5, 11, base=10.0).to(apart)
+    inverse = torch.cat((steps.new_zeros(1), steps)) * 2 / largest[:, None]
+    everyone = torch.arange(V, device=apart.device).expand(len(apart), V, V)
+    seen = _sees(cameras, everyone, inverse[:, None].expand(-1, V, -1)).to(apart).mean((-1, -2))
+    focal = cameras.intrinsics[..., 0, 0] / cameras.width
+    parallax = focal[:, :, None, None] * apart[..., None] * inverse[:, None, None]
+    useful = (parallax / USEFUL_PARALLAX).clamp_max(1) / (1 + (parallax / WIDE_PARALLAX) ** 2)
+    score = (seen * useful).sum(-1)
+    # Nearer than this, two centres differ by rounding.
+    score = score.masked_fill(apart < 1e-5 * cameras.centers.abs().amax((-1, -2))[:, None, None], 0)
+    score.diagonal(dim1=-2, dim2=-1).fill_(0)
+    # Stable, so that equal scores give the same views on every machine.
+    order = score.argsort(dim=-1, descending=True, stable=True)[..., : min(count, max(V - 1, 1))]
+    return order.masked_fill(score.gather(-1, order) <= 0, -1)
+
+
+def inverse_depth_range(
+    cameras: Cameras, neighbours: Int[Tensor, "B V K"]
+) -> Float[Tensor, "B V 2"]:
+    """Return the least and the greatest inverse depth at which neighbours see enough of a view.
+
+    Both are 0 for a view without neighbours; the least is 0 where infinity is seen.
+    """
+    centers = cameras.centers
+    scene = torch.arange(len(centers), device=centers.device)[:, None, None]
+    distance = (centers[scene, neighbours.clamp_min(0)] - centers[:, :, None]).norm(dim=-1)
+    distance = distance.masked_fill(neighbours < 0, 0).amax(-1)
+    steps = torch.logspace(-2, 2, 97, base=10.0).to(centers)
+    inverse = steps / distance.clamp_min(1e-12)[..., None]
+    share = _sees(cameras, neighbours, inverse).any(2).to(centers).mean((-1, -2))
+    enough = share >= LEAST_SHARE
+    first = enough.int().argmax(-1, keepdim=True)
+    last = enough.shape[-1] - 1 - enough.flip(-1).int().argmax(-1, keepdim=True)
+    least = inverse.gather(-1, first).masked_fill(first == 0, 0)
+    greatest = torch.where(
+        enough.any(-1, keepdim=True), inverse.gather(-1, last), inverse[..., -1:]
+    )
+    ranges = torch.cat((least, greatest), dim=-1)
+    return ranges.masked_fill((distance == 0)[..., None], 0)
+
+
+def relative_projections(
+    cameras: Cameras, neighbours: Int[Tensor, "B V K"]
+) -> Float[Tensor, "B V K 3 4"]:
+    """Return M with which (x, y, 1, inverse depth) of a view is a neighbour's homogeneous pixel.
+
+    x and y are counted from the image's corner; the third coordinate is the neighbour's depth over
+    the view's own. A neighbour of -1 stands for the first view.
+    """
+    double = cameras.to(torch.float64)
+    scene = torch.arange(len(neighbours), device=neighbours.device)[:, None, None]
+    others = neighbours.clamp_min(0)
+    world_to_cam = torch.linalg.inv(double.cam_to_world)
+    relative = world_to_cam[scene, others] @ double.cam_to_world[:, :, None]
+    intrinsics = double.intrinsics[scene, others]
+    rays = relative[..., :3, :3] @ torch.linalg.inv(double.intrinsics)[:, :, None]
+    matrix = torch.cat((intrinsics @ rays, intrinsics @ relative[..., :3, 3:]), dim=-1)
+    return matrix.to(cameras.intrinsics.dtype)
+
+
+def _sees(
+    cameras: Cameras, others: Int[Tensor, "B V K"], inverse: Float[Tensor, "B V n"]
+) -> Bool[Tensor, "B V K n s s"]:
+    """Return which points of a view, at each of n inverse depths, are within each other view."""
+    small = cameras.resized(SAMPLES, SAMPLES)
+    pixels = torch.arange(SAMPLES, device=inverse.device) + 0.5
+    y, x = torch.meshgrid(pixels, pixels, indexing="ij")
+    points = torch.stack((x, y, torch.ones_like(x))).to(inverse)
+    matrix = relative_projections(small, others)
+    flat = torch.einsum("bvkij,jyx->bvkiyx", matrix[..., :3], points)[:, :, :, None]
+    moved = matrix[..., None, :, 3, None, None] * inverse[:, :, None, :, None, None, None]
+    u, v, z = (flat + moved).unbind(-3)
+    return (z > FRONT) & (u > 0) & (u < SAMPLES * z) & (v > 0) & (v < SAMPLES * z)
