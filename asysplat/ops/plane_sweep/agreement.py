@@ -39,7 +39,7 @@ def compare(
     Each neighbour that sees the point agrees, has something in front of it, which says nothing, or
     sees through it, which speaks against it.
     """
-    B, V, h, w = found.inverse.shape
+    B, _, h, w = found.inverse.shape
     scene = torch.arange(B, device=neighbours.device)[:, None, None]
     view = neighbours.clamp_min(0)
     matrix = relative_projections(cameras, neighbours)
