@@ -92,12 +92,13 @@ def _sweep(
     grey = (images * images.new_tensor(LUMA)[:, None, None]).sum(2)
     costs = form.match(grey, chosen, projections, ranges, planes, stride)
     edges = _edges(images, stride)
-    confidence = images.new_ones(*images.shape[:2], small.height, small.width)
+    agreement = images.new_ones(*images.shape[:2], small.height, small.width)
     for _ in range(2):  # once with all costs, once with those of what the neighbours agree on
-        plane = form.smooth(costs, confidence, edges)
+        plane = form.smooth(costs, agreement, edges)
         found = Depths.at_planes(plane, ranges, planes)
-        confidence = compare(found, small, chosen)
-    return fill(found.inverse, confidence), confidence
+        agreement = compare(found, small, chosen)
+    precision = found.precision()
+    return fill(found.inverse, agreement * precision), agreement * (1 + precision) / 2
 
 
 @_sweep.register_fake
