@@ -50,6 +50,7 @@ class Vector(types.Type):
 
 
 VECTOR = Vector()
+MASK = types.uint16  # a bit for each of a vector's numbers
 
 
 @register_model(Vector)
@@ -228,20 +229,132 @@ def _arithmetic(symbol: Callable, instruction: str) -> None:
 _arithmetic(operator.add, "fadd")
 _arithmetic(operator.sub, "fsub")
 _arithmetic(operator.mul, "fmul")
+_arithmetic(operator.truediv, "fdiv")
+
+
+def _extremum(symbol: Callable, comparison: str) -> None:
+    """Overload `symbol`, max or min, for vectors: the second number where the first is NaN."""
+
+    @intrinsic
+    def choose(typing_context, a, b):
+        def generate(context, builder, signature, args):
+            return builder.select(builder.fcmp_ordered(comparison, *args), *args)
+
+        return VECTOR(VECTOR, VECTOR), generate
+
+    @overload(symbol)
+    def _(a, b):
+        if VECTOR in (a, b):
+            return lambda a, b: choose(a, b)
+
+
+_extremum(max, ">")
+_extremum(min, "<")
+
+
+def _rounded(name: str) -> Callable:
+    """Make the intrinsic that applies one of LLVM's functions to every number of a vector."""
+
+    @intrinsic
+    def compute(typing_context, value):
+        def generate(context, builder, signature, args):
+            function = ir.FunctionType(FLOATS, [FLOATS])
+            full = f"llvm.{name}.v{LANES}f32"
+            return builder.call(
+                cgutils.get_or_insert_function(builder.module, function, full), args
+            )
+
+        return VECTOR(VECTOR), generate
+
+    return compute
+
+
+sqrt, floor = _rounded("sqrt"), _rounded("floor")
 
 
 @intrinsic
-def _larger(typing_context, a, b):
+def positive(typing_context, value):
+    """Return a bit for each number of a vector, the lowest for the first: 1 if it is > 0."""
+
     def generate(context, builder, signature, args):
-        return builder.select(builder.fcmp_ordered(">", *args), *args)
+        nothing = ir.Constant(FLOATS, [0.0] * LANES)
+        return builder.bitcast(builder.fcmp_ordered(">", args[0], nothing), ir.IntType(LANES))
 
-    return VECTOR(VECTOR, VECTOR), generate
+    return MASK(VECTOR), generate
 
 
-@overload(max)
-def _max(a, b):
-    if VECTOR in (a, b):
-        return lambda a, b: _larger(a, b)
+@intrinsic
+def where(typing_context, mask, yes, no):
+    """Return the numbers of `yes` whose bit of `mask` is 1, and those of `no` elsewhere."""
+
+    def generate(context, builder, signature, args):
+        bits = builder.bitcast(args[0], ir.VectorType(ir.IntType(1), LANES))
+        return builder.select(bits, *args[1:])
+
+    return VECTOR(MASK, VECTOR, VECTOR), generate
+
+
+@intrinsic
+def least(typing_context, value):
+    """Return the least of a vector's numbers."""
+
+    def generate(context, builder, signature, args):
+        kind = ir.FunctionType(ir.FloatType(), [FLOATS])
+        name = f"llvm.vector.reduce.fmin.v{LANES}f32"
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
+
+    return types.float32(VECTOR), generate
+
+
+@intrinsic
+def gather_pairs(typing_context, image, row, column):
+    """Return LANES numbers of a contiguous array [H, W], and those to the right of each.
+
+    Their rows and columns are vectors of whole numbers. A pair is read as one number of 64 bits.
+    """
+
+    def generate(context, builder, signature, args):
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        width = builder.trunc(builder.extract_value(array.shape, 1), ir.IntType(32))
+        row, column = (builder.fptosi(value, INTEGERS) for value in args[1:])
+        index = builder.add(builder.mul(row, splat(builder, width)), column)
+        if numba.config.BOUNDSCHECK:
+            for lane in range(LANES):
+                first = builder.extract_element(index, ir.IntType(32)(lane))
+                first = builder.sext(first, array.nitems.type)
+                check_range(context, builder, first, first.type(2), array.nitems)
+        half = LANES // 2
+        pairs = ir.VectorType(ir.IntType(64), half)
+        begin = builder.ptrtoint(array.data, ir.IntType(64))
+        begin = builder.insert_element(ir.Constant(pairs, ir.Undefined), begin, ir.IntType(32)(0))
+        begin = builder.shuffle_vector(
+            begin, begin, ir.Constant(ir.VectorType(ir.IntType(32), half), [0] * half)
+        )
+        pointers = ir.VectorType(ir.IntType(64).as_pointer(), half)
+        masks = ir.VectorType(ir.IntType(1), half)
+        kind = ir.FunctionType(pairs, [pointers, ir.IntType(32), masks, pairs])
+        name = f"llvm.masked.gather.v{half}i64.v{half}p0"
+        gather = cgutils.get_or_insert_function(builder.module, kind, name)
+        found = []
+        for first in (0, half):
+            order = ir.Constant(
+                ir.VectorType(ir.IntType(32), half), list(range(first, first + half))
+            )
+            part = builder.sext(builder.shuffle_vector(index, index, order), pairs)
+            byte = builder.add(begin, builder.shl(part, ir.Constant(pairs, [2] * half)))
+            every = ir.Constant(masks, [1] * half)
+            nothing = ir.Constant(pairs, [0] * half)
+            loaded = builder.call(
+                gather, [builder.inttoptr(byte, pointers), ir.IntType(32)(4), every, nothing]
+            )
+            found.append(builder.bitcast(loaded, FLOATS))
+        sides = [
+            builder.shuffle_vector(*found, ir.Constant(INTEGERS, list(range(k, 2 * LANES, 2))))
+            for k in (0, 1)
+        ]
+        return context.make_tuple(builder, signature.return_type, sides)
+
+    return types.UniTuple(VECTOR, 2)(image, row, column), generate
 
 
 @intrinsic

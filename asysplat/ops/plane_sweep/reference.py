@@ -14,6 +14,8 @@ NOISE = 3e-4  # variance of a patch that says nothing
 SMALL_STEP = 0.1  # the penalty for one plane more or less than the pixel before
 LARGE_STEP = 0.6  # for more than that,
 EDGE = 0.05  # half of it where the colour changes by this
+LEAST_WEIGHT = 0.05  # of a pixel's own costs
+FLATTEST = 1e-9  # bend of a parabola that has a minimum
 
 
 def match(
@@ -77,15 +79,15 @@ def _compare(
     warped = F.grid_sample(
         other.expand(len(places), 1, H, W), places, padding_mode="border", align_corners=False
     )[:, 0]
-    mean, other_mean = _patch_mean(image), _patch_mean(warped)
-    both = _patch_mean(image * warped) - mean * other_mean
-    variance = _patch_mean(image**2) - mean**2
-    other_variance = _patch_mean(warped**2) - other_mean**2
+    mean, other_mean = patch_mean(image), patch_mean(warped)
+    both = patch_mean(image * warped) - mean * other_mean
+    variance = patch_mean(image**2) - mean**2
+    other_variance = patch_mean(warped**2) - other_mean**2
     norm = (variance.clamp_min(0) + NOISE) * (other_variance.clamp_min(0) + NOISE)
     return torch.where(seen, 1 - both / norm.sqrt(), UNSEEN)
 
 
-def _patch_mean(values: Float[Tensor, "*more H W"]) -> Float[Tensor, "*more H W"]:
+def patch_mean(values: Float[Tensor, "*more H W"]) -> Float[Tensor, "*more H W"]:
     """Return the mean over WINDOW x WINDOW pixels; beyond the border, its pixels go on."""
     flat = values.reshape(-1, 1, *values.shape[-2:])
     padded = F.pad(flat, (WINDOW // 2,) * 4, mode="replicate")
@@ -102,7 +104,7 @@ def smooth(
     The costs are added up along rows and columns, both ways; a step between neighbouring pixels
     costs less where the colour changes (`edges`, to the left and above).
     """
-    costs = costs * weights[..., None].clamp_min(0.05)
+    costs = costs * weights[..., None].clamp_min(LEAST_WEIGHT)
     penalty = LARGE_STEP / (1 + edges / EDGE)
     left, above = penalty[:, :, 0], penalty[:, :, 1]
     total = (
@@ -117,8 +119,8 @@ def smooth(
     before = total.gather(-1, (best - 1).clamp_min(0))
     after = total.gather(-1, (best + 1).clamp_max(planes - 1))
     bend = before + after - 2 * middle
-    inside = (best > 0) & (best < planes - 1) & (bend > 1e-9)
-    shift = torch.where(inside, (before - after) / (2 * bend.clamp_min(1e-9)), 0)
+    inside = (best > 0) & (best < planes - 1) & (bend > FLATTEST)
+    shift = torch.where(inside, (before - after) / (2 * bend.clamp_min(FLATTEST)), 0)
     return (best + shift.clamp(-0.5, 0.5))[..., 0]
 
 

@@ -1,0 +1,6 @@
+"""The plane sweep for CPUs (Numba): sixteen planes of a pixel at a time."""
+
+from asysplat.ops.plane_sweep.cpu.match import match
+from asysplat.ops.plane_sweep.cpu.smooth import smooth
+
+__all__ = ["match", "smooth"]
