@@ -1,11 +1,18 @@
-"""Find the checkpoint to resume or to start from, and check that it fits the model."""
+"""Find the checkpoint to resume or to start from, and check that it fits the model.
+
+A checkpoint is what a run writes (.ckpt), or weights alone (.safetensors), as those that ship.
+"""
 
 from pathlib import Path
 
 import torch
-from torch import nn
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
 
 from asysplat.errors import InputError
+
+SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_sweep.safetensors"
 
 
 def find_checkpoint(asked: str | None, runs: Path) -> Path | None:
@@ -42,32 +49,77 @@ def check_checkpoint(path: Path | None, module: nn.Module) -> None:
     """
     if path is None:
         return
-    try:
-        state = torch.load(path, map_location="meta", weights_only=True)["state_dict"]
-    except Exception as error:
-        raise InputError(
-            f"{path} cannot be read as a checkpoint: name a .ckpt file that a run has written."
-        ) from error
-    expected = module.state_dict()
+    _check_state(_read_shapes(path), path, module)
+
+
+def _check_state(state: dict[str, tuple[int, ...]], path: Path, module: nn.Module) -> None:
+    """Check names and shapes, those of a file at `path`, against the module's.
+
+    Raises:
+        InputError: they differ.
+    """
+    expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
     for name in sorted(expected.keys() | state.keys()):
         there, here = state.get(name), expected.get(name)
-        if there is None or here is None or there.shape != here.shape:
-            sizes = [None if t is None else tuple(t.shape) for t in (there, here)]
+        if there != here:
             raise InputError(
-                f"{path} does not fit this model: {name} is {sizes[0]} there and {sizes[1]} here; "
-                "give the options that the run was started with (see its config.yaml)."
+                f"{path} does not fit this model: {name} is {there} there and {here} here; "
+                "give the options that it was trained with (a run's config.yaml, or the card "
+                "beside a .safetensors file)."
             )
 
 
 def load_weights(path: str | None, module: nn.Module) -> None:
-    """Load the weights of the checkpoint `path`, if given, but neither optimizer nor schedule.
+    """Load weights, if a path is given, but neither optimizer nor schedule.
+
+    Args:
+        path: None, a .ckpt or .safetensors file, or "shipped" for the model in checkpoints/.
+        module: takes them.
 
     Raises:
         InputError: there is no such file, or it does not fit.
     """
     if path is None:
         return
-    if not Path(path).is_file():
-        raise InputError(f"init_path={path} does not exist: name a .ckpt file.")
-    check_checkpoint(Path(path), module)
-    module.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["state_dict"])
+    file = weights_file(path)
+    if not file.is_file():
+        raise InputError(
+            f"init_path={path} does not exist: name a .ckpt or .safetensors file, or shipped."
+        )
+    check_checkpoint(file, module)
+    module.load_state_dict(_read_weights(file))
+
+
+def weights_file(path: str) -> Path:
+    """Return the file that `init_path` names."""
+    return SHIPPED if path == "shipped" else Path(path)
+
+
+def save_weights(module: nn.Module, path: Path) -> None:
+    """Write the weights alone, in half precision: what a published model is read from."""
+    halves = {
+        name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
+        for name, tensor in module.state_dict().items()
+    }
+    save_file(halves, path)
+
+
+def _read_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Read the shapes of the weights in a file, by name, and as little else as possible."""
+    try:
+        if path.suffix == ".safetensors":
+            with safe_open(path, "pt") as file:
+                return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+        state = torch.load(path, map_location="meta", weights_only=True)["state_dict"]
+        return {name: tuple(tensor.shape) for name, tensor in state.items()}
+    except Exception as error:
+        raise InputError(
+            f"{path} cannot be read as a checkpoint: name a .ckpt file that a run has written, or "
+            "a .safetensors file."
+        ) from error
+
+
+def _read_weights(path: Path) -> dict[str, Tensor]:
+    if path.suffix == ".safetensors":
+        return load_file(path)
+    return torch.load(path, map_location="cpu", weights_only=True)["state_dict"]

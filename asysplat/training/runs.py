@@ -15,6 +15,7 @@ import torch
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
 from asysplat.data.build import tested_sets
+from asysplat.training.checkpoints import weights_file
 from asysplat.training.revision import revision
 
 RESULTS = "metrics.json"
@@ -92,7 +93,7 @@ def data_of(config: DictConfig) -> dict[str, str]:
         "run/data/root": _name(data.get("root")),
         "run/data/test_root": _name(data.get("test_root")),
         "run/data/index": _content(data.get("index")),
-        "run/init_path": _content(config.init_path),
+        "run/init_path": _content(config.init_path and weights_file(config.init_path)),
     }
     tested = tested_sets(data["test_sets"], data["name"], on_disk="root" in data)
     for name, options in tested.items():
@@ -107,7 +108,7 @@ def _name(path: str | None) -> str | None:
     return None if path in (None, MISSING) else Path(os.path.abspath(path)).name
 
 
-def _content(path: str | None) -> str | None:
+def _content(path: str | Path | None) -> str | None:
     """Hash a file's content; return the path's name if it cannot be read as a file."""
     if path in (None, MISSING):
         return None

@@ -7,7 +7,11 @@ from torch.utils.data import DataLoader
 
 from asysplat.errors import InputError
 from asysplat.training.callbacks import Checkpoints
-from asysplat.training.checkpoints import check_checkpoint
+from asysplat.training.checkpoints import (
+    check_checkpoint,
+    load_weights,
+    save_weights,
+)
 
 
 class Module(lightning.LightningModule):
@@ -74,3 +78,19 @@ def test_a_file_that_is_none_is_one_sentence(tmp_path):
     path.write_text("a text")
     with pytest.raises(InputError, match=r"notes\.ckpt cannot be read as a checkpoint: [^\n]*$"):
         check_checkpoint(path, torch.nn.Linear(1, 1))
+
+
+def test_weights_alone_are_read_as_they_were_written(tmp_path):
+    net = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))
+    save_weights(net, tmp_path / "net.safetensors")
+    again = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))
+    load_weights(str(tmp_path / "net.safetensors"), again)
+    for name, tensor in again.state_dict().items():
+        torch.testing.assert_close(tensor, net.state_dict()[name], rtol=1e-3, atol=1e-6)
+        assert tensor.dtype == net.state_dict()[name].dtype
+
+
+def test_weights_of_another_model_are_refused(tmp_path):
+    save_weights(torch.nn.Linear(3, 2), tmp_path / "net.safetensors")
+    with pytest.raises(InputError, match=r"bias is \(2,\) there and \(3,\) here"):
+        load_weights(str(tmp_path / "net.safetensors"), torch.nn.Linear(3, 3))

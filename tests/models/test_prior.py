@@ -1,0 +1,148 @@
+"""Priors: what they give to tokens and heads, what is unknown, and every head and model with one."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from test_head import make_views
+
+from asysplat.evaluation.static_cost import static_costs
+from asysplat.models import DepthPrior, LongLRMHead, PhotographHead, SweepPrior
+from asysplat.models.prior import UNKNOWN, Prior
+from asysplat.scene import Cameras, Views
+
+MODELS = ["asysplat_4m4s", "longlrm", "single_branch", "asysplat_pred_fine"]
+PRIORS = {"sweep": SweepPrior, "depth": DepthPrior}
+
+
+def wall(views=4, size=32, depth=2.0, step=0.15):
+    """Cameras side by side in front of a textured wall, and its depths."""
+    poses = torch.eye(4).repeat(1, views, 1, 1)
+    poses[0, :, 0, 3] = step * torch.arange(views)
+    intrinsics = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
+    cameras = Cameras(intrinsics.repeat(1, views, 1, 1), poses, size, size)
+    directions = cameras.pixel_directions()
+    places = poses[..., None, None, :3, 3] + depth * directions
+    waves = torch.tensor([[7.0, 3.0], [-2.0, 9.0], [5.0, -6.0]])
+    images = 0.5 + 0.4 * torch.sin(places[..., :2] @ waves.T).permute(0, 1, 4, 2, 3)
+    depths = torch.full(images.shape[:2] + images.shape[-2:], depth)
+    return Views(cameras, images, depths)
+
+
+def make_net(*overrides):
+    with initialize_config_dir(str(CONF), version_base=None):
+        return instantiate(compose("train", [*overrides, "width=0.125", "state_size=8"]).model)
+
+
+@pytest.fixture(autouse=True)
+def conf(repository):
+    global CONF
+    CONF = repository / "conf"
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_a_wall_is_where_it_is(name):
+    views = wall()
+    prior = PRIORS[name]()(views, (16, 16))
+    length = views.cameras.resized(16, 16).pixel_directions().norm(dim=-1)
+    inner = (slice(None), slice(None), slice(2, -2), slice(4, -4))
+    torch.testing.assert_close(prior.distance[inner], 2 * length[inner], rtol=0.05, atol=0)
+    assert prior.confidence[inner].mean() > 0.8
+
+
+@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize("case", ["one view", "one place", "black", "apart"])
+def test_what_cannot_be_known_is_unknown(name, case):
+    views = replace(wall(), depths=None)
+    if case == "one view":
+        views = Views(views.cameras.select([0]), views.images[:, :1])
+    elif case == "one place":
+        poses = views.cameras.cam_to_world[:, :1].expand(1, 4, 4, 4)
+        views = replace(views, cameras=replace(views.cameras, cam_to_world=poses))
+    elif case == "black":
+        views = replace(views, images=torch.zeros_like(views.images))
+    else:
+        poses = views.cameras.cam_to_world.clone()
+        turned = torch.tensor([-1.0, 1.0, -1.0])
+        poses[0, 1::2, :3, :3] *= turned
+        poses[0, :, 2, 3] -= torch.tensor([0.0, 5.0, 0.0, 5.0])
+        views = replace(views, cameras=replace(views.cameras, cam_to_world=poses))
+        views = replace(views, images=torch.rand_like(views.images))
+        views = Views(views.cameras.select([0, 1]), views.images[:, :2])
+    prior = PRIORS[name]()(views, (16, 16))
+    assert prior.distance.isfinite().all() and (prior.distance > 0).all()
+    assert prior.confidence.max() == 0
+
+
+def test_unknown_is_the_untrained_distance():
+    views = make_views()
+    head = PhotographHead(8, 16, 8)
+    torch.nn.init.zeros_(head.decode.weight)
+    shape = (1, 2, 8, 8)
+    unknown = Prior(torch.full(shape, UNKNOWN), torch.zeros(shape))
+    tokens = torch.zeros(1, 2, 1, 1, 8)
+    with_prior, without = head(tokens, views, unknown), head(tokens, views)
+    torch.testing.assert_close(with_prior.means, without.means)
+    torch.testing.assert_close(with_prior.opacities, without.opacities)
+
+
+@pytest.mark.parametrize("head", [PhotographHead, LongLRMHead])
+def test_gaussians_start_where_the_prior_says(head):
+    views = make_views()
+    built = head(8, 16, 8, opacity_bias=-2.0, opacity_gain=4.0)
+    torch.nn.init.zeros_(built.decode.weight)
+    distance = torch.linspace(0.5, 8, 128).reshape(1, 2, 8, 8)
+    if head is LongLRMHead:
+        distance = 10 * distance  # of a range of 500
+    prior = Prior(distance, torch.linspace(0, 1, 128).reshape(1, 2, 8, 8))
+    gaussians = built(torch.zeros(1, 2, 1, 1, 8), views, prior)
+    origins = views.cameras.centers[0, :, None].expand(2, 64, 3).reshape(-1, 3)
+    found = (gaussians.means[0] - origins).norm(dim=-1)
+    torch.testing.assert_close(found, distance.flatten(), rtol=1e-4, atol=0)
+    low, high = gaussians.opacities[0, 0].item(), gaussians.opacities[0, -1].item()
+    assert (low, high) == pytest.approx((1 / (1 + math.exp(2)), 1 / (1 + math.exp(-2))))
+
+
+def test_features_are_bounded_at_any_distance():
+    distance = torch.tensor([1e-6, 1.0, 1e6]).reshape(1, 1, 1, 3)
+    features = Prior(distance, torch.full_like(distance, 0.5)).features(1, 3)
+    assert features.shape == (1, 1, 1, 3, 2) and features.abs().max() <= 2
+    assert (features[..., 0].diff(dim=-1) > 0).all()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_model_takes_a_prior(model):
+    views = wall(2)
+    plain, swept = (make_net(f"model={model}", f"model/prior={p}") for p in ("none", "sweep"))
+    gaussians = swept(views)
+    assert gaussians.num_gaussians == plain(views).num_gaussians
+    sum(field.sum() for field in vars(gaussians).values()).backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in swept.parameters())
+    tokenizers = {n for n, _ in plain.named_parameters() if "tokenizer.embed" in n}
+    different = {
+        name
+        for (name, a), b in zip(plain.named_parameters(), swept.parameters(), strict=True)
+        if a.shape != b.shape
+    }
+    assert different == tokenizers
+
+
+def test_costs_are_counted_without_content():
+    costs = static_costs(make_net("model=asysplat_sweep"), 3, 32, 32)
+    assert costs["gaussians"] == 3 * 16 * 16 and costs["activation_gb"] > 0
+
+
+def test_depth_of_the_data_is_averaged_where_it_is_known():
+    views = wall(1)
+    depths = views.depths.clone()
+    depths[..., :16] = 0
+    depths[..., 16:20] = 0
+    depths[..., 0, 17] = 4.0
+    prior = DepthPrior()(replace(views, depths=depths), (16, 16))
+    assert prior.confidence[0, 0, 0, 8] == 0.25 and prior.confidence[..., :8].max() == 0
+    length = views.cameras.resized(16, 16).pixel_directions().norm(dim=-1)
+    assert (prior.distance[..., 10:] / length[..., 10:]).mean().item() == pytest.approx(2, rel=1e-3)
+    assert prior.distance.min() > 1.5  # gaps are filled from around
