@@ -19,6 +19,7 @@ from asysplat.scene import TensorRecord, Views
 PRIOR_CHANNELS = 2
 UNKNOWN = 10**0.5  # a distance for what nobody knows, the middle of PhotographHead's range
 LONGEST_SIDE = 128  # of the images that are swept: twice the planes
+BLOCK = 2  # swept pixels along a side that share a depth: two compare better than one
 
 
 @dataclass(frozen=True)
@@ -62,16 +63,17 @@ class SweepPrior(nn.Module):
     """
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
-        cameras, factor = views.cameras, 1
-        while max(cameras.height, cameras.width) > LONGEST_SIDE * factor and not (
-            cameras.height % (2 * factor) or cameras.width % (2 * factor)
-        ):
+        height, width, factor = views.cameras.height, views.cameras.width, 1
+        while max(height, width) > LONGEST_SIDE * factor:
             factor *= 2
-        small = cameras.resized(cameras.height // factor, cameras.width // factor)
-        images = F.avg_pool2d(views.images.flatten(0, 1), factor).unflatten(
-            0, views.images.shape[:2]
+        multiple = factor * BLOCK
+        small = views.cameras.resized(
+            max(1, height // multiple) * BLOCK, max(1, width // multiple) * BLOCK
         )
-        found = plane_sweep(images, small, stride=max(1, small.height // size[0]))
+        images = F.interpolate(
+            views.images.flatten(0, 1), (small.height, small.width), mode="area"
+        ).unflatten(0, views.images.shape[:2])
+        found = plane_sweep(images, small, stride=BLOCK)
         return Prior.of_inverse_depth(found.inverse_depth, found.confidence, views, size)
 
 

@@ -8,16 +8,19 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from asysplat.errors import InputError
+from asysplat.evaluation.metrics import ssim
 from asysplat.training.disparity import InputDisparity, RenderedDisparity
 from asysplat.training.outcome import Outcome
 from asysplat.training.perceptual import PerceptualDistance, vgg16
 
 
 class ReconstructionLoss(nn.Module):
-    """MSE + lambda_p perceptual + lambda_d normalised-disparity SmoothL1.
+    """MSE + lambda_p perceptual + lambda_d normalised-disparity SmoothL1, and ours, 1 - SSIM.
+
+    SSIM wants edges as the perceptual term does, at little cost and without weights to fetch.
 
     Args:
-        mse, perceptual, depth: weights of the terms; 0 turns a term off. The perceptual term is
+        mse, perceptual, depth, ssim: weights of the terms; 0 turns a term off. The perceptual term is
             also off if its network is not on this machine, the depth term if the data has no
             depths; a warning says so once.
         perceptual_term, depth_term: constructors, called if the term's weight is not 0.
@@ -31,18 +34,19 @@ class ReconstructionLoss(nn.Module):
         mse: float,
         perceptual: float,
         depth: float,
+        ssim: float = 0.0,
         perceptual_term: Callable[[], PerceptualDistance | None] = vgg16,
         depth_term: Callable[[], RenderedDisparity | InputDisparity] = RenderedDisparity,
     ):
         super().__init__()
-        self.mse, self.perceptual, self.depth = mse, perceptual, depth
+        self.mse, self.perceptual, self.depth, self.ssim = mse, perceptual, depth, ssim
         distance = perceptual_term() if perceptual else None
         # A list hides the frozen network from checkpoints.
         self._perceptual_term = [] if distance is None else [distance]
         self._depth_term = depth_term() if depth else None
-        if not (mse or self._perceptual_term or depth):
+        if not (mse or self._perceptual_term or depth or ssim):
             raise InputError(
-                "training.loss has no term that is on: give mse, perceptual or depth a weight "
+                "training.loss has no term that is on: give mse, ssim, perceptual or depth a weight "
                 "above 0, and for perceptual alone its network (paths.download=true fetches it)."
             )
         self._warned_of_depth = False
@@ -63,6 +67,8 @@ class ReconstructionLoss(nn.Module):
         terms, image = {}, targets.masked(outcome.rendering.image)
         if self.mse:
             terms["mse"] = F.mse_loss(image, targets.images)
+        if self.ssim:
+            terms["ssim"] = 1 - ssim(image, targets.images).mean()
         for distance in self._perceptual_term:
             terms["perceptual"] = distance.to(image.device)(image, targets.images)
         if self._depth_term is not None:

@@ -53,7 +53,8 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         lambda value: is_number(value) and value >= 0,
         (
             "training.optimizer.weight_decay",
-            *("training.loss.mse", "training.loss.perceptual", "training.loss.depth"),
+            *("training.loss.mse", "training.loss.ssim"),
+            *("training.loss.perceptual", "training.loss.depth"),
         ),
     ),
     (

@@ -21,9 +21,11 @@ CHOICES = (
     "data.width",
     "data.batch_size",
     "metrics.name",
+    "training.loss.ssim",
     "training.loss.perceptual",
     "training.loss.depth",
 )
+TERMS = ("mse", "ssim", "perceptual", "depth")
 HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
 
 PAGE = {
@@ -34,7 +36,7 @@ PAGE = {
         "AbsRel": ["Multiline", ["val/absrel"]],
     },
     "training": {
-        "loss": ["Multiline", ["train/loss", "train/mse", "train/perceptual", "train/depth"]],
+        "loss": ["Multiline", [f"train/{term}" for term in ("loss", *TERMS)]],
         "gradient norm": ["Multiline", ["train/grad_norm"]],
         "learning rate": ["Multiline", ["train/learning_rate"]],
     },

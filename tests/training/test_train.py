@@ -231,7 +231,7 @@ REFUSED = {
         "SSIM needs images of at least 11x11 pixels, these have 4x4",
     ),
     "a loss of nothing": (
-        ["training.loss.mse=0", "training.loss.perceptual=0", "training.loss.depth=0"],
+        [f"training.loss.{term}=0" for term in ("mse", "ssim", "perceptual", "depth")],
         "training.loss has no term that is on",
     ),
     "an unusable layer mix": (["model.layers=4q"], "such as 4m4s"),
