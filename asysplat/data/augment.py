@@ -1,6 +1,6 @@
-"""Augmentation of training tasks: the order of the inputs, and a crop; never in evaluation.
+"""Augmentation of training tasks: order of the inputs, crop, exposure, noise; never in evaluation.
 
-As in Long-LRM (arXiv 2410.12781).
+Order and crop as in Long-LRM (arXiv 2410.12781).
 """
 
 from collections.abc import Sequence
@@ -8,10 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch.nn.functional import interpolate
 
 from asysplat.errors import InputError
 from asysplat.scene import Views
+
+GAMMA = 2.2  # of photographs, about that of sRGB
 
 
 @dataclass(frozen=True)
@@ -21,18 +24,25 @@ class Augmentation:
     Args:
         reverse, shuffle: how likely the inputs are given backwards, and in random order.
         crop: the least share of the sides that a crop keeps; 1 crops nothing.
+        exposure: the most stops by which a task, inputs and targets alike, is brighter or darker.
+        white_balance: the most stops by which its red and its blue are, beside its green.
+        flicker: the most stops by which one input is, beside the other views.
+        noise: the greatest standard deviation of the noise of a task's inputs.
 
     Raises:
-        InputError: a probability outside [0, 1], or a share outside (0, 1].
+        InputError: a number outside [0, 1], or a share of 0.
     """
 
     reverse: float = 0.0
     shuffle: float = 0.0
     crop: float = 1.0
+    exposure: float = 0.0
+    white_balance: float = 0.0
+    flicker: float = 0.0
+    noise: float = 0.0
 
     def __post_init__(self):
-        for name in ("reverse", "shuffle", "crop"):
-            value = getattr(self, name)
+        for name, value in vars(self).items():
             if not 0 <= value <= 1 or (name == "crop" and value == 0):
                 raise InputError(
                     f"data.augmentation.{name} is {value}: give a number from 0 to 1"
@@ -51,6 +61,34 @@ class Augmentation:
     def share(self, rng: np.random.Generator) -> float:
         """Draw the share of the sides that a crop keeps; one for all views of a task."""
         return float(rng.uniform(self.crop, 1.0))
+
+    def expose(
+        self, inputs: Views, targets: Views, rng: np.random.Generator
+    ) -> tuple[Views, Views]:
+        """Vary the exposure of a task's views, and add noise to its inputs.
+
+        Args:
+            inputs, targets: [V, ...].
+        """
+        red, blue = rng.uniform(-self.white_balance, self.white_balance, 2)
+        stops = rng.uniform(-self.exposure, self.exposure) + np.array([red, 0.0, blue])
+        flicker = rng.uniform(-self.flicker, self.flicker, (inputs.cameras.num_views, 1))
+        noise = rng.uniform(0, self.noise)
+        inputs, targets = brightened(inputs, stops + flicker), brightened(targets, stops[None])
+        if noise:
+            grain = torch.from_numpy(rng.standard_normal(inputs.images.shape, np.float32))
+            noisy = inputs.images + noise * grain.to(inputs.images)
+            inputs = replace(inputs, images=noisy.clamp(0, 1))
+        return inputs, targets
+
+
+def brightened(views: Views, stops: Float[np.ndarray, "#V 3"]) -> Views:
+    """Multiply the light of every view by 2^stops, for red, green and blue; 1 is the brightest.
+
+    Images are taken to hold light to the power of 1 / GAMMA.
+    """
+    gains = torch.from_numpy(2 ** (stops / GAMMA)).to(views.images)
+    return replace(views, images=(views.images * gains[..., None, None]).clamp(max=1))
 
 
 def cropped(views: Views, share: float) -> Views:

@@ -20,6 +20,7 @@ def procedural_data(
     val_scenes: int,
     test_scenes: int,
     places: str,
+    varied: bool = False,
     test_sets: Mapping[str, Any] | None = None,
     **options,
 ) -> SceneDataModule:
@@ -28,7 +29,7 @@ def procedural_data(
     The arguments are those of ProceduralSource and `scene_data`.
     """
 
-    make_source = partial(ProceduralSource, window=window, val_scenes=val_scenes)
+    make_source = partial(ProceduralSource, window=window, val_scenes=val_scenes, varied=varied)
     changeable = {
         "height": height,
         "width": width,

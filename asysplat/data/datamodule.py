@@ -140,7 +140,9 @@ class TrainingTasks(Dataset):
         task = self.source.training(self.inputs, self.targets, rng)
         inputs = self.augmentation.order(task.selection.inputs, rng)
         share = self.augmentation.share(rng)
-        return load(Task(task.capture, Selection(inputs, task.selection.targets)), share)
+        sample = load(Task(task.capture, Selection(inputs, task.selection.targets)), share)
+        inputs, targets = self.augmentation.expose(sample["inputs"], sample["targets"], rng)
+        return {"scene": sample["scene"], "inputs": inputs, "targets": targets}
 
 
 class FixedTasks(Dataset):

@@ -57,6 +57,7 @@ class ProceduralSource:
         window: least and greatest number of consecutive frames that a training task is drawn from.
         val_scenes, test_scenes: how many scenes each split has.
         places: what the scenes show: both, rooms or outdoors.
+        varied: whether scenes that train are varied ones; see ProceduralScene.
     """
 
     def __init__(
@@ -68,9 +69,10 @@ class ProceduralSource:
         val_scenes: int,
         test_scenes: int,
         places: str = "both",
+        varied: bool = False,
     ):
         self.height, self.width, self.num_frames = height, width, num_frames
-        self.places = places
+        self.places, self.varied = places, varied
         self.window = (window[0], window[1])
         self.counts = {"val": val_scenes, "test": test_scenes}
 
@@ -83,8 +85,14 @@ class ProceduralSource:
         return [Task(self._scene(split, index), selection) for index in range(self.counts[split])]
 
     def _scene(self, split: Literal["train", "val", "test"], index: int) -> ProceduralScene:
-        seed = split_seed(split, index)
-        return ProceduralScene(seed, self.height, self.width, self.num_frames, places=self.places)
+        return ProceduralScene(
+            split_seed(split, index),
+            self.height,
+            self.width,
+            self.num_frames,
+            places=self.places,
+            varied=self.varied and split == "train",
+        )
 
 
 class FilesSource:

@@ -1,4 +1,4 @@
-"""Crops move content and cameras together; orders hold the same frames."""
+"""Crops move content and cameras together; orders hold the same frames; targets have no noise."""
 
 from dataclasses import replace
 
@@ -94,7 +94,55 @@ def test_shares_fill_their_range_and_the_seed_repeats_them():
     assert Augmentation().share(rng) == 1
 
 
-@pytest.mark.parametrize("option", [{"reverse": 1.5}, {"shuffle": -0.1}, {"crop": 0.0}])
+def test_a_task_has_one_exposure():
+    views = make_views()
+    # Dark enough that nothing is clipped.
+    views = replace(views, images=0.1 + 0.3 * views.images)
+    exposing = Augmentation(exposure=0.5, white_balance=0.2)
+    inputs, targets = exposing.expose(views, views.select([2]), np.random.default_rng(0))
+    assert torch.equal(inputs.images[2], targets.images[0])
+    gains = inputs.images / views.images
+    torch.testing.assert_close(gains, gains[:1, :, :1, :1].expand_as(gains))
+    stops = 2.2 * gains[0, :, 0, 0].log2()
+    assert len(set(stops.tolist())) == 3
+    assert stops.abs().max() < 0.7 and (stops - stops[1]).abs().max() < 0.2
+    assert torch.equal(inputs.depths, views.depths)
+
+
+def test_flicker_and_noise_are_of_inputs_alone():
+    views = make_views(12)
+    views = replace(views, images=0.1 + 0.3 * views.images)
+    for option in ({"flicker": 0.3}, {"noise": 0.02}):
+        inputs, targets = Augmentation(**option).expose(views, views, np.random.default_rng(0))
+        assert torch.equal(targets.images, views.images)
+        assert not torch.equal(inputs.images, views.images)
+        again, _ = Augmentation(**option).expose(views, views, np.random.default_rng(0))
+        assert torch.equal(inputs.images, again.images)
+        if "flicker" in option:
+            gains = (inputs.images / views.images).flatten(1)
+            assert gains.std(1).max() < 1e-6 and len(gains[:, 0].unique()) == 12
+            assert 2.2 * gains.log2().abs().max() < 0.3
+    rng = np.random.default_rng(0)
+    noises = [
+        (Augmentation(noise=0.02).expose(views, views, rng)[0].images - views.images).std()
+        for _ in range(20)
+    ]
+    assert 0 < min(noises) < 0.005 and 0.015 < max(noises) < 0.0205
+
+
+def test_images_stay_within_their_range_and_without_options_as_they_are():
+    views = make_views()
+    strong = Augmentation(exposure=1.0, white_balance=1.0, flicker=1.0, noise=1.0)
+    for seed in range(5):
+        inputs, targets = strong.expose(views, views, np.random.default_rng(seed))
+        inputs.validate(), targets.validate()
+    inputs, targets = Augmentation().expose(views, views, np.random.default_rng(0))
+    assert torch.equal(inputs.images, views.images) and torch.equal(targets.images, views.images)
+
+
+@pytest.mark.parametrize(
+    "option", [{"reverse": 1.5}, {"shuffle": -0.1}, {"crop": 0.0}, {"noise": 2.0}]
+)
 def test_unusable_options_are_named(option):
     (name,) = option
     with pytest.raises(InputError, match=rf"data\.augmentation\.{name} is"):

@@ -70,7 +70,10 @@ def test_another_seed_gives_other_tasks():
 def test_augmented_tasks_are_repeated_by_their_seed():
     plain, varied = (
         TrainingTasks(procedural(augmentation=augmentation))
-        for augmentation in (Augmentation(), Augmentation(reverse=0.5, shuffle=0.5, crop=0.5))
+        for augmentation in (
+            Augmentation(),
+            Augmentation(reverse=0.5, shuffle=0.5, crop=0.5, exposure=0.5, noise=0.02),
+        )
     )
     orders = set()
     for index in range(6):

@@ -54,6 +54,11 @@ class FloorPlan:
     def add_sphere(self, center, radius: float, material: Material) -> None:
         self.spheres.append((np.array(center, float), radius, material))
 
+    def materials(self) -> list[Material]:
+        """Return every material, each once."""
+        things = (*self.boxes, *self.spheres)
+        return list(dict.fromkeys([*(thing[-1] for thing in things), *self.shell]))
+
     def free(self, spots: Float[np.ndarray, "K 2"], radius: float) -> Bool[np.ndarray, " K"]:
         """Tell which spots have room for a disc, clear of the walk and of what stands there."""
         to_walk = np.linalg.norm(spots[:, None] - self.walk, axis=-1).min(1)

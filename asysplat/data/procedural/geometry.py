@@ -11,9 +11,41 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 MARCH_STEPS = 18
-REFINE_STEPS = 8
 TINY = 1e-20  # avoids division by 0
+ROUNDING = 1e-3  # radians, more than angles are off
 NEAREST = 0.5  # no ray meets the ground before this t, as cameras are at eye level
+
+
+@dataclass(frozen=True)
+class Cone:
+    """What the rays from one point may meet; lets a view pass over what lies outside.
+
+    Args:
+        axis: of length 1.
+        angle: between the axis and the side, radians.
+    """
+
+    apex: Float[Tensor, " 3"]
+    axis: Float[Tensor, " 3"]
+    angle: Float[Tensor, ""]
+
+    @classmethod
+    def around(cls, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]) -> "Cone":
+        """Return the narrowest cone about the mean direction; with several origins, all space."""
+        unit = directions * (directions * directions).sum(0).rsqrt()
+        mean = unit.mean(1)
+        axis = mean / mean.norm()
+        one = origins.shape[1] == 1
+        widest = (axis @ unit).amin().clamp(-1, 1).acos() if one else axis.new_tensor(torch.pi)
+        return cls(origins[:, 0], axis, widest)
+
+    def meets(self, centers: Float[Tensor, "S 3"], radii: Float[Tensor, " S"]) -> Int[Tensor, " K"]:
+        """Return the spheres that reach into the cone, and maybe some more; never none."""
+        to_center = centers - self.apex
+        distance = to_center.norm(dim=1)
+        off_axis = (to_center @ self.axis / distance).clamp(-1, 1).acos()
+        gap = off_axis - (radii / distance).clamp(max=1).asin() - self.angle
+        return (gap <= gap.min().clamp(min=ROUNDING)).nonzero()[:, 0]
 
 
 @dataclass(frozen=True)
@@ -25,13 +57,13 @@ class Boxes:
     axes: Float[Tensor, "B 3 3"]
 
     def _local(self, directions: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
-        return (self._axes_first() @ directions).view(3, -1, directions.shape[1])
+        return (self._axes_first() @ directions).view(3, len(self.centers), directions.shape[1])
 
     def _to_centers(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
         """Return the offsets from each point to each box's centre, along the box's axes."""
         centers = torch.einsum("bij,bj->ib", self.axes, self.centers).reshape(-1, 1)
         offsets = torch.addmm(centers, self._axes_first(), points, alpha=-1)
-        return offsets.view(3, -1, points.shape[1])
+        return offsets.view(3, len(self.centers), points.shape[1])
 
     def _axes_first(self) -> Float[Tensor, "axes 3"]:
         return self.axes.transpose(0, 1).reshape(-1, 3)
@@ -40,11 +72,20 @@ class Boxes:
         self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
     ) -> Float[Tensor, "B R"]:
         """Return the t at which each ray enters each box (slab test; Kay and Kajiya, 1986)."""
-        inverse = 1 / (self._local(directions) + TINY)
+        # In place, as most of the time goes into memory.
+        inverse = self._local(directions).add_(TINY).reciprocal_()
         middle = self._to_centers(origins) * inverse
-        half_span = self.halves.T[..., None] * inverse.abs()
-        enter, leave = (middle - half_span).amax(0), (middle + half_span).amin(0)
+        half_span = inverse.abs_().mul_(self.halves.T[..., None])
+        enter, leave = (middle - half_span).amax(0), middle.add_(half_span).amin(0)
         return torch.where((enter <= leave) & (enter > 0), enter, torch.inf)
+
+    def within(self, cone: Cone, reach: float = 0.0) -> Int[Tensor, " K"]:
+        """Return the boxes that come nearer to the cone than `reach`, as `Cone.meets` does."""
+        return cone.meets(self.centers, self.halves.norm(dim=1) + reach)
+
+    def select(self, boxes: Int[Tensor, " K"]) -> "Boxes":
+        """Return the named boxes."""
+        return Boxes(self.centers[boxes], self.halves[boxes], self.axes[boxes])
 
     def facing(self, points: Float[Tensor, "3 R"], box: Int[Tensor, " R"]) -> Int[Tensor, " R"]:
         """Return the axis of its box that is normal to each point's face."""
@@ -89,14 +130,23 @@ class Spheres:
         square = (directions * directions).sum(0)
         to_center = self.centers[..., None] - origins
         nearest = (to_center * directions).sum(1) / square
-        missed_by = to_center - nearest[:, None] * directions
-        left = self.radii[:, None] ** 2 - (missed_by * missed_by).sum(1)
+        missed_by = nearest[:, None] * directions
+        torch.sub(to_center, missed_by, out=missed_by)
+        left = self.radii[:, None] ** 2 - missed_by.mul_(missed_by).sum(1)
         return nearest, (left / square).sqrt()
 
     def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
         """Return the distance from each point to the nearest sphere; 0 inside."""
         offset = points - self.centers[..., None]
         return ((offset * offset).sum(1).sqrt() - self.radii[:, None]).amin(0).clamp(min=0)
+
+    def within(self, cone: Cone, reach: float = 0.0) -> Int[Tensor, " K"]:
+        """Return the spheres that come nearer to the cone than `reach`, as `Cone.meets` does."""
+        return cone.meets(self.centers, self.radii + reach)
+
+    def select(self, spheres: Int[Tensor, " K"]) -> "Spheres":
+        """Return the named spheres."""
+        return Spheres(self.centers[spheres], self.radii[spheres])
 
 
 @dataclass(frozen=True)
@@ -158,10 +208,12 @@ class Terrain:
         origins: Float[Tensor, "3 #R"],
         directions: Float[Tensor, "3 R"],
         limits: Float[Tensor, " R"],
+        refine_steps: int,
     ) -> Float[Tensor, " R"]:
         """Return the t at which each ray first goes under the ground, before its limit.
 
-        Steps grow with distance; the step that crosses is narrowed by false position (Illinois).
+        Steps grow with distance; the one that crosses is narrowed by false position (Illinois),
+        `refine_steps` times.
         """
         progress = torch.linspace(0, 1, MARCH_STEPS, device=limits.device)[:, None]
         t = NEAREST * (limits / NEAREST) ** progress
@@ -174,7 +226,7 @@ class Terrain:
         before = after - 1
         low, high = t.gather(0, before), t.gather(0, after)
         gap_low, gap_high = above.gather(0, before), above.gather(0, after)
-        for _ in range(REFINE_STEPS):
+        for _ in range(refine_steps):
             middle = low + (high - low) * gap_low / (gap_low - gap_high).clamp(min=TINY)
             gap = self.above(origins[:, None] + middle * directions[:, None])
             over = gap > 0

@@ -32,10 +32,13 @@ class Material:
     variation: float = 0.0  # brightness differences between cells
     checker: float = 0.0  # brightness difference of a chequered pattern
     grain: tuple[float, float] = (1.0, 1.0)  # lattice points of the coarsest noise a metre
+    gloss: float = 0.0  # brightness of a highlight's middle
+    shininess: float = 1.0  # how narrow highlights are: exponent of Blinn and Phong
 
     def row(self) -> list[float]:
         plain = (self.shift, self.joint, self.variation, self.checker)
-        return [*self.base, *self.accent, *self.cell, *plain, *self.grain]
+        film = (self.gloss, self.shininess)
+        return [*self.base, *self.accent, *self.cell, *plain, *self.grain, *film]
 
 
 def hsv(hue: float, saturation: float, value: float) -> Colour:
@@ -190,11 +193,13 @@ def albedo(
     """Compute the linear colour of each hit.
 
     Args:
-        rows: `Material.row` of each hit's surface.
+        rows: `Material.row` of each hit's surface; its gloss is not looked at.
         uv: place on the surface, metres.
         footprint: width of the pixel on the surface, metres.
     """
-    base, accent, cell, (shift, joint, variation, checker), grain = rows.split((3, 3, 2, 4, 2))
+    base, accent, cell, (shift, joint, variation, checker), grain, _ = rows.split(
+        (3, 3, 2, 4, 2, 2)
+    )
     noise = fractal_noise(lattice, uv * grain, footprint * grain.amax(0))
     tone, parity, covered = cell_pattern(lattice, uv, footprint, cell, shift, joint)
     mix = (0.5 + 0.5 * noise[0]).clamp(0, 1)

@@ -1,0 +1,141 @@
+"""What scenes that train have beyond the others: smooth edges, gloss, paths, focal lengths."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import max_pool2d
+
+from asysplat.data import ProceduralSource
+from asysplat.data.procedural import ProceduralScene, split_seed
+from asysplat.data.procedural.edges import SAMPLES, edge_pixels, mixed, samples
+from asysplat.data.procedural.floor_plan import FloorPlan
+from asysplat.data.procedural.path import circle, forward, hand_held_path, pan
+from asysplat.data.procedural.textures import Material
+from asysplat.data.procedural.world import World
+
+SEEDS = range(6)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Images this small gain nothing from threads, and lose much where other tests run too."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_only_scenes_that_train_are_varied():
+    source = ProceduralSource(16, 16, 24, (12, 24), val_scenes=1, test_scenes=1, varied=True)
+    rng = np.random.default_rng(0)
+    focals = [
+        source.training(3, 1, rng).capture.cameras.intrinsics[0, 0, 0].item() for _ in range(40)
+    ]
+    degrees = np.degrees(2 * np.arctan(8 / np.array(focals)))
+    assert 35 <= degrees.min() < 45 and 80 < degrees.max() <= 90
+    for split in ("val", "test"):
+        (task,) = source.evaluation(split, 3, 1)
+        plain = ProceduralScene(split_seed(split, 0), 16, 16, 24)
+        assert torch.equal(task.capture.views([5]).images, plain.views([5]).images)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_pixel_at_an_edge_lies_between_its_neighbours(seed):
+    scene = ProceduralScene(seed, 48, 48, varied=True)
+    smooth = scene.views([0, 60])
+    scene._smooth_edges = False
+    sharp = scene.views([0, 60])
+    assert torch.equal(smooth.depths, sharp.depths)
+    changed = (smooth.images != sharp.images).any(1)
+    assert 0.01 < changed.float().mean() < 0.4
+    brightest = max_pool2d(sharp.images, 3, 1, 1)
+    darkest = -max_pool2d(-sharp.images, 3, 1, 1)
+    assert (smooth.images < brightest + 1e-5).all() and (smooth.images > darkest - 1e-5).all()
+
+
+def test_a_pixel_is_as_bright_as_it_is_covered():
+    """A white surface right of a slanted edge on black, where the exact coverage is known."""
+    size, pixel = 32, 2 / 32
+
+    def surface(directions):
+        return (directions[0] > 0.3 * directions[1] + 0.01).long()
+
+    y, x = torch.meshgrid(*2 * [torch.linspace(-1 + 1 / size, 1 - 1 / size, size)], indexing="ij")
+    directions = torch.stack((x, y, torch.ones_like(x))).flatten(1)
+    surfaces = surface(directions).view(size, size)
+    light = surfaces.float().flatten().repeat(3, 1)
+    edges = edge_pixels(surfaces)
+    seen = surface(samples(directions[:, edges], pixel))
+    found = mixed(light, surfaces, edges, seen)[0]
+    fine = (torch.arange(40) + 0.5) / 40 - 0.5
+    offsets = torch.cartesian_prod(fine, fine).T * pixel
+    around = directions[:2, edges, None] + offsets[:, None]
+    covered = surface(around).float().mean(1)
+    assert len(SAMPLES) == 4 and set(found.tolist()) == {0, 0.25, 0.5, 0.75, 1}
+    assert (found - covered).abs().max() < 0.26
+    assert (found - covered).abs().mean() < 0.5 * (light[0, edges] - covered).abs().mean()
+
+
+@pytest.mark.parametrize("gloss", [0.0, 1.0])
+def test_gloss_is_brightest_where_the_light_is_mirrored(gloss):
+    """The floor of a room right between eye and lamp, which are equally high."""
+    grey = Material((0.5, 0.5, 0.5), (0.5, 0.5, 0.5), gloss=gloss, shininess=30.0)
+    plan = FloorPlan(
+        walk=np.zeros((1, 2)),
+        light=np.array([2.0, 0.0, 2.0]),
+        light_colour=np.ones(3),
+        falloff=3.0,
+        ambient=0.1 * np.ones(3),
+        shell=[grey] * 6,
+        room=(np.array([-4.0, -4.0, 0.0]), np.array([4.0, 4.0, 4.0])),
+    )
+    plan.add_box((3.5, 3.5, 0.2), (0.2, 0.2, 0.2), 0.0, grey)
+    plan.add_sphere((-3.5, 3.5, 0.2), 0.2, grey)
+    world = World(plan, np.random.default_rng(0), torch.device("cpu"))
+    mirrored, aside, back = (
+        world.trace(eye[:, None], -eye[:, None], pixel=0.01)[0].mean()
+        for eye in torch.tensor([[-2.0, 0.0, 2.0], [0.0, 2.0, 2.0], [2.0, 0.5, 2.0]])
+    )
+    torch.testing.assert_close(aside, back, rtol=0.02, atol=0)
+    assert (mirrored > 1.5 * aside) == bool(gloss)
+
+
+def turn(angles):
+    return np.degrees(np.ptp(np.unwrap(angles)))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_circle_goes_around_and_looks_inward(seed):
+    poses = hand_held_path(np.random.default_rng(seed), 96, 2.0, circle)
+    centers, gaze = poses[:, :2, 3], poses[:, :2, 2]
+    assert 105 < turn(np.arctan2(*centers.T)) < 290
+    assert (-(centers * gaze).sum(1) / np.linalg.norm(centers, axis=1) > 0.75).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_walk_leads_forward(seed):
+    poses = hand_held_path(np.random.default_rng(seed), 96, 2.0, forward)
+    way = poses[-1, :3, 3] - poses[0, :3, 3]
+    assert 1.4 < np.linalg.norm(way) < 4.2
+    assert (poses[:, :3, 2] @ way / np.linalg.norm(way) > 0.6).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_pan_turns_nearly_on_the_spot(seed):
+    poses = hand_held_path(np.random.default_rng(seed), 96, 2.0, pan)
+    assert 45 < turn(np.arctan2(*poses[:, :2, 2].T)) < 130
+    assert np.ptp(poses[:, :3, 3], axis=0).max() < 1.1
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_cameras_move_smoothly_and_keep_clear(seed):
+    scene = ProceduralScene(seed, 16, 16, varied=True)
+    poses = scene.cameras.cam_to_world
+    steps = [(after - before)[:3, 3].norm() for before, after in pairwise(poses)]
+    assert 0.002 < max(steps) < 0.25
+    cosines = ((poses[1:, :3, :3] * poses[:-1, :3, :3]).sum((1, 2)) - 1) / 2
+    assert torch.rad2deg(cosines.clamp(max=1).arccos()).max() < 6
+    views = scene.views(range(0, 96, 6)).validate()
+    assert views.depths.min() > 0.3
