@@ -11,7 +11,7 @@ from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.stage import Component, Stage
-from asysplat.models.tokenizer import Tokenizer, pixel_features
+from asysplat.models.tokenizer import Tokenizer
 from asysplat.scene import Gaussians, Views
 
 APPEARANCE_MLP_RATIO = 4
@@ -33,6 +33,7 @@ class AsySplat(Network):
         source: component that merges the branches.
         head: component that decodes Gaussians.
         patch_coarse, patch_fine: p_c, p_f; the first a multiple of the second.
+        prior: of Network.
 
     Raises:
         InputError: an unusable layer mix, patch sizes that do not divide, unequal stage counts.
@@ -52,8 +53,9 @@ class AsySplat(Network):
         head: Component,
         patch_coarse: int = 16,
         patch_fine: int = 8,
+        prior: nn.Module | None = None,
     ):
-        super().__init__(widths, patch_coarse)
+        super().__init__(widths, patch_coarse, prior)
         if patch_coarse % patch_fine:
             raise InputError(
                 f"model.patch_coarse={patch_coarse} is not a multiple of "
@@ -72,7 +74,7 @@ class AsySplat(Network):
         fine = StageShape(widths.fine, widths.head_dim, APPEARANCE_MLP_RATIO)
         self.geometry = nn.ModuleDict(
             {
-                "tokenizer": Tokenizer(patch_coarse, widths.stages[0]),
+                "tokenizer": Tokenizer(patch_coarse, widths.stages[0], self.pixel_channels),
                 "stages": nn.ModuleList(
                     Stage(previous.width, shape, layers, blocks)
                     for previous, shape in zip([shapes[0], *shapes], shapes, strict=False)
@@ -82,7 +84,7 @@ class AsySplat(Network):
         )
         self.appearance = nn.ModuleDict(
             {
-                "tokenizer": Tokenizer(patch_fine, widths.fine),
+                "tokenizer": Tokenizer(patch_fine, widths.fine, self.pixel_channels),
                 "stages": nn.ModuleList(
                     Layers(*(appearance_block(fine) for _ in range(appearance_layers)))
                     for _ in shapes
@@ -95,7 +97,7 @@ class AsySplat(Network):
 
     def predict(self, views: Views) -> Gaussians:
         """Predict Gaussians [B, N] from views [B, V]; N = V H W (p_f / p_c)^2."""
-        pixels = pixel_features(views)
+        pixels, prior = self.look(views, self.head.stride)
         coarse = self.geometry["tokenizer"](pixels)
         fine = self.appearance["tokenizer"](pixels)
         branches = zip(
@@ -109,7 +111,7 @@ class AsySplat(Network):
             coarse, fine = geometry(coarse), appearance(fine)
             # Both links read the values from before the exchange (Eq. 3).
             coarse, fine = coarse_reads_fine(coarse, fine), fine_reads_coarse(fine, coarse)
-        return self.head(self.source(coarse, fine), views)
+        return self.head(self.source(coarse, fine), views, prior)
 
     def geometry_share(self) -> float:
         """Return the share of parameters outside the appearance branch (paper: about 0.9)."""

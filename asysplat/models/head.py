@@ -3,6 +3,7 @@
 The paper fixes the 59 numbers of a Gaussian, not what they stand for: here are two readings.
 """
 
+import math
 from abc import ABC, abstractmethod
 
 import torch
@@ -11,6 +12,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from asysplat.models.prior import Prior
 from asysplat.ops.precision import without_autocast
 from asysplat.scene import Cameras, Gaussians, Views
 
@@ -27,11 +29,21 @@ class GaussianHead(nn.Module, ABC):
         width: d_3.
         patch_coarse, patch_fine: p_c, p_f.
         sh_degree: 0 to 3.
+        opacity_gain: logit that a sure prior adds to an untrained opacity.
         std: standard deviation of the untrained weights.
     """
 
-    def __init__(self, width: int, patch_coarse: int, patch_fine: int, sh_degree: int, std: float):
+    def __init__(
+        self,
+        width: int,
+        patch_coarse: int,
+        patch_fine: int,
+        sh_degree: int,
+        opacity_gain: float,
+        std: float,
+    ):
         super().__init__()
+        self.opacity_gain = opacity_gain
         self.patch, self.stride = patch_fine, patch_coarse // patch_fine
         # position, quaternion, scale, opacity, SH
         self.splits = (3, 4, 3, 1, 3 * (sh_degree + 1) ** 2)
@@ -39,8 +51,14 @@ class GaussianHead(nn.Module, ABC):
         self.decode = nn.Linear(width, patch_fine**2 * sum(self.splits), bias=False)
         nn.init.normal_(self.decode.weight, std=std)
 
-    def forward(self, features: Float[Tensor, "B V h w d"], views: Views) -> Gaussians:
-        """Decode Gaussians [B, V h p_f w p_f], row by row of view after view."""
+    def forward(
+        self, features: Float[Tensor, "B V h w d"], views: Views, prior: Prior | None = None
+    ) -> Gaussians:
+        """Decode Gaussians [B, V h p_f w p_f], row by row of view after view.
+
+        With a prior, distances are corrections of its own, and opacities start higher where it is
+        sure.
+        """
         raw = rearrange(
             self.decode(self.norm(features)),
             "b v h w (p q z) -> b v (h p) (w q) z",
@@ -51,11 +69,20 @@ class GaussianHead(nn.Module, ABC):
             raw = raw.to(views.images.dtype)
             position, quats, scales, opacities, sh = raw.split(self.splits, dim=-1)
             # The mean of three outputs, as in Long-LRM.
-            depth_fraction = position.mean(-1, keepdim=True).sigmoid()
+            depth_logit = position.mean(-1, keepdim=True)
+            if prior is not None:
+                expected = self.depth_fraction(prior.distance).clamp(0.01, 0.99)
+                depth_logit = depth_logit + expected.logit()[..., None]
+                opacities = opacities + self.opacity_gain * prior.confidence[..., None]
             sh = sh.unflatten(-1, (-1, 3))
-            return self.activate(depth_fraction, quats, scales, opacities[..., 0], sh, views).map(
-                lambda field: field.flatten(1, 3)
+            gaussians = self.activate(
+                depth_logit.sigmoid(), quats, scales, opacities[..., 0], sh, views
             )
+            return gaussians.map(lambda field: field.flatten(1, 3))
+
+    @abstractmethod
+    def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
+        """Return where a distance is in the head's range, in [0, 1] if it is inside."""
 
     @abstractmethod
     def activate(
@@ -84,7 +111,7 @@ class PhotographHead(GaussianHead):
     branches: what the appearance branch adds is less than with colours of its own.
 
     Args:
-        width, patch_coarse, patch_fine, sh_degree: of GaussianHead.
+        width, patch_coarse, patch_fine, sh_degree, opacity_gain: of GaussianHead.
         near, far: distances along the ray lie between them, in units of the normalised scene.
         opacity_bias: logit of an untrained opacity.
         scale_bias: log of an untrained size, in pixel footprints.
@@ -100,10 +127,14 @@ class PhotographHead(GaussianHead):
         far: float = 100.0,
         opacity_bias: float = 0.0,
         scale_bias: float = -0.5,
+        opacity_gain: float = 4.0,
     ):
-        super().__init__(width, patch_coarse, patch_fine, sh_degree, std=1e-3)
+        super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_gain, std=1e-3)
         self.near, self.far = near, far
         self.opacity_bias, self.scale_bias = opacity_bias, scale_bias
+
+    def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
+        return (distance / self.near).log() / math.log(self.far / self.near)
 
     def activate(
         self,
@@ -144,7 +175,7 @@ class LongLRMHead(GaussianHead):
     plane at 0.01, as `asysplat.rendering` does, and a far one at 1e6, beyond all that is predicted.
 
     Args:
-        width, patch_coarse, patch_fine, sh_degree: of GaussianHead.
+        width, patch_coarse, patch_fine, sh_degree, opacity_gain: of GaussianHead.
         farthest: distance, in units of the normalised scene.
         opacity_bias: logit of an untrained opacity.
         scale_bias: log of an untrained size.
@@ -161,10 +192,14 @@ class LongLRMHead(GaussianHead):
         opacity_bias: float = -2.0,
         scale_bias: float = -6.9,
         largest: float = -1.2,
+        opacity_gain: float = 4.0,
     ):
-        super().__init__(width, patch_coarse, patch_fine, sh_degree, std=0.02)
+        super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_gain, std=0.02)
         self.farthest = farthest
         self.opacity_bias, self.scale_bias, self.largest = opacity_bias, scale_bias, largest
+
+    def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
+        return distance / self.farthest
 
     def activate(
         self,

@@ -2,11 +2,16 @@
 
 from abc import ABC, abstractmethod
 
-from torch import nn
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.models.layers import Layers
+from asysplat.models.prior import PRIOR_CHANNELS, Prior
 from asysplat.models.shapes import Widths
+from asysplat.models.tokenizer import PIXEL_CHANNELS, pixel_features
+from asysplat.ops.precision import without_autocast
 from asysplat.scene import Gaussians, Views
 
 
@@ -16,11 +21,12 @@ class Network(nn.Module, ABC):
     Args:
         widths: of the network.
         patch: image pixels along a side of its largest token.
+        prior: views and the size of the head's grid -> what is known of the surfaces; or None.
     """
 
-    def __init__(self, widths: Widths, patch: int):
+    def __init__(self, widths: Widths, patch: int, prior: nn.Module | None):
         super().__init__()
-        self.widths, self.patch = widths, patch
+        self.widths, self.patch, self.prior = widths, patch, prior
 
     def forward(self, views: Views) -> Gaussians:
         """Predict Gaussians [..., N] from views [..., V].
@@ -40,6 +46,20 @@ class Network(nn.Module, ABC):
     @abstractmethod
     def geometry_share(self) -> float:
         """Return the share of parameters outside an appearance branch."""
+
+    @property
+    def pixel_channels(self) -> int:
+        """The number of channels that a tokenizer sees of each pixel."""
+        return PIXEL_CHANNELS + (0 if self.prior is None else PRIOR_CHANNELS)
+
+    def look(self, views: Views, stride: int) -> tuple[Float[Tensor, "B V H W c"], Prior | None]:
+        """Return what the tokenizers see of every pixel, and the prior on the head's grid."""
+        if self.prior is None:
+            return pixel_features(views, None), None
+        cameras = views.cameras
+        with torch.no_grad(), without_autocast(views.images):
+            prior = self.prior(views, (cameras.height // stride, cameras.width // stride))
+        return pixel_features(views, prior), prior
 
     def describe(self) -> str:
         """Return the sizes and what they come to, in a line."""

@@ -13,7 +13,7 @@ from asysplat.models.attention import SparseAttention
 from asysplat.models.network import Network
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.stage import Component, build_layers, to_width
-from asysplat.models.tokenizer import Tokenizer, pixel_features
+from asysplat.models.tokenizer import Tokenizer
 from asysplat.scene import Gaussians, Views
 
 
@@ -29,6 +29,7 @@ class SingleBranch(Network):
         head: component that decodes Gaussians.
         patch: side of a token's patch before any merge.
         global_tokens: number of learned tokens that come before the others and have no place.
+        prior: of Network.
 
     Raises:
         InputError: lists of unequal length, an unusable layer mix, or global tokens with sparse
@@ -45,8 +46,9 @@ class SingleBranch(Network):
         head: Component,
         patch: int = 8,
         global_tokens: int = 0,
+        prior: nn.Module | None = None,
     ):
-        super().__init__(widths, patch * 2 ** sum(merges))
+        super().__init__(widths, patch * 2 ** sum(merges), prior)
         lists = {"stage_ratios": stage_ratios, "stage_layers": stage_layers, "merges": merges}
         for name, values in lists.items():
             if len(values) != len(widths.stages):
@@ -54,7 +56,7 @@ class SingleBranch(Network):
                     f"model.{name} has {len(values)} entries for {len(widths.stages)} stages of "
                     "model.stage_widths: give one a stage."
                 )
-        self.tokenizer = Tokenizer(patch, widths.stages[0])
+        self.tokenizer = Tokenizer(patch, widths.stages[0], self.pixel_channels)
         shapes = [
             StageShape(width, widths.head_dim, ratio)
             for width, ratio in zip(widths.stages, stage_ratios, strict=True)
@@ -79,13 +81,14 @@ class SingleBranch(Network):
 
     def predict(self, views: Views) -> Gaussians:
         """Predict Gaussians [B, N] from views [B, V]; N = V H W."""
-        tokens = self.tokenizer(pixel_features(views))
+        pixels, prior = self.look(views, self.head.stride)
+        tokens = self.tokenizer(pixels)
         extra = None
         if self.global_tokens is not None:
             extra = self.tokenizer.norm(self.global_tokens).expand(len(tokens), -1, -1)
         for stage in self.stages:
             tokens, extra = stage(tokens, extra)
-        return self.head(tokens, views)
+        return self.head(tokens, views, prior)
 
     def geometry_share(self) -> float:
         """Return 1: there is no appearance branch."""

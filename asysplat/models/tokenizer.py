@@ -5,16 +5,20 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from asysplat.models.prior import Prior
 from asysplat.scene import Views
 
 PIXEL_CHANNELS = 9
 
 
-def pixel_features(views: Views) -> Float[Tensor, "B V H W 9"]:
-    """Return RGB in [-1, 1], ray moment o x d and unit direction d of every pixel."""
+def pixel_features(views: Views, prior: Prior | None) -> Float[Tensor, "B V H W c"]:
+    """Return RGB in [-1, 1], ray moment o x d, unit direction d and the prior of every pixel."""
     origins, directions = views.cameras.rays()
     colours = rearrange(views.images, "b v c h w -> b v h w c") * 2 - 1
-    return torch.cat((colours, torch.linalg.cross(origins, directions), directions), dim=-1)
+    features = [colours, torch.linalg.cross(origins, directions), directions]
+    if prior is not None:
+        features.append(prior.features(views.cameras.height, views.cameras.width))
+    return torch.cat(features, dim=-1)
 
 
 class Tokenizer(nn.Module):
@@ -23,15 +27,16 @@ class Tokenizer(nn.Module):
     Args:
         patch: p_c or p_f, in pixels.
         width: d_c or d_f.
+        channels: of a pixel, PIXEL_CHANNELS and those of the prior.
     """
 
-    def __init__(self, patch: int, width: int):
+    def __init__(self, patch: int, width: int, channels: int = PIXEL_CHANNELS):
         super().__init__()
         self.patch = patch
-        self.embed = nn.Linear(PIXEL_CHANNELS * patch**2, width, bias=False)
+        self.embed = nn.Linear(channels * patch**2, width, bias=False)
         self.norm = nn.LayerNorm(width)
 
-    def forward(self, pixels: Float[Tensor, "B V H W 9"]) -> Float[Tensor, "B V h w d"]:
+    def forward(self, pixels: Float[Tensor, "B V H W c"]) -> Float[Tensor, "B V h w d"]:
         patches = rearrange(
             pixels, "b v (h p) (w q) c -> b v h w (p q c)", p=self.patch, q=self.patch
         )

@@ -42,7 +42,6 @@ class SweptDepth(TensorRecord):
     confidence: Float[Tensor, "*batch V h w"]
 
 
-@torch.no_grad()
 def plane_sweep(
     images: Float[Tensor, "B V 3 H W"],
     cameras: Cameras,
@@ -66,29 +65,50 @@ def plane_sweep(
         InputError: sizes that do not go together, or an unknown backend.
     """
     _check(images, cameras, stride, planes, neighbours)
-    form = _load(_auto(images) if backend == "auto" else backend, images)
-    shape = (*images.shape[:2], cameras.height // stride, cameras.width // stride)
-    if images.device.type == "meta":
-        return SweptDepth(images.new_empty(shape), images.new_empty(shape))
+    backend = _auto(images) if backend == "auto" else backend
+    _check_backend(backend, images)
     images = images if images.dtype == torch.float64 else images.float()
-    cameras = cameras.to(images.dtype)
+    poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
+    return SweptDepth(*_sweep(images, intrinsics, poses, stride, planes, neighbours, backend))
+
+
+@torch.library.custom_op("asysplat::plane_sweep", mutates_args=())
+def _sweep(
+    images: Tensor,
+    intrinsics: Tensor,
+    cam_to_world: Tensor,
+    stride: int,
+    planes: int,
+    neighbours: int,
+    backend: str,
+) -> tuple[Tensor, Tensor]:
+    """Sweep: one operator for torch, so that devices without content know its shapes."""
+    form = _load(backend)
+    cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
+    small = cameras.resized(cameras.height // stride, cameras.width // stride)
     chosen = choose_neighbours(cameras, neighbours)
     ranges = inverse_depth_range(cameras, chosen)
     projections = relative_projections(cameras, chosen)
     grey = (images * images.new_tensor(LUMA)[:, None, None]).sum(2)
     costs = form.match(grey, chosen, projections, ranges, planes, stride)
-    small = cameras.resized(*shape[2:])
     edges = _edges(images, stride)
-    confidence = torch.ones(shape, dtype=images.dtype, device=images.device)
+    agreement = images.new_ones(*images.shape[:2], small.height, small.width)
     for _ in range(2):  # once with all costs, once with those of what the neighbours agree on
-        plane = form.smooth(costs, confidence, edges)
+        plane = form.smooth(costs, agreement, edges)
         found = Depths.at_planes(plane, ranges, planes)
-        confidence = compare(found, small, chosen)
-    return SweptDepth(fill(found.inverse, confidence), confidence)
+        agreement = compare(found, small, chosen)
+    precision = found.precision()
+    return fill(found.inverse, agreement * precision), agreement * (1 + precision) / 2
 
 
-def _edges(images: Tensor, stride: int) -> Tensor:
-    """Return the mean absolute colour difference to the block on the left and above, [B,V,2,h,w]."""
+@_sweep.register_fake
+def _(images, intrinsics, cam_to_world, stride, planes, neighbours, backend):
+    shape = (*images.shape[:2], images.shape[-2] // stride, images.shape[-1] // stride)
+    return images.new_empty(shape), images.new_empty(shape)
+
+
+def _edges(images: Tensor, stride: int) -> Float[Tensor, "B V 2 h w"]:
+    """Return the mean absolute colour difference to the block on the left, and to that above."""
     blocks = torch.nn.functional.avg_pool2d(images.flatten(0, 1), stride).unflatten(
         0, images.shape[:2]
     )
@@ -105,18 +125,22 @@ def _auto(images: Tensor) -> str:
     return images.device.type
 
 
-def _load(backend: str, images: Tensor) -> ModuleType:
+def _check_backend(backend: str, images: Tensor) -> None:
     pick_backend("plane_sweep", dict.fromkeys(("auto", "reference", *FAST)), backend)
-    if backend == "reference":
-        return reference
-    check_fast_backend("plane_sweep", backend, images)
+    if backend != "reference":
+        check_fast_backend("plane_sweep", backend, images)
+
+
+def _load(backend: str) -> ModuleType:
     if backend == "cpu":
         from asysplat.ops.plane_sweep import cpu
 
         return cpu
-    from asysplat.ops.plane_sweep import cuda
+    if backend == "cuda":
+        from asysplat.ops.plane_sweep import cuda
 
-    return cuda
+        return cuda
+    return reference
 
 
 def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbours: int) -> None:

@@ -11,7 +11,7 @@ from asysplat.ops.plane_sweep.cameras import FRONT, relative_projections
 from asysplat.scene import Cameras
 
 TOLERANCE = 0.05  # of an inverse depth, or one plane if that is more: two views agree
-TRUST = 0.05  # weight of what lies around a pixel against its own depth at confidence 1
+AROUND = 0.05  # weight of what lies around a pixel against its own depth, fully trusted
 
 
 @dataclass(frozen=True)
@@ -30,16 +30,21 @@ class Depths:
         step = (greatest - least) / (planes - 1)
         return cls(least[..., None, None] + plane * step[..., None, None], step)
 
+    def precision(self) -> Float[Tensor, "B V h w"]:
+        """Return how well the planes tell a depth from others, in [0, 1]; 0 at infinity."""
+        squared = self.inverse**2
+        return squared / (squared + self.step[..., None, None] ** 2).clamp_min(1e-30)
+
 
 def compare(
     found: Depths, cameras: Cameras, neighbours: Int[Tensor, "B V K"]
 ) -> Float[Tensor, "B V h w"]:
-    """Return the confidence of every depth: in [0, 1], 0 where no neighbour agrees.
+    """Return how far the neighbours agree with every depth: in [0, 1], 0 where none does.
 
     Each neighbour that sees the point agrees, has something in front of it, which says nothing, or
     sees through it, which speaks against it.
     """
-    B, V, h, w = found.inverse.shape
+    B, _, h, w = found.inverse.shape
     scene = torch.arange(B, device=neighbours.device)[:, None, None]
     view = neighbours.clamp_min(0)
     matrix = relative_projections(cameras, neighbours)
@@ -62,18 +67,21 @@ def compare(
     tolerance = torch.maximum(found.step[scene, view][..., None, None], TOLERANCE * there)
     agree = (seen & (difference.abs() <= tolerance)).sum(2)
     against = (seen & (difference > tolerance)).sum(2)
-    confidence = 2 * agree / (agree + against + 1)
-    return confidence.clamp_max(1).to(found.inverse)
+    return (2 * agree / (agree + against + 1)).clamp_max(1).to(found.inverse)
 
 
 def fill(
-    inverse: Float[Tensor, "B V h w"], confidence: Float[Tensor, "B V h w"]
+    inverse: Float[Tensor, "B V h w"], trust: Float[Tensor, "B V h w"]
 ) -> Float[Tensor, "B V h w"]:
     """Replace what is uncertain by what lies around it, the nearer the more; 0 if nothing is known.
 
     A pyramid of weighted means from the whole scene's down to each pixel's.
+
+    Args:
+        inverse: inverse depths.
+        trust: in [0, 1], squared for a pixel's weight.
     """
-    weights, sums = [confidence**2], [confidence**2 * inverse]
+    weights, sums = [trust**2], [trust**2 * inverse]
     while max(weights[-1].shape[-2:]) > 1:
         for maps in (weights, sums):
             maps.append(F.avg_pool2d(maps[-1], 2, ceil_mode=True))
@@ -81,5 +89,5 @@ def fill(
     filled = scene.expand_as(weights[-1])
     for weight, total in zip(reversed(weights), reversed(sums), strict=True):
         around = F.interpolate(filled, weight.shape[-2:], mode="bilinear")
-        filled = (total + TRUST * around) / (weight + TRUST)
+        filled = (total + AROUND * around) / (weight + AROUND)
     return filled

@@ -1,0 +1,89 @@
+"""What is known of the surfaces before a network looks: ours, not the paper's.
+
+A prior is called with views and the size of the head's grid. It tells the tokenizers a distance
+and a confidence for each pixel, and gives the head a distance to correct and an opacity to start
+from. Without one (`model/prior=none`) the network is the paper's.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from asysplat.ops import plane_sweep
+from asysplat.ops.plane_sweep import fill
+from asysplat.scene import TensorRecord, Views
+
+PRIOR_CHANNELS = 2
+UNKNOWN = 10**0.5  # a distance for what nobody knows, the middle of PhotographHead's range
+LONGEST_SIDE = 128  # of the images that are swept: twice the planes
+
+
+@dataclass(frozen=True)
+class Prior(TensorRecord):
+    """Distances and how far to trust them.
+
+    Args:
+        distance: along the ray of each pixel of the head's grid, > 0, in scene units.
+        confidence: in [0, 1].
+    """
+
+    distance: Float[Tensor, "B V h w"]
+    confidence: Float[Tensor, "B V h w"]
+
+    @classmethod
+    def of_inverse_depth(
+        cls,
+        inverse: Float[Tensor, "B V h w"],
+        confidence: Float[Tensor, "B V h w"],
+        views: Views,
+        size: tuple[int, int],
+    ) -> "Prior":
+        """Return the prior of depths along the z axis, 0 where unknown, at the grid's size."""
+        inverse = F.interpolate(inverse, size, mode="bilinear")
+        length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
+        distance = torch.where(inverse > 0, length / inverse.clamp_min(1e-6), UNKNOWN)
+        return cls(distance, F.interpolate(confidence, size, mode="bilinear"))
+
+    def features(self, height: int, width: int) -> Float[Tensor, "B V H W 2"]:
+        """Return the logarithm of the distance and the confidence, both in about [-1, 1]."""
+        maps = ((self.distance / UNKNOWN).log().clamp(-4, 4) / 2, self.confidence * 2 - 1)
+        return torch.stack(
+            [F.interpolate(each, (height, width), mode="bilinear") for each in maps], dim=-1
+        )
+
+
+class SweepPrior(nn.Module):
+    """Depth from a plane sweep over each view's neighbours (`asysplat.ops.plane_sweep`).
+
+    Large images are swept at a size that suits the number of planes.
+    """
+
+    def forward(self, views: Views, size: tuple[int, int]) -> Prior:
+        cameras, factor = views.cameras, 1
+        while max(cameras.height, cameras.width) > LONGEST_SIDE * factor and not (
+            cameras.height % (2 * factor) or cameras.width % (2 * factor)
+        ):
+            factor *= 2
+        small = cameras.resized(cameras.height // factor, cameras.width // factor)
+        images = F.avg_pool2d(views.images.flatten(0, 1), factor).unflatten(
+            0, views.images.shape[:2]
+        )
+        found = plane_sweep(images, small, stride=max(1, small.height // size[0]))
+        return Prior.of_inverse_depth(found.inverse_depth, found.confidence, views, size)
+
+
+class DepthPrior(nn.Module):
+    """The depths that come with the data, where there are any; gaps are filled from around."""
+
+    def forward(self, views: Views, size: tuple[int, int]) -> Prior:
+        depths = views.depths
+        if depths is None:
+            depths = views.images.new_zeros(*views.images.shape[:2], *views.images.shape[-2:])
+        known = (depths > 0).to(depths)
+        stride = depths.shape[-2] // size[0]
+        share = F.avg_pool2d(known, stride)
+        inverse = F.avg_pool2d(known / depths.clamp_min(1e-6), stride) / share.clamp_min(1e-6)
+        return Prior.of_inverse_depth(fill(inverse, share), share, views, size)
