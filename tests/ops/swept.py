@@ -66,6 +66,7 @@ def texture(points: Tensor, scale: float = 1.0, seed: int = 0) -> Tensor:
 
 
 def slanted_plane(cameras: Cameras, distance: float = 3.0, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Images and depths of a textured plane at about this distance, whose waves go with it."""
+    """Images and depths of a textured plane at about this distance; waves as wide in the image."""
     depth, points = depth_of_plane(cameras, distance, slant=0.3)
-    return texture(points, scale=distance / 3, seed=seed), depth
+    focal = (cameras.intrinsics[..., 0, 0] / cameras.width).mean().item()
+    return texture(points, scale=distance / (3 * focal), seed=seed), depth

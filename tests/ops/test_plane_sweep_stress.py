@@ -146,7 +146,7 @@ def test_shapes_on_a_device_without_content():
         ({"backend": "fast"}, "backend='fast': expected one of auto, reference, cpu, cuda"),
         (
             {"images": torch.rand(1, 4, 3, 24, 32).double(), "backend": "cpu"},
-            "backend 'cpu' computes in float32 and x is float64",
+            "backend 'cpu' computes in float32 and x is float64: choose 'auto'",
         ),
     ],
     ids=str,

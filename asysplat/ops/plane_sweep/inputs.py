@@ -9,7 +9,7 @@ from torch import Tensor
 
 from asysplat.ops.plane_sweep.reference import NOISE, patch_mean
 
-VECTOR = 16  # planes that a kernel for CPUs takes at once
+VECTOR = 16  # planes that a kernel for CPUs takes at once: LANES, which needs Numba
 
 
 class MatchInputs(NamedTuple):
