@@ -44,7 +44,7 @@ def check_fast_backend(operator: str, backend: str, x: Tensor) -> None:
     if x.dtype == torch.float64:
         raise InputError(
             f"{operator}'s backend {backend!r} computes in float32 and x is float64: choose "
-            "'chunked', or give float32."
+            "'auto', or give float32."
         )
     if x.device.type not in (backend, "meta") and not _interpreted(backend):
         raise InputError(

@@ -252,7 +252,7 @@ _extremum(max, ">")
 _extremum(min, "<")
 
 
-def _rounded(name: str) -> Callable:
+def _applied(name: str) -> Callable:
     """Make the intrinsic that applies one of LLVM's functions to every number of a vector."""
 
     @intrinsic
@@ -269,7 +269,7 @@ def _rounded(name: str) -> Callable:
     return compute
 
 
-sqrt, floor = _rounded("sqrt"), _rounded("floor")
+sqrt, floor = _applied("sqrt"), _applied("floor")
 
 
 @intrinsic
@@ -323,38 +323,35 @@ def gather_pairs(typing_context, image, row, column):
                 first = builder.extract_element(index, ir.IntType(32)(lane))
                 first = builder.sext(first, array.nitems.type)
                 check_range(context, builder, first, first.type(2), array.nitems)
-        half = LANES // 2
-        pairs = ir.VectorType(ir.IntType(64), half)
         begin = builder.ptrtoint(array.data, ir.IntType(64))
-        begin = builder.insert_element(ir.Constant(pairs, ir.Undefined), begin, ir.IntType(32)(0))
-        begin = builder.shuffle_vector(
-            begin, begin, ir.Constant(ir.VectorType(ir.IntType(32), half), [0] * half)
-        )
-        pointers = ir.VectorType(ir.IntType(64).as_pointer(), half)
-        masks = ir.VectorType(ir.IntType(1), half)
-        kind = ir.FunctionType(pairs, [pointers, ir.IntType(32), masks, pairs])
-        name = f"llvm.masked.gather.v{half}i64.v{half}p0"
-        gather = cgutils.get_or_insert_function(builder.module, kind, name)
-        found = []
-        for first in (0, half):
-            order = ir.Constant(
-                ir.VectorType(ir.IntType(32), half), list(range(first, first + half))
-            )
-            part = builder.sext(builder.shuffle_vector(index, index, order), pairs)
-            byte = builder.add(begin, builder.shl(part, ir.Constant(pairs, [2] * half)))
-            every = ir.Constant(masks, [1] * half)
-            nothing = ir.Constant(pairs, [0] * half)
-            loaded = builder.call(
-                gather, [builder.inttoptr(byte, pointers), ir.IntType(32)(4), every, nothing]
-            )
-            found.append(builder.bitcast(loaded, FLOATS))
+        halves = [_pairs(builder, begin, index, first) for first in (0, LANES // 2)]
         sides = [
-            builder.shuffle_vector(*found, ir.Constant(INTEGERS, list(range(k, 2 * LANES, 2))))
+            builder.shuffle_vector(*halves, ir.Constant(INTEGERS, list(range(k, 2 * LANES, 2))))
             for k in (0, 1)
         ]
         return context.make_tuple(builder, signature.return_type, sides)
 
     return types.UniTuple(VECTOR, 2)(image, row, column), generate
+
+
+def _pairs(builder: ir.IRBuilder, begin: ir.Value, index: ir.Value, first: int) -> ir.Value:
+    """Return the pairs of float32 at half of the indices, from the index `first` on."""
+    count = LANES // 2
+    bits, order = ir.VectorType(ir.IntType(64), count), ir.VectorType(ir.IntType(32), count)
+    base = ir.Constant(bits, ir.Undefined)
+    base = builder.insert_element(base, begin, ir.IntType(32)(0))
+    base = builder.shuffle_vector(base, base, ir.Constant(order, [0] * count))
+    chosen = ir.Constant(order, list(range(first, first + count)))
+    index = builder.sext(builder.shuffle_vector(index, index, chosen), bits)
+    byte = builder.add(base, builder.shl(index, ir.Constant(bits, [2] * count)))
+    pointers = builder.inttoptr(byte, ir.VectorType(ir.IntType(64).as_pointer(), count))
+    every = ir.Constant(ir.VectorType(ir.IntType(1), count), [1] * count)
+    kind = ir.FunctionType(bits, [pointers.type, ir.IntType(32), every.type, bits])
+    name = f"llvm.masked.gather.v{count}i64.v{count}p0"
+    gather = cgutils.get_or_insert_function(builder.module, kind, name)
+    nothing = ir.Constant(bits, [0] * count)
+    found = builder.call(gather, [pointers, ir.IntType(32)(4), every, nothing])
+    return builder.bitcast(found, FLOATS)
 
 
 @intrinsic

@@ -24,10 +24,10 @@ def choose_neighbours(cameras: Cameras, count: int) -> Int[Tensor, "B V K"]:
     apart = torch.cdist(cameras.centers, cameras.centers)
     largest = apart.amax((-1, -2)).clamp_min(1e-12)
     steps = torch.logspace(-1.5, 1.5, 11, base=10.0).to(apart)
-    inverse = torch.cat((steps.new_zeros(1), steps)) * 2 / largest[:, None]
+    focal = cameras.intrinsics[..., 0, 0] / cameras.width
+    inverse = torch.cat((steps.new_zeros(1), steps)) * 2 / (largest * focal.mean(-1))[:, None]
     everyone = torch.arange(V, device=apart.device).expand(len(apart), V, V)
     seen = _sees(cameras, everyone, inverse[:, None].expand(-1, V, -1)).to(apart).mean((-1, -2))
-    focal = cameras.intrinsics[..., 0, 0] / cameras.width
     parallax = focal[:, :, None, None] * apart[..., None] * inverse[:, None, None]
     useful = (parallax / USEFUL_PARALLAX).clamp_max(1) / (1 + (parallax / WIDE_PARALLAX) ** 2)
     score = (seen * useful).sum(-1)
@@ -51,7 +51,8 @@ def inverse_depth_range(
     distance = (centers[scene, neighbours.clamp_min(0)] - centers[:, :, None]).norm(dim=-1)
     distance = distance.masked_fill(neighbours < 0, 0).amax(-1)
     steps = torch.logspace(-2, 2, 97, base=10.0).to(centers)
-    inverse = steps / distance.clamp_min(1e-12)[..., None]
+    focal = cameras.intrinsics[..., 0, 0] / cameras.width
+    inverse = steps / (distance.clamp_min(1e-12) * focal)[..., None]
     share = _sees(cameras, neighbours, inverse).any(2).to(centers).mean((-1, -2))
     enough = share >= LEAST_SHARE
     first = enough.int().argmax(-1, keepdim=True)

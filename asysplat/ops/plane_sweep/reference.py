@@ -113,7 +113,12 @@ def smooth(
         + _along(costs, above, 2)
         + _along(costs.flip(2), above.roll(-1, 2).flip(2), 2).flip(2)
     )
-    planes = costs.shape[-1]
+    return lowest_plane(total)
+
+
+def lowest_plane(total: Float[Tensor, "*pixels D"]) -> Float[Tensor, "*pixels"]:
+    """Return the plane of least cost, between planes by the parabola through three."""
+    planes = total.shape[-1]
     best = total.argmin(-1, keepdim=True)
     middle = total.gather(-1, best)
     before = total.gather(-1, (best - 1).clamp_min(0))

@@ -4,11 +4,8 @@ Of each neighbour it warps one row after the other, and keeps as many as a patch
 patches are taken along columns first, then along the row.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -31,6 +28,7 @@ from asysplat.ops.cpu.vectors import (
 )
 from asysplat.ops.plane_sweep import reference
 from asysplat.ops.plane_sweep.cameras import FRONT as LEAST_FRONT
+from asysplat.ops.plane_sweep.inputs import MatchInputs, prepare
 from asysplat.ops.plane_sweep.reference import BEST, WINDOW
 
 assert BEST == 2  # the kernel keeps the least cost and the one after
@@ -40,28 +38,6 @@ FRONT = np.float32(LEAST_FRONT)
 UNSEEN, NOISE = np.float32(reference.UNSEEN), np.float32(reference.NOISE)
 INFINITY = np.float32(np.inf)
 SHARE = np.float32(1 / WINDOW**2)  # of a pixel in a patch
-
-
-class Sweep(NamedTuple):
-    """What is compared; n counts the views of all scenes.
-
-    Args:
-        images: [n, H, W], less the mean of each.
-        padded: the same, [n, H + 1, W + 1]: the last row and column are there twice.
-        means: [n, H, W], of patches.
-        scales: [n, H, W], 1 / standard deviation of patches.
-        neighbours: [n, K], counted as n is; -1 for none.
-        projections: [n, K, 3, 4].
-        inverse: [n, vectors of planes, LANES], inverse depths.
-    """
-
-    images: np.ndarray
-    padded: np.ndarray
-    means: np.ndarray
-    scales: np.ndarray
-    neighbours: np.ndarray
-    projections: np.ndarray
-    inverse: np.ndarray
 
 
 def match(
@@ -74,42 +50,30 @@ def match(
 ) -> Float[Tensor, "B V h w D"]:
     """Compute the costs in float32; see `reference.match`."""
     B, V, H, W = images.shape
+    inputs = prepare(images, neighbours, projections, ranges, planes)
     costs = torch.empty(B * V, H // stride, W // stride, planes)
-    # Less its mean, an image's small variances are not lost beside large squares.
-    flat = (images - images.mean((-1, -2), keepdim=True)).flatten(0, 1)
-    padded = F.pad(flat[:, None], (0, 1, 0, 1), mode="replicate")[:, 0]
-    means = reference.patch_mean(flat)
-    variances = (reference.patch_mean(flat**2) - means**2).clamp_min(0)
-    first = torch.arange(B)[:, None, None] * V
-    everyone = torch.where(neighbours >= 0, neighbours + first, -1).flatten(0, 1)
-    vectors = -(-planes // LANES)
-    steps = (ranges[..., 1:] - ranges[..., :1]) / (planes - 1)
-    inverse = ranges[..., :1] + torch.arange(vectors * LANES) * steps
-    sweep = Sweep(
-        images=flat.numpy(),
-        padded=padded.numpy(),
-        means=means.numpy(),
-        scales=(variances + reference.NOISE).rsqrt().numpy(),
-        neighbours=everyone.numpy(),
-        projections=projections.flatten(0, 1).contiguous().numpy(),
-        inverse=inverse.reshape(B * V, vectors, LANES).numpy(),
+    run_blocks(
+        match_planes,
+        even_bounds(B * V * (inputs.inverse.shape[1] // LANES)),
+        MatchInputs(*(tensor.numpy() for tensor in inputs)),
+        stride,
+        costs.numpy(),
     )
-    run_blocks(match_planes, even_bounds(B * V * vectors), sweep, stride, costs.numpy())
     return costs.unflatten(0, (B, V))
 
 
 @kernel
-def match_planes(start, stop, sweep, stride, costs):
+def match_planes(start, stop, inputs, stride, costs):
     """Write the costs of the blocks start to stop, counted over [views, vectors of planes].
 
     Args:
-        sweep: see `Sweep`.
+        inputs: see `MatchInputs`.
         costs: [n, h, w, D].
     """
-    H, W = sweep.images.shape[1:]
+    H, W = inputs.images.shape[1:]
     h, w, planes = costs.shape[1:]
-    K = sweep.neighbours.shape[1]
-    vectors = sweep.inverse.shape[1]
+    K = inputs.neighbours.shape[1]
+    vectors = inputs.inverse.shape[1] // LANES
     share = np.float32(0.5 / (stride * stride))
     # A place for each of the last rows of each neighbour.
     warped = np.empty((K, WINDOW, W, LANES), np.float32)
@@ -118,10 +82,10 @@ def match_planes(start, stop, sweep, stride, costs):
     sums = np.empty((w, LANES), np.float32)
     for block in range(start, stop):
         view, vector = block // vectors, block % vectors
-        inverse = sweep.inverse[view]
+        inverse = inputs.inverse[view].reshape(vectors, LANES)
         number = 0
         for k in range(K):
-            number += sweep.neighbours[view, k] >= 0
+            number += inputs.neighbours[view, k] >= 0
         for y in range(H):
             if y % stride == 0:
                 sums[:] = ZERO
@@ -129,14 +93,14 @@ def match_planes(start, stop, sweep, stride, costs):
             first[:] = UNSEEN if number < 2 else INFINITY
             second[:] = UNSEEN if number < 1 else INFINITY
             for k in range(K):
-                if sweep.neighbours[view, k] < 0:
+                if inputs.neighbours[view, k] < 0:
                     continue
-                other = sweep.padded[sweep.neighbours[view, k]]
-                matrix = sweep.projections[view, k]
+                other = inputs.padded[inputs.neighbours[view, k]]
+                matrix = inputs.projections[view, k]
                 for row in range(0 if y == 0 else y + AROUND, min(y + AROUND + 1, H)):
                     place = row % WINDOW
                     _warp_row(warped[k, place], seen[k, place], other, matrix, row, inverse, vector)
-                _compare_row(first, second, sweep, view, y, warped[k], seen[k, y % WINDOW])
+                _compare_row(first, second, inputs, view, y, warped[k], seen[k, y % WINDOW])
             for x in range(W):
                 i = x // stride
                 store(sums, i, load(sums, i) + (load(first, x) + load(second, x)))
@@ -176,10 +140,10 @@ def _warp_row(warped, seen, other, matrix, y, inverse, vector):
 
 
 @inline
-def _compare_row(first, second, sweep, view, y, warped, seen):
+def _compare_row(first, second, inputs, view, y, warped, seen):
     """Put the costs of a neighbour among the two least of each pixel of row y."""
-    H, W = sweep.images.shape[1:]
-    image, means, scales = sweep.images[view], sweep.means[view, y], sweep.scales[view, y]
+    H, W = inputs.images.shape[1:]
+    image, means, scales = inputs.images[view], inputs.means[view, y], inputs.scales[view, y]
     # The sums along the last columns of the neighbour, its square, and its product with the view.
     a1, a2, a3, a4 = zeros(), zeros(), zeros(), zeros()
     b1, b2, b3, b4 = zeros(), zeros(), zeros(), zeros()

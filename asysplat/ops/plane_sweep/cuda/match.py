@@ -1,0 +1,196 @@
+"""The costs: a program takes some columns and planes down a band of a view's rows.
+
+The sums along a patch's last rows stay in registers, of every neighbour.
+"""
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from asysplat.ops.cuda.kernel import kernel
+from asysplat.ops.cuda.scans import FUSED, INTERPRETED
+from asysplat.ops.plane_sweep import cameras, reference
+from asysplat.ops.plane_sweep.inputs import prepare
+
+AROUND = tl.constexpr(reference.WINDOW // 2)
+KEPT = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch
+SHARE = tl.constexpr(1 / reference.WINDOW**2)  # of a pixel in a patch
+FRONT, NOISE = tl.constexpr(cameras.FRONT), tl.constexpr(reference.NOISE)
+UNSEEN, INFINITY = tl.constexpr(reference.UNSEEN), tl.constexpr(float("inf"))
+TILE, BAND = (8192, 1024) if INTERPRETED else (128, 16)  # columns x planes; rows of blocks
+
+
+def match(
+    images: Float[Tensor, "B V H W"],
+    neighbours: Int[Tensor, "B V K"],
+    projections: Float[Tensor, "B V K 3 4"],
+    ranges: Float[Tensor, "B V 2"],
+    planes: int,
+    stride: int,
+) -> Float[Tensor, "B V h w D"]:
+    """Compute the costs in float32; see `reference.match`."""
+    B, V, H, W = images.shape
+    h, w = H // stride, W // stride
+    inputs = prepare(images, neighbours, projections, ranges, planes)
+    costs = images.new_zeros(B * V, h, w, planes)
+    tile_planes = min(triton.next_power_of_2(planes), TILE)
+    columns = min(triton.next_power_of_2(w), TILE // tile_planes)
+    tiles = -(-w // columns) * -(-planes // tile_planes)
+    with torch.cuda.device_of(images):
+        match_band[(tiles, -(-h // BAND), B * V)](
+            *inputs,
+            costs=costs,
+            height=H,
+            width=W,
+            planes=planes,
+            padded_planes=inputs.inverse.shape[1],
+            stride=stride,
+            K=neighbours.shape[2],
+            COLUMNS=columns,
+            PLANES=tile_planes,
+            BAND=BAND,
+            **FUSED,
+        )
+    return costs.unflatten(0, (B, V))
+
+
+@kernel
+def match_band(
+    images,
+    padded,
+    means,
+    scales,
+    neighbours,
+    projections,
+    inverse,
+    costs,
+    height,
+    width,
+    planes,
+    padded_planes,
+    stride,
+    K: tl.constexpr,
+    COLUMNS: tl.constexpr,
+    PLANES: tl.constexpr,
+    BAND: tl.constexpr,
+):
+    """Add to zeros the costs [n, h, w, D] of COLUMNS x PLANES in BAND rows.
+
+    Args:
+        images, padded, means, scales, neighbours, projections, inverse: see `MatchInputs`.
+    """
+    view = tl.program_id(2).to(tl.int64)
+    parts = tl.cdiv(planes, PLANES)
+    block = tl.program_id(0) // parts * COLUMNS + tl.arange(0, COLUMNS)
+    plane = tl.program_id(0) % parts * PLANES + tl.arange(0, PLANES)
+    depth = tl.load(inverse + view * padded_planes + plane, mask=plane < planes, other=0.0)[None, :]
+    number = 0
+    for k in tl.static_range(K):
+        number += (tl.load(neighbours + view * K + k) >= 0).to(tl.int32)
+    begin = tl.program_id(1) * BAND * stride
+    rows = tl.minimum(BAND * stride, height - begin)
+    nothing = tl.zeros((COLUMNS, PLANES), tl.float32)
+    for part in range(stride):
+        x = tl.minimum(block * stride + part, width - 1)
+        sums = ()
+        for _ in tl.static_range(K * KEPT):
+            sums = sums + ((nothing, nothing, nothing),)
+        total = nothing
+        for step in range(rows + 2 * AROUND):
+            y = begin + step - 2 * AROUND  # all rows of its patch are there now
+            row = tl.minimum(tl.maximum(y + AROUND, 0), height - 1)
+            middle = tl.minimum(tl.maximum(y, 0), height - 1)
+            pixel = (view * height + middle) * width + x
+            mean, scale = tl.load(means + pixel)[:, None], tl.load(scales + pixel)[:, None]
+            # What fewer neighbours than two leave open is unseen.
+            first = nothing + tl.where(number < 2, UNSEEN, INFINITY)
+            second = nothing + tl.where(number < 1, UNSEEN, INFINITY)
+            kept = ()
+            for k in tl.static_range(K):
+                neighbour = tl.load(neighbours + view * K + k).to(tl.int64)
+                other = padded + tl.maximum(neighbour, 0) * (height + 1) * (width + 1)
+                matrix = projections + (view * K + k) * 12
+                line = images + (view * height + row) * width
+                a, b, c = add_row(line, other, matrix, x, row, depth, height, width)
+                total_a, total_b, total_c = a, b, c
+                for j in tl.static_range(KEPT):
+                    earlier = sums[k * KEPT + j]
+                    total_a += earlier[0]
+                    total_b += earlier[1]
+                    total_c += earlier[2]
+                    if j > 0:
+                        kept = kept + (earlier,)
+                kept = kept + ((a, b, c),)
+                u, v, z = project(factors_at(matrix, middle), x, depth)
+                seen = (z > FRONT) & (u > 0) & (u < width) & (v > 0) & (v < height)
+                other_mean = total_a * SHARE
+                both = total_c * SHARE - mean * other_mean
+                variance = tl.maximum(total_b * SHARE - other_mean * other_mean, 0.0) + NOISE
+                cost = tl.where(seen, 1 - both * scale / tl.sqrt(variance), UNSEEN)
+                cost = tl.where(neighbour >= 0, cost, INFINITY)
+                second = tl.minimum(second, tl.maximum(first, cost))
+                first = tl.minimum(first, cost)
+            sums = kept
+            total = tl.where(y % stride == 0, 0.0, total) + 0.5 * (first + second)
+            limit = tl.where((y >= begin) & (y % stride == stride - 1), width, 0)
+            done = (block * stride < limit)[:, None] & (plane < planes)[None, :]
+            blocks = ((view * (height // stride) + y // stride) * (width // stride) + block)[
+                :, None
+            ]
+            place = costs + blocks * planes + plane[None, :]
+            before = tl.load(place, mask=done, other=0.0)
+            tl.store(place, before + total / (stride * stride), mask=done)
+
+
+@kernel
+def add_row(line, other, matrix, x, row, depth, height, width):
+    """Return the sums of a neighbour along a patch's row, of its square, its product with `line`.
+
+    Beyond the border, its pixels go on.
+    """
+    factors = factors_at(matrix, row)
+    a, b, c = 0.0, 0.0, 0.0
+    for k in tl.static_range(-AROUND, AROUND + 1):
+        column = tl.minimum(tl.maximum(x + k, 0), width - 1)
+        u, v, _ = project(factors, column, depth)
+        u = tl.minimum(tl.maximum(u - 0.5, 0.0), width - 1.0)
+        v = tl.minimum(tl.maximum(v - 0.5, 0.0), height - 1.0)
+        left, top = u.to(tl.int32), v.to(tl.int32)
+        u, v = u - left, v - top
+        place = other + top * (width + 1) + left
+        above, below = tl.load(place), tl.load(place + width + 1)
+        above += (tl.load(place + 1) - above) * u
+        below += (tl.load(place + width + 2) - below) * u
+        value = above + (below - above) * v
+        a += value
+        b += value * value
+        c += value * tl.load(line + column)[:, None]
+    return a, b, c
+
+
+@kernel
+def factors_at(matrix, y):
+    """Return by what x, 1 and the inverse depth are multiplied for the pixels of a row.
+
+    Three numbers for each of a neighbour's homogeneous coordinates.
+    """
+    y += 0.5
+    factors = ()
+    for i in tl.static_range(3):
+        row = matrix + 4 * i
+        flat = tl.load(row + 1) * y + tl.load(row + 2)
+        factors = factors + (tl.load(row), flat, tl.load(row + 3))
+    return factors
+
+
+@kernel
+def project(factors, x, depth):
+    """Return where a neighbour has the pixels, [columns, planes], and at which depth."""
+    x = x[:, None] + 0.5
+    u = factors[0] * x + factors[1] + factors[2] * depth
+    v = factors[3] * x + factors[4] + factors[5] * depth
+    z = factors[6] * x + factors[7] + factors[8] * depth
+    scale = 1 / tl.maximum(z, FRONT)
+    return u * scale, v * scale, z

@@ -1,0 +1,98 @@
+"""The smoothed costs: a program takes some rows or columns of a view, from one end to the other."""
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.ops.cuda.kernel import kernel
+from asysplat.ops.cuda.scans import FUSED, INTERPRETED
+from asysplat.ops.plane_sweep import reference
+
+SMALL_STEP, INFINITY = tl.constexpr(reference.SMALL_STEP), tl.constexpr(float("inf"))
+TILE = 8192 if INTERPRETED else 256  # lines x planes
+
+
+def smooth(
+    costs: Float[Tensor, "B V h w D"],
+    weights: Float[Tensor, "B V h w"],
+    edges: Float[Tensor, "B V 2 h w"],
+) -> Float[Tensor, "B V h w"]:
+    """Return the plane of least smoothed cost; see `reference.smooth`."""
+    B, V, h, w, planes = costs.shape
+    costs = costs.contiguous()
+    weights = weights.clamp_min(reference.LEAST_WEIGHT).contiguous()
+    penalties = reference.LARGE_STEP / (1 + edges / reference.EDGE)
+    total = torch.zeros_like(costs)
+    tile_planes = triton.next_power_of_2(planes)
+    directions = (
+        (penalties[:, :, 0], (h, w), (w, 1)),  # along rows, and along columns
+        (penalties[:, :, 1], (w, h), (1, w)),
+    )
+    with torch.cuda.device_of(costs):
+        for penalty, (lines, length), (apart, step) in directions:
+            tile_lines = min(triton.next_power_of_2(lines), max(TILE // tile_planes, 1))
+            for reverse in (False, True):
+                add_paths[(-(-lines // tile_lines), B * V)](
+                    *(costs, weights, penalty.contiguous(), total),
+                    lines=lines,
+                    length=length,
+                    apart=apart,
+                    step=step,
+                    planes=planes,
+                    REVERSE=reverse,
+                    LINES=tile_lines,
+                    PLANES=tile_planes,
+                    **FUSED,
+                )
+    return reference.lowest_plane(total)
+
+
+@kernel
+def add_paths(
+    costs,
+    weights,
+    penalties,
+    total,
+    lines,
+    length,
+    apart,
+    step,
+    planes,
+    REVERSE: tl.constexpr,
+    LINES: tl.constexpr,
+    PLANES: tl.constexpr,
+):
+    """Add to `total` what the paths along LINES lines cost, in one direction.
+
+    Args:
+        costs, total: [n, h, w, D].
+        weights: [n, h, w], of a pixel's costs.
+        penalties: [n, h, w], of a step of several planes from the pixel before in a line.
+        apart, step: from one line to the next, and from one pixel to the next, in pixels.
+    """
+    view = tl.program_id(1).to(tl.int64)
+    line = tl.program_id(0) * LINES + tl.arange(0, LINES)
+    plane = tl.broadcast_to(tl.arange(0, PLANES)[None, :], (LINES, PLANES))
+    there = line < lines
+    path = tl.zeros((LINES, PLANES), tl.float32)  # it begins where all planes cost nothing
+    low = tl.zeros((LINES,), tl.float32)
+    for k in range(length):
+        position = length - 1 - k if REVERSE else k
+        pixel = view * lines * length + line * apart + position * step
+        # A path's first pixel has no step before it, and any will do.
+        entry = pixel + tl.where(k > 0, step, 0) if REVERSE else pixel
+        far = low + tl.load(penalties + entry, mask=there, other=0.0)
+        weight = tl.load(weights + pixel, mask=there, other=0.0)[:, None]
+        place = pixel[:, None] * planes + plane
+        inside = there[:, None] & (plane < planes)
+        cost = tl.load(costs + place, mask=inside, other=0.0) * weight
+        nearer = tl.gather(path, tl.minimum(plane + 1, PLANES - 1), 1)
+        farther = tl.gather(path, tl.maximum(plane - 1, 0), 1)
+        near = tl.minimum(nearer, farther) + SMALL_STEP  # at both ends that of the plane itself
+        path = tl.minimum(tl.minimum(path, near), far[:, None]) - low[:, None]
+        path = tl.where(plane < planes, cost + path, INFINITY)
+        low = tl.min(path, 1)
+        before = tl.load(total + place, mask=inside, other=0.0)
+        tl.store(total + place, before + path, mask=inside)

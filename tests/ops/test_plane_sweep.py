@@ -1,0 +1,188 @@
+"""The plane sweep: its back ends against the reference in float64, and depths that are known.
+
+Triton reads TRITON_INTERPRET when it is first imported, so one test runs this file a second time,
+in a process that has it set: there, "cuda" runs on a CPU.
+"""
+
+import os
+import subprocess
+import sys
+from importlib import import_module
+
+import pytest
+import torch
+from swept import cameras_at, depth_of_plane, four_cameras, slanted_plane, texture
+
+from asysplat.ops import plane_sweep
+from asysplat.ops.plane_sweep import cameras as sweep_cameras
+from asysplat.ops.plane_sweep import reference
+from asysplat.scene import Cameras
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+FAST = [
+    pytest.param("cpu", marks=pytest.mark.skipif(INTERPRETED, reason="for cuda alone")),
+    pytest.param("cuda", marks=[] if INTERPRETED else pytest.mark.gpu),
+]
+DEVICE = {"cpu": "cpu", "cuda": "cpu" if INTERPRETED else "cuda"}
+# height, width, scenes, views, neighbours, planes, stride
+SIZES = [
+    (6, 8, 1, 3, 2, 16, 1),
+    (9, 6, 1, 2, 4, 5, 3),
+    (3, 4, 2, 3, 2, 20, 1),  # smaller than a patch
+    (1, 1, 1, 2, 1, 4, 1),
+]
+LARGER = [(32, 48, 1, 5, 4, 64, 2), (30, 21, 2, 4, 3, 33, 3), (16, 16, 1, 1, 4, 64, 2)]
+if not INTERPRETED:
+    SIZES += LARGER
+
+
+def match_arguments(height, width, scenes, views, neighbours, planes, stride):
+    """What `match` is given, in float32: noise that cameras turned a little look at."""
+    centers = [(0.2 * v, 0.1 * (v % 2), 0.05 * v) for v in range(views)]
+    cameras = cameras_at(centers, height=height, width=width, scenes=scenes)
+    angles = 0.1 * torch.randn(scenes, views, 3, 3, dtype=torch.float64)
+    cameras.cam_to_world[..., :3, :3] = torch.linalg.matrix_exp(angles - angles.mT)
+    cameras = cameras.to(torch.float32)
+    chosen = sweep_cameras.choose_neighbours(cameras, neighbours)
+    ranges = sweep_cameras.inverse_depth_range(cameras, chosen)
+    projections = sweep_cameras.relative_projections(cameras, chosen)
+    images = torch.rand(scenes, views, height, width)
+    return images, chosen, projections, ranges, planes, stride
+
+
+def moved(arguments, target):
+    return [a.to(target) if torch.is_tensor(a) and a.is_floating_point() else a for a in arguments]
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("backend", FAST)
+def test_costs_are_those_of_the_reference(backend, size):
+    form = import_module(f"asysplat.ops.plane_sweep.{backend}")
+    arguments = match_arguments(*size)
+    exact = reference.match(*moved(arguments, torch.float64))
+    device = DEVICE[backend]
+    got = form.match(*(a.to(device) if torch.is_tensor(a) else a for a in arguments))
+    assert got.dtype == torch.float32 and got.shape == exact.shape
+    # Seen or not, at the border of an image, may turn on the last bit: of a pixel in a thousand.
+    error = (got.cpu() - exact).abs()
+    assert (error > 2e-5).double().mean() <= 1e-3, error.max()
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("backend", FAST)
+def test_smoothed_planes_are_those_of_the_reference(backend, size):
+    height, width, scenes, views, _, planes, _ = size
+    form = import_module(f"asysplat.ops.plane_sweep.{backend}")
+    costs = 2 * torch.rand(scenes, views, height, width, planes)
+    weights = torch.rand(scenes, views, height, width)
+    edges = 0.2 * torch.rand(scenes, views, 2, height, width)
+    exact = reference.smooth(costs.double(), weights.double(), edges.double())
+    got = form.smooth(*(tensor.to(DEVICE[backend]) for tensor in (costs, weights, edges))).cpu()
+    assert got.dtype == torch.float32 and got.shape == exact.shape
+    # Two planes may cost the same to the last bit: of a pixel in a hundred.
+    assert ((got - exact).abs() > 1e-3).double().mean() <= 1e-2
+
+
+@pytest.mark.skipif(INTERPRETED, reason="slow")
+@pytest.mark.parametrize("stride", [1, 2])
+def test_the_whole_sweep_is_that_of_the_reference(stride):
+    cameras = four_cameras()
+    images, _ = slanted_plane(cameras)
+    exact = plane_sweep(images, cameras, stride, backend="reference")
+    got = plane_sweep(images.float(), cameras.to(torch.float32), stride, backend="cpu")
+    for name in ("inverse_depth", "confidence"):
+        error = (getattr(got, name) - getattr(exact, name)).abs()
+        assert (error > 1e-3).double().mean() <= 1e-2, name
+
+
+def relative_error(found, depth):
+    return (found.inverse_depth * depth - 1).abs()
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_a_textured_plane_is_found(stride):
+    cameras = four_cameras()
+    images, depth = slanted_plane(cameras)
+    depth = torch.nn.functional.avg_pool2d(depth, stride)
+    found = plane_sweep(images, cameras, stride)
+    error = relative_error(found, depth)
+    assert error.median() < 0.02 and error.quantile(0.9) < 0.06
+    assert found.confidence.mean() > 0.9
+
+
+def test_exposure_changes_nothing_much():
+    cameras = four_cameras()
+    images, depth = slanted_plane(cameras)
+    gain = torch.tensor([1, 0.6, 0.8, 1], dtype=torch.float64).view(1, 4, 1, 1, 1)
+    offset = torch.tensor([0, 0.1, 0.05, 0], dtype=torch.float64).view(1, 4, 1, 1, 1)
+    found = plane_sweep(gain * images + offset, cameras)
+    error = relative_error(found, depth)
+    assert error.median() < 0.02 and error.quantile(0.9) < 0.06
+    assert found.confidence.mean() > 0.9
+
+
+def test_what_is_hidden_is_less_certain():
+    """A square before a wall, seen by two cameras: some of the wall is seen by one alone."""
+    cameras = cameras_at([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0)])
+    wall, wall_points = depth_of_plane(cameras, 3.0)
+    square, square_points = depth_of_plane(cameras, 1.5)
+
+    def within(points):
+        return (points[..., :2] - torch.tensor([0.1, 0.0])).abs().amax(-1) < 0.35
+
+    covered = within(square_points)
+    images = torch.where(
+        covered[:, :, None], texture(square_points, scale=0.5, seed=1), texture(wall_points)
+    )
+    # Where the other camera's ray to the wall goes through the square's plane.
+    other = cameras.centers.flip(1)[..., None, None, :]
+    hidden = within(other + (wall_points - other) / 2) & ~covered
+    open_wall = ~hidden & ~covered
+    found = plane_sweep(images, cameras)
+    assert relative_error(found, torch.where(covered, square, wall))[~hidden].median() < 0.05
+    assert found.confidence[hidden].mean() < 0.75 * found.confidence[open_wall].mean()
+
+
+def test_a_unit_of_length_is_as_good_as_another():
+    cameras = four_cameras()
+    images, _ = slanted_plane(cameras)
+    at_one = plane_sweep(images, cameras)
+    for scale in (1e-3, 1e4):
+        cam_to_world = cameras.cam_to_world.clone()
+        cam_to_world[..., :3, 3] *= scale
+        scaled = Cameras(cameras.intrinsics, cam_to_world, cameras.height, cameras.width)
+        found = plane_sweep(images, scaled)
+        for got, expected in (
+            (found.inverse_depth * scale, at_one.inverse_depth),
+            (found.confidence, at_one.confidence),
+        ):
+            torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_scenes_of_a_batch_do_not_meet():
+    cameras = four_cameras()
+    scenes = [slanted_plane(cameras, seed=seed)[0].float() for seed in range(2)]
+    both = Cameras(
+        cameras.intrinsics.float().repeat(2, 1, 1, 1),
+        cameras.cam_to_world.float().repeat(2, 1, 1, 1),
+        cameras.height,
+        cameras.width,
+    )
+    together = plane_sweep(torch.cat(scenes), both)
+    for scene, images in enumerate(scenes):
+        alone = plane_sweep(images, cameras.to(torch.float32))
+        torch.testing.assert_close(together.inverse_depth[scene], alone.inverse_depth[0])
+        torch.testing.assert_close(together.confidence[scene], alone.confidence[0])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(INTERPRETED, reason="this is that process")
+def test_kernels_in_the_interpreter():
+    pytest.importorskip("triton")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", __file__, "-k", "cuda"],
+        env={**os.environ, "TRITON_INTERPRET": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout

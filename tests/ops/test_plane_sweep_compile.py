@@ -1,0 +1,54 @@
+"""The plane sweep's kernels compile for GPUs that are not at hand: what the interpreter takes, the
+compiler may not."""
+
+import pytest
+import torch
+
+triton = pytest.importorskip("triton")
+
+pytestmark = pytest.mark.slow
+
+TYPES = {torch.float32: "fp32", torch.int64: "i64"}
+
+
+def compiled(kernel, arguments, architecture):
+    """The kernel for these arguments, constants and options of a launch, all by name."""
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    signature, constants = {}, {}
+    for parameter in kernel.params:
+        name, value = parameter.name, arguments.pop(parameter.name)
+        if parameter.is_constexpr:
+            signature[name], constants[name] = "constexpr", value
+        else:
+            is_array = isinstance(value, torch.Tensor)
+            signature[name] = "*" + TYPES[value.dtype] if is_array else "i32"
+    source = ASTSource(kernel, signature, constants)
+    return triton.compile(source, GPUTarget("cuda", architecture, 32), arguments)
+
+
+@pytest.mark.parametrize("architecture", [80, 90], ids="sm_{}".format)
+def test_all_kernels_compile(monkeypatch, architecture):
+    from triton.runtime.jit import JITFunction
+
+    from asysplat.ops.plane_sweep import cuda
+
+    kernels = {}
+
+    def run(kernel, *arguments, grid, warmup, **others):
+        arguments = dict(zip(kernel.arg_names, arguments, strict=False)) | others
+        name = kernel.fn.__name__, arguments.get("REVERSE")
+        if name not in kernels:
+            kernels[name] = compiled(kernel, arguments, architecture)
+
+    monkeypatch.setattr(JITFunction, "run", run)
+    neighbours = torch.tensor([[[1, -1, -1, -1], [0, -1, -1, -1]]])
+    costs = cuda.match(
+        *(torch.zeros(1, 2, 8, 12), neighbours, torch.zeros(1, 2, 4, 3, 4), torch.zeros(1, 2, 2)),
+        planes=48,
+        stride=2,
+    )
+    cuda.smooth(costs, torch.ones(1, 2, 4, 6), torch.zeros(1, 2, 2, 4, 6))
+    assert {name for name, _ in kernels} == {"match_band", "add_paths"}
+    assert all(kernel.asm["cubin"] for kernel in kernels.values())

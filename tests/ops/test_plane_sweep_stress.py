@@ -1,0 +1,158 @@
+"""Views that say little or nothing of depth: the plane sweep knows that, and never fails."""
+
+import inspect
+
+import pytest
+import torch
+from swept import cameras_at, four_cameras, slanted_plane, turned
+
+from asysplat.errors import InputError
+from asysplat.ops import plane_sweep
+from asysplat.scene import Cameras
+
+BACKENDS = ["reference", "cpu"]
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request):
+    return request.param
+
+
+def joined(*parts):
+    """The views of several cameras as those of one scene."""
+    return Cameras(
+        torch.cat([part.intrinsics for part in parts], 1),
+        torch.cat([part.cam_to_world for part in parts], 1),
+        parts[0].height,
+        parts[0].width,
+    )
+
+
+def sweep(cameras, backend, images=None):
+    """Sweep in float32, and check that the result is in range."""
+    if images is None:
+        images = torch.rand(*cameras.intrinsics.shape[:2], 3, cameras.height, cameras.width)
+    found = plane_sweep(images.float(), cameras.to(torch.float32), backend=backend)
+    assert found.inverse_depth.isfinite().all() and (found.inverse_depth >= 0).all()
+    assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
+    return found
+
+
+@pytest.mark.parametrize("views", [1, 2, 5])
+def test_nothing_is_known_without_parallax(backend, views):
+    found = sweep(cameras_at([(0.3, -2.0, 1.0)] * views), backend)
+    assert not found.confidence.any() and not found.inverse_depth.any()
+
+
+def test_nothing_is_known_of_what_no_other_view_sees(backend):
+    ahead = cameras_at([(0.0, 0.0, 1.0)])
+    behind = turned(cameras_at([(0.0, 0.0, -1.0)]), 180)
+    found = sweep(joined(ahead, behind), backend)
+    assert not found.confidence.any() and not found.inverse_depth.any()
+
+
+def test_views_behind_each_other(backend):
+    cameras = cameras_at([(0.0, 0.0, 0.4 * v) for v in range(4)])
+    images, depth = slanted_plane(cameras)
+    found = sweep(cameras, backend, images)
+    error = (found.inverse_depth * depth - 1).abs()
+    assert error[found.confidence > 0.9].median() < 0.1
+
+
+def test_views_that_face_each_other(backend):
+    sweep(joined(cameras_at([(0, 0, 0)]), turned(cameras_at([(0, 0, 4)]), 180)), backend)
+
+
+def test_views_at_right_angles(backend):
+    cameras = cameras_at([(0, 0, 0)])
+    sweep(
+        joined(*(turned(cameras_at([(0.1 * v, 0, 0)]), 90 * v) for v in range(4)), cameras), backend
+    )
+
+
+@pytest.mark.parametrize("focal", [0.3, 1, 5, 30])
+def test_focal_lengths(backend, focal):
+    centers = [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (0.3, 0.3, 0.0)]
+    cameras = cameras_at(centers, focal=focal)
+    images, depth = slanted_plane(cameras, distance=3 * focal)
+    found = sweep(cameras, backend, images)
+    error = (found.inverse_depth * depth - 1).abs()
+    assert error[found.confidence > 0.5].median() < 0.1
+
+
+def test_cameras_of_different_focal_lengths(backend):
+    parts = [cameras_at([(0.1 * i, 0, 0)], focal=focal) for i, focal in enumerate((0.3, 1, 30))]
+    sweep(joined(*parts), backend)
+
+
+@pytest.mark.xfail(reason="all planes cost the same, and so all views agree on the first")
+@pytest.mark.parametrize("value", [0.0, 0.37, 1.0])
+def test_blank_images_say_nothing(backend, value):
+    cameras = four_cameras()
+    found = sweep(cameras, backend, torch.full((1, 4, 3, cameras.height, cameras.width), value))
+    assert found.confidence.max() < 0.05
+
+
+@pytest.mark.parametrize("value", [0.0, 0.37, 1.0])
+def test_blank_images_give_numbers(backend, value):
+    cameras = four_cameras()
+    sweep(cameras, backend, torch.full((1, 4, 3, cameras.height, cameras.width), value))
+
+
+def test_noise_is_believed_less_than_texture(backend):
+    cameras = four_cameras()
+    noise = sweep(cameras, backend).confidence.mean()
+    assert noise < 0.75 * sweep(cameras, backend, slanted_plane(cameras)[0]).confidence.mean()
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    cameras = four_cameras()
+    images = torch.rand(1, 4, 3, cameras.height, cameras.width)
+    before = torch.get_num_threads()
+    try:
+        found = []
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            found.append(sweep(cameras, "cpu", images))
+    finally:
+        torch.set_num_threads(before)
+    for other in found[1:]:
+        assert torch.equal(other.inverse_depth, found[0].inverse_depth)
+        assert torch.equal(other.confidence, found[0].confidence)
+
+
+def test_shapes_on_a_device_without_content():
+    cameras = four_cameras().to("meta", torch.float32)
+    images = torch.empty(1, 4, 3, cameras.height, cameras.width, device="meta")
+    found = plane_sweep(images, cameras, stride=4)
+    assert found.inverse_depth.shape == found.confidence.shape == (1, 4, 6, 8)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (
+            {"images": torch.rand(1, 3, 3, 24, 32)},
+            r"images have shape .* expected \(1, 4, 3, 24, 32\)",
+        ),
+        (
+            {"images": torch.rand(4, 3, 24, 32)},
+            r"images have shape .* expected \(1, 4, 3, 24, 32\)",
+        ),
+        ({"stride": 5}, "stride=5 for images of 24x32: give a number that divides both"),
+        ({"stride": 0}, "stride=0"),
+        ({"planes": 3}, "planes=3 .* at least 4 planes"),
+        ({"neighbours": 0}, "neighbours=0: give at least 4 planes and one neighbour"),
+        ({"backend": "fast"}, "backend='fast': expected one of auto, reference, cpu, cuda"),
+        (
+            {"images": torch.rand(1, 4, 3, 24, 32).double(), "backend": "cpu"},
+            "backend 'cpu' computes in float32 and x is float64: choose 'auto'",
+        ),
+    ],
+    ids=str,
+)
+def test_input_that_cannot_be_swept(change, message):
+    arguments = {"images": torch.rand(1, 4, 3, 24, 32), "cameras": four_cameras()} | change
+    with pytest.raises(InputError, match=message):
+        # Behind the back of the tests' type checker, which would be first to complain.
+        inspect.unwrap(plane_sweep)(**arguments)
