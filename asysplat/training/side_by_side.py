@@ -70,19 +70,18 @@ class SideBySide:
         while len(self.copies) < count:
             shared = {id(parameter): parameter for parameter in self.net.parameters()}
             self.copies.append(copy.deepcopy(self.net, shared))
-        copies = self.copies[:count]
+        copies, buffers = self.copies[:count], list(self.net.buffers())
         for net in copies:
-            for module, original in zip(net.modules(), self.net.modules(), strict=True):
-                module.training = original.training
-            for buffer, original in zip(net.buffers(), self.net.buffers(), strict=True):
+            if net.training != self.net.training:
+                net.train(self.net.training)
+            for buffer, original in zip(net.buffers(), buffers, strict=True):
                 buffer.copy_(original)
         return copies
 
     def _count_scenes(self, copies: list[nn.Module]) -> None:
         """Move the buffers by the mean of the copies' changes; counters by that of one."""
-        for buffer, *changed in zip(
-            self.net.buffers(), *(net.buffers() for net in copies), strict=True
-        ):
+        buffers = zip(self.net.buffers(), *(net.buffers() for net in copies), strict=True)
+        for buffer, *changed in buffers:
             if buffer.is_floating_point():
                 buffer += torch.stack([other - buffer for other in changed]).mean(0)
             else:
