@@ -94,11 +94,17 @@ def disparity_distance(
     target: Float[Tensor, "*batch V H W"],
     valid: Bool[Tensor, "*batch V H W"],
 ) -> Float[Tensor, ""]:
-    """Compute the mean SmoothL1 between normalised disparities over the valid pixels."""
-    depth, target, valid = (maps.flatten(0, -3) for maps in (depth, target, valid))
-    found, expected = (normalised_disparity(maps, valid) for maps in (depth, target))
-    error = F.smooth_l1_loss(found, expected, reduction="none")
-    return (error * valid).sum() / valid.sum().clamp_min(1)
+    """Compute the mean over scenes of the mean SmoothL1 between normalised disparities.
+
+    The inner mean is over a scene's valid pixels.
+    """
+    found, expected = (
+        normalised_disparity(maps.flatten(0, -3), valid.flatten(0, -3)).view_as(maps)
+        for maps in (depth, target)
+    )
+    error = F.smooth_l1_loss(found, expected, reduction="none") * valid
+    of_scene = (-3, -2, -1)
+    return (error.sum(of_scene) / valid.sum(of_scene).clamp_min(1)).mean()
 
 
 def normalised_disparity(

@@ -16,6 +16,7 @@ from asysplat.models.network import Network
 from asysplat.rendering import render
 from asysplat.training.losses import ReconstructionLoss
 from asysplat.training.outcome import Outcome
+from asysplat.training.side_by_side import SideBySide
 
 
 class Reconstruction(lightning.LightningModule):
@@ -45,6 +46,7 @@ class Reconstruction(lightning.LightningModule):
         net.checkpoint_layers(checkpoint_layers)
         self.net, self.loss = net, loss
         self.optimizer, self.schedule = optimizer, schedule
+        self._side_by_side = SideBySide(net, self._terms)
         self.register_buffer("background", torch.tensor(background), persistent=False)
 
     def reconstruct(self, batch: dict[str, Any], depth: bool) -> Outcome:
@@ -54,7 +56,10 @@ class Reconstruction(lightning.LightningModule):
             batch: `inputs` and `targets`, both Views.
             depth: whether to render depth too.
         """
-        gaussians = self.net(batch["inputs"])
+        return self._reconstruct(self.net, batch, depth)
+
+    def _reconstruct(self, net: nn.Module, batch: dict[str, Any], depth: bool) -> Outcome:
+        gaussians = net(batch["inputs"])
         targets = batch["targets"]
         rendering = render(
             gaussians, targets.cameras, self.background, depth=depth, masks=targets.masks
@@ -62,15 +67,23 @@ class Reconstruction(lightning.LightningModule):
         return Outcome(gaussians, rendering)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
-        outcome = self.reconstruct(batch, depth=self.loss.needs_depth)
-        terms = self.loss(outcome, batch)
         size = len(batch["scene"])
+        if self.device.type == "cpu" and size > 1:
+            terms = self._side_by_side(batch)
+        else:
+            terms = self._terms(self.net, batch)
+        quality = terms.pop("psnr")
         self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
         self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])
-        targets = batch["targets"]
-        quality = psnr(targets.masked(outcome.rendering.image.detach()), targets.images).mean()
         self.log("train/psnr", quality, prog_bar=True, batch_size=size)
         return terms["loss"]
+
+    def _terms(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Compute the loss, its terms and the PSNR: means over the scenes of the batch."""
+        outcome = self._reconstruct(net, batch, depth=self.loss.needs_depth)
+        targets = batch["targets"]
+        image = targets.masked(outcome.rendering.image.detach())
+        return {**self.loss(outcome, batch), "psnr": psnr(image, targets.images).mean()}
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> Outcome:
         return self.reconstruct(batch, depth=True)

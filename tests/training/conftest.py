@@ -67,4 +67,5 @@ def make_train(logs, run_script, repository):
             process.communicate()
 
     run.alone, run.start, run.complete, run.environment = run_alone, start, complete, environment
+    run.logs = logs
     return run

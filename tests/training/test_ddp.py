@@ -18,8 +18,7 @@ pytestmark = [pytest.mark.hours, pytest.mark.timeout(1800)]
 CONF = Path(__file__).parents[2] / "conf"
 PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
 MODELS = sorted(p.stem for p in (CONF / "model").glob("*.yaml") if p.stem not in PARTS)
-# The depth term's mean is over the known pixels of a batch, not over its scenes.
-OVERRIDES = ["width=0.125", "state_size=8", "training.loss.depth=0", "training.loss.perceptual=0"]
+OVERRIDES = ["width=0.125", "state_size=8", "training.loss.perceptual=0"]
 SIZE, INPUTS, TARGETS, PROCESSES = 32, 2, 1, 2
 
 
@@ -139,7 +138,7 @@ def test_two_processes_take_the_step_of_one(results, model):
 
 def first_moments(train, *overrides):
     """Train; return AdamW's running means of the gradients after the last step."""
-    batches = ["model=asysplat_pred_fine", "model.layers=1m1t", "training.loss.depth=0"]
+    batches = ["model=asysplat_pred_fine", "model.layers=1m1t"]
     result = train.alone(*batches, *overrides)
     assert result.returncode == 0, result.stderr
     (line,) = [line for line in result.stdout.splitlines() if line.startswith("run: ")]

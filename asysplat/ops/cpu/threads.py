@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
+from threading import get_ident
 from typing import TypeVar
 
 import numpy as np
@@ -39,7 +40,8 @@ def _run(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> li
     ]
     if threads == 1 or len(ranges) == 1:
         return [kernel(start, stop, *args) for start, stop in ranges]
-    jobs = [_pool(threads).submit(kernel, start, stop, *args) for start, stop in ranges]
+    pool = _pool(threads, get_ident())
+    jobs = [pool.submit(kernel, start, stop, *args) for start, stop in ranges]
     return [job.result() for job in jobs]
 
 
@@ -73,7 +75,8 @@ def _portions() -> int:
 
 
 @cache
-def _pool(threads: int) -> ThreadPoolExecutor:
+def _pool(threads: int, caller: int) -> ThreadPoolExecutor:
+    """Return the threads of `caller`: those that compute side by side do not wait for another's."""
     return ThreadPoolExecutor(threads, thread_name_prefix="asysplat")
 
 

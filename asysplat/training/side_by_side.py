@@ -1,0 +1,127 @@
+"""The scenes of a batch side by side on a CPU, each in a thread of its own.
+
+A scene at small resolution leaves most cores idle: its operators are too short to be divided. Whole
+scenes divide well. Each gives its gradients, which are averaged in the order of the scenes: the
+number of threads that take turns at them changes no bit.
+"""
+
+import copy
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial, reduce
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+Batch = dict[str, Any]
+Terms = dict[str, Tensor]
+
+
+class SideBySide:
+    """Computes means over the scenes of a batch, and their gradients.
+
+    Batch norms see one scene at a time, as if each scene had a process of its own; their running
+    means move by the mean of what they saw.
+
+    Args:
+        net: whose parameters are trained.
+        compute: network, batch -> terms, "loss" among them.
+    """
+
+    def __init__(self, net: nn.Module, compute: Callable[[nn.Module, Batch], Terms]):
+        self.net, self.compute = net, compute
+        self.copies: list[nn.Module] = []  # one a scene, with the parameters of `net`
+
+    def __call__(self, batch: Batch) -> Terms:
+        """Compute the mean of each term; the backward pass of "loss" gives the mean gradients."""
+        scenes = split(batch)
+        copies = self._copies(len(scenes))
+        parameters = [p for p in self.net.parameters() if p.requires_grad]
+        # Autocast is a setting of this thread alone.
+        autocast = partial(
+            torch.autocast,
+            "cpu",
+            enabled=torch.is_autocast_enabled("cpu"),
+            dtype=torch.get_autocast_dtype("cpu"),
+            cache_enabled=False,  # it would be shared by all threads
+        )
+
+        def differentiate(net: nn.Module, scene: Batch) -> tuple[Terms, tuple[Tensor, ...]]:
+            with autocast():
+                terms = self.compute(net, scene)
+            grads = torch.autograd.grad(terms["loss"], parameters, materialize_grads=True)
+            return {name: term.detach() for name, term in terms.items()}, grads
+
+        cores = torch.get_num_threads()
+        workers = min(len(scenes), cores)
+        found = list(_pool(workers, cores // workers).map(differentiate, copies, scenes))
+        self._count_scenes(copies)
+        terms, grads = zip(*found, strict=True)
+        means = {name: torch.stack([each[name] for each in terms]).mean() for name in terms[0]}
+        sums = [reduce(torch.add, each) for each in zip(*grads, strict=True)]
+        means["loss"] = _Known.apply(means["loss"], sums, len(scenes), *parameters)
+        return means
+
+    def _copies(self, count: int) -> list[nn.Module]:
+        """Return networks that share the parameters and start from the same running means."""
+        while len(self.copies) < count:
+            shared = {id(parameter): parameter for parameter in self.net.parameters()}
+            self.copies.append(copy.deepcopy(self.net, shared))
+        copies, buffers = self.copies[:count], list(self.net.buffers())
+        for net in copies:
+            if net.training != self.net.training:
+                net.train(self.net.training)
+            for buffer, original in zip(net.buffers(), buffers, strict=True):
+                buffer.copy_(original)
+        return copies
+
+    def _count_scenes(self, copies: list[nn.Module]) -> None:
+        """Move the buffers by the mean of the copies' changes; counters by that of one."""
+        buffers = zip(self.net.buffers(), *(net.buffers() for net in copies), strict=True)
+        for buffer, *changed in buffers:
+            if buffer.is_floating_point():
+                buffer += torch.stack([other - buffer for other in changed]).mean(0)
+            else:
+                buffer.copy_(changed[0])
+
+
+def split(batch: Batch) -> list[Batch]:
+    """Return a batch of one scene for each of the scenes."""
+    return [
+        {
+            "scene": [scene],
+            "inputs": batch["inputs"].map(lambda tensor, i=index: tensor[i, None]),
+            "targets": batch["targets"].map(lambda tensor, i=index: tensor[i, None]),
+        }
+        for index, scene in enumerate(batch["scene"])
+    ]
+
+
+class _Known(torch.autograd.Function):
+    """A number whose gradients are known: `sums` / `count`."""
+
+    @staticmethod
+    def forward(ctx, number, sums, count, *parameters):
+        ctx.sums, ctx.count = sums, count
+        return number.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        factor = grad / ctx.count
+        return None, None, None, *(total * factor for total in ctx.sums)
+
+
+@cache
+def _pool(workers: int, threads: int) -> ThreadPoolExecutor:
+    """Return threads that compute, each with `threads` for its operators."""
+    return ThreadPoolExecutor(
+        workers, "asysplat-scene", initializer=torch.set_num_threads, initargs=(threads,)
+    )
+
+
+# A forked process starts without its parent's threads.
+os.register_at_fork(after_in_child=_pool.cache_clear)
