@@ -127,7 +127,7 @@ class PhotographHead(GaussianHead):
         far: float = 100.0,
         opacity_bias: float = 0.0,
         scale_bias: float = -0.5,
-        opacity_gain: float = 4.0,
+        opacity_gain: float = 0.0,
     ):
         super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_gain, std=1e-3)
         self.near, self.far = near, far
@@ -192,7 +192,7 @@ class LongLRMHead(GaussianHead):
         opacity_bias: float = -2.0,
         scale_bias: float = -6.9,
         largest: float = -1.2,
-        opacity_gain: float = 4.0,
+        opacity_gain: float = 0.0,
     ):
         super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_gain, std=0.02)
         self.farthest = farthest
