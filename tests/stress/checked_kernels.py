@@ -14,9 +14,9 @@ from poison import FILLS, poisoned
 from tangents import tangent_scene
 from torch import Tensor
 
-from asysplat.ops import selective_scan, ssd
+from asysplat.ops import plane_sweep, selective_scan, ssd
 from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.vectors import load, load_some, store
+from asysplat.ops.cpu.vectors import gather_pairs, load, load_some, store, zeros
 from asysplat.rendering import Skips
 from asysplat.rendering.cpu.math import take_sum
 from asysplat.scene import Cameras, Gaussians
@@ -26,6 +26,7 @@ CPU = next(backend for backend in FAST if backend.name == "cpu")
 SSD_SIZES = [(1, 1, 1, 1), (2, 63, 3, 5), (1, 65, 2, 16), (1, 200, 5, 20), (1, 1100, 3, 33)]
 SCAN_SIZES = [(1, 1, 1), (2, 31, 16), (1, 33, 40), (3, 64, 17), (1, 257, 128)]
 STATES = (1, 16, 20)
+ONE, LAST = np.float32(1), np.float32(15)
 
 
 def wild_scene(seed: int, height: int, width: int, degree: int) -> tuple[Gaussians, Cameras]:
@@ -96,6 +97,27 @@ def scanned(scan, size: tuple[int, ...], state: int, reverse: bool) -> Result:
     return Result({"y": y.detach()}, dict(zip(inputs, grads, strict=True)), {})
 
 
+def check_sweeps() -> int:
+    """How many scenes were swept, each in all memories."""
+    sizes = [(1, 1, 1, 4), (3, 4, 1, 20), (12, 9, 3, 33), (24, 32, 2, 64)]
+    for seed, (height, width, stride, planes) in enumerate(sizes):
+        generator = torch.Generator().manual_seed(seed)
+        images = torch.rand(2, 4, 3, height, width, generator=generator)
+        angles = torch.randn(2, 4, 3, 3, generator=generator)
+        poses = torch.eye(4).repeat(2, 4, 1, 1)
+        poses[..., :3, :3] = torch.linalg.matrix_exp(0.2 * (angles - angles.mT))
+        poses[..., :3, 3] = torch.randn(2, 4, 3, generator=generator)
+        pinhole = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+        cameras = Cameras(pinhole.expand(2, 4, 3, 3), poses, height, width)
+        in_all_memories(lambda i=images, c=cameras, s=stride, p=planes: swept(i, c, s, p))
+    return len(sizes)
+
+
+def swept(images: Tensor, cameras: Cameras, stride: int, planes: int) -> Result:
+    found = plane_sweep(images, cameras, stride, planes, backend="cpu")
+    return Result({"depth": found.inverse_depth, "confidence": found.confidence}, {}, {})
+
+
 def in_all_memories(run) -> None:
     plain = run()
     for fill in FILLS:
@@ -115,11 +137,13 @@ def _step_out(which, numbers, rows):
         store(rows, len(rows), load(rows, 0))
     elif which == 3:
         store(rows, 0, load_some(numbers, len(numbers) - 3, 4))
+    elif which == 4:  # the last number has none to its right
+        store(rows, 0, gather_pairs(rows, zeros() + ONE, zeros() + LAST)[0])
 
 
 def check_the_checks() -> int:
     """A step out of an array is an error, whichever way it is taken."""
-    kinds = 4
+    kinds = 5
     for which in range(kinds):
         try:
             _step_out(which, np.zeros(32, np.float32), np.zeros((2, 16), np.float32))
@@ -133,4 +157,5 @@ if __name__ == "__main__":
     assert numba.config.BOUNDSCHECK, "set NUMBA_BOUNDSCHECK=1"
     print(f"{check_the_checks()} steps out of an array seen")
     print(f"{check_scans()} sequences, {len(FILLS) + 1} memories: the same bits", flush=True)
+    print(f"{check_sweeps()} sweeps, {len(FILLS) + 1} memories: the same bits", flush=True)
     print(f"{check_renderer()} scenes, {len(FILLS) + 1} memories: the same bits and statistics")
