@@ -26,6 +26,7 @@ from asysplat.scene import Cameras, TensorRecord
 
 PLANES = 64
 NEIGHBOURS = 4
+SURE = 0.5  # by which the best plane's costs, of four paths, are less than the mean
 LUMA = (0.299, 0.587, 0.114)
 
 
@@ -98,9 +99,10 @@ def _sweep(
     edges = _edges(images, stride)
     agreement = images.new_ones(*images.shape[:2], small.height, small.width)
     for _ in range(2):  # once with all costs, once with those of what the neighbours agree on
-        plane = form.smooth(costs, agreement, edges)
-        found = Depths.at_planes(plane, ranges, planes)
+        lowest = form.smooth(costs, agreement, edges)
+        found = Depths.at_planes(lowest.plane, ranges, planes)
         agreement = compare(found, small, chosen)
+    agreement = agreement * (lowest.contrast / SURE).clamp(0, 1)
     precision = found.precision()
     return fill(found.inverse, agreement * precision), agreement * (1 + precision) / 2
 

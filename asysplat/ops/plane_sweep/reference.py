@@ -1,5 +1,7 @@
 """The plane sweep's two kernels in torch, for any device and float type."""
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
@@ -16,6 +18,13 @@ LARGE_STEP = 0.6  # for more than that,
 EDGE = 0.05  # half of it where the colour changes by this
 LEAST_WEIGHT = 0.05  # of a pixel's own costs
 FLATTEST = 1e-9  # bend of a parabola that has a minimum
+
+
+class Lowest(NamedTuple):
+    """Where the costs of a pixel are least, counted in planes, and how much less than their mean."""
+
+    plane: Float[Tensor, "B V h w"]
+    contrast: Float[Tensor, "B V h w"]
 
 
 def match(
@@ -98,8 +107,8 @@ def smooth(
     costs: Float[Tensor, "B V h w D"],
     weights: Float[Tensor, "B V h w"],
     edges: Float[Tensor, "B V 2 h w"],
-) -> Float[Tensor, "B V h w"]:
-    """Return the plane of least smoothed cost, between planes by the parabola through three.
+) -> Lowest:
+    """Find the plane of least smoothed cost.
 
     The costs are added up along rows and columns, both ways; a step between neighbouring pixels
     costs less where the colour changes (`edges`, to the left and above).
@@ -116,8 +125,8 @@ def smooth(
     return lowest_plane(total)
 
 
-def lowest_plane(total: Float[Tensor, "*pixels D"]) -> Float[Tensor, "*pixels"]:
-    """Return the plane of least cost, between planes by the parabola through three."""
+def lowest_plane(total: Float[Tensor, "B V h w D"]) -> Lowest:
+    """Find the plane of least cost, between planes by the parabola through three."""
     planes = total.shape[-1]
     best = total.argmin(-1, keepdim=True)
     middle = total.gather(-1, best)
@@ -126,7 +135,8 @@ def lowest_plane(total: Float[Tensor, "*pixels D"]) -> Float[Tensor, "*pixels"]:
     bend = before + after - 2 * middle
     inside = (best > 0) & (best < planes - 1) & (bend > FLATTEST)
     shift = torch.where(inside, (before - after) / (2 * bend.clamp_min(FLATTEST)), 0)
-    return (best + shift.clamp(-0.5, 0.5))[..., 0]
+    contrast = total.mean(-1) - middle[..., 0]
+    return Lowest((best + shift.clamp(-0.5, 0.5))[..., 0], contrast)
 
 
 def _along(

@@ -29,29 +29,29 @@ def smooth(
     costs: Float[Tensor, "B V h w D"],
     weights: Float[Tensor, "B V h w"],
     edges: Float[Tensor, "B V 2 h w"],
-) -> Float[Tensor, "B V h w"]:
-    """Return the plane of least smoothed cost; see `reference.smooth`."""
-    found = torch.empty(weights.shape)
+) -> reference.Lowest:
+    """Find the plane of least smoothed cost; see `reference.smooth`."""
+    found = reference.Lowest(torch.empty(weights.shape), torch.empty(weights.shape))
     run_blocks(
         smooth_views,
         even_bounds(weights.shape[0] * weights.shape[1]),
         costs.flatten(0, 1).contiguous().numpy(),
         weights.clamp_min(reference.LEAST_WEIGHT).flatten(0, 1).contiguous().numpy(),
         (reference.LARGE_STEP / (1 + edges / reference.EDGE)).flatten(0, 1).contiguous().numpy(),
-        found.flatten(0, 1).numpy(),
+        *(each.flatten(0, 1).numpy() for each in found),
     )
     return found
 
 
 @kernel
-def smooth_views(start, stop, costs, weights, penalties, found):
-    """Write the planes of the views start to stop.
+def smooth_views(start, stop, costs, weights, penalties, plane, contrast):
+    """Write the planes of the views start to stop, and the contrasts.
 
     Args:
         costs: [n, h, w, D].
         weights: [n, h, w], of a pixel's costs.
         penalties: [n, 2, h, w], of a step of several planes from the left and from above.
-        found: [n, h, w].
+        plane, contrast: [n, h, w].
     """
     h, w, planes = costs.shape[1:]
     vectors = -(-planes // LANES)
@@ -101,7 +101,9 @@ def smooth_views(start, stop, costs, weights, penalties, found):
                     value = load_some(up, 1 + v * LANES, LANES) + load(total[y, x], v)
                     store(total[y, x], v, value)
                     best = min(best, value)
-                found[n, y, x] = _between(total[y, x].ravel(), least(best), planes)
+                costs_here, lowest = total[y, x].ravel(), least(best)
+                plane[n, y, x] = _between(costs_here, lowest, planes)
+                contrast[n, y, x] = costs_here[:planes].mean() - lowest
 
 
 @inline

@@ -18,8 +18,8 @@ def smooth(
     costs: Float[Tensor, "B V h w D"],
     weights: Float[Tensor, "B V h w"],
     edges: Float[Tensor, "B V 2 h w"],
-) -> Float[Tensor, "B V h w"]:
-    """Return the plane of least smoothed cost; see `reference.smooth`."""
+) -> reference.Lowest:
+    """Find the plane of least smoothed cost; see `reference.smooth`."""
     B, V, h, w, planes = costs.shape
     costs = costs.contiguous()
     weights = weights.clamp_min(reference.LEAST_WEIGHT).contiguous()
