@@ -54,8 +54,8 @@ def plane_sweep(
     """Find the depth of every `stride` x `stride` block of pixels; h = H / stride, w = W / stride.
 
     The costs take 4 B V h w D bytes for D planes. Beside them "cpu" holds twice those of one view
-    for each thread, "cuda" all of them once more, and "reference" about eight times, and about ten
-    maps [D, H, W] of one view.
+    for each thread, "cuda" all of them once more, and "reference" several times, and some fifty
+    maps [D, H, W] while it compares one view.
 
     Args:
         images: RGB in [0, 1].
