@@ -5,6 +5,7 @@ and a confidence for each pixel, and gives the head a distance to correct and an
 from. Without one (`model/prior=none`) the network is the paper's.
 """
 
+import warnings
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +19,7 @@ from asysplat.scene import TensorRecord, Views
 
 PRIOR_CHANNELS = 2
 UNKNOWN = 10**0.5  # a distance for what nobody knows, the middle of PhotographHead's range
+SPREAD = (0, 1, 2, 4)  # blocks around a point: one farther away is trusted a quarter less
 LONGEST_SIDE = 128  # of the images that are swept: twice the planes
 
 
@@ -79,11 +81,43 @@ class DepthPrior(nn.Module):
     """The depths that come with the data, where there are any; gaps are filled from around."""
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
-        depths = views.depths
-        if depths is None:
-            depths = views.images.new_zeros(*views.images.shape[:2], *views.images.shape[-2:])
-        known = (depths > 0).to(depths)
-        stride = depths.shape[-2] // size[0]
-        share = F.avg_pool2d(known, stride)
-        inverse = F.avg_pool2d(known / depths.clamp_min(1e-6), stride) / share.clamp_min(1e-6)
+        inverse, share = _blocks(views.depths, views, size)
         return Prior.of_inverse_depth(fill(inverse, share), share, views, size)
+
+
+class PointsPrior(nn.Module):
+    """The depths of the scene's sparse points, spread to what lies around them.
+
+    Views without points (`data.points`) are unknown everywhere; a warning says so once.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.warned = False
+
+    def forward(self, views: Views, size: tuple[int, int]) -> Prior:
+        if views.point_depths is None and not self.warned:
+            self.warned = True
+            warnings.warn(
+                "model/prior=points has no points to look at: set data.points=true, with data whose "
+                "files have sparse points (data/README.md). It goes on knowing nothing.",
+                stacklevel=2,
+            )
+        inverse, share = _blocks(views.point_depths, views, size)
+        known = (share > 0).to(share)
+        spread = [F.max_pool2d(known, 2 * r + 1, stride=1, padding=r) for r in SPREAD]
+        confidence = torch.stack(spread).mean(0)
+        return Prior.of_inverse_depth(fill(inverse, known), confidence, views, size)
+
+
+def _blocks(
+    depths: Float[Tensor, "B V H W"] | None, views: Views, size: tuple[int, int]
+) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V h w"]]:
+    """Return the mean inverse depth of each block of pixels, and the share that is known."""
+    if depths is None:
+        depths = torch.zeros_like(views.images[:, :, 0])
+    known = (depths > 0).to(depths)
+    stride = depths.shape[-2] // size[0]
+    share = F.avg_pool2d(known, stride)
+    inverse = F.avg_pool2d(known / depths.clamp_min(1e-6), stride) / share.clamp_min(1e-6)
+    return inverse, share
