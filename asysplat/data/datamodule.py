@@ -1,5 +1,6 @@
 """Batches of reconstruction tasks, the same for the same seed wherever a run is resumed."""
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from multiprocessing import get_all_start_methods
@@ -78,7 +79,7 @@ class SceneDataModule(lightning.LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         """Make the validation and test tasks, and try one training task."""
         if not self.evaluation:
-            TrainingTasks(self)[0]
+            samples = {"training": TrainingTasks(self)[0]}
             for name in ("val", "test"):
                 tasks = self.source.evaluation(name, self.inputs, self.targets)
                 self.evaluation[name] = FixedTasks(tasks, self.points)
@@ -88,6 +89,9 @@ class SceneDataModule(lightning.LightningDataModule):
                     self.tests[name] = FixedTasks(make_tasks(), self.points)
                 except InputError as error:
                     raise InputError(f"data.test_sets.{name}: {error}") from error
+            samples |= {name: tasks[0] for name, tasks in self.tests.items()}
+            if self.points:
+                _warn_of_no_points(samples)
 
     def check_sizes(self, check: Callable[[int, int], None]) -> None:
         """Call `check(height, width)` for every set; its InputError names the set."""
@@ -196,6 +200,20 @@ def with_points(views: Views, capture: Capture) -> Views:
     if points is None:
         return views
     return replace(views, point_depths=depths_of_points(points, views.cameras))
+
+
+def _warn_of_no_points(samples: Mapping[str, Sample]) -> None:
+    lacking = [
+        f"{samples[name]['scene']} ({name})"
+        for name in samples
+        if samples[name]["inputs"].point_depths is None
+    ]
+    if lacking:
+        warnings.warn(
+            f"data.points=true, but there are no sparse points of {', '.join(lacking)}: a prior "
+            "knows nothing from them. data/README.md says which files have some.",
+            stacklevel=3,
+        )
 
 
 def collate(samples: list[Sample]) -> Sample:

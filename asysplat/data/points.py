@@ -32,9 +32,7 @@ def depths_of_points(points: Points, cameras: Cameras) -> Float[Tensor, "V H W"]
     return torch.where(seen, 1 / inverse, 0).to(cameras.intrinsics)
 
 
-def _nearest(
-    projected: Float[Tensor, "P 3"], height: int, width: int
-) -> Float[Tensor, "{height} {width}"]:
+def _nearest(projected: Float[Tensor, "P 3"], height: int, width: int) -> Float[Tensor, "H W"]:
     """Return the greatest inverse depth in every pixel, from homogeneous image positions."""
     z = projected[:, 2]
     x, y = (projected[:, :2] / z[:, None]).floor().unbind(-1)

@@ -5,7 +5,6 @@ and a confidence for each pixel, and gives the head a distance to correct and an
 from. Without one (`model/prior=none`) the network is the paper's.
 """
 
-import warnings
 from dataclasses import dataclass
 
 import torch
@@ -88,21 +87,10 @@ class DepthPrior(nn.Module):
 class PointsPrior(nn.Module):
     """The depths of the scene's sparse points, spread to what lies around them.
 
-    Views without points (`data.points`) are unknown everywhere; a warning says so once.
+    The data gives them with `data.points=true`; without any, all is unknown.
     """
 
-    def __init__(self):
-        super().__init__()
-        self.warned = False
-
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
-        if views.point_depths is None and not self.warned:
-            self.warned = True
-            warnings.warn(
-                "model/prior=points has no points to look at: set data.points=true, with data whose "
-                "files have sparse points (data/README.md). It goes on knowing nothing.",
-                stacklevel=2,
-            )
         inverse, share = _blocks(views.point_depths, views, size)
         known = (share > 0).to(share)
         spread = [F.max_pool2d(known, 2 * r + 1, stride=1, padding=r) for r in SPREAD]

@@ -73,9 +73,7 @@ def plane_sweep(
     images = images if images.dtype == torch.float64 else images.float()
     poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
     return SweptDepth(
-        *_sweep(
-            images, intrinsics, poses, stride, planes, neighbours, backend, ranges=ranges
-        )
+        *_sweep(images, intrinsics, poses, stride, planes, neighbours, backend, ranges=ranges)
     )
 
 
