@@ -18,6 +18,9 @@ from asysplat.scene import TensorRecord, Views
 
 PRIOR_CHANNELS = 2
 UNKNOWN = 10**0.5  # a distance for what nobody knows, the middle of PhotographHead's range
+OUTLIERS = 0.02  # share of a view's points, at either end, that do not count for its range,
+MARGIN = 2.0  # and how much wider it is: surfaces without texture have no points
+FEWEST = 16  # points in a view that tell its range
 SPREAD = (0, 1, 2, 4)  # blocks around a point: one farther away is trusted a quarter less
 LONGEST_SIDE = 128  # of the images that are swept: twice the planes
 
@@ -59,7 +62,8 @@ class Prior(TensorRecord):
 class SweepPrior(nn.Module):
     """Depth from a plane sweep over each view's neighbours (`asysplat.ops.plane_sweep`).
 
-    Large images are swept at a size that suits the number of planes.
+    Large images are swept at a size that suits the number of planes. How far is swept follows from
+    the cameras, and in views that see enough sparse points from those.
     """
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
@@ -72,7 +76,12 @@ class SweepPrior(nn.Module):
         images = F.avg_pool2d(views.images.flatten(0, 1), factor).unflatten(
             0, views.images.shape[:2]
         )
-        found = plane_sweep(images, small, stride=max(1, small.height // size[0]))
+        found = plane_sweep(
+            images,
+            small,
+            stride=max(1, small.height // size[0]),
+            ranges=_ranges(views.point_depths, factor),
+        )
         return Prior.of_inverse_depth(found.inverse_depth, found.confidence, views, size)
 
 
@@ -96,6 +105,24 @@ class PointsPrior(nn.Module):
         spread = [F.max_pool2d(known, 2 * r + 1, stride=1, padding=r) for r in SPREAD]
         confidence = torch.stack(spread).mean(0)
         return Prior.of_inverse_depth(fill(inverse, known), confidence, views, size)
+
+
+def _ranges(depths: Float[Tensor, "B V H W"] | None, factor: int) -> Float[Tensor, "B V 2"] | None:
+    """Return the least and greatest inverse depth that points suggest; 0 and 0 where few are seen.
+
+    Args:
+        depths: of points.
+        factor: side of the blocks of pixels of which the nearest point counts.
+    """
+    if depths is None:
+        return None
+    inverse = F.max_pool2d((depths > 0) / depths.clamp_min(1e-6), factor).flatten(2)
+    ordered = inverse.sort(dim=-1).values  # pixels without a point come first
+    count = (ordered > 0).sum(-1, keepdim=True)
+    shares = ordered.new_tensor([OUTLIERS, 1 - OUTLIERS])
+    index = ordered.shape[-1] - count + (shares * (count - 1)).round().long()
+    ranges = ordered.gather(-1, index.clamp_max(ordered.shape[-1] - 1))
+    return ranges.where(count >= FEWEST, 0) * ordered.new_tensor([1 / MARGIN, MARGIN])
 
 
 def _blocks(

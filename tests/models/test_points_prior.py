@@ -1,10 +1,14 @@
-"""Sparse points as a prior: exact at a point, less trusted with its distance, unknown without."""
+"""Sparse points as a prior, exact at a point and less trusted away from it, and in a sweep."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 
-from asysplat.models import PointsPrior
+from asysplat.models import PointsPrior, SweepPrior
+from asysplat.models import prior as prior_module
 from asysplat.models.prior import UNKNOWN
+from asysplat.ops import plane_sweep
 from asysplat.scene import Cameras, Views
 
 SIZE = (16, 16)
@@ -53,3 +57,33 @@ def test_gaussians_start_at_the_points(build):
     points = torch.full((1, 2, 32, 32), 4.0)
     gaussians = net(make_views(points))
     torch.testing.assert_close(gaussians.means[..., 2], torch.full((1, 512), 4.0))
+
+
+def test_a_sweep_looks_where_the_points_are(monkeypatch):
+    """As far as they say in a view with enough of them, and as the cameras say in the other."""
+    given = []
+
+    def spy(images, cameras, stride, ranges):
+        given.append(ranges)
+        return plane_sweep(images, cameras, stride, backend="reference", ranges=ranges)
+
+    monkeypatch.setattr(prior_module, "plane_sweep", spy)
+    points = torch.zeros(1, 2, 32, 32)
+    points[0, 0, :10, :10] = torch.linspace(2, 4, 100).reshape(10, 10)
+    points[0, 0, 20, 20] = 0.01  # a stray point
+    points[0, 1, 3, 3:6] = 1.0  # too few
+    views = make_views(points)
+    views.cameras.cam_to_world[0, 1, 0, 3] = 0.5
+    known = SweepPrior()(views, SIZE)
+    assert given[0][0, 0].tolist() == pytest.approx([1 / 8, 1], rel=0.05)
+    assert given[0][0, 1].tolist() == [0, 0]
+    unknown = SweepPrior()(replace(views, point_depths=torch.zeros_like(points)), SIZE)
+    cameras = SweepPrior()(replace(views, point_depths=None), SIZE)
+    assert given[2] is None and torch.equal(unknown.distance, cameras.distance)
+    assert not torch.equal(known.distance, cameras.distance)
+
+
+def test_a_sweep_of_one_view_with_points_is_unknown():
+    views = make_views(torch.full((1, 2, 32, 32), 2.0)).map(lambda tensor: tensor[:, :1])
+    prior = SweepPrior()(views, SIZE)
+    assert prior.confidence.max() == 0 and prior.distance.isfinite().all()
