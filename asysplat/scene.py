@@ -179,18 +179,21 @@ class Views(TensorRecord):
         images: [..., V, 3, H, W] RGB in [0, 1].
         depths: [..., V, H, W] along the camera's z axis, in scene units; 0 where unknown.
         masks: [..., V, H, W], True where the pixel counts.
+        point_depths: [..., V, H, W], as depths, of the scene's sparse points; 0 where there is
+            none.
     """
 
     cameras: Cameras
     images: Float[Tensor, "*batch V 3 H W"]
     depths: Float[Tensor, "*batch V H W"] | None = None
     masks: Bool[Tensor, "*batch V H W"] | None = None
+    point_depths: Float[Tensor, "*batch V H W"] | None = None
 
     def __post_init__(self):
         batch = self.cameras.intrinsics.shape[:-2]
         size = (self.cameras.height, self.cameras.width)
         _check_exact("Views.images", self.images, (*batch, 3, *size))
-        for name in ("depths", "masks"):
+        for name in ("depths", "masks", "point_depths"):
             if getattr(self, name) is not None:
                 _check_exact(f"Views.{name}", getattr(self, name), (*batch, *size))
 
@@ -211,6 +214,7 @@ class Views(TensorRecord):
             images=pick(self.images, -4),
             depths=pick(self.depths, -3),
             masks=pick(self.masks, -3),
+            point_depths=pick(self.point_depths, -3),
         )
 
     def masked(self, rendered: Float[Tensor, "*batch V 3 H W"]) -> Float[Tensor, "*batch V 3 H W"]:
@@ -232,13 +236,16 @@ class Views(TensorRecord):
             ((self.images >= 0) & (self.images <= 1)).all(-1).all(-1).all(-1),
             "has values outside [0, 1]: divide 8-bit images by 255",
         )
-        if self.depths is not None:
-            _check_finite(f"{name}.depths", self.depths, 2)
-            _check_all(
-                f"{name}.depths",
-                (self.depths >= 0).all(-1).all(-1),
-                "has negative values: give distances along the camera's z axis, 0 where unknown",
-            )
+        for field in ("depths", "point_depths"):
+            depths = getattr(self, field)
+            if depths is not None:
+                _check_finite(f"{name}.{field}", depths, 2)
+                _check_all(
+                    f"{name}.{field}",
+                    (depths >= 0).all(-1).all(-1),
+                    "has negative values: give distances along the camera's z axis, 0 where "
+                    "unknown",
+                )
         return self
 
 

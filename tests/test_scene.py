@@ -37,12 +37,19 @@ def test_rays_of_resized_cameras_are_those_between_the_pixels():
 
 
 def test_select_and_stack_and_to():
-    views = Views(cameras(3), torch.rand(3, 3, 4, 6), torch.rand(3, 4, 6))
+    views = Views(
+        cameras(3),
+        torch.rand(3, 3, 4, 6),
+        torch.rand(3, 4, 6),
+        point_depths=torch.rand(3, 4, 6),
+    )
     picked = views.select([2, 0])
+    assert torch.equal(picked.point_depths, views.point_depths[[2, 0]])
     assert torch.equal(picked.images[0], views.images[2])
     assert torch.equal(picked.depths[1], views.depths[0])
     batch = Views.stack([views, picked.select([0, 1, 1])])
     assert batch.images.shape == (2, 3, 3, 4, 6)
+    assert torch.equal(batch.point_depths[0], views.point_depths)
     assert batch.to(torch.float64).cameras.intrinsics.dtype == torch.float64
 
 

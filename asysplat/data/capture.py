@@ -127,6 +127,11 @@ class PhotographCapture:
     def num_frames(self) -> int:
         return len(self.scene.photographs)
 
+    @property
+    def points(self) -> Points | None:
+        """Sparse points of the scene's surfaces, read when first asked for; None without any."""
+        return self.scene.points
+
     def views(self, frames: Sequence[int]) -> Views:
         """Return the named frames, in the given order.
 

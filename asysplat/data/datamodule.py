@@ -1,6 +1,8 @@
 """Batches of reconstruction tasks, the same for the same seed wherever a run is resumed."""
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from multiprocessing import get_all_start_methods
 from typing import Any
 
@@ -9,7 +11,9 @@ import numpy as np
 from torch.utils.data import DataLoader, Dataset, DistributedSampler, Subset
 
 from asysplat.data.augment import Augmentation, cropped
+from asysplat.data.capture import Capture
 from asysplat.data.normalise import normalise
+from asysplat.data.points import depths_of_points
 from asysplat.data.selection import Selection
 from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
@@ -37,6 +41,7 @@ class SceneDataModule(lightning.LightningDataModule):
         steps_per_epoch: steps between two validations.
         test_sets: further test sets by name, each a function that makes its tasks.
         augmentation: how training tasks are varied; None leaves them as they are.
+        points: whether the inputs come with the depths of the scene's sparse points.
 
     Raises:
         InputError: a task that cannot be loaded. `setup` tries one training task, and as many of
@@ -57,6 +62,7 @@ class SceneDataModule(lightning.LightningDataModule):
         steps_per_epoch: int,
         test_sets: Mapping[str, Callable[[], list[Task]]] | None = None,
         augmentation: Augmentation | None = None,
+        points: bool = False,
     ):
         super().__init__()
         self.name, self.source = name, source
@@ -66,22 +72,26 @@ class SceneDataModule(lightning.LightningDataModule):
         self.steps_per_epoch = steps_per_epoch
         self.test_sets = test_sets or {}
         self.augmentation = augmentation or Augmentation()
+        self.points = points
         self.evaluation: dict[str, FixedTasks] = {}  # val and test of this data set
         self.tests: dict[str, FixedTasks] = {}  # by test set, this data set first
 
     def setup(self, stage: str | None = None) -> None:
         """Make the validation and test tasks, and try one training task."""
         if not self.evaluation:
-            TrainingTasks(self)[0]
+            samples = {"training": TrainingTasks(self)[0]}
             for name in ("val", "test"):
                 tasks = self.source.evaluation(name, self.inputs, self.targets)
-                self.evaluation[name] = FixedTasks(tasks)
+                self.evaluation[name] = FixedTasks(tasks, self.points)
             self.tests[self.name] = self.evaluation["test"]
             for name, make_tasks in self.test_sets.items():
                 try:
-                    self.tests[name] = FixedTasks(make_tasks())
+                    self.tests[name] = FixedTasks(make_tasks(), self.points)
                 except InputError as error:
                     raise InputError(f"data.test_sets.{name}: {error}") from error
+            samples |= {name: tasks[0] for name, tasks in self.tests.items()}
+            if self.points:
+                _warn_of_no_points(samples)
 
     def check_sizes(self, check: Callable[[int, int], None]) -> None:
         """Call `check(height, width)` for every set; its InputError names the set."""
@@ -133,14 +143,15 @@ class TrainingTasks(Dataset):
 
     def __init__(self, data: SceneDataModule):
         self.source, self.seed, self.augmentation = data.source, data.seed, data.augmentation
-        self.inputs, self.targets = data.inputs, data.targets
+        self.inputs, self.targets, self.points = data.inputs, data.targets, data.points
 
     def __getitem__(self, index: int) -> Sample:
         rng = np.random.default_rng((self.seed, index))
         task = self.source.training(self.inputs, self.targets, rng)
         inputs = self.augmentation.order(task.selection.inputs, rng)
         share = self.augmentation.share(rng)
-        sample = load(Task(task.capture, Selection(inputs, task.selection.targets)), share)
+        task = Task(task.capture, Selection(inputs, task.selection.targets))
+        sample = load(task, share, self.points)
         inputs, targets = self.augmentation.expose(sample["inputs"], sample["targets"], rng)
         return {"scene": sample["scene"], "inputs": inputs, "targets": targets}
 
@@ -148,12 +159,12 @@ class TrainingTasks(Dataset):
 class FixedTasks(Dataset):
     """Evaluation tasks; the first of them stay loaded, up to KEPT_BYTES."""
 
-    def __init__(self, tasks: Sequence[Task]):
-        self.tasks = tasks
+    def __init__(self, tasks: Sequence[Task], points: bool = False):
+        self.tasks, self.points = tasks, points
         self._kept: list[Sample] = []
         size = 0
         for task in tasks:
-            self._kept.append(load(task))
+            self._kept.append(load(task, points=points))
             size += sum(self._kept[-1][views].images.nbytes for views in ("inputs", "targets"))
             if size > KEPT_BYTES:
                 break
@@ -162,20 +173,49 @@ class FixedTasks(Dataset):
         return len(self.tasks)
 
     def __getitem__(self, index: int) -> Sample:
-        return self._kept[index] if index < len(self._kept) else load(self.tasks[index])
+        if index < len(self._kept):
+            return self._kept[index]
+        return load(self.tasks[index], points=self.points)
 
 
-def load(task: Task, share: float = 1.0) -> Sample:
-    """Read a task's views, validate, crop to `share` of their sides, and normalise them."""
+def load(task: Task, share: float = 1.0, points: bool = False) -> Sample:
+    """Read a task's views, validate, crop to `share` of their sides, and normalise them.
+
+    With `points`, the inputs have the depths of the capture's sparse points, if it has any.
+    """
     inputs, targets = task.selection.inputs, task.selection.targets
     # A frame that is both input and target is decoded once.
     frames = list(dict.fromkeys(inputs + targets))
     views = cropped(task.capture.views(frames).validate(task.capture.name), share)
-    inputs, targets, _ = normalise(
-        views.select([frames.index(frame) for frame in inputs]),
-        views.select([frames.index(frame) for frame in targets]),
+    inputs, targets = (
+        views.select([frames.index(frame) for frame in chosen]) for chosen in (inputs, targets)
     )
+    if points:
+        inputs = with_points(inputs, task.capture)
+    inputs, targets, _ = normalise(inputs, targets)
     return {"scene": task.capture.name, "inputs": inputs, "targets": targets}
+
+
+def with_points(views: Views, capture: Capture) -> Views:
+    """Return the views with the depths of their capture's sparse points, if it has any."""
+    points = getattr(capture, "points", None)  # synthetic scenes have none
+    if points is None:
+        return views
+    return replace(views, point_depths=depths_of_points(points, views.cameras))
+
+
+def _warn_of_no_points(samples: Mapping[str, Sample]) -> None:
+    lacking = [
+        f"{samples[name]['scene']} ({name})"
+        for name in samples
+        if samples[name]["inputs"].point_depths is None
+    ]
+    if lacking:
+        warnings.warn(
+            f"data.points=true, but there are no sparse points of {', '.join(lacking)}: a prior "
+            "knows nothing from them. data/README.md says which files have some.",
+            stacklevel=3,
+        )
 
 
 def collate(samples: list[Sample]) -> Sample:

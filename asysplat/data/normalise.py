@@ -27,8 +27,11 @@ class Normalisation(TensorRecord):
         poses = self.world_to_mean @ views.cameras.cam_to_world.double()
         poses[:, :3, 3] *= self.scale
         cameras = replace(views.cameras, cam_to_world=poses.to(views.cameras.cam_to_world))
-        depths = None if views.depths is None else views.depths * self.scale
-        return replace(views, cameras=cameras, depths=depths)
+        depths, point_depths = (
+            None if depths is None else depths * self.scale
+            for depths in (views.depths, views.point_depths)
+        )
+        return replace(views, cameras=cameras, depths=depths, point_depths=point_depths)
 
     def undo(self, gaussians: Gaussians) -> Gaussians:
         """Bring Gaussians back to the data set's world, where its own cameras see the same."""

@@ -6,7 +6,7 @@ from asysplat.models.bilateral import CoarseReadsFine, FineReadsCoarse, NoLink
 from asysplat.models.head import GaussianHead, LongLRMHead, PhotographHead
 from asysplat.models.mamba2 import BiMamba2
 from asysplat.models.mamba_vision import MambaVision
-from asysplat.models.prior import DepthPrior, SweepPrior
+from asysplat.models.prior import DepthPrior, PointsPrior, SweepPrior
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.single_branch import SingleBranch, build_single_branch
 from asysplat.models.source import CoarseSource, FineSource, MergedSource
@@ -26,6 +26,7 @@ __all__ = [
     "MergedSource",
     "NoLink",
     "PhotographHead",
+    "PointsPrior",
     "SingleBranch",
     "SparseAttention",
     "StageShape",

@@ -18,6 +18,10 @@ from asysplat.scene import TensorRecord, Views
 
 PRIOR_CHANNELS = 2
 UNKNOWN = 10**0.5  # a distance for what nobody knows, the middle of PhotographHead's range
+OUTLIERS = 0.02  # share of a view's points, at either end, that do not count for its range,
+MARGIN = 2.0  # and how much wider it is: surfaces without texture have no points
+FEWEST = 16  # points in a view that tell its range
+SPREAD = (0, 1, 2, 4)  # blocks around a point: one farther away is trusted a quarter less
 LONGEST_SIDE = 128  # of the images that are swept: twice the planes
 BLOCK = 2  # swept pixels along a side that share a depth: two compare better than one
 
@@ -59,7 +63,8 @@ class Prior(TensorRecord):
 class SweepPrior(nn.Module):
     """Depth from a plane sweep over each view's neighbours (`asysplat.ops.plane_sweep`).
 
-    Large images are swept at a size that suits the number of planes.
+    Large images are swept at a size that suits the number of planes. How far is swept follows from
+    the cameras, and in views that see enough sparse points from those.
     """
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
@@ -73,7 +78,8 @@ class SweepPrior(nn.Module):
         images = F.interpolate(
             views.images.flatten(0, 1), (small.height, small.width), mode="area"
         ).unflatten(0, views.images.shape[:2])
-        found = plane_sweep(images, small, stride=BLOCK)
+        ranges = _ranges(views.point_depths, factor)
+        found = plane_sweep(images, small, stride=BLOCK, ranges=ranges)
         return Prior.of_inverse_depth(found.inverse_depth, found.confidence, views, size)
 
 
@@ -81,11 +87,50 @@ class DepthPrior(nn.Module):
     """The depths that come with the data, where there are any; gaps are filled from around."""
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
-        depths = views.depths
-        if depths is None:
-            depths = views.images.new_zeros(*views.images.shape[:2], *views.images.shape[-2:])
-        known = (depths > 0).to(depths)
-        stride = depths.shape[-2] // size[0]
-        share = F.avg_pool2d(known, stride)
-        inverse = F.avg_pool2d(known / depths.clamp_min(1e-6), stride) / share.clamp_min(1e-6)
+        inverse, share = _blocks(views.depths, views, size)
         return Prior.of_inverse_depth(fill(inverse, share), share, views, size)
+
+
+class PointsPrior(nn.Module):
+    """The depths of the scene's sparse points, spread to what lies around them.
+
+    The data gives them with `data.points=true`; without any, all is unknown.
+    """
+
+    def forward(self, views: Views, size: tuple[int, int]) -> Prior:
+        inverse, share = _blocks(views.point_depths, views, size)
+        known = (share > 0).to(share)
+        spread = [F.max_pool2d(known, 2 * r + 1, stride=1, padding=r) for r in SPREAD]
+        confidence = torch.stack(spread).mean(0)
+        return Prior.of_inverse_depth(fill(inverse, known), confidence, views, size)
+
+
+def _ranges(depths: Float[Tensor, "B V H W"] | None, factor: int) -> Float[Tensor, "B V 2"] | None:
+    """Return the least and greatest inverse depth that points suggest; 0 and 0 where few are seen.
+
+    Args:
+        depths: of points.
+        factor: side of the blocks of pixels of which the nearest point counts.
+    """
+    if depths is None:
+        return None
+    inverse = F.max_pool2d((depths > 0) / depths.clamp_min(1e-6), factor).flatten(2)
+    ordered = inverse.sort(dim=-1).values  # pixels without a point come first
+    count = (ordered > 0).sum(-1, keepdim=True)
+    shares = ordered.new_tensor([OUTLIERS, 1 - OUTLIERS])
+    index = ordered.shape[-1] - count + (shares * (count - 1)).round().long()
+    ranges = ordered.gather(-1, index.clamp_max(ordered.shape[-1] - 1))
+    return ranges.where(count >= FEWEST, 0) * ordered.new_tensor([1 / MARGIN, MARGIN])
+
+
+def _blocks(
+    depths: Float[Tensor, "B V H W"] | None, views: Views, size: tuple[int, int]
+) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V h w"]]:
+    """Return the mean inverse depth of each block of pixels, and the share that is known."""
+    if depths is None:
+        depths = torch.zeros_like(views.images[:, :, 0])
+    known = (depths > 0).to(depths)
+    stride = depths.shape[-2] // size[0]
+    share = F.avg_pool2d(known, stride)
+    inverse = F.avg_pool2d(known / depths.clamp_min(1e-6), stride) / share.clamp_min(1e-6)
+    return inverse, share

@@ -26,6 +26,7 @@ def make_views(rotations: torch.Tensor, centers: torch.Tensor) -> Views:
         cameras=Cameras(intrinsics, poses, HEIGHT, WIDTH),
         images=torch.rand(count, 3, HEIGHT, WIDTH),
         depths=torch.rand(count, HEIGHT, WIDTH) + 1,
+        point_depths=torch.rand(count, HEIGHT, WIDTH) + 1,
     )
 
 
@@ -85,7 +86,9 @@ def test_depth_reprojection_is_unchanged(pair):
     torch.testing.assert_close(
         project_depth(inputs, targets), project_depth(*pair), atol=2e-3, rtol=1e-3
     )
-    torch.testing.assert_close(targets.depths, pair[1].depths * frame.scale)
+    for name in ("depths", "point_depths"):
+        before, after = (getattr(views, name) for views in (pair[1], targets))
+        torch.testing.assert_close(after, before * frame.scale)
     assert torch.equal(inputs.images, pair[0].images)
 
 

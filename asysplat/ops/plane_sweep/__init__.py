@@ -50,6 +50,7 @@ def plane_sweep(
     planes: int = PLANES,
     neighbours: int = NEIGHBOURS,
     backend: str = "auto",
+    ranges: Float[Tensor, "B V 2"] | None = None,
 ) -> SweptDepth:
     """Find the depth of every `stride` x `stride` block of pixels; h = H / stride, w = W / stride.
 
@@ -65,6 +66,8 @@ def plane_sweep(
         neighbours: number of views that each is compared with, at most.
         backend: "reference" (torch, any device and float type), "cpu" or "cuda", or "auto", which
             is the fast one for the device, and "reference" for float64.
+        ranges: least and greatest inverse depth of each view; the cameras decide for a view with
+            0 and 0, and for all without it.
 
     Raises:
         InputError: sizes that do not go together, or an unknown backend.
@@ -74,7 +77,9 @@ def plane_sweep(
     _check_backend(backend, images)
     images = images if images.dtype == torch.float64 else images.float()
     poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
-    return SweptDepth(*_sweep(images, intrinsics, poses, stride, planes, neighbours, backend))
+    return SweptDepth(
+        *_sweep(images, intrinsics, poses, stride, planes, neighbours, backend, ranges=ranges)
+    )
 
 
 @torch.library.custom_op("asysplat::plane_sweep", mutates_args=())
@@ -86,13 +91,15 @@ def _sweep(
     planes: int,
     neighbours: int,
     backend: str,
+    ranges: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Sweep: one operator for torch, so that devices without content know its shapes."""
     form = _load(backend)
     cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
     small = cameras.resized(cameras.height // stride, cameras.width // stride)
     chosen = choose_neighbours(cameras, neighbours)
-    ranges = inverse_depth_range(cameras, chosen)
+    seen = inverse_depth_range(cameras, chosen)
+    ranges = seen if ranges is None else torch.where(ranges[..., 1:] > 0, ranges.to(seen), seen)
     projections = relative_projections(cameras, chosen)
     grey = (images * images.new_tensor(LUMA)[:, None, None]).sum(2)
     costs = form.match(grey, chosen, projections, ranges, planes, stride)
@@ -108,7 +115,7 @@ def _sweep(
 
 
 @_sweep.register_fake
-def _(images, intrinsics, cam_to_world, stride, planes, neighbours, backend):
+def _(images, intrinsics, cam_to_world, stride, planes, neighbours, backend, ranges):
     shape = (*images.shape[:2], images.shape[-2] // stride, images.shape[-1] // stride)
     return images.new_empty(shape), images.new_empty(shape)
 

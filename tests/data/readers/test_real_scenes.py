@@ -5,6 +5,7 @@ import pytest
 
 from asysplat.data import open_scene
 from asysplat.data.bad_frames import BadFrames
+from asysplat.data.points import depths_of_points
 from asysplat.data.readers import colmap, llff, long_lrm, posed, transforms
 
 SCENES = {"fern": llff, "fox": transforms, "mydesk": long_lrm, "hololens-000": posed}
@@ -52,6 +53,18 @@ def test_it_opens_in_its_own_layout(scene):
     views = capture.views([0, capture.num_frames // 2, capture.num_frames - 1]).validate()
     assert views.images.std() > 0.05
     assert (views.depths is not None) == (scene.name == "hololens-000")
+
+
+def test_points_seen_lie_on_the_surfaces(scene):
+    capture = open_scene(scene, 64, 64)
+    views = capture.views(range(0, capture.num_frames, 10))
+    depths = depths_of_points(capture.points, views.cameras)
+    assert (depths > 0).sum((1, 2)).median() > 200
+    if views.depths is not None:
+        known = (depths > 0) & (views.depths > 0)
+        ratio = (depths[known] / views.depths[known]).log()
+        assert ratio.abs().median() < 0.03
+        assert (ratio > 0.1).float().mean() < 0.05  # hidden points are left out
 
 
 def test_points_lie_before_the_cameras_that_see_them(scene):

@@ -1,0 +1,89 @@
+"""Sparse points as a prior, exact at a point and less trusted away from it, and in a sweep."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from asysplat.models import PointsPrior, SweepPrior
+from asysplat.models import prior as prior_module
+from asysplat.models.prior import UNKNOWN
+from asysplat.ops import plane_sweep
+from asysplat.scene import Cameras, Views
+
+SIZE = (16, 16)
+TINY = ["model=asysplat_sweep", "model/prior=points", "width=0.125", "state_size=8"]
+
+
+def make_views(point_depths=None):
+    intrinsics = torch.tensor([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]).expand(1, 2, 3, 3)
+    cameras = Cameras(intrinsics, torch.eye(4).repeat(1, 2, 1, 1), 32, 32)
+    return Views(cameras, torch.rand(1, 2, 3, 32, 32), point_depths=point_depths)
+
+
+def depth(prior, views):
+    length = views.cameras.resized(*SIZE).pixel_directions().norm(dim=-1)
+    return prior.distance / length
+
+
+def test_points_are_kept_and_spread():
+    points = torch.zeros(1, 2, 32, 32)
+    points[0, 0, 4, 4], points[0, 0, 5, 5] = 2.0, 6.0  # one block
+    points[0, 0, 20, 28] = 5.0
+    views = make_views(points)
+    prior = PointsPrior()(views, SIZE)
+    depths = depth(prior, views)[0, 0]
+    assert depths[2, 2].item() == pytest.approx(3, rel=0.05)  # the mean inverse depth's
+    assert depths[10, 14].item() == pytest.approx(5, rel=0.05)
+    assert depths.min() > 2.9 and depths.max() < 5.1
+    assert depths[:6, :6].max() < depths[8:12, 12:].min()
+    confidence = prior.confidence[0]
+    assert confidence[0, 2, 2:8].tolist() == [1, 0.75, 0.5, 0.25, 0.25, 0]
+    assert confidence[1].max() == 0  # the other view sees no point,
+    assert 2.9 < depth(prior, views)[0, 1].mean() < 5.1  # but the scene's depth
+
+
+def test_views_without_points_are_unknown():
+    unknown = PointsPrior()(make_views(), SIZE)
+    none_seen = PointsPrior()(make_views(torch.zeros(1, 2, 32, 32)), SIZE)
+    for prior in (unknown, none_seen):
+        assert prior.confidence.max() == 0
+        assert (prior.distance == UNKNOWN).all()
+
+
+def test_gaussians_start_at_the_points(build):
+    net = build(*TINY)
+    torch.nn.init.zeros_(net.head.decode.weight)
+    points = torch.full((1, 2, 32, 32), 4.0)
+    gaussians = net(make_views(points))
+    torch.testing.assert_close(gaussians.means[..., 2], torch.full((1, 512), 4.0))
+
+
+def test_a_sweep_looks_where_the_points_are(monkeypatch):
+    """As far as they say in a view with enough of them, and as the cameras say in the other."""
+    given = []
+
+    def spy(images, cameras, stride, ranges):
+        given.append(ranges)
+        return plane_sweep(images, cameras, stride, backend="reference", ranges=ranges)
+
+    monkeypatch.setattr(prior_module, "plane_sweep", spy)
+    points = torch.zeros(1, 2, 32, 32)
+    points[0, 0, :10, :10] = torch.linspace(2, 4, 100).reshape(10, 10)
+    points[0, 0, 20, 20] = 0.01  # a stray point
+    points[0, 1, 3, 3:6] = 1.0  # too few
+    views = make_views(points)
+    views.cameras.cam_to_world[0, 1, 0, 3] = 0.5
+    known = SweepPrior()(views, SIZE)
+    assert given[0][0, 0].tolist() == pytest.approx([1 / 8, 1], rel=0.05)
+    assert given[0][0, 1].tolist() == [0, 0]
+    unknown = SweepPrior()(replace(views, point_depths=torch.zeros_like(points)), SIZE)
+    cameras = SweepPrior()(replace(views, point_depths=None), SIZE)
+    assert given[2] is None and torch.equal(unknown.distance, cameras.distance)
+    assert not torch.equal(known.distance, cameras.distance)
+
+
+def test_a_sweep_of_one_view_with_points_is_unknown():
+    views = make_views(torch.full((1, 2, 32, 32), 2.0)).map(lambda tensor: tensor[:, :1])
+    prior = SweepPrior()(views, SIZE)
+    assert prior.confidence.max() == 0 and prior.distance.isfinite().all()
