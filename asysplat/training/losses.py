@@ -20,8 +20,8 @@ class ReconstructionLoss(nn.Module):
     SSIM wants edges as the perceptual term does, at little cost and without weights to fetch.
 
     Args:
-        mse, perceptual, depth, ssim: weights of the terms; 0 turns a term off. The perceptual term is
-            also off if its network is not on this machine, the depth term if the data has no
+        mse, perceptual, depth, ssim: weights of the terms; 0 turns a term off. The perceptual term
+            is also off if its network is not on this machine, the depth term if the data has no
             depths; a warning says so once.
         perceptual_term, depth_term: constructors, called if the term's weight is not 0.
 
@@ -46,8 +46,8 @@ class ReconstructionLoss(nn.Module):
         self._depth_term = depth_term() if depth else None
         if not (mse or self._perceptual_term or depth or ssim):
             raise InputError(
-                "training.loss has no term that is on: give mse, ssim, perceptual or depth a weight "
-                "above 0, and for perceptual alone its network (paths.download=true fetches it)."
+                "training.loss has no term that is on: give mse, ssim, perceptual or depth a "
+                "weight above 0, and for perceptual alone its network (paths.download=true fetches it)."
             )
         self._warned_of_depth = False
 

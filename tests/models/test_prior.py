@@ -1,4 +1,4 @@
-"""Priors: what they give to tokens and heads, what is unknown, and every head and model with one."""
+"""Priors: what they give to tokens and heads, what is unknown, and all models with one."""
 
 import math
 from dataclasses import replace

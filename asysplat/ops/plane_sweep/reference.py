@@ -21,7 +21,7 @@ FLATTEST = 1e-9  # bend of a parabola that has a minimum
 
 
 class Lowest(NamedTuple):
-    """Where the costs of a pixel are least, counted in planes, and how much less than their mean."""
+    """Where the costs of a pixel are least, in planes, and how much less than their mean."""
 
     plane: Float[Tensor, "B V h w"]
     contrast: Float[Tensor, "B V h w"]
