@@ -47,7 +47,8 @@ class ReconstructionLoss(nn.Module):
         if not (mse or self._perceptual_term or depth or ssim):
             raise InputError(
                 "training.loss has no term that is on: give mse, ssim, perceptual or depth a "
-                "weight above 0, and for perceptual alone its network (paths.download=true fetches it)."
+                "weight above 0, and for perceptual alone its network (paths.download=true fetches "
+                "it)."
             )
         self._warned_of_depth = False
 
