@@ -3,6 +3,7 @@
 A checkpoint is what a run writes (.ckpt), or weights alone (.safetensors), as those that ship.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -95,11 +96,11 @@ def weights_file(path: str) -> Path:
     return SHIPPED if path == "shipped" else Path(path)
 
 
-def save_weights(module: nn.Module, path: Path) -> None:
-    """Write the weights alone, in half precision: what a published model is read from."""
+def save_weights(weights: Mapping[str, Tensor], path: Path) -> None:
+    """Write a state dict in half precision: what a published model is read from."""
     halves = {
         name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
-        for name, tensor in module.state_dict().items()
+        for name, tensor in weights.items()
     }
     save_file(halves, path)
 

@@ -54,7 +54,10 @@ def test_parameters_at_full_width(build, model):
 
 
 def test_geometry_share_of_the_paper(build):
-    assert abs(build("scale=paper", device="meta").geometry_share() - 0.905) < 0.001
+    assert (
+        abs(build("model=asysplat_4m4s", "scale=paper", device="meta").geometry_share() - 0.905)
+        < 0.001
+    )
 
 
 @pytest.mark.slow
@@ -106,7 +109,7 @@ def test_geometry_ratio_that_cannot_be_met(build, ratio, complaint):
 
 def test_one_gaussian_per_output_pixel_at_its_ray(build):
     views = make_views()
-    net = build(*TINY)
+    net = build("model=asysplat_4m4s", *TINY)
     gaussians = net(views).validate()
     assert gaussians.means.shape == (2, 3 * 16 * 32, 3)
     camera = views.cameras.resized(16, 32)
@@ -124,7 +127,7 @@ def test_one_gaussian_per_output_pixel_at_its_ray(build):
 
 def test_untrained_colours_are_the_photographs(build):
     views = make_views()
-    dc = build(*TINY)(views).sh[..., 0, :] * 0.28209479 + 0.5
+    dc = build("model=asysplat_4m4s", *TINY)(views).sh[..., 0, :] * 0.28209479 + 0.5
     photographs = torch.nn.functional.avg_pool2d(views.images.flatten(0, 1), 2)
     expected = photographs.permute(0, 2, 3, 1).reshape(2, -1, 3)
     assert (dc - expected).abs().mean() < 0.02
@@ -172,7 +175,7 @@ def test_views_exchange_only_through_the_geometry_branch(build):
 
     def moved(*overrides):
         torch.manual_seed(0)
-        net = build(*TINY, *overrides).eval()
+        net = build("model=asysplat_4m4s", *TINY, *overrides).eval()
         first_view = 16 * 32
         return (net(views).opacities - net(other).opacities)[:first_view].abs().max()
 

@@ -56,7 +56,7 @@ def test_gaussians_start_at_the_points(build):
     torch.nn.init.zeros_(net.head.decode.weight)
     points = torch.full((1, 2, 32, 32), 4.0)
     gaussians = net(make_views(points))
-    torch.testing.assert_close(gaussians.means[..., 2], torch.full((1, 512), 4.0))
+    torch.testing.assert_close(gaussians.means[..., 2], torch.full((1, 2048), 4.0))
 
 
 def test_a_sweep_looks_where_the_points_are(monkeypatch):

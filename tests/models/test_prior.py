@@ -132,7 +132,7 @@ def test_every_model_takes_a_prior(model):
 
 def test_costs_are_counted_without_content():
     costs = static_costs(make_net("model=asysplat_sweep"), 3, 32, 32)
-    assert costs["gaussians"] == 3 * 16 * 16 and costs["activation_gb"] > 0
+    assert costs["gaussians"] == 3 * 32 * 32 and costs["activation_gb"] > 0
 
 
 def test_depth_of_the_data_is_averaged_where_it_is_known():
