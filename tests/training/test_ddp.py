@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.hours, pytest.mark.timeout(1800)]
 CONF = Path(__file__).parents[2] / "conf"
 PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
 MODELS = sorted(p.stem for p in (CONF / "model").glob("*.yaml") if p.stem not in PARTS)
-OVERRIDES = ["width=0.125", "state_size=8", "training.loss.perceptual=0"]
+OVERRIDES = ["width=0.125", "state_size=8", "training.loss.depth=0", "training.loss.perceptual=0"]
 SIZE, INPUTS, TARGETS, PROCESSES = 32, 2, 1, 2
 
 

@@ -164,7 +164,7 @@ def test_killed_and_resumed_with_scenes_side_by_side(train):
 def kill_and_resume(train, whole, *overrides):
     """Kill a run of 6 steps, resume it, and expect the weights of `whole` to the bit."""
     command = ("name=killed", "steps=6", *overrides)
-    with train.start(*command, until="last.ckpt") as process:
+    with train.start(*command, until="killed/*/checkpoints/last.ckpt") as process:
         process.send_signal(signal.SIGKILL)
         process.wait()
     assert not list(train.logs.glob("killed/*/metrics.json"))
