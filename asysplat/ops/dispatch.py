@@ -24,15 +24,20 @@ def pick_backend(operator: str, backends: Mapping[str, Form], backend: str) -> F
     return backends[backend]
 
 
-def fast_backend(x: Tensor) -> str:
-    """Return the name of the fastest back end of a scan for the device and the type of x."""
+def fast_backend(x: Tensor, in_torch: str) -> str:
+    """Return the name of the fastest back end for the device and the type of x.
+
+    Args:
+        x: what is computed with.
+        in_torch: the name of the one for any device and type.
+    """
     if x.dtype == torch.float64:
-        return "chunked"
+        return in_torch
     if x.device.type in ("cpu", "meta"):
         return "cpu"
     if x.device.type == "cuda" and find_spec("triton"):
         return "cuda"
-    return "chunked"
+    return in_torch
 
 
 def check_fast_backend(operator: str, backend: str, x: Tensor) -> None:

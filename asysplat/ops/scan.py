@@ -76,7 +76,7 @@ class Scan:
         """
         self._check(inputs)
         if backend == "auto":
-            backend = fast_backend(inputs.x)
+            backend = fast_backend(inputs.x, "chunked")
         with without_autocast(inputs.x):
             if backend in FAST:
                 check_fast_backend(self.name, backend, inputs.x)

@@ -103,7 +103,7 @@ def data_of(config: DictConfig) -> dict[str, str]:
     return {key: value for key, value in places.items() if value is not None}
 
 
-def _name(path: str | None) -> str | None:
+def _name(path: str | Path | None) -> str | None:
     """Return the name of a folder; None if it is not given."""
     return None if path in (None, MISSING) else Path(os.path.abspath(path)).name
 

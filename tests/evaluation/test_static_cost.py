@@ -6,7 +6,7 @@ from asysplat.evaluation.static_cost import activation_gb, blank_views, static_c
 
 
 def test_full_width_at_32_views_of_256(build):
-    costs = static_costs(build("scale=paper", device="meta"), 32, 256, 256)
+    costs = static_costs(build("model=asysplat_4m4s", "scale=paper", device="meta"), 32, 256, 256)
     assert abs(costs["gflops"] / 2033 - 1) < 0.005  # paper, Table 6c
     assert costs["gflops_true"] > 1.2 * costs["gflops"]
     assert costs["gaussians"] == 32 * 128 * 128
@@ -16,7 +16,7 @@ def test_full_width_at_32_views_of_256(build):
 
 
 def test_activation_memory_is_what_a_forward_pass_keeps(build):
-    net = build("width=0.125", "state_size=8")
+    net = build("model=asysplat_4m4s", "width=0.125", "state_size=8")
     views = blank_views(2, 64, 64).map(torch.zeros_like)
     parameters = {p.untyped_storage().data_ptr() for p in [*net.parameters(), *net.buffers()]}
     kept = {}

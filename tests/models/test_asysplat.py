@@ -64,8 +64,9 @@ def test_geometry_share_of_the_paper(build):
 @pytest.mark.parametrize("ratio", [0.3, 0.5, 0.7, 0.9, 0.95])
 @pytest.mark.parametrize("width", [0.125, 0.25, 1.0])
 def test_geometry_ratio(build, ratio, width):
-    base = build(f"width={width}", device="meta")
-    net = build(f"width={width}", f"geometry_ratio={ratio}", device="meta")
+    model = ("model=asysplat_4m4s", f"width={width}")
+    base = build(*model, device="meta")
+    net = build(*model, f"geometry_ratio={ratio}", device="meta")
     total, expected = (sum(p.numel() for p in n.parameters()) for n in (net, base))
     assert abs(net.geometry_share() - ratio) <= 0.015
     assert abs(total / expected - 1) < 0.01

@@ -99,7 +99,9 @@ DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
 
 def test_runs_on_the_papers_data(compose, tmp_path):
     """Found though the report is given no path; a test set without one has no numbers."""
-    config = compose(["sweeps=geometry_ratio", *DL3DV, "paths.mipnerf360=/a/360_v2"])
+    config = compose(
+        ["sweeps=geometry_ratio", "model=asysplat_4m4s", *DL3DV, "paths.mipnerf360=/a/360_v2"]
+    )
     numbers = {"test/dl3dv/psnr": 19.0, "test/mipnerf360/psnr": 17.0, "protocol/name": "longlrm"}
     write_run(tmp_path / "run", config, numbers | {"protocol/psnr": "of each image"}, 0)
     runs = finished_runs(tmp_path)
@@ -122,9 +124,14 @@ def test_runs_on_the_papers_data(compose, tmp_path):
 
 def test_a_run_that_was_tested_on_all_sets_comes_first(compose, tmp_path):
     paths = ["paths.mipnerf360=/a/360_v2"]
-    every = compose(["sweeps=geometry_ratio", *DL3DV, *paths])
+    every = compose(["sweeps=geometry_ratio", "model=asysplat_4m4s", *DL3DV, *paths])
     write_run(tmp_path / "a", every, {"test/dl3dv/psnr": 1.0, "test/mipnerf360/psnr": 2.0}, 0)
-    write_run(tmp_path / "b", compose(["sweeps=layers", *DL3DV]), {"test/dl3dv/psnr": 3.0}, 0)
+    write_run(
+        tmp_path / "b",
+        compose(["sweeps=layers", "model=asysplat_4m4s", *DL3DV]),
+        {"test/dl3dv/psnr": 3.0},
+        0,
+    )
     runs = finished_runs(tmp_path)
 
     def first_row(key, *more):
@@ -136,7 +143,7 @@ def test_a_run_that_was_tested_on_all_sets_comes_first(compose, tmp_path):
 
 def test_a_row_of_a_further_test_set_has_its_costs(compose, tmp_path):
     costs = {"cost/inference_seconds": 0.5, "cost/more_views/inference_seconds": 0.9}
-    config = compose(["sweeps=more_views"])
+    config = compose(["sweeps=more_views", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, costs | {"test/more_views/psnr": 18.0}, 0)
     filled = fill_table(load_paper()["more_views"], [], compose, finished_runs(tmp_path))
     ours = [row.values for row in filled.rows if not row.paper.quoted]
@@ -173,7 +180,7 @@ def test_post_optimisation_is_not_run_until_evaluation_adds_it(compose, tmp_path
     "text", ["", '{"run/config_hash": "1', "[]", '{"test/procedural/psnr": 1}']
 )
 def test_half_written_results_are_no_results(compose, tmp_path, text):
-    config = compose(["sweeps=layers"])
+    config = compose(["sweeps=layers", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, {"test/procedural/psnr": 20.0}, 0)
     config.seed = 0
     assert find_run(tmp_path, config).folder == tmp_path / "run"

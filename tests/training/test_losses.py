@@ -132,7 +132,7 @@ def test_input_disparity_by_hand():
 
 def test_input_disparity_of_a_network(build):
     """Its Gaussians are the map that the term takes them to be, in a batch, at half the size."""
-    net = build(*NETWORK)
+    net = build("model=asysplat_4m4s", *NETWORK)
     two = cameras(32)
     inputs = Views(two, torch.rand(2, 3, 32, 32), 1 + torch.rand(2, 32, 32))
     inputs = Views.stack([inputs, inputs])

@@ -49,7 +49,7 @@ def test_a_run_leaves_what_is_promised(whole):
     assert "window 11x11" in numbers["protocol/ssim"] and numbers["protocol/name"] == "default"
     assert "all measurements but the longest" in numbers["protocol/seconds"]
     assert numbers["cost/render_seconds_per_step"] < numbers["cost/seconds_per_step"]
-    assert numbers["cost/gaussians"] == 3 * 16 * 16
+    assert numbers["cost/gaussians"] == 3 * 32 * 32
     assert numbers["cost/gflops_true"] > numbers["cost/gflops"] > 0
     assert 0 < numbers["cost/peak_bytes_per_token"] < 1e9 * numbers["cost/peak_gb"]
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.ops.dispatch import FAST, check_fast_backend, pick_backend
+from asysplat.ops.dispatch import FAST, check_fast_backend, fast_backend, pick_backend
 from asysplat.ops.plane_sweep import reference
 from asysplat.ops.plane_sweep.agreement import Depths, compare, fill
 from asysplat.ops.plane_sweep.cameras import (
@@ -73,7 +73,7 @@ def plane_sweep(
         InputError: sizes that do not go together, or an unknown backend.
     """
     _check(images, cameras, stride, planes, neighbours)
-    backend = _auto(images) if backend == "auto" else backend
+    backend = fast_backend(images, "reference") if backend == "auto" else backend
     _check_backend(backend, images)
     images = images if images.dtype == torch.float64 else images.float()
     poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
@@ -130,12 +130,6 @@ def _edges(images: Tensor, stride: int) -> Float[Tensor, "B V 2 h w"]:
     left[..., 1:] = blocks.diff(dim=-1).abs().mean(2)
     above[..., 1:, :] = blocks.diff(dim=-2).abs().mean(2)
     return torch.stack((left, above), dim=2)
-
-
-def _auto(images: Tensor) -> str:
-    if images.dtype == torch.float64 or images.device.type not in FAST:
-        return "reference"
-    return images.device.type
 
 
 def _check_backend(backend: str, images: Tensor) -> None:
