@@ -16,6 +16,7 @@ from asysplat.models.prior import Prior
 from asysplat.ops.precision import without_autocast
 from asysplat.scene import Cameras, Gaussians, Views
 
+SURE_CORRECTION = 0.1  # of a distance that the prior is sure of, over that of an unknown one
 SH_C0 = 0.28209479177387814  # Y_0, so that colour = 0.5 + SH_C0 * sh_0
 
 
@@ -56,8 +57,8 @@ class GaussianHead(nn.Module, ABC):
     ) -> Gaussians:
         """Decode Gaussians [B, V h p_f w p_f], row by row of view after view.
 
-        With a prior, distances are corrections of its own, and opacities start higher where it is
-        sure.
+        With a prior, distances are corrections of its own, smaller where it is sure, and opacities
+        start higher there.
         """
         raw = rearrange(
             self.decode(self.norm(features)),
@@ -72,8 +73,10 @@ class GaussianHead(nn.Module, ABC):
             depth_logit = position.mean(-1, keepdim=True)
             if prior is not None:
                 expected = self.depth_fraction(prior.distance).clamp(0.01, 0.99)
-                depth_logit = depth_logit + expected.logit()[..., None]
-                opacities = opacities + self.opacity_gain * prior.confidence[..., None]
+                confidence = prior.confidence[..., None]
+                unsure = 1 - (1 - SURE_CORRECTION) * confidence
+                depth_logit = expected.logit()[..., None] + unsure * depth_logit
+                opacities = opacities + self.opacity_gain * confidence
             sh = sh.unflatten(-1, (-1, 3))
             gaussians = self.activate(
                 depth_logit.sigmoid(), quats, scales, opacities[..., 0], sh, views
