@@ -5,6 +5,7 @@ from importlib import import_module
 
 import pytest
 import torch
+from compiler import compiled
 
 from asysplat.ops import selective_scan, ssd
 
@@ -12,7 +13,6 @@ triton = pytest.importorskip("triton")
 
 pytestmark = pytest.mark.slow
 
-TYPES = {torch.bfloat16: "bf16", torch.float32: "fp32"}
 SCANS = {"ssd": ssd, "selective_scan": selective_scan}
 KERNELS = {
     "ssd": {
@@ -21,24 +21,6 @@ KERNELS = {
     },
     "selective_scan": {"sum_chunk", "pass_states", "forward_chunk", "backward_chunk"},
 }
-
-
-def compiled(kernel, arguments, architecture):
-    """The kernel for these arguments, constants and options of a launch, all by name."""
-    from triton.backends.compiler import GPUTarget
-    from triton.compiler import ASTSource
-
-    signature, constants = {}, {}
-    for parameter in kernel.params:
-        name, value = parameter.name, arguments.pop(parameter.name)
-        if parameter.is_constexpr:
-            signature[name], constants[name] = "constexpr", value
-        else:
-            is_array = isinstance(value, torch.Tensor)
-            signature[name] = "*" + TYPES[value.dtype] if is_array else "i32"
-    source = ASTSource(kernel, signature, constants)
-    options = arguments
-    return triton.compile(source, GPUTarget("cuda", architecture, 32), options)
 
 
 @pytest.mark.parametrize("name", SCANS)
