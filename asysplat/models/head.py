@@ -30,7 +30,7 @@ class GaussianHead(nn.Module, ABC):
         width: d_3.
         patch_coarse, patch_fine: p_c, p_f.
         sh_degree: 0 to 3.
-        opacity_gain: logit that a sure prior adds to an untrained opacity.
+        opacity_bias: logit of an untrained opacity without a prior.
         std: standard deviation of the untrained weights.
     """
 
@@ -40,11 +40,11 @@ class GaussianHead(nn.Module, ABC):
         patch_coarse: int,
         patch_fine: int,
         sh_degree: int,
-        opacity_gain: float,
+        opacity_bias: float,
         std: float,
     ):
         super().__init__()
-        self.opacity_gain = opacity_gain
+        self.opacity_bias = opacity_bias
         self.patch, self.stride = patch_fine, patch_coarse // patch_fine
         # position, quaternion, scale, opacity, SH
         self.splits = (3, 4, 3, 1, 3 * (sh_degree + 1) ** 2)
@@ -58,7 +58,7 @@ class GaussianHead(nn.Module, ABC):
         """Decode Gaussians [B, V h p_f w p_f], row by row of view after view.
 
         With a prior, distances are corrections of its own, smaller where it is sure, and opacities
-        start higher there.
+        of its own.
         """
         raw = rearrange(
             self.decode(self.norm(features)),
@@ -71,15 +71,17 @@ class GaussianHead(nn.Module, ABC):
             position, quats, scales, opacities, sh = raw.split(self.splits, dim=-1)
             # The mean of three outputs, as in Long-LRM.
             depth_logit = position.mean(-1, keepdim=True)
-            if prior is not None:
+            opacities = opacities[..., 0]
+            if prior is None:
+                opacities = opacities + self.opacity_bias
+            else:
                 expected = self.depth_fraction(prior.distance).clamp(0.01, 0.99)
-                confidence = prior.confidence[..., None]
-                unsure = 1 - (1 - SURE_CORRECTION) * confidence
-                depth_logit = expected.logit()[..., None] + unsure * depth_logit
-                opacities = opacities + self.opacity_gain * confidence
+                unsure = 1 - (1 - SURE_CORRECTION) * prior.confidence
+                depth_logit = expected.logit()[..., None] + unsure[..., None] * depth_logit
+                opacities = opacities + prior.opacity.logit()
             sh = sh.unflatten(-1, (-1, 3))
             gaussians = self.activate(
-                depth_logit.sigmoid(), quats, scales, opacities[..., 0], sh, views
+                depth_logit.sigmoid(), quats, scales, opacities.sigmoid(), sh, views
             )
             return gaussians.map(lambda field: field.flatten(1, 3))
 
@@ -101,7 +103,8 @@ class GaussianHead(nn.Module, ABC):
 
         Args:
             depth_fraction: in [0, 1], where in the head's range of distances.
-            quats, scales, opacities, sh: any numbers.
+            opacities: in [0, 1].
+            quats, scales, sh: any numbers.
             views: what the tokens were made of.
         """
 
@@ -114,9 +117,8 @@ class PhotographHead(GaussianHead):
     branches: what the appearance branch adds is less than with colours of its own.
 
     Args:
-        width, patch_coarse, patch_fine, sh_degree, opacity_gain: of GaussianHead.
+        width, patch_coarse, patch_fine, sh_degree, opacity_bias: of GaussianHead.
         near, far: distances along the ray lie between them, in units of the normalised scene.
-        opacity_bias: logit of an untrained opacity.
         scale_bias: log of an untrained size, in pixel footprints.
     """
 
@@ -130,11 +132,10 @@ class PhotographHead(GaussianHead):
         far: float = 100.0,
         opacity_bias: float = 0.0,
         scale_bias: float = -0.5,
-        opacity_gain: float = 0.0,
     ):
-        super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_gain, std=1e-3)
+        super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_bias, std=1e-3)
         self.near, self.far = near, far
-        self.opacity_bias, self.scale_bias = opacity_bias, scale_bias
+        self.scale_bias = scale_bias
 
     def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
         return (distance / self.near).log() / math.log(self.far / self.near)
@@ -156,7 +157,7 @@ class PhotographHead(GaussianHead):
             means=origins + distance * directions,
             quats=quats + identity,
             scales=(scales + self.scale_bias).clamp(-5, 3).exp() * distance * footprint(cameras),
-            opacities=(opacities + self.opacity_bias).sigmoid(),
+            opacities=opacities,
             sh=torch.cat((sh[..., :1, :] + self._photograph(views), sh[..., 1:, :]), dim=-2),
         )
 
@@ -178,9 +179,8 @@ class LongLRMHead(GaussianHead):
     plane at 0.01, as `asysplat.rendering` does, and a far one at 1e6, beyond all that is predicted.
 
     Args:
-        width, patch_coarse, patch_fine, sh_degree, opacity_gain: of GaussianHead.
+        width, patch_coarse, patch_fine, sh_degree, opacity_bias: of GaussianHead.
         farthest: distance, in units of the normalised scene.
-        opacity_bias: logit of an untrained opacity.
         scale_bias: log of an untrained size.
         largest: log of the largest size.
     """
@@ -195,11 +195,10 @@ class LongLRMHead(GaussianHead):
         opacity_bias: float = -2.0,
         scale_bias: float = -6.9,
         largest: float = -1.2,
-        opacity_gain: float = 0.0,
     ):
-        super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_gain, std=0.02)
+        super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_bias, std=0.02)
         self.farthest = farthest
-        self.opacity_bias, self.scale_bias, self.largest = opacity_bias, scale_bias, largest
+        self.scale_bias, self.largest = scale_bias, largest
 
     def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
         return distance / self.farthest
@@ -220,7 +219,7 @@ class LongLRMHead(GaussianHead):
             quats=quats,
             # Ours: a size stays above 0 where the exponential underflows.
             scales=sizes.clamp_min(torch.finfo(sizes.dtype).tiny),
-            opacities=(opacities + self.opacity_bias).sigmoid(),
+            opacities=opacities,
             sh=sh,
         )
 

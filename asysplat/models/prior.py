@@ -2,7 +2,8 @@
 
 A prior is called with views and the size of the head's grid. It tells the tokenizers a distance
 and a confidence for each pixel, and gives the head a distance to correct and an opacity to start
-from. Without one (`model/prior=none`) the network is the paper's.
+from: views that see the same surface share it. Without one (`model/prior=none`) the network is the
+paper's.
 """
 
 from dataclasses import dataclass
@@ -13,14 +14,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.ops import plane_sweep
-from asysplat.ops.plane_sweep import fill
+from asysplat.ops.plane_sweep import SweptDepth
+from asysplat.ops.plane_sweep.agreement import Depths, fill, other_views, votes
+from asysplat.ops.plane_sweep.cameras import observed_range
 from asysplat.scene import TensorRecord, Views
 
 PRIOR_CHANNELS = 2
 UNKNOWN = 10**0.5  # a distance for what nobody knows, the middle of PhotographHead's range
-OUTLIERS = 0.02  # share of a view's points, at either end, that do not count for its range,
-MARGIN = 2.0  # and how much wider it is: surfaces without texture have no points
-FEWEST = 16  # points in a view that tell its range
+COVER = 0.95  # of what lies behind, hidden by all views that are sure of a surface together,
+UNSURE_COVER = 0.7  # and by all that see a place where none is sure
 SPREAD = (0, 1, 2, 4)  # blocks around a point: one farther away is trusted a quarter less
 LONGEST_SIDE = 128  # of the images that are swept: twice the planes
 BLOCK = 2  # swept pixels along a side that share a depth: two compare better than one
@@ -33,24 +35,47 @@ class Prior(TensorRecord):
     Args:
         distance: along the ray of each pixel of the head's grid, > 0, in scene units.
         confidence: in [0, 1].
+        opacity: to start from, in (0, 1).
     """
 
     distance: Float[Tensor, "B V h w"]
     confidence: Float[Tensor, "B V h w"]
+    opacity: Float[Tensor, "B V h w"]
 
     @classmethod
-    def of_inverse_depth(
-        cls,
-        inverse: Float[Tensor, "B V h w"],
-        confidence: Float[Tensor, "B V h w"],
-        views: Views,
-        size: tuple[int, int],
-    ) -> "Prior":
+    def of_depths(cls, found: SweptDepth, views: Views, size: tuple[int, int]) -> "Prior":
         """Return the prior of depths along the z axis, 0 where unknown, at the grid's size."""
-        inverse = F.interpolate(inverse, size, mode="bilinear")
+        alone = (found.within == 0).to(found.confidence)
+        sure = _share(COVER, found.same).logit()
+        unsure = _share(UNSURE_COVER, found.within).logit()
+        start = unsure + (sure - unsure) * torch.maximum(found.confidence, alone)
+        inverse, confidence, start = (
+            F.interpolate(each, size, mode="bilinear")
+            for each in (found.inverse_depth, found.confidence, start)
+        )
         length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
         distance = torch.where(inverse > 0, length / inverse.clamp_min(1e-6), UNKNOWN)
-        return cls(distance, F.interpolate(confidence, size, mode="bilinear"))
+        return cls(distance, confidence, start.sigmoid())
+
+    @classmethod
+    def of_known_depths(
+        cls,
+        inverse: Float[Tensor, "B V h w"],
+        known: Float[Tensor, "B V h w"],
+        confidence: Float[Tensor, "B V h w"],
+        views: Views,
+    ) -> "Prior":
+        """Return the prior of depths that are given, filled where `known` is less than 1."""
+        scenes, count, *size = inverse.shape
+        inverse = fill(inverse, known)
+        others = votes(
+            Depths(inverse, torch.zeros_like(inverse[..., 0, 0])),
+            views.cameras.resized(*size),
+            other_views(count, scenes, inverse.device),
+            trust=confidence,
+        )
+        found = SweptDepth(inverse, confidence, others.same, others.within)
+        return cls.of_depths(found, views, tuple(size))
 
     def features(self, height: int, width: int) -> Float[Tensor, "B V H W 2"]:
         """Return the logarithm of the distance and the confidence, both in about [-1, 1]."""
@@ -80,7 +105,7 @@ class SweepPrior(nn.Module):
         ).unflatten(0, views.images.shape[:2])
         ranges = _ranges(views.point_depths, factor)
         found = plane_sweep(images, small, stride=BLOCK, ranges=ranges)
-        return Prior.of_inverse_depth(found.inverse_depth, found.confidence, views, size)
+        return Prior.of_depths(found, views, size)
 
 
 class DepthPrior(nn.Module):
@@ -88,7 +113,7 @@ class DepthPrior(nn.Module):
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
         inverse, share = _blocks(views.depths, views, size)
-        return Prior.of_inverse_depth(fill(inverse, share), share, views, size)
+        return Prior.of_known_depths(inverse, share, share, views)
 
 
 class PointsPrior(nn.Module):
@@ -102,7 +127,7 @@ class PointsPrior(nn.Module):
         known = (share > 0).to(share)
         spread = [F.max_pool2d(known, 2 * r + 1, stride=1, padding=r) for r in SPREAD]
         confidence = torch.stack(spread).mean(0)
-        return Prior.of_inverse_depth(fill(inverse, known), confidence, views, size)
+        return Prior.of_known_depths(inverse, known, confidence, views)
 
 
 def _ranges(depths: Float[Tensor, "B V H W"] | None, factor: int) -> Float[Tensor, "B V 2"] | None:
@@ -115,12 +140,12 @@ def _ranges(depths: Float[Tensor, "B V H W"] | None, factor: int) -> Float[Tenso
     if depths is None:
         return None
     inverse = F.max_pool2d((depths > 0) / depths.clamp_min(1e-6), factor).flatten(2)
-    ordered = inverse.sort(dim=-1).values  # pixels without a point come first
-    count = (ordered > 0).sum(-1, keepdim=True)
-    shares = ordered.new_tensor([OUTLIERS, 1 - OUTLIERS])
-    index = ordered.shape[-1] - count + (shares * (count - 1)).round().long()
-    ranges = ordered.gather(-1, index.clamp_max(ordered.shape[-1] - 1))
-    return ranges.where(count >= FEWEST, 0) * ordered.new_tensor([1 / MARGIN, MARGIN])
+    return observed_range(inverse, inverse > 0)
+
+
+def _share(cover: float, others: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
+    """Return the opacity with which a view and as many others hide `cover` together."""
+    return 1 - (1 - cover) ** (1 / (1 + others))
 
 
 def _blocks(

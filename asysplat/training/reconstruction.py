@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, Literal
 
 import lightning
 import torch
@@ -28,7 +28,8 @@ class Reconstruction(lightning.LightningModule):
         optimizer: parameter groups -> optimizer; weight decay applies to those of `decaying`
             alone.
         schedule: optimizer -> its learning rates, one for each step.
-        background: RGB in [0, 1] behind the Gaussians.
+        background: RGB in [0, 1] behind the Gaussians, or "inputs": the mean colour of the input
+            views.
         checkpoint_layers: compute each layer again in the backward pass, to save memory.
     """
 
@@ -38,7 +39,7 @@ class Reconstruction(lightning.LightningModule):
         loss: ReconstructionLoss,
         optimizer: Callable[[list[dict[str, Any]]], Optimizer],
         schedule: Callable[[Optimizer], LRScheduler],
-        background: Sequence[float],
+        background: Sequence[float] | Literal["inputs"],
         checkpoint_layers: bool = False,
     ):
         super().__init__()
@@ -47,7 +48,8 @@ class Reconstruction(lightning.LightningModule):
         self.net, self.loss = net, loss
         self.optimizer, self.schedule = optimizer, schedule
         self._side_by_side = SideBySide(net, self._terms)
-        self.register_buffer("background", torch.tensor(background), persistent=False)
+        fixed = None if background == "inputs" else torch.tensor(background)
+        self.register_buffer("background", fixed, persistent=False)
 
     def reconstruct(self, batch: dict[str, Any], depth: bool) -> Outcome:
         """Predict the Gaussians of the inputs and render them at the target cameras.
@@ -61,10 +63,16 @@ class Reconstruction(lightning.LightningModule):
     def _reconstruct(self, net: nn.Module, batch: dict[str, Any], depth: bool) -> Outcome:
         gaussians = net(batch["inputs"])
         targets = batch["targets"]
-        rendering = render(
-            gaussians, targets.cameras, self.background, depth=depth, masks=targets.masks
-        )
+        background = self.behind(batch)
+        rendering = render(gaussians, targets.cameras, background, depth=depth, masks=targets.masks)
         return Outcome(gaussians, rendering)
+
+    def behind(self, batch: dict[str, Any]) -> Tensor:
+        """Return the background of the targets: [3], or [B, V, 3] where it follows the inputs."""
+        if self.background is not None:
+            return self.background
+        mean = batch["inputs"].images.mean((1, 3, 4))[:, None]
+        return mean.expand(-1, batch["targets"].cameras.num_views, -1)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         size = len(batch["scene"])

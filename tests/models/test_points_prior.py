@@ -75,7 +75,7 @@ def test_a_sweep_looks_where_the_points_are(monkeypatch):
     views = make_views(points)
     views.cameras.cam_to_world[0, 1, 0, 3] = 0.5
     known = SweepPrior()(views, SIZE)
-    assert given[0][0, 0].tolist() == pytest.approx([1 / 8, 1], rel=0.05)
+    assert given[0][0, 0].tolist() == pytest.approx([1 / 6, 3 / 4], rel=0.05)
     assert given[0][0, 1].tolist() == [0, 0]
     unknown = SweepPrior()(replace(views, point_depths=torch.zeros_like(points)), SIZE)
     cameras = SweepPrior()(replace(views, point_depths=None), SIZE)

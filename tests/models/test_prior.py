@@ -1,6 +1,5 @@
 """Priors: what they give to tokens and heads, what is unknown, and all models with one."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -11,7 +10,7 @@ from test_head import make_views
 
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.models import DepthPrior, LongLRMHead, PhotographHead, SweepPrior
-from asysplat.models.prior import UNKNOWN, Prior
+from asysplat.models.prior import COVER, UNKNOWN, Prior
 from asysplat.scene import Cameras, Views
 
 MODELS = ["asysplat_4m4s", "longlrm", "single_branch", "asysplat_pred_fine"]
@@ -82,7 +81,7 @@ def test_unknown_is_the_untrained_distance():
     head = PhotographHead(8, 16, 8)
     torch.nn.init.zeros_(head.decode.weight)
     shape = (1, 2, 8, 8)
-    unknown = Prior(torch.full(shape, UNKNOWN), torch.zeros(shape))
+    unknown = Prior(torch.full(shape, UNKNOWN), torch.zeros(shape), torch.full(shape, 0.5))
     tokens = torch.zeros(1, 2, 1, 1, 8)
     with_prior, without = head(tokens, views, unknown), head(tokens, views)
     torch.testing.assert_close(with_prior.means, without.means)
@@ -92,25 +91,42 @@ def test_unknown_is_the_untrained_distance():
 @pytest.mark.parametrize("head", [PhotographHead, LongLRMHead])
 def test_gaussians_start_where_the_prior_says(head):
     views = make_views()
-    built = head(8, 16, 8, opacity_bias=-2.0, opacity_gain=4.0)
+    built = head(8, 16, 8)
     torch.nn.init.zeros_(built.decode.weight)
     distance = torch.linspace(0.5, 8, 128).reshape(1, 2, 8, 8)
     if head is LongLRMHead:
         distance = 10 * distance  # of a range of 500
-    prior = Prior(distance, torch.linspace(0, 1, 128).reshape(1, 2, 8, 8))
+    confidence = torch.linspace(0, 1, 128).reshape(1, 2, 8, 8)
+    prior = Prior(distance, confidence, 0.1 + 0.8 * confidence)
     gaussians = built(torch.zeros(1, 2, 1, 1, 8), views, prior)
     origins = views.cameras.centers[0, :, None].expand(2, 64, 3).reshape(-1, 3)
     found = (gaussians.means[0] - origins).norm(dim=-1)
     torch.testing.assert_close(found, distance.flatten(), rtol=1e-4, atol=0)
-    low, high = gaussians.opacities[0, 0].item(), gaussians.opacities[0, -1].item()
-    assert (low, high) == pytest.approx((1 / (1 + math.exp(2)), 1 / (1 + math.exp(-2))))
+    torch.testing.assert_close(gaussians.opacities[0], prior.opacity.flatten())
 
 
 def test_features_are_bounded_at_any_distance():
     distance = torch.tensor([1e-6, 1.0, 1e6]).reshape(1, 1, 1, 3)
-    features = Prior(distance, torch.full_like(distance, 0.5)).features(1, 3)
+    half = torch.full_like(distance, 0.5)
+    features = Prior(distance, half, half).features(1, 3)
     assert features.shape == (1, 1, 1, 3, 2) and features.abs().max() <= 2
     assert (features[..., 0].diff(dim=-1) > 0).all()
+
+
+@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize("views", [2, 4, 8])
+def test_those_who_see_a_wall_hide_it_together(name, views):
+    prior = PRIORS[name]()(wall(views, step=0.1), (16, 16))
+    middle = prior.opacity[:, views // 2, 4:12, 4:12]
+    hidden = 1 - (1 - middle) ** views
+    assert hidden.median() > 0.8 and hidden.max() < 0.98
+
+
+def test_what_one_view_alone_sees_is_opaque():
+    views = wall(2, step=1.5)  # three quarters of a picture at the wall's distance
+    prior = DepthPrior()(views, (16, 16))
+    assert (prior.opacity[:, 0, :, :11] - COVER).abs().max() < 1e-3
+    assert prior.opacity[:, 0, :, 13:].max() < 0.8
 
 
 @pytest.mark.parametrize("model", MODELS)

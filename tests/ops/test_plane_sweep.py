@@ -107,8 +107,8 @@ def test_a_textured_plane_is_found(stride):
     depth = torch.nn.functional.avg_pool2d(depth, stride)
     found = plane_sweep(images, cameras, stride)
     error = relative_error(found, depth)
-    assert error.median() < 0.02 and error.quantile(0.9) < 0.06
-    assert found.confidence.mean() > 0.9
+    assert error.median() < 0.015 and error.quantile(0.9) < 0.05
+    assert found.confidence.median() > 0.9 and found.confidence.mean() > 0.85
 
 
 def test_exposure_changes_nothing_much():

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from asysplat.scene import Cameras, Views
 from asysplat.training import Reconstruction, ReconstructionLoss
 from asysplat.training.schedule import cosine
 
@@ -14,13 +15,13 @@ FOLDER = Path(__file__).parents[2] / "conf" / "model"
 MODELS = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem not in PARTS)
 
 
-def make_module(net):
+def make_module(net, background=(0.5, 0.5, 0.5)):
     return Reconstruction(
         net=net,
         loss=ReconstructionLoss(mse=1.0, perceptual=0.0, depth=0.0),
         optimizer=partial(torch.optim.AdamW, lr=1e-3, weight_decay=0.05, fused=True),
         schedule=partial(cosine, warmup_steps=1, total_steps=2),
-        background=(0.5, 0.5, 0.5),
+        background=background,
     )
 
 
@@ -78,3 +79,16 @@ def test_a_branch_that_nothing_reads_is_not_trained(build):
     assert not any(p.requires_grad for p in net.geometry.parameters())
     assert all(p.requires_grad for p in net.appearance.parameters())
     assert all(isinstance(p, torch.nn.Parameter) and not p.is_meta for p in net.parameters())
+
+
+def test_the_background_follows_the_inputs(build):
+    """What no Gaussian covers has the mean colour of each scene's inputs."""
+    module = make_module(build("width=0.125", "state_size=8"), "inputs")
+    poses = torch.eye(4).repeat(2, 2, 1, 1)
+    intrinsics = torch.tensor([[32.0, 0, 16], [0, 32, 16], [0, 0, 1]]).repeat(2, 2, 1, 1)
+    inputs = Views(Cameras(intrinsics, poses, 32, 32), torch.rand(2, 2, 3, 32, 32))
+    away = poses[:, :1] * torch.tensor([-1.0, 1, -1, 1])  # turned round
+    targets = Views(Cameras(intrinsics[:, :1], away, 32, 32), torch.rand(2, 1, 3, 32, 32))
+    outcome = module.reconstruct({"inputs": inputs, "targets": targets}, depth=False)
+    expected = inputs.images.mean((1, 3, 4))[:, None, :, None, None].expand(2, 1, 3, 32, 32)
+    torch.testing.assert_close(outcome.rendering.image, expected)

@@ -3,30 +3,36 @@
 What is swept and how far follows from the cameras (`cameras.py`). Each pixel is compared with its
 neighbours' at every plane (`match`), the costs are smoothed along the image's rows and columns as
 in semi-global matching (`smooth`, Hirschmueller 2008), and what the views say of each other's
-depths gives the confidence (`agreement.py`). `match` and `smooth` are kernels in cpu/ and cuda/.
+depths gives the confidence (`agreement.py`). A first sweep of images of half the size finds the
+range in which the second places its planes: surfaces take a tenth of what cameras could see.
+`match` and `smooth` are kernels in cpu/ and cuda/.
 """
 
 from dataclasses import dataclass
 from types import ModuleType
 
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.ops.dispatch import FAST, check_fast_backend, fast_backend, pick_backend
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.agreement import Depths, compare, fill
+from asysplat.ops.plane_sweep.agreement import CONTRADICTION, Depths, fill, other_views, votes
 from asysplat.ops.plane_sweep.cameras import (
     choose_neighbours,
     inverse_depth_range,
+    least_step,
+    observed_range,
     relative_projections,
 )
 from asysplat.scene import Cameras, TensorRecord
 
-PLANES = 64
+PLANES = 48
 NEIGHBOURS = 4
 SURE = 0.5  # by which the best plane's costs, of four paths, are less than the mean
+AGREED = 0.5  # agreement of a depth that counts for the range of the second sweep
 LUMA = (0.299, 0.587, 0.114)
 
 
@@ -37,10 +43,14 @@ class SweptDepth(TensorRecord):
     Args:
         inverse_depth: 1 / depth along the camera's z axis, > 0; 0 where nothing is known.
         confidence: in [0, 1]; 0 where no neighbour sees the same.
+        same: how many other views find the same, each counted as far as it is trusted.
+        within: in how many other views it would be, seen or hidden.
     """
 
     inverse_depth: Float[Tensor, "*batch V h w"]
     confidence: Float[Tensor, "*batch V h w"]
+    same: Float[Tensor, "*batch V h w"]
+    within: Float[Tensor, "*batch V h w"]
 
 
 def plane_sweep(
@@ -54,9 +64,10 @@ def plane_sweep(
 ) -> SweptDepth:
     """Find the depth of every `stride` x `stride` block of pixels; h = H / stride, w = W / stride.
 
-    The costs take 4 B V h w D bytes for D planes. Beside them "cpu" holds twice those of one view
-    for each thread, "cuda" all of them once more, and "reference" several times, and some fifty
-    maps [D, H, W] while it compares one view.
+    The costs take 4 B V h w D bytes for D planes; a quarter of that was taken before, by those of
+    the first sweep. Beside them "cpu" holds twice those of one view for each thread, "cuda" all of
+    them once more, and "reference" several times, and some fifty maps [D, H, W] while it compares
+    one view.
 
     Args:
         images: RGB in [0, 1].
@@ -92,39 +103,82 @@ def _sweep(
     neighbours: int,
     backend: str,
     ranges: Tensor | None,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Sweep: one operator for torch, so that devices without content know its shapes."""
     form = _load(backend)
     cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
-    small = cameras.resized(cameras.height // stride, cameras.width // stride)
     chosen = choose_neighbours(cameras, neighbours)
     seen = inverse_depth_range(cameras, chosen)
     ranges = seen if ranges is None else torch.where(ranges[..., 1:] > 0, ranges.to(seen), seen)
-    projections = relative_projections(cameras, chosen)
-    grey = (images * images.new_tensor(LUMA)[:, None, None]).sum(2)
-    costs = form.match(grey, chosen, projections, ranges, planes, stride)
-    edges = _edges(images, stride)
-    agreement = images.new_ones(*images.shape[:2], small.height, small.width)
-    for _ in range(2):  # once with all costs, once with those of what the neighbours agree on
-        lowest = form.smooth(costs, agreement, edges)
-        found = Depths.at_planes(lowest.plane, ranges, planes)
-        agreement = compare(found, small, chosen)
-    agreement = agreement * (lowest.contrast / SURE).clamp(0, 1)
+    half = cameras.resized(*(max(1, side // (2 * stride)) * stride for side in images.shape[-2:]))
+    smaller = F.interpolate(images.flatten(0, 1), (half.height, half.width), mode="area")
+    smaller = smaller.unflatten(0, images.shape[:2])
+    found, agreement = _depths(form, smaller, half, chosen, ranges, planes, stride, smoothings=1)
+    ranges = _narrowed(ranges, found, agreement, planes * least_step(cameras, chosen))
+    found, agreement = _depths(form, images, cameras, chosen, ranges, planes, stride, smoothings=2)
+    everyone = other_views(images.shape[1], images.shape[0], images.device)
+    small = cameras.resized(cameras.height // stride, cameras.width // stride)
+    others = votes(found, small, everyone, trust=agreement)
+    agreement = agreement / (1 + CONTRADICTION * others.through)
     precision = found.precision()
-    return fill(found.inverse, agreement * precision), agreement * (1 + precision) / 2
+    inverse = fill(found.inverse, agreement * precision)
+    return inverse, agreement * (1 + precision) / 2, others.same, others.within
 
 
 @_sweep.register_fake
 def _(images, intrinsics, cam_to_world, stride, planes, neighbours, backend, ranges):
     shape = (*images.shape[:2], images.shape[-2] // stride, images.shape[-1] // stride)
-    return images.new_empty(shape), images.new_empty(shape)
+    return tuple(images.new_empty(shape) for _ in range(4))
+
+
+def _depths(
+    form: ModuleType,
+    images: Float[Tensor, "B V 3 H W"],
+    cameras: Cameras,
+    chosen: Int[Tensor, "B V K"],
+    ranges: Float[Tensor, "B V 2"],
+    planes: int,
+    stride: int,
+    smoothings: int,
+) -> tuple[Depths, Float[Tensor, "B V h w"]]:
+    """Return the depths of all views, and how far their neighbours agree with them.
+
+    After the first smoothing a pixel's costs count as much as its neighbours agreed with it.
+    """
+    small = cameras.resized(cameras.height // stride, cameras.width // stride)
+    grey = (images * images.new_tensor(LUMA)[:, None, None]).sum(2)
+    projections = relative_projections(cameras, chosen)
+    costs = form.match(grey, chosen, projections, ranges, planes, stride)
+    edges = _edges(images, stride)
+    least, greatest = ranges[..., None, None, :].unbind(-1)
+    plane = (greatest - least) / (planes - 1)
+    step = torch.maximum(plane[..., 0, 0], least_step(cameras, chosen))
+    agreement = images.new_ones(*images.shape[:2], small.height, small.width)
+    for _ in range(smoothings):
+        lowest = form.smooth(costs, agreement, edges)
+        found = Depths(least + lowest.plane * plane, step)
+        agreement = votes(found, small, chosen).agreement()
+    return found, agreement * (lowest.contrast / SURE).clamp(0, 1)
+
+
+def _narrowed(
+    ranges: Float[Tensor, "B V 2"],
+    found: Depths,
+    agreement: Float[Tensor, "B V h w"],
+    shortest: Float[Tensor, "B V"],
+) -> Float[Tensor, "B V 2"]:
+    """Return the ranges of what neighbours agree on, within those given; few depths change none."""
+    observed = observed_range(found.inverse.flatten(2), agreement.flatten(2) > AGREED)
+    half_step = found.step / 2
+    least = torch.maximum(ranges[..., 0], observed[..., 0] - half_step)
+    greatest = torch.maximum(observed[..., 1] + half_step, least + shortest)
+    narrowed = torch.stack((least, torch.minimum(ranges[..., 1], greatest)), dim=-1)
+    return torch.where(observed[..., 1:] > 0, narrowed, ranges)
 
 
 def _edges(images: Tensor, stride: int) -> Float[Tensor, "B V 2 h w"]:
     """Return the mean absolute colour difference to the block on the left, and to that above."""
-    blocks = torch.nn.functional.avg_pool2d(images.flatten(0, 1), stride).unflatten(
-        0, images.shape[:2]
-    )
+    blocks = F.avg_pool2d(images.flatten(0, 1), stride).unflatten(0, images.shape[:2])
     left = torch.zeros_like(blocks[:, :, 0])
     above = torch.zeros_like(left)
     left[..., 1:] = blocks.diff(dim=-1).abs().mean(2)

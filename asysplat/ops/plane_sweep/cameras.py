@@ -10,6 +10,10 @@ SAMPLES = 6  # points along each side of a view that stand for all its pixels
 USEFUL_PARALLAX = 0.1  # in image widths: more adds nothing,
 WIDE_PARALLAX = 0.5  # and from here on two views look too different
 LEAST_SHARE = 0.2  # of a view that a neighbour sees at the nearest plane
+OUTLIERS = 0.02  # share of the depths that are known, at either end, that do not count for a range,
+FEWEST = 16  # how many it takes to tell one
+MARGIN = 1.5  # and how much wider it is: surfaces without texture are not known
+SUBPIXEL = 0.25  # pixels by which matches are off
 FRONT = 1e-6  # least depth in front of a camera, over the depth in the other
 
 
@@ -46,14 +50,11 @@ def inverse_depth_range(
 
     Both are 0 for a view without neighbours; the least is 0 where infinity is seen.
     """
-    centers = cameras.centers
-    scene = torch.arange(len(centers), device=centers.device)[:, None, None]
-    distance = (centers[scene, neighbours.clamp_min(0)] - centers[:, :, None]).norm(dim=-1)
-    distance = distance.masked_fill(neighbours < 0, 0).amax(-1)
-    steps = torch.logspace(-2, 2, 97, base=10.0).to(centers)
+    distance = _farthest(cameras, neighbours)
+    steps = torch.logspace(-2, 2, 97, base=10.0).to(distance)
     focal = cameras.intrinsics[..., 0, 0] / cameras.width
     inverse = steps / (distance.clamp_min(1e-12) * focal)[..., None]
-    share = _sees(cameras, neighbours, inverse).any(2).to(centers).mean((-1, -2))
+    share = _sees(cameras, neighbours, inverse).any(2).to(distance).mean((-1, -2))
     enough = share >= LEAST_SHARE
     first = enough.int().argmax(-1, keepdim=True)
     last = enough.shape[-1] - 1 - enough.flip(-1).int().argmax(-1, keepdim=True)
@@ -63,6 +64,24 @@ def inverse_depth_range(
     )
     ranges = torch.cat((least, greatest), dim=-1)
     return ranges.masked_fill((distance == 0)[..., None], 0)
+
+
+def least_step(cameras: Cameras, neighbours: Int[Tensor, "B V K"]) -> Float[Tensor, "B V"]:
+    """Return the inverse depth that moves a pixel by SUBPIXEL in the farthest neighbour's image."""
+    pixels = cameras.intrinsics[..., 0, 0] * _farthest(cameras, neighbours)
+    return torch.where(pixels > 0, SUBPIXEL / pixels.clamp_min(1e-30), 0)
+
+
+def observed_range(
+    inverse: Float[Tensor, "B V n"], known: Bool[Tensor, "B V n"]
+) -> Float[Tensor, "B V 2"]:
+    """Return the least and greatest inverse depth that those known suggest; 0 and 0 of too few."""
+    ordered = inverse.masked_fill(~known, torch.inf).sort(dim=-1).values
+    count = known.sum(-1, keepdim=True)
+    shares = inverse.new_tensor([OUTLIERS, 1 - OUTLIERS])
+    index = (shares * (count - 1)).round().long().clamp(0, ordered.shape[-1] - 1)
+    ranges = ordered.gather(-1, index) * ordered.new_tensor([1 / MARGIN, MARGIN])
+    return torch.where(count >= FEWEST, ranges, 0)
 
 
 def relative_projections(
@@ -82,6 +101,14 @@ def relative_projections(
     rays = relative[..., :3, :3] @ torch.linalg.inv(double.intrinsics)[:, :, None]
     matrix = torch.cat((intrinsics @ rays, intrinsics @ relative[..., :3, 3:]), dim=-1)
     return matrix.to(cameras.intrinsics.dtype)
+
+
+def _farthest(cameras: Cameras, neighbours: Int[Tensor, "B V K"]) -> Float[Tensor, "B V"]:
+    """Return the distance of the farthest neighbour, 0 without any."""
+    centers = cameras.centers
+    scene = torch.arange(len(centers), device=centers.device)[:, None, None]
+    distance = (centers[scene, neighbours.clamp_min(0)] - centers[:, :, None]).norm(dim=-1)
+    return distance.masked_fill(neighbours < 0, 0).amax(-1)
 
 
 def _sees(

@@ -71,9 +71,8 @@ class Costs(lightning.Callback):
         with torch.no_grad():
             gaussians = module.net(inputs)
         module.net.train(was_training)
-        return render_seconds(
-            gaussians, targets.cameras, module.background, module.loss.needs_depth
-        )
+        background = module.behind({"inputs": inputs, "targets": targets})
+        return render_seconds(gaussians, targets.cameras, background, module.loss.needs_depth)
 
     def on_test_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         self.tests = [
