@@ -101,9 +101,11 @@ def _measured_grid(filled: FilledTable) -> Grid:
     columns = [[Cell(row.name) for row in filled.rows]]
     for column in filled.measured_columns:
         arrow = ARROWS[column.better]
-        headings += [Heading(column.title + arrow, "paper")]
+        if filled.paper.number is not None:
+            headings += [Heading(column.title + arrow, "paper")]
+            columns += [_paper_cells(filled.rows, column)]
         headings += [Heading(filled.our_title(column) + arrow, "ours")]
-        columns += [_paper_cells(filled.rows, column), _our_cells(filled.rows, column)]
+        columns += [_our_cells(filled.rows, column)]
     return Grid("Measured", tuple(headings), tuple(zip(*columns, strict=True)))
 
 

@@ -85,7 +85,10 @@ class FilledTable:
 
     @property
     def title(self) -> str:
-        return f"Table {self.paper.number}: {self.paper.title}"
+        number = self.paper.number
+        return (
+            f"Ours: {self.paper.title}" if number is None else f"Table {number}: {self.paper.title}"
+        )
 
     @property
     def networks(self) -> list[FilledRow]:

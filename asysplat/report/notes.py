@@ -52,6 +52,8 @@ def rho_text(filled: FilledTable) -> str:
 
 
 def _stand_ins(filled: FilledTable) -> str:
+    if filled.paper.number is None:
+        return ""
     pairs = [(key, ours) for key, ours in filled.sets.items() if ours != key]
     return "; ".join(f"{set_titles()[key]} by our test set {ours}" for key, ours in pairs)
 

@@ -1,4 +1,7 @@
-"""The paper's tables as values: paper.yaml holds every number that the paper prints."""
+"""The paper's tables as values, and ours: paper.yaml holds every number that the paper prints.
+
+ours.yaml has the rows of tables that the paper does not have.
+"""
 
 import difflib
 from collections.abc import Collection, Iterable, Sequence
@@ -11,6 +14,7 @@ from omegaconf import OmegaConf
 from asysplat.errors import InputError
 
 PAPER = Path(__file__).with_name("paper.yaml")
+OURS = Path(__file__).with_name("ours.yaml")
 
 
 @dataclass(frozen=True)
@@ -104,11 +108,12 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One table of the paper, and the sweep of the same key that reproduces it.
+    """One table of the paper, and the sweep of the same key that reproduces it; or one of ours.
 
     Args:
         key: name of the file in sweeps/.
-        number: in the paper, such as "6b" or "A3".
+        number: in the paper, such as "6b" or "A3"; None of a table of ours, which has no numbers of
+            the paper.
         title: what it compares.
         protocol: what the paper measured it with.
         columns, rows: in the paper's order.
@@ -116,7 +121,7 @@ class PaperTable:
     """
 
     key: str
-    number: str
+    number: str | None
     title: str
     protocol: str
     columns: tuple[Column, ...]
@@ -131,17 +136,24 @@ class PaperTable:
 
 @cache
 def load_paper() -> dict[str, PaperTable]:
-    """Read every table; by key, in the paper's order."""
+    """Read every table of the paper; by key, in its order."""
     return {key: _table(key, entry) for key, entry in _raw()["tables"].items()}
 
 
+@cache
+def load_ours() -> dict[str, PaperTable]:
+    """Read every table of ours; by key."""
+    tables = OmegaConf.to_container(OmegaConf.load(OURS))["tables"]
+    return {key: _table(key, entry) for key, entry in tables.items()}
+
+
 def find_tables(names: str | Sequence[str]) -> list[PaperTable]:
-    """Find the tables called `names`: one, several with commas between, or "all".
+    """Find the tables called `names`, the paper's and ours: one, some with commas, or "all".
 
     Raises:
         InputError: a name that no table has, with the nearest ones.
     """
-    tables = load_paper()
+    tables = load_paper() | load_ours()
     names = names.split(",") if isinstance(names, str) else list(names)
     if names == ["all"]:
         return list(tables.values())
@@ -192,7 +204,7 @@ def _nearest(name: str, known: Iterable[str]) -> str:
 def _table(key: str, entry: dict) -> PaperTable:
     return PaperTable(
         key,
-        str(entry["number"]),
+        None if entry["number"] is None else str(entry["number"]),
         entry["title"],
         entry["protocol"],
         tuple(_column(column) for column in entry["columns"]),
@@ -210,7 +222,7 @@ def _column(key: str) -> Column:
 
 def _row(row: dict, table: dict) -> PaperRow:
     """Make a row; its views and size are its table's unless it names its own."""
-    printed = dict(zip(table["columns"], row["paper"], strict=True))
+    printed = dict(zip(table["columns"], row["paper"], strict=True)) if "paper" in row else {}
     return PaperRow(
         name=row["name"],
         numbers={k: float(v) for k, v in printed.items() if isinstance(v, int | float)},

@@ -1,5 +1,6 @@
 """Our numbers in the paper's tables: costs of every row, and runs matched by configuration."""
 
+import itertools
 import json
 from copy import deepcopy
 from functools import cache
@@ -11,7 +12,7 @@ from hydra import initialize_config_dir
 
 from asysplat.report.fill import fill_table, finished_runs, with_costs
 from asysplat.report.filled import check, fits
-from asysplat.report.paper import find_tables, load_paper
+from asysplat.report.paper import find_tables, load_ours, load_paper
 from asysplat.training.revision import revision
 from asysplat.training.runs import describe_run, find_run
 
@@ -187,3 +188,18 @@ def test_half_written_results_are_no_results(compose, tmp_path, text):
     (tmp_path / "run" / "metrics.json").write_text(text)
     with pytest.warns(UserWarning, match="is not the results of a finished run"):
         assert find_run(tmp_path, config) is None
+
+
+@pytest.mark.parametrize("table", load_ours().values(), ids=lambda table: table.key)
+def test_rows_of_our_tables_are_those_of_their_sweeps(compose, table):
+    varied = dict(compose([f"sweeps={table.key}"]).hydra.sweeper.params)
+    varied.pop("seed")
+    choices = itertools.product(*(str(value).split(",") for value in varied.values()))
+    swept = [[f"{k}={v}" for k, v in zip(varied, row, strict=True)] for row in choices]
+    models = [
+        str(compose([f"sweeps={table.key}", *run]).model)
+        for runs in (swept, [row.run for row in table.rows])
+        for run in runs
+    ]
+    half = len(models) // 2
+    assert sorted(models[:half]) == sorted(models[half:]) and len(set(models)) == half

@@ -136,7 +136,8 @@ def test_text_is_in_the_unit_of_the_title():
 
 def test_a_table_is_found_by_its_name():
     assert [table.number for table in find_tables("layers,mamba_ratio")] == ["6b", "A2"]
-    assert len(find_tables("all")) == 12
+    assert len(find_tables("all")) == 13
+    assert [table.number for table in find_tables("prior")] == [None]
     with pytest.raises(InputError, match=r"table=layer is unknown: did you mean layers"):
         find_tables("layer")
 

@@ -8,7 +8,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from asysplat.report.filled import FilledRow, FilledTable
+from asysplat.report.filled import COMPUTED, FilledRow, FilledTable
 from asysplat.report.html import render_html
 from asysplat.report.markdown import escape, render_markdown
 from asysplat.report.paper import Column, PaperRow, PaperTable, Reading
@@ -219,6 +219,18 @@ def test_a_number_of_ours_stands_under_the_name_of_our_test_set(table, ratios):
             labels = [f"{axes.get_xlabel()} {axes.get_ylabel()}" for axes in (ours, paper)]
             assert "my_rooms PSNR" in labels[0] and "DL3DV-140 PSNR" in labels[1]
             assert "DL3DV" not in labels[0] + caption and "my_rooms" not in labels[1]
+
+
+def test_a_table_of_ours_has_no_columns_of_the_paper(table):
+    columns = [column.key for column in table.paper.columns]
+    rows = tuple(
+        replace(row, paper=replace(row.paper, numbers={}, bounds={})) for row in table.rows
+    )
+    paper = replace(table.paper, number=None, protocol="", rank_by=None)
+    text = render_markdown([replace(table, paper=paper, rows=rows)])
+    assert text.count("## Ours: ") == 1 and "paper |" not in text and "Stand-ins" not in text
+    measured = [column for column in columns if column not in COMPUTED]
+    assert len(line(text, "Net\\*")) == len(measured)
 
 
 def test_a_set_of_the_papers_has_one_heading(table):
