@@ -16,7 +16,13 @@ from asysplat.models.prior import Prior
 from asysplat.ops.precision import without_autocast
 from asysplat.scene import Cameras, Gaussians, Views
 
-SURE_CORRECTION = 0.1  # of a distance that the prior is sure of, over that of an unknown one
+# With a prior, corrections are bounded: on scenes unlike those of its training a network is wrong
+# more often than the prior. Logits of places in the head's range and of opacity; logarithm of size.
+FARTHEST = 0.3  # where the prior is not sure,
+SURE = 0.1  # times that where it is
+UNBOUNDED = 10.0  # in scenes of which it knows nothing
+MOST_OPACITY = 0.5
+MOST_SIZE = 1.0
 SH_C0 = 0.28209479177387814  # Y_0, so that colour = 0.5 + SH_C0 * sh_0
 
 
@@ -75,10 +81,12 @@ class GaussianHead(nn.Module, ABC):
             if prior is None:
                 opacities = opacities + self.opacity_bias
             else:
-                expected = self.depth_fraction(prior.distance).clamp(0.01, 0.99)
-                unsure = 1 - (1 - SURE_CORRECTION) * prior.confidence
-                depth_logit = expected.logit()[..., None] + unsure[..., None] * depth_logit
-                opacities = opacities + prior.opacity.logit()
+                expected = self.depth_fraction(prior.distance).clamp(0.01, 0.99).logit()
+                bound = FARTHEST * (1 - (1 - SURE) * prior.confidence)
+                bound = torch.where(prior.knows_something, bound, UNBOUNDED)
+                depth_logit = (expected + bounded(depth_logit[..., 0], bound))[..., None]
+                opacities = prior.opacity.logit() + bounded(opacities, MOST_OPACITY)
+                scales = bounded(scales, MOST_SIZE)
             sh = sh.unflatten(-1, (-1, 3))
             gaussians = self.activate(
                 depth_logit.sigmoid(), quats, scales, opacities.sigmoid(), sh, views
@@ -222,6 +230,11 @@ class LongLRMHead(GaussianHead):
             opacities=opacities,
             sh=sh,
         )
+
+
+def bounded(values: Tensor, bound: Tensor | float) -> Tensor:
+    """Return numbers within the bound; those well inside it hardly change."""
+    return bound * (values / bound).tanh()
 
 
 def footprint(cameras: Cameras) -> Float[Tensor, "B V 1 1 1"]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from asysplat.ops import plane_sweep
@@ -41,6 +41,11 @@ class Prior(TensorRecord):
     distance: Float[Tensor, "B V h w"]
     confidence: Float[Tensor, "B V h w"]
     opacity: Float[Tensor, "B V h w"]
+
+    @property
+    def knows_something(self) -> Bool[Tensor, "B 1 1 1"]:
+        """Tell the scenes of which any depth is known."""
+        return (self.confidence > 0).flatten(1).any(dim=-1)[:, None, None, None]
 
     @classmethod
     def of_depths(cls, found: SweptDepth, views: Views, size: tuple[int, int]) -> "Prior":
@@ -78,8 +83,12 @@ class Prior(TensorRecord):
         return cls.of_depths(found, views, tuple(size))
 
     def features(self, height: int, width: int) -> Float[Tensor, "B V H W 2"]:
-        """Return the logarithm of the distance and the confidence, both in about [-1, 1]."""
-        maps = ((self.distance / UNKNOWN).log().clamp(-4, 4) / 2, self.confidence * 2 - 1)
+        """Return the logarithm of the distance, over the scene's middle, and the confidence.
+
+        Both are in about [-1, 1]. Places and things, seen from near and far, look alike.
+        """
+        middle = self.distance.flatten(1).median(dim=-1).values[:, None, None, None]
+        maps = ((self.distance / middle).log().clamp(-4, 4) / 2, self.confidence * 2 - 1)
         return torch.stack(
             [F.interpolate(each, (height, width), mode="bilinear") for each in maps], dim=-1
         )

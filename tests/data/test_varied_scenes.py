@@ -34,7 +34,7 @@ def test_only_scenes_that_train_are_varied():
         source.training(3, 1, rng).capture.cameras.intrinsics[0, 0, 0].item() for _ in range(40)
     ]
     degrees = np.degrees(2 * np.arctan(8 / np.array(focals)))
-    assert 35 <= degrees.min() < 45 and 80 < degrees.max() <= 90
+    assert 25 <= degrees.min() < 35 and 70 < degrees.max() <= 80
     for split in ("val", "test"):
         (task,) = source.evaluation(split, 3, 1)
         plain = ProceduralScene(split_seed(split, 0), 16, 16, 24)

@@ -1,5 +1,6 @@
 """Priors: what they give to tokens and heads, what is unknown, and all models with one."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -103,6 +104,30 @@ def test_gaussians_start_where_the_prior_says(head):
     found = (gaussians.means[0] - origins).norm(dim=-1)
     torch.testing.assert_close(found, distance.flatten(), rtol=1e-4, atol=0)
     torch.testing.assert_close(gaussians.opacities[0], prior.opacity.flatten())
+
+
+@pytest.mark.parametrize("sure", [0.0, 1.0])
+def test_corrections_are_bounded_where_something_is_known(sure):
+    views, shape = make_views(), (1, 2, 8, 8)
+    head = PhotographHead(8, 16, 8)
+    torch.nn.init.normal_(head.decode.weight, std=100.0)
+    confidence = torch.full(shape, sure)
+    confidence[0, 0, 0, 0] = 0.5
+    prior = Prior(torch.full(shape, 3.0), confidence, torch.full(shape, 0.5))
+    tokens = torch.randn(1, 2, 1, 1, 8)
+    start = PhotographHead(8, 16, 8)
+    torch.nn.init.zeros_(start.decode.weight)
+    moved, before = head(tokens, views, prior), start(tokens, views, prior)
+    origins = views.cameras.centers[0, :, None].expand(2, 64, 3).reshape(-1, 3)
+    ratio = (moved.means[0] - origins).norm(dim=-1) / (before.means[0] - origins).norm(dim=-1)
+    # A logit of 0.3 is at most 0.075 of the range, which is a factor of 1000.
+    bound = (0.03 if sure else 0.3) / 4 * math.log(1000)
+    assert ratio[1:].log().abs().max() <= 1.001 * bound
+    assert (moved.opacities.logit() - before.opacities.logit()).abs().max() <= 0.501
+    assert (moved.scales / before.scales).log().abs().max() < 1.3  # of size and of distance
+    unknown = replace(prior, confidence=torch.zeros(shape))
+    free = head(tokens, views, unknown)
+    assert ((free.means[0] - origins).norm(dim=-1) / 3).log().abs().max() > 1
 
 
 def test_features_are_bounded_at_any_distance():

@@ -57,6 +57,24 @@ def circle(
     return positions, targets
 
 
+def above(
+    rng: np.random.Generator, num_frames: int, radius: float
+) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3"]]:
+    """Draw a way of 90 to 270 degrees around something low, at 0.25 to 0.5 times `radius`.
+
+    Cameras look down at it from close by, as when a thing is photographed and not a place.
+    """
+    time = np.linspace(0, 1, num_frames)
+    turn = np.radians(rng.uniform(90, 270)) * rng.choice([-1, 1])
+    angle = rng.uniform(0, 2 * np.pi) + turn * (time + 0.03 * sway(rng, time, (1.0, 2.0)))
+    distance = radius * rng.uniform(0.25, 0.5) * (1 + 0.15 * sway(rng, time, (0.7, 1.6)))
+    positions = _on_ground(distance * np.array([np.cos(angle), np.sin(angle)]), rng, time)
+    positions[:, 2] += 0.15 * sway(rng, time, (0.6, 1.4))
+    targets = np.stack([0.15 * sway(rng, time, (0.6, 1.7)) for _ in range(3)], 1)
+    targets[:, 2] += rng.uniform(0.2, 0.6)
+    return positions, targets
+
+
 def forward(
     rng: np.random.Generator, num_frames: int, radius: float
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3"]]:

@@ -11,15 +11,15 @@ from torch import Tensor
 from asysplat.data.procedural.clutter import add_clutter, polish
 from asysplat.data.procedural.edges import SAMPLES, edge_pixels, mixed, samples
 from asysplat.data.procedural.floor_plan import furnished_room, outdoor_place
-from asysplat.data.procedural.path import arc, circle, forward, hand_held_path, pan
+from asysplat.data.procedural.path import above, arc, circle, forward, hand_held_path, pan
 from asysplat.data.procedural.world import World
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 
 SPLITS = ("train", "val", "test")
 PLACES = ("both", "rooms", "outdoors")
-VARIED_PATHS = (arc, arc, circle, forward, pan)
-FOV, VARIED_FOV = (60, 75), (35, 90)  # least and greatest, degrees along the longer side
+VARIED_PATHS = (arc, arc, circle, above, above, forward, pan)
+FOV, VARIED_FOV = (60, 75), (25, 80)  # least and greatest, degrees along the longer side
 RAYS_IN_CACHE = 4096  # traced at once on a CPU
 PROBE_FRAMES = 4  # frames by which the exposure is set
 PROBE_SIZE = 16  # pixels a side of those frames
@@ -57,7 +57,7 @@ class ProceduralScene:
         device: where images are computed.
         places: rooms or outdoors; with both, the seed decides.
         varied: whether there are thin and small near things, gloss, smooth edges, cameras that
-            circle, walk forward or pan, and focal lengths from wide to long.
+            circle, look down from above, walk forward or pan, and focal lengths from wide to long.
 
     Raises:
         InputError: unknown places.
