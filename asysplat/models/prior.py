@@ -87,7 +87,8 @@ class Prior(TensorRecord):
 
         Both are in about [-1, 1]. Places and things, seen from near and far, look alike.
         """
-        middle = self.distance.flatten(1).median(dim=-1).values[:, None, None, None]
+        ordered = self.distance.flatten(1).sort(dim=-1).values
+        middle = ordered[:, (ordered.shape[1] - 1) // 2, None, None, None]
         maps = ((self.distance / middle).log().clamp(-4, 4) / 2, self.confidence * 2 - 1)
         return torch.stack(
             [F.interpolate(each, (height, width), mode="bilinear") for each in maps], dim=-1
