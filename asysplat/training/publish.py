@@ -15,11 +15,14 @@ from asysplat.errors import InputError
 from asysplat.training.checkpoints import save_weights
 from asysplat.training.summary import METRICS
 
+LIMITS = "\n## Limits\n"
 LARGEST = 16e6  # bytes: more does not belong into a repository
 
 
 def publish(run: Path, target: Path) -> None:
     """Write `target`.safetensors, and `target`.md with where it comes from and what it measured.
+
+    What stands below "## Limits" in a card that is there already is kept: it is written by hand.
 
     Args:
         run: the folder of a finished run.
@@ -45,7 +48,10 @@ def publish(run: Path, target: Path) -> None:
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     save_weights(weights, target.with_suffix(".safetensors"))
-    target.with_suffix(".md").write_text(_card(run, results, saved["global_step"], size))
+    card = target.with_suffix(".md")
+    before = card.read_text() if card.exists() else ""
+    limits = before[before.index(LIMITS) :] if LIMITS in before else ""
+    card.write_text(_card(run, results, saved["global_step"], size) + limits)
 
 
 def _card(run: Path, results: dict[str, float | int | str], steps: int, size: int) -> str:
