@@ -18,8 +18,8 @@ from asysplat.scene import Cameras, Gaussians, Views
 
 # With a prior, corrections are bounded: on scenes unlike those of its training a network is wrong
 # more often than the prior. Logits of places in the head's range and of opacity; logarithm of size.
-FARTHEST = 0.3  # where the prior is not sure,
-SURE = 0.1  # times that where it is
+FARTHEST = 0.01  # where the prior is not sure: more makes surfaces rough,
+SURE = 0.3  # times that where it is
 UNBOUNDED = 10.0  # in scenes of which it knows nothing
 MOST_OPACITY = 0.5
 MOST_SIZE = 1.0

@@ -11,6 +11,7 @@ from test_head import make_views
 
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.models import DepthPrior, LongLRMHead, PhotographHead, SweepPrior
+from asysplat.models.head import FARTHEST, SURE
 from asysplat.models.prior import COVER, UNKNOWN, Prior
 from asysplat.scene import Cameras, Views
 
@@ -120,8 +121,8 @@ def test_corrections_are_bounded_where_something_is_known(sure):
     moved, before = head(tokens, views, prior), start(tokens, views, prior)
     origins = views.cameras.centers[0, :, None].expand(2, 64, 3).reshape(-1, 3)
     ratio = (moved.means[0] - origins).norm(dim=-1) / (before.means[0] - origins).norm(dim=-1)
-    # A logit of 0.3 is at most 0.075 of the range, which is a factor of 1000.
-    bound = (0.03 if sure else 0.3) / 4 * math.log(1000)
+    # A logit is at most a quarter of the range, which is a factor of 1000.
+    bound = FARTHEST * (SURE if sure else 1) / 4 * math.log(1000)
     assert ratio[1:].log().abs().max() <= 1.001 * bound
     assert (moved.opacities.logit() - before.opacities.logit()).abs().max() <= 0.501
     # Sizes are in pixels, so that they follow the distance.
