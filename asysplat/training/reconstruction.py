@@ -29,7 +29,8 @@ class Reconstruction(lightning.LightningModule):
             alone.
         schedule: optimizer -> its learning rates, one for each step.
         background: RGB in [0, 1] behind the Gaussians, or "inputs": the mean colour of the input
-            views.
+            views; while it trains black or white, whichever is less like it, so that being
+            transparent never pays.
         checkpoint_layers: compute each layer again in the backward pass, to save memory.
     """
 
@@ -72,7 +73,8 @@ class Reconstruction(lightning.LightningModule):
         if self.background is not None:
             return self.background
         mean = batch["inputs"].images.mean((1, 3, 4))[:, None]
-        return mean.expand(-1, batch["targets"].cameras.num_views, -1)
+        colour = (mean < 0.5).to(mean) if self.training else mean
+        return colour.expand(-1, batch["targets"].cameras.num_views, -1)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         size = len(batch["scene"])

@@ -89,6 +89,10 @@ def test_the_background_follows_the_inputs(build):
     inputs = Views(Cameras(intrinsics, poses, 32, 32), torch.rand(2, 2, 3, 32, 32))
     away = poses[:, :1] * torch.tensor([-1.0, 1, -1, 1])  # turned round
     targets = Views(Cameras(intrinsics[:, :1], away, 32, 32), torch.rand(2, 1, 3, 32, 32))
-    outcome = module.reconstruct({"inputs": inputs, "targets": targets}, depth=False)
+    batch = {"inputs": inputs, "targets": targets}
+    inputs.images[1] = 0.4 * inputs.images[1]
+    trained = module.train().reconstruct(batch, depth=False).rendering.image
+    assert set(trained[0].unique().tolist()) <= {0, 1} and (trained[1] == 1).all()
+    outcome = module.eval().reconstruct(batch, depth=False)
     expected = inputs.images.mean((1, 3, 4))[:, None, :, None, None].expand(2, 1, 3, 32, 32)
     torch.testing.assert_close(outcome.rendering.image, expected)
