@@ -70,7 +70,7 @@ def _card(run: Path, results: dict[str, float | int | str], steps: int, size: in
     ]
     with open(run / "curve.csv", newline="") as file:
         curve = [dict(row) for row in csv.DictReader(file)]
-    columns = [name for name in ("step", "val/psnr", "val/lpips", "val/absrel") if name in curve[0]]
+    columns = [name for name in ("step", "minutes", "psnr", "lpips", "absrel") if name in curve[0]]
     every = max(1, len(curve) // 10)
     return "\n".join(
         [

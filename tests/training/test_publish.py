@@ -27,7 +27,13 @@ def test_a_run_is_published(run, tmp_path, monkeypatch):
     for name, there in trained.items():
         torch.testing.assert_close(weights[name].to(there), there, rtol=1e-3, atol=1e-6)
     card = target.with_suffix(".md").read_text()
-    for part in ("python train.py", "2 steps of", "revision", "| this model |", "| 2 |"):
+    for part in (
+        "python train.py",
+        "2 steps of",
+        "revision",
+        "| this model |",
+        "| step | minutes | psnr |",
+    ):
         assert part in card, card
     # What was written by hand outlives the next one.
     target.with_suffix(".md").write_text(card + "\n## Limits\n\nNot for mirrors.\n")

@@ -1,0 +1,77 @@
+"""The model that ships: what it is, and real photographs beside what one gets for nothing.
+
+pytest tests/training/test_shipped.py -s prints the numbers of the README.
+"""
+
+import itertools
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from asysplat.data.datamodule import collate, load
+from asysplat.data.sources import FilesSource
+from asysplat.evaluation.baselines import mean_colour, nearest_view
+from asysplat.evaluation.lpips import load_lpips, lpips_distance
+from asysplat.evaluation.metrics import psnr
+from asysplat.training.checkpoints import SHIPPED, load_weights
+
+SCENES = {"fern": (8, 15), "fox": (8, 16, 32), "hololens-000": (8, 16, 32), "mydesk": (8, 16, 32)}
+TARGETS = 4
+
+
+@pytest.fixture(scope="module")
+def module(repository):
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        config = compose("train", [])
+    built = instantiate(config.training, net=instantiate(config.model))
+    load_weights("shipped", built)
+    return built.eval()
+
+
+def test_it_is_small_and_has_a_card():
+    assert SHIPPED.stat().st_size <= 16e6
+    card = SHIPPED.with_suffix(".md").read_text()
+    for part in ("python train.py", "revision", "Limits", "AbsRel", "nearest input view"):
+        assert part in card
+
+
+def measure(module, lpips, batch):
+    """PSNR and LPIPS of the model, of the nearest view and of the mean colour."""
+    inputs, targets = batch["inputs"], batch["targets"]
+    with torch.no_grad():
+        image = module.reconstruct(batch, depth=False).rendering.image.clamp(0, 1)
+    drawn = (image, nearest_view(inputs, targets), mean_colour(inputs, targets))
+    return [
+        (
+            psnr(each, targets.images).mean().item(),
+            lpips_distance(lpips, each, targets.images).mean().item(),
+        )
+        for each in drawn
+    ]
+
+
+@pytest.mark.slow
+def test_real_photographs(module, shared):
+    """PSNR above the nearest view's and the mean colour's everywhere, LPIPS on half the scenes."""
+    lpips = load_lpips("alex", shared / "weights")
+    if lpips is None:
+        pytest.skip(f"{shared} has no weights of LPIPS")
+    sharper = 0
+    for scene, numbers in SCENES.items():
+        folder = shared / "data" / scene
+        if not folder.is_dir():
+            pytest.skip(f"{folder} is absent")
+        distances = []
+        for size, views in itertools.product((128, 256), numbers):
+            source = FilesSource(str(folder), size, size, window=(24, 96))
+            batch = collate([load(task) for task in source.evaluation("test", views, TARGETS)])
+            model, nearest, mean = measure(module, lpips, batch)
+            cells = " | ".join(f"{p:.2f} / {d:.3f}" for p, d in (model, nearest, mean))
+            print(f"| {scene}, {views} views of {size}x{size} | {cells} |")
+            assert model[0] > max(nearest[0], mean[0]), (scene, size, views)
+            distances.append((model[1], nearest[1]))
+        ours, theirs = torch.tensor(distances).mean(0)
+        sharper += int(ours < theirs)
+    assert sharper >= len(SCENES) / 2
