@@ -51,10 +51,12 @@ def publish(run: Path, target: Path) -> None:
     card = target.with_suffix(".md")
     before = card.read_text() if card.exists() else ""
     limits = before[before.index(LIMITS) :] if LIMITS in before else ""
-    card.write_text(_card(run, results, saved["global_step"], size) + limits)
+    card.write_text(_card(target.name, run, results, saved["global_step"], size) + limits)
 
 
-def _card(run: Path, results: dict[str, float | int | str], steps: int, size: int) -> str:
+def _card(
+    name: str, run: Path, results: dict[str, float | int | str], steps: int, size: int
+) -> str:
     """Write the card: command, data, time, numbers and learning curve."""
     config = OmegaConf.load(run / "config.yaml")
     overrides = OmegaConf.load(run / ".hydra" / "overrides.yaml")
@@ -74,7 +76,7 @@ def _card(run: Path, results: dict[str, float | int | str], steps: int, size: in
     every = max(1, len(curve) // 10)
     return "\n".join(
         [
-            f"# {config.name}",
+            f"# {name}",
             "",
             f"`python train.py {' '.join(overrides)}`, {steps:,} steps of "
             f"{config.data.batch_size} scenes in {hours:.1f} hours on {results['run/machine']}, "
