@@ -81,7 +81,7 @@ class GaussianHead(nn.Module, ABC):
             if prior is None:
                 opacities = opacities + self.opacity_bias
             else:
-                expected = self.depth_fraction(prior.distance).clamp(0.01, 0.99).logit()
+                expected = self.depth_fraction(prior.distance).clamp(1e-4, 0.99).logit()
                 bound = FARTHEST * (1 - (1 - SURE) * prior.confidence)
                 bound = torch.where(prior.knows_something, bound, UNBOUNDED)
                 depth_logit = (expected + bounded(depth_logit[..., 0], bound))[..., None]

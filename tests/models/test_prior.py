@@ -96,8 +96,6 @@ def test_gaussians_start_where_the_prior_says(head):
     built = head(8, 16, 8)
     torch.nn.init.zeros_(built.decode.weight)
     distance = torch.linspace(0.5, 8, 128).reshape(1, 2, 8, 8)
-    if head is LongLRMHead:
-        distance = 10 * distance  # of a range of 500
     confidence = torch.linspace(0, 1, 128).reshape(1, 2, 8, 8)
     prior = Prior(distance, confidence, 0.1 + 0.8 * confidence)
     gaussians = built(torch.zeros(1, 2, 1, 1, 8), views, prior)
