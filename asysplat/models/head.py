@@ -139,7 +139,7 @@ class PhotographHead(GaussianHead):
         near: float = 0.1,
         far: float = 100.0,
         opacity_bias: float = 0.0,
-        scale_bias: float = -1.7,
+        scale_bias: float = -0.5,
     ):
         super().__init__(width, patch_coarse, patch_fine, sh_degree, opacity_bias, std=1e-3)
         self.near, self.far = near, far

@@ -47,7 +47,7 @@ def test_untrained_photograph():
     middle = math.sqrt(0.1 * 100)
     torch.testing.assert_close(distances(gaussians, views), torch.full((2, 64), middle))
     # Half the resolution has half the focal length in pixels.
-    size = math.exp(-1.7) * middle / (FOCAL / 2)
+    size = math.exp(-0.5) * middle / (FOCAL / 2)
     torch.testing.assert_close(gaussians.scales, torch.full_like(gaussians.scales, size))
     assert (gaussians.opacities == 0.5).all()
     assert (gaussians.quats == torch.tensor([1.0, 0, 0, 0])).all()
