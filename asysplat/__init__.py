@@ -18,7 +18,8 @@ The paper's symbols, as the code names and shapes them:
                                                       + 1 opacity + 48 spherical harmonics
 """
 
+from asysplat.export import read_gaussians, write_gaussians
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 
-__all__ = ["Cameras", "Gaussians", "Views", "render"]
+__all__ = ["Cameras", "Gaussians", "Views", "read_gaussians", "render", "write_gaussians"]

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from asysplat.errors import InputError
+from asysplat.files import replaced
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_sweep.safetensors"
 
@@ -102,7 +103,8 @@ def save_weights(weights: Mapping[str, Tensor], path: Path) -> None:
         name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
         for name, tensor in weights.items()
     }
-    save_file(halves, path)
+    with replaced(path) as partial:
+        partial.write_bytes(save(halves))
 
 
 def _read_shapes(path: Path) -> dict[str, tuple[int, ...]]:

@@ -12,6 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
+from asysplat.files import replaced
 from asysplat.training.checkpoints import save_weights
 from asysplat.training.summary import METRICS
 
@@ -51,7 +52,9 @@ def publish(run: Path, target: Path) -> None:
     card = target.with_suffix(".md")
     before = card.read_text() if card.exists() else ""
     limits = before[before.index(LIMITS) :] if LIMITS in before else ""
-    card.write_text(_card(target.name, run, results, saved["global_step"], size) + limits)
+    text = _card(target.name, run, results, saved["global_step"], size) + limits
+    with replaced(card) as partial:
+        partial.write_text(text)
 
 
 def _card(

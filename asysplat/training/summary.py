@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from asysplat.evaluation.measured_cost import SECONDS
+from asysplat.files import replaced
 
 Results = dict[str, float | int | str]  # flat, as in metrics.json
 
@@ -30,9 +31,8 @@ def write_json(path: Path, results: Results) -> None:
         for key, value in results.items()
     }
     finite["protocol/seconds"] = SECONDS
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
-    partial.replace(path)
+    with replaced(path) as partial:
+        partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
 
 
 def test_sets(results: Results) -> list[str]:

@@ -19,6 +19,7 @@ from asysplat import Cameras, Gaussians, Views, render
 from asysplat.data.normalise import normalise
 from asysplat.data.readers import open_scene
 from asysplat.evaluation.metrics import psnr
+from asysplat.export import read_splat
 
 SIDE = 256  # pixels
 COUNT = 60_000
@@ -35,19 +36,6 @@ def photographs(scene: Path) -> Views:
     count = min(MOST_VIEWS, capture.num_frames)
     views = capture.views(np.linspace(0, capture.num_frames - 1, count).astype(int).tolist())
     return normalise(views, views)[0]
-
-
-def read_splat(path: Path) -> Gaussians:
-    kind = [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)]
-    rows = np.fromfile(path, np.dtype(kind))
-    rgba = torch.from_numpy(rows["rgba"] / np.float32(255))
-    return Gaussians(
-        means=torch.from_numpy(rows["mean"].copy()),
-        quats=torch.from_numpy((rows["quat"].astype(np.float32) - 128) / 128),
-        scales=torch.from_numpy(rows["scale"].copy()),
-        opacities=rgba[:, 3].contiguous(),
-        sh=((rgba[:, None, :3] - 0.5) / 0.28209479177387814).contiguous(),
-    )
 
 
 def circle_around(gaussians: Gaussians, views: int = 16, radius: float = 1.6) -> Views:

@@ -1,0 +1,108 @@
+"""Gaussians as PLY, in the layout of Kerbl et al. 2023 that trainers and viewers share.
+
+A vertex is a Gaussian, its properties are float32: the mean, a normal that nobody uses, SH (of
+degree 0, then all others of one colour after another), the logit of the opacity, the logarithms of
+the scales, and a quaternion wxyz.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.lib.recfunctions import structured_to_unstructured
+
+from asysplat.errors import InputError
+from asysplat.export.checks import TINY, as_read, as_written, existing
+from asysplat.export.ply_table import read_vertices
+from asysplat.files import replaced
+from asysplat.scene import Gaussians
+
+MEAN, NORMAL, COLOR = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
+SCALE, ROTATION = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
+REST = (0, 9, 24, 45)  # numbers of properties f_rest_*, of SH of degree 0 to 3
+CERTAIN = 1 - 1e-7  # the largest opacity whose logit is written: that of 1 is infinite
+
+
+def write_ply(path: str | Path, gaussians: Gaussians) -> None:
+    """Write one scene as binary little-endian PLY.
+
+    Args:
+        gaussians: without batch dimension; quaternions are normalised, and an opacity of 1 is
+            written as 1 - 1e-7.
+
+    Raises:
+        InputError: numbers that cannot be rendered, or a file that cannot be written.
+    """
+    gaussians = as_written(gaussians)
+    opacities = gaussians.opacities.double().clamp_max(CERTAIN)
+    columns = (
+        gaussians.means,
+        torch.zeros_like(gaussians.means),
+        gaussians.sh[:, 0],
+        gaussians.sh[:, 1:].mT.flatten(1),
+        opacities.logit()[:, None].float(),
+        gaussians.scales.double().log().float(),
+        torch.nn.functional.normalize(gaussians.quats.double(), dim=-1).float(),
+    )
+    table = torch.cat(columns, 1).numpy().astype("<f4", copy=False)
+    rest = _rest(3 * (gaussians.sh.shape[1] - 1))
+    names = [*MEAN, *NORMAL, *COLOR, *rest, "opacity", *SCALE, *ROTATION]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(table)}",
+        *(f"property float {name}" for name in names),
+        "end_header\n",
+    ]
+    with replaced(path) as partial, open(partial, "wb") as file:
+        file.write("\n".join(header).encode())
+        file.write(table.data)
+
+
+def read_ply(path: str | Path) -> Gaussians:
+    """Read one scene from PLY, little-endian, big-endian or ASCII, in float32.
+
+    Properties may stand in any order, and others than those of Gaussians are ignored.
+
+    Raises:
+        InputError: no PLY file, one that is cut off, a missing property, no Gaussians, or numbers
+            that cannot be rendered.
+    """
+    path = existing(path)
+    vertices = read_vertices(path)
+    there = vertices.dtype.names
+    count = sum(name.startswith("f_rest_") for name in there)
+    if count not in REST:
+        raise InputError(
+            f"{path} has {count} properties f_rest_*: expected {', '.join(map(str, REST))} (SH of "
+            "degree 0 to 3)."
+        )
+    names = [*MEAN, *COLOR, *_rest(count), "opacity", *SCALE, *ROTATION]
+    missing = [name for name in names if name not in there]
+    if missing:
+        raise InputError(
+            f"{path} has no property {missing[0]}: expected the properties of 3D Gaussians, "
+            f"{', '.join(name for name in names if 'rest' not in name)}."
+        )
+    table = structured_to_unstructured(vertices[names], np.float32)
+    finite = np.isfinite(table)
+    if not finite.all():
+        row, column = np.argwhere(~finite)[0]
+        raise InputError(
+            f"{path}: {names[column]} of vertex {row} is {table[row, column]}: repair or remove "
+            "that vertex."
+        )
+    parts = torch.from_numpy(table).split((3, 3, count, 1, 3, 4), 1)
+    means, color, rest, logits, scales, quats = parts
+    gaussians = Gaussians(
+        means=means.contiguous(),
+        quats=quats.contiguous(),
+        scales=scales.double().exp().float().clamp_min(TINY),
+        opacities=logits[:, 0].double().sigmoid().float().clamp_min(TINY),
+        sh=torch.cat((color[:, None], rest.unflatten(1, (3, count // 3)).mT), 1),
+    )
+    return as_read(path, gaussians)
+
+
+def _rest(count: int) -> list[str]:
+    return [f"f_rest_{i}" for i in range(count)]

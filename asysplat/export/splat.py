@@ -1,0 +1,42 @@
+"""Gaussians from .splat files, as antimatter15's viewer and many phone apps use: 32 bytes each."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from asysplat.errors import InputError
+from asysplat.export.checks import TINY, as_read, existing
+from asysplat.rendering.formulas import Y0
+from asysplat.scene import Gaussians
+
+ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+
+def read_splat(path: str | Path) -> Gaussians:
+    """Read a .splat file: N Gaussians with SH of degree 0, colours and rotations of 8 bits.
+
+    Scales are stored as they are, alpha is the opacity, rotations are (v - 128) / 128, wxyz.
+    Format: https://github.com/antimatter15/splat
+
+    Raises:
+        InputError: no file, one that is no whole number of rows, or numbers that cannot be
+            rendered.
+    """
+    path = existing(path)
+    size = path.stat().st_size
+    if size == 0 or size % ROW.itemsize:
+        raise InputError(
+            f"{path} has {size} bytes: expected a multiple of {ROW.itemsize}, so it is cut off or "
+            "no .splat file; copy it again."
+        )
+    rows = np.fromfile(path, ROW)
+    rgba = torch.from_numpy(rows["rgba"] / np.float32(255))
+    gaussians = Gaussians(
+        means=torch.tensor(rows["mean"]),
+        quats=(torch.tensor(rows["quat"], dtype=torch.float32) - 128) / 128,
+        scales=torch.tensor(rows["scale"]).clamp_min(TINY),
+        opacities=rgba[:, 3].clamp_min(TINY),
+        sh=(rgba[:, None, :3] - 0.5) / Y0,
+    )
+    return as_read(path, gaussians)

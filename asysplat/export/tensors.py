@@ -1,0 +1,61 @@
+"""Gaussians as safetensors: the fields as they are, and what is to be said about them."""
+
+from dataclasses import fields
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from asysplat.errors import InputError
+from asysplat.export.checks import as_read, as_written, existing
+from asysplat.files import replaced
+from asysplat.scene import Gaussians
+
+NAMES = tuple(field.name for field in fields(Gaussians))
+
+
+def write_safetensors(
+    path: str | Path, gaussians: Gaussians, metadata: dict[str, str] | None = None
+) -> None:
+    """Write means, quats, scales, opacities and sh in float32, under those names.
+
+    Args:
+        gaussians: one scene, without batch dimension.
+        metadata: kept beside them, such as units or where the scene comes from.
+
+    Raises:
+        InputError: numbers that cannot be rendered, or a file that cannot be written.
+    """
+    gaussians = as_written(gaussians)
+    content = save({name: getattr(gaussians, name).contiguous() for name in NAMES}, metadata)
+    with replaced(path) as partial:
+        partial.write_bytes(content)
+
+
+def read_safetensors(path: str | Path) -> tuple[Gaussians, dict[str, str]]:
+    """Read what `write_safetensors` has written: a scene in float32, and its metadata.
+
+    Raises:
+        InputError: no such file, a missing field, or numbers that cannot be rendered.
+    """
+    path = existing(path)
+    try:
+        with safe_open(path, "pt") as file:
+            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
+            metadata = file.metadata() or {}
+    except SafetensorError as error:
+        raise InputError(
+            f"{path} cannot be read as safetensors ({error}): it is cut off or of another format; "
+            "copy it again."
+        ) from error
+    missing = [name for name in NAMES if name not in tensors]
+    if missing:
+        raise InputError(
+            f"{path} has no {', '.join(missing)}: expected the fields {', '.join(NAMES)} of a "
+            "scene."
+        )
+    try:
+        gaussians = Gaussians(**{name: tensors[name] for name in NAMES})
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return as_read(path, gaussians), metadata
