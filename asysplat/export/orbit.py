@@ -7,8 +7,9 @@ from numpy import ndarray
 from asysplat.export.poses import SAME, checked_poses, features, lengths, spread, with_poses
 from asysplat.scene import Cameras
 
-PARALLEL = 0.01  # mean square of the angles between the axes and their mean: 6 degrees
+PARALLEL = 0.01  # mean square of the angles between axes and their mean: 6 degrees
 AHEAD = 4.0  # times the cameras' spread: how far what they show is, where axes do not tell
+MOST_TILTED = 0.5  # the cosine between the world's up and the cameras' mean up: 60 degrees
 WIDEST_GAP = np.radians(90)  # between neighbours on a circle that is seen from all around
 LEAST_SWING = np.radians(5)  # to either side
 STEEPEST = 10.0  # times the radius: a distance from which no camera looks straight down
@@ -36,11 +37,7 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
     focus = _focus(poses, cameras, middle)
     sees = _sees(focus, poses, cameras)
     sees[middle] = True
-    up = -poses[:, :3, 1].mean(0)
-    if np.linalg.norm(up) < SAME:  # they cancel
-        up = -poses[middle, :3, 1]
-    up /= np.linalg.norm(up)
-
+    up = _up(poses, middle)
     offsets = poses[sees, :3, 3] - focus
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
@@ -49,6 +46,21 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
     angles = _angles(np.arctan2(flat @ y, flat @ x), frames)[:, None]
     circle = radius * (np.cos(angles) * x + np.sin(angles) * y)
     return with_poses(cameras, _looking_at(focus, focus + heights.mean() * up + circle, up))
+
+
+def _up(poses: Float[ndarray, "V 4 4"], middle: int) -> Float[ndarray, "3"]:
+    """Return the direction that is upwards in the world.
+
+    Photographs are taken with a level horizon, however far the camera looks down: up is across all
+    cameras' x axes. Where those do not tell, it is the cameras' mean up.
+    """
+    right, up = poses[:, :3, 0], -poses[:, :3, 1].mean(0)
+    if np.linalg.norm(up) < SAME:  # they cancel
+        up = -poses[middle, :3, 1]
+    up /= np.linalg.norm(up)
+    spreads, directions = np.linalg.eigh(right.T @ right / len(right))
+    across = directions[:, 0] * np.sign(directions[:, 0] @ up)
+    return across if spreads[1] > PARALLEL and across @ up > MOST_TILTED else up
 
 
 def _focus(poses: Float[ndarray, "V 4 4"], cameras: Cameras, middle: int) -> Float[ndarray, "3"]:

@@ -1,13 +1,12 @@
 """Cameras of a video along the photographs' own way."""
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from asysplat.export.poses import SAME, checked_poses, features, lengths, with_poses
+from asysplat.rendering.reference.math import rotations
 from asysplat.scene import Cameras
 
 JUMPING = 1.5  # times the shorter way: then the views' order is not that of a walk
@@ -70,11 +69,17 @@ def _smoothed(
         way: from the first pose to each, increasing.
 
     Returns:
-        centres and quaternions xyzw of any length, close together.
+        centres and quaternions wxyz of any length, close together.
     """
+    # Here, as these would slow down import asysplat.
+    from scipy.interpolate import CubicSpline
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.spatial.transform import Rotation, RotationSpline
+
     samples = np.linspace(0, way[-1], SAMPLES)
     centers = CubicSpline(way, poses[:, :3, 3])(samples)
-    quats = RotationSpline(way, Rotation.from_matrix(poses[:, :3, :3]))(samples).as_quat()
+    quats = RotationSpline(way, Rotation.from_matrix(poses[:, :3, :3]))(samples)
+    quats = quats.as_quat(scalar_first=True)
     # q and -q are the same rotation: neighbours get the same sign.
     flips = (quats[1:] * quats[:-1]).sum(1) < 0
     quats[1:] *= np.where(flips, -1, 1).cumprod()[:, None]
@@ -84,6 +89,6 @@ def _smoothed(
 
 def _rigid(states: Float[ndarray, "T 7"]) -> Float[ndarray, "T 4 4"]:
     poses = np.tile(np.eye(4), (len(states), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(states[:, 3:]).as_matrix()
+    poses[:, :3, :3] = rotations(torch.from_numpy(states[:, 3:])).numpy()
     poses[:, :3, 3] = states[:, :3]
     return poses

@@ -1,0 +1,293 @@
+"""Gaussians as PLY, against plyfile and the way INRIA's code reads them."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+
+from asysplat.errors import InputError
+from asysplat.export import read_ply, write_ply
+from asysplat.rendering import render
+from asysplat.scene import Gaussians
+
+
+@pytest.fixture
+def scene(make_scene):
+    return make_scene(count=12, degree=3, dtype=torch.float32)[0]
+
+
+@pytest.fixture
+def written(scene, tmp_path):
+    write_ply(tmp_path / "scene.ply", scene)
+    return tmp_path / "scene.ply"
+
+
+def assert_same(one: Gaussians, other: Gaussians):
+    other = replace(other, quats=torch.nn.functional.normalize(other.quats, dim=-1))
+    for field in fields(Gaussians):
+        ours, theirs = getattr(one, field.name), getattr(other, field.name)
+        assert ours.dtype == torch.float32
+        torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-6)
+
+
+def as_inria_reads(path) -> Gaussians:
+    vertex = PlyData.read(path)["vertex"]
+
+    def columns(start):
+        names = sorted(
+            (name for name in vertex.data.dtype.names if name.startswith(start)),
+            key=lambda name: int(name.split("_")[-1]),
+        )
+        return torch.tensor(np.stack([vertex[name] for name in names], 1))
+
+    return Gaussians(
+        means=torch.tensor(np.stack((vertex["x"], vertex["y"], vertex["z"]), 1)),
+        quats=torch.nn.functional.normalize(columns("rot_")),
+        scales=columns("scale_").exp(),
+        opacities=torch.tensor(vertex["opacity"]).sigmoid(),
+        sh=torch.cat(
+            (columns("f_dc_")[:, :, None], columns("f_rest_").unflatten(1, (3, -1))), 2
+        ).mT,
+    )
+
+
+def rewritten(path, change=lambda rows: rows, **kwargs):
+    """The same file after a change of its vertices, in another format."""
+    rows = change(PlyData.read(path, mmap=False)["vertex"].data)
+    PlyData([PlyElement.describe(rows, "vertex")], **kwargs).write(path)
+    return path
+
+
+def without(*names):
+    def change(rows):
+        return np.array(
+            rows[[name for name in rows.dtype.names if name not in names]].tolist(),
+            [kind for kind in rows.dtype.descr if kind[0] not in names],
+        )
+
+    return change
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_round_trip(make_scene, tmp_path, degree):
+    scene, _ = make_scene(degree=degree, dtype=torch.float32)
+    write_ply(tmp_path / "scene.ply", scene)
+    read = read_ply(tmp_path / "scene.ply")
+    assert read.sh.shape == (12, (degree + 1) ** 2, 3)
+    assert_same(read, scene)
+
+
+@settings(max_examples=50)
+@given(
+    st.floats(2**-100, 1, width=32),
+    st.floats(2**-20, 2**20, width=32),
+    st.floats(-(2**60), 2**60, width=32),
+)
+def test_round_trip_of_any_number(tmp_path_factory, opacity, scale, number):
+    path = tmp_path_factory.getbasetemp() / "any.ply"
+    scene = Gaussians(
+        torch.full((2, 3), number),
+        torch.tensor([[0.0, 0, 1, 0]]).repeat(2, 1),
+        torch.full((2, 3), scale),
+        torch.full((2,), opacity),
+        torch.full((2, 4, 3), number),
+    )
+    write_ply(path, scene)
+    assert_same(read_ply(path), scene)
+
+
+@pytest.mark.parametrize("opacity", [1.0, 1 - 2**-24, 1 - 1e-6, 0.5, 1e-6, 1e-30, 1e-38])
+def test_opacities_beyond_the_logit_of_float32(scene, tmp_path, opacity):
+    opacities = torch.full_like(scene.opacities, opacity)
+    write_ply(tmp_path / "scene.ply", replace(scene, opacities=opacities))
+    assert np.isfinite(PlyData.read(tmp_path / "scene.ply")["vertex"]["opacity"]).all()
+    read = read_ply(tmp_path / "scene.ply").opacities
+    torch.testing.assert_close(read, opacities, rtol=0, atol=1e-6)
+
+
+def test_opacities_and_scales_that_round_to_zero_can_still_be_rendered(written):
+    def fade(rows):
+        rows["opacity"], rows["scale_0"] = -200, -200
+        return rows
+
+    read = read_ply(rewritten(written, fade))
+    assert (read.opacities > 0).all() and (read.opacities < 1e-30).all()
+    assert (read.scales[:, 0] > 0).all() and (read.scales[:, 0] < 1e-30).all()
+
+
+def test_layout(written, scene):
+    header = written.read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(45)] + ["opacity", "scale_0", "scale_1", "scale_2"]
+    names += ["rot_0", "rot_1", "rot_2", "rot_3"]
+    assert header[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 12"]
+    assert header[3:] == [f"property float {name}" for name in names]
+    vertex = PlyData.read(written)["vertex"]
+    # All of red, then all of green, then all of blue.
+    assert vertex["f_rest_0"][5] == scene.sh[5, 1, 0]
+    assert vertex["f_rest_14"][5] == scene.sh[5, 15, 0]
+    assert vertex["f_rest_15"][5] == scene.sh[5, 1, 1]
+    assert vertex["f_rest_44"][5] == scene.sh[5, 15, 2]
+
+
+def test_it_renders_as_what_inria_s_code_reads(written, make_scene):
+    scene, cameras = make_scene(count=12, views=2, degree=3, dtype=torch.float32)
+    theirs = as_inria_reads(written)
+    assert_same(theirs, scene)
+    image = render(scene, cameras, backend="reference").image
+    for other in (theirs, read_ply(written)):
+        torch.testing.assert_close(render(other, cameras, backend="reference").image, image)
+    interleaved = theirs.sh[:, 1:].mT.reshape(12, 15, 3)
+    wrong = replace(theirs, sh=torch.cat((theirs.sh[:, :1], interleaved), 1))
+    assert (render(wrong, cameras, backend="reference").image - image).abs().max() > 0.01
+
+
+FORMATS = {"ascii": {"text": True}, "big-endian": {"byte_order": ">"}}
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_other_formats_are_read(written, scene, kind):
+    assert_same(read_ply(rewritten(written, **FORMATS[kind])), scene)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+def test_order_extra_properties_and_other_elements_do_not_matter(written, scene, kind):
+    rows = PlyData.read(written, mmap=False)["vertex"].data
+    kinds = [("label", "u1"), *reversed(rows.dtype.descr), ("score", "f8")]
+    shuffled = np.zeros(len(rows), kinds)
+    for name in rows.dtype.names:
+        shuffled[name] = rows[name]
+    before = np.array([(1, 2.5), (2, 3.5)], [("number", "i2"), ("value", "f4")])
+    after = np.empty(1, [("vertex_indices", object)])
+    after["vertex_indices"][0] = np.arange(3, dtype=np.int32)
+    elements = [
+        PlyElement.describe(before, "camera"),
+        PlyElement.describe(shuffled, "vertex"),
+        PlyElement.describe(after, "face"),
+    ]
+    PlyData(elements, text=kind == "ascii", comments=["by another program"]).write(written)
+    assert_same(read_ply(written), scene)
+
+
+def test_windows_line_ends_in_the_header_are_read(written, scene):
+    rewritten(written, text=True)
+    written.write_bytes(written.read_bytes().replace(b"\n", b"\r\n"))
+    assert_same(read_ply(written), scene)
+
+
+def put(name, value):
+    def change(rows):
+        rows[name][3] = value
+        return rows
+
+    return change
+
+
+CHANGES = {
+    "no opacity": (without("opacity"), "has no property opacity"),
+    "no rotation": (without("rot_2"), "has no property rot_2"),
+    "no points": (without("x"), "has no property x"),
+    "missing coefficient": (without("f_rest_7"), "has 44 properties f_rest_"),
+    "other coefficients": (
+        without("f_rest_7", *[f"f_rest_{i}" for i in range(25, 45)]),
+        "f_rest_7",
+    ),
+    "nan": (put("f_rest_9", np.nan), r"f_rest_9 of vertex 3 is nan"),
+    "infinity": (put("opacity", np.inf), r"opacity of vertex 3 is inf"),
+    "too large": (put("scale_1", 100), r"Gaussians\.scales\[3\] holds NaN or infinity"),
+    "nothing": (lambda rows: rows[:0], "has no vertices"),
+}
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("case", CHANGES)
+def test_scenes_that_cannot_be_used_are_refused(written, case, text):
+    change, message = CHANGES[case]
+    with pytest.raises(InputError, match=rf"scene\.ply.*{message}"):
+        read_ply(rewritten(written, change, text=text))
+
+
+BYTES = {
+    "empty": (lambda content: b"", "is no PLY file"),
+    "another format": (lambda content: b"\x89PNG\r\n" + content, "is no PLY file"),
+    "one long line": (lambda content: bytes(10**6), "is no PLY file"),
+    "cut in the header": (lambda content: content[:200], "in its header"),
+    "cut at a line of the header": (
+        lambda content: content[: content.index(b"end_header")],
+        "has no end_header in its header",
+    ),
+    "cut in the vertices": (lambda content: content[:-1], "is cut off"),
+    "cut behind the header": (
+        lambda content: content[: content.index(b"end_header") + 11],
+        "is cut off: its header names 12 vertices, and 0 bytes follow",
+    ),
+    "more vertices than memory": (
+        lambda content: content.replace(b"vertex 12", b"vertex 12000000000000"),
+        "is cut off",
+    ),
+    "a strange count": (lambda content: content.replace(b"vertex 12", b"vertex -3"), "vertex -3'"),
+    "a strange type": (lambda content: content.replace(b"float nx", b"half nx"), "half nx'"),
+    "a property twice": (lambda content: content.replace(b"float nx", b"float x"), "float x'"),
+    "no format": (
+        lambda content: content.replace(b"format binary_little_endian 1.0\n", b""),
+        "has no format",
+    ),
+    "a list": (
+        lambda content: content.replace(b"float nx", b"list uchar int nx"),
+        "has a list in its element vertex",
+    ),
+    "no vertices": (lambda content: content.replace(b"vertex", b"point"), "has no element vertex"),
+}
+
+
+@pytest.mark.parametrize("case", BYTES)
+def test_damaged_files_are_refused(written, case):
+    change, message = BYTES[case]
+    written.write_bytes(change(written.read_bytes()))
+    with pytest.raises(InputError, match=rf"scene\.ply.*{message}"):
+        read_ply(written)
+
+
+TEXTS = {
+    "a line missing": (lambda lines: lines[:-1], "is cut off: .* and 11 lines follow"),
+    "all lines missing": (lambda lines: lines[:-12], "is cut off"),
+    "a number missing": (
+        lambda lines: [*lines[:-1], lines[-1].rsplit(" ", 1)[0]],
+        "a vertex that cannot be read",
+    ),
+    "letters": (
+        lambda lines: [*lines[:-1], lines[-1].replace("0.0", "zero", 1)],
+        "a vertex that cannot be read",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TEXTS)
+def test_damaged_text_is_refused(written, case):
+    change, message = TEXTS[case]
+    lines = rewritten(written, text=True).read_text().splitlines()
+    written.write_text("\n".join(change(lines)) + "\n")
+    with pytest.raises(InputError, match=rf"scene\.ply.*{message}"):
+        read_ply(written)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"absent\.ply is no file"):
+        read_ply(tmp_path / "absent.ply")
+
+
+def test_what_cannot_be_rendered_is_not_written_over_a_file(written, scene):
+    before = written.read_bytes()
+    for bad, message in (
+        (replace(scene, scales=-scene.scales), r"scales\[0\] is <= 0"),
+        (replace(scene, means=scene.means / 0), r"means\[0\] holds NaN or infinity"),
+        (scene.keep(scene.opacities > 2), "no Gaussians"),
+        (Gaussians.stack([scene, scene]), "one by one"),
+    ):
+        with pytest.raises(InputError, match=message):
+            write_ply(written, bad)
+        assert written.read_bytes() == before

@@ -1,0 +1,137 @@
+"""Videos, read back frame by frame."""
+
+import sys
+import weakref
+
+import numpy as np
+import pytest
+import torch
+from full_disk import largest_file
+
+from asysplat.errors import InputError
+from asysplat.export import write_video
+
+av = pytest.importorskip("av")
+
+
+def image(index: int, height: int, width: int) -> torch.Tensor:
+    """Smooth colours that change from frame to frame."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
+    return 0.25 + 0.5 * torch.stack((x, y, torch.full_like(x, index / 20)))
+
+
+def frames_of(path) -> list[np.ndarray]:
+    with av.open(path) as container:
+        return [
+            frame.to_ndarray(format="rgb24", interpolation="ACCURATE_RND")
+            for frame in container.decode(video=0)
+        ]
+
+
+@pytest.mark.parametrize(("height", "width"), [(32, 48), (33, 47), (1, 1)])
+def test_all_frames_come_back(tmp_path, height, width):
+    path = tmp_path / "way.mp4"
+    write_video(path, (image(i, height, width) for i in range(21)), fps=24)
+    frames = frames_of(path)
+    assert len(frames) == 21
+    for index, frame in enumerate(frames):
+        assert frame.shape == (height + height % 2, width + width % 2, 3)
+        expected = 255 * image(index, height, width).permute(1, 2, 0).numpy()
+        assert np.abs(frame[:height, :width] - expected).mean() < 3
+        if width % 2:
+            assert np.abs(frame[:, -1].astype(int) - frame[:, -2]).max() < 12  # a copy, not black
+
+
+def test_browsers_play_it(tmp_path):
+    path = tmp_path / "way.mp4"
+    write_video(path, [image(i, 64, 64) for i in range(3)], fps=29.97)
+    with av.open(path) as container:
+        stream = container.streams.video[0]
+        codec = stream.codec_context
+        assert (codec.name, codec.pix_fmt, codec.colorspace) == ("h264", "yuv420p", 1)
+        assert (codec.color_primaries, codec.color_trc) == (1, 1)
+        assert float(stream.average_rate) == pytest.approx(29.97)
+        assert stream.frames == 3
+    content = path.read_bytes()
+    assert content.index(b"moov") < content.index(b"mdat")
+
+
+@pytest.mark.parametrize("color", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.2, 0.7, 0.4), (2, -1, 0.5)])
+def test_colours_are_right_and_clamped(tmp_path, color):
+    color = torch.tensor(color, dtype=torch.float32)[:, None, None]
+    write_video(tmp_path / "way.mp4", [color.expand(3, 16, 16)])
+    found = frames_of(tmp_path / "way.mp4")[0].astype(float)
+    assert np.abs(found - 255 * color.clamp(0, 1).permute(1, 2, 0).numpy()).max() < 4
+
+
+def test_images_are_not_kept(tmp_path):
+    alive = []
+
+    def images():
+        for index in range(12):
+            made = image(index, 16, 16)
+            alive.append(weakref.ref(made))
+            yield made
+            del made
+            assert sum(ref() is not None for ref in alive) <= 1
+
+    write_video(tmp_path / "way.mp4", images())
+    assert len(alive) == 12
+
+
+@pytest.fixture
+def old(tmp_path):
+    (tmp_path / "way.mp4").write_text("old")
+    return tmp_path / "way.mp4"
+
+
+def assert_untouched(file):
+    assert file.read_text() == "old" and list(file.parent.iterdir()) == [file]
+
+
+def interrupted():
+    yield image(0, 16, 16)
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("images", "error", "message"),
+    [
+        ([], InputError, "has no images"),
+        ([image(0, 16, 16), image(0, 18, 16)], InputError, r"image 1 .*\(3, 18, 16\).*16 x 16"),
+        ([image(0, 16, 16) * torch.nan], InputError, "image 0 of .*NaN"),
+        (interrupted(), KeyboardInterrupt, None),
+    ],
+)
+def test_what_goes_wrong_leaves_the_old_file(old, images, error, message):
+    with pytest.raises(error, match=message):
+        write_video(old, images)
+    assert_untouched(old)
+
+
+@pytest.mark.parametrize("size", [0, 4000])
+def test_a_full_disk_leaves_the_old_file(old, size):
+    message = r"way\.mp4 cannot be written \(File too large\)"
+    with largest_file(size), pytest.raises(InputError, match=message):
+        write_video(old, (torch.rand(3, 64, 64) for _ in range(40)))
+    assert_untouched(old)
+
+
+@pytest.mark.parametrize(
+    ("name", "fps", "message"),
+    [
+        ("way.avi", 30, r"way\.avi is no name for a video"),
+        ("way.mp4", 0, "fps is 0"),
+        ("absent/way.mp4", 30, r"absent/way\.mp4 cannot be written \(No such file"),
+    ],
+)
+def test_mistakes_are_refused(tmp_path, name, fps, message):
+    with pytest.raises(InputError, match=message):
+        write_video(tmp_path / name, [image(0, 16, 16)], fps)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_package_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match=r"needs PyAV: pip install 'asysplat\[video\]'"):
+        write_video(tmp_path / "way.mp4", [image(0, 16, 16)])
