@@ -138,6 +138,23 @@ def test_rows_with_a_gradient_that_is_not_finite_are_left_out_of_all_tensors(dty
     assert type(ours.skipped) is int
 
 
+def test_a_gradient_whose_square_is_infinite_stops_its_number_alone():
+    optimizer = VisibleAdam(normal())
+    every = torch.ones(NUM, dtype=torch.bool)
+    for step in range(3):
+        gradients = random_gradients()
+        gradients["sh"][7, 2, 1] = 1e30 if step == 0 else 1.0
+        optimizer.step(gradients, RATES, every)
+    infinite = {
+        name: tensor.isinf().nonzero().tolist() for name, tensor in everything(optimizer).items()
+    }
+    assert {name: places for name, places in infinite.items() if places} == {
+        "sh.square": [[7, 2, 1]]
+    }
+    assert all(tensor.isfinite().all() for tensor in optimizer.parameters.values())
+    assert optimizer.skipped == 0
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_tensor_without_a_rate_is_left_out_and_may_begin_later(dtype):
     ours = VisibleAdam(normal(dtype=dtype))

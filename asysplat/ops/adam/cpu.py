@@ -48,8 +48,9 @@ class FlatRows(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """1 - beta1, 1 - beta2, eps; [steps, 2] what a step's mean and root are multiplied by."""
+    """Settings, 1 - beta as `new`; [steps, 2] what a step's mean and root are multiplied by."""
 
+    beta2: np.float32
     new1: np.float32
     new2: np.float32
     eps: np.float32
@@ -84,6 +85,7 @@ def _constants(settings: Settings) -> Constants:
     t[0] = 1  # is not used: a row's first step is 1
     first, second = 1 - settings.beta1**t, 1 - settings.beta2**t
     return Constants(
+        beta2=np.float32(settings.beta2),
         new1=np.float32(1 - settings.beta1),
         new2=np.float32(1 - settings.beta2),
         eps=np.float32(settings.eps),
@@ -189,7 +191,7 @@ def _update(factors, alive, tensor, first, constants):
             mean = load_some(tensor.mean, place, count)
             square = load_some(tensor.square, place, count)
             new_mean = fma(constants.new1, gradient - mean, mean)
-            new_square = fma(constants.new2, gradient * gradient - square, square)
+            new_square = fma(constants.new2 * gradient, gradient, constants.beta2 * square)
             root = fma(to_root, sqrt(new_square), constants.eps)
             step = load(tensor.rates, k) * to_mean * new_mean / root
             updated = positive(to_mean)
