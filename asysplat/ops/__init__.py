@@ -7,8 +7,9 @@ of each, and `chunk.py` what these share.
 """
 
 from asysplat.ops.grid_attention import grid_attention
+from asysplat.ops.image_loss import image_loss
 from asysplat.ops.plane_sweep import plane_sweep
 from asysplat.ops.selective_scan import selective_scan
 from asysplat.ops.ssd import ssd
 
-__all__ = ["grid_attention", "plane_sweep", "selective_scan", "ssd"]
+__all__ = ["grid_attention", "image_loss", "plane_sweep", "selective_scan", "ssd"]

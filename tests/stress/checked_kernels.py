@@ -14,9 +14,10 @@ from poison import FILLS, poisoned
 from tangents import tangent_scene
 from torch import Tensor
 
-from asysplat.ops import plane_sweep, selective_scan, ssd
+from asysplat.ops import image_loss, plane_sweep, selective_scan, ssd
 from asysplat.ops.cpu.kernel import kernel
 from asysplat.ops.cpu.vectors import gather_pairs, load, load_some, store, zeros
+from asysplat.reconstruction.adam import VisibleAdam
 from asysplat.rendering import Skips
 from asysplat.rendering.cpu.math import take_sum
 from asysplat.scene import Cameras, Gaussians
@@ -118,6 +119,45 @@ def swept(images: Tensor, cameras: Cameras, stride: int, planes: int) -> Result:
     return Result({"depth": found.inverse_depth, "confidence": found.confidence}, {}, {})
 
 
+def check_losses() -> int:
+    """How many pairs of images were compared, each in all memories, with a gradient and without."""
+    sizes = [(1, 1), (10, 40), (11, 11), (12, 16), (64, 27), (65, 33), (140, 100)]
+    for (height, width), grad in itertools.product(sizes, (False, True)):
+        in_all_memories(lambda h=height, w=width, g=grad: compared(h, w, g))
+    return 2 * len(sizes)
+
+
+def compared(height: int, width: int, grad: bool) -> Result:
+    generator = torch.Generator().manual_seed(0)
+    rendered, target = torch.rand(2, 2, 3, height, width, generator=generator)
+    loss = image_loss(rendered.requires_grad_(grad), target, backend="cpu")
+    grads = torch.autograd.grad(loss.sum(), rendered) if grad else ()
+    return Result({"loss": loss.detach()}, dict(zip(["rendered"], grads, strict=False)), {})
+
+
+def check_adam() -> int:
+    """How many numbers of rows took steps, each in all memories."""
+    numbers = (0, 1, 17, 1023, 1025, 2100)
+    for num in numbers:
+        in_all_memories(lambda n=num: stepped(n))
+    return len(numbers)
+
+
+def stepped(num: int) -> Result:
+    generator = torch.Generator().manual_seed(0)
+    shapes = {"means": (3,), "quats": (4,), "opacities": (), "sh": (4, 3), "more": (16, 3)}
+
+    def normal() -> dict[str, Tensor]:
+        return {name: torch.randn(num, *s, generator=generator) for name, s in shapes.items()}
+
+    optimizer, rates = VisibleAdam(normal()), dict.fromkeys(shapes, 0.1)
+    for _ in range(3):
+        gradients = normal()
+        gradients["sh"][::100] = torch.nan
+        optimizer.step(gradients, rates, torch.rand(num, generator=generator) < 0.5)
+    return Result(optimizer.parameters | optimizer.state(), {}, {"skipped": optimizer.skipped})
+
+
 def in_all_memories(run) -> None:
     plain = run()
     for fill in FILLS:
@@ -158,4 +198,6 @@ if __name__ == "__main__":
     print(f"{check_the_checks()} steps out of an array seen")
     print(f"{check_scans()} sequences, {len(FILLS) + 1} memories: the same bits", flush=True)
     print(f"{check_sweeps()} sweeps, {len(FILLS) + 1} memories: the same bits", flush=True)
+    print(f"{check_losses()} pairs of images, {len(FILLS) + 1} memories: the same bits", flush=True)
+    print(f"{check_adam()} optimizers, {len(FILLS) + 1} memories: the same bits", flush=True)
     print(f"{check_renderer()} scenes, {len(FILLS) + 1} memories: the same bits and statistics")

@@ -1,0 +1,200 @@
+"""Adam for CPUs (Numba): a task takes blocks of rows, a vector sixteen numbers that lie together.
+
+Sixteen rows of K numbers are K vectors; a row of sixteen numbers or more is taken by itself. In all
+tensors a block's gradients are looked through before one is changed; they are in the cache then.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+from torch import Tensor
+
+from asysplat.ops.adam.reference import Rows, Settings
+from asysplat.ops.cpu.kernel import inline, kernel
+from asysplat.ops.cpu.threads import even_bounds, run_blocks
+from asysplat.ops.cpu.vectors import (
+    LANES,
+    ZERO,
+    fma,
+    gather_pairs,
+    load,
+    load_some,
+    positive,
+    sqrt,
+    store_some,
+    total,
+    where,
+    zeros,
+)
+
+BLOCK = 1024  # rows
+ROUNDING = 2.0**-25  # what is less does not change 1 in float32
+
+
+class FlatRows(NamedTuple):
+    """`Rows` as [N * K] each, and of the K numbers of LANES rows, [K, LANES], rates and rows."""
+
+    parameter: np.ndarray
+    gradient: np.ndarray
+    mean: np.ndarray
+    square: np.ndarray
+    steps: np.ndarray
+    rates: np.ndarray
+    rows: np.ndarray
+
+
+class Constants(NamedTuple):
+    """Settings, 1 - beta as `new`; [steps, 2] what a step's mean and root are multiplied by."""
+
+    beta2: np.float32
+    new1: np.float32
+    new2: np.float32
+    eps: np.float32
+    corrections: np.ndarray
+
+
+def adam_step_cpu(tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: Settings) -> int:
+    """Update the rows that were seen; see `asysplat.ops.adam.adam_step`."""
+    flat = tuple(
+        FlatRows(
+            *(tensor.view(-1).numpy() for tensor in rows[:4]),
+            rows.steps.numpy(),
+            rows.rates.repeat(LANES).view(-1, LANES).numpy(),
+            _rows_of_numbers(len(rows.rates)),
+        )
+        for rows in tensors
+    )
+    blocks = even_bounds(-(-len(seen) // BLOCK))
+    return sum(run_blocks(update_blocks, blocks, flat, seen.numpy(), _constants(settings)))
+
+
+@cache
+def _rows_of_numbers(numbers: int) -> np.ndarray:
+    return (np.arange(numbers * LANES) // numbers).astype(np.float32).reshape(numbers, LANES)
+
+
+@cache
+def _constants(settings: Settings) -> Constants:
+    """Tabulate 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t), up to a step from where they are 1."""
+    slowest = max(settings.beta1, settings.beta2, ROUNDING)
+    t = np.arange(2 + math.ceil(math.log(ROUNDING) / math.log(slowest)))
+    t[0] = 1  # is not used: a row's first step is 1
+    first, second = 1 - settings.beta1**t, 1 - settings.beta2**t
+    return Constants(
+        beta2=np.float32(settings.beta2),
+        new1=np.float32(1 - settings.beta1),
+        new2=np.float32(1 - settings.beta2),
+        eps=np.float32(settings.eps),
+        corrections=np.stack((1 / first, 1 / np.sqrt(second)), -1).astype(np.float32),
+    )
+
+
+@kernel
+def update_blocks(start, stop, tensors, seen, constants):
+    """Update the rows of the blocks start to stop; return how many were seen and are not finite.
+
+    Args:
+        tensors: a tuple of `FlatRows`.
+        seen: [N].
+        constants: see `Constants`.
+    """
+    alive = np.zeros(BLOCK, np.bool_)
+    factors = np.zeros((BLOCK, 2), np.float32)
+    skipped = 0
+    for block in range(start, stop):
+        first = block * BLOCK
+        rows = min(BLOCK, len(seen) - first)
+        alive[:rows] = seen[first : first + rows]
+        alive[rows:] = False
+        for k in range(len(tensors)):
+            skipped += _drop_not_finite(alive, tensors[k], first)
+        for k in range(len(tensors)):
+            _count(factors, alive, tensors[k], first, constants.corrections)
+            _update(factors, alive, tensors[k], first, constants)
+    return skipped
+
+
+@inline
+def _rows_at_a_time(numbers):
+    """Say how many rows make whole vectors: LANES, or if one fills a vector, itself is enough."""
+    return LANES if numbers < LANES else 1
+
+
+@inline
+def _any(flags, first, count):
+    found = False
+    for i in range(first, first + count):
+        found |= flags[i]
+    return found
+
+
+@inline
+def _drop_not_finite(alive, tensor, first):
+    """Take rows whose gradient is not finite out of `alive`; return how many."""
+    numbers, size = len(tensor.rates), len(tensor.gradient)
+    rows = _rows_at_a_time(numbers)
+    dropped = 0
+    for row in range(0, len(alive), rows):
+        if not _any(alive, row, rows):
+            continue
+        begin = (first + row) * numbers
+        end = min(begin + rows * numbers, size)
+        nothing = zeros()
+        for i in range(begin, end, LANES):
+            nothing = fma(load_some(tensor.gradient, i, min(LANES, end - i)), ZERO, nothing)
+        if total(nothing) == 0:
+            continue
+        for i in range(begin, end):
+            here = i // numbers - first
+            if alive[here] and not np.isfinite(tensor.gradient[i]):
+                alive[here] = False
+                dropped += 1
+    return dropped
+
+
+@inline
+def _count(factors, alive, tensor, first, corrections):
+    """Count the step of each row and write its corrections; the first is 0 if it is not updated."""
+    last = np.int32(len(corrections) - 1)
+    for row in range(min(len(alive), len(tensor.steps) - first)):
+        steps = tensor.steps[first + row] + np.int32(alive[row])
+        tensor.steps[first + row] = steps
+        known = np.uint32(min(steps, last))
+        factors[row, 0] = corrections[known, 0] * np.float32(alive[row])
+        factors[row, 1] = corrections[known, 1]
+
+
+@inline
+def _update(factors, alive, tensor, first, constants):
+    """Update the rows that are `alive`."""
+    numbers, size = len(tensor.rates), len(tensor.parameter)
+    rows = _rows_at_a_time(numbers)
+    for row in range(0, len(alive), rows):
+        if not _any(alive, row, rows):
+            continue
+        begin = (first + row) * numbers
+        end = min(begin + rows * numbers, size)
+        for k in range(-(-(end - begin) // LANES)):
+            place = begin + k * LANES
+            count = min(LANES, end - place)
+            if rows == 1:
+                to_mean, to_root = zeros() + factors[row, 0], zeros() + factors[row, 1]
+            else:
+                rows_of_vector = load(tensor.rows, k) + np.float32(row)
+                to_mean, to_root = gather_pairs(factors, rows_of_vector, zeros())
+            parameter = load_some(tensor.parameter, place, count)
+            gradient = load_some(tensor.gradient, place, count)
+            mean = load_some(tensor.mean, place, count)
+            square = load_some(tensor.square, place, count)
+            new_mean = fma(constants.new1, gradient - mean, mean)
+            new_square = fma(constants.new2 * gradient, gradient, constants.beta2 * square)
+            root = fma(to_root, sqrt(new_square), constants.eps)
+            step = load(tensor.rates, k) * to_mean * new_mean / root
+            updated = positive(to_mean)
+            store_some(tensor.parameter, place, count, where(updated, parameter - step, parameter))
+            store_some(tensor.mean, place, count, where(updated, new_mean, mean))
+            store_some(tensor.square, place, count, where(updated, new_square, square))

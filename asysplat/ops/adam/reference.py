@@ -1,0 +1,53 @@
+"""Adam as its formulas, in torch: for any device and float type."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int32
+from torch import Tensor
+
+
+class Rows(NamedTuple):
+    """A tensor of N rows, each K numbers, and what Adam knows of it.
+
+    Args:
+        parameter: is changed, as `mean`, `square` and `steps` are.
+        gradient: of what is minimised.
+        mean, square: the decaying averages of the gradient and of its square.
+        steps: how often each row was updated.
+        rates: of each number of a row, >= 0.
+    """
+
+    parameter: Float[Tensor, "N K"]
+    gradient: Float[Tensor, "N K"]
+    mean: Float[Tensor, "N K"]
+    square: Float[Tensor, "N K"]
+    steps: Int32[Tensor, "N"]
+    rates: Float[Tensor, "K"]
+
+
+class Settings(NamedTuple):
+    """How fast both averages decay, each in [0, 1), and what is added to the square's root, > 0."""
+
+    beta1: float
+    beta2: float
+    eps: float
+
+
+def adam_step_reference(
+    tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: Settings
+) -> int:
+    """Update the rows that were seen; see `asysplat.ops.adam.adam_step`."""
+    finite = torch.stack([rows.gradient.isfinite().all(1) for rows in tensors]).all(0)
+    index = (seen & finite).nonzero().squeeze(1)
+    for parameter, gradient, mean, square, steps, rates in tensors:
+        steps[index] += 1
+        t = steps[index, None].to(parameter.dtype)
+        g = gradient[index]
+        mean[index] = settings.beta1 * mean[index] + (1 - settings.beta1) * g
+        square[index] = settings.beta2 * square[index] + (1 - settings.beta2) * g * g
+        corrected_mean = mean[index] / (1 - settings.beta1**t)
+        corrected_square = square[index] / (1 - settings.beta2**t)
+        parameter[index] -= rates * corrected_mean / (corrected_square.sqrt() + settings.eps)
+    return int((seen & ~finite).sum())

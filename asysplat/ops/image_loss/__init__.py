@@ -1,0 +1,88 @@
+"""The loss that 3D Gaussians are fitted to photographs with: L1 and SSIM (Kerbl et al. 2023)."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from asysplat.errors import InputError
+from asysplat.ops.dispatch import check_fast_backend, pick_backend
+from asysplat.ops.image_loss.reference import SIZE, image_loss_reference
+from asysplat.ops.precision import without_autocast
+
+
+def image_loss(
+    rendered: Float[Tensor, "*batch 3 H W"],
+    target: Float[Tensor, "*batch 3 H W"],
+    ssim_weight: float = 0.2,
+    masks: Bool[Tensor, "*batch H W"] | None = None,
+    backend: str = "auto",
+) -> Float[Tensor, "*batch"]:
+    """Compute (1 - w) mean|rendered - target| + w (1 - mean SSIM) of each image.
+
+    SSIM (Wang et al. 2004) is that of `asysplat.evaluation.metrics.ssim`, but `rendered` is not
+    clamped: windows of 11x11, Gaussian of sigma 1.5, biased covariance, wholly inside the image.
+    An image without such a window, less than 11 pixels high or wide, has the loss of w = 0.
+
+    Args:
+        rendered: RGB; half precision is computed in fp32.
+        target: RGB in [0, 1]; a constant, no gradient is computed for it.
+        ssim_weight: w in [0, 1]; 0 costs nothing.
+        masks: False where a pixel does not count: it takes the target's values, so that it has no
+            error and no gradient.
+        backend: "cpu", "reference" (torch, any device and float type), or "auto": "cpu" for tensors
+            there, and "reference" for others and for float64.
+
+    Returns:
+        In fp32, or float64 for float64.
+
+    Raises:
+        InputError: shapes, types or devices that do not go together, a weight outside [0, 1], an
+            unknown backend or one that cannot take these tensors.
+    """
+    _check(rendered, target, ssim_weight, masks)
+    on_cpu = rendered.device.type == "cpu" and rendered.dtype != torch.float64
+    backends = {"auto": "cpu" if on_cpu else "reference", "reference": "reference", "cpu": "cpu"}
+    backend = pick_backend("image_loss", backends, backend)
+    dtype = torch.promote_types(rendered.dtype, torch.float32)
+    rendered, target = rendered.to(dtype), target.detach().to(dtype)
+    if masks is not None:
+        rendered = torch.where(masks[..., None, :, :], rendered, target)
+    if min(rendered.shape[-2:]) < SIZE:
+        ssim_weight = 0.0
+    if backend == "cpu":
+        check_fast_backend("image_loss", backend, rendered)
+        from asysplat.ops.image_loss.cpu import image_loss_cpu
+
+        return image_loss_cpu(rendered, target, ssim_weight)
+    with without_autocast(rendered):
+        return image_loss_reference(rendered, target, ssim_weight)
+
+
+def _check(rendered: Tensor, target: Tensor, ssim_weight: float, masks: Tensor | None) -> None:
+    if rendered.ndim < 3 or rendered.shape[-3] != 3 or rendered.numel() == 0:
+        raise InputError(
+            f"image_loss's rendered has shape {tuple(rendered.shape)}: expected [..., 3, H, W], "
+            "every side at least 1."
+        )
+    others = {"target": (target, rendered.shape)}
+    if masks is not None:
+        others["masks"] = (masks, rendered.shape[:-3] + rendered.shape[-2:])
+    for name, (tensor, shape) in others.items():
+        if tensor.shape != shape:
+            raise InputError(
+                f"image_loss's {name} has shape {tuple(tensor.shape)}: expected {tuple(shape)}, as "
+                f"rendered has shape {tuple(rendered.shape)}."
+            )
+        if tensor.device != rendered.device:
+            raise InputError(
+                f"image_loss's {name} is on {tensor.device} and rendered on {rendered.device}: "
+                "move both to one device."
+            )
+    for name, tensor in {"rendered": rendered, "target": target}.items():
+        if not tensor.is_floating_point():
+            raise InputError(
+                f"image_loss's {name} is {tensor.dtype}: give floating-point numbers, 8-bit images "
+                "divided by 255."
+            )
+    if not 0 <= ssim_weight <= 1:
+        raise InputError(f"image_loss got ssim_weight={ssim_weight}: give a number from 0 to 1.")

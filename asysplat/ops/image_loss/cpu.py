@@ -1,0 +1,258 @@
+"""Loss and gradient for CPUs (Numba), in one pass: a task takes a band of rows of a channel.
+
+Of the sum s = x + y and the difference d = x - y of both images, with their means S, D and their
+variances V, U in a window, SSIM is
+
+    (1 - D^2 / P) (1 - U / Q),  P = (S^2 + D^2) / 2 + C1,  Q = (V + U) / 2 + C2.
+
+Nothing cancels in it where the images are alike, nor in a variance: it is the mean of those within
+the window's columns and that of the columns' means. The gradient of 1 - SSIM is at each pixel
+a + b d + c s, where a, b and c are sums over its windows; what they are for one window follows from
+S, D, V and U.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from asysplat.ops.cpu.kernel import inline, kernel
+from asysplat.ops.cpu.threads import even_bounds, run_blocks
+from asysplat.ops.cpu.vectors import (
+    LANES,
+    ONE,
+    ZERO,
+    fma,
+    load_some,
+    positive,
+    store_some,
+    total,
+    where,
+    zeros,
+)
+from asysplat.ops.image_loss import reference
+from asysplat.ops.image_loss.reference import SIZE, window_weights
+
+BAND = 64  # rows of a task; for their gradients it also takes the windows that begin above
+REACH = SIZE - 1
+WINDOW = window_weights().float().numpy()
+C1, C2 = np.float32(reference.C1), np.float32(reference.C2)
+HALF, TWO = np.float32(0.5), np.float32(2)
+
+
+class Images(NamedTuple):
+    """Both images, [channels of all images, H, W]."""
+
+    rendered: np.ndarray
+    target: np.ndarray
+
+
+class Weights(NamedTuple):
+    """What |d| of a pixel and 1 - SSIM of a window weigh in the loss."""
+
+    pixel: np.float32
+    window: np.float32
+
+
+class Statistics(NamedTuple):
+    """Means and variances of s and d, [width], over each column of a row of windows."""
+
+    mean_s: np.ndarray
+    mean_d: np.ndarray
+    variance_s: np.ndarray
+    variance_d: np.ndarray
+
+
+class Factors(NamedTuple):
+    """What each window adds to a, b and c: those of a row [width], or summed along rows."""
+
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+
+
+def image_loss_cpu(
+    rendered: Float[Tensor, "*batch 3 H W"],
+    target: Float[Tensor, "*batch 3 H W"],
+    ssim_weight: float,
+) -> Float[Tensor, "*batch"]:
+    """Compute the loss in float32; see `asysplat.ops.image_loss`."""
+    keep = torch.is_grad_enabled() and rendered.requires_grad
+    return _ImageLoss.apply(rendered.contiguous(), target.contiguous(), ssim_weight, keep)
+
+
+class _ImageLoss(torch.autograd.Function):
+    """The loss, which leaves nothing but its gradient for the backward pass."""
+
+    @staticmethod
+    def forward(ctx, rendered, target, ssim_weight, keep):
+        H, W = rendered.shape[-2:]
+        per_pixel = (1 - ssim_weight) / (3 * H * W)
+        per_window = ssim_weight / (3 * (H - REACH) * (W - REACH)) if ssim_weight else 0.0
+        images = Images(*(tensor.view(-1, H, W).numpy() for tensor in (rendered, target)))
+        gradient = torch.empty_like(rendered) if keep else None
+        sums = torch.empty(len(images.target) * -(-H // BAND), 2, dtype=torch.float64)
+        run_blocks(
+            compare_bands,
+            even_bounds(len(sums)),
+            images,
+            Weights(np.float32(per_pixel), np.float32(per_window)),
+            sums.numpy(),
+            gradient.view(-1, H, W).numpy() if keep else None,
+        )
+        ctx.save_for_backward(gradient)
+        absolute, dissimilar = sums.view(*rendered.shape[:-3], -1, 2).sum(-2).unbind(-1)
+        return (per_pixel * absolute + per_window * dissimilar).float()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_output):
+        (gradient,) = ctx.saved_tensors
+        return grad_output[..., None, None, None] * gradient, None, None, None
+
+
+@kernel
+def compare_bands(start, stop, images, weights, sums, gradient):
+    """Compare the bands start to stop, counted over [channels of all images, bands of one].
+
+    Args:
+        images, weights: see `Images` and `Weights`.
+        sums: [bands, 2], written: of |d| over a band's pixels, and of 1 - SSIM over the windows
+            that begin in it.
+        gradient: of the loss, as `images.rendered`, written; None costs nothing.
+    """
+    _, H, W = images.rendered.shape
+    bands = -(-H // BAND)
+    windows = H - REACH if weights.window > ZERO else 0  # rows of them
+    above = REACH if gradient is not None else 0  # rows of windows that reach into a band
+    width = -(-W // LANES) * LANES
+    # What lies beyond the image, and windows that are not wholly inside it, are zeros.
+    padded = np.zeros((7, width + LANES), np.float32)
+    columns = Statistics(padded[0], padded[1], padded[2], padded[3])
+    factors = Factors(padded[4], padded[5], padded[6])
+    rows = np.zeros((3, BAND + above, width), np.float32)
+    sums_along = Factors(rows[0], rows[1], rows[2])
+    for band in range(start, stop):
+        plane, top = band // bands, band % bands * BAND
+        bottom = min(top + BAND, H)
+        absolute = dissimilar = 0.0
+        for y in range(top - above, bottom):
+            row, inside = y - (top - above), 0 <= y < windows
+            if inside:
+                _compare_columns(columns, images, (plane * H + y) * W)
+                found = _compare_windows(factors, columns, W - REACH)
+                dissimilar += found if y >= top else 0.0
+            if gradient is not None and inside:
+                _sum_along_row(sums_along, row, factors)
+            elif gradient is not None:
+                rows[:, row] = ZERO
+        for y in range(top, bottom):
+            absolute += _finish_row(
+                gradient, sums_along, y - top, images, (plane * H + y) * W, weights
+            )
+        sums[band, 0], sums[band, 1] = absolute, dissimilar
+
+
+@inline
+def _compare_columns(columns, images, first):
+    """Write the statistics of columns of SIZE pixels, the topmost of which begin at `first`."""
+    W = images.rendered.shape[2]
+    for x in range(0, W, LANES):
+        count = min(LANES, W - x)
+        mean_s, mean_d = zeros(), zeros()
+        for k in range(SIZE):
+            rendered = load_some(images.rendered, first + k * W + x, count)
+            target = load_some(images.target, first + k * W + x, count)
+            mean_s = fma(WINDOW[k], rendered + target, mean_s)
+            mean_d = fma(WINDOW[k], rendered - target, mean_d)
+        variance_s, variance_d = zeros(), zeros()
+        for k in range(SIZE):
+            rendered = load_some(images.rendered, first + k * W + x, count)
+            target = load_some(images.target, first + k * W + x, count)
+            s, d = (rendered + target) - mean_s, (rendered - target) - mean_d
+            variance_s = fma(WINDOW[k] * s, s, variance_s)
+            variance_d = fma(WINDOW[k] * d, d, variance_d)
+        store_some(columns.mean_s, x, LANES, mean_s)
+        store_some(columns.mean_d, x, LANES, mean_d)
+        store_some(columns.variance_s, x, LANES, variance_s)
+        store_some(columns.variance_d, x, LANES, variance_d)
+
+
+@inline
+def _compare_windows(factors, columns, w):
+    """Write the factors of a row of `w` windows; return the sum of their 1 - SSIM."""
+    dissimilar = zeros()
+    for x in range(0, w, LANES):
+        S, D = zeros(), zeros()
+        for k in range(SIZE):
+            S = fma(WINDOW[k], load_some(columns.mean_s, x + k, LANES), S)
+            D = fma(WINDOW[k], load_some(columns.mean_d, x + k, LANES), D)
+        V, U = zeros(), zeros()
+        for k in range(SIZE):
+            s = load_some(columns.mean_s, x + k, LANES) - S
+            d = load_some(columns.mean_d, x + k, LANES) - D
+            V = fma(WINDOW[k], fma(s, s, load_some(columns.variance_s, x + k, LANES)), V)
+            U = fma(WINDOW[k], fma(d, d, load_some(columns.variance_d, x + k, LANES)), U)
+        over_P = ONE / fma(HALF, fma(S, S, D * D), C1)
+        over_Q = ONE / fma(HALF, V + U, C2)
+        D_over_P, U_over_Q = D * over_P, U * over_Q
+        means = ONE - D * D_over_P
+        means, rest = ONE - D * D_over_P, ONE - U_over_Q
+        count = min(LANES, w - x)
+        unlike = fma(U_over_Q, means, D * D_over_P)
+        dissimilar = dissimilar + where(np.uint16((1 << count) - 1), unlike, zeros())
+        c = means * U_over_Q * over_Q
+        b = fma(TWO * means, over_Q, ZERO - c)
+        a = rest * D_over_P * (TWO - (S + D) * D_over_P) + (c * S - b * D)
+        store_some(factors.a, REACH + x, count, a)
+        store_some(factors.b, REACH + x, count, b)
+        store_some(factors.c, REACH + x, count, ZERO - c)
+    return total(dissimilar)
+
+
+@inline
+def _sum_along_row(sums, row, factors):
+    """Write the sums of the factors over each pixel's windows of one row."""
+    width = sums.a.shape[1]
+    for x in range(0, width, LANES):
+        a, b, c = zeros(), zeros(), zeros()
+        for k in range(SIZE):
+            a = fma(WINDOW[k], load_some(factors.a, x + k, LANES), a)
+            b = fma(WINDOW[k], load_some(factors.b, x + k, LANES), b)
+            c = fma(WINDOW[k], load_some(factors.c, x + k, LANES), c)
+        store_some(sums.a, row * width + x, LANES, a)
+        store_some(sums.b, row * width + x, LANES, b)
+        store_some(sums.c, row * width + x, LANES, c)
+
+
+@inline
+def _finish_row(gradient, sums, row, images, first, weights):
+    """Return the sum of |d| over the row of pixels at `first`; write its gradient.
+
+    Its windows are those of the rows `row` and below of `sums`.
+    """
+    W, width = images.rendered.shape[2], sums.a.shape[1]
+    absolute = zeros()
+    for x in range(0, W, LANES):
+        count = min(LANES, W - x)
+        rendered = load_some(images.rendered, first + x, count)
+        target = load_some(images.target, first + x, count)
+        d = rendered - target
+        absolute = absolute + max(d, ZERO - d)
+        if gradient is not None:
+            # Of 0 and of NaN it is that itself.
+            sign = where(positive(d), zeros() + ONE, where(positive(ZERO - d), zeros() - ONE, d))
+            a, b, c = zeros(), zeros(), zeros()
+            if weights.window > ZERO:
+                for k in range(SIZE):
+                    place = (row + k) * width + x
+                    a = fma(WINDOW[k], load_some(sums.a, place, LANES), a)
+                    b = fma(WINDOW[k], load_some(sums.b, place, LANES), b)
+                    c = fma(WINDOW[k], load_some(sums.c, place, LANES), c)
+            similar = fma(b, d, fma(c, rendered + target, a))
+            grad = fma(weights.window, similar, weights.pixel * sign)
+            store_some(gradient, first + x, count, grad)
+    return total(absolute)

@@ -1,0 +1,45 @@
+"""The loss of images as the formula, in torch: for any device and float type."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SIZE = 11  # of a window, in pixels on a side
+SIGMA = 1.5
+C1, C2 = 0.01**2, 0.03**2  # of Wang et al. 2004, for a data range of 1
+
+
+def window_weights() -> Float[Tensor, "11"]:
+    """Return the Gaussian along one side of a window, in float64; it sums up to 1."""
+    offsets = torch.arange(SIZE, dtype=torch.float64) - SIZE // 2
+    weights = torch.exp(-(offsets**2) / (2 * SIGMA**2))
+    return weights / weights.sum()
+
+
+def image_loss_reference(
+    rendered: Float[Tensor, "*batch 3 H W"],
+    target: Float[Tensor, "*batch 3 H W"],
+    ssim_weight: float,
+) -> Float[Tensor, "*batch"]:
+    """Compute the loss; see `asysplat.ops.image_loss`. SSIM is left out if its weight is 0."""
+    loss = (1 - ssim_weight) * (rendered - target).abs().mean((-3, -2, -1))
+    if ssim_weight:
+        loss = loss + ssim_weight * (1 - _ssim(rendered, target).mean((-3, -2, -1)))
+    return loss
+
+
+def _ssim(x: Float[Tensor, "*batch 3 H W"], y: Float[Tensor, "*batch 3 H W"]) -> Tensor:
+    """Compute the SSIM of each window that lies wholly inside the image (Wang et al. 2004)."""
+    mean_x, mean_y = _blur(x), _blur(y)
+    variance_x, variance_y = _blur(x * x) - mean_x**2, _blur(y * y) - mean_y**2
+    covariance = _blur(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
+    return luminance * (2 * covariance + C2) / (variance_x + variance_y + C2)
+
+
+def _blur(image: Float[Tensor, "*batch 3 H W"]) -> Float[Tensor, "*batch 3 h w"]:
+    # Not a convolution: cuDNN would round its factors to TF32.
+    weights = window_weights().to(image)
+    for dim in (-1, -2):
+        image = image.unfold(dim, SIZE, 1) @ weights
+    return image

@@ -1,0 +1,1 @@
+"""One scene's Gaussians, fitted to its photographs."""

@@ -1,0 +1,205 @@
+"""The loss of images: its formula, the kernel against it in float64, and what must not matter."""
+
+import inspect
+
+import pytest
+import torch
+
+from asysplat.errors import InputError
+from asysplat.evaluation.metrics import ssim
+from asysplat.ops import image_loss
+
+# Around the window's size, a vector's and a band's.
+SIZES = [(11, 11), (12, 29), (26, 16), (37, 53), (64, 17), (75, 40), (139, 33), (20, 300)]
+SMALL = [(1, 1), (1, 40), (10, 10), (3, 17), (10, 30), (70, 9)]
+VALUE, GRADIENT = 1e-6, 1e-5  # of the kernel against float64, the latter relative in L2
+
+
+@pytest.fixture
+def threads():
+    """Sets their number, until the test's end."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def images(kind, *shape):
+    """A rendering and its target [*shape]: noise, alike, or bright, alike and nearly flat."""
+    target = torch.rand(shape)
+    if kind == "noise":
+        return torch.rand(shape), target
+    if kind == "flat":
+        target = 0.95 + 0.002 * target
+    return target + 0.02 * torch.randn(shape), target
+
+
+def both_ways(rendered, target, *args, dtype=torch.float32, **options):
+    """The loss of each image, and the gradient of their sum."""
+    rendered = rendered.to(dtype, copy=True).requires_grad_()
+    loss = image_loss(rendered, target.to(dtype), *args, **options)
+    return loss.detach(), torch.autograd.grad(loss.sum(), rendered)[0]
+
+
+def assert_close(got, exact):
+    (loss, grad), (exact_loss, exact_grad) = got, exact
+    assert loss.dtype == grad.dtype == torch.float32
+    assert loss.shape == exact_loss.shape and grad.shape == exact_grad.shape
+    assert (loss - exact_loss).abs().max() <= VALUE
+    assert (grad - exact_grad).norm() <= GRADIENT * exact_grad.norm()
+
+
+@pytest.mark.parametrize("kind", ["noise", "alike", "flat"])
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_the_kernel_computes_the_reference(size, kind):
+    pair = images(kind, 2, 3, *size)
+    exact = both_ways(*pair, dtype=torch.float64)
+    assert exact[0].dtype == torch.float64
+    assert_close(both_ways(*pair, backend="cpu"), exact)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_gradients_of_the_reference_are_finite_differences(weight):
+    rendered, target = (image.double() for image in images("alike", 2, 3, 13, 12))
+    rendered.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: image_loss(x, target, weight), rendered)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_it_is_l1_and_the_ssim_that_is_published(backend):
+    rendered, target = images("alike", 2, 2, 3, 24, 31)
+    rendered = rendered.clamp(0, 1)
+    l1, similarity = (rendered - target).abs().mean((-3, -2, -1)), ssim(rendered, target)
+    for weight in (0.0, 0.2, 1.0):
+        expected = (1 - weight) * l1 + weight * (1 - similarity)
+        found = image_loss(rendered, target, weight, backend=backend)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("size", SMALL, ids=str)
+def test_an_image_without_a_window_has_the_loss_l1(size, weight):
+    rendered, target = images("noise", 3, *size)
+    loss, grad = both_ways(rendered, target, weight)
+    torch.testing.assert_close(loss, (rendered - target).abs().mean())
+    torch.testing.assert_close(grad, (rendered - target).sign() / rendered.numel())
+    assert_close((loss, grad), both_ways(rendered, target, weight, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("size", [(40, 30), (7, 5)], ids=str)
+def test_identical_images_have_no_loss_and_no_gradient(size):
+    _, target = images("flat", 2, 3, *size)
+    loss, grad = both_ways(target, target)
+    assert torch.equal(loss, torch.zeros(2))
+    assert (grad == 0).all()
+
+
+def test_constant_images():
+    """Without contrast SSIM is that of the means; a window's gradient adds up to its derivative."""
+    x, y, C1 = 0.6, 0.5, 1e-4
+    similarity = (2 * x * y + C1) / (x**2 + y**2 + C1)
+    slope = (2 * y - 2 * x * similarity) / (x**2 + y**2 + C1)
+    loss, grad = both_ways(torch.full((3, 30, 20), x), torch.full((3, 30, 20), y))
+    assert loss.item() == pytest.approx(0.8 * (x - y) + 0.2 * (1 - similarity), abs=1e-6)
+    assert grad.sum().item() == pytest.approx(0.8 - 0.2 * slope, rel=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_masked_pixels_take_the_targets_values(dtype):
+    rendered, target = images("noise", 2, 3, 30, 20)
+    masks = torch.rand(2, 30, 20) > 0.3
+    seen = masks[:, None].expand_as(rendered)
+    loss, grad = both_ways(rendered.where(seen, torch.nan), target, masks=masks, dtype=dtype)
+    exact_loss, exact_grad = both_ways(rendered.where(seen, target), target, dtype=dtype)
+    assert torch.equal(loss, exact_loss)
+    assert torch.equal(grad, exact_grad.where(seen, 0))
+    nothing, none = both_ways(rendered, target, masks=torch.zeros_like(masks), dtype=dtype)
+    assert nothing.abs().max() < 1e-12 and (none == 0).all()
+
+
+def test_images_of_a_batch_do_not_meet():
+    rendered, target = images("noise", 2, 2, 3, 40, 33)
+    together = both_ways(rendered, target)
+    assert together[0].shape == (2, 2)
+    for i in range(2):
+        for j in range(2):
+            alone = both_ways(rendered[i, j], target[i, j])
+            assert alone[0].shape == ()
+            assert torch.equal(together[0][i, j], alone[0])
+            assert torch.equal(together[1][i, j], alone[1])
+
+
+def test_any_number_of_threads_gives_the_same_bits(threads):
+    pair = images("alike", 2, 3, 150, 70)
+    threads(1)
+    one = both_ways(*pair)
+    for count in (2, 3):
+        threads(count)
+        assert all(map(torch.equal, both_ways(*pair), one))
+
+
+@pytest.mark.parametrize("size", [(40, 33), (7, 5)], ids=str)
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_what_is_not_a_number_stays_none_in_its_image(size, value):
+    rendered, target = images("noise", 3, 3, *size)
+    clean = both_ways(rendered, target)
+    rendered[1, 2, 3, 4] = value
+    loss, grad = both_ways(rendered, target)
+    assert not loss[1].isfinite()
+    for good in (0, 2):
+        assert torch.equal(loss[good], clean[0][good])
+        assert torch.equal(grad[good], clean[1][good])
+    if value != value:
+        assert grad[1, 2, 3, 4].isnan()
+
+
+def test_gradients_are_taken_when_and_as_often_as_asked():
+    rendered, target = images("noise", 2, 3, 20, 20)
+    assert not image_loss(rendered, target).requires_grad
+    rendered.requires_grad_()
+    target.requires_grad_()
+    with torch.no_grad():
+        assert not image_loss(rendered, target).requires_grad
+    loss = image_loss(rendered, target)
+    weights = torch.tensor([1.0, -3.0])
+    first, of_target = torch.autograd.grad(
+        (weights * loss).sum(), (rendered, target), retain_graph=True, allow_unused=True
+    )
+    assert of_target is None
+    again, *_ = torch.autograd.grad(loss.sum(), rendered)
+    torch.testing.assert_close(first, weights[:, None, None, None] * again)
+
+
+def test_other_layouts_and_types():
+    rendered, target = images("noise", 2, 20, 30, 3)
+    pair = rendered.movedim(-1, -3), target.movedim(-1, -3)
+    strided = both_ways(*pair)
+    whole = both_ways(*(image.contiguous() for image in pair))
+    assert all(map(torch.equal, strided, whole))
+    half = tuple(image.bfloat16() for image in pair)
+    assert torch.equal(image_loss(*half), image_loss(*(image.float() for image in half)))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        inside = image_loss(*pair, backend="reference")
+    assert torch.equal(inside, image_loss(*pair, backend="reference"))
+
+
+def test_mistakes_are_named():
+    rendered, target = images("noise", 3, 20, 20)
+    wrong = {
+        r"rendered has shape \(20, 20\): expected \[..., 3, H, W\]": (rendered[0], target[0]),
+        r"target has shape \(3, 20, 19\): expected \(3, 20, 20\)": (rendered, target[..., 1:]),
+        "target is torch.uint8: give floating": (rendered, target.byte()),
+        "ssim_weight=1.5: give a number from 0 to 1": (rendered, target, 1.5),
+        r"masks has shape \(3, 20\): expected \(20, 20\)": (
+            rendered,
+            target,
+            0.2,
+            torch.ones(3, 20, dtype=torch.bool),
+        ),
+    }
+    for sentence, args in wrong.items():
+        with pytest.raises(InputError, match=sentence):
+            inspect.unwrap(image_loss)(*args)  # without the checks of types that tests have
+    with pytest.raises(InputError, match="backend='gpu': expected one of auto, reference, cpu"):
+        image_loss(rendered, target, backend="gpu")
+    with pytest.raises(InputError, match="computes in float32"):
+        image_loss(rendered.double(), target, backend="cpu")
