@@ -199,7 +199,6 @@ def _compare_windows(factors, columns, w):
         over_P = ONE / fma(HALF, fma(S, S, D * D), C1)
         over_Q = ONE / fma(HALF, V + U, C2)
         D_over_P, U_over_Q = D * over_P, U * over_Q
-        means = ONE - D * D_over_P
         means, rest = ONE - D * D_over_P, ONE - U_over_Q
         count = min(LANES, w - x)
         unlike = fma(U_over_Q, means, D * D_over_P)
