@@ -1,0 +1,230 @@
+"""Fit a scene's Gaussians to its photographs: per-scene optimisation from a good start.
+
+The paper's post-optimisation is one setting of it, `PAPER`.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.errors import InputError
+from asysplat.ops.image_loss import image_loss
+from asysplat.reconstruction.densify import LEAST_OPACITY, gaussians_where_wrong, look
+from asysplat.reconstruction.fields import Fields
+from asysplat.reconstruction.settings import Settings
+from asysplat.reconstruction.start import footprints
+from asysplat.rendering import render
+from asysplat.scene import Gaussians, Views
+
+VIEWS_A_ROUND = 8  # in which wrong pixels are looked for
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a refinement is.
+
+    Args:
+        step: steps that were taken.
+        share: of the refinement, in [0, 1].
+        seconds: since it began.
+        psnr: of the photographs, each before the step that it was looked at, in dB: mean of the
+            last ones.
+        gaussians: how many there are.
+    """
+
+    step: int
+    share: float
+    seconds: float
+    psnr: float
+    gaussians: int
+
+
+class Refinement:
+    """Gaussians, the photographs they are fitted to, and a step.
+
+    Args:
+        gaussians: [N], to start from.
+        views: the photographs, [V].
+        background: behind all; the mean colour of the photographs where it is None.
+        settings: see `Settings`.
+        seed: of the order of the photographs and of new Gaussians.
+
+    Raises:
+        InputError: no Gaussians, or values that cannot be used.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        views: Views,
+        background: Float[Tensor, "3"] | None = None,
+        settings: Settings = Settings(),  # noqa: B008
+        seed: int = 0,
+    ):
+        if gaussians.num_gaussians == 0:
+            raise InputError("refine got no Gaussians: start from at least one.")
+        gaussians.validate("refine's gaussians")
+        self.views = views.validate("refine's views")
+        self.settings = settings
+        self.background = mean_colour(views) if background is None else background
+        self._generator = torch.Generator().manual_seed(seed)
+        self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
+        self._half = half_size(views) if settings.half_size > 0 or settings.rounds else views
+        self._queue: list[int] = []
+        self._steps = 0
+        self._last_seen = torch.zeros(len(self.fields), dtype=torch.long)
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The Gaussians as they are now, copied."""
+        return self.fields.gaussians().map(lambda field: field.detach().clone())
+
+    def step(self, share: float) -> float:
+        """Take a step; return the mean squared error of the photographs that it looked at.
+
+        Args:
+            share: of the refinement that has passed, in [0, 1].
+        """
+        settings = self.settings
+        views = self._half if share < settings.half_size else self.views
+        chosen = self._next(settings.views_a_step or self.views.num_views)
+        leaves = self.fields.leaves()
+        error, gradients = 0.0, {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
+        for view in chosen:
+            target = views.select([view])
+            image = render(
+                self.fields.gaussians(leaves),
+                target.cameras,
+                self.background,
+                depth=False,
+                masks=target.masks,
+            ).image
+            loss = self._loss(image, target)
+            found = torch.autograd.grad(loss, list(leaves.values()))
+            for name, gradient in zip(leaves, found, strict=True):
+                gradients[name] = gradient if len(chosen) == 1 else gradients[name] + gradient
+            error += F.mse_loss(target.masked(image.detach()), target.images).item() / len(chosen)
+        seen = self.fields.step(gradients, settings.rates, self._factor(share))
+        self._steps += 1
+        self._last_seen[seen] = self._steps
+        return error
+
+    def densify(self, share: float) -> None:
+        """Drop Gaussians that are of no use, and add some where pixels are wrong.
+
+        Args:
+            share: of the refinement that has passed, in [0, 1].
+        """
+        settings = self.settings
+        views = self._half if share < settings.half_size else self.views
+        opacities = self.fields.numbers["logits"].detach().sigmoid()
+        # Seen by none of the photographs, all of which have come twice.
+        lost = self._steps - self._last_seen > 2 * views.num_views
+        kept = torch.nonzero((opacities > LEAST_OPACITY) & ~lost)[:, 0]
+        self.fields.keep(kept)
+        self._last_seen = self._last_seen[kept]
+        count = min(settings.most - len(self.fields), int(settings.growth * len(self.fields)))
+        if count > 0:
+            order = torch.randperm(views.num_views, generator=self._generator)
+            some = views.select(order[:VIEWS_A_ROUND])
+            gaussians = self.gaussians
+            new, units = gaussians_where_wrong(
+                gaussians, some, *look(gaussians, some, self.background), count, self._generator
+            )
+            self.fields.append(new, units)
+            now = torch.full((new.num_gaussians,), self._steps)
+            self._last_seen = torch.cat((self._last_seen, now))
+
+    def _loss(self, image: Float[Tensor, "1 3 H W"], target: Views) -> Tensor:
+        if self.settings.ssim is None:
+            return F.mse_loss(target.masked(image), target.images)
+        return image_loss(image, target.images, self.settings.ssim, target.masks).sum()
+
+    def _factor(self, share: float) -> float:
+        """Return the factor of all rates: 1, then down to `decay` over the cool-down."""
+        cool_down = self.settings.cool_down
+        if cool_down == 0:
+            return 1.0
+        return self.settings.decay ** max(0.0, (share - 1 + cool_down) / cool_down)
+
+    def _next(self, count: int) -> list[int]:
+        """Return the next photographs: all of them come before one comes again."""
+        while len(self._queue) < count:
+            self._queue += torch.randperm(self.views.num_views, generator=self._generator).tolist()
+        chosen, self._queue = self._queue[:count], self._queue[count:]
+        return chosen
+
+    def _units(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        if self.settings.rates.unit == "scene":
+            return torch.ones_like(means[:, 0])
+        return footprints(means, self.views.cameras)
+
+
+def refine(
+    gaussians: Gaussians,
+    views: Views,
+    settings: Settings = Settings(),  # noqa: B008
+    *,
+    seconds: float | None = None,
+    steps: int | None = None,
+    background: Float[Tensor, "3"] | None = None,
+    seed: int = 0,
+    watch: Callable[[Progress, Refinement], bool] | None = None,
+) -> Gaussians:
+    """Refine Gaussians until the seconds or the steps are used.
+
+    With `steps`, the same inputs and seed give the same bits.
+
+    Args:
+        gaussians, views, background, settings, seed: see `Refinement`.
+        seconds, steps: give one of them.
+        watch: called after each step; True ends the refinement.
+
+    Raises:
+        InputError: neither seconds nor steps, or both; see `Refinement`.
+    """
+    if (seconds is None) == (steps is None):
+        raise InputError(f"refine got seconds={seconds} and steps={steps}: give one of them.")
+    refinement = Refinement(gaussians, views, background, settings, seed)
+    clock = time.perf_counter()
+    step, rounds, recent = 0, 0, []
+    while True:
+        passed = time.perf_counter() - clock
+        share = step / steps if seconds is None else passed / seconds
+        if share >= 1:
+            return refinement.gaussians
+        if settings.densify != "none" and share < settings.until:
+            due = int(share / settings.until * (settings.rounds + 1))
+            if due > rounds:
+                refinement.densify(share)
+                rounds = due
+        recent = [*recent[-views.num_views + 1 :], refinement.step(share)]
+        step += 1
+        psnr = -10 * torch.tensor(recent).mean().clamp_min(1e-10).log10().item()
+        progress = Progress(step, share, time.perf_counter() - clock, psnr, len(refinement.fields))
+        if watch is not None and watch(progress, refinement):
+            return refinement.gaussians
+
+
+def mean_colour(views: Views) -> Float[Tensor, "3"]:
+    """Return the mean colour of photographs."""
+    return views.images.mean((0, 2, 3))
+
+
+def half_size(views: Views) -> Views:
+    """Return the views with half as many pixels along each side."""
+    height, width = max(1, views.cameras.height // 2), max(1, views.cameras.width // 2)
+    masks = views.masks
+    if masks is not None:
+        kept = F.interpolate(masks[:, None].float(), (height, width), mode="area")
+        masks = kept[:, 0] == 1
+    return Views(
+        views.cameras.resized(height, width),
+        F.interpolate(views.images, (height, width), mode="area"),
+        masks=masks,
+    )
