@@ -18,7 +18,7 @@ from asysplat.scene import Cameras, Gaussians
 
 FLUID = 0.05  # seconds that a picture should take while something changes
 REST = 0.2  # seconds without a change after which a picture is drawn in full
-LEAST_PIXELS, MOST_PIXELS = 160 * 120, 1920 * 1080  # of a picture
+LEAST_PIXELS, MOST_PIXELS = 320 * 200, 1920 * 1080  # of a picture
 FRUSTUM = (0.03, 0.2)  # least and greatest length of a frustum, in the page's units
 
 
@@ -80,9 +80,11 @@ def frustum_length(cameras: Cameras) -> float:
     return min(max(0.5 * usual, FRUSTUM[0]), FRUSTUM[1])
 
 
-def field_of_view(cameras: Cameras, view: int) -> float:
-    """Return a camera's vertical field of view, in radians."""
-    return 2 * math.atan(cameras.height / 2 / cameras.intrinsics[view, 1, 1].item())
+def field_of_view(cameras: Cameras, view: int) -> tuple[float, float]:
+    """Return a camera's vertical field of view, in radians, and its aspect ratio, across to up."""
+    focal_x, focal_y = cameras.intrinsics[view].diagonal()[:2].tolist()
+    up, across = cameras.height / focal_y, cameras.width / focal_x
+    return 2 * math.atan(up / 2), across / up
 
 
 def quaternion(cameras: Cameras, view: int) -> ndarray:

@@ -27,7 +27,7 @@ from asysplat.scene import Gaussians, Views
 
 THUMBNAIL = 96  # longer side of a photograph in its frustum, in pixels
 IN_ONE_PLACE = 1e-3  # how near a camera stands to where a photograph was taken
-WAITING = "Waiting for a scene."
+WAITING = "Waiting for the first picture; where the renderer compiles for it, that takes minutes."
 NO_PHOTOGRAPH = "To see the error, click a camera: it is known where a photograph was taken."
 
 
@@ -63,6 +63,8 @@ class Viewer:
         except ImportError as error:
             raise InputError("The viewer needs viser: pip install 'viser>=1.1'.") from error
         _check_one_scene("views", views.images.shape[:-4])
+        if gaussians is not None:
+            _check_one_scene("gaussians", gaussians.opacities.shape[:-1])
         self._frame = Frame.of(views.cameras, gaussians)
         self._views = replace(views.to("cpu"), cameras=self._frame.cameras(views.cameras))
         self._up = mean_up(self._views.cameras)
@@ -133,6 +135,8 @@ class Viewer:
 
     def _add_panel(self) -> None:
         gui = self._server.gui
+        # Its button would let anyone in, through a server of viser's.
+        gui.configure_theme(show_logo=False, show_share_button=False)
         self._layer = gui.add_dropdown("Layer", LAYERS)
         self._sh_degree = gui.add_slider("SH degree", 0, 3, 1, 3)
         self._least_opacity = gui.add_slider("Least opacity", 0.0, 1.0, 0.01, 0.0)
@@ -150,12 +154,13 @@ class Viewer:
         # Who stands in a camera should see the scene, and not the photograph in its frustum.
         self._server.initial_camera.near = 1.5 * length
         for view in range(cameras.num_views):
-            intrinsics = cameras.intrinsics[view]
+            fov, aspect = field_of_view(cameras, view)
             frustum = scene.add_camera_frustum(
                 f"/cameras/{view}",
-                fov=field_of_view(cameras, view),
-                aspect=float(cameras.width / cameras.height * intrinsics[1, 1] / intrinsics[0, 0]),
-                scale=length,
+                fov=fov,
+                aspect=aspect,
+                # viser's scale is the cube root of the frustum's volume, not its length.
+                scale=length * (aspect * math.tan(fov / 2) ** 2 / 3) ** (1 / 3),
                 thickness=1.5,
                 thickness_units="screen",
                 color=(209, 98, 45),
@@ -189,7 +194,7 @@ class Viewer:
         distance = 1.0 if gaussians is None else distance_along(gaussians, position, forward)
         up = self._up - (self._up @ right) * right
         vectors = (position, position + distance * forward, up)
-        return *(vector.numpy() for vector in vectors), field_of_view(cameras, view)
+        return *(vector.numpy() for vector in vectors), field_of_view(cameras, view)[0]
 
     # Coroutines, which viser runs in the order of the events.
     async def _open_page(self, client: Any) -> None:
@@ -232,6 +237,8 @@ class Viewer:
             photograph = photograph_at(self._views, camera, IN_ONE_PLACE)
             text = text if photograph is not None else f"{NO_PHOTOGRAPH}\n\n{text}"
         picture = draw(gaussians, camera.to(gaussians.means.device), look, photograph)
+        if client.client_id not in self._pages:
+            return True
         client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90)
         client.flush()
         took = 1000 * (time.perf_counter() - start)
