@@ -124,8 +124,8 @@ def camera_of(page: Any, pixels: int) -> tuple[Cameras, bool]:
     return cameras.resized(max(round(shrink * height), 1), max(round(shrink * width), 1)), False
 
 
-class Page:
-    """A thread that draws for one open page: always the newest, leaving out what it came late for.
+class Page(Thread):
+    """Draws for one open page: always the newest, leaving out what it came late for.
 
     While something changes it asks for as many pixels as it has time for, then once for all.
 
@@ -134,11 +134,10 @@ class Page:
     """
 
     def __init__(self, draw: Callable[[int], bool]):
-        self._draw, self._open = draw, True
+        super().__init__(name="asysplat-page", daemon=True)
+        self._draw, self.is_open = draw, True
         self._changed = Event()
         self._changed.set()
-        self._thread = Thread(target=self._work, name="asysplat-page", daemon=True)
-        self._thread.start()
 
     def change(self) -> None:
         """Have the page drawn again."""
@@ -146,19 +145,15 @@ class Page:
 
     def leave(self) -> None:
         """Let the thread end, after the picture that it is drawing."""
-        self._open = False
+        self.is_open = False
         self._changed.set()
 
-    def join(self) -> None:
-        """Wait until the thread has ended."""
-        self._thread.join()
-
-    def _work(self) -> None:
+    def run(self) -> None:
         in_full, coarse, pause = True, MOST_PIXELS // 16, REST
         while True:
             changed = self._changed.wait(None if in_full else pause)
             self._changed.clear()
-            if not self._open:
+            if not self.is_open:
                 return
             start = time.perf_counter()
             in_full = self._draw(coarse if changed else MOST_PIXELS)

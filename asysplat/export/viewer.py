@@ -196,20 +196,22 @@ class Viewer:
         vectors = (position, position + distance * forward, up)
         return *(vector.numpy() for vector in vectors), field_of_view(cameras, view)[0]
 
-    # Coroutines, which viser runs in the order of the events.
+    # A coroutine runs before the page's next event, so that the page is known when it leaves.
     async def _open_page(self, client: Any) -> None:
         page = Page(lambda pixels: self._draw(client, pixels))
         self._pages[client.client_id] = page
+        page.start()
 
         async def moved(_: Any) -> None:
             page.change()
 
         client.camera.on_update(moved)
 
-    async def _close_page(self, client: Any) -> None:
-        page = self._pages.pop(client.client_id, None)
-        if page is not None:
-            page.leave()
+    def _close_page(self, client: Any) -> None:
+        page = self._pages[client.client_id]
+        page.leave()
+        page.join()
+        del self._pages[client.client_id]
 
     def _change(self) -> None:
         for page in list(self._pages.values()):
@@ -237,7 +239,7 @@ class Viewer:
             photograph = photograph_at(self._views, camera, IN_ONE_PLACE)
             text = text if photograph is not None else f"{NO_PHOTOGRAPH}\n\n{text}"
         picture = draw(gaussians, camera.to(gaussians.means.device), look, photograph)
-        if client.client_id not in self._pages:
+        if not self._pages[client.client_id].is_open:
             return True
         client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90)
         client.flush()

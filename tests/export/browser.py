@@ -23,10 +23,10 @@ def find_chromium() -> str | None:
 
 
 class Tab:
-    """One page; what its console and its network complain of is kept in `complaints`."""
+    """One page; the errors of its console and its network are kept in `errors`."""
 
     def __init__(self, socket):
-        self._socket, self._numbers, self.complaints = socket, count(1), []
+        self._socket, self._numbers, self.errors = socket, count(1), []
 
     def __call__(self, method: str, **params) -> dict:
         """Send a command of the protocol and return its result."""
@@ -42,13 +42,13 @@ class Tab:
     def _note(self, message: dict) -> None:
         method, params = message.get("method"), message.get("params", {})
         if method == "Runtime.exceptionThrown":
-            self.complaints.append(params["exceptionDetails"])
-        elif method == "Runtime.consoleAPICalled" and params["type"] in ("error", "warning"):
-            self.complaints.append([arg.get("value") for arg in params["args"]])
-        elif method == "Log.entryAdded" and params["entry"]["level"] in ("error", "warning"):
-            self.complaints.append(params["entry"])
+            self.errors.append(params["exceptionDetails"])
+        elif method == "Runtime.consoleAPICalled" and params["type"] == "error":
+            self.errors.append([arg.get("value") for arg in params["args"]])
+        elif method == "Log.entryAdded" and params["entry"]["level"] == "error":
+            self.errors.append(params["entry"])
         elif method == "Network.loadingFailed":
-            self.complaints.append(params)
+            self.errors.append(params)
 
     def evaluate(self, script: str):
         return self("Runtime.evaluate", expression=script)["result"].get("value")

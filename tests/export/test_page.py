@@ -137,6 +137,7 @@ def test_coarse_first_and_in_full_at_rest():
     drawings = Drawings()
     drawings.turn.set()
     page = Page(drawings)
+    page.start()
     assert drawings.asked.get(timeout=60) < MOST_PIXELS
     assert drawings.asked.get(timeout=60) == MOST_PIXELS
     page.leave()
@@ -147,6 +148,7 @@ def test_coarse_first_and_in_full_at_rest():
 def test_changes_that_come_late_are_drawn_once():
     drawings = Drawings()
     page = Page(drawings)
+    page.start()
     for _ in range(20):
         page.change()
     drawings.turn.set()

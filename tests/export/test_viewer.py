@@ -3,6 +3,7 @@
 import sys
 import time
 from dataclasses import replace
+from itertools import combinations
 from threading import Event, Thread
 from urllib.error import URLError
 from urllib.request import urlopen
@@ -18,7 +19,7 @@ from asysplat.export.page import quaternion
 from asysplat.export.viewer import IN_ONE_PLACE, NO_PHOTOGRAPH, Viewer, photograph_at
 
 pytest.importorskip("viser", minversion="1.1")
-from wire import open_page
+from wire import TOLERANCE, open_page
 
 
 @pytest.fixture
@@ -112,18 +113,18 @@ def test_pages_are_sent_what_render_gives_for_their_cameras(scene, viewer):
 
 def test_the_panel_changes_what_is_sent(scene, viewer):
     gaussians, cameras = inside(viewer, scene[0])
+    camera = cameras.select([1])
+    photograph = photograph_at(viewer._views, camera, IN_ONE_PLACE)
+    looks = [*map(Look, LAYERS), Look("colour", 0, 0.5, 0.5)]
+    expected = [draw(gaussians, camera, look, photograph) for look in looks]
+    for one, other in combinations(expected, 2):
+        assert np.abs(one.astype(int) - other).mean() > 2 * TOLERANCE
     with open_page(viewer) as page:
         page.stand(cameras, 1)
-        for layer in LAYERS[1:]:
-            viewer._layer.value = layer
-            camera = cameras.select([1])
-            photograph = photograph_at(viewer._views, camera, IN_ONE_PLACE)
-            page.picture_like(draw(gaussians, camera, Look(layer), photograph))
-        viewer._layer.value = "colour"
-        viewer._sh_degree.value = 0
-        viewer._least_opacity.value = 0.5
-        viewer._size.value = 0.5
-        page.picture_like(draw(gaussians, camera, Look("colour", 0, 0.5, 0.5)))
+        for look, picture in zip(looks, expected, strict=True):
+            viewer._layer.value, viewer._sh_degree.value = look.layer, min(look.sh_degree, 1)
+            viewer._least_opacity.value, viewer._size.value = look.least_opacity, look.size
+            page.picture_like(picture)
 
 
 def test_error_asks_for_a_place_where_a_photograph_was_taken(scene, viewer):

@@ -12,6 +12,8 @@ from websockets.sync.client import connect
 
 from asysplat.export.page import field_of_view, quaternion
 
+TOLERANCE = 6  # of 255, on average: what JPEG may change
+
 
 @contextmanager
 def open_page(viewer):
@@ -53,7 +55,7 @@ class WirePage:
                     self._pictures.append(cv2.imdecode(pixels, cv2.IMREAD_COLOR)[..., ::-1])
         return self._pictures.popleft()
 
-    def picture_like(self, expected: np.ndarray, tolerance: float = 6) -> None:
+    def picture_like(self, expected: np.ndarray) -> None:
         """Wait for a picture that is like the expected one, but for what JPEG takes away.
 
         Fails after 20 others.
@@ -62,6 +64,6 @@ class WirePage:
             found = self.picture()
             if found.shape == expected.shape:
                 difference = np.abs(found.astype(int) - expected).mean()
-                if difference < tolerance:
+                if difference < TOLERANCE:
                     return
         raise AssertionError(f"the last picture differs by {difference} of 255 on average")
