@@ -8,13 +8,14 @@ from jaxtyping import Float, UInt8
 from matplotlib import colormaps
 from numpy import ndarray
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, interpolate
 
 from asysplat.evaluation.pictures import ERROR_RANGE, disparity
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 
 LAYERS = ("colour", "depth", "alpha", "error")
+THUMBNAIL = 96  # longer side, in pixels
 SAMPLED = 10_000  # pixels from which the range of depths is found
 
 
@@ -66,7 +67,7 @@ def draw(
     elif look.layer == "error" and photograph is not None:
         error = (image - photograph.to(image)).abs().mean(0)
         return _mapped(error.nan_to_num() / ERROR_RANGE, "magma")
-    return (255 * image).round().byte().permute(1, 2, 0).cpu().numpy()
+    return _bytes(image)
 
 
 def _mapped(values: Float[Tensor, "H W"], name: str) -> UInt8[ndarray, "H W 3"]:
@@ -108,3 +109,14 @@ def photograph_at(
         )
         known = known & (counts[0, 0] > 0)
     return colours.where(known, torch.nan)
+
+
+def thumbnail(image: Float[Tensor, "3 H W"]) -> UInt8[ndarray, "h w 3"]:
+    """Return an RGB image in [0, 1] as bytes, no larger than a frustum needs it."""
+    factor = min(1, THUMBNAIL / max(image.shape[1:]))
+    size = [max(round(factor * side), 1) for side in image.shape[1:]]
+    return _bytes(interpolate(image[None], size, mode="area")[0])
+
+
+def _bytes(image: Float[Tensor, "3 H W"]) -> UInt8[ndarray, "H W 3"]:
+    return (255 * image).round().byte().permute(1, 2, 0).cpu().numpy()

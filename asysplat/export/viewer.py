@@ -2,30 +2,27 @@
 
 import math
 import time
-from dataclasses import replace
 from threading import Event
 from typing import Any
 
-from jaxtyping import Float, UInt8
+import torch
 from numpy import ndarray
-from torch import Tensor
-from torch.nn.functional import interpolate
 
 from asysplat.errors import InputError
-from asysplat.export.layers import LAYERS, Look, draw, photograph_at
-from asysplat.export.page import (
+from asysplat.export.frame import (
     Frame,
-    Page,
     camera_of,
     distance_along,
     field_of_view,
     frustum_length,
     mean_up,
+    pointed_at,
     quaternion,
 )
+from asysplat.export.layers import LAYERS, Look, draw, photograph_at, thumbnail
+from asysplat.export.page import MOST_PIXELS, Page
 from asysplat.scene import Gaussians, Views
 
-THUMBNAIL = 96  # longer side of a photograph in its frustum, in pixels
 IN_ONE_PLACE = 1e-3  # how near a camera stands to where a photograph was taken
 WAITING = "Waiting for the first picture; where the renderer compiles for it, that takes minutes."
 NO_PHOTOGRAPH = "To see the error, click a camera: it is known where a photograph was taken."
@@ -66,8 +63,10 @@ class Viewer:
         if gaussians is not None:
             _check_one_scene("gaussians", gaussians.opacities.shape[:-1])
         self._frame = Frame.of(views.cameras, gaussians)
-        self._views = replace(views.to("cpu"), cameras=self._frame.cameras(views.cameras))
-        self._up = mean_up(self._views.cameras)
+        masks = None if views.masks is None else views.masks.cpu()
+        cameras = self._frame.cameras(views.cameras)
+        self._views = Views(cameras, views.images.cpu(), masks=masks)
+        self._up = mean_up(cameras)
         self._scene: tuple[Gaussians | None, str] = (None, WAITING)
         self._pages: dict[int, Page] = {}
         self._closed = Event()
@@ -150,7 +149,7 @@ class Viewer:
         scene, cameras = self._server.scene, self._views.cameras
         scene.set_up_direction(self._up.numpy())
         parent = scene.add_frame("/cameras", show_axes=False)
-        length = frustum_length(cameras)
+        self._length = length = frustum_length(cameras)
         # Who stands in a camera should see the scene, and not the photograph in its frustum.
         self._server.initial_camera.near = 1.5 * length
         for view in range(cameras.num_views):
@@ -164,18 +163,28 @@ class Viewer:
                 thickness=1.5,
                 thickness_units="screen",
                 color=(209, 98, 45),
-                image=_thumbnail(self._views.images[view]),
+                image=thumbnail(self._views.images[view]),
                 wxyz=quaternion(cameras, view),
                 position=cameras.centers[view].numpy(),
             )
-            frustum.on_click(lambda event, view=view: self._fly(event.client, view))
-        self._cameras_shown.on_update(
-            lambda _: setattr(parent, "visible", self._cameras_shown.value)
-        )
+            frustum.on_click(self._click)
+
+        @self._cameras_shown.on_update
+        def _(_: Any) -> None:
+            parent.visible = self._cameras_shown.value
 
     def _set_first_camera(self) -> None:
         first = self._server.initial_camera
         first.position, first.look_at, first.up, first.fov = self._stand(0)
+
+    def _click(self, event: Any) -> None:
+        # The page takes what it does not draw, in front of its near plane, for what was clicked.
+        camera, _ = camera_of(event.client.camera, MOST_PIXELS)
+        start, ray = (torch.tensor(v).float() for v in (event.ray_origin, event.ray_direction))
+        to_near = event.client.camera.near / (ray @ camera.cam_to_world[0, :3, 2])
+        view = pointed_at(self._views.cameras, self._length, start, to_near * ray)
+        if view is not None:
+            self._fly(event.client, view)
 
     def _fly(self, client: Any, view: int) -> None:
         camera = client.camera
@@ -254,10 +263,3 @@ def _check_one_scene(name: str, batch: tuple[int, ...]) -> None:
         raise InputError(
             f"The viewer's {name} have the batch dimensions {tuple(batch)}: give one scene's."
         )
-
-
-def _thumbnail(image: Float[Tensor, "3 H W"]) -> UInt8[ndarray, "h w 3"]:
-    factor = min(1, THUMBNAIL / max(image.shape[1:]))
-    size = [max(round(factor * side), 1) for side in image.shape[1:]]
-    small = interpolate(image[None], size, mode="area")[0]
-    return (255 * small).round().byte().permute(1, 2, 0).numpy()

@@ -9,8 +9,9 @@ import pytest
 from browser import find_chromium, open_page
 
 from asysplat.data import ProceduralScene
+from asysplat.export.frame import camera_of
 from asysplat.export.layers import Look, draw
-from asysplat.export.page import MOST_PIXELS, camera_of
+from asysplat.export.page import MOST_PIXELS
 from asysplat.export.viewer import Viewer
 
 pytest.importorskip("viser", minversion="1.1")
@@ -68,18 +69,20 @@ def test_a_person_sees_what_is_rendered_and_flies_by_clicks(chromium, viewer, tm
         (client,) = until(viewer._server.get_clients).values()
         arrive(tab, viewer, client, 0, tmp_path)
 
+        # Click on the third camera, from behind them all.
         viewer._cameras_shown.value = True
         center, forward = cameras.centers.mean(0), cameras.cam_to_world[0, :3, 2]
         client.camera.position = (center - 2 * forward).numpy()
         client.camera.look_at = center.numpy()
-        time.sleep(1)
         camera, _ = camera_of(client.camera, MOST_PIXELS)
-        inside = camera.cam_to_world[0].inverse() @ cameras.cam_to_world
-        places = (inside[:, :3, 3] + 0.02 * inside[:, :3, 2]) @ camera.intrinsics[0].mT
-        print(places[:, :2] / places[:, 2:])
-        cv2.imwrite(str(tmp_path / "afar.png"), 255 * tab.screenshot()[..., ::-1])
-        x, y = (places[2, :2] / places[2, 2]).tolist()
-        tab.click(x, y)
+        inside = camera.cam_to_world[0].inverse() @ cameras.cam_to_world[2]
+        place = camera.intrinsics[0] @ (inside[:3, 3] + 0.02 * inside[:3, 2])
+
+        def clicked():
+            tab.click(*(WIDTH / camera.width * place[:2] / place[2]).tolist())
+            return np.allclose(client.camera.position, cameras.centers[2], atol=1e-4)
+
+        until(clicked)
         viewer._cameras_shown.value = False
         arrive(tab, viewer, client, 2, tmp_path)
         assert tab.errors == []

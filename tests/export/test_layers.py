@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from asysplat import Cameras, Gaussians, Views, render
-from asysplat.export.layers import LAYERS, Look, draw, photograph_at
+from asysplat.export.layers import LAYERS, Look, draw, photograph_at, thumbnail
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +161,13 @@ def test_of_several_in_one_place_the_one_that_looks_that_way(photographs):
     for view in range(2):
         seen = photograph_at(views, cameras.select([view]), 1e-3)
         torch.testing.assert_close(seen, views.images[view], atol=1e-4, rtol=0)
+
+
+def test_thumbnails_are_small_and_as_bright():
+    image = torch.rand(3, 150, 300)
+    small = thumbnail(image)
+    assert small.shape == (48, 96, 3)
+    np.testing.assert_allclose(small.mean((0, 1)) / 255, image.mean((1, 2)), atol=0.01)
+    np.testing.assert_array_equal(
+        thumbnail(image[:, :20, :30]), bytes_of(image[:, :20, :30]).transpose(1, 2, 0)
+    )

@@ -14,8 +14,8 @@ import torch
 
 from asysplat import Views
 from asysplat.errors import InputError
+from asysplat.export.frame import quaternion
 from asysplat.export.layers import LAYERS, Look, draw
-from asysplat.export.page import quaternion
 from asysplat.export.viewer import IN_ONE_PLACE, NO_PHOTOGRAPH, Viewer, photograph_at
 
 pytest.importorskip("viser", minversion="1.1")
