@@ -4,7 +4,7 @@ The paper's post-optimisation is one setting of it, `PAPER`.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,8 +14,9 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.ops.image_loss import image_loss
+from asysplat.reconstruction.corrections import Corrections, exposed, moved_cameras
 from asysplat.reconstruction.densify import LEAST_OPACITY, gaussians_where_wrong, look
-from asysplat.reconstruction.fields import Fields
+from asysplat.reconstruction.fields import Fields, Numbers
 from asysplat.reconstruction.settings import Settings
 from asysplat.reconstruction.start import footprints
 from asysplat.rendering import render
@@ -74,6 +75,7 @@ class Refinement:
         self.background = mean_colour(views) if background is None else background
         self._generator = torch.Generator().manual_seed(seed)
         self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
+        self.corrections = Corrections(views.num_views, settings.rates)
         self._half = half_size(views) if settings.half_size > 0 or settings.rounds else views
         self._queue: list[int] = []
         self._steps = 0
@@ -93,23 +95,14 @@ class Refinement:
         settings = self.settings
         views = self._half if share < settings.half_size else self.views
         chosen = self._next(settings.views_a_step or self.views.num_views)
-        leaves = self.fields.leaves()
+        leaves, factor = self.fields.leaves(), self._factor(share)
         error, gradients = 0.0, {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
         for view in chosen:
-            target = views.select([view])
-            image = render(
-                self.fields.gaussians(leaves),
-                target.cameras,
-                self.background,
-                depth=False,
-                masks=target.masks,
-            ).image
-            loss = self._loss(image, target)
-            found = torch.autograd.grad(loss, list(leaves.values()))
+            mse, found = self._gradients(views.select([view]), view, leaves, factor)
             for name, gradient in zip(leaves, found, strict=True):
                 gradients[name] = gradient if len(chosen) == 1 else gradients[name] + gradient
-            error += F.mse_loss(target.masked(image.detach()), target.images).item() / len(chosen)
-        seen = self.fields.step(gradients, settings.rates, self._factor(share))
+            error += mse / len(chosen)
+        seen = self.fields.step(gradients, settings.rates, factor)
         self._steps += 1
         self._last_seen[seen] = self._steps
         return error
@@ -139,6 +132,35 @@ class Refinement:
             self.fields.append(new, units)
             now = torch.full((new.num_gaussians,), self._steps)
             self._last_seen = torch.cat((self._last_seen, now))
+
+    def _gradients(
+        self, target: Views, view: int, leaves: Numbers, factor: float
+    ) -> tuple[float, Sequence[Tensor]]:
+        """Render a photograph; return its squared error and the gradients of the leaves.
+
+        What the photograph itself is forgiven is corrected at once.
+        """
+        cameras, forgiven = target.cameras, {}
+        if self.corrections.wanted:
+            forgiven = self.corrections.leaves(view)
+            cameras = moved_cameras(cameras, forgiven["poses"])
+        image = render(
+            self.fields.gaussians(leaves),
+            cameras,
+            self.background,
+            depth=False,
+            masks=target.masks,
+        ).image
+        if forgiven:
+            image = exposed(image, forgiven["exposure"])
+        found = torch.autograd.grad(
+            self._loss(image, target), [*leaves.values(), *forgiven.values()]
+        )
+        if forgiven:
+            own = dict(zip(forgiven, found[len(leaves) :], strict=True))
+            self.corrections.step(view, own, factor)
+        mse = F.mse_loss(target.masked(image.detach()), target.images).item()
+        return mse, found[: len(leaves)]
 
     def _loss(self, image: Float[Tensor, "1 3 H W"], target: Views) -> Tensor:
         if self.settings.ssim is None:
