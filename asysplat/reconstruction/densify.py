@@ -17,46 +17,42 @@ AROUND = 3  # pixels over which an error is averaged: one wrong pixel may be noi
 
 @torch.no_grad()
 def gaussians_where_wrong(
-    gaussians: Gaussians,
     views: Views,
     rendered: Float[Tensor, "V 3 H W"],
     depth: Float[Tensor, "V H W"],
     count: int,
     generator: torch.Generator,
-) -> tuple[Gaussians, Float[Tensor, "M"]]:
+) -> Gaussians:
     """Return Gaussians at pixels of the photographs, drawn as often as they are wrong.
 
     Each has the pixel's colour and lies where the pixel's ray now ends, so that a surface gets the
     detail that the photographs show of it.
 
     Args:
-        gaussians: [N], whose number of SH coefficients the new ones have.
         views: the photographs, [V].
         rendered: what is rendered of them.
         depth: of the rendering, 0 where nothing is seen.
         count: how many to draw; fewer where fewer pixels are wrong.
         generator: of random numbers.
-
-    Returns:
-        the Gaussians and what a pixel covers at each.
     """
     error = (views.masked(rendered) - views.images).abs().mean(1)
     error = F.avg_pool2d(error, AROUND, stride=1, padding=AROUND // 2) * (depth > 0)
+    if views.masks is not None:
+        error = error * views.masks
     count = min(count, int((error > 0).sum()))
-    if count == 0:
-        return gaussians.keep(torch.zeros(gaussians.num_gaussians, dtype=torch.bool)), depth[
-            0, 0, :0
-        ]
-    chosen = torch.multinomial(error.flatten(), count, generator=generator)
+    # As torch.multinomial does, which takes no more than 2^24 pixels: the least of exponential
+    # times with these rates come first (Efraimidis and Spirakis 2006).
+    times = torch.empty_like(error).exponential_(generator=generator).clamp_min(1e-30)
+    chosen = (error / times).flatten().topk(count).indices
     cameras = views.cameras
     view = chosen // error[0].numel()
     directions = cameras.pixel_directions().flatten(0, 2)[chosen]
     z = depth.flatten()[chosen]
     pose = cameras.cam_to_world[view]
     means = (pose[:, :3, :3] @ (z[:, None] * directions)[..., None])[..., 0] + pose[:, :3, 3]
-    units = z / cameras.intrinsics[view, 0, 0]
+    sizes = SIZE * z / cameras.intrinsics[view, 0, 0]
     colours = views.images.movedim(1, -1).flatten(0, 2)[chosen]
-    return round_gaussians(means, SIZE * units, torch.full_like(z, OPACITY), colours), units
+    return round_gaussians(means, sizes, torch.full_like(z, OPACITY), colours)
 
 
 @torch.no_grad()

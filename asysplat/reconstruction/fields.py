@@ -76,11 +76,10 @@ class Fields:
         seen = gradients["logits"] != 0
         bands = torch.full((self.count, 1), rates.sh * rates.higher)
         bands[0] = rates.sh
-        means: float | Tensor = rates.means
         self._adam.step(
             gradients,
             {
-                "offsets": means * factor,
+                "offsets": rates.means * factor,
                 "quats": rates.quats * factor,
                 "log_scales": rates.scales * factor,
                 "logits": rates.opacities * factor,
@@ -102,23 +101,16 @@ class Fields:
         self._origins = torch.cat((self._origins, origins))
         self._units = torch.cat((self._units, units[:, None].to(self._units)))
 
-    def replace(self, rows: Int[Tensor, "M"], gaussians: Gaussians) -> None:
-        """Put other Gaussians in the place of rows, without steps yet; units stay."""
-        origins, numbers = self._unconstrained(gaussians)
-        self._origins[rows] = origins
-        for name, tensor in numbers.items():
-            self.numbers[name][rows] = tensor
-        self._adam.reset(rows)
-
     def _unconstrained(self, gaussians: Gaussians) -> tuple[Float[Tensor, "N 3"], Numbers]:
+        """Return where the offsets begin, and the numbers: copies in float32."""
+        options = {"dtype": torch.float32, "memory_format": torch.contiguous_format, "copy": True}
+        gaussians = gaussians.map(lambda field: field.detach().to(**options))
         sh = gaussians.sh[:, : self.count]
         missing = sh.new_zeros(len(sh), self.count - sh.shape[1], 3)
-        numbers = {
+        return gaussians.means, {
             "offsets": torch.zeros_like(gaussians.means),
             "quats": gaussians.quats,
             "log_scales": gaussians.scales.log(),
             "logits": gaussians.opacities.clamp(1e-6, 1 - 1e-6).logit(),
             "sh": torch.cat((sh, missing), dim=1),
         }
-        numbers = {name: tensor.detach().float().contiguous() for name, tensor in numbers.items()}
-        return gaussians.means.detach().float().clone(), {n: t.clone() for n, t in numbers.items()}

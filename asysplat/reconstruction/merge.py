@@ -15,31 +15,34 @@ COARSER = 2**0.5  # by which cells grow until few enough Gaussians are left
 def merged(gaussians: Gaussians, cells: Float[Tensor, "N"]) -> Gaussians:
     """Merge the Gaussians of each cubic cell: their mean, weighted by opacity.
 
-    Together they hide what all of them hid. What is left covers its cell.
+    Together they hide what all of them hid, in the range from LEAST_OPACITY to MOST_OPACITY. What
+    is left covers its cell.
 
     Args:
-        gaussians: [N].
-        cells: side of the cell that each is in, in scene units; rounded to a power of 2, so that
-            cells of one size tile the space.
+        gaussians: [N], N >= 1.
+        cells: side of the cell that each is in, > 0, in scene units; rounded to a power of 2, so
+            that cells of one size tile the space, from the least corner of all means.
     """
-    cell = _cell_of(gaussians.means, cells)
-    count = int(cell.max()) + 1 if len(cell) else 0
-    weights = gaussians.opacities
+    cell, count = _ranks_of_cells(gaussians.means, cells)
+    weights = gaussians.opacities.clamp_min(1e-6)  # what nobody sees has a mean, too
     total = weights.new_zeros(count).index_add_(0, cell, weights)
 
     def mean(values: Tensor) -> Tensor:
-        shaped = weights.view(-1, *[1] * (values.ndim - 1))
-        summed = values.new_zeros(count, *values.shape[1:]).index_add_(0, cell, values * shaped)
-        return summed / total.view(-1, *[1] * (values.ndim - 1))
+        shape = (-1, *[1] * (values.ndim - 1))
+        summed = values.new_zeros(count, *values.shape[1:])
+        return summed.index_add_(0, cell, values * weights.view(shape)) / total.view(shape)
 
     hidden = torch.log1p(-gaussians.opacities.clamp(max=0.999))
     opacities = 1 - weights.new_zeros(count).index_add_(0, cell, hidden).exp()
-    # q and -q are one rotation: all are turned to the half space of the first component.
-    quats = F.normalize(gaussians.quats * gaussians.quats[:, :1].sign(), dim=-1)
+    # q and -q are one rotation: all of a cell are turned to the side of its first.
+    every = torch.arange(len(cell))
+    first = every.new_full((count,), len(cell)).scatter_reduce_(0, cell, every, "amin")[cell]
+    quats = F.normalize(gaussians.quats, dim=-1)
+    opposite = (quats * quats[first]).sum(-1, keepdim=True) < 0
     scales = mean(gaussians.scales.log()).exp()
     return Gaussians(
         means=mean(gaussians.means),
-        quats=mean(quats),
+        quats=F.normalize(mean(torch.where(opposite, -quats, quats)), dim=-1),
         scales=torch.maximum(scales, SPREAD * mean(cells.log()).exp()[:, None]),
         opacities=opacities.clamp(LEAST_OPACITY, MOST_OPACITY),
         sh=mean(gaussians.sh),
@@ -50,22 +53,38 @@ def thinned(gaussians: Gaussians, cameras: Cameras, pixels: float, most: int) ->
     """Merge Gaussians in cells of `pixels`, and of more until at most `most` are left.
 
     Args:
-        gaussians: [N].
+        gaussians: [N], N >= 1.
         cameras: that see them.
-        pixels: side of a cell, in pixels of the camera that sees it closest.
+        pixels: > 0, side of a cell, in pixels of the camera that sees it closest.
         most: >= 1.
+
+    Raises:
+        InputError: values that cannot be used.
     """
+    gaussians.validate("thinned's gaussians")
     cells = pixels * footprints(gaussians.means, cameras)
-    while True:
-        fewer = merged(gaussians, cells)
-        if fewer.num_gaussians <= most:
-            return fewer
-        cells = cells * COARSER
+    extent = (gaussians.means.amax(0) - gaussians.means.amin(0)).max()
+    largest = torch.maximum(2 * extent, cells.max())  # it holds all of them
+    while _ranks_of_cells(gaussians.means, cells)[1] > most and cells.min() < largest:
+        cells = torch.minimum(COARSER * cells, largest)
+    return merged(gaussians, cells)
 
 
-def _cell_of(means: Float[Tensor, "N 3"], cells: Float[Tensor, "N"]) -> Int[Tensor, "N"]:
-    """Give each mean the number of its cell, from 0."""
+def _ranks_of_cells(
+    means: Float[Tensor, "N 3"], cells: Float[Tensor, "N"]
+) -> tuple[Int[Tensor, "N"], int]:
+    """Give each mean the rank of its cell, from 0, and tell how many cells there are."""
     level = cells.double().log2().round()
-    place = (means.double() / (2**level)[:, None]).floor()
-    key = torch.cat((place, level[:, None]), dim=-1).long()
-    return torch.unique(key, dim=0, return_inverse=True)[1]
+    offsets = means.double() - means.double().amin(0)
+    place = (offsets / (2**level)[:, None]).floor()
+    ranks, count = _ranks(level)
+    for axis in place.unbind(-1):
+        # Ranks, as places themselves may be too large for an integer that holds all three.
+        along, length = _ranks(axis)
+        ranks, count = _ranks(ranks * length + along)
+    return ranks, count
+
+
+def _ranks(values: Tensor) -> tuple[Int[Tensor, "N"], int]:
+    ordered, ranks = values.unique(return_inverse=True)
+    return ranks, len(ordered)

@@ -4,6 +4,7 @@ The paper's post-optimisation is one setting of it, `PAPER`.
 """
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -76,7 +77,7 @@ class Refinement:
         self._generator = torch.Generator().manual_seed(seed)
         self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
         self.corrections = Corrections(views.num_views, settings.rates)
-        self._half = half_size(views) if settings.half_size > 0 or settings.rounds else views
+        self._half = half_size(views) if settings.half_size > 0 else views
         self._queue: list[int] = []
         self._steps = 0
         self._last_seen = torch.zeros(len(self.fields), dtype=torch.long)
@@ -118,18 +119,18 @@ class Refinement:
         opacities = self.fields.numbers["logits"].detach().sigmoid()
         # Seen by none of the photographs, all of which have come twice.
         lost = self._steps - self._last_seen > 2 * views.num_views
-        kept = torch.nonzero((opacities > LEAST_OPACITY) & ~lost)[:, 0]
+        useful = (opacities > LEAST_OPACITY) & ~lost
+        useful[opacities.argmax()] = True  # one is left
+        kept = torch.nonzero(useful)[:, 0]
         self.fields.keep(kept)
         self._last_seen = self._last_seen[kept]
         count = min(settings.most - len(self.fields), int(settings.growth * len(self.fields)))
         if count > 0:
             order = torch.randperm(views.num_views, generator=self._generator)
             some = views.select(order[:VIEWS_A_ROUND])
-            gaussians = self.gaussians
-            new, units = gaussians_where_wrong(
-                gaussians, some, *look(gaussians, some, self.background), count, self._generator
-            )
-            self.fields.append(new, units)
+            seen = look(self.gaussians, some, self.background)
+            new = gaussians_where_wrong(some, *seen, count, self._generator)
+            self.fields.append(new, self._units(new.means))
             now = torch.full((new.num_gaussians,), self._steps)
             self._last_seen = torch.cat((self._last_seen, now))
 
@@ -210,12 +211,12 @@ def refine(
     Raises:
         InputError: neither seconds nor steps, or both; see `Refinement`.
     """
-    if (seconds is None) == (steps is None):
-        raise InputError(f"refine got seconds={seconds} and steps={steps}: give one of them.")
+    if (seconds is None) == (steps is None) or not (steps if seconds is None else seconds) > 0:
+        raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")
     refinement = Refinement(gaussians, views, background, settings, seed)
     _compile_kernels(gaussians, views, settings)
     clock = time.perf_counter()
-    step, rounds, recent = 0, 0, []
+    step, rounds, recent = 0, 0, deque(maxlen=views.num_views)
     while True:
         passed = time.perf_counter() - clock
         share = step / steps if seconds is None else passed / seconds
@@ -226,7 +227,7 @@ def refine(
             if due > rounds:
                 refinement.densify(share)
                 rounds = due
-        recent = [*recent[-views.num_views + 1 :], refinement.step(share)]
+        recent.append(refinement.step(share))
         step += 1
         psnr = -10 * torch.tensor(recent).mean().clamp_min(1e-10).log10().item()
         progress = Progress(step, share, time.perf_counter() - clock, psnr, len(refinement.fields))
@@ -243,8 +244,11 @@ def _compile_kernels(gaussians: Gaussians, views: Views, settings: Settings) -> 
 
 
 def mean_colour(views: Views) -> Float[Tensor, "3"]:
-    """Return the mean colour of photographs."""
-    return views.images.mean((0, 2, 3))
+    """Return the mean colour of the pixels of photographs that count; grey where none does."""
+    colours = views.images.movedim(-3, -1)
+    if views.masks is not None:
+        colours = colours[views.masks]
+    return colours.flatten(0, -2).mean(0).nan_to_num(0.5)
 
 
 def half_size(views: Views) -> Views:

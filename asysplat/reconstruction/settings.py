@@ -47,7 +47,7 @@ class Settings:
         half_size: share of the refinement that looks at photographs of half the size.
         densify: "error": new Gaussians where pixels are wrong; "mcmc": those of no use move to
             where others are (Kheradmand et al. 2024); "none".
-        most: Gaussians, at most, after densification.
+        most: Gaussians up to which densification adds more.
         rounds: how often Gaussians are added and dropped, over the first `until` of the refinement.
         until: see `rounds`.
         growth: share of the Gaussians that a round adds, at most.
@@ -81,6 +81,8 @@ class Settings:
                 raise InputError(f"refinement.{name}={getattr(self, name)}: give 0 to 1.")
         if self.densify not in ("error", "mcmc", "none"):
             raise InputError(f"refinement.densify={self.densify}: choose error, mcmc or none.")
+        if self.rates.unit not in ("pixel", "scene"):
+            raise InputError(f"refinement.rates.unit={self.rates.unit}: choose pixel or scene.")
         if self.sh_degree not in (None, 0, 1, 2, 3):
             raise InputError(f"refinement.sh_degree={self.sh_degree}: choose 0, 1, 2, 3 or null.")
         if self.most < 1 or self.rounds < 0 or (self.views_a_step or 1) < 1:

@@ -6,6 +6,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from asysplat.errors import InputError
 from asysplat.models.head import SH_C0
 from asysplat.models.prior import Prior
 from asysplat.scene import Cameras, Gaussians, Views
@@ -18,6 +19,8 @@ FAINT = 0.1  # opacity of a point
 def gaussians_of_prior(views: Views, prior: Prior) -> Gaussians:
     """Put a round Gaussian where each pixel of a prior's grid sees its surface.
 
+    Pixels that are masked out, wholly or in part, get none, unless there are no others.
+
     Args:
         views: [V].
         prior: of these, [1, V, h, w].
@@ -27,12 +30,16 @@ def gaussians_of_prior(views: Views, prior: Prior) -> Gaussians:
     origins, directions = cameras.rays()
     distance = prior.distance[0].to(directions)
     small = F.interpolate(views.images, size, mode="area").movedim(1, -1)
-    return round_gaussians(
+    gaussians = round_gaussians(
         (origins + distance[..., None] * directions).flatten(0, 2),
         (distance / cameras.intrinsics[:, 0, 0, None, None] * SPREAD).flatten(),
         prior.opacity[0].to(directions).flatten(),
         small.flatten(0, 2),
     )
+    if views.masks is None:
+        return gaussians
+    counts = F.interpolate(views.masks[:, None].float(), size, mode="area").flatten() == 1
+    return gaussians.keep(counts) if counts.any() else gaussians
 
 
 def gaussians_of_points(points: Float[Tensor, "P 3"], views: Views) -> Gaussians:
@@ -41,13 +48,21 @@ def gaussians_of_points(points: Float[Tensor, "P 3"], views: Views) -> Gaussians
     Args:
         points: in the world of the views.
         views: [V]; a point's colour is the mean of the pixels that it falls on.
+
+    Raises:
+        InputError: no points, or one that is NaN or infinite.
     """
-    tree = cKDTree(points.numpy())
-    near = tree.query(points.numpy(), k=min(NEIGHBOURS + 1, len(points)))[0].reshape(
-        len(points), -1
-    )
-    sizes = torch.as_tensor(near[:, 1:].mean(-1) if near.shape[1] > 1 else near[:, 0])
-    sizes = sizes.to(points).clamp_min(1e-6 * points.abs().max().item())
+    if len(points) == 0 or not points.isfinite().all():
+        raise InputError(
+            f"gaussians_of_points got {len(points)} points with {int((~points.isfinite()).sum())} "
+            "coordinates that are NaN or infinite: give at least one point, and finite numbers."
+        )
+    # No point is smaller than a pixel: neither one that is alone nor two at one place.
+    sizes = footprints(points, views.cameras)
+    if len(points) > 1:
+        ranks = range(2, min(NEIGHBOURS + 1, len(points)) + 1)  # the first is the point itself
+        distances = cKDTree(points.numpy()).query(points.numpy(), k=list(ranks))[0]
+        sizes = torch.maximum(sizes, torch.as_tensor(distances.mean(-1)).to(points))
     return round_gaussians(points, sizes, torch.full_like(sizes, FAINT), colours_at(points, views))
 
 
@@ -100,14 +115,15 @@ def footprints(points: Float[Tensor, "N 3"], cameras: Cameras) -> Float[Tensor, 
 
 
 def colours_at(points: Float[Tensor, "N 3"], views: Views) -> Float[Tensor, "N 3"]:
-    """Return the mean colour of the pixels that points fall on; grey where no camera sees one."""
+    """Return the mean colour of the pixels that points fall on; grey where none of them counts."""
     total, count = torch.zeros_like(points), torch.zeros_like(points[:, :1])
-    size = points.new_tensor([views.cameras.width, views.cameras.height])
     for view in range(views.num_views):
         pixels, depth = seen_at(points, views.cameras.select([view]))
-        grid = (2 * pixels / size - 1).clamp(-1, 1)
-        seen = (depth[0] > 0)[:, None].to(points)
-        sampled = F.grid_sample(views.images[view, None], grid[None], align_corners=False)
-        total += seen * sampled[0, :, 0].mT
-        count += seen
+        seen = depth[0].nonzero()[:, 0]
+        column, row = pixels[0, seen].long().unbind(-1)
+        if views.masks is not None:
+            counts = views.masks[view, row, column]
+            seen, row, column = seen[counts], row[counts], column[counts]
+        total[seen] += views.images[view, :, row, column].mT
+        count[seen] += 1
     return torch.where(count > 0, total / count.clamp_min(1), 0.5)
