@@ -1,11 +1,13 @@
 """The tables and the picture of refinements."""
 
+from collections.abc import Mapping
+
 from matplotlib.figure import Figure
 from rich.table import Table
 
 from asysplat.benchmark.plot import against_seconds
 from asysplat.benchmark.reconstruct.scene import FOR_NOTHING, NEAREST
-from asysplat.benchmark.table import NOTHING, make_table, measured_on, number, spread, text
+from asysplat.benchmark.table import NOTHING, Write, make_table, measured_on, number, spread, text
 from asysplat.benchmark.timing import Result
 
 ALL, START = "all", "start"  # all parts of the refinement, and 0 seconds of it
@@ -14,7 +16,7 @@ METRICS = {  # headings, and how numbers are written
     "ssim": ("SSIM", "{:.3f}"),
     "lpips": ("LPIPS", "{:.3f}"),
     "absrel": ("AbsRel", "{:.3f}"),
-    "delta1": ("delta < 1.25", "{:.3f}"),
+    "delta1": ("delta\n< 1.25", "{:.3f}"),
 }
 
 
@@ -34,7 +36,6 @@ def tables(results: Result) -> list[Table]:
         "start, s": number("start", "{:.1f}"),
         "steps": number("steps", "{:,.0f}"),
         "ms / step": number("seconds_a_step", "{:.0f}", unit=1e-3),
-        "step, ms": spread("step"),
         "renderer, ms": spread("renderer"),
         "step\n/ renderer": number("over_renderer", "{:.2f}"),
     }
@@ -49,27 +50,22 @@ def tables(results: Result) -> list[Table]:
         notes += "\nthe suite was stopped before its end"
     cost_notes = (
         f"{measured_on(results)}\n"
-        "step, renderer: the last Gaussians and one photograph, in turns; ms / step: the whole run"
+        "ms / step: of the whole run; the others: the last Gaussians, one photograph, in turns"
     )
     refined = [row for row in rows if row["variant"] not in FOR_NOTHING]
     found = [
         make_table("Photographs held back", names | metrics, rows, notes, names=3),
         make_table("What it took", names | costs, refined, cost_notes, names=3),
     ]
-    parts = compare_parts(results)
-    if parts:
-        more = {
-            f"{heading}\nover all": number(f"more.{name}", pattern.replace(":", ":+"))
-            for name, (heading, pattern) in shown.items()
-        }
-        columns = {"refinement": text("{variant}"), "scenes": text("{scenes}")} | metrics | more
-        title = f"Parts of the refinement, {results['budget']:g} s, means over scenes"
-        found.append(make_table(title, columns, parts))
-    return found
+    written = {heading: _more(name, pattern) for name, (heading, pattern) in shown.items()}
+    columns = {"refinement": text("{variant}"), "scenes": text("{scenes}")} | written
+    title = f"Parts of the refinement: {ALL}, and how much more the others have"
+    part_notes = f"means over scenes, after {results['budget']:g} s from {results['inits'][0]}"
+    return [*found, make_table(title, columns, compare_parts(results), part_notes)]
 
 
 def compare_parts(results: Result) -> list[Result]:
-    """Compare ALL and each variant: their means over scenes, and how much more than ALL's they are.
+    """Average the metrics of ALL over scenes, and those of each variant less those of ALL.
 
     All have the variants' budget and start.
     """
@@ -78,37 +74,43 @@ def compare_parts(results: Result) -> list[Result]:
         alike = (row.get("init"), row.get("budget")) == (results["inits"][0], results["budget"])
         if alike and row["variant"] in runs:
             runs[row["variant"]][row["scene"]] = row
-    compared = []
-    for name, found in runs.items():
-        if not found:
-            continue
-        pairs = [(row, runs[ALL][scene]) for scene, row in found.items()]
-        row = {"variant": name, "scenes": len(pairs), "more": {}}
-        for metric in METRICS:
-            both = [
-                (one[metric], other[metric])
-                for one, other in pairs
-                if one.get(metric) is not None and other.get(metric) is not None
-            ]
-            if both:
-                row[metric] = sum(one for one, _ in both) / len(both)
-                row["more"][metric] = sum(one - other for one, other in both) / len(both)
-        compared.append(row)
-    return compared
+    return [
+        {"variant": name, "scenes": len(found)}
+        | {metric: _mean_more(name, found, runs[ALL], metric) for metric in METRICS}
+        for name, found in runs.items()
+    ]
+
+
+def _mean_more(
+    name: str, found: Mapping[str, Result], whole: Mapping[str, Result], metric: str
+) -> float | None:
+    pairs = [(row.get(metric), whole[scene].get(metric)) for scene, row in found.items()]
+    values = [
+        value if name == ALL else value - of_all
+        for value, of_all in pairs
+        if None not in (value, of_all)
+    ]
+    return sum(values) / len(values) if values else None
+
+
+def _more(metric: str, pattern: str) -> Write:
+    """Write a metric of ALL, and with its sign what others have more."""
+    signed = number(metric, pattern.replace(":", ":+"))
+    return lambda row: (number(metric, pattern) if row["variant"] == ALL else signed)(row)
 
 
 def plot(results: Result) -> Figure:
     """Plot PSNR and LPIPS of each scene against the seconds of refinement."""
     rows = results["rows"]
-    metrics = {"psnr": "PSNR, dB", "lpips": "LPIPS"}
+    own = (ALL, START, NEAREST)  # before the variants, in the legend
     panels: dict[str, dict[str, list[Result]]] = {scene: {} for scene in results["scenes"]}
-    for row in rows:
+    for row in sorted(rows, key=lambda row: row["variant"] not in own):
         name = f"from {row['init']}" if row["variant"] in (ALL, START) else row["variant"]
-        if name not in FOR_NOTHING or name == NEAREST:
+        if name in (NEAREST, *results["variants"]) or row["variant"] in own:
             panels[row["scene"]].setdefault(name, []).append(row)
-    names = dict.fromkeys(name for panel in panels.values() for name in panel)
+    metrics = {"psnr": "PSNR, dB", "lpips": "LPIPS"}
     shown = {name: label for name, label in metrics.items() if _any(rows, name)}
-    return against_seconds(panels, shown, list(names))
+    return against_seconds(panels, shown)
 
 
 def _any(rows: list[Result], name: str) -> bool:
