@@ -141,11 +141,15 @@ def _sees(
     projections: Projections, others: Int[Tensor, "B V K"], inverse: Float[Tensor, "B V n"]
 ) -> Float[Tensor, "B V K n s s"]:
     """Return 1 for points of a view, at each of n inverse depths, that are within another view."""
-    matrix = projections.into(others, SAMPLES, SAMPLES)[..., None, None, None].to(inverse)
-    right, down, corner, away = matrix.unbind(-4)
+    u, v, z = projections.into(others, SAMPLES, SAMPLES).to(inverse).unbind(-2)
+    # Within are those for which all of these are positive; their depth is, too.
+    sides = torch.stack((u, SAMPLES * z - u, v, SAMPLES * z - v), dim=-2)
+    right, down, corner, away = sides[..., None, None].unbind(-3)
     pixels = torch.arange(SAMPLES, device=inverse.device) + 0.5
     flat = right * pixels + down * pixels[:, None] + corner
-    moved = away * inverse[:, :, None, None, :, None, None]
-    u, v, z = (a + b for a, b in zip(flat.unbind(3), moved.unbind(3), strict=True))
-    far = SAMPLES * z
-    return ((z > FRONT) & (u > 0) & (u < far) & (v > 0) & (v < far)).to(inverse)
+    bound = -flat / away
+    never = (away == 0) & (flat <= 0)
+    least = torch.where(away > 0, bound, torch.where(never, torch.inf, -torch.inf)).amax(3)
+    greatest = torch.where(away < 0, bound, torch.inf).amin(3)
+    inverse = inverse[:, :, None, :, None, None]
+    return ((inverse > least[:, :, :, None]) & (inverse < greatest[:, :, :, None])).to(inverse)

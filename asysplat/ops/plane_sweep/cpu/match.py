@@ -96,8 +96,10 @@ def match_planes(start, stop, inputs, stride, costs):
                     _find_span(spans[k, y], inputs.projections[view, k], y, depth, H, W)
         for y in range(0, H, 2):
             # What fewer neighbours than two leave open is unseen.
-            first[:] = UNSEEN if number < 2 else INFINITY
-            second[:] = UNSEEN if number < 1 else INFINITY
+            for row in range(2):
+                for x in range(W):
+                    store(first[row], x, zeros() + (UNSEEN if number < 2 else INFINITY))
+                    store(second[row], x, zeros() + (UNSEEN if number < 1 else INFINITY))
             for k in range(K):
                 if inputs.neighbours[view, k] < 0:
                     continue

@@ -65,13 +65,14 @@ def smooth_views(start, stop, costs, weights, penalties, plane, contrast):
     for n in range(start, stop):
         for y in range(h):
             for x in range(w):
-                _weigh(weighted[y, x], costs[n, y, x], weights[n, y, x])
-        sums[:] = ZERO
+                _begin(weighted[y, x], sums[y, x], costs[n, y, x], weights[n, y, x])
         for direction in range(4):
             along, back = direction % 2 == 0, direction // 2
             lines, length = (h, w) if along else (w, h)
-            paths[:, :, 1:-1] = ZERO  # a path begins where all planes cost nothing
-            lows[:] = ZERO
+            for line in range(lines):  # a path begins where all planes cost nothing
+                lows[line] = ZERO
+                for v in range(vectors):
+                    store_some(paths[0, line], 1 + v * LANES, LANES, zeros())
             for k in range(length):
                 position = length - 1 - k if back else k
                 entry = min(position + back, length - 1)  # whose penalty lies on the way here
@@ -88,12 +89,13 @@ def smooth_views(start, stop, costs, weights, penalties, plane, contrast):
 
 
 @inline
-def _weigh(weighted, costs, weight):
-    planes = len(costs)
-    weighted[:] = INFINITY
-    for d in range(0, planes, LANES):
-        count = min(planes - d, LANES)
+def _begin(weighted, sums, costs, weight):
+    """Write the weighted costs of a pixel, infinite beyond its planes, and sums of nothing."""
+    for d in range(0, len(weighted), LANES):
+        count = min(len(costs) - d, LANES)
+        store_some(weighted, d, LANES, INFINITY + zeros())
         store_some(weighted, d, count, load_some(costs, d, count) * weight)
+        store_some(sums, d, LANES, zeros())
 
 
 @inline
@@ -103,8 +105,9 @@ def _go_on(old, new, low, far, cost, sums):
     Args:
         old, new: a place more at both ends than there are planes.
         low: the least of `old`.
+        far: that and the penalty for several planes more or less.
         cost: of the pixel's planes.
-        step: the penalty for several planes more or less.
+        sums: of the costs of all paths to the pixel, to which these are added.
     """
     lowest = INFINITY + zeros()
     for d in range(0, len(cost), LANES):
