@@ -47,7 +47,7 @@ def match_arguments(height, width, scenes, views, neighbours, planes, stride):
     chosen = choose_neighbours(cameras, between, neighbours)
     ranges = inverse_depth_range(cameras, between, chosen)
     images = torch.rand(scenes, views, height, width)
-    return images, chosen, between.into(chosen), ranges, planes, stride
+    return images, chosen, between.into(chosen, height, width), ranges, planes, stride
 
 
 def moved(arguments, target):

@@ -22,7 +22,8 @@ def wall(halved=()):
 
 def ask_everyone(found, trust=None):
     everyone = other_views(4, 1, torch.device("cpu"))
-    return votes(found, everyone, Projections.between(CAMERAS).into(everyone), trust)
+    projections = Projections.between(CAMERAS).into(everyone, CAMERAS.height, CAMERAS.width)
+    return votes(found, everyone, projections, trust)
 
 
 def test_all_views_find_the_same_wall():

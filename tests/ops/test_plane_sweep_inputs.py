@@ -34,7 +34,7 @@ def test_projections_are_of_every_size():
     others = torch.tensor([[[1, 2], [3, -1], [0, 3], [2, 1]]])
     matrix = Projections.between(cameras).into(others, 12, 8)
     small = cameras.resized(12, 8)
-    torch.testing.assert_close(matrix, Projections.between(small).into(others))
+    torch.testing.assert_close(matrix, Projections.between(small).into(others, 12, 8))
     pixel, depth = torch.tensor([3.5, 7.5, 1], dtype=torch.float64), 2.5
     for view, chosen in enumerate(others[0].tolist()):
         inside = torch.linalg.inv(small.intrinsics[0, view]) @ pixel * depth

@@ -5,7 +5,7 @@ neighbours' at every plane (`match`), the costs are smoothed along the image's r
 in semi-global matching (`smooth`, Hirschmueller 2008), and what the views say of each other's
 depths gives the confidence (`agreement.py`). A first sweep of images of half the size finds the
 range in which the second places its planes: surfaces take a tenth of what cameras could see.
-`match` and `smooth` are kernels in cpu/ and cuda/.
+`match` and `smooth` are kernels in cpu/ and cuda/, `count_votes` is one in cpu/ alone.
 """
 
 from dataclasses import dataclass

@@ -25,13 +25,10 @@ class Projections:
 
     Args:
         unit: of images one wide and one high, as `into` describes them.
-        height, width: of the cameras' own images.
         dtype: of the cameras.
     """
 
     unit: Float[Tensor, "B V V 3 4"]
-    height: int
-    width: int
     dtype: torch.dtype
 
     @classmethod
@@ -44,17 +41,17 @@ class Projections:
         rays = relative[..., :3, :3] @ torch.linalg.inv(intrinsics)[:, :, None]
         moved = torch.cat((rays, relative[..., :3, 3:]), dim=-1)
         unit = intrinsics[:, None] @ moved
-        return cls(unit, cameras.height, cameras.width, cameras.intrinsics.dtype)
+        return cls(unit, cameras.intrinsics.dtype)
 
     def into(
-        self, others: Int[Tensor, "B V K"], height: int | None = None, width: int | None = None
+        self, others: Int[Tensor, "B V K"], height: int, width: int
     ) -> Float[Tensor, "B V K 3 4"]:
         """Return M with which (x, y, 1, inverse depth) of a view is another's homogeneous pixel.
 
-        x and y are counted from the image's corner; the third coordinate is the other's depth over
-        the view's own. A view of -1 stands for the first.
+        Both have `height` x `width` pixels; x and y are counted from the image's corner. The third
+        coordinate is the other's depth over the view's own. A view of -1 stands for the first.
         """
-        size = self.unit.new_tensor([width or self.width, height or self.height, 1])
+        size = self.unit.new_tensor([width, height, 1])
         factors = torch.cat((1 / size, size.new_ones(1))) * size[:, None]
         index = others.clamp_min(0)[..., None, None].expand(-1, -1, -1, 3, 4)
         return (self.unit.gather(2, index) * factors).to(self.dtype)

@@ -196,8 +196,8 @@ def _compare_rows(first, second, inputs, view, y, warped, seen, spans):
             _put(first[row], second[row], x, UNSEEN + zeros())
     top, bottom = max(y - AROUND, 0), min(y + AROUND + 1, H - 1)
     # The sums along the last columns: of the neighbour, its square, its product with the view.
-    a, b, c = (_no_sums(), _no_sums(), _no_sums())
-    d, e, f = (_no_sums(), _no_sums(), _no_sums())
+    nothing = (zeros(), zeros(), zeros(), zeros())
+    a, b, c, d, e, f = nothing, nothing, nothing, nothing, nothing, nothing
     for right in range(begin - AROUND, end + AROUND):
         column = min(max(right, 0), W - 1)  # beyond the border its pixels go on
         common = (zeros(), zeros(), zeros())
@@ -222,11 +222,6 @@ def _compare_rows(first, second, inputs, view, y, warped, seen, spans):
 def _add(sums, value, pixel):
     """Add a neighbour's values to the three sums."""
     return sums[0] + value, fma(value, value, sums[1]), fma(value, pixel, sums[2])
-
-
-@inline
-def _no_sums():
-    return zeros(), zeros(), zeros(), zeros()
 
 
 @inline
