@@ -251,13 +251,28 @@ _extremum(max, ">")
 _extremum(min, "<")
 
 
+def emit_sqrt(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    """Emit the square root of every number of a vector."""
+    kind, name = ir.FunctionType(FLOATS, [FLOATS]), f"llvm.sqrt.v{LANES}f32"
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [value])
+
+
+@intrinsic
+def sqrt(typing_context, value):
+    """Compute the square root of every number of a vector."""
+
+    def generate(context, builder, signature, args):
+        return emit_sqrt(builder, args[0])
+
+    return VECTOR(VECTOR), generate
+
+
 @intrinsic
 def rsqrt(typing_context, value):
     """Compute 1 / sqrt(x) of every number of a vector, to 3e-7 of itself."""
 
     def generate(context, builder, signature, args):
-        kind, name = ir.FunctionType(FLOATS, [FLOATS]), f"llvm.sqrt.v{LANES}f32"
-        root = builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
+        root = emit_sqrt(builder, args[0])
         # "arcp" lets the compiler refine the processor's estimate, in a third of the time.
         return builder.fdiv(ir.Constant(FLOATS, [1.0] * LANES), root, flags=("arcp",))
 
