@@ -6,7 +6,7 @@ The paper's post-optimisation is one setting of it, `PAPER`.
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -214,6 +214,7 @@ def refine(
     if (seconds is None) == (steps is None) or not (steps if seconds is None else seconds) > 0:
         raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")
     refinement = Refinement(gaussians, views, background, settings, seed)
+    _compile_kernels(gaussians, views, settings)
     clock = time.perf_counter()
     step, rounds, recent = 0, 0, deque(maxlen=views.num_views)
     while True:
@@ -232,6 +233,14 @@ def refine(
         progress = Progress(step, share, time.perf_counter() - clock, psnr, len(refinement.fields))
         if watch is not None and watch(progress, refinement):
             return refinement.gaussians
+
+
+def _compile_kernels(gaussians: Gaussians, views: Views, settings: Settings) -> None:
+    """Take steps with few Gaussians, so that compiling kernels, once, takes none of the time."""
+    few = gaussians.map(lambda field: field[:10])
+    small = Refinement(few, views.select([0]), settings=replace(settings, views_a_step=1))
+    small.step(0.0)
+    small.densify(0.0)
 
 
 def mean_colour(views: Views) -> Float[Tensor, "3"]:

@@ -1,0 +1,38 @@
+"""How well Gaussians show photographs, one view after the other."""
+
+import torch
+from jaxtyping import Float
+from lpips import LPIPS
+from torch import Tensor
+
+from asysplat.evaluation.protocol import Protocol
+from asysplat.rendering import render
+from asysplat.scene import Gaussians, Views
+
+
+@torch.no_grad()
+def measure_scene(
+    gaussians: Gaussians,
+    views: Views,
+    background: Float[Tensor, "3"],
+    protocol: Protocol,
+    lpips: LPIPS | None = None,
+) -> dict[str, list[float]]:
+    """Render each view and compute all metrics of the protocol: name -> a number a view.
+
+    Args:
+        gaussians: [N].
+        views: the photographs, [V].
+        background: RGB.
+        protocol: of the metrics.
+        lpips: see `load_lpips`; None for no LPIPS.
+    """
+    found: dict[str, list[float]] = {}
+    for view in range(views.num_views):
+        target = views.select([view])
+        out = render(gaussians, target.cameras, background)
+        values = protocol.image_metrics(out.image, target, lpips)
+        values |= protocol.depth_metrics(out.depth, target)
+        for name, value in values.items():
+            found.setdefault(name, []).append(value.item())
+    return found

@@ -1,0 +1,101 @@
+"""What a person sees of a refinement, and how it is stopped."""
+
+import signal
+import time
+from types import FrameType, TracebackType
+
+from rich import progress
+from rich.console import Console
+
+from asysplat.export.viewer import Viewer
+from asysplat.reconstruction.refine import Progress, Refinement
+from asysplat.scene import Gaussians, Views
+
+SHOWN_EVERY = 1.0  # seconds between two states that the viewer is given
+TOLD_EVERY = 10.0  # seconds between two lines where there is no terminal
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Watch:
+    """A progress bar, and a viewer if wanted; Ctrl-C ends the refinement after its step.
+
+    Use it as a context: the signals are its own until its end, and from the first one on those of
+    before.
+
+    Args:
+        views: the photographs.
+        view: whether to open a viewer in the browser.
+        seconds, steps: how long the refinement is.
+    """
+
+    def __init__(
+        self, views: Views, view: bool, seconds: float | None = None, steps: int | None = None
+    ):
+        self.last: Progress | None = None
+        self.stopped = False
+        self._total = steps if seconds is None else seconds
+        self._in_steps = seconds is None
+        self._console = Console()
+        self._told = self._shown = time.monotonic()
+        self._viewer = None
+        if view:
+            self._viewer = Viewer(views)
+            print(f"viewer: {self._viewer.url}")
+
+    def __enter__(self) -> "Watch":
+        self._before = {number: signal.signal(number, self._stop) for number in SIGNALS}
+        self._bar = progress.Progress(
+            progress.TextColumn("refining"),
+            progress.BarColumn(),
+            progress.TextColumn("{task.fields[text]}"),
+            progress.TimeRemainingColumn(),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._task = self._bar.add_task("", total=self._total, text="")
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+        self._restore()
+        if self._viewer is not None:
+            self._viewer.close()
+
+    def __call__(self, now: Progress, refinement: Refinement) -> bool:
+        """Show how far it is; return whether to stop."""
+        self.last = now
+        text = f"step {now.step}, PSNR {now.psnr:.2f} dB, {now.gaussians:,} Gaussians"
+        done = now.step if self._in_steps else min(now.seconds, self._total)
+        self._bar.update(self._task, completed=done, text=text)
+        clock = time.monotonic()
+        if not self._console.is_terminal and clock - self._told > TOLD_EVERY:
+            self._told = clock
+            print(f"{now.seconds:.0f} s: {text}", flush=True)
+        if self._viewer is not None and clock - self._shown > SHOWN_EVERY:
+            self._shown = clock
+            self._viewer.show(refinement.gaussians, text)
+        return self.stopped
+
+    def show(self, gaussians: Gaussians) -> None:
+        """Show what came out in the viewer, if there is one, until Ctrl-C."""
+        self._bar.stop()
+        self._restore()
+        if self._viewer is not None:
+            self._viewer.show(gaussians, "done")
+            print(f"viewer: {self._viewer.url}, until Ctrl-C")
+            self._viewer.wait()
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        self.stopped = True
+        print("stopping after this step; once more, and nothing is kept", flush=True)
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,106 @@
+"""Turn posed photographs into a scene of Gaussians that opens everywhere.
+
+python reconstruct.py my_scene
+"""
+
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: who waits must not spin
+
+import hydra
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from asysplat.errors import InputError
+from asysplat.export.gaussians import read_gaussians
+from asysplat.export.results import Results
+from asysplat.export.watch import Watch
+from asysplat.motion import moved
+from asysplat.overrides import exit_at_unknown_overrides
+from asysplat.reconstruction import mean_colour, refine
+from asysplat.reconstruction.begin import INITS, best_init, starting_gaussians
+from asysplat.reconstruction.photographs import Photographs, open_photographs
+from asysplat.scene import Gaussians
+from asysplat.training.load import load
+
+
+@hydra.main(config_path="conf", config_name="reconstruct", version_base="1.3")
+def main(config: DictConfig) -> None:
+    try:
+        reconstruct(config)
+    except KeyboardInterrupt:
+        sys.exit("stopped.")
+    except InputError as error:
+        sys.exit(f"error: {error}")
+
+
+def reconstruct(config: DictConfig) -> None:
+    """Start, refine, hand over."""
+    if OmegaConf.is_missing(config, "path"):
+        raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
+    settings = instantiate(config.refinement)
+    results = Results(Path(config.paths.run), config)
+    photographs = open_photographs(
+        config.path,
+        config.height,
+        config.width,
+        config.views,
+        config.held_back,
+        config.most_measured,
+        config.layout,
+        config.on_bad_frame,
+    )
+    gaussians = start(config, photographs, settings.most)
+    background = mean_colour(photographs.inputs)
+    results.first_picture(gaussians, photographs, background)
+    limits = {"seconds": config.seconds} if config.steps is None else {"steps": config.steps}
+    with Watch(photographs.inputs, config.view, **limits) as watch:
+        gaussians = refine(
+            gaussians,
+            photographs.inputs,
+            settings,
+            background=background,
+            seed=config.seed,
+            watch=watch,
+            **limits,
+        )
+        results.hand_over(gaussians, photographs, background, watch.last)
+        watch.show(gaussians)
+
+
+def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
+    """Return what the refinement starts from, in the network's frame."""
+    init = config.init or best_init(photographs.inputs.num_views)
+    if init not in INITS and Path(init).suffix:
+        frame = photographs.frame
+        return moved(read_gaussians(init), frame.world_to_mean).scale_by(frame.scale)
+    network = None
+    if init == "network":
+        try:
+            network = load(config.checkpoint)
+        except InputError as error:
+            if config.init is not None:
+                raise
+            print(f"warning: {error} Starting from the plane sweep, init=sweep.")
+            init = "sweep"
+    gaussians = starting_gaussians(init, photographs, most, network)
+    print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
+    return gaussians
+
+
+def as_overrides(words: list[str]) -> list[str]:
+    """Write the first word as path=..., and --view as view=true."""
+    words = ["view=true" if word == "--view" else word for word in words]
+    if words and "=" not in words[0] and not words[0].startswith("-"):
+        quoted = words[0].replace("\\", "\\\\").replace("'", "\\'")
+        words[0] = f"path='{quoted}'"
+    return words
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
+    sys.argv[1:] = as_overrides(sys.argv[1:])
+    exit_at_unknown_overrides("reconstruct")
+    main()
