@@ -20,6 +20,7 @@ from asysplat.ops.image_loss import image_loss
 from asysplat.reconstruction.corrections import Corrections, exposed, moved_cameras
 from asysplat.reconstruction.densify import LEAST_OPACITY, gaussians_where_wrong, look
 from asysplat.reconstruction.fields import Fields, Numbers
+from asysplat.reconstruction.relocate import regulariser, relocate, shake
 from asysplat.reconstruction.settings import Settings
 from asysplat.reconstruction.start import footprints
 from asysplat.rendering import render
@@ -141,6 +142,8 @@ class Refinement:
                 gradients[name] = gradient if len(chosen) == 1 else gradients[name] + gradient
             error += mse / len(chosen)
         seen = self.fields.step(gradients, settings.rates, factor)
+        if settings.densify == "mcmc":
+            shake(self.fields, factor, self._generator)
         self._steps += 1
         self._last_seen[seen] = self._steps
         return error
@@ -152,6 +155,10 @@ class Refinement:
             share: of the refinement that has passed, in [0, 1].
         """
         settings = self.settings
+        if settings.densify == "mcmc":
+            relocate(self.fields, settings.most, settings.growth, self._generator)
+            self._last_seen = torch.full((len(self.fields),), self._steps)
+            return
         views = self._half if share < settings.half_size else self.views
         opacities = self.fields.numbers["logits"].detach().sigmoid()
         # Seen by none of the photographs, all of which have come twice.
@@ -182,18 +189,14 @@ class Refinement:
         if self.corrections.wanted:
             forgiven = self.corrections.leaves(view)
             cameras = moved_cameras(cameras, forgiven["poses"])
-        image = render(
-            self.fields.gaussians(leaves),
-            cameras,
-            self.background,
-            depth=False,
-            masks=target.masks,
-        ).image
+        gaussians = self.fields.gaussians(leaves)
+        image = render(gaussians, cameras, self.background, depth=False, masks=target.masks).image
         if forgiven:
             image = exposed(image, forgiven["exposure"])
-        found = torch.autograd.grad(
-            self._loss(image, target), [*leaves.values(), *forgiven.values()]
-        )
+        loss = self._loss(image, target)
+        if self.settings.densify == "mcmc":
+            loss = loss + regulariser(gaussians)
+        found = torch.autograd.grad(loss, [*leaves.values(), *forgiven.values()])
         if forgiven:
             own = dict(zip(forgiven, found[len(leaves) :], strict=True))
             self.corrections.step(view, own, factor)
