@@ -1,11 +1,14 @@
-"""Time against error, in one process.
+"""Time against error, and quality against seconds, in one process.
 
 python benchmark.py suite=render scenes=[A,C]
 """
 
 import json
+import os
 import sys
 from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: who waits must not spin
 
 import hydra
 from omegaconf import DictConfig
@@ -42,5 +45,6 @@ def benchmark(options: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     exit_at_unknown_overrides("benchmark")
     main()

@@ -8,7 +8,7 @@ import torch
 
 from asysplat.errors import InputError
 
-SUITES = ("render", "ops", "model", "data")
+SUITES = ("render", "ops", "model", "data", "reconstruct")
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
 

@@ -1,9 +1,10 @@
-"""The pictures of all suites: time against error, and bars."""
+"""The pictures of all suites: time against error, bars, and metrics against seconds."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -86,6 +87,54 @@ def bars(
         axes.invert_yaxis()
         figure.legend(loc="outside right upper", frameon=False)
     return figure
+
+
+def against_seconds(
+    panels: Mapping[str, Mapping[str, Sequence[Result]]],
+    metrics: Mapping[str, str],
+    names: Sequence[str],
+) -> Figure:
+    """Plot metrics against the seconds of a budget: a column for each panel, a line for each name.
+
+    Args:
+        panels: by title, the rows of each name; one of no budget, or of 0, is a dashed level.
+        metrics: keys of a row, and their labels.
+        names: of all panels, in the legend's order.
+    """
+    colours = matplotlib.colormaps["tab20"].colors
+    looks = {
+        name: {"color": colour, "marker": MARKS[number % len(MARKS)], "ms": 6, "alpha": 0.8}
+        for number, (name, colour) in enumerate(zip(names, colours, strict=False))
+    }
+    with matplotlib.rc_context(STYLE):
+        size = (2.2 + 2.8 * len(panels), 0.8 + 2.6 * len(metrics))
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(len(metrics), len(panels), sharex=True, squeeze=False)
+        for column, (title, found) in enumerate(panels.items()):
+            grid[0, column].set_title(title)
+            grid[-1, column].set_xlabel("seconds of refinement")
+            for axes, metric in zip(grid[:, column], metrics, strict=True):
+                for name, rows in found.items():
+                    _line(axes, rows, metric, looks[name])
+                axes.set_xscale("log")
+                axes.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+                axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                axes.xaxis.set_minor_formatter(NullFormatter())
+        for axes, label in zip(grid[:, 0], metrics.values(), strict=True):
+            axes.set_ylabel(label)
+        handles = [Line2D([], [], label=name, **look) for name, look in looks.items()]
+        handles.append(Line2D([], [], label="without refinement", color=INK, ls="--"))
+        figure.legend(handles=handles, loc="outside right upper", frameon=False)
+    return figure
+
+
+def _line(axes: Axes, rows: Sequence[Result], metric: str, look: Mapping[str, Any]) -> None:
+    rows = [row for row in rows if row.get(metric) is not None]
+    for row in rows:
+        if not row.get("budget"):
+            axes.axhline(row[metric], color=look["color"], ls="--", alpha=look["alpha"])
+    timed = [row for row in rows if row.get("budget")]
+    axes.plot([row["budget"] for row in timed], [row[metric] for row in timed], **look)
 
 
 def _look(mark: str, colour: str, hollow: bool = False) -> dict[str, Any]:

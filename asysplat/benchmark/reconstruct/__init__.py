@@ -1,0 +1,1 @@
+"""Scenes fitted to their photographs."""

@@ -1,0 +1,160 @@
+"""Photographs held back, against the seconds of refinement: every start, and every part of it."""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
+
+from asysplat.benchmark.options import check_names
+from asysplat.benchmark.reconstruct.scene import SEED, MeasuredScene
+from asysplat.benchmark.reconstruct.shown import ALL, START, plot, tables
+from asysplat.benchmark.timing import Result
+from asysplat.errors import InputError, input_error_behind
+from asysplat.evaluation.lpips import load_lpips
+from asysplat.models.network import Network
+from asysplat.reconstruction import Settings
+from asysplat.reconstruction.begin import INITS
+from asysplat.reconstruction.photographs import open_photographs
+from asysplat.training.load import load
+
+SIDE = 256  # pixels of the crops
+Say = Callable[[str], None]
+
+__all__ = ["measure", "plot", "tables"]
+
+
+def measure(options: DictConfig, console: Console) -> Result:
+    """Refine the scenes `options.reconstruct.scenes`: from every init, and without every part.
+
+    The whole refinement starts from each init and has each budget, a run of its own: what rates and
+    sizes are follows the share of the budget. The variants start from the first init and have
+    `options.reconstruct.budget`. Ctrl-C ends the suite with what was measured so far.
+
+    Returns:
+        "protocol": see `Protocol.sentences`; "complete": whether nothing was stopped; "scenes": the
+        number of views of each that are fitted to and measured; "rows": what was measured of each
+        scene, by "variant", "init" and "budget" in seconds, see `MeasuredScene`.
+
+    Raises:
+        InputError: an unknown option, or no scene is there.
+    """
+    wanted = options.reconstruct
+    settings = find_settings(options.refinement, wanted.variants)
+    check_budgets([*wanted.budgets, wanted.budget])
+    check_names("reconstruct.inits", wanted.inits, INITS)
+    network = load() if "network" in wanted.inits else None
+    protocol = instantiate(options.metrics)
+    say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
+    lpips = load_lpips(protocol.lpips_net, Path(wanted.shared) / "weights")
+    if lpips is None:
+        say("LPIPS is left out: its weights are not here.")
+    scenes, rows, complete = {}, [], False
+    try:
+        for name, folder in find_folders(wanted, say).items():
+            photographs = open_photographs(folder, SIDE, SIDE, say=say)
+            inputs, measured = photographs.inputs, photographs.measured
+            scenes[name] = {"inputs": inputs.num_views, "measured": measured.num_views}
+            scene = MeasuredScene(photographs, protocol, lpips)
+            for row in measure_scene(scene, settings, options, network, say):
+                rows.append({"scene": name} | row)
+                say(_line(rows[-1]))
+        complete = True
+    except KeyboardInterrupt:
+        if not rows:
+            raise
+        say("stopped: what was measured so far is kept.")
+    return {
+        "protocol": protocol.sentences(),
+        "complete": complete,
+        "size": [SIDE, SIDE],
+        "seed": SEED,
+        "inits": list(wanted.inits),
+        "budget": wanted.budget,
+        "variants": OmegaConf.to_container(wanted.variants),
+        "scenes": scenes,
+        "rows": rows,
+    }
+
+
+def measure_scene(
+    scene: MeasuredScene,
+    settings: Mapping[str, Settings],
+    options: DictConfig,
+    network: Network | None,
+    say: Say,
+) -> Iterator[Result]:
+    """Yield the rows of a scene; a start for which it lacks something is left out."""
+    wanted = options.reconstruct
+    yield from scene.for_nothing()
+    for init in wanted.inits:
+        try:
+            gaussians, row = scene.start(init, settings[ALL].most, network)
+        except InputError as error:
+            say(f"left out: {error}")
+            continue
+        yield {"init": init, "variant": START, "budget": 0} | row
+        runs = [(ALL, budget) for budget in sorted({*wanted.budgets, wanted.budget})]
+        if init == wanted.inits[0]:
+            runs += [(name, wanted.budget) for name in settings if name != ALL]
+        for name, budget in runs:
+            row = scene.refined(gaussians, settings[name], options.repeats, seconds=budget)
+            yield {"init": init, "variant": name, "budget": budget} | row
+
+
+def find_settings(refinement: DictConfig, variants: DictConfig) -> dict[str, Settings]:
+    """Return the settings of the whole refinement, called ALL, and of each variant.
+
+    Args:
+        refinement: a file of conf/refinement.
+        variants: by name, what is different from it.
+
+    Raises:
+        InputError: an unknown setting or one out of range.
+    """
+    found = {}
+    for name, different in ({ALL: {}} | dict(variants)).items():
+        try:
+            found[name] = instantiate(OmegaConf.merge(refinement, different))
+        except (OmegaConfBaseException, InstantiationException) as error:
+            said = input_error_behind(error) or str(error).splitlines()[0]
+            raise InputError(f"reconstruct.variants.{name}: {said}") from None
+    return found
+
+
+def check_budgets(budgets: list) -> None:
+    """Raise InputError unless all are numbers above 0."""
+    for budget in budgets:
+        if not isinstance(budget, int | float) or not 0 < budget < float("inf"):
+            raise InputError(
+                f"reconstruct has the budget {budget}: give seconds of refinement, above 0."
+            )
+
+
+def find_folders(wanted: DictConfig, say: Say) -> dict[str, Path]:
+    """Return the folder of each scene that is there; say which are not.
+
+    Raises:
+        InputError: none is there.
+    """
+    places = {name: Path(wanted.shared) / "data" / name for name in wanted.scenes}
+    there = {name: place for name, place in places.items() if place.is_dir()}
+    for name in places.keys() - there.keys():
+        say(f"{name} is left out: {places[name]} is no folder.")
+    if not there:
+        raise InputError(
+            f"reconstruct.scenes={list(wanted.scenes)}: none is a folder of "
+            f"{Path(wanted.shared) / 'data'}; set ASYSPLAT_SHARED to the folder that holds data/."
+        )
+    return there
+
+
+def _line(row: Result) -> str:
+    """Write a row as it is measured."""
+    after = f" after {row['budget']:g} s" if "budget" in row else ""
+    start = f" from {row['init']}" if "init" in row else ""
+    return f"{row['scene']}: {row['variant']}{start}{after}, {row['psnr']:.2f} dB"
