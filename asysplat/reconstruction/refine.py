@@ -259,7 +259,7 @@ def refine(
     clock = time.perf_counter()
     total, step, rounds = float(seconds or steps), 0, 0
     while True:
-        passed = step if seconds is None else time.perf_counter() - clock
+        passed = float(step) if seconds is None else time.perf_counter() - clock
         share = passed / total
         if share >= 1:
             return refinement.gaussians

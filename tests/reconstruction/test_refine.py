@@ -13,7 +13,7 @@ from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
 from asysplat.reconstruction import PAPER, Rates, Refinement, Settings, mean_colour, refine
 from asysplat.reconstruction.densify import LEAST_OPACITY
-from asysplat.reconstruction.refine import half_size
+from asysplat.reconstruction.refine import Gains, half_size
 from asysplat.reconstruction.start import footprints, round_gaussians
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
@@ -414,3 +414,37 @@ def unchecked(kind, **options):
 def test_settings_that_cannot_be_are_named(sentence, options):
     with pytest.raises(InputError, match=f"refinement.*{sentence}"):
         unchecked(Settings, **options)
+
+
+def test_gains_follow_the_logarithm_of_time():
+    gains = Gains(2)
+    for step in range(400):
+        gains.add(float(step), 0.1 * (step + 1) ** -0.5)  # 5 dB for ten times as long
+    assert gains.psnr == pytest.approx(-10 * math.log10(0.1 * 399.5**-0.5), abs=1e-3)
+    assert gains.of_a_tenth() == pytest.approx(5 * math.log10(1.1), rel=0.01)
+
+
+def test_a_gain_is_told_after_two_rounds_of_photographs():
+    gains = Gains(8)
+    for step in range(60):
+        told = math.isfinite(gains.of_a_tenth()) if step else False
+        assert told == (step - 1 >= 25)  # of the last quarter a round
+        gains.add(float(step), 0.01)
+
+
+def test_it_cools_down_where_time_does_not_pay():
+    """An hour's worth of steps ends early, as if it had been asked for fewer."""
+    taken = []
+    never = Settings(densify="none", half_size=0.0)
+    for pays in (0.0, 100.0):
+        seen = []
+        refine(
+            small_scene(),
+            small_views(),
+            replace(never, pays=pays),
+            steps=120,
+            watch=lambda progress, _, seen=seen: seen.append(progress.share) and False,
+        )
+        taken.append(len(seen))
+    assert taken[0] == 120
+    assert taken[1] < 60
