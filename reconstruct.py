@@ -4,10 +4,13 @@ python reconstruct.py my_scene
 """
 
 import os
+import re
+import signal
 import sys
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: who waits must not spin
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # while modules load there is nothing to clean up
 
 import hydra
 from hydra.utils import instantiate
@@ -28,6 +31,7 @@ from asysplat.training.load import load
 
 @hydra.main(config_path="conf", config_name="reconstruct", version_base="1.3")
 def main(config: DictConfig) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         reconstruct(config)
     except KeyboardInterrupt:
@@ -40,6 +44,7 @@ def reconstruct(config: DictConfig) -> None:
     """Start, refine, hand over."""
     if OmegaConf.is_missing(config, "path"):
         raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
+    limits = limits_of(config)
     settings = instantiate(config.refinement)
     results = Results(Path(config.paths.run), config)
     photographs = open_photographs(
@@ -55,7 +60,6 @@ def reconstruct(config: DictConfig) -> None:
     gaussians = start(config, photographs, settings.most)
     background = mean_colour(photographs.inputs)
     results.first_picture(gaussians, photographs, background)
-    limits = {"seconds": config.seconds} if config.steps is None else {"steps": config.steps}
     with Watch(photographs.inputs, config.view, **limits) as watch:
         gaussians = refine(
             gaussians,
@@ -68,6 +72,15 @@ def reconstruct(config: DictConfig) -> None:
         )
         results.hand_over(gaussians, photographs, background, watch.last)
         watch.show(gaussians)
+
+
+def limits_of(config: DictConfig) -> dict[str, float]:
+    """Return how long is refined, before anything is read: steps, or else seconds."""
+    name = "seconds" if config.steps is None else "steps"
+    value, kinds = config[name], int if name == "steps" else int | float
+    if not isinstance(value, kinds) or isinstance(value, bool) or not value > 0:
+        raise InputError(f"{name}={value}: give a number above 0; steps go before seconds.")
+    return {name: value}
 
 
 def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
@@ -92,11 +105,13 @@ def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
 
 def as_overrides(words: list[str]) -> list[str]:
     """Write the first word as path=..., and --view as view=true."""
-    words = ["view=true" if word == "--view" else word for word in words]
-    if words and "=" not in words[0] and not words[0].startswith("-"):
-        quoted = words[0].replace("\\", "\\\\").replace("'", "\\'")
+    view = ["view=true"] if "--view" in words else []
+    words = [word for word in words if word != "--view"]
+    if words and not words[0].startswith("-") and ("=" not in words[0] or Path(words[0]).exists()):
+        # Hydra reads a backslash as one of its own only before a quote.
+        quoted = re.sub(r"(\\+)(?='|$)", r"\1\1", words[0]).replace("'", "\\'")
         words[0] = f"path='{quoted}'"
-    return words
+    return words + view
 
 
 if __name__ == "__main__":

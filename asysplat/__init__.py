@@ -18,8 +18,36 @@ The paper's symbols, as the code names and shapes them:
                                                       + 1 opacity + 48 spherical harmonics
 """
 
+from importlib import import_module
+
 from asysplat.export import read_gaussians, write_gaussians
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 
-__all__ = ["Cameras", "Gaussians", "Views", "read_gaussians", "render", "write_gaussians"]
+# Imported when first asked for: they bring Hydra, image readers and plots along.
+LATER = {
+    "load": "asysplat.training.load",
+    "mean_colour": "asysplat.reconstruction",
+    "open_photographs": "asysplat.reconstruction.photographs",
+    "refine": "asysplat.reconstruction",
+}
+
+__all__ = [
+    "Cameras",
+    "Gaussians",
+    "Views",
+    "load",
+    "mean_colour",
+    "open_photographs",
+    "read_gaussians",
+    "refine",
+    "render",
+    "write_gaussians",
+]
+
+
+def __getattr__(name: str) -> object:
+    """Import what LATER names."""
+    if name not in LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(LATER[name]), name)

@@ -4,6 +4,7 @@ GPU test without a GPU."""
 import io
 import os
 import runpy
+import signal
 import subprocess
 import sys
 import warnings
@@ -65,6 +66,7 @@ def _run_script(name: str, *overrides: str) -> subprocess.CompletedProcess:
         sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
 
     deterministic = torch.get_deterministic_debug_mode()
+    on_interrupt = signal.getsignal(signal.SIGINT)
     with (
         pytest.MonkeyPatch.context() as patch,
         mock.patch.dict(os.environ),
@@ -83,6 +85,7 @@ def _run_script(name: str, *overrides: str) -> subprocess.CompletedProcess:
         except SystemExit as end:
             status = end.code
     torch.set_deterministic_debug_mode(deterministic)
+    signal.signal(signal.SIGINT, on_interrupt)
     if isinstance(status, str):
         print(status, file=err)
     code = status if isinstance(status, int) else int(status is not None)

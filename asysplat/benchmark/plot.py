@@ -35,6 +35,8 @@ def time_against_error(
         grid = figure.subplots(1, len(errors), squeeze=False)
         for axes, (name, (label, path)) in zip(grid[0], errors.items(), strict=True):
             for row, hollow in zip(rows, in_bf16, strict=True):
+                if not row[name]:
+                    continue
                 look = _look(marks[row[case]], COLOURS[row[backend]], hollow)
                 axes.plot(1000 * row[name]["median"], worst(row, path), **look)
             title = name.replace("_", " and ")

@@ -25,6 +25,9 @@ CALLS = {call.default for call in (aten.mm, aten.addmm, aten.bmm, aten.baddbmm, 
 # Numbers of one operand or result: few enough to stay in a cache, enough to fill a GPU.
 LARGEST = {"cpu": 2**22, "cuda": 2**26}
 MOST_CALLS = 16  # of a product that are timed together
+# Multiplications of a plane sweep for a pixel and a plane: to find its place, to interpolate there,
+# and for the square and the product that are summed over patches.
+SWEEP_TERMS = 3 + 3 + 2
 
 Size = tuple[int, int, int, int]  # [m, k] x [k, n], as often as the first says
 
@@ -142,6 +145,18 @@ def grid_attention_sizes(
     """List the products of each grid place by itself, maps padded to whole grids."""
     tokens = views * -(-height // grid) * -(-width // grid)
     return attention_sizes(batch * grid**2 * heads, tokens, tokens, head_dim)
+
+
+def sweep_sizes(pairs: int, planes: int, height: int, width: int) -> list[Size]:
+    """List products with as many multiplications as the costs of a plane sweep.
+
+    It has none itself; images are compared twice, first at half the size.
+
+    Args:
+        pairs: of a view and a neighbour.
+    """
+    pixels = height * width
+    return [(pairs, size, SWEEP_TERMS, planes) for size in (pixels, pixels // 4)]
 
 
 def with_gradients(sizes: Iterable[Size]) -> list[Size]:

@@ -1,5 +1,6 @@
 """What a person sees of a refinement, and how it is stopped."""
 
+import os
 import signal
 import time
 from types import FrameType, TracebackType
@@ -13,6 +14,7 @@ from asysplat.scene import Gaussians, Views
 
 SHOWN_EVERY = 1.0  # seconds between two states that the viewer is given
 TOLD_EVERY = 10.0  # seconds between two lines where there is no terminal
+STDERR = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -93,7 +95,8 @@ class Watch:
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self.stopped = True
-        print("stopping after this step; once more, and nothing is kept", flush=True)
+        # print may be under way, and cannot be entered twice.
+        os.write(STDERR, b"stopping after this step; once more, and nothing is kept\n")
         self._restore()
 
     def _restore(self) -> None:

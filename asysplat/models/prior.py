@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from asysplat.ops import plane_sweep
 from asysplat.ops.plane_sweep import SweptDepth
 from asysplat.ops.plane_sweep.agreement import Depths, fill, other_views, votes
-from asysplat.ops.plane_sweep.cameras import observed_range
+from asysplat.ops.plane_sweep.cameras import Projections, observed_range
+from asysplat.ops.plane_sweep.images import shrink
 from asysplat.scene import TensorRecord, Views
 
 PRIOR_CHANNELS = 2
@@ -73,10 +74,11 @@ class Prior(TensorRecord):
         """Return the prior of depths that are given, filled where `known` is less than 1."""
         scenes, count, *size = inverse.shape
         inverse = fill(inverse, known)
+        everyone = other_views(count, scenes, inverse.device)
         others = votes(
             Depths(inverse, torch.zeros_like(inverse[..., 0, 0])),
-            views.cameras.resized(*size),
-            other_views(count, scenes, inverse.device),
+            everyone,
+            Projections.between(views.cameras).into(everyone, *size),
             trust=confidence,
         )
         found = SweptDepth(inverse, confidence, others.same, others.within)
@@ -110,9 +112,7 @@ class SweepPrior(nn.Module):
         small = views.cameras.resized(
             max(1, height // multiple) * BLOCK, max(1, width // multiple) * BLOCK
         )
-        images = F.interpolate(
-            views.images.flatten(0, 1), (small.height, small.width), mode="area"
-        ).unflatten(0, views.images.shape[:2])
+        images = shrink(views.images, small.height, small.width)
         ranges = _ranges(views.point_depths, factor)
         found = plane_sweep(images, small, stride=BLOCK, ranges=ranges)
         return Prior.of_depths(found, views, size)

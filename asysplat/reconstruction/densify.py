@@ -11,7 +11,7 @@ from asysplat.scene import Gaussians, Views
 
 LEAST_OPACITY = 0.005  # below it a Gaussian is dropped (Kerbl et al. 2023)
 SIZE = 0.5  # standard deviation of a new Gaussian, in pixels
-OPACITY = 0.3  # of a new Gaussian
+OPACITY = 0.1  # of a new Gaussian
 AROUND = 3  # pixels over which an error is averaged: one wrong pixel may be noise
 
 

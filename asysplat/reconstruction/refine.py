@@ -3,7 +3,9 @@
 The paper's post-optimisation is one setting of it, `PAPER`.
 """
 
+import math
 import time
+from bisect import bisect
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,12 +20,48 @@ from asysplat.ops.image_loss import image_loss
 from asysplat.reconstruction.corrections import Corrections, exposed, moved_cameras
 from asysplat.reconstruction.densify import LEAST_OPACITY, gaussians_where_wrong, look
 from asysplat.reconstruction.fields import Fields, Numbers
+from asysplat.reconstruction.relocate import regulariser, relocate, shake
 from asysplat.reconstruction.settings import Settings
 from asysplat.reconstruction.start import footprints
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
+LATE = 0.75  # of the time, since which a gain is measured
 VIEWS_A_ROUND = 8  # in which wrong pixels are looked for
+
+
+class Gains:
+    """How the PSNR of the photographs rises with what has passed, seconds or steps.
+
+    Args:
+        num_views: photographs: the last step at each of them counts.
+    """
+
+    def __init__(self, num_views: int):
+        self._errors: deque[float] = deque(maxlen=num_views)
+        self._records: list[tuple[float, float]] = []
+
+    @property
+    def psnr(self) -> float:
+        """The PSNR in dB of the mean squared error of the last steps."""
+        return -10 * math.log10(max(sum(self._errors) / len(self._errors), 1e-10))
+
+    def add(self, passed: float, error: float) -> None:
+        """Note the squared error of a step."""
+        self._errors.append(error)
+        self._records.append((passed, self.psnr))
+
+    def of_a_tenth(self) -> float:
+        """Return what 10 % more time gave of late, in dB; infinity before that can be told.
+
+        The PSNR rises about with the logarithm of time, so the rise since LATE of it tells.
+        """
+        passed, psnr = self._records[-1]
+        since = bisect(self._records, (LATE * passed, math.inf)) - 1
+        if since < len(self._errors) or len(self._records) - since < len(self._errors):
+            return math.inf
+        then, before = self._records[since]
+        return (psnr - before) / math.log(passed / then) * math.log(1.1)
 
 
 @dataclass(frozen=True)
@@ -104,6 +142,8 @@ class Refinement:
                 gradients[name] = gradient if len(chosen) == 1 else gradients[name] + gradient
             error += mse / len(chosen)
         seen = self.fields.step(gradients, settings.rates, factor)
+        if settings.densify == "mcmc":
+            shake(self.fields, factor, self._generator)
         self._steps += 1
         self._last_seen[seen] = self._steps
         return error
@@ -115,6 +155,10 @@ class Refinement:
             share: of the refinement that has passed, in [0, 1].
         """
         settings = self.settings
+        if settings.densify == "mcmc":
+            relocate(self.fields, settings.most, settings.growth, self._generator)
+            self._last_seen = torch.full((len(self.fields),), self._steps)
+            return
         views = self._half if share < settings.half_size else self.views
         opacities = self.fields.numbers["logits"].detach().sigmoid()
         # Seen by none of the photographs, all of which have come twice.
@@ -145,18 +189,14 @@ class Refinement:
         if self.corrections.wanted:
             forgiven = self.corrections.leaves(view)
             cameras = moved_cameras(cameras, forgiven["poses"])
-        image = render(
-            self.fields.gaussians(leaves),
-            cameras,
-            self.background,
-            depth=False,
-            masks=target.masks,
-        ).image
+        gaussians = self.fields.gaussians(leaves)
+        image = render(gaussians, cameras, self.background, depth=False, masks=target.masks).image
         if forgiven:
             image = exposed(image, forgiven["exposure"])
-        found = torch.autograd.grad(
-            self._loss(image, target), [*leaves.values(), *forgiven.values()]
-        )
+        loss = self._loss(image, target)
+        if self.settings.densify == "mcmc":
+            loss = loss + regulariser(gaussians)
+        found = torch.autograd.grad(loss, [*leaves.values(), *forgiven.values()])
         if forgiven:
             own = dict(zip(forgiven, found[len(leaves) :], strict=True))
             self.corrections.step(view, own, factor)
@@ -215,11 +255,12 @@ def refine(
         raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")
     refinement = Refinement(gaussians, views, background, settings, seed)
     _compile_kernels(gaussians, views, settings)
+    gains = Gains(views.num_views)
     clock = time.perf_counter()
-    step, rounds, recent = 0, 0, deque(maxlen=views.num_views)
+    total, step, rounds = float(seconds or steps), 0, 0
     while True:
-        passed = time.perf_counter() - clock
-        share = step / steps if seconds is None else passed / seconds
+        passed = float(step) if seconds is None else time.perf_counter() - clock
+        share = passed / total
         if share >= 1:
             return refinement.gaussians
         if settings.densify != "none" and share < settings.until:
@@ -227,10 +268,13 @@ def refine(
             if due > rounds:
                 refinement.densify(share)
                 rounds = due
-        recent.append(refinement.step(share))
+        gains.add(passed, refinement.step(share))
         step += 1
-        psnr = -10 * torch.tensor(recent).mean().clamp_min(1e-10).log10().item()
-        progress = Progress(step, share, time.perf_counter() - clock, psnr, len(refinement.fields))
+        before_cool_down = settings.half_size < LATE * share < LATE * (1 - settings.cool_down)
+        if settings.pays > 0 and before_cool_down and gains.of_a_tenth() < settings.pays:
+            total = passed / (1 - settings.cool_down)
+        now = time.perf_counter() - clock
+        progress = Progress(step, share, now, gains.psnr, len(refinement.fields))
         if watch is not None and watch(progress, refinement):
             return refinement.gaussians
 

@@ -85,7 +85,8 @@ class Settings:
             raise InputError(f"refinement.rates.unit={self.rates.unit}: choose pixel or scene.")
         if self.sh_degree not in (None, 0, 1, 2, 3):
             raise InputError(f"refinement.sh_degree={self.sh_degree}: choose 0, 1, 2, 3 or null.")
-        if self.most < 1 or self.rounds < 0 or (self.views_a_step or 1) < 1:
+        least_views = 1 if self.views_a_step is None else self.views_a_step
+        if self.most < 1 or self.rounds < 0 or least_views < 1:
             raise InputError(
                 f"refinement has most={self.most}, rounds={self.rounds} and "
                 f"views_a_step={self.views_a_step}: give at least 1 Gaussian, 0 rounds and 1 view."

@@ -15,6 +15,7 @@ from asysplat.errors import InputError
 from asysplat.files import replaced
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_sweep.safetensors"
+LISTED = 5  # differences between a file and a model
 
 
 def find_checkpoint(asked: str | None, runs: Path) -> Path | None:
@@ -61,14 +62,16 @@ def _check_state(state: dict[str, tuple[int, ...]], path: Path, module: nn.Modul
         InputError: they differ.
     """
     expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
-    for name in sorted(expected.keys() | state.keys()):
-        there, here = state.get(name), expected.get(name)
-        if there != here:
-            raise InputError(
-                f"{path} does not fit this model: {name} is {there} there and {here} here; "
-                "give the options that it was trained with (a run's config.yaml, or the card "
-                "beside a .safetensors file)."
-            )
+    names = sorted(expected.keys() | state.keys())
+    differing = [name for name in names if state.get(name) != expected.get(name)]
+    if not differing:
+        return
+    listed = [f"{n} is {state.get(n)} there and {expected.get(n)} here" for n in differing[:LISTED]]
+    raise InputError(
+        f"{path} does not fit this model, {len(differing)} of {len(names)} weights differ: "
+        f"{', '.join(listed)}{', ...' if len(differing) > LISTED else ''}; give the options that "
+        "it was trained with (a run's config.yaml, or the card beside a .safetensors file)."
+    )
 
 
 def load_weights(path: str | None, module: nn.Module) -> None:

@@ -12,21 +12,26 @@ from omegaconf import OmegaConf
 from asysplat.benchmark.ops.cases import SCANS, Case
 from asysplat.benchmark.ops.paths import make_path
 from asysplat.benchmark.ops.suite import PASSES, make_rows
+from asysplat.benchmark.ops.sweep import SLANT, SweepCase
 from asysplat.benchmark.options import PRECISIONS, check_names, check_repeats, find_device
 from asysplat.benchmark.products import (
     LARGEST,
+    SWEEP_TERMS,
     Operand,
     RecordProducts,
     products,
     with_gradients,
 )
+from asysplat.benchmark.scenes import DISTANCE
 from asysplat.errors import InputError
 from asysplat.evaluation.cost import true_flops
+from asysplat.scene import Cameras
 
 pytestmark = pytest.mark.slow
 
 CPU = torch.device("cpu")
 BOUNDS = {"fp32": 2e-6, "bf16": 1e-2}
+MOST_OF_SWEEP = 1e-5  # a pixel whose best two planes cost the same to the last bit may turn
 LENGTH, LOOP_TOKENS = 150, 50
 TINY = {
     "ssd": {"batch": 1, "length": LENGTH, "heads": 8, "head_dim": 16, "state": 8},
@@ -40,11 +45,21 @@ TINY = {
         "head_dim": 8,
         "grids": [1, 2],
     },
+    "plane_sweep": {
+        "batch": 1,
+        "views": 4,
+        "height": 24,
+        "width": 32,
+        "stride": 2,
+        "planes": 20,
+        "neighbours": 2,
+    },
     "loop_tokens": LOOP_TOKENS,
     "exact": {
         "ssd": {"length": 140},  # all heads: few numbers would make an error of A's gradient chance
         "selective_scan": {"batch": 1},
         "grid_attention": {"views": 1},
+        "plane_sweep": {"views": 3},
     },
 }
 ATTENTION = ("grid_attention/1", "grid_attention/2")
@@ -76,6 +91,8 @@ def test_every_operator_has_a_path_and_what_it_is_compared_with(measured):
             assert paths - {"loop", "matmuls"}
             assert ("matmuls" in paths) == (operator != "selective_scan")
             assert ("loop" in paths) == (operator in SCANS and precision == "fp32")
+    sweeps = {(precision, path) for name, precision, path in rows if name == "plane_sweep"}
+    assert sweeps == {("fp32", path) for path in ("reference", "cpu", "matmuls")}
     assert (folder / "ops.png").stat().st_size > 0
 
 
@@ -86,9 +103,13 @@ def test_errors_are_below_their_bounds(measured):
             assert row["error"] is None
             continue
         error = row["error"]
+        assert error["measured_on"] != row["sizes"]
+        if operator == "plane_sweep":
+            assert error["gradients"] is None
+            assert 0 < error["forward"] < MOST_OF_SWEEP, path
+            continue
         names = {"q", "k", "v"} if operator in ATTENTION else {"x", "dt", "A", "B", "C", "D"}
         assert error["gradients"].keys() == names
-        assert error["measured_on"] != row["sizes"]
         worst = max(error["forward"], *error["gradients"].values())
         assert 0 < worst < BOUNDS[precision], (operator, precision, path)
 
@@ -96,9 +117,12 @@ def test_errors_are_below_their_bounds(measured):
 def test_ratios_are_those_of_the_times(measured):
     rows, _ = measured
     for (operator, precision, _), row in rows.items():
-        loop = rows.get((operator, "fp32", "loop"))
+        loop = rows.get((operator, "fp32", "loop")) or rows.get((operator, "fp32", "reference"))
         matmuls = rows.get((operator, precision, "matmuls"))
         for name in PASSES:
+            if row[name] is None:
+                assert (operator, name) == ("plane_sweep", "forward_backward")
+                continue
             seconds = row[name]["median"]
             assert seconds > 0 and math.isfinite(row[name]["iqr"])
             if loop:
@@ -199,3 +223,29 @@ def test_a_wrong_size_is_not_taken_for_a_path_that_is_not_there():
     case = Case("grid_attention", MAPS | {"grid": 0})
     with pytest.raises(InputError, match="grid=0"):
         make_rows(case, PRECISIONS, LOOP_TOKENS, CPU)
+
+
+def test_a_sweep_is_of_a_wall_that_can_be_found():
+    sizes = {"batch": 2, "views": 4, "height": 24, "width": 32}
+    case = SweepCase("plane_sweep", sizes | {"stride": 2, "planes": 24, "neighbours": 3})
+    tensors = case.tensors()
+    assert tensors["images"].min() >= 0 and tensors["images"].max() <= 1
+    found = case.run({name: tensor.float() for name, tensor in tensors.items()}, "cpu")
+    assert torch.equal(found[0], found[1])
+    cameras = Cameras(tensors["intrinsics"], tensors["cam_to_world"], 24, 32).resized(12, 16)
+    # Along rays of z = 1: the wall is at z = DISTANCE + SLANT x.
+    rays = (cameras.cam_to_world[..., None, None, :3, :3] @ cameras.pixel_directions()[..., None])[
+        ..., 0
+    ]
+    x, _, z = cameras.centers.unbind(-1)
+    missing = (DISTANCE + SLANT * x - z)[..., None, None]
+    depth = missing / (rays[..., 2] - SLANT * rays[..., 0])
+    assert (found * depth - 1).abs().median() < 0.03
+
+
+def test_products_of_a_sweep_multiply_as_often_as_its_costs():
+    sizes = {"batch": 1, "views": 3, "height": 16, "width": 24, "stride": 2, "planes": 20}
+    case = SweepCase("plane_sweep", sizes | {"neighbours": 2})
+    counts = products(case.products(), torch.float32, CPU)
+    costs = 3 * 2 * 20 * (16 * 24 + 8 * 12)
+    assert flops_of(counts) == 2 * SWEEP_TERMS * costs

@@ -14,8 +14,8 @@ import torch
 from swept import cameras_at, depth_of_plane, four_cameras, slanted_plane, texture
 
 from asysplat.ops import plane_sweep
-from asysplat.ops.plane_sweep import cameras as sweep_cameras
 from asysplat.ops.plane_sweep import reference
+from asysplat.ops.plane_sweep.cameras import Projections, choose_neighbours, inverse_depth_range
 from asysplat.scene import Cameras
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -43,11 +43,11 @@ def match_arguments(height, width, scenes, views, neighbours, planes, stride):
     angles = 0.1 * torch.randn(scenes, views, 3, 3, dtype=torch.float64)
     cameras.cam_to_world[..., :3, :3] = torch.linalg.matrix_exp(angles - angles.mT)
     cameras = cameras.to(torch.float32)
-    chosen = sweep_cameras.choose_neighbours(cameras, neighbours)
-    ranges = sweep_cameras.inverse_depth_range(cameras, chosen)
-    projections = sweep_cameras.relative_projections(cameras, chosen)
+    between = Projections.between(cameras)
+    chosen = choose_neighbours(cameras, between, neighbours)
+    ranges = inverse_depth_range(cameras, between, chosen)
     images = torch.rand(scenes, views, height, width)
-    return images, chosen, projections, ranges, planes, stride
+    return images, chosen, between.into(chosen, height, width), ranges, planes, stride
 
 
 def moved(arguments, target):
@@ -82,6 +82,26 @@ def test_smoothed_planes_are_those_of_the_reference(backend, size):
         assert here.dtype == torch.float32 and here.shape == there.shape
         # Two planes may cost the same to the last bit: of a pixel in a hundred.
         assert ((here.cpu() - there).abs() > 1e-3).double().mean() <= 1e-2
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("backend", FAST)
+def test_votes_are_those_of_the_reference(backend, size):
+    """Depths of which some agree, seen by views turned a little."""
+    form = import_module(f"asysplat.ops.plane_sweep.{backend}")
+    _, chosen, projections, ranges, _, _ = match_arguments(*size)
+    height, width, scenes, views = size[:4]
+    inverse = ranges.mean(-1)[..., None, None] * (1 + torch.rand(scenes, views, height, width)) / 2
+    trust = torch.rand(scenes, views, height, width)
+    arguments = inverse, inverse.mean((-1, -2)) / 4, trust, chosen, projections
+    exact = reference.count_votes(*moved(arguments, torch.float64))
+    got = form.count_votes(*(tensor.to(DEVICE[backend]) for tensor in arguments))
+    for name, there, here in zip(exact._fields, exact, got, strict=True):
+        assert here.dtype == torch.float32 and here.shape == there.shape
+        # Seen or not, and the same or not, may turn on the last bit: of a pixel in a thousand.
+        assert ((here.cpu() - there).abs() > 1e-5).double().mean() <= 1e-3, name
+    if len(chosen[0]) > 1 and height > 4:
+        assert all(votes.any() for votes in exact)
 
 
 @pytest.mark.skipif(INTERPRETED, reason="slow")

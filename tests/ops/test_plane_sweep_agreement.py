@@ -4,9 +4,9 @@ import pytest
 import torch
 from swept import cameras_at, depth_of_plane, four_cameras, slanted_plane
 
-from asysplat.ops.plane_sweep import agreement, plane_sweep
+from asysplat.ops.plane_sweep import plane_sweep, reference
 from asysplat.ops.plane_sweep.agreement import Depths, other_views, votes
-from asysplat.ops.plane_sweep.cameras import MARGIN, observed_range
+from asysplat.ops.plane_sweep.cameras import MARGIN, Projections, observed_range
 
 CAMERAS = cameras_at([(0.1 * v, 0.05 * (v % 2), 0.0) for v in range(4)])
 INNER = (slice(None), slice(None), slice(4, -4), slice(12, -12))
@@ -20,8 +20,14 @@ def wall(halved=()):
     return Depths(inverse, torch.zeros(1, 4, dtype=torch.float64))
 
 
+def ask_everyone(found, trust=None):
+    everyone = other_views(4, 1, torch.device("cpu"))
+    projections = Projections.between(CAMERAS).into(everyone, CAMERAS.height, CAMERAS.width)
+    return votes(found, everyone, projections, trust)
+
+
 def test_all_views_find_the_same_wall():
-    found = votes(wall(), CAMERAS, other_views(4, 1, torch.device("cpu")))
+    found = ask_everyone(wall())
     assert (found.same[INNER] == 3).all() and (found.within[INNER] == 3).all()
     assert not found.through.any()
     assert (found.within[:, 0, :, 0] < 3).all()  # cameras on the right do not see the left border
@@ -29,7 +35,7 @@ def test_all_views_find_the_same_wall():
 
 
 def test_others_see_through_what_is_too_near():
-    found = votes(wall(halved=[3]), CAMERAS, other_views(4, 1, torch.device("cpu")))
+    found = ask_everyone(wall(halved=[3]))
     assert (found.through[:, 3][:, 4:-4, 12:-12] == 3).all() and not found.same[:, 3].any()
     # What is near in the fourth view hides the wall of the others: it says nothing of theirs.
     assert (found.same[:, :3][INNER] == 2).all() and not found.through[:, :3].any()
@@ -38,16 +44,15 @@ def test_others_see_through_what_is_too_near():
 def test_a_vote_counts_as_far_as_it_is_trusted():
     trust = torch.ones(1, 4, 24, 32, dtype=torch.float64)
     trust[:, 0] = 0.25
-    found = votes(wall(halved=[3]), CAMERAS, other_views(4, 1, torch.device("cpu")), trust)
+    found = ask_everyone(wall(halved=[3]), trust)
     assert (found.through[:, 3][:, 4:-4, 12:-12] == 2.25).all()
     assert (found.same[:, 1][:, 4:-4, 12:-12] == 1.25).all()
 
 
 def test_chunks_give_the_same_votes(monkeypatch):
-    everyone = other_views(4, 1, torch.device("cpu"))
-    expected = votes(wall(halved=[1]), CAMERAS, everyone)
-    monkeypatch.setattr(agreement, "PLACES", 1)
-    for got, there in zip(votes(wall(halved=[1]), CAMERAS, everyone), expected, strict=True):
+    expected = ask_everyone(wall(halved=[1]))
+    monkeypatch.setattr(reference, "PLACES", 1)
+    for got, there in zip(ask_everyone(wall(halved=[1])), expected, strict=True):
         assert torch.equal(got, there)
 
 

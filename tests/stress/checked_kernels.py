@@ -15,8 +15,9 @@ from tangents import tangent_scene
 from torch import Tensor
 
 from asysplat.ops import image_loss, plane_sweep, selective_scan, ssd
+from asysplat.ops.cpu.gathers import gather_pairs, gather_squares
 from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.vectors import gather_pairs, load, load_some, store, zeros
+from asysplat.ops.cpu.vectors import load, load_some, store, zeros
 from asysplat.reconstruction.adam import VisibleAdam
 from asysplat.rendering import Skips
 from asysplat.rendering.cpu.math import take_sum
@@ -27,7 +28,7 @@ CPU = next(backend for backend in FAST if backend.name == "cpu")
 SSD_SIZES = [(1, 1, 1, 1), (2, 63, 3, 5), (1, 65, 2, 16), (1, 200, 5, 20), (1, 1100, 3, 33)]
 SCAN_SIZES = [(1, 1, 1), (2, 31, 16), (1, 33, 40), (3, 64, 17), (1, 257, 128)]
 STATES = (1, 16, 20)
-ONE, LAST = np.float32(1), np.float32(15)
+ONE, EIGHT, LAST = np.float32(1), np.float32(8), np.float32(15)
 
 
 def wild_scene(seed: int, height: int, width: int, degree: int) -> tuple[Gaussians, Cameras]:
@@ -100,7 +101,7 @@ def scanned(scan, size: tuple[int, ...], state: int, reverse: bool) -> Result:
 
 def check_sweeps() -> int:
     """How many scenes were swept, each in all memories."""
-    sizes = [(1, 1, 1, 4), (3, 4, 1, 20), (12, 9, 3, 33), (24, 32, 2, 64)]
+    sizes = [(1, 1, 1, 4), (3, 4, 1, 20), (12, 9, 3, 33), (7, 37, 1, 17), (24, 32, 2, 64)]
     for seed, (height, width, stride, planes) in enumerate(sizes):
         generator = torch.Generator().manual_seed(seed)
         images = torch.rand(2, 4, 3, height, width, generator=generator)
@@ -115,8 +116,7 @@ def check_sweeps() -> int:
 
 
 def swept(images: Tensor, cameras: Cameras, stride: int, planes: int) -> Result:
-    found = plane_sweep(images, cameras, stride, planes, backend="cpu")
-    return Result({"depth": found.inverse_depth, "confidence": found.confidence}, {}, {})
+    return Result(vars(plane_sweep(images, cameras, stride, planes, backend="cpu")), {}, {})
 
 
 def check_losses() -> int:
@@ -177,13 +177,17 @@ def _step_out(which, numbers, rows):
         store(rows, len(rows), load(rows, 0))
     elif which == 3:
         store(rows, 0, load_some(numbers, len(numbers) - 3, 4))
-    elif which == 4:  # the last number has none to its right
-        store(rows, 0, gather_pairs(rows, zeros() + ONE, zeros() + LAST)[0])
+    elif which == 4:  # the last number has none to its right,
+        store(rows, 0, gather_squares(rows, zeros(), zeros() + LAST)[0])
+    elif which == 5:  # and none below
+        store(rows, 0, gather_squares(rows, zeros() + ONE, zeros())[0])
+    elif which == 6:
+        store(rows, 0, gather_pairs(numbers.reshape(2, 8, 2), zeros() + ONE, zeros() + EIGHT)[0])
 
 
 def check_the_checks() -> int:
     """A step out of an array is an error, whichever way it is taken."""
-    kinds = 5
+    kinds = 7
     for which in range(kinds):
         try:
             _step_out(which, np.zeros(32, np.float32), np.zeros((2, 16), np.float32))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from asysplat import ops
+from asysplat.benchmark.options import PRECISIONS
 from asysplat.benchmark.products import Size, grid_attention_sizes, ssd_sizes
 from asysplat.benchmark.scenes import random_numbers
 
@@ -48,6 +49,9 @@ class Case:
     operator: str  # of `asysplat.ops`
     sizes: Mapping[str, int]  # of its inputs, as SHAPES names them, and the grid of an attention
     exact: Mapping[str, int] = field(default_factory=dict)  # sizes that differ for errors
+
+    differentiable = True
+    precisions = tuple(PRECISIONS)  # in which it computes
 
     @property
     def name(self) -> str:

@@ -11,7 +11,7 @@ from asysplat.benchmark.timing import Result, relative_l2, rise_gb, seconds_of
 from asysplat.evaluation.cost import GB
 
 KEPT = ("dt", "A", "D")  # inputs that are always fp32
-Gradients = tuple[Tensor, dict[str, Tensor]]  # the output, and the gradient of each input
+Gradients = tuple[Tensor, dict[str, Tensor]]  # the output, and the gradients that inputs have
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,15 @@ class Path:
             return self.case.run(self.inputs, self.backend)
 
     def forward_backward(self) -> Gradients:
+        if not self.case.differentiable:
+            return self.forward(), {}
         output = self.case.run(self.inputs, self.backend)
         gradients = torch.autograd.grad(output, list(self.inputs.values()), self.weights)
         return output.detach(), dict(zip(self.inputs, gradients, strict=True))
 
     def passes(self) -> dict[str, Callable[[], object]]:
+        if not self.case.differentiable:
+            return {"forward": self.forward}
         return {"forward": self.forward, "forward_backward": self.forward_backward}
 
     def seconds(self) -> dict[str, float]:
@@ -55,7 +59,8 @@ class Path:
         output, gradients = self.forward_backward()
         wrong = {name: relative_l2(gradients[name], true) for name, true in exact[1].items()}
         forward = relative_l2(output, exact[0])
-        return {"measured_on": dict(self.case.sizes), "forward": forward, "gradients": wrong}
+        measured_on = dict(self.case.sizes)
+        return {"measured_on": measured_on, "forward": forward, "gradients": wrong or None}
 
 
 def make_path(case: Case, backend: str, dtype: torch.dtype, device: torch.device) -> Path:

@@ -13,16 +13,26 @@ from rich.table import Table
 
 from asysplat.benchmark.ops.cases import SCANS, Case, find_cases
 from asysplat.benchmark.ops.paths import make_path
+from asysplat.benchmark.ops.sweep import SweepCase
 from asysplat.benchmark.options import PRECISIONS, check_names, find_device
 from asysplat.benchmark.plot import time_against_error
 from asysplat.benchmark.products import products, time_products, with_gradients
-from asysplat.benchmark.table import error, limited, make_table, measured_on, number, spread, text
+from asysplat.benchmark.table import (
+    Write,
+    error,
+    limited,
+    make_table,
+    measured_on,
+    number,
+    spread,
+    text,
+)
 from asysplat.benchmark.timing import Measurement, Result, Timer, ratios, time_in_rounds
 from asysplat.errors import InputError
 
 PASSES = {"forward": "Forward", "forward_backward": "Forward and backward"}
 ERRORS = {"forward": "error.forward", "forward_backward": "error.gradients"}
-LOOP, MATMULS = "loop", "matmuls"
+LOOP, REFERENCE, MATMULS = "loop", "reference", "matmuls"
 MOST_OVER_MATMULS = 2.5  # is asked of ssd
 
 
@@ -32,7 +42,8 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": one for each operator, precision and path, times in seconds. The path "loop" is the
         reference in fp32 on a shorter sequence, its times scaled to the whole; "matmuls" are the
-        operator's matrix products by themselves.
+        operator's matrix products by themselves. plane_sweep, which has neither and no gradients,
+        has its reference on all pixels, and products with as many multiplications.
 
     Raises:
         InputError: an unknown precision or device, sizes an operator cannot take.
@@ -41,18 +52,24 @@ def measure(options: DictConfig, console: Console) -> Result:
     sizes = OmegaConf.to_container(options.ops, resolve=True)
     check_names("ops.precisions", sizes["precisions"], PRECISIONS)
     results: list[Result] = []
-    for case in track(find_cases(sizes), "operators", console=console):
+    sweep = SweepCase("plane_sweep", sizes["plane_sweep"], sizes["exact"]["plane_sweep"])
+    for case in track([*find_cases(sizes), sweep], "operators", console=console):
         rows = make_rows(case, sizes["precisions"], sizes["loop_tokens"], device)
         time_in_rounds(rows, options.repeats)
-        found = [row.found | {name: row.summary(name) for name in PASSES} for row in rows]
+        found = [row.found | _summaries(row) for row in rows]
         paths = {(result["path"], result["precision"]): result for result in found}
-        loop = paths.get((LOOP, "fp32"))
+        loop = paths.get((LOOP, "fp32")) or paths.get((REFERENCE, "fp32"))
         for result in found:
             matmuls = paths.get((MATMULS, result["precision"]))
             result["faster_than_loop"] = loop and ratios(loop, result, PASSES)
             result["over_matmuls"] = matmuls and ratios(result, matmuls, PASSES)
         results += found
     return {"rows": results}
+
+
+def _summaries(row: Measurement) -> Result:
+    """Return those of both passes, None for one that there is not."""
+    return {name: row.summary(name) if name in row.seconds else None for name in PASSES}
 
 
 def make_rows(
@@ -65,7 +82,7 @@ def make_rows(
         loop_tokens: length of the sequence that the loop is timed on.
     """
     rows = []
-    for precision in precisions:
+    for precision in [name for name in precisions if name in case.precisions]:
         dtype = PRECISIONS[precision]
         exact = make_path(case.small, "reference", dtype, device).truth()
         for backend in case.backends:
@@ -79,10 +96,9 @@ def make_rows(
             found = {"error": errors, "bytes_per_token": path.bytes_per_token()}
             rows.append(_row(case, precision, backend, path.seconds, **found))
         if case.products():
-            sizes = {
-                "forward": case.products(),
-                "forward_backward": with_gradients(case.products()),
-            }
+            sizes = {"forward": case.products()}
+            if case.differentiable:
+                sizes["forward_backward"] = with_gradients(case.products())
             groups = {name: products(size, dtype, device) for name, size in sizes.items()}
             rows.append(_row(case, precision, MATMULS, partial(time_products, groups, device)))
     return [*rows, _loop(case, loop_tokens, device)] if case.operator in SCANS else rows
@@ -117,8 +133,10 @@ def tables(results: Result) -> list[Table]:
     loop = max((row["loop_tokens"] for row in rows if row["path"] == LOOP), default=0)
     notes = (
         f"{measured_on(results)}\n"
-        f"loop: reference.py in fp32 on {loop} tokens, times scaled to the whole sequence\n"
-        "matmuls: the operator's matrix products by themselves\n"
+        f"loop: reference.py in fp32 on {loop} tokens, times scaled to the whole sequence; of "
+        "plane_sweep the reference\n"
+        "matmuls: the operator's matrix products by themselves; of plane_sweep as many "
+        "multiplications\n"
         "error: against the reference in float64, relative in L2; *: of a smaller one of its kind"
     )
 
@@ -129,12 +147,21 @@ def tables(results: Result) -> list[Table]:
             "path": text("{path}"),
             "ms": spread(name),
             "loop\n/ path": number(f"faster_than_loop.{name}", "{:.1f}"),
-            "path\n/ matmuls": limited(f"over_matmuls.{name}", MOST_OVER_MATMULS),
+            "path\n/ matmuls": _over_matmuls(f"over_matmuls.{name}"),
             "error": error(ERRORS[name]),
             "kB\n/ token": number(f"bytes_per_token.{name}", "{:.2f}", unit=1e3),
         }
 
-    return [make_table(title, columns(name), rows, notes, 3) for name, title in PASSES.items()]
+    return [
+        make_table(title, columns(name), [row for row in rows if row[name]], notes, 3)
+        for name, title in PASSES.items()
+    ]
+
+
+def _over_matmuls(path: str) -> Write:
+    """Write the ratio, in red where ssd is above its limit."""
+    asked, others = limited(path, MOST_OVER_MATMULS), number(path, "{:.2f}")
+    return lambda row: (asked if row["operator"] == "ssd" else others)(row)
 
 
 def plot(results: Result) -> Figure:

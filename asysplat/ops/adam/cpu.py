@@ -14,16 +14,16 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from asysplat.ops.adam.reference import Rows, Settings
+from asysplat.ops.cpu.gathers import gather_pairs
 from asysplat.ops.cpu.kernel import inline, kernel
 from asysplat.ops.cpu.threads import even_bounds, run_blocks
 from asysplat.ops.cpu.vectors import (
     LANES,
     ZERO,
     fma,
-    gather_pairs,
+    less,
     load,
     load_some,
-    positive,
     sqrt,
     store_some,
     total,
@@ -103,7 +103,7 @@ def update_blocks(start, stop, tensors, seen, constants):
         constants: see `Constants`.
     """
     alive = np.zeros(BLOCK, np.bool_)
-    factors = np.zeros((BLOCK, 2), np.float32)
+    factors = np.zeros((1, BLOCK, 2), np.float32)
     skipped = 0
     for block in range(start, stop):
         first = block * BLOCK
@@ -164,8 +164,8 @@ def _count(factors, alive, tensor, first, corrections):
         steps = tensor.steps[first + row] + np.int32(alive[row])
         tensor.steps[first + row] = steps
         known = np.uint32(min(steps, last))
-        factors[row, 0] = corrections[known, 0] * np.float32(alive[row])
-        factors[row, 1] = corrections[known, 1]
+        factors[0, row, 0] = corrections[known, 0] * np.float32(alive[row])
+        factors[0, row, 1] = corrections[known, 1]
 
 
 @inline
@@ -182,10 +182,10 @@ def _update(factors, alive, tensor, first, constants):
             place = begin + k * LANES
             count = min(LANES, end - place)
             if rows == 1:
-                to_mean, to_root = zeros() + factors[row, 0], zeros() + factors[row, 1]
+                to_mean, to_root = zeros() + factors[0, row, 0], zeros() + factors[0, row, 1]
             else:
                 rows_of_vector = load(tensor.rows, k) + np.float32(row)
-                to_mean, to_root = gather_pairs(factors, rows_of_vector, zeros())
+                to_mean, to_root = gather_pairs(factors, zeros(), rows_of_vector)
             parameter = load_some(tensor.parameter, place, count)
             gradient = load_some(tensor.gradient, place, count)
             mean = load_some(tensor.mean, place, count)
@@ -194,7 +194,7 @@ def _update(factors, alive, tensor, first, constants):
             new_square = fma(constants.new2 * gradient, gradient, constants.beta2 * square)
             root = fma(to_root, sqrt(new_square), constants.eps)
             step = load(tensor.rates, k) * to_mean * new_mean / root
-            updated = positive(to_mean)
+            updated = less(zeros(), to_mean)
             store_some(tensor.parameter, place, count, where(updated, parameter - step, parameter))
             store_some(tensor.mean, place, count, where(updated, new_mean, mean))
             store_some(tensor.square, place, count, where(updated, new_square, square))

@@ -26,8 +26,8 @@ from asysplat.ops.cpu.vectors import (
     ONE,
     ZERO,
     fma,
+    less,
     load_some,
-    positive,
     store_some,
     total,
     where,
@@ -243,7 +243,7 @@ def _finish_row(gradient, sums, row, images, first, weights):
         absolute = absolute + max(d, ZERO - d)
         if gradient is not None:
             # Of 0 and of NaN it is that itself.
-            sign = where(positive(d), zeros() + ONE, where(positive(ZERO - d), zeros() - ONE, d))
+            sign = where(less(zeros(), d), zeros() + ONE, where(less(d, zeros()), zeros() - ONE, d))
             a, b, c = zeros(), zeros(), zeros()
             if weights.window > ZERO:
                 for k in range(SIZE):

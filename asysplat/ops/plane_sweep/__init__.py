@@ -5,35 +5,32 @@ neighbours' at every plane (`match`), the costs are smoothed along the image's r
 in semi-global matching (`smooth`, Hirschmueller 2008), and what the views say of each other's
 depths gives the confidence (`agreement.py`). A first sweep of images of half the size finds the
 range in which the second places its planes: surfaces take a tenth of what cameras could see.
-`match` and `smooth` are kernels in cpu/ and cuda/.
+`match` and `smooth` are kernels in cpu/ and cuda/, `count_votes` is one in cpu/ alone.
 """
 
 from dataclasses import dataclass
-from types import ModuleType
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.ops.dispatch import FAST, check_fast_backend, fast_backend, pick_backend
-from asysplat.ops.plane_sweep import reference
 from asysplat.ops.plane_sweep.agreement import CONTRADICTION, Depths, fill, other_views, votes
+from asysplat.ops.plane_sweep.backends import choose, load
 from asysplat.ops.plane_sweep.cameras import (
+    Projections,
     choose_neighbours,
     inverse_depth_range,
     least_step,
     observed_range,
-    relative_projections,
 )
+from asysplat.ops.plane_sweep.images import edges, grey, shrink
 from asysplat.scene import Cameras, TensorRecord
 
 PLANES = 48
 NEIGHBOURS = 4
 SURE = 0.5  # by which the best plane's costs, of four paths, are less than the mean
 AGREED = 0.5  # agreement of a depth that counts for the range of the second sweep
-LUMA = (0.299, 0.587, 0.114)
 
 
 @dataclass(frozen=True)
@@ -84,8 +81,7 @@ def plane_sweep(
         InputError: sizes that do not go together, or an unknown backend.
     """
     _check(images, cameras, stride, planes, neighbours)
-    backend = fast_backend(images, "reference") if backend == "auto" else backend
-    _check_backend(backend, images)
+    backend = choose(backend, images)
     images = images if images.dtype == torch.float64 else images.float()
     poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
     return SweptDepth(
@@ -105,20 +101,19 @@ def _sweep(
     ranges: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Sweep: one operator for torch, so that devices without content know its shapes."""
-    form = _load(backend)
     cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
-    chosen = choose_neighbours(cameras, neighbours)
-    seen = inverse_depth_range(cameras, chosen)
+    projections = Projections.between(cameras)
+    chosen = choose_neighbours(cameras, projections, neighbours)
+    seen = inverse_depth_range(cameras, projections, chosen)
     ranges = seen if ranges is None else torch.where(ranges[..., 1:] > 0, ranges.to(seen), seen)
-    half = cameras.resized(*(max(1, side // (2 * stride)) * stride for side in images.shape[-2:]))
-    smaller = F.interpolate(images.flatten(0, 1), (half.height, half.width), mode="area")
-    smaller = smaller.unflatten(0, images.shape[:2])
-    found, agreement = _depths(form, smaller, half, chosen, ranges, planes, stride, smoothings=1)
-    ranges = _narrowed(ranges, found, agreement, planes * least_step(cameras, chosen))
-    found, agreement = _depths(form, images, cameras, chosen, ranges, planes, stride, smoothings=2)
+    sweep = _Sweep(projections, chosen, least_step(cameras, chosen), planes, stride, backend)
+    half = (max(1, side // (2 * stride)) * stride for side in images.shape[-2:])
+    found, agreement = sweep.depths(shrink(images, *half), ranges, smoothings=1)
+    ranges = _narrowed(ranges, found, agreement, planes * sweep.least_step)
+    found, agreement = sweep.depths(images, ranges, smoothings=2)
     everyone = other_views(images.shape[1], images.shape[0], images.device)
-    small = cameras.resized(cameras.height // stride, cameras.width // stride)
-    others = votes(found, small, everyone, trust=agreement)
+    small = projections.into(everyone, *found.inverse.shape[-2:])
+    others = votes(found, everyone, small, trust=agreement, backend=backend)
     agreement = agreement / (1 + CONTRADICTION * others.through)
     precision = found.precision()
     inverse = fill(found.inverse, agreement * precision)
@@ -131,34 +126,40 @@ def _(images, intrinsics, cam_to_world, stride, planes, neighbours, backend, ran
     return tuple(images.new_empty(shape) for _ in range(4))
 
 
-def _depths(
-    form: ModuleType,
-    images: Float[Tensor, "B V 3 H W"],
-    cameras: Cameras,
-    chosen: Int[Tensor, "B V K"],
-    ranges: Float[Tensor, "B V 2"],
-    planes: int,
-    stride: int,
-    smoothings: int,
-) -> tuple[Depths, Float[Tensor, "B V h w"]]:
-    """Return the depths of all views, and how far their neighbours agree with them.
+@dataclass(frozen=True)
+class _Sweep:
+    """What both sweeps have in common."""
 
-    After the first smoothing a pixel's costs count as much as its neighbours agreed with it.
-    """
-    small = cameras.resized(cameras.height // stride, cameras.width // stride)
-    grey = (images * images.new_tensor(LUMA)[:, None, None]).sum(2)
-    projections = relative_projections(cameras, chosen)
-    costs = form.match(grey, chosen, projections, ranges, planes, stride)
-    edges = _edges(images, stride)
-    least, greatest = ranges[..., None, None, :].unbind(-1)
-    plane = (greatest - least) / (planes - 1)
-    step = torch.maximum(plane[..., 0, 0], least_step(cameras, chosen))
-    agreement = images.new_ones(*images.shape[:2], small.height, small.width)
-    for _ in range(smoothings):
-        lowest = form.smooth(costs, agreement, edges)
-        found = Depths(least + lowest.plane * plane, step)
-        agreement = votes(found, small, chosen).agreement()
-    return found, agreement * (lowest.contrast / SURE).clamp(0, 1)
+    projections: Projections
+    chosen: Int[Tensor, "B V K"]
+    least_step: Float[Tensor, "B V"]
+    planes: int
+    stride: int
+    backend: str
+
+    def depths(
+        self, images: Float[Tensor, "B V 3 H W"], ranges: Float[Tensor, "B V 2"], smoothings: int
+    ) -> tuple[Depths, Float[Tensor, "B V h w"]]:
+        """Return the depths of all views, and how far their neighbours agree with them.
+
+        After the first smoothing a pixel's costs count as much as its neighbours agreed with it.
+        """
+        form = load(self.backend, images)
+        height, width = images.shape[-2:]
+        h, w = height // self.stride, width // self.stride
+        projections = self.projections.into(self.chosen, height, width)
+        costs = form.match(grey(images), self.chosen, projections, ranges, self.planes, self.stride)
+        borders = edges(shrink(images, h, w))
+        least, greatest = ranges[..., None, None, :].unbind(-1)
+        plane = (greatest - least) / (self.planes - 1)
+        step = torch.maximum(plane[..., 0, 0], self.least_step)
+        small = self.projections.into(self.chosen, h, w)
+        agreement = images.new_ones(*images.shape[:2], h, w)
+        for _ in range(smoothings):
+            lowest = form.smooth(costs, agreement, borders)
+            found = Depths(least + lowest.plane * plane, step)
+            agreement = votes(found, self.chosen, small, backend=self.backend).agreement()
+        return found, agreement * (lowest.contrast / SURE).clamp(0, 1)
 
 
 def _narrowed(
@@ -174,34 +175,6 @@ def _narrowed(
     greatest = torch.maximum(observed[..., 1] + half_step, least + shortest)
     narrowed = torch.stack((least, torch.minimum(ranges[..., 1], greatest)), dim=-1)
     return torch.where(observed[..., 1:] > 0, narrowed, ranges)
-
-
-def _edges(images: Tensor, stride: int) -> Float[Tensor, "B V 2 h w"]:
-    """Return the mean absolute colour difference to the block on the left, and to that above."""
-    blocks = F.avg_pool2d(images.flatten(0, 1), stride).unflatten(0, images.shape[:2])
-    left = torch.zeros_like(blocks[:, :, 0])
-    above = torch.zeros_like(left)
-    left[..., 1:] = blocks.diff(dim=-1).abs().mean(2)
-    above[..., 1:, :] = blocks.diff(dim=-2).abs().mean(2)
-    return torch.stack((left, above), dim=2)
-
-
-def _check_backend(backend: str, images: Tensor) -> None:
-    pick_backend("plane_sweep", dict.fromkeys(("auto", "reference", *FAST)), backend)
-    if backend != "reference":
-        check_fast_backend("plane_sweep", backend, images)
-
-
-def _load(backend: str) -> ModuleType:
-    if backend == "cpu":
-        from asysplat.ops.plane_sweep import cpu
-
-        return cpu
-    if backend == "cuda":
-        from asysplat.ops.plane_sweep import cuda
-
-        return cuda
-    return reference
 
 
 def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbours: int) -> None:

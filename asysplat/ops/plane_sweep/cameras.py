@@ -1,5 +1,7 @@
 """What to sweep: which views see the same as a view, and at which depths. Cameras decide alone."""
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -17,7 +19,47 @@ SUBPIXEL = 0.25  # pixels by which matches are off
 FRONT = 1e-6  # least depth in front of a camera, over the depth in the other
 
 
-def choose_neighbours(cameras: Cameras, count: int) -> Int[Tensor, "B V K"]:
+@dataclass(frozen=True)
+class Projections:
+    """Where all views have each other's pixels: from the cameras once, for images of any size.
+
+    Args:
+        unit: of images one wide and one high, as `into` describes them.
+        dtype: of the cameras.
+    """
+
+    unit: Float[Tensor, "B V V 3 4"]
+    dtype: torch.dtype
+
+    @classmethod
+    def between(cls, cameras: Cameras) -> "Projections":
+        """Compute them in float64."""
+        poses = cameras.cam_to_world.to(torch.float64)
+        size = poses.new_tensor([1 / cameras.width, 1 / cameras.height, 1])
+        intrinsics = size[:, None] * cameras.intrinsics.to(torch.float64)
+        relative = torch.linalg.inv(poses)[:, None] @ poses[:, :, None]
+        rays = relative[..., :3, :3] @ torch.linalg.inv(intrinsics)[:, :, None]
+        moved = torch.cat((rays, relative[..., :3, 3:]), dim=-1)
+        unit = intrinsics[:, None] @ moved
+        return cls(unit, cameras.intrinsics.dtype)
+
+    def into(
+        self, others: Int[Tensor, "B V K"], height: int, width: int
+    ) -> Float[Tensor, "B V K 3 4"]:
+        """Return M with which (x, y, 1, inverse depth) of a view is another's homogeneous pixel.
+
+        Both have `height` x `width` pixels; x and y are counted from the image's corner. The third
+        coordinate is the other's depth over the view's own. A view of -1 stands for the first.
+        """
+        size = self.unit.new_tensor([width, height, 1])
+        factors = torch.cat((1 / size, size.new_ones(1))) * size[:, None]
+        index = others.clamp_min(0)[..., None, None].expand(-1, -1, -1, 3, 4)
+        return (self.unit.gather(2, index) * factors).to(self.dtype)
+
+
+def choose_neighbours(
+    cameras: Cameras, projections: Projections, count: int
+) -> Int[Tensor, "B V K"]:
     """Return the views that see most of what a view sees, from elsewhere; -1 for none.
 
     Two views are scored by the share of pixels that both see at inverse depths from 0 to many
@@ -31,7 +73,7 @@ def choose_neighbours(cameras: Cameras, count: int) -> Int[Tensor, "B V K"]:
     focal = cameras.intrinsics[..., 0, 0] / cameras.width
     inverse = torch.cat((steps.new_zeros(1), steps)) * 2 / (largest * focal.mean(-1))[:, None]
     everyone = torch.arange(V, device=apart.device).expand(len(apart), V, V)
-    seen = _sees(cameras, everyone, inverse[:, None].expand(-1, V, -1)).to(apart).mean((-1, -2))
+    seen = _sees(projections, everyone, inverse[:, None].expand(-1, V, -1)).mean((-1, -2))
     parallax = focal[:, :, None, None] * apart[..., None] * inverse[:, None, None]
     useful = (parallax / USEFUL_PARALLAX).clamp_max(1) / (1 + (parallax / WIDE_PARALLAX) ** 2)
     score = (seen * useful).sum(-1)
@@ -44,7 +86,7 @@ def choose_neighbours(cameras: Cameras, count: int) -> Int[Tensor, "B V K"]:
 
 
 def inverse_depth_range(
-    cameras: Cameras, neighbours: Int[Tensor, "B V K"]
+    cameras: Cameras, projections: Projections, neighbours: Int[Tensor, "B V K"]
 ) -> Float[Tensor, "B V 2"]:
     """Return the least and the greatest inverse depth at which neighbours see enough of a view.
 
@@ -54,7 +96,7 @@ def inverse_depth_range(
     steps = torch.logspace(-2, 2, 97, base=10.0).to(distance)
     focal = cameras.intrinsics[..., 0, 0] / cameras.width
     inverse = steps / (distance.clamp_min(1e-12) * focal)[..., None]
-    share = _sees(cameras, neighbours, inverse).any(2).to(distance).mean((-1, -2))
+    share = _sees(projections, neighbours, inverse).amax(2).mean((-1, -2))
     enough = share >= LEAST_SHARE
     first = enough.int().argmax(-1, keepdim=True)
     last = enough.shape[-1] - 1 - enough.flip(-1).int().argmax(-1, keepdim=True)
@@ -84,25 +126,6 @@ def observed_range(
     return torch.where(count >= FEWEST, ranges, 0)
 
 
-def relative_projections(
-    cameras: Cameras, neighbours: Int[Tensor, "B V K"]
-) -> Float[Tensor, "B V K 3 4"]:
-    """Return M with which (x, y, 1, inverse depth) of a view is a neighbour's homogeneous pixel.
-
-    x and y are counted from the image's corner; the third coordinate is the neighbour's depth over
-    the view's own. A neighbour of -1 stands for the first view.
-    """
-    double = cameras.to(torch.float64)
-    scene = torch.arange(len(neighbours), device=neighbours.device)[:, None, None]
-    others = neighbours.clamp_min(0)
-    world_to_cam = torch.linalg.inv(double.cam_to_world)
-    relative = world_to_cam[scene, others] @ double.cam_to_world[:, :, None]
-    intrinsics = double.intrinsics[scene, others]
-    rays = relative[..., :3, :3] @ torch.linalg.inv(double.intrinsics)[:, :, None]
-    matrix = torch.cat((intrinsics @ rays, intrinsics @ relative[..., :3, 3:]), dim=-1)
-    return matrix.to(cameras.intrinsics.dtype)
-
-
 def _farthest(cameras: Cameras, neighbours: Int[Tensor, "B V K"]) -> Float[Tensor, "B V"]:
     """Return the distance of the farthest neighbour, 0 without any."""
     centers = cameras.centers
@@ -112,15 +135,18 @@ def _farthest(cameras: Cameras, neighbours: Int[Tensor, "B V K"]) -> Float[Tenso
 
 
 def _sees(
-    cameras: Cameras, others: Int[Tensor, "B V K"], inverse: Float[Tensor, "B V n"]
-) -> Bool[Tensor, "B V K n s s"]:
-    """Return which points of a view, at each of n inverse depths, are within each other view."""
-    small = cameras.resized(SAMPLES, SAMPLES)
+    projections: Projections, others: Int[Tensor, "B V K"], inverse: Float[Tensor, "B V n"]
+) -> Float[Tensor, "B V K n s s"]:
+    """Return 1 for points of a view, at each of n inverse depths, that are within another view."""
+    u, v, z = projections.into(others, SAMPLES, SAMPLES).to(inverse).unbind(-2)
+    # Within are those for which all of these are positive; their depth is, too.
+    sides = torch.stack((u, SAMPLES * z - u, v, SAMPLES * z - v), dim=-2)
+    right, down, corner, away = sides[..., None, None].unbind(-3)
     pixels = torch.arange(SAMPLES, device=inverse.device) + 0.5
-    y, x = torch.meshgrid(pixels, pixels, indexing="ij")
-    points = torch.stack((x, y, torch.ones_like(x))).to(inverse)
-    matrix = relative_projections(small, others)
-    flat = torch.einsum("bvkij,jyx->bvkiyx", matrix[..., :3], points)[:, :, :, None]
-    moved = matrix[..., None, :, 3, None, None] * inverse[:, :, None, :, None, None, None]
-    u, v, z = (flat + moved).unbind(-3)
-    return (z > FRONT) & (u > 0) & (u < SAMPLES * z) & (v > 0) & (v < SAMPLES * z)
+    flat = right * pixels + down * pixels[:, None] + corner
+    bound = -flat / away
+    never = (away == 0) & (flat <= 0)
+    least = torch.where(away > 0, bound, torch.where(never, torch.inf, -torch.inf)).amax(3)
+    greatest = torch.where(away < 0, bound, torch.inf).amin(3)
+    inverse = inverse[:, :, None, :, None, None]
+    return ((inverse > least[:, :, :, None]) & (inverse < greatest[:, :, :, None])).to(inverse)

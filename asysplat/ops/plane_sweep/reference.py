@@ -18,6 +18,8 @@ LARGE_STEP = 0.6  # for more than that,
 EDGE = 0.05  # half of it where the colour changes by this
 LEAST_WEIGHT = 0.05  # of a pixel's own costs
 FLATTEST = 1e-9  # bend of a parabola that has a minimum
+TOLERANCE = 0.01  # of an inverse depth, or half a step if that is more: two views agree
+PLACES = 2**20  # whose votes are counted at a time
 
 
 class Lowest(NamedTuple):
@@ -25,6 +27,18 @@ class Lowest(NamedTuple):
 
     plane: Float[Tensor, "B V h w"]
     contrast: Float[Tensor, "B V h w"]
+
+
+class Votes(NamedTuple):
+    """How many other views find the same, how many see through it, and in how many it would be."""
+
+    same: Float[Tensor, "B V h w"]
+    through: Float[Tensor, "B V h w"]
+    within: Float[Tensor, "B V h w"]
+
+    def agreement(self) -> Float[Tensor, "B V h w"]:
+        """Return how far the others agree, in [0, 1]: 0 where none does."""
+        return (2 * self.same / (self.same + self.through + 1)).clamp_max(1)
 
 
 def match(
@@ -98,9 +112,10 @@ def _compare(
 
 def patch_mean(values: Float[Tensor, "*more H W"]) -> Float[Tensor, "*more H W"]:
     """Return the mean over WINDOW x WINDOW pixels; beyond the border, its pixels go on."""
-    flat = values.reshape(-1, 1, *values.shape[-2:])
-    padded = F.pad(flat, (WINDOW // 2,) * 4, mode="replicate")
-    return F.avg_pool2d(padded, WINDOW, stride=1).reshape(values.shape)
+    H, W = values.shape[-2:]
+    padded = F.pad(values.reshape(-1, 1, H, W), (WINDOW // 2,) * 4, mode="replicate")
+    rows = sum(padded[..., k : k + H, :] for k in range(WINDOW))
+    return (sum(rows[..., k : k + W] for k in range(WINDOW)) / WINDOW**2).reshape(values.shape)
 
 
 def smooth(
@@ -154,3 +169,59 @@ def _along(
         step = torch.minimum(torch.minimum(nearer, farther) + SMALL_STEP, least + step[..., None])
         paths.append(cost + torch.minimum(before, step) - least)
     return torch.stack(paths, dim=dim)
+
+
+def count_votes(
+    inverse: Float[Tensor, "B V h w"],
+    steps: Float[Tensor, "B V"],
+    trust: Float[Tensor, "B V h w"],
+    others: Int[Tensor, "B V K"],
+    projections: Float[Tensor, "B V K 3 4"],
+) -> Votes:
+    """Ask other views about the point that each pixel sees.
+
+    Args:
+        inverse: depths.
+        steps: between those that a view can tell apart.
+        trust: in a view's depths, in [0, 1]: what its vote counts.
+        others: the views that are asked; -1 for none.
+        projections: into those.
+    """
+    chunk = max(1, PLACES // inverse.numel())
+    few = zip(others.split(chunk, dim=2), projections.split(chunk, dim=2), strict=True)
+    parts = [_votes_of(inverse, steps, trust, *asked) for asked in few]
+    return Votes(*(torch.stack(counts).sum(0) for counts in zip(*parts, strict=True)))
+
+
+def _votes_of(
+    inverse: Float[Tensor, "B V h w"],
+    steps: Float[Tensor, "B V"],
+    trust: Float[Tensor, "B V h w"],
+    others: Int[Tensor, "B V K"],
+    projections: Float[Tensor, "B V K 3 4"],
+) -> Votes:
+    B, _, h, w = inverse.shape
+    scene = torch.arange(B, device=others.device)[:, None, None]
+    view = others.clamp_min(0)
+    y, x = torch.meshgrid(
+        torch.arange(h, device=others.device) + 0.5,
+        torch.arange(w, device=others.device) + 0.5,
+        indexing="ij",
+    )
+    pixels = torch.stack((x, y, torch.ones_like(x))).to(inverse)
+    flat = torch.einsum("bvkij,jyx->bvkiyx", projections[..., :3], pixels)
+    moved = projections[..., 3, None, None] * inverse[:, :, None, None]
+    x, y, z = (flat + moved).unbind(3)
+    front = z.clamp_min(FRONT)
+    x, y = x / front, y / front
+    within = (z > FRONT) & (x > 0) & (x < w) & (y > 0) & (y < h)
+    within &= (others >= 0)[..., None, None]
+    column, row = x.clamp(0, w - 1).long(), y.clamp(0, h - 1).long()
+    place = (scene[..., None, None], view[..., None, None], row, column)
+    nearer = inverse[:, :, None] / front - inverse[place]
+    half_step = steps[scene, view][..., None, None] / 2
+    tolerance = torch.maximum(half_step, TOLERANCE * inverse[place])
+    same = within & (nearer.abs() <= tolerance)
+    through = within & (nearer > tolerance)
+    weight = trust[place]
+    return Votes((same * weight).sum(2), (through * weight).sum(2), within.to(weight).sum(2))

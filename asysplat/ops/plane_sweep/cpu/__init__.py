@@ -2,5 +2,6 @@
 
 from asysplat.ops.plane_sweep.cpu.match import match
 from asysplat.ops.plane_sweep.cpu.smooth import smooth
+from asysplat.ops.plane_sweep.cpu.votes import count_votes
 
-__all__ = ["match", "smooth"]
+__all__ = ["count_votes", "match", "smooth"]

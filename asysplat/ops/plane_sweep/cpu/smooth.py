@@ -11,10 +11,11 @@ from asysplat.ops.cpu.vectors import (
     LANES,
     ZERO,
     least,
-    load,
+    less,
     load_some,
-    store,
     store_some,
+    total,
+    where,
     zeros,
 )
 from asysplat.ops.plane_sweep import reference
@@ -56,86 +57,91 @@ def smooth_views(start, stop, costs, weights, penalties, plane, contrast):
     h, w, planes = costs.shape[1:]
     vectors = -(-planes // LANES)
     weighted = np.empty((h, w, vectors * LANES), np.float32)
-    total = np.empty((h, w, vectors, LANES), np.float32)
-    # Costs of the paths to a pixel and to the one before: infinite on both sides of the planes.
-    size = vectors * LANES + 2
-    along = np.full((2, size), INFINITY, np.float32)
-    across = np.full((2, w, size), INFINITY, np.float32)
-    lows = np.empty(w, np.float32)
+    sums = np.empty((h, w, vectors * LANES), np.float32)
+    # Costs of the paths to the last two pixels of each line: infinite on both sides of the planes.
+    paths = np.full((2, max(h, w), vectors * LANES + 2), INFINITY, np.float32)
+    lows = np.empty(max(h, w), np.float32)  # the least of each path
+    numbers = np.arange(vectors * LANES).astype(np.float32)
     for n in range(start, stop):
         for y in range(h):
             for x in range(w):
-                for d in range(planes):
-                    weighted[y, x, d] = costs[n, y, x, d] * weights[n, y, x]
-                weighted[y, x, planes:] = INFINITY
-        left, above = penalties[n]
-        across[1, :, 1:-1] = ZERO  # a path begins where all planes cost nothing
-        lows[:] = ZERO
+                _begin(weighted[y, x], sums[y, x], costs[n, y, x], weights[n, y, x])
+        for direction in range(4):
+            along, back = direction % 2 == 0, direction // 2
+            lines, length = (h, w) if along else (w, h)
+            for line in range(lines):  # a path begins where all planes cost nothing
+                lows[line] = ZERO
+                for v in range(vectors):
+                    store_some(paths[0, line], 1 + v * LANES, LANES, zeros())
+            for k in range(length):
+                position = length - 1 - k if back else k
+                entry = min(position + back, length - 1)  # whose penalty lies on the way here
+                for line in range(lines):
+                    y, x = (line, position) if along else (position, line)
+                    penalty = penalties[n, 0, y, entry] if along else penalties[n, 1, entry, x]
+                    old, new = paths[k % 2, line], paths[(k + 1) % 2, line]
+                    lows[line] = _go_on(
+                        old, new, lows[line], lows[line] + penalty, weighted[y, x], sums[y, x]
+                    )
         for y in range(h):
-            along[1, 1:-1] = ZERO
-            low = ZERO
             for x in range(w):
-                old, new = along[(x + 1) % 2], along[x % 2]
-                low = _go_on(old, new, low, weighted[y, x], left[y, x])
-                for v in range(vectors):
-                    store(total[y, x], v, load_some(new, 1 + v * LANES, LANES))
-            along[w % 2, 1:-1] = ZERO
-            low = ZERO
-            for x in range(w - 1, -1, -1):
-                old, new = along[(x + 1) % 2], along[x % 2]
-                low = _go_on(old, new, low, weighted[y, x], left[y, min(x + 1, w - 1)])
-                old, down = across[(y + 1) % 2, x], across[y % 2, x]
-                lows[x] = _go_on(old, down, lows[x], weighted[y, x], above[y, x])
-                for v in range(vectors):
-                    place = 1 + v * LANES
-                    both = load_some(new, place, LANES) + load_some(down, place, LANES)
-                    store(total[y, x], v, load(total[y, x], v) + both)
-        across[h % 2, :, 1:-1] = ZERO
-        lows[:] = ZERO
-        for y in range(h - 1, -1, -1):
-            for x in range(w):
-                old, up = across[(y + 1) % 2, x], across[y % 2, x]
-                lows[x] = _go_on(old, up, lows[x], weighted[y, x], above[min(y + 1, h - 1), x])
-                best = load_some(up, 1, LANES) + load(total[y, x], 0)
-                for v in range(vectors):
-                    value = load_some(up, 1 + v * LANES, LANES) + load(total[y, x], v)
-                    store(total[y, x], v, value)
-                    best = min(best, value)
-                costs_here, lowest = total[y, x].ravel(), least(best)
-                plane[n, y, x] = _between(costs_here, lowest, planes)
-                contrast[n, y, x] = costs_here[:planes].mean() - lowest
+                plane[n, y, x], contrast[n, y, x] = _find_lowest(sums[y, x], numbers, planes)
 
 
 @inline
-def _go_on(old, new, low, cost, step):
+def _begin(weighted, sums, costs, weight):
+    """Write the weighted costs of a pixel, infinite beyond its planes, and sums of nothing."""
+    for d in range(0, len(weighted), LANES):
+        count = min(len(costs) - d, LANES)
+        store_some(weighted, d, LANES, INFINITY + zeros())
+        store_some(weighted, d, count, load_some(costs, d, count) * weight)
+        store_some(sums, d, LANES, zeros())
+
+
+@inline
+def _go_on(old, new, low, far, cost, sums):
     """Write what the paths to a pixel cost, from those to the one before; return the least.
 
     Args:
         old, new: a place more at both ends than there are planes.
         low: the least of `old`.
+        far: that and the penalty for several planes more or less.
         cost: of the pixel's planes.
-        step: the penalty for several planes more or less.
+        sums: of the costs of all paths to the pixel, to which these are added.
     """
-    far, lowest = low + step, INFINITY + zeros()
+    lowest = INFINITY + zeros()
     for d in range(0, len(cost), LANES):
         one = min(load_some(old, d, LANES), load_some(old, d + 2, LANES)) + SMALL_STEP
         path = min(min(load_some(old, d + 1, LANES), one), far)
         path = load_some(cost, d, LANES) + (path - low)
         store_some(new, d + 1, LANES, path)
+        store_some(sums, d, LANES, load_some(sums, d, LANES) + path)
         lowest = min(lowest, path)
     return least(lowest)
 
 
 @inline
-def _between(costs, lowest, planes):
-    """Return the place of the lowest cost, moved to the minimum of the parabola through three."""
-    best = 0
-    while costs[best] > lowest:
-        best += 1
+def _find_lowest(costs, numbers, planes):
+    """Return the place of the lowest cost, and how much less it is than the mean.
+
+    It is moved to the minimum of the parabola through three.
+    """
+    lowest, everything = INFINITY + zeros(), zeros()
+    for d in range(0, planes, LANES):
+        lowest = min(lowest, load_some(costs, d, LANES))
+        everything = everything + load_some(costs, d, min(planes - d, LANES))
+    low = least(lowest)
+    first = INFINITY + zeros()
+    for d in range(0, planes, LANES):
+        first = min(
+            first,
+            where(less(low, load_some(costs, d, LANES)), INFINITY, load_some(numbers, d, LANES)),
+        )
+    best = np.int64(least(first))
     shift = ZERO
     if 0 < best < planes - 1:
         before, after = costs[best - 1], costs[best + 1]
         bend = before + after - 2 * costs[best]
         if bend > FLATTEST:
             shift = min(max((before - after) / (2 * bend), -HALF), HALF)
-    return best + shift
+    return best + shift, total(everything) / planes - low

@@ -1,0 +1,110 @@
+"""Numbers at sixteen places of an image at once, two neighbours in one read."""
+
+import numba
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from asysplat.ops.cpu.vectors import FLOATS, INTEGERS, LANES, VECTOR, check_range, lanes, splat
+
+HALF = LANES // 2
+PAIR = ir.IntType(64)
+
+
+@intrinsic
+def gather_pairs(typing_context, image, y, x):
+    """Return both numbers at LANES places of a contiguous array [H, W, 2].
+
+    Args:
+        y, x: vectors of the places, >= 0; what they have beside whole numbers does not count.
+    """
+
+    def generate(context, builder, signature, args):
+        image = _Image(context, builder, signature, args)
+        pairs = image.pairs(image.index(*image.whole(args[1:])), PAIR)
+        return context.make_tuple(builder, signature.return_type, pairs)
+
+    return types.UniTuple(VECTOR, 2)(image, y, x), generate
+
+
+@intrinsic
+def gather_squares(typing_context, image, y, x):
+    """Return the four numbers around LANES places of a contiguous array [H, W].
+
+    Args:
+        y, x: vectors of the places, from 0 to less than H - 1 and W - 1.
+
+    Returns:
+        The numbers above on the left and right, and below; how far the place is below and right of
+        the first, in [0, 1).
+    """
+
+    def generate(context, builder, signature, args):
+        image = _Image(context, builder, signature, args)
+        whole = image.whole(args[1:])
+        above = image.index(*whole)
+        below = builder.add(above, image.width)
+        numbers = [pair for row in (above, below) for pair in image.pairs(row, ir.FloatType())]
+        parts = [
+            builder.fsub(place, builder.sitofp(number, FLOATS))
+            for place, number in zip(args[1:], whole, strict=True)
+        ]
+        return context.make_tuple(builder, signature.return_type, numbers + parts)
+
+    return types.UniTuple(VECTOR, 6)(image, y, x), generate
+
+
+class _Image:
+    """A contiguous float32 array [H, W] or [H, W, 2], in the code that is generated."""
+
+    def __init__(self, context, builder, signature, args):
+        self.context, self.builder = context, builder
+        self.array = context.make_array(signature.args[0])(context, builder, args[0])
+        width = builder.extract_value(self.array.shape, 1)
+        self.width = splat(builder, builder.trunc(width, ir.IntType(32)))
+
+    def whole(self, places):
+        """Return the whole numbers of places, rounded down."""
+        return [self.builder.fptosi(place, INTEGERS) for place in places]
+
+    def index(self, row: ir.Value, column: ir.Value) -> ir.Value:
+        return self.builder.add(self.builder.mul(row, self.width), column)
+
+    def pairs(self, index: ir.Value, kind: ir.Type) -> list[ir.Value]:
+        """Return the numbers at indices, and those after them; a pair is read as one of 64 bits.
+
+        Args:
+            index: counted in numbers or in pairs, as `kind` says.
+        """
+        builder = self.builder
+        self._check(index, kind)
+        pointer = self.array.data
+        pointers, bits = ir.VectorType(pointer.type, HALF), ir.VectorType(PAIR, HALF)
+        every = ir.Constant(ir.VectorType(ir.IntType(1), HALF), [1] * HALF)
+        function = ir.FunctionType(bits, [pointers, ir.IntType(32), every.type, bits])
+        name = f"llvm.masked.gather.v{HALF}i64.v{HALF}p0"
+        gather = cgutils.get_or_insert_function(builder.module, function, name)
+        first = builder.insert_element(
+            ir.Constant(pointers, ir.Undefined), pointer, ir.IntType(32)(0)
+        )
+        base = builder.shuffle_vector(first, first, ir.Constant(lanes(0, HALF).type, [0] * HALF))
+        halves = []
+        for begin in (0, HALF):
+            some = builder.shuffle_vector(index, index, lanes(begin, begin + HALF))
+            places = builder.gep(base, [some], source_etype=kind)
+            nothing = ir.Constant(bits, [0] * HALF)
+            found = builder.call(gather, [places, ir.IntType(32)(4), every, nothing])
+            halves.append(builder.bitcast(found, FLOATS))
+        return [builder.shuffle_vector(*halves, lanes(k, 2 * LANES, 2)) for k in (0, 1)]
+
+    def _check(self, index: ir.Value, kind: ir.Type) -> None:
+        """With NUMBA_BOUNDSCHECK=1, check that every pair is inside the array."""
+        if not numba.config.BOUNDSCHECK:
+            return
+        step = 2 if kind == PAIR else 1
+        for lane in range(LANES):
+            first = self.builder.extract_element(index, ir.IntType(32)(lane))
+            first = self.builder.sext(first, self.array.nitems.type)
+            first = self.builder.mul(first, first.type(step))
+            check_range(self.context, self.builder, first, first.type(2), self.array.nitems)

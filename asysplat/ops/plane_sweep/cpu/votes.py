@@ -1,0 +1,112 @@
+"""What views say of each other's depths: a task takes a view, sixteen pixels of a row at a time."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from asysplat.ops.cpu.gathers import gather_pairs
+from asysplat.ops.cpu.kernel import kernel
+from asysplat.ops.cpu.threads import even_bounds, run_blocks
+from asysplat.ops.cpu.vectors import (
+    LANES,
+    ONE,
+    ZERO,
+    fma,
+    less,
+    load_some,
+    store_some,
+    where,
+    zeros,
+)
+from asysplat.ops.plane_sweep import reference
+from asysplat.ops.plane_sweep.cameras import FRONT as LEAST_FRONT
+
+HALF, FRONT = np.float32(0.5), np.float32(LEAST_FRONT)
+TOLERANCE = np.float32(reference.TOLERANCE)
+
+
+class VoteInputs(NamedTuple):
+    """NumPy's arrays; n counts the views of all scenes.
+
+    Args:
+        maps: [n, h, w, 2], inverse depths and how far they are trusted.
+        half_steps: [n].
+        others: [n, K], counted as n is; -1 for none.
+        projections: [n, K, 3, 4].
+    """
+
+    maps: np.ndarray
+    half_steps: np.ndarray
+    others: np.ndarray
+    projections: np.ndarray
+
+
+def count_votes(
+    inverse: Float[Tensor, "B V h w"],
+    steps: Float[Tensor, "B V"],
+    trust: Float[Tensor, "B V h w"],
+    others: Int[Tensor, "B V K"],
+    projections: Float[Tensor, "B V K 3 4"],
+) -> reference.Votes:
+    """Count the votes in float32; see `reference.count_votes`."""
+    B, V, h, w = inverse.shape
+    first = torch.arange(B)[:, None, None] * V
+    inputs = VoteInputs(
+        maps=torch.stack((inverse, trust), dim=-1).flatten(0, 1).numpy(),
+        half_steps=(steps / 2).flatten().numpy(),
+        others=torch.where(others >= 0, others + first, -1).flatten(0, 1).numpy(),
+        projections=projections.flatten(0, 1).contiguous().numpy(),
+    )
+    found = reference.Votes(*(torch.empty(B, V, h, w) for _ in reference.Votes._fields))
+    arrays = reference.Votes(*(votes.flatten(0, 1).numpy() for votes in found))
+    run_blocks(count_views, even_bounds(B * V), inputs, arrays)
+    return found
+
+
+@kernel
+def count_views(start, stop, inputs, votes):
+    """Write the votes on the views start to stop.
+
+    Args:
+        inputs: see `VoteInputs`.
+        votes: of `reference.Votes`, each [n, h, w].
+    """
+    h, w = inputs.maps.shape[1:3]
+    bottom, right = np.float32(h), np.float32(w)
+    columns = np.arange(w).astype(np.float32) + HALF
+    for n in range(start, stop):
+        for y in range(h):
+            row = np.float32(y) + HALF
+            own = inputs.maps[n, y, :, 0].copy()
+            for x in range(0, w, LANES):
+                count = min(LANES, w - x)
+                column, depth = load_some(columns, x, count), load_some(own, x, count)
+                same, through, within = zeros(), zeros(), zeros()
+                for k in range(inputs.others.shape[1]):
+                    other = inputs.others[n, k]
+                    if other < 0:
+                        continue
+                    m = inputs.projections[n, k]
+                    z = fma(depth, m[2, 3], fma(column, m[2, 0], fma(m[2, 1], row, m[2, 2])))
+                    scale = ONE / max(z, FRONT)
+                    u = fma(depth, m[0, 3], fma(column, m[0, 0], fma(m[0, 1], row, m[0, 2])))
+                    v = fma(depth, m[1, 3], fma(column, m[1, 0], fma(m[1, 1], row, m[1, 2])))
+                    u, v = u * scale, v * scale
+                    inside = less(ZERO, u) & less(u, right) & less(ZERO, v) & less(v, bottom)
+                    inside = inside & less(FRONT, z)
+                    u = min(max(u, ZERO), right - ONE)
+                    v = min(max(v, ZERO), bottom - ONE)
+                    there, trust = gather_pairs(inputs.maps[other], v, u)
+                    nearer = depth * scale - there
+                    tolerance = max(there * TOLERANCE, inputs.half_steps[other])
+                    weight = where(inside, trust, ZERO)
+                    apart = max(nearer, ZERO - nearer)
+                    same = same + where(less(tolerance, apart), ZERO, weight)
+                    through = through + where(less(tolerance, nearer), weight, ZERO)
+                    within = within + where(inside, ONE, ZERO)
+                store_some(votes.same[n, y], x, count, same)
+                store_some(votes.through[n, y], x, count, through)
+                store_some(votes.within[n, y], x, count, within)

@@ -1,0 +1,41 @@
+"""Photographs in, Gaussians out, from Python: load, predict, refine, render, write.
+
+python examples/reconstruct_scene.py [my_scene]
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+
+from asysplat import load, mean_colour, open_photographs, refine, render, write_gaussians
+from asysplat.data import ProceduralScene
+from asysplat.data.write import write_transforms
+from asysplat.evaluation.pictures import comparison
+
+
+def reconstruct(folder: Path, scene: Path, picture: Path) -> None:
+    photographs = open_photographs(folder, height=128, width=128, views=16)
+    with torch.no_grad():
+        start = load("shipped")(photographs.inputs)
+    gaussians = refine(start, photographs.inputs, seconds=30)
+    write_gaussians(scene, photographs.frame.undo(gaussians))  # in the world of the files
+
+    background = mean_colour(photographs.inputs)
+    rendering = render(gaussians, photographs.measured.cameras, background)
+    comparison(photographs.inputs, photographs.measured, rendering).savefig(picture, dpi=110)
+    print(f"{gaussians.num_gaussians:,} Gaussians; scene: {scene}; picture: {picture}")
+
+
+def made_up(folder: Path) -> Path:
+    """Write a synthetic scene in place of photographs."""
+    scene = ProceduralScene(seed=7, height=128, width=128, num_frames=24)
+    write_transforms(scene.views(range(scene.num_frames)), folder)
+    return folder
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as empty:
+        given = Path(sys.argv[1]) if len(sys.argv) > 1 else made_up(Path(empty) / "made_up")
+        reconstruct(given, Path("reconstructed.ply"), Path("reconstructed.png"))
