@@ -14,7 +14,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import nn
 
 from asysplat.data import SceneDataModule
@@ -68,6 +68,8 @@ def evaluate(options: DictConfig) -> None:
     scenes = measure_scenes(tests, predict, measure, fabric.device, subject.folder, subject.kept)
     sentences = {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
     how = {"evaluation/post_optimisation": HOW}
+    if options.run is None:  # which has one
+        OmegaConf.save(options, subject.folder / "config.yaml", resolve=True)
     results = subject.described | sentences | how | set_results(scenes, measure.protocol.mean_over)
     write_csv(subject.folder / "evaluation.csv", image_rows(scenes))
     write_csv(subject.folder / "evaluation_scenes.csv", scene_rows(scenes))

@@ -96,8 +96,8 @@ class PostOptimisation:
             scene: its name.
             predict: the input views -> [N] Gaussians in their frame.
             inputs, targets: the scene's views, without a batch dimension.
-            watch: called after the prediction and after each step with the number of steps and,
-                where the scene is measured, with the rendering of the targets.
+            watch: called after each step, and where the scene is measured: with the number of
+                steps, and there with the rendering of the targets.
         """
         background = self.background
         if background is None:
@@ -108,7 +108,7 @@ class PostOptimisation:
             result.add("targets", source.__name__, metrics)
         meter = CostMeter(inputs.images.device)
 
-        def measure(step: int, gaussians: Gaussians) -> Rendering:
+        def measure(step: int, gaussians: Gaussians) -> None:
             meter.stop()
             source = f"post{step}"
             result.costs[source] = {"seconds": sum(meter.seconds)}
@@ -121,17 +121,20 @@ class PostOptimisation:
             shown = _draw(gaussians, inputs, background).image
             result.add("inputs", source, {"psnr": self.protocol.psnr(shown, inputs)})
             result.gaussians = gaussians.num_gaussians
+            watch(step, rendering)
             meter.start()
-            return rendering
 
         def look(progress: Progress, refinement: Refinement) -> bool:
-            step = progress.step
-            watch(step, measure(step, refinement.gaussians) if step in self.steps else None)
+            if progress.step in self.steps:
+                measure(progress.step, refinement.gaussians)
+            else:
+                watch(progress.step, None)
             return False
 
         meter.start()
         gaussians = predict(inputs)
-        watch(0, measure(0, gaussians) if 0 in self.steps else None)
+        if 0 in self.steps:
+            measure(0, gaussians)
         if self.steps[-1] > 0:
             refine(
                 gaussians,

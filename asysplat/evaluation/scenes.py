@@ -1,11 +1,11 @@
 """Measure all scenes of all test sets, going on where an earlier process was."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from torch.utils.data import Dataset
 
 from asysplat.evaluation.pictures import comparison
 from asysplat.evaluation.post_optimisation import PostOptimisation, Predict, SceneResult
@@ -15,7 +15,7 @@ from asysplat.rendering import Rendering
 
 
 def measure_scenes(
-    tests: Mapping[str, Sequence[Mapping[str, Any]]],
+    tests: Mapping[str, Dataset],
     predict: Predict,
     measure: PostOptimisation,
     device: torch.device,
@@ -25,7 +25,8 @@ def measure_scenes(
     """Measure every scene that has no result yet, under a progress bar, and draw the first.
 
     Args:
-        tests: by test set its scenes: their name, `inputs` and `targets`.
+        tests: by test set, that of the data itself first, its scenes: their name, `scene`, and
+            `inputs` and `targets`.
         predict, measure: see `PostOptimisation`.
         device: where to work.
         folder: for pictures/evaluation-post<steps>.png: the first scene at the first and the last

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from asysplat.errors import InputError
 from asysplat.training.ranges import check_ranges
@@ -53,12 +53,13 @@ def find_subject(options: DictConfig, overrides: Sequence[str]) -> Subject:
         )
     if options.run is not None:
         return _of_run(options, overrides)
-    kept = [key for key in options if key not in ("run", "scene")]
-    config = OmegaConf.masked_copy(options, kept)
+    config = options.copy()
+    with open_dict(config):
+        del config["run"], config["scene"]
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
     # Its `steps` are not train.py's.
-    check_ranges(OmegaConf.masked_copy(config, [key for key in kept if key != "steps"]))
+    check_ranges(OmegaConf.masked_copy(config, [key for key in config if key != "steps"]))
     described = _describe(config, options)
     stem = Path(options.scene or options.init_path).stem
     folder = Path(options.paths.logs) / "evaluate" / f"{stem}-{hash_of(described)[:8]}"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from asysplat.evaluation.measured_cost import SECONDS
 from asysplat.files import replaced
@@ -15,11 +15,11 @@ Results = dict[str, float | int | str]  # flat, as in metrics.json
 
 METRICS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "absrel": "AbsRel"}
 METRICS["delta1"] = "delta<1.25"
-SOURCES = {
-    "trained": "test/{}",
+BASELINES = {
     "nearest view, copied": "baseline/{}/nearest_view",
     "mean colour": "baseline/{}/mean_colour",
 }
+SOURCES = {"trained": "test/{}"} | BASELINES
 
 
 def write_json(path: Path, results: Results) -> None:
@@ -63,7 +63,7 @@ def psnr_table(results: Results, names: list[str]) -> Table:
 
 
 def post_optimisation_table(results: Results, name: str, costs: str) -> Table:
-    """Make the table of one test set before and after steps of post-optimisation.
+    """Make the table of one test set after steps of post-optimisation, and of its inputs' PSNR.
 
     Args:
         results: as in evaluation.json.
@@ -75,12 +75,10 @@ def post_optimisation_table(results: Results, name: str, costs: str) -> Table:
     shown = [metric for metric in METRICS if [metric] in [key[3:] for key in keys]]
     title = f"test scenes: {name}, metrics: {results['protocol/name']}, "
     title += f"{results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
-    table = Table("steps", "seconds", "GB", "inputs' PSNR", *(METRICS[m] for m in shown))
-    table.title = title
+    titles = ("seconds", "GB", "inputs (dB)", *(METRICS[metric] for metric in shown))
+    table = Table(Column("steps", min_width=12), *titles, title=title)
     rows = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
-    rows |= {
-        label: (prefix.format(name), "") for label, prefix in SOURCES.items() if label != "trained"
-    }
+    rows |= {label: (prefix.format(name), "") for label, prefix in BASELINES.items()}
     for label, (prefix, source) in rows.items():
         seconds, gb = (results.get(f"{costs}/{source}/{unit}") for unit in ("seconds", "gb"))
         inputs = results.get(f"inputs/{name}/{source}/psnr")
