@@ -14,7 +14,8 @@ def kept(repository, tmp_path):
 
     def find(*overrides):
         with initialize_config_dir(str(repository / "conf"), version_base=None):
-            options = compose("evaluate", [*overrides, f"paths.logs={tmp_path}"])
+            paths = [f"paths.logs={tmp_path}", "paths.run=unused"]
+            options = compose("evaluate", [*overrides, *paths])
         return find_subject(options, overrides).kept
 
     return find
