@@ -101,7 +101,7 @@ def test_trains_a_step_at_a_tiny_size(choice):
 )
 def test_first_comment_is_the_command(path):
     comments = [line for line in path.read_text().splitlines()[:2] if line.startswith("# ")]
-    scripts = {name: f"{name}.py" for name in ("report", "benchmark", "reconstruct")}
+    scripts = {name: f"{name}.py" for name in ("report", "benchmark", "evaluate", "reconstruct")}
     scripts["refinement"] = "reconstruct.py"  # a folder
     script = scripts.get(path.stem, scripts.get(path.parent.stem, "train.py"))
     assert any(f"python {script}" in comment for comment in comments)
