@@ -89,9 +89,6 @@ def limits_of(config: DictConfig) -> dict[str, float]:
 def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
     """Return what the refinement starts from, in the network's frame."""
     init = config.init or best_init(photographs.inputs.num_views)
-    if init not in INITS and Path(init).suffix:
-        frame = photographs.frame
-        return moved(read_gaussians(init), frame.world_to_mean).scale_by(frame.scale)
     network = None
     if init == "network":
         try:
@@ -101,7 +98,11 @@ def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
                 raise
             print(f"warning: {error} Starting from the plane sweep, init=sweep.")
             init = "sweep"
-    gaussians = starting_gaussians(init, photographs, most, network)
+    if init not in INITS and Path(init).suffix:
+        frame = photographs.frame
+        gaussians = moved(read_gaussians(init), frame.world_to_mean).scale_by(frame.scale)
+    else:
+        gaussians = starting_gaussians(init, photographs, most, network)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
     return gaussians
 
