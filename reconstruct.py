@@ -16,7 +16,7 @@ import hydra
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from asysplat.errors import InputError
+from asysplat.errors import InputError, input_error_behind
 from asysplat.export.gaussians import read_gaussians
 from asysplat.export.results import Results
 from asysplat.export.watch import Watch
@@ -36,8 +36,11 @@ def main(config: DictConfig) -> None:
         reconstruct(config)
     except KeyboardInterrupt:
         sys.exit("stopped.")
-    except InputError as error:
-        sys.exit(f"error: {error}")
+    except Exception as error:
+        known = input_error_behind(error)
+        if known is None:
+            raise
+        sys.exit(f"error: {known}")
 
 
 def reconstruct(config: DictConfig) -> None:

@@ -3,11 +3,9 @@
 python train.py model=asysplat_4m4s scale=laptop
 """
 
-import logging
 import os
 import sys
 import traceback
-import warnings
 from pathlib import Path
 
 import hydra
@@ -22,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.errors import InputError, input_error_behind
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.training.checkpoints import check_checkpoint, find_checkpoint, load_weights
+from asysplat.training.quiet import quiet_lightning
 from asysplat.training.ranges import check_ranges
 from asysplat.training.revision import revision
 from asysplat.training.runs import Run, describe_run, find_run
@@ -71,13 +70,6 @@ def finished_text(run: Run) -> str:
     """Write what a sweep prints about a run that it does not repeat."""
     other = f" by {run.revision}, while this is {revision()}; to run it again: rerun=true"
     return f"finished already{other if run.revision != revision() else ''}\nrun: {run.folder}"
-
-
-def quiet_lightning() -> None:
-    """Hide Lightning's tips and deprecations; show other warnings without their line of code."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", module="lightning")
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
 
 
 def train(config: DictConfig) -> float | None:

@@ -134,7 +134,11 @@ def find_rows(floors: dict[str, int], imports: Counter[tuple[str, str]]) -> list
     # What a room on the way imports stands below it, even if it imports another one itself.
     above -= {to for room in way for to in reached(room, imports)}
     below = {*floors} - {*way} - above
-    rows: list[list[str]] = [["scripts"], sorted(above - {"scripts"}, key=floors.get), way]
+    rows: list[list[str]] = [
+        ["scripts"],
+        sorted(above - {"scripts"}, key=lambda r: (floors[r], r)),
+        way,
+    ]
     rows.append(sorted((room for room in below if floors[room]), key=lambda r: (-floors[r], r)))
     return [*rows, sorted(room for room in below if not floors[room])]
 

@@ -1,5 +1,6 @@
 """Every example runs as printed."""
 
+import json
 import os
 import runpy
 import subprocess
@@ -7,9 +8,12 @@ import sys
 from pathlib import Path
 
 import cv2
+import nbformat
 import pytest
+from nbclient import NotebookClient
 from tiny import NETWORK, VIEWS
 
+from asysplat import read_gaussians
 from asysplat.data import open_scene
 
 
@@ -20,6 +24,48 @@ def test_it_draws_a_picture(repository, tmp_path, monkeypatch, capsys, name):
     runpy.run_path(str(repository / "examples" / f"{name}.py"), run_name="__main__")
     assert cv2.imread(str(picture)).std() > 20
     assert str(picture) in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_scene_is_reconstructed(repository, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["reconstruct_scene"])
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(repository / "examples" / "reconstruct_scene.py"), run_name="__main__")
+    count = read_gaussians("reconstructed.ply").num_gaussians
+    assert f"{count:,} Gaussians" in capsys.readouterr().out
+    assert cv2.imread("reconstructed.png").std() > 20
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_and_holds_no_outputs(repository, tmp_path):
+    notebook = nbformat.read(repository / "examples" / "reconstruct_scene.ipynb", as_version=4)
+    nbformat.validate(notebook)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(cell.outputs == [] and cell.execution_count is None for cell in cells)
+    # What it imports is this copy of the project.
+    first = nbformat.v4.new_code_cell(f"import sys; sys.path.insert(0, {str(repository)!r})")
+    notebook.cells.insert(0, first)
+    NotebookClient(notebook, timeout=500, resources={"metadata": {"path": tmp_path}}).execute()
+    kinds = [kind for cell in cells for out in cell.outputs for kind in out.get("data", ())]
+    assert "image/png" in kinds
+    scene = cells[-1].outputs[-1].text.strip()
+    assert read_gaussians(scene).num_gaussians > 1000
+
+
+@pytest.mark.slow
+def test_names_that_bring_much_along_are_imported_when_asked_for(repository):
+    heavy = ["lightning", "hydra", "cv2", "matplotlib", "pycolmap"]
+    program = (
+        "import asysplat, json, sys\n"
+        f"before = [name for name in {heavy} if name in sys.modules]\n"
+        "found = [getattr(asysplat, name).__name__ for name in asysplat.LATER]\n"
+        "print(json.dumps([before, sorted(found), sorted(asysplat.LATER)]))"
+    )
+    command = [sys.executable, "-c", program]
+    said = subprocess.run(command, cwd=repository, capture_output=True, text=True)
+    assert said.returncode == 0, said.stderr
+    before, found, names = json.loads(said.stdout)
+    assert before == [] and found == names
 
 
 @pytest.mark.slow

@@ -70,6 +70,10 @@ def test_unknown_overrides(override):
 def test_options_of_the_other_scripts():
     check_overrides(["table=[layers,geometry_ratio]", "costs=true", "logs=elsewhere"], "report")
     check_overrides(["suite=ops", "ops.ssd.length=512", "model.names=[longlrm]"], "benchmark")
+    check_overrides(["run=logs/asysplat/one", "steps=[0,5]", "paths.logs=elsewhere"], "evaluate")
+    check_overrides(["init_path=shipped", "data=files", "data.root=x", "scale=gpu"], "evaluate")
+    with pytest.raises(InputError, match="did you mean scene"):
+        check_overrides(["scen=a.ply"], "evaluate")
     with pytest.raises(InputError, match="did you mean costs"):
         check_overrides(["cots=true"], "report")
     with pytest.raises(InputError, match="did you mean repeats"):
@@ -84,7 +88,9 @@ def test_a_script_says_it_from_any_folder(repository, tmp_path):
     assert result.stderr == "error: cots is unknown: did you mean costs?\n"
 
 
-COMMAND = re.compile(r"python (train|report|benchmark)\.py((?: [^\s#`:,;()]+(?:,[^\s`]+)*)*)")
+COMMAND = re.compile(
+    r"python (train|evaluate|reconstruct|report|benchmark)\.py((?: [^\s#`:,;()]+(?:,[^\s`]+)*)*)"
+)
 IN_A_TABLE = re.compile(r"\| `([\w./]+=[^`]+)`")
 
 
@@ -107,4 +113,7 @@ def test_every_printed_command_names_what_is_there(repository):
     printed = printed_commands(repository)
     assert len(printed) > 100
     for script, overrides in printed:
-        check_overrides(get_args_parser().parse_args(shlex.split(overrides)).overrides, script)
+        words = shlex.split(overrides)
+        if script == "reconstruct":  # its photographs, and --view
+            words = [word for word in words if word not in ("my_scene", "--view")]
+        check_overrides(get_args_parser().parse_args(words).overrides, script)

@@ -181,7 +181,8 @@ class FixedTasks(Dataset):
 def load(task: Task, share: float = 1.0, points: bool = False) -> Sample:
     """Read a task's views, validate, crop to `share` of their sides, and normalise them.
 
-    With `points`, the inputs have the depths of the capture's sparse points, if it has any.
+    With `points`, the inputs have the depths of the capture's sparse points, if it has any. The
+    sample's `frame` says how it was normalised.
     """
     inputs, targets = task.selection.inputs, task.selection.targets
     # A frame that is both input and target is decoded once.
@@ -192,8 +193,8 @@ def load(task: Task, share: float = 1.0, points: bool = False) -> Sample:
     )
     if points:
         inputs = with_points(inputs, task.capture)
-    inputs, targets, _ = normalise(inputs, targets)
-    return {"scene": task.capture.name, "inputs": inputs, "targets": targets}
+    inputs, targets, frame = normalise(inputs, targets)
+    return {"scene": task.capture.name, "inputs": inputs, "targets": targets, "frame": frame}
 
 
 def with_points(views: Views, capture: Capture) -> Views:

@@ -33,6 +33,10 @@ class Normalisation(TensorRecord):
         )
         return replace(views, cameras=cameras, depths=depths, point_depths=point_depths)
 
+    def bring(self, gaussians: Gaussians) -> Gaussians:
+        """Bring Gaussians from the data set's world into the network's frame."""
+        return moved(gaussians, self.world_to_mean).scale_by(self.scale)
+
     def undo(self, gaussians: Gaussians) -> Gaussians:
         """Bring Gaussians back to the data set's world, where its own cameras see the same."""
         return moved(gaussians.scale_by(1 / self.scale), torch.linalg.inv(self.world_to_mean))

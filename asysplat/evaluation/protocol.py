@@ -89,6 +89,13 @@ class Protocol:
             values["lpips"] = lpips_distance(lpips, shown, target)
         return values
 
+    def without_lpips(self) -> str:
+        """Say that LPIPS is not measured, and how to get its backbone."""
+        return (
+            f"{BACKBONES[self.lpips_net]} is neither in torch's hub cache nor in paths.weights: "
+            "the run goes on without LPIPS; paths.download=true fetches it."
+        )
+
     def _shown(self, rendered: Images, targets: Views) -> Images:
         """Clamp to [0, 1], cut to 8 bits if set, and fill in the photograph at excluded pixels."""
         rendered = rendered.float().clamp(0, 1)

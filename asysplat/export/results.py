@@ -66,8 +66,18 @@ class Results:
     def first_picture(
         self, gaussians: Gaussians, photographs: Photographs, background: Float[Tensor, "3"]
     ) -> None:
-        """Write start.png: what the refinement starts from."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        """Write start.png: what the refinement starts from.
+
+        Raises:
+            InputError: the folder cannot be made, or written to.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"{self.folder} cannot be made ({error.strerror}): set paths.logs to a folder that "
+                "you may write to."
+            ) from error
         self._save("start.png", contact_sheet(gaussians, photographs, background))
         print(f"picture: {self.folder / 'start.png'}")
 

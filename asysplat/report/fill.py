@@ -165,7 +165,7 @@ def _note(
     row: PaperRow, values: dict[str, list[Number]], runs: dict[int, Run], wanted: Sequence[int]
 ) -> str:
     if row.post_optimisation and not values:
-        return "not run: needs post-optimisation of a trained model (evaluate.py)"
+        return "not run: python evaluate.py run=... adds post-optimisation to a finished run"
     missing = [str(seed) for seed in wanted if seed not in runs]
     if values and missing:
         return f"seeds still to run: {', '.join(missing)}"

@@ -78,7 +78,7 @@ def config_hash(config: DictConfig) -> str:
     for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)
-    return _hash(resolved)
+    return hash_of(resolved)
 
 
 def data_of(config: DictConfig) -> dict[str, str]:
@@ -92,14 +92,14 @@ def data_of(config: DictConfig) -> dict[str, str]:
     places = {
         "run/data/root": _name(data.get("root")),
         "run/data/test_root": _name(data.get("test_root")),
-        "run/data/index": _content(data.get("index")),
-        "run/init_path": _content(config.init_path and weights_file(config.init_path)),
+        "run/data/index": content_of(data.get("index")),
+        "run/init_path": content_of(config.init_path and weights_file(config.init_path)),
     }
     tested = tested_sets(data["test_sets"], data["name"], on_disk="root" in data)
     for name, options in tested.items():
         how = dict(options or {})
-        how |= {"root": _name(how.get("root")), "index": _content(how.get("index"))}
-        places[f"run/test_sets/{name}"] = _hash(how)
+        how |= {"root": _name(how.get("root")), "index": content_of(how.get("index"))}
+        places[f"run/test_sets/{name}"] = hash_of(how)
     return {key: value for key, value in places.items() if value is not None}
 
 
@@ -108,7 +108,7 @@ def _name(path: str | Path | None) -> str | None:
     return None if path in (None, MISSING) else Path(os.path.abspath(path)).name
 
 
-def _content(path: str | Path | None) -> str | None:
+def content_of(path: str | Path | None) -> str | None:
     """Hash a file's content; return the path's name if it cannot be read as a file."""
     if path in (None, MISSING):
         return None
@@ -119,7 +119,8 @@ def _content(path: str | Path | None) -> str | None:
         return _name(path)
 
 
-def _hash(values: Any) -> str:
+def hash_of(values: Any) -> str:
+    """Hash plain values."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -1,11 +1,12 @@
-"""The results of a run: metrics.json, and tables on the terminal."""
+"""The results of a run or an evaluation: a file, and tables on the terminal."""
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from asysplat.evaluation.measured_cost import SECONDS
 from asysplat.files import replaced
@@ -14,11 +15,11 @@ Results = dict[str, float | int | str]  # flat, as in metrics.json
 
 METRICS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "absrel": "AbsRel"}
 METRICS["delta1"] = "delta<1.25"
-SOURCES = {
-    "trained": "test/{}",
+BASELINES = {
     "nearest view, copied": "baseline/{}/nearest_view",
     "mean colour": "baseline/{}/mean_colour",
 }
+SOURCES = {"trained": "test/{}"} | BASELINES
 
 
 def write_json(path: Path, results: Results) -> None:
@@ -61,6 +62,32 @@ def psnr_table(results: Results, names: list[str]) -> Table:
     return table
 
 
+def post_optimisation_table(results: Results, name: str, costs: str) -> Table:
+    """Make the table of one test set after steps of post-optimisation, and of its inputs' PSNR.
+
+    Args:
+        results: as in evaluation.json.
+        name: of the test set.
+        costs: the beginning of the keys of its costs.
+    """
+    keys = [key.split("/") for key in results if key.startswith(f"test/{name}/post")]
+    steps = sorted({int(key[2].removeprefix("post")) for key in keys})
+    shown = [metric for metric in METRICS if [metric] in [key[3:] for key in keys]]
+    title = f"test scenes: {name}, metrics: {results['protocol/name']}, "
+    title += f"{results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
+    titles = ("seconds", "GB", "inputs (dB)", *(METRICS[metric] for metric in shown))
+    table = Table(Column("steps", min_width=12), *titles, title=title)
+    rows = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
+    rows |= {label: (prefix.format(name), "") for label, prefix in BASELINES.items()}
+    for label, (prefix, source) in rows.items():
+        seconds, gb = (results.get(f"{costs}/{source}/{unit}") for unit in ("seconds", "gb"))
+        inputs = results.get(f"inputs/{name}/{source}/psnr")
+        values = [inputs, *(results.get(f"{prefix}/{metric}") for metric in shown)]
+        cells = ["" if each is None else f"{each:.2f}" for each in (seconds, gb)]
+        table.add_row(label, *cells, *("" if v is None else f"{v:.3f}" for v in values))
+    return table
+
+
 def cost_sentence(results: Results) -> str:
     """Write the measured costs as a sentence; empty if none were measured."""
     costs = []
@@ -99,3 +126,20 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
     for picture in sorted((folder / "pictures").glob("test-*.png")):
         console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"run: {folder}", soft_wrap=True)
+
+
+def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> None:
+    """Print what evaluate.py found: a table for each test set, pictures and, last, the folder.
+
+    Args:
+        results: as in evaluation.json.
+        sets: the test sets, that of the data itself first.
+        folder: where the results are.
+    """
+    console = Console()
+    for name in sets:
+        costs = "cost" if name == sets[0] else f"cost/{name}"
+        console.print(post_optimisation_table(results, name, costs))
+    for picture in sorted((folder / "pictures").glob("evaluation-*.png")):
+        console.print(f"picture: {picture}", soft_wrap=True)
+    console.print(f"evaluation: {folder}", soft_wrap=True)

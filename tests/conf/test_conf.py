@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from tiny import SCENES, SIZE, VIEWS
 
 from asysplat.data.datamodule import TrainingTasks, collate
+from asysplat.reconstruction import PAPER, Settings
 from asysplat.report.paper import find_tables
 
 ROOT = Path(__file__).parents[2]
@@ -18,7 +19,7 @@ CONF, SWEEPS = ROOT / "conf", ROOT / "sweeps"
 GROUPS = [
     (str(path.parent.relative_to(CONF)), path.stem)
     for path in sorted(CONF.rglob("*.yaml"))
-    if path.parent != CONF
+    if path.parent not in (CONF, CONF / "refinement")
 ]
 # Shared parts of the files that use them.
 PARTS = {("model", "asysplat"), ("model", "blocks"), ("model", "one_branch")}
@@ -30,9 +31,9 @@ TRAINED += [("stage", stage) for stage in STAGES]
 TINY = [*SIZE, *VIEWS, *SCENES, "data.test_sets=null", "data.batch_size=1"]
 
 
-def compose_train(*overrides):
+def compose_train(*overrides, script="train"):
     with initialize_config_dir(str(CONF), version_base=None):
-        return compose("train", list(overrides), return_hydra_config=True)
+        return compose(script, list(overrides), return_hydra_config=True)
 
 
 def first_rows(config) -> list[str]:
@@ -46,6 +47,14 @@ def test_composes_and_builds_its_model(group):
     with torch.device("meta"):
         net = instantiate(config.model)
     assert sum(p.numel() for p in net.parameters()) > 1e6
+
+
+def test_refinements_are_the_defaults_of_the_code():
+    known = {path.stem for path in (CONF / "refinement").glob("*.yaml")}
+    assert known == {"default", "paper"}
+    for name, expected in (("default", Settings()), ("paper", PAPER)):
+        config = compose_train(f"refinement={name}", script="reconstruct")
+        assert instantiate(config.refinement) == expected
 
 
 @pytest.mark.slow
@@ -92,8 +101,9 @@ def test_trains_a_step_at_a_tiny_size(choice):
 )
 def test_first_comment_is_the_command(path):
     comments = [line for line in path.read_text().splitlines()[:2] if line.startswith("# ")]
-    scripts = {"report": "report.py", "benchmark": "benchmark.py"}
-    script = scripts.get(path.stem, "train.py")
+    scripts = {name: f"{name}.py" for name in ("report", "benchmark", "evaluate", "reconstruct")}
+    scripts["refinement"] = "reconstruct.py"  # a folder
+    script = scripts.get(path.stem, scripts.get(path.parent.stem, "train.py"))
     assert any(f"python {script}" in comment for comment in comments)
 
 

@@ -136,6 +136,18 @@ def test_what_is_undone_looks_the_same_from_the_data_set_s_cameras(make_scene, d
     torch.testing.assert_close(after.depth * frame.scale, before.depth, atol=1e-8, rtol=1e-8)
 
 
+def test_what_is_brought_back_is_where_it_was(make_scene, pair):
+    gaussians, _ = make_scene(count=40, dtype=torch.float64)
+    frame = normalise(*pair)[2]
+    back = frame.bring(frame.undo(gaussians))
+    assert not torch.allclose(frame.undo(gaussians).means, gaussians.means, atol=1)
+    for name in ("means", "scales", "sh"):
+        torch.testing.assert_close(getattr(back, name), getattr(gaussians, name))
+    # q and -q are one rotation.
+    turns = [one.quats[:, :, None] * one.quats[:, None] for one in (back, gaussians)]
+    torch.testing.assert_close(*turns)
+
+
 def test_undone_gaussians_keep_their_type(make_scene, pair):
     gaussians, _ = make_scene(dtype=torch.float32)
     undone = normalise(*pair)[2].undo(gaussians).validate()

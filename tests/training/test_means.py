@@ -5,7 +5,7 @@ import math
 import pytest
 from hydra import compose, initialize_config_dir
 
-from asysplat.training.callbacks.metrics import average
+from asysplat.evaluation.rows import average
 from asysplat.training.runs import config_hash
 
 

@@ -1,10 +1,9 @@
 """Measure every validation and test image, and the baselines that need no training."""
 
-import csv
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning
 import torch
@@ -13,11 +12,11 @@ from torch import Tensor
 from asysplat.evaluation import baselines
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.measured_cost import CostMeter
-from asysplat.evaluation.protocol import BACKBONES, Protocol
+from asysplat.evaluation.protocol import Protocol
+from asysplat.evaluation.rows import ImageRow, average, write_csv
 from asysplat.scene import Views
 from asysplat.training.outcome import Outcome
 
-ImageRow = dict[str, str | float]
 IMAGE = ("set", "scene", "view")  # the columns that say which image a row is of
 Measure = Callable[[Tensor, Views], dict[str, Tensor]]
 
@@ -49,11 +48,8 @@ class Metrics(lightning.Callback):
             return
         self.lpips = load_lpips(self.protocol.lpips_net, self.backbone_dir, self.download)
         if self.lpips is None and trainer.is_global_zero:
-            warnings.warn(
-                f"{BACKBONES[self.protocol.lpips_net]} is neither in torch's hub cache nor in "
-                "paths.weights: the run goes on without LPIPS; paths.download=true fetches it.",
-                stacklevel=1,  # Lightning calls this, and its own warnings are not shown
-            )
+            # Lightning calls this, and its own warnings are not shown.
+            warnings.warn(self.protocol.without_lpips(), stacklevel=1)
 
     def measure(self, rendered: Tensor, targets: Views) -> dict[str, Tensor]:
         """Compute the image metrics, each [B, V]."""
@@ -136,32 +132,3 @@ def gather(trainer: lightning.Trainer, rows: list[ImageRow]) -> list[ImageRow]:
     # Scenes given to two processes, so that all have equally many, count once.
     images = {tuple(row[key] for key in IMAGE): row for part in per_process for row in part}
     return list(images.values())
-
-
-def average(rows: Sequence[ImageRow], over: Literal["images", "scenes"]) -> dict[str, float]:
-    """Average every numeric column over the images that have it; NaN is left out.
-
-    Args:
-        rows: of one test set.
-        over: "images": all alike, or "scenes": each scene's images first, then the scenes.
-    """
-    if over == "scenes":
-        scenes: dict[str | float, list[ImageRow]] = {}
-        for row in rows:
-            scenes.setdefault(row["scene"], []).append(row)
-        rows = [average(images, "images") for images in scenes.values()]
-    columns: dict[str, list[float]] = {}
-    for row in rows:
-        for name, value in row.items():
-            if name not in IMAGE:
-                columns.setdefault(name, []).append(value)
-    return {name: torch.tensor(values).nanmean().item() for name, values in columns.items()}
-
-
-def write_csv(path: Path, rows: list[ImageRow]) -> None:
-    """Write a line for each image; a scene without depths leaves those columns empty."""
-    with path.open("w", newline="") as file:
-        columns = dict.fromkeys(name for row in rows for name in row)
-        writer = csv.DictWriter(file, fieldnames=list(columns))
-        writer.writeheader()
-        writer.writerows(rows)

@@ -1,0 +1,151 @@
+"""A model or a file of Gaussians, before and after the paper's post-optimisation.
+
+python evaluate.py run=last
+"""
+
+import os
+import sys
+import warnings
+from pathlib import Path
+
+import hydra
+import lightning
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from torch import nn
+
+from asysplat.data import SceneDataModule
+from asysplat.errors import InputError, input_error_behind
+from asysplat.evaluation.lpips import load_lpips
+from asysplat.evaluation.post_optimisation import HOW, PostOptimisation, Predict
+from asysplat.evaluation.rows import write_csv
+from asysplat.evaluation.scene_results import image_rows, scene_rows, set_results
+from asysplat.evaluation.scenes import measure_scenes
+from asysplat.export import read_gaussians
+from asysplat.overrides import exit_at_unknown_overrides
+from asysplat.rendering import render
+from asysplat.scene import Gaussians, Views
+from asysplat.training.checkpoints import load_weights
+from asysplat.training.quiet import quiet_lightning
+from asysplat.training.runs import EVALUATION
+from asysplat.training.subject import find_subject
+from asysplat.training.summary import print_evaluation, write_json
+
+
+@hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
+def main(options: DictConfig) -> None:
+    try:
+        evaluate(options)
+    except KeyboardInterrupt:
+        sys.exit("stopped; the same command goes on with the scenes that are missing.")
+    except Exception as error:
+        mistake = input_error_behind(error)
+        if mistake is None:
+            raise
+        sys.exit(f"error: {mistake}")
+
+
+def evaluate(options: DictConfig) -> None:
+    """Measure every scene that was not measured yet; write and print what all give together."""
+    quiet_lightning()
+    subject = find_subject(options, HydraConfig.get().overrides.task)
+    config = subject.config
+    lightning.seed_everything(config.seed, workers=True, verbose=False)
+    fabric = make_fabric(config.trainer)
+    measure = make_measure(config, options, fabric.device)
+    data = instantiate(config.data)
+    data.setup()
+    data.check_sizes(measure.protocol.check_size)
+    if options.scene is None:
+        predict = network(config, data, fabric)
+    else:
+        predict = gaussians_of_file(options.scene, data, fabric.device)
+
+    tests = data.tests if options.scene is None else {data.name: data.tests[data.name]}
+    scenes = measure_scenes(tests, predict, measure, fabric.device, subject.folder, subject.kept)
+    sentences = {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
+    how = {"evaluation/post_optimisation": HOW}
+    if options.run is None:  # which has one
+        OmegaConf.save(options, subject.folder / "config.yaml", resolve=True)
+    results = subject.described | sentences | how | set_results(scenes, measure.protocol.mean_over)
+    write_csv(subject.folder / "evaluation.csv", image_rows(scenes))
+    write_csv(subject.folder / "evaluation_scenes.csv", scene_rows(scenes))
+    write_json(subject.folder / EVALUATION, results)
+    print_evaluation(results, list(scenes), subject.folder)
+
+
+def make_fabric(trainer: DictConfig) -> lightning.Fabric:
+    """Choose the device and the precision of a prediction, as train.py's test does.
+
+    Raises:
+        InputError: there is no such device or precision.
+    """
+    try:
+        return lightning.Fabric(
+            accelerator=trainer.accelerator, devices=1, precision=trainer.precision
+        )
+    except (ValueError, MisconfigurationException) as error:
+        raise InputError(f"trainer: {error}") from error
+
+
+def make_measure(config: DictConfig, options: DictConfig, device: torch.device) -> PostOptimisation:
+    """Build what measures a scene; without LPIPS, and a warning, where its backbone is missing."""
+    protocol = instantiate(config.metrics)
+    paths = options.paths
+    lpips = load_lpips(protocol.lpips_net, Path(paths.weights), paths.download)
+    if lpips is None:
+        warnings.warn(protocol.without_lpips(), stacklevel=1)
+    else:
+        lpips.to(device)
+    steps = tuple(options.steps) if isinstance(options.steps, ListConfig) else (options.steps,)
+    colour = config.training.background
+    background = None if colour == "inputs" else torch.tensor(colour, device=device)
+    return PostOptimisation(steps, protocol, lpips, background)
+
+
+def network(config: DictConfig, data: SceneDataModule, fabric: lightning.Fabric) -> Predict:
+    """Build the model and load its weights."""
+    net = instantiate(config.model)
+    data.check_sizes(net.check_size)
+    load_weights(config.init_path, nn.ModuleDict({"net": net}))  # as a checkpoint names them
+    net.to(fabric.device).eval()
+    print(f"model: {net.describe()}")
+
+    def predict(inputs: Views) -> Gaussians:
+        with torch.no_grad(), fabric.autocast():
+            return net(Views.stack([inputs])).map(lambda tensor: tensor[0].float())
+
+    return predict
+
+
+def gaussians_of_file(path: str, data: SceneDataModule, device: torch.device) -> Predict:
+    """Read the Gaussians of the data's one scene.
+
+    Raises:
+        InputError: the file cannot be used, there are several scenes, or none of the Gaussians is
+            seen in them.
+    """
+    scenes = data.tests[data.name]
+    if len(scenes) != 1:
+        raise InputError(
+            f"scene={path} is one scene, and the data has {len(scenes)} to test: name the folder "
+            "of that scene as data.root."
+        )
+    sample = scenes[0]
+    gaussians = sample["frame"].bring(read_gaussians(path)).to(device)
+    if not render(gaussians, sample["inputs"].cameras.to(device), depth=False).alpha.any():
+        raise InputError(
+            f"scene={path} has {gaussians.num_gaussians} Gaussians, and the input views of "
+            f"{sample['scene']} see none of them: name the file of that scene, in the world and "
+            "the units of its cameras."
+        )
+    return lambda inputs: gaussians
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
+    exit_at_unknown_overrides("evaluate")
+    main()

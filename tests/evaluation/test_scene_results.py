@@ -1,0 +1,71 @@
+"""Results of scenes: kept and read again, and put together for each set."""
+
+import pytest
+
+from asysplat.evaluation.post_optimisation import SceneResult
+from asysplat.evaluation.scene_results import (
+    image_rows,
+    keep_scene,
+    kept_scene,
+    scene_rows,
+    set_results,
+)
+
+
+def result(scene, psnrs, seconds):
+    """A scene with a target for each PSNR, and an input that is 1 dB better."""
+    rows = []
+    for source, gain in (("post0", 0.0), ("post3", 2.0)):
+        for view, psnr in enumerate(psnrs):
+            rows.append({"images": "targets", "view": view, "source": source, "psnr": psnr + gain})
+        rows.append({"images": "inputs", "view": 0, "source": source, "psnr": psnrs[0] + gain + 1})
+    rows.append({"images": "targets", "view": 0, "source": "mean_colour", "psnr": 5.0})
+    costs = {
+        "post0": {"seconds": seconds, "gb": 1.0},
+        "post3": {"seconds": 2 * seconds, "gb": seconds},
+    }
+    return SceneResult(scene, 100, costs, rows)
+
+
+SCENES = {
+    "main": [result("a", [10.0, 20.0], 1.0), result("b", [30.0], 3.0), result("c", [40.0], 9.0)],
+    "other": [result("d", [50.0], 4.0)],
+}
+
+
+def test_a_scene_is_read_as_it_was_kept(tmp_path):
+    path = tmp_path / "main-0.json"
+    assert kept_scene(path) is None
+    keep_scene(path, SCENES["main"][0])
+    assert kept_scene(path) == SCENES["main"][0]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_numbers_of_a_set():
+    found = set_results(SCENES, "images")
+    assert found["test/main/post0/psnr"] == pytest.approx(25)
+    assert found["test/main/post3/psnr"] == pytest.approx(27)
+    assert found["inputs/main/post3/psnr"] == pytest.approx((13 + 33 + 43) / 3)
+    assert found["baseline/main/mean_colour/psnr"] == 5
+    # The longest of three does not count, as the one that may have compiled.
+    assert (found["cost/post0/seconds"], found["cost/post3/seconds"]) == (2, 4)
+    assert (found["cost/post3/gb"], found["cost/gaussians"]) == (9, 100)
+    assert found["test/other/post3/psnr"] == 52 and found["cost/other/post3/seconds"] == 8
+    assert set_results(SCENES, "scenes")["test/main/post0/psnr"] == pytest.approx(85 / 3)
+
+
+def test_rows_of_images_and_of_scenes():
+    assert len(image_rows(SCENES)) == 4 * 2 * 2 + 2 + 4
+    rows = {(row["scene"], row["source"]): row for row in scene_rows(SCENES)}
+    assert len(rows) == 4 * 3
+    assert rows["a", "post3"] == {
+        "set": "main",
+        "scene": "a",
+        "source": "post3",
+        "gaussians": 100,
+        "seconds": 2.0,
+        "gb": 1.0,
+        "inputs/psnr": 13.0,
+        "psnr": 17.0,
+    }
+    assert "seconds" not in rows["a", "mean_colour"]

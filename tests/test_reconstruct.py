@@ -1,0 +1,345 @@
+"""The script: what it hands over, and what it says when it cannot, on tiny made-up photographs."""
+
+import csv
+import json
+import math
+import os
+import random
+import signal
+import struct
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+import yaml
+from full_disk import largest_file
+from safetensors import safe_open
+from safetensors.torch import save_file
+from scipy.spatial.transform import Rotation
+
+from asysplat import read_gaussians, render, write_gaussians
+from asysplat.data import ProceduralScene, open_scene
+from asysplat.data.write import write_transforms
+
+SIZE = 48
+LAYOUTS = Path(__file__).parent / "data" / "readers"  # writers of them
+TINY = (f"height={SIZE}", "steps=60", "refinement.most=3000", "views=12", "init=sweep")
+TINY += ("video.seconds=0.2", "paths.weights=none")
+FILES = {"scene.ply", "scene.safetensors", "path.mp4", "contact.png", "start.png"}
+FILES |= {"metrics.json", "metrics.csv", "config.yaml"}
+
+
+@pytest.fixture(scope="session")
+def views():
+    scene = ProceduralScene(seed=7, height=SIZE, width=SIZE, num_frames=16)
+    return scene.views(range(scene.num_frames))
+
+
+@pytest.fixture(scope="session")
+def photographs(views, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photographs") / "scene"
+    write_transforms(views, folder)
+    return folder
+
+
+@pytest.fixture
+def command(run_script, tmp_path):
+    """The script in this process, tiny where nothing else is said; its folder is tmp_path/run."""
+
+    def run(path, *overrides):
+        keys = [override.split("=")[0] for override in overrides]
+        tiny = [option for option in TINY if option.split("=")[0] not in keys]
+        words = [] if path is None else [path]
+        return run_script("reconstruct.py", *words, *overrides, *tiny, f"paths.run={folder}")
+
+    folder = tmp_path / "run"
+    return run
+
+
+def finished(result):
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def numbers_of(folder):
+    return json.loads((folder / "metrics.json").read_text())
+
+
+@pytest.mark.slow
+def test_it_hands_over_what_is_promised(command, photographs, tmp_path):
+    said = finished(command(photographs))
+    folder = tmp_path / "run"
+    assert {path.name for path in folder.iterdir()} == FILES
+    numbers = numbers_of(folder)
+    for baseline in ("nearest_view", "mean_colour"):
+        assert numbers["held_back/psnr"] > numbers[f"baseline/{baseline}/psnr"] + 1
+        assert numbers["held_back/ssim"] > numbers[f"baseline/{baseline}/ssim"]
+    assert numbers["held_back/absrel"] < 0.2 < 0.8 < numbers["held_back/delta1"]
+    assert numbers["steps"] == 60 and numbers["gaussians"] <= 3000
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["set"] for row in rows] == ["inputs"] * 12 + ["held_back"] * 2
+    assert [Path(row["file"]).stem for row in rows[12:]] == ["00000", "00008"]
+    for name in ("inputs", "held_back"):
+        values = [float(row["psnr"]) for row in rows if row["set"] == name]
+        assert sum(values) / len(values) == pytest.approx(numbers[f"{name}/psnr"], abs=1e-4)
+    assert yaml.safe_load((folder / "config.yaml").read_text())["path"] == str(photographs)
+    for name in ("start.png", "contact.png"):
+        assert cv2.imread(str(folder / name)).std() > 20
+    assert cv2.VideoCapture(str(folder / "path.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 6
+    assert "held back" in said and f"scene: {folder / 'scene.ply'}" in said.replace("\n", "")
+    ply, tensors = (read_gaussians(folder / f"scene.{suffix}") for suffix in ("ply", "safetensors"))
+    assert ply.num_gaussians == tensors.num_gaussians == numbers["gaussians"]
+    torch.testing.assert_close(ply.means, tensors.means)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e3])
+def test_the_scene_stands_in_the_world_of_the_files(command, views, tmp_path, unit):
+    poses = views.cameras.cam_to_world.double()
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = torch.tensor(Rotation.from_euler("xyz", (0.4, -1.1, 2.0)).as_matrix())
+    turn[:3, 3] = torch.tensor([3.0, -2.0, 5.0])
+    poses = turn @ poses
+    poses[:, :3, 3] *= unit
+    cameras = replace(views.cameras, cam_to_world=poses.float())
+    write_transforms(replace(views, cameras=cameras, depths=None), tmp_path / "photographs")
+    finished(command(tmp_path / "photographs"))
+    folder = tmp_path / "run"
+    gaussians = read_gaussians(folder / "scene.ply")
+    with safe_open(folder / "scene.safetensors", "pt") as file:
+        background = torch.tensor([float(x) for x in file.metadata()["background"].split()])
+    with (folder / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    seen = open_scene(tmp_path / "photographs", SIZE, SIZE)
+    seen = seen.views([int(Path(row["file"]).stem) for row in rows])
+    images = render(gaussians, seen.cameras, background).image.clamp(0, 1)
+    psnr = -10 * (images - seen.images).square().mean((1, 2, 3)).log10()
+    assert psnr.min() > 20
+    expected = torch.tensor([float(row["psnr"]) for row in rows])
+    torch.testing.assert_close(psnr, expected, atol=0.01, rtol=0)
+
+
+@pytest.mark.slow
+def test_the_same_steps_and_seed_give_the_same_bytes(run_script, photographs, tmp_path):
+    def scene(name, *overrides):
+        options = [*TINY, "steps=20", "held_back=null", "video.path=none", *overrides]
+        options = [*dict((option.split("=")[0], option) for option in options).values()]
+        folder = tmp_path / name
+        finished(run_script("reconstruct.py", photographs, f"paths.run={folder}", *options))
+        return (folder / "scene.ply").read_bytes()
+
+    first = scene("first")
+    assert scene("second") == first
+    assert scene("third", "seed=1") != first
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("init", ["network", "depth", "points", "file"])
+def test_what_it_starts_from(command, views, photographs, tmp_path, monkeypatch, init):
+    folder = tmp_path / "run"
+    if init == "points":
+        monkeypatch.syspath_prepend(LAYOUTS)
+        photographs = import_module("layouts.colmap").write(views, tmp_path / "colmap")
+    elif init == "file":
+        finished(command(photographs))
+        init = (folder / "scene.ply").rename(tmp_path / "a first scene.ply")
+        before = numbers_of(folder)
+    said = finished(command(photographs, f"init='{init}'", "steps=40"))
+    assert f"init={init}" in said
+    after = numbers_of(folder)
+    if init == "points":  # a few, at the rims of the photographs
+        assert after["inputs/psnr"] > after["baseline/mean_colour/psnr"]
+    elif Path(init).suffix:  # goes on where the other was
+        assert after["held_back/psnr"] > before["held_back/psnr"] - 0.5
+    else:
+        assert after["held_back/psnr"] > after["baseline/nearest_view/psnr"] + 1
+
+
+@pytest.mark.slow
+def test_where_there_is_no_network_it_starts_from_the_sweep(command, photographs, tmp_path):
+    overrides = ("views=4", "checkpoint=absent.safetensors", "steps=2")
+    said = finished(command(photographs, "init=null", *overrides))
+    assert "absent.safetensors does not exist" in said and "by init=sweep" in said
+    asked = command(photographs, "init=network", *overrides)
+    assert asked.returncode == 1 and "absent.safetensors does not exist" in asked.stderr
+
+
+@pytest.mark.slow
+def test_paths_with_spaces_quotes_and_equal_signs(command, photographs, tmp_path, monkeypatch):
+    for name in ("it's \"a\" \\'scene\\", "a=b, [c]"):
+        (tmp_path / name).symlink_to(photographs)
+        said = finished(command(tmp_path / name, "views=3", "steps=1", "video.path=none"))
+        config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+        assert config["path"] == str(tmp_path / name) and "views=3" not in said
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["scene"], ["path='scene'"]),
+        (["scene", "seconds=5", "--view"], ["path='scene'", "seconds=5", "view=true"]),
+        (["--view", "scene"], ["path='scene'", "view=true"]),
+        (["path=scene", "view=true"], ["path=scene", "view=true"]),
+        (["--cfg", "job"], ["--cfg", "job"]),
+        ([], []),
+    ],
+)
+def test_words_of_the_command(repository, monkeypatch, words, expected):
+    monkeypatch.syspath_prepend(repository)
+    on_interrupt = signal.getsignal(signal.SIGINT)
+    assert import_module("reconstruct").as_overrides(words) == expected
+    signal.signal(signal.SIGINT, on_interrupt)
+
+
+REFUSED = {
+    "no path": ([], "no photographs: python reconstruct.py my_scene"),
+    "an unknown option": (["heigth=9"], "heigth is unknown: did you mean height?"),
+    "an unknown init": (["init=swep"], "init=swep: choose network, sweep, points, depth, or a"),
+    "no such file": (["init=absent.ply"], "absent.ply"),
+    "no points": (["init=points"], "has no sparse points; choose sweep"),
+    "no time": (["steps=null", "seconds=null"], "seconds=None: give a number above 0"),
+    "zero seconds": (["steps=null", "seconds=0"], "seconds=0: give a number above 0"),
+    "seconds below zero": (["steps=null", "seconds=-3"], "seconds=-3: give a number above 0"),
+    "words for seconds": (["steps=null", "seconds=long"], "seconds=long: give a number above 0"),
+    "zero steps": (["steps=0"], "steps=0: give a number above 0"),
+    "half a step": (["steps=0.5"], "steps=0.5: give a number above 0"),
+    "a video of nothing": (["video.path=spiral"], "video.path=spiral: choose own, orbit or none"),
+    "no pixels": (["height=0"], "height=0, width=None"),
+    "a setting out of range": (["refinement.until=2.5"], "refinement.until=2.5: give 0 to 1"),
+    "no such photographs": (["path=absent"], "absent does not exist: name a scene"),
+}
+
+
+def check_refusal(result, message):
+    assert result.returncode == 1
+    assert message in result.stderr and "Traceback" not in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_mistakes_are_one_sentence(command, photographs, tmp_path, case):
+    overrides, message = REFUSED[case]
+    own = case == "no path" or any(override.startswith("path=") for override in overrides)
+    check_refusal(command(None if own else photographs, *overrides), message)
+    assert not list(tmp_path.rglob("scene.*"))
+
+
+def test_too_few_photographs(command, views, tmp_path):
+    write_transforms(views.select([0, 5]), tmp_path / "two")
+    check_refusal(command(tmp_path / "two"), "has 2 photographs, of which held_back=8 leaves 1")
+
+
+@pytest.mark.parametrize("case", ["nan", "none"])
+def test_files_of_gaussians_that_cannot_be_used(command, photographs, make_scene, tmp_path, case):
+    file = tmp_path / f"{case}.ply"
+    write_gaussians(file, make_scene(count=2)[0])
+    head, end, numbers = file.read_bytes().partition(b"end_header\n")
+    if case == "nan":
+        file.write_bytes(head + end + struct.pack("<f", math.nan) + numbers[4:])
+    else:
+        file.write_bytes(head.replace(b"vertex 2", b"vertex 0") + end)
+    check_refusal(command(photographs, f"init={file}"), str(file))
+
+
+def test_a_checkpoint_of_another_model(command, photographs, tmp_path):
+    file = tmp_path / "other.safetensors"
+    save_file({"net.layer": torch.zeros(2)}, file)
+    result = command(photographs, "init=network", f"checkpoint={file}")
+    check_refusal(result, f"{file} does not fit this model, ")
+    assert result.stderr.count(" there and ") == 5 and ", ...; give the options" in result.stderr
+
+
+@pytest.mark.slow
+def test_cameras_that_see_nothing_in_common(command, views, tmp_path):
+    poses = views.cameras.cam_to_world.clone()
+    poses[:, :3, 3] += 100 * torch.arange(len(poses))[:, None]
+    apart = replace(views, cameras=replace(views.cameras, cam_to_world=poses), depths=None)
+    write_transforms(apart, tmp_path / "apart")
+    assert "warning: " in finished(command(tmp_path / "apart", "steps=5"))
+
+
+def test_logs_that_cannot_be_written(command, photographs, tmp_path):
+    (tmp_path / "run").write_text("a file")
+    check_refusal(command(photographs), str(tmp_path / "run"))
+
+
+@pytest.mark.slow
+def test_a_full_disk_leaves_the_old_scene(command, photographs, tmp_path):
+    overrides = ("views=3", "steps=2", "video.path=none", "refinement.most=6000")
+    finished(command(photographs, *overrides))
+    file = tmp_path / "run" / "scene.ply"
+    before = file.read_bytes()
+    with largest_file(len(before) // 2):
+        result = command(photographs, "seed=1", *overrides)
+    check_refusal(result, "cannot be written (File too large)")
+    assert file.read_bytes() == before
+
+
+@pytest.fixture
+def process(repository, photographs, tmp_path):
+    """The script in an interpreter of its own, which takes SIGINT as in a terminal."""
+
+    tiny = [f"paths.run={tmp_path / 'run'}", *TINY[:1], *TINY[2:]]
+
+    def start(*overrides):
+        return subprocess.Popen(
+            [sys.executable, "reconstruct.py", photographs, *overrides, *tiny],
+            cwd=repository,
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+
+    started = []
+    yield lambda *overrides: started.append(start(*overrides)) or started[-1]
+    for one in started:
+        one.kill()
+        one.wait()
+
+
+@pytest.mark.slow
+def test_interrupted_at_any_moment_there_is_a_whole_file_or_none(process, tmp_path):
+    clock = time.monotonic()
+    said, _ = (running := process("seconds=2")).communicate(timeout=200)
+    assert running.returncode == 0, said
+    lasts, moments = time.monotonic() - clock, random.Random(0)
+    for number in 5 * (signal.SIGINT, signal.SIGTERM):
+        running = process("seconds=2", f"seed={moments.randrange(1000)}")
+        time.sleep(moments.uniform(0.1, 1.0) * lasts)
+        running.send_signal(number)
+        _, errors = running.communicate(timeout=200)
+        assert "Traceback" not in errors and running.returncode in (0, 1, -number), errors
+        for name in ("scene.ply", "scene.safetensors"):
+            file = tmp_path / "run" / name
+            if file.exists():
+                assert read_gaussians(file).num_gaussians > 0
+                file.unlink()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1, 2])
+def test_the_first_interruption_hands_over_and_the_second_stops(process, tmp_path, times):
+    running = process("seconds=600")
+    while not running.stdout.readline().startswith("picture:"):
+        assert running.poll() is None, running.stderr.read()
+    time.sleep(2)
+    running.send_signal(signal.SIGINT)
+    assert running.stderr.readline().startswith("stopping after this step")
+    if times == 2:
+        running.send_signal(signal.SIGINT)
+    _, errors = running.communicate(timeout=60)
+    file = tmp_path / "run" / "scene.ply"
+    if times == 1:
+        assert running.returncode == 0 and read_gaussians(file).num_gaussians > 0, errors
+    else:
+        assert running.returncode == 1 and errors.endswith("stopped.\n"), errors
+        assert not list((tmp_path / "run").glob(".*"))

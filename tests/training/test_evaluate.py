@@ -1,0 +1,233 @@
+"""The script evaluate.py: a run, a checkpoint, a file; going on; the report; what it refuses."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from conftest import TINY_SCENES, make_train
+from hydra import initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from tiny import SIZE, VIEWS
+from tiny import STEPS as TRAINING
+
+from asysplat.data.procedural import ProceduralScene
+from asysplat.data.write import write_transforms
+from asysplat.evaluation import scenes
+from asysplat.export import write_gaussians
+from asysplat.report.fill import fill_table, finished_runs
+from asysplat.report.paper import load_paper
+from asysplat.scene import Views
+from asysplat.training.checkpoints import load_weights
+
+pytestmark = pytest.mark.slow
+
+STEPS = "steps=[0,3,10]"
+MODEL = ["model=asysplat_4m4s", "metrics=longlrm", *SIZE]  # of Table 2
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, run_script, repository) -> Path:
+    """The folder of a finished run of the model of Table 2."""
+    train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
+    result = train(*MODEL, "model.layers=4m4s", "~callbacks.pictures", "~callbacks.curve")
+    assert result.returncode == 0, result.stderr
+    return Path(result.stdout.strip().splitlines()[-1].removeprefix("run: "))
+
+
+@pytest.fixture
+def evaluate(tmp_path, run_script):
+    """Runs evaluate.py with overrides; new folders go below tmp_path."""
+    return lambda *overrides: run_script("evaluate.py", *overrides, f"paths.logs={tmp_path}")
+
+
+def outcome(result) -> tuple[Path, dict]:
+    """The folder that the script prints last, and its evaluation.json."""
+    assert result.returncode == 0, result.stderr
+    label, folder = result.stdout.strip().splitlines()[-1].split(": ", 1)
+    assert label == "evaluation"
+    return Path(folder), json.loads((Path(folder) / "evaluation.json").read_text())
+
+
+def qualities(results: dict) -> dict:
+    return {k: v for k, v in results.items() if k.split("/")[0] in ("test", "inputs", "baseline")}
+
+
+@pytest.fixture(scope="module")
+def evaluated(whole, run_script) -> dict:
+    """The run's evaluation."""
+    folder, results = outcome(run_script("evaluate.py", f"run={whole}", STEPS))
+    assert folder == whole
+    return results
+
+
+def test_a_run_has_its_evaluation_beside_its_results(whole, evaluated):
+    own = json.loads((whole / "metrics.json").read_text())
+    for name in ("procedural", "rooms", "outdoors"):
+        for metric in ("psnr", "ssim", "absrel"):
+            after = evaluated[f"test/{name}/post0/{metric}"]
+            assert after == pytest.approx(own[f"test/{name}/{metric}"], abs=1e-4)
+        inputs = [evaluated[f"inputs/{name}/post{steps}/psnr"] for steps in (0, 3, 10)]
+        assert inputs == sorted(set(inputs))
+    shared = own.keys() & evaluated.keys()
+    assert {"cost/gaussians", "baseline/rooms/nearest_view/psnr"} <= shared
+    for key in shared:
+        assert evaluated[key] == (
+            own[key] if isinstance(own[key], str) else pytest.approx(own[key], abs=1e-4)
+        )
+    assert evaluated["cost/post0/seconds"] < evaluated["cost/post10/seconds"]
+    assert {"post0", "post10"} == {
+        path.stem.partition("-")[2] for path in (whole / "pictures").glob("evaluation-*.png")
+    }
+
+
+def test_files_have_every_image_and_every_scene(whole, evaluated):
+    with (whole / "evaluation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    of_set = [row for row in rows if row["set"] == "rooms" and row["source"] == "post3"]
+    # 2 scenes of 2 targets and 3 inputs.
+    assert [sum(r["images"] == images for r in of_set) for images in ("targets", "inputs")] == [
+        4,
+        6,
+    ]
+    mean = sum(float(row["psnr"]) for row in of_set if row["images"] == "targets") / 4
+    assert mean == pytest.approx(evaluated["test/rooms/post3/psnr"], abs=1e-4)
+    with (whole / "evaluation_scenes.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 3 * 2 * (3 + 2)
+
+
+def test_the_report_has_rows_with_post_optimisation(whole, evaluated, repository):
+    tiny = [*SIZE, *VIEWS, *TINY_SCENES, *TRAINING]
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        filled = fill_table(
+            load_paper()["state_of_the_art"],
+            tiny,
+            lambda overrides: hydra.compose("train", list(overrides), return_hydra_config=True),
+            finished_runs(whole.parents[1]),
+        )
+    rows = {r.paper.post_optimisation: r for r in filled.rows if r.name.startswith("AsySplat")}
+    for steps in (3, 10):
+        values = rows[steps].values
+        assert values["dl3dv/psnr"] == [evaluated[f"test/procedural/post{steps}/psnr"]]
+        assert values["mipnerf360/psnr"] == [evaluated[f"test/outdoors/post{steps}/psnr"]]
+        assert values["inference_seconds"] == [evaluated[f"cost/post{steps}/seconds"]]
+    assert "evaluate.py" in rows[28].note and not rows[28].values
+
+
+def test_a_checkpoint_by_path_has_the_numbers_of_its_run(whole, evaluated, evaluate, tmp_path):
+    weights = whole / "checkpoints" / "last.ckpt"
+    options = [*MODEL, *VIEWS, *TINY_SCENES, STEPS]
+    folder, results = outcome(evaluate(f"init_path={weights}", *options))
+    assert folder.parent == tmp_path / "evaluate" and (folder / "config.yaml").is_file()
+    assert qualities(results) == qualities(evaluated)
+
+
+def test_interrupted_it_goes_on_where_it_was(whole, evaluated, evaluate, tmp_path, monkeypatch):
+    weights = f"init_path={whole}/checkpoints/last.ckpt"
+    command = [weights, *MODEL, *VIEWS, *TINY_SCENES]
+    keep = scenes.keep_scene
+
+    def interrupted(path, result):
+        if path.name == "rooms-0.json":
+            raise KeyboardInterrupt
+        keep(path, result)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(scenes, "keep_scene", interrupted)
+        stopped = evaluate(*command, STEPS)
+    assert stopped.returncode != 0 and "the same command goes on" in stopped.stderr
+    assert not list(tmp_path.rglob("evaluation.json"))
+    kept = {path: path.read_bytes() for path in tmp_path.rglob("procedural-*.json")}
+    assert len(kept) == 2
+    measured = []
+    monkeypatch.setattr(scenes, "keep_scene", lambda p, r: (measured.append(p.stem), keep(p, r)))
+    _, results = outcome(evaluate(*command, STEPS))
+    assert measured == ["rooms-0", "rooms-1", "outdoors-0", "outdoors-1"]
+    assert {path: path.read_bytes() for path in kept} == kept
+    assert qualities(results) == qualities(evaluated)
+
+    # What is finished is read; another set of steps is another evaluation.
+    measured.clear()
+    outcome(evaluate(*command, STEPS))
+    assert measured == []
+    alone = "data.test_sets=null"
+    outcome(evaluate(*command, "steps=[0,2]", alone))
+    assert measured == ["procedural-0", "procedural-1"]
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory) -> Path:
+    """A folder with a scene on disk."""
+    folder = tmp_path_factory.mktemp("scene")
+    scene = ProceduralScene(3, 32, 32, num_frames=24)
+    write_transforms(scene.views(range(24)), folder)
+    return folder
+
+
+ON_DISK = ["data=files", "data.cache.folder=null", "data.window=[12,24]", "data.val_scenes=1"]
+
+
+def test_a_file_of_gaussians_in_the_worlds_units(whole, photographs, evaluate, tmp_path):
+    """What a network predicts, brought to the world and written, measures as the network does."""
+    data = [*ON_DISK, f"data.root={photographs}", *VIEWS, "steps=[0,2]"]
+    weights = whole / "checkpoints" / "last.ckpt"
+    folder, expected = outcome(evaluate(f"init_path={weights}", *MODEL, *data))
+    config = OmegaConf.load(folder / "config.yaml")
+    module = torch.nn.ModuleDict({"net": instantiate(config.model)})
+    load_weights(str(weights), module)
+    loaded = instantiate(config.data)
+    loaded.setup()
+    sample = loaded.tests["files"][0]
+    with torch.no_grad():
+        gaussians = module.net.eval()(Views.stack([sample["inputs"]])).map(lambda t: t[0])
+    path = tmp_path / "scene.ply"
+    write_gaussians(path, sample["frame"].undo(gaussians))
+    _, found = outcome(evaluate(f"scene={path}", "metrics=longlrm", *data))
+    assert qualities(found) == pytest.approx(qualities(expected), abs=0.01)
+
+    behind = replace(gaussians, means=gaussians.means - torch.tensor([0.0, 0.0, 1000.0]))
+    write_gaussians(path, sample["frame"].undo(behind))
+    assert "see none of them" in refusal(evaluate(f"scene={path}", *data))
+    synthetic = evaluate(f"scene={path}", *VIEWS, *TINY_SCENES)
+    assert "is one scene, and the data has 2" in refusal(synthetic)
+
+
+def refusal(result) -> str:
+    """The one sentence that the script says."""
+    assert result.returncode != 0 and "Traceback" not in result.stderr
+    (said,) = (line for line in result.stderr.splitlines() if line.startswith("error: "))
+    return said
+
+
+REFUSED = {
+    "nothing": ([], "nothing is given to evaluate: give one of"),
+    "two at once": (["run=last", "init_path=shipped"], "run and init_path is given"),
+    "no run": (["run=nowhere"], "run=nowhere has no metrics.json"),
+    "no runs": (["run=last"], "run=last found no finished run in"),
+    "no weights": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
+    "no file": (["scene=none.ply", "data.test_scenes=1"], "none.ply is no file"),
+    "no folder": (["init_path=shipped", "data=files"], "add data.root=..."),
+    "another model": (
+        ["init_path=shipped", "width=0.125"],
+        "asysplat_sweep.safetensors does not fit this model: net.",
+    ),
+    "steps that do not increase": (["init_path=shipped", "steps=[3,3]"], "above the one before"),
+    "a size out of range": (["init_path=shipped", "data.height=0"], "data.height=0: give a whole"),
+    "an unknown option": (["ryn=last"], "ryn is unknown"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_mistakes_are_one_clear_sentence(evaluate, case, tmp_path):
+    overrides, message = REFUSED[case]
+    assert message in refusal(evaluate(*overrides))
+    assert not list(tmp_path.rglob("evaluation*.*"))
+
+
+def test_a_run_is_measured_as_it_was_tested(whole, evaluate):
+    said = refusal(evaluate(f"run={whole}", "width=0.5"))
+    assert f"width does not go with run={whole}" in said and "last.ckpt" in said
