@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -44,7 +45,8 @@ def measure(options: DictConfig, console: Console) -> Result:
         InputError: an unknown option, or no scene is there.
     """
     wanted = options.reconstruct
-    settings = find_settings(options.refinement, wanted.variants)
+    variants = OmegaConf.to_container(wanted).get("variants") or {}
+    settings = find_settings(options.refinement, variants)
     check_budgets([*wanted.budgets, wanted.budget])
     check_names("reconstruct.inits", wanted.inits, INITS)
     network = load() if "network" in wanted.inits else None
@@ -75,7 +77,7 @@ def measure(options: DictConfig, console: Console) -> Result:
         "seed": SEED,
         "inits": list(wanted.inits),
         "budget": wanted.budget,
-        "variants": OmegaConf.to_container(wanted.variants),
+        "variants": variants,
         "scenes": scenes,
         "rows": rows,
     }
@@ -106,7 +108,7 @@ def measure_scene(
             yield {"init": init, "variant": name, "budget": budget} | row
 
 
-def find_settings(refinement: DictConfig, variants: DictConfig) -> dict[str, Settings]:
+def find_settings(refinement: DictConfig, variants: Mapping[str, Any]) -> dict[str, Settings]:
     """Return the settings of the whole refinement, called ALL, and of each variant.
 
     Args:
@@ -117,11 +119,11 @@ def find_settings(refinement: DictConfig, variants: DictConfig) -> dict[str, Set
         InputError: an unknown setting or one out of range.
     """
     found = {}
-    for name, different in ({ALL: {}} | dict(variants)).items():
+    for name, different in ({ALL: {}} | variants).items():
         try:
             found[name] = instantiate(OmegaConf.merge(refinement, different))
-        except (OmegaConfBaseException, InstantiationException) as error:
-            said = input_error_behind(error) or str(error).splitlines()[0]
+        except (OmegaConfBaseException, InstantiationException, ValueError) as error:
+            said = input_error_behind(error) or f"{different} are no settings of a refinement."
             raise InputError(f"reconstruct.variants.{name}: {said}") from None
     return found
 
