@@ -83,7 +83,7 @@ def limits_of(config: DictConfig) -> dict[str, float]:
     value, kinds = config[name], int if name == "steps" else int | float
     if not isinstance(value, kinds) or isinstance(value, bool) or not value > 0:
         raise InputError(f"{name}={value}: give a number above 0; steps go before seconds.")
-    return {name: value}
+    return {name: value if name == "steps" else float(value)}
 
 
 def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
