@@ -16,7 +16,7 @@ from rich.console import Console
 
 from asysplat.benchmark.machine import describe_machine
 from asysplat.benchmark.options import check_repeats, find_suite
-from asysplat.errors import InputError
+from asysplat.errors import input_error_behind
 from asysplat.overrides import exit_at_unknown_overrides
 
 
@@ -24,8 +24,11 @@ from asysplat.overrides import exit_at_unknown_overrides
 def main(options: DictConfig) -> None:
     try:
         benchmark(options)
-    except InputError as error:
-        sys.exit(f"error: {error}")
+    except Exception as error:
+        known = input_error_behind(error)
+        if known is None:
+            raise
+        sys.exit(f"error: {known}")
 
 
 def benchmark(options: DictConfig) -> None:

@@ -1,7 +1,7 @@
 """The pictures of all suites: time against error, bars, and metrics against seconds."""
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
+from itertools import count, cycle
 from typing import Any
 
 import matplotlib
@@ -103,7 +103,7 @@ def against_seconds(
     timed: dict[str, set[float]] = {}
     for name, rows in (item for panel in panels.values() for item in panel.items()):
         timed.setdefault(name, set()).update(row["budget"] for row in rows if row.get("budget"))
-    looks, colours = {}, cycle(matplotlib.colormaps["tab10"].colors)
+    looks, colours = {}, (f"C{number}" for number in count())  # matplotlib's own, in turns
     for (name, budgets), mark in zip(timed.items(), cycle(MARKS), strict=False):
         looks[name] = {"color": FAINT, "ls": "--"}  # of what has no budget at all
         if budgets:

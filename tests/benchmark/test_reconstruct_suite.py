@@ -76,6 +76,7 @@ def scene(shared_folder):
     return MeasuredScene(photographs, PROTOCOL, None)
 
 
+@pytest.mark.slow
 def test_rows_are_complete_and_consistent(measured):
     results, said = measured
     assert results["complete"] and results["variants"] == PARTS
@@ -156,6 +157,7 @@ def test_parts_are_compared_with_the_whole_scene_by_scene():
     assert other == {"variant": "other", "scenes": 0} | nothing
 
 
+@pytest.mark.slow
 def test_the_picture_has_curves_levels_and_marks(measured):
     results, _ = measured
     (axes,) = plot(results).axes  # LPIPS needs weights that are not here
@@ -209,7 +211,10 @@ MISTAKES = {
     "a budget of variants": ({"budget": "long"}, r"^reconstruct has the budget long: give"),
     "a scene": ({"scenes": ["ferns"]}, r"^reconstruct\.scenes=\['ferns'\]: none is a folder of .*"),
     "a setting": ({"variants": {"a": {"densfy": "none"}}}, r"variants\.a: .*densfy.* no settings"),
-    "a value": ({"variants": {"a": {"half_size": 2}}}, r"variants\.a: refinement\.half_size=2: "),
+    "a value": (
+        {"variants": {"a": {"half_size": 2.0}}},
+        r"variants\.a: refinement\.half_size=2\.0: ",
+    ),
     "no settings": ({"variants": {"a": 3}}, r"variants\.a: 3 are no settings of a refinement\."),
 }
 

@@ -70,7 +70,7 @@ class MeasuredScene:
         return gaussians, {"start": seconds} | self._measured(gaussians)
 
     def refined(
-        self, gaussians: Gaussians, settings: Settings, repeats: int, **limit: float
+        self, gaussians: Gaussians, settings: Settings, repeats: int, **limit: float | int
     ) -> Result:
         """Refine Gaussians, then measure them: no measurement takes of the refinement's time.
 

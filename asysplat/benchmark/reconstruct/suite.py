@@ -104,7 +104,7 @@ def measure_scene(
         if init == wanted.inits[0]:
             runs += [(name, wanted.budget) for name in settings if name != ALL]
         for name, budget in runs:
-            row = scene.refined(gaussians, settings[name], options.repeats, seconds=budget)
+            row = scene.refined(gaussians, settings[name], options.repeats, seconds=float(budget))
             yield {"init": init, "variant": name, "budget": budget} | row
 
 
