@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.errors import InputError, input_error_behind
 from asysplat.export.gaussians import read_gaussians
 from asysplat.export.results import Results
-from asysplat.export.watch import Watch
+from asysplat.export.watch import SIGNALS, Watch
 from asysplat.motion import moved
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.reconstruction import mean_colour, refine
@@ -31,7 +31,8 @@ from asysplat.training.load import load
 
 @hydra.main(config_path="conf", config_name="reconstruct", version_base="1.3")
 def main(config: DictConfig) -> None:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in SIGNALS:
+        signal.signal(number, signal.default_int_handler)
     try:
         reconstruct(config)
     except KeyboardInterrupt:
@@ -119,6 +120,7 @@ def as_overrides(words: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at which pycolmap prints a stack trace
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     sys.argv[1:] = as_overrides(sys.argv[1:])
     exit_at_unknown_overrides("reconstruct")

@@ -66,7 +66,7 @@ def _run_script(name: str, *overrides: str) -> subprocess.CompletedProcess:
         sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
 
     deterministic = torch.get_deterministic_debug_mode()
-    on_interrupt = signal.getsignal(signal.SIGINT)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     with (
         pytest.MonkeyPatch.context() as patch,
         mock.patch.dict(os.environ),
@@ -85,7 +85,8 @@ def _run_script(name: str, *overrides: str) -> subprocess.CompletedProcess:
         except SystemExit as end:
             status = end.code
     torch.set_deterministic_debug_mode(deterministic)
-    signal.signal(signal.SIGINT, on_interrupt)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
     if isinstance(status, str):
         print(status, file=err)
     code = status if isinstance(status, int) else int(status is not None)

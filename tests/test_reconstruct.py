@@ -328,16 +328,17 @@ def test_interrupted_at_any_moment_there_is_a_whole_file_or_none(process, tmp_pa
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("times", [1, 2])
-def test_the_first_interruption_hands_over_and_the_second_stops(process, tmp_path, times):
+def test_the_first_interruption_hands_over_and_the_second_stops(process, tmp_path, times, number):
     running = process("seconds=600")
     while not running.stdout.readline().startswith("picture:"):
         assert running.poll() is None, running.stderr.read()
     time.sleep(2)
-    running.send_signal(signal.SIGINT)
+    running.send_signal(number)
     assert running.stderr.readline().startswith("stopping after this step")
     if times == 2:
-        running.send_signal(signal.SIGINT)
+        running.send_signal(number)
     _, errors = running.communicate(timeout=60)
     file = tmp_path / "run" / "scene.ply"
     if times == 1:
