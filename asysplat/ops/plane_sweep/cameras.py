@@ -73,7 +73,7 @@ def choose_neighbours(
     focal = cameras.intrinsics[..., 0, 0] / cameras.width
     inverse = torch.cat((steps.new_zeros(1), steps)) * 2 / (largest * focal.mean(-1))[:, None]
     everyone = torch.arange(V, device=apart.device).expand(len(apart), V, V)
-    seen = _sees(projections, everyone, inverse[:, None].expand(-1, V, -1)).mean((-1, -2))
+    seen = _sees(projections, everyone, inverse[:, None].expand(-1, V, -1)).mean(-2)
     parallax = focal[:, :, None, None] * apart[..., None] * inverse[:, None, None]
     useful = (parallax / USEFUL_PARALLAX).clamp_max(1) / (1 + (parallax / WIDE_PARALLAX) ** 2)
     score = (seen * useful).sum(-1)
@@ -96,7 +96,7 @@ def inverse_depth_range(
     steps = torch.logspace(-2, 2, 97, base=10.0).to(distance)
     focal = cameras.intrinsics[..., 0, 0] / cameras.width
     inverse = steps / (distance.clamp_min(1e-12) * focal)[..., None]
-    share = _sees(projections, neighbours, inverse).amax(2).mean((-1, -2))
+    share = _sees(projections, neighbours, inverse).amax(2).mean(-2)
     enough = share >= LEAST_SHARE
     first = enough.int().argmax(-1, keepdim=True)
     last = enough.shape[-1] - 1 - enough.flip(-1).int().argmax(-1, keepdim=True)
@@ -136,8 +136,8 @@ def _farthest(cameras: Cameras, neighbours: Int[Tensor, "B V K"]) -> Float[Tenso
 
 def _sees(
     projections: Projections, others: Int[Tensor, "B V K"], inverse: Float[Tensor, "B V n"]
-) -> Float[Tensor, "B V K n s s"]:
-    """Return 1 for points of a view, at each of n inverse depths, that are within another view."""
+) -> Float[Tensor, "B V K p n"]:
+    """Return 1 for p points of a view, each at n inverse depths, that are within another view."""
     u, v, z = projections.into(others, SAMPLES, SAMPLES).to(inverse).unbind(-2)
     # Within are those for which all of these are positive; their depth is, too.
     sides = torch.stack((u, SAMPLES * z - u, v, SAMPLES * z - v), dim=-2)
@@ -148,5 +148,6 @@ def _sees(
     never = (away == 0) & (flat <= 0)
     least = torch.where(away > 0, bound, torch.where(never, torch.inf, -torch.inf)).amax(3)
     greatest = torch.where(away < 0, bound, torch.inf).amin(3)
-    inverse = inverse[:, :, None, :, None, None]
-    return ((inverse > least[:, :, :, None]) & (inverse < greatest[:, :, :, None])).to(inverse)
+    least, greatest = least.flatten(-2)[..., None], greatest.flatten(-2)[..., None]
+    inverse = inverse[:, :, None, None]
+    return ((inverse > least) & (inverse < greatest)).to(inverse)

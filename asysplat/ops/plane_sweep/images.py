@@ -3,6 +3,8 @@
 Sums of shifted maps: on a CPU, torch's pooling takes several times as long.
 """
 
+from functools import reduce
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -27,8 +29,8 @@ def shrink(
     down, right = H // height, W // width
     if down == right == 1:
         return images
-    rows = sum(images[..., k::down, :] for k in range(down))
-    return sum(rows[..., k::right] for k in range(right)) / (down * right)
+    rows = reduce(torch.add, (images[..., k::down, :] for k in range(down)))
+    return reduce(torch.add, (rows[..., k::right] for k in range(right))) / (down * right)
 
 
 def edges(images: Float[Tensor, "B V 3 h w"]) -> Float[Tensor, "B V 2 h w"]:

@@ -7,8 +7,6 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.ops.plane_sweep.reference import NOISE, patch_mean
-
 VECTOR = 16  # planes that a kernel for CPUs takes at once: LANES, which needs Numba
 
 
@@ -18,8 +16,6 @@ class MatchInputs(NamedTuple):
     Args:
         images: [n, H, W], less the mean of each.
         padded: the same, [n, H + 1, W + 1]: the last row and column are there twice.
-        means: [n, H, W], of patches.
-        scales: [n, H, W], 1 / standard deviation of patches.
         neighbours: [n, K], counted as n is; -1 for none.
         projections: [n, K, 3, 4].
         inverse: [n, planes and more, to whole vectors], inverse depths.
@@ -27,8 +23,6 @@ class MatchInputs(NamedTuple):
 
     images: Tensor
     padded: Tensor
-    means: Tensor
-    scales: Tensor
     neighbours: Tensor
     projections: Tensor
     inverse: Tensor
@@ -45,16 +39,12 @@ def prepare(
     device = images.device
     # Less its mean, an image's small variances are not lost beside large squares.
     flat = (images - images.mean((-1, -2), keepdim=True)).flatten(0, 1)
-    means = patch_mean(flat)
-    variances = (patch_mean(flat**2) - means**2).clamp_min(0)
     first = torch.arange(len(images), device=device)[:, None, None] * images.shape[1]
     steps = (ranges[..., 1:] - ranges[..., :1]) / (planes - 1)
     places = torch.arange(-(-planes // VECTOR) * VECTOR, device=device)
     return MatchInputs(
         images=flat.contiguous(),
         padded=F.pad(flat[:, None], (0, 1, 0, 1), mode="replicate")[:, 0].contiguous(),
-        means=means,
-        scales=(variances + NOISE).rsqrt(),
         neighbours=torch.where(neighbours >= 0, neighbours + first, -1).flatten(0, 1).contiguous(),
         projections=projections.flatten(0, 1).contiguous(),
         inverse=(ranges[..., :1] + places * steps).flatten(0, 1),

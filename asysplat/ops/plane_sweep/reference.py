@@ -1,5 +1,6 @@
 """The plane sweep's two kernels in torch, for any device and float type."""
 
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -114,8 +115,9 @@ def patch_mean(values: Float[Tensor, "*more H W"]) -> Float[Tensor, "*more H W"]
     """Return the mean over WINDOW x WINDOW pixels; beyond the border, its pixels go on."""
     H, W = values.shape[-2:]
     padded = F.pad(values.reshape(-1, 1, H, W), (WINDOW // 2,) * 4, mode="replicate")
-    rows = sum(padded[..., k : k + H, :] for k in range(WINDOW))
-    return (sum(rows[..., k : k + W] for k in range(WINDOW)) / WINDOW**2).reshape(values.shape)
+    rows = reduce(torch.add, (padded[..., k : k + H, :] for k in range(WINDOW)))
+    total = reduce(torch.add, (rows[..., k : k + W] for k in range(WINDOW)))
+    return (total / WINDOW**2).reshape(values.shape)
 
 
 def smooth(

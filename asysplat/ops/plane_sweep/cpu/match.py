@@ -29,17 +29,15 @@ from asysplat.ops.cpu.vectors import (
 )
 from asysplat.ops.plane_sweep import reference
 from asysplat.ops.plane_sweep.cameras import FRONT as LEAST_FRONT
+from asysplat.ops.plane_sweep.cpu.patches import AROUND, describe_row, variance
 from asysplat.ops.plane_sweep.inputs import MatchInputs, prepare
 from asysplat.ops.plane_sweep.reference import BEST, WINDOW
 
 assert BEST == 2 and WINDOW == 5  # the least cost and the one after; sums of five columns
-AROUND = WINDOW // 2
 KEPT = WINDOW + 1  # rows that two rows of patches take
 HALF = np.float32(0.5)
 FRONT = np.float32(LEAST_FRONT)
 UNSEEN = np.float32(reference.UNSEEN)
-COUNT = np.float32(WINDOW**2)  # pixels of a patch
-NOISE = np.float32(reference.NOISE * WINDOW**4)  # in the variance of sums
 INFINITY = np.float32(np.inf)
 
 
@@ -84,10 +82,14 @@ def match_planes(start, stop, inputs, stride, costs):
     spans = np.empty((K, H, 2), np.int64)
     # The least cost of each pixel of two rows, and the one after.
     first, second = np.empty((2, W, LANES), np.float32), np.empty((2, W, LANES), np.float32)
+    # Of the patches of these rows.
+    offsets, scales = np.empty((2, W), np.float32), np.empty((2, W), np.float32)
+    along = np.empty((2, W + WINDOW - 1), np.float32)
     sums = np.empty((w, LANES), np.float32)
     for block in range(start, stop):
         view, vector = block // vectors, block % vectors
         depth = load(inputs.inverse[view], vector)
+        image = inputs.images[view]
         number = 0
         for k in range(K):
             if inputs.neighbours[view, k] >= 0:
@@ -97,6 +99,7 @@ def match_planes(start, stop, inputs, stride, costs):
         for y in range(0, H, 2):
             # What fewer neighbours than two leave open is unseen.
             for row in range(2):
+                describe_row(offsets[row], scales[row], image, min(y + row, H - 1), along)
                 for x in range(W):
                     store(first[row], x, zeros() + (UNSEEN if number < 2 else INFINITY))
                     store(second[row], x, zeros() + (UNSEEN if number < 1 else INFINITY))
@@ -112,7 +115,8 @@ def match_planes(start, stop, inputs, stride, costs):
                     columns = range(max(begin - AROUND, 0), min(end + AROUND, W))
                     place = row % KEPT
                     _warp_row(warped[k, place], seen[k, place], other, matrix, row, depth, columns)
-                _compare_rows(first, second, inputs, view, y, warped[k], seen[k], spans[k])
+                patches = (image, offsets, scales)
+                _compare_rows(first, second, patches, y, warped[k], seen[k], spans[k])
             for row in range(y, min(y + 2, H)):
                 if row % stride == 0:
                     sums[:] = ZERO
@@ -179,13 +183,13 @@ def _warp_row(warped, seen, other, matrix, y, depth, columns):
 
 
 @inline
-def _compare_rows(first, second, inputs, view, y, warped, seen, spans):
+def _compare_rows(first, second, patches, y, warped, seen, spans):
     """Put the costs of a neighbour among the two least of each pixel of the rows y and y + 1.
 
     Both rows' patches have four rows in common. Past the last row, y stands in for y + 1.
     """
-    H, W = inputs.images.shape[1:]
-    image, means, scales = inputs.images[view], inputs.means[view], inputs.scales[view]
+    image, offsets, scales = patches
+    H, W = image.shape
     below = min(y + 1, H - 1)
     begin = min(spans[y, 0], spans[below, 0])
     end = max(begin, spans[y, 1], spans[below, 1])
@@ -209,10 +213,10 @@ def _compare_rows(first, second, inputs, view, y, warped, seen, spans):
         x = right - AROUND
         if x >= begin:
             sums = (_sum(a, upper[0]), _sum(b, upper[1]), _sum(c, upper[2]))
-            cost = where(seen[y % KEPT, x], _cost(sums, means[y, x], scales[y, x]), UNSEEN)
+            cost = where(seen[y % KEPT, x], _cost(sums, offsets[0, x], scales[0, x]), UNSEEN)
             _put(first[0], second[0], x, cost)
             sums = (_sum(d, lower[0]), _sum(e, lower[1]), _sum(f, lower[2]))
-            cost = _cost(sums, means[below, x], scales[below, x])
+            cost = _cost(sums, offsets[1, x], scales[1, x])
             _put(first[1], second[1], x, where(seen[below % KEPT, x], cost, UNSEEN))
         a, b, c = _go_on(a, upper[0]), _go_on(b, upper[1]), _go_on(c, upper[2])
         d, e, f = _go_on(d, lower[0]), _go_on(e, lower[1]), _go_on(f, lower[2])
@@ -237,11 +241,10 @@ def _sum(last, new):
 
 
 @inline
-def _cost(sums, mean, scale):
-    """Return 1 - the correlation, from the sums over a patch."""
+def _cost(sums, offset, scale):
+    """Return 1 - the correlation, from the sums over a patch; see `describe_row`."""
     total, square, both = sums
-    variance = max(fma(square, COUNT, ZERO - total * total), ZERO) + NOISE
-    return fma(fma(total, mean * scale, both * -scale), rsqrt(variance), ONE)
+    return fma(fma(total, offset, both * -scale), rsqrt(variance(total, square)), ONE)
 
 
 @inline

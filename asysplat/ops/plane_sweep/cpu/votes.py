@@ -33,13 +33,13 @@ class VoteInputs(NamedTuple):
 
     Args:
         maps: [n, h, w, 2], inverse depths and how far they are trusted.
-        half_steps: [n].
-        others: [n, K], counted as n is; -1 for none.
+        steps: [n].
+        others: [n, K], counted from a scene's first view; -1 for none.
         projections: [n, K, 3, 4].
     """
 
     maps: np.ndarray
-    half_steps: np.ndarray
+    steps: np.ndarray
     others: np.ndarray
     projections: np.ndarray
 
@@ -53,25 +53,25 @@ def count_votes(
 ) -> reference.Votes:
     """Count the votes in float32; see `reference.count_votes`."""
     B, V, h, w = inverse.shape
-    first = torch.arange(B)[:, None, None] * V
     inputs = VoteInputs(
         maps=torch.stack((inverse, trust), dim=-1).flatten(0, 1).numpy(),
-        half_steps=(steps / 2).flatten().numpy(),
-        others=torch.where(others >= 0, others + first, -1).flatten(0, 1).numpy(),
+        steps=steps.flatten().numpy(),
+        others=others.flatten(0, 1).contiguous().numpy(),
         projections=projections.flatten(0, 1).contiguous().numpy(),
     )
     found = reference.Votes(*(torch.empty(B, V, h, w) for _ in reference.Votes._fields))
     arrays = reference.Votes(*(votes.flatten(0, 1).numpy() for votes in found))
-    run_blocks(count_views, even_bounds(B * V), inputs, arrays)
+    run_blocks(count_views, even_bounds(B * V), inputs, V, arrays)
     return found
 
 
 @kernel
-def count_views(start, stop, inputs, votes):
+def count_views(start, stop, inputs, views, votes):
     """Write the votes on the views start to stop.
 
     Args:
         inputs: see `VoteInputs`.
+        views: of a scene.
         votes: of `reference.Votes`, each [n, h, w].
     """
     h, w = inputs.maps.shape[1:3]
@@ -86,9 +86,9 @@ def count_views(start, stop, inputs, votes):
                 column, depth = load_some(columns, x, count), load_some(own, x, count)
                 same, through, within = zeros(), zeros(), zeros()
                 for k in range(inputs.others.shape[1]):
-                    other = inputs.others[n, k]
-                    if other < 0:
+                    if inputs.others[n, k] < 0:
                         continue
+                    other = n // views * views + inputs.others[n, k]
                     m = inputs.projections[n, k]
                     z = fma(depth, m[2, 3], fma(column, m[2, 0], fma(m[2, 1], row, m[2, 2])))
                     scale = ONE / max(z, FRONT)
@@ -101,7 +101,7 @@ def count_views(start, stop, inputs, votes):
                     v = min(max(v, ZERO), bottom - ONE)
                     there, trust = gather_pairs(inputs.maps[other], v, u)
                     nearer = depth * scale - there
-                    tolerance = max(there * TOLERANCE, inputs.half_steps[other])
+                    tolerance = max(there * TOLERANCE, inputs.steps[other] * HALF)
                     weight = where(inside, trust, ZERO)
                     apart = max(nearer, ZERO - nearer)
                     same = same + where(less(tolerance, apart), ZERO, weight)

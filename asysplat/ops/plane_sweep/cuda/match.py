@@ -34,6 +34,8 @@ def match(
     B, V, H, W = images.shape
     h, w = H // stride, W // stride
     inputs = prepare(images, neighbours, projections, ranges, planes)
+    means = reference.patch_mean(inputs.images)
+    variances = (reference.patch_mean(inputs.images**2) - means**2).clamp_min(0)
     costs = images.new_zeros(B * V, h, w, planes)
     tile_planes = min(triton.next_power_of_2(planes), TILE)
     columns = min(triton.next_power_of_2(w), TILE // tile_planes)
@@ -41,6 +43,8 @@ def match(
     with torch.cuda.device_of(images):
         match_band[(tiles, -(-h // BAND), B * V)](
             *inputs,
+            means=means,
+            scales=(variances + reference.NOISE).rsqrt(),
             costs=costs,
             height=H,
             width=W,
@@ -60,11 +64,11 @@ def match(
 def match_band(
     images,
     padded,
-    means,
-    scales,
     neighbours,
     projections,
     inverse,
+    means,
+    scales,
     costs,
     height,
     width,
@@ -79,7 +83,8 @@ def match_band(
     """Add to zeros the costs [n, h, w, D] of COLUMNS x PLANES in BAND rows.
 
     Args:
-        images, padded, means, scales, neighbours, projections, inverse: see `MatchInputs`.
+        images, padded, neighbours, projections, inverse: see `MatchInputs`.
+        means, scales: [n, H, W], of patches, and 1 / their standard deviations.
     """
     view = tl.program_id(2).to(tl.int64)
     parts = tl.cdiv(planes, PLANES)
