@@ -95,9 +95,9 @@ class Watch:
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self.stopped = True
+        self._restore()  # before it is said: the next one may follow at once
         # print may be under way, and cannot be entered twice.
         os.write(STDERR, b"stopping after this step; once more, and nothing is kept\n")
-        self._restore()
 
     def _restore(self) -> None:
         for number, handler in self._before.items():

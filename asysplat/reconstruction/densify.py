@@ -42,8 +42,8 @@ def gaussians_where_wrong(
     count = min(count, int((error > 0).sum()))
     # As torch.multinomial does, which takes no more than 2^24 pixels: the least of exponential
     # times with these rates come first (Efraimidis and Spirakis 2006).
-    times = torch.empty_like(error).exponential_(generator=generator).clamp_min(1e-30)
-    chosen = (error / times).flatten().topk(count).indices
+    times = torch.empty(error.shape).exponential_(generator=generator).clamp_min(1e-30)
+    chosen = (error / times.to(error)).flatten().topk(count).indices
     cameras = views.cameras
     view = chosen // error[0].numel()
     directions = cameras.pixel_directions().flatten(0, 2)[chosen]

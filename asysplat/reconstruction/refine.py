@@ -27,6 +27,7 @@ from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
 LATE = 0.75  # of the time, since which a gain is measured
+PIXELS_EACH = 8  # of the photographs, at least, for each Gaussian: with fewer they learn noise
 VIEWS_A_ROUND = 8  # in which wrong pixels are looked for
 
 
@@ -118,7 +119,8 @@ class Refinement:
         self._half = half_size(views) if settings.half_size > 0 else views
         self._queue: list[int] = []
         self._steps = 0
-        self._last_seen = torch.zeros(len(self.fields), dtype=torch.long)
+        self._last_seen = views.images.new_zeros(len(self.fields), dtype=torch.long)
+        self._room = min(settings.most, views.images[:, 0].numel() // PIXELS_EACH)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -156,8 +158,8 @@ class Refinement:
         """
         settings = self.settings
         if settings.densify == "mcmc":
-            relocate(self.fields, settings.most, settings.growth, self._generator)
-            self._last_seen = torch.full((len(self.fields),), self._steps)
+            relocate(self.fields, self._room, settings.growth, self._generator)
+            self._last_seen = self._last_seen.new_full((len(self.fields),), self._steps)
             return
         views = self._half if share < settings.half_size else self.views
         opacities = self.fields.numbers["logits"].detach().sigmoid()
@@ -168,14 +170,14 @@ class Refinement:
         kept = torch.nonzero(useful)[:, 0]
         self.fields.keep(kept)
         self._last_seen = self._last_seen[kept]
-        count = min(settings.most - len(self.fields), int(settings.growth * len(self.fields)))
+        count = min(self._room - len(self.fields), int(settings.growth * len(self.fields)))
         if count > 0:
             order = torch.randperm(views.num_views, generator=self._generator)
             some = views.select(order[:VIEWS_A_ROUND])
             seen = look(self.gaussians, some, self.background)
             new = gaussians_where_wrong(some, *seen, count, self._generator)
             self.fields.append(new, self._units(new.means))
-            now = torch.full((new.num_gaussians,), self._steps)
+            now = self._last_seen.new_full((new.num_gaussians,), self._steps)
             self._last_seen = torch.cat((self._last_seen, now))
 
     def _gradients(
@@ -233,7 +235,7 @@ def refine(
     views: Views,
     settings: Settings = Settings(),  # noqa: B008
     *,
-    seconds: float | None = None,
+    seconds: float | int | None = None,
     steps: int | None = None,
     background: Float[Tensor, "3"] | None = None,
     seed: int = 0,
@@ -254,7 +256,8 @@ def refine(
     if (seconds is None) == (steps is None) or not (steps if seconds is None else seconds) > 0:
         raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")
     refinement = Refinement(gaussians, views, background, settings, seed)
-    _compile_kernels(gaussians, views, settings)
+    if seconds is not None:
+        _compile_kernels(gaussians, views, settings)
     gains = Gains(views.num_views)
     clock = time.perf_counter()
     total, step, rounds = float(seconds or steps), 0, 0

@@ -47,7 +47,8 @@ class Settings:
         half_size: share of the refinement that looks at photographs of half the size.
         densify: "error": new Gaussians where pixels are wrong; "mcmc": those of no use move to
             where others are (Kheradmand et al. 2024); "none".
-        most: Gaussians up to which densification adds more.
+        most: Gaussians up to which densification adds more, if all photographs together have 8
+            pixels for each.
         rounds: how often Gaussians are added and dropped, over the first `until` of the refinement.
         until: see `rounds`.
         growth: share of the Gaussians that a round adds, at most.

@@ -227,10 +227,18 @@ def test_no_more_than_most_and_growth(kind):
         counts.append(progress.gaussians)
         return False
 
-    settings = Settings(densify=kind, most=60, rounds=9, growth=0.25, until=1.0)
+    settings = Settings(densify=kind, most=40, rounds=9, growth=0.25, until=1.0)
     refine(small_scene(), small_views(), settings, steps=20, watch=watch)
-    assert counts[0] == 20 and max(counts) == 60
+    assert counts[0] == 20 and max(counts) == 40
     assert all(b <= 1.25 * a for a, b in pairwise(counts))
+
+
+@pytest.mark.parametrize("kind", ["error", "mcmc"])
+def test_small_photographs_have_room_for_few(kind):
+    """Two of 12 x 15 pixels: one Gaussian for 8 of them."""
+    settings = Settings(densify=kind, most=10**6, rounds=9, growth=0.25, until=1.0)
+    refined = refine(small_scene(), small_views(), settings, steps=20)
+    assert refined.num_gaussians == 2 * 12 * 15 // 8
 
 
 def test_rounds_and_their_time():

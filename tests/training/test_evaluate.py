@@ -213,7 +213,7 @@ REFUSED = {
     "no folder": (["init_path=shipped", "data=files"], "add data.root=..."),
     "another model": (
         ["init_path=shipped", "width=0.125"],
-        "asysplat_sweep.safetensors does not fit this model: net.",
+        "asysplat_sweep.safetensors does not fit this model, ",
     ),
     "steps that do not increase": (["init_path=shipped", "steps=[3,3]"], "above the one before"),
     "a size out of range": (["init_path=shipped", "data.height=0"], "data.height=0: give a whole"),
