@@ -145,8 +145,9 @@ def find_folders(wanted: DictConfig, say: Say) -> dict[str, Path]:
     """
     places = {name: Path(wanted.shared) / "data" / name for name in wanted.scenes}
     there = {name: place for name, place in places.items() if place.is_dir()}
-    for name in places.keys() - there.keys():
-        say(f"{name} is left out: {places[name]} is no folder.")
+    for name, place in places.items():
+        if name not in there:
+            say(f"{name} is left out: {place} is no folder.")
     if not there:
         raise InputError(
             f"reconstruct.scenes={list(wanted.scenes)}: none is a folder of "
