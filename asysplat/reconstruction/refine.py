@@ -17,6 +17,7 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.ops.image_loss import image_loss
+from asysplat.reconstruction.clone_split import Pulls
 from asysplat.reconstruction.corrections import Corrections, exposed, moved_cameras
 from asysplat.reconstruction.densify import LEAST_OPACITY, gaussians_where_wrong, look
 from asysplat.reconstruction.fields import Fields, Numbers
@@ -120,6 +121,7 @@ class Refinement:
         self._queue: list[int] = []
         self._steps = 0
         self._last_seen = views.images.new_zeros(len(self.fields), dtype=torch.long)
+        self._pulls = Pulls(self.fields) if settings.densify == "gradient" else None
         self._room = min(settings.most, views.images[:, 0].numel() // PIXELS_EACH)
 
     @property
@@ -140,6 +142,8 @@ class Refinement:
         error, gradients = 0.0, {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
         for view in chosen:
             mse, found = self._gradients(views.select([view]), view, leaves, factor)
+            if self._pulls is not None:
+                self._pulls.add(found[0], views.cameras.select([view]))
             for name, gradient in zip(leaves, found, strict=True):
                 gradients[name] = gradient if len(chosen) == 1 else gradients[name] + gradient
             error += mse / len(chosen)
@@ -157,10 +161,17 @@ class Refinement:
             share: of the refinement that has passed, in [0, 1].
         """
         settings = self.settings
+        if settings.densify == "error":
+            self._densify_where_wrong(share)
+            return
         if settings.densify == "mcmc":
             relocate(self.fields, self._room, settings.growth, self._generator)
-            self._last_seen = self._last_seen.new_full((len(self.fields),), self._steps)
-            return
+        elif self._pulls is not None:
+            self._pulls.clone_and_split(self._room, self._generator)
+        self._last_seen = self._last_seen.new_full((len(self.fields),), self._steps)
+
+    def _densify_where_wrong(self, share: float) -> None:
+        settings = self.settings
         views = self._half if share < settings.half_size else self.views
         opacities = self.fields.numbers["logits"].detach().sigmoid()
         # Seen by none of the photographs, all of which have come twice.
@@ -260,12 +271,14 @@ def refine(
         _compile_kernels(gaussians, views, settings)
     gains = Gains(views.num_views)
     clock = time.perf_counter()
-    total, step, rounds = float(seconds or steps), 0, 0
+    total, step, rounds, half = float(seconds or steps), 0, 0, True
     while True:
         passed = float(step) if seconds is None else time.perf_counter() - clock
         share = passed / total
         if share >= 1:
             return refinement.gaussians
+        if half and share >= settings.half_size:
+            half, gains = False, Gains(views.num_views)  # whole photographs are harder
         if settings.densify != "none" and share < settings.until:
             due = int(share / settings.until * (settings.rounds + 1))
             if due > rounds:
@@ -273,7 +286,7 @@ def refine(
                 rounds = due
         gains.add(passed, refinement.step(share))
         step += 1
-        before_cool_down = settings.half_size < LATE * share < LATE * (1 - settings.cool_down)
+        before_cool_down = not half and share < 1 - settings.cool_down
         if settings.pays > 0 and before_cool_down and gains.of_a_tenth() < settings.pays:
             total = passed / (1 - settings.cool_down)
         now = time.perf_counter() - clock

@@ -1,11 +1,11 @@
 """What a refinement may change, how fast, and when."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from asysplat.errors import InputError
 
-Densify = Literal["error", "mcmc", "none"]
+Densify = Literal["error", "mcmc", "gradient", "none"]
 Unit = Literal["pixel", "scene"]
 
 
@@ -46,7 +46,8 @@ class Settings:
         sh_degree: 0 to 3; None keeps that of the Gaussians. Higher degrees join one by one.
         half_size: share of the refinement that looks at photographs of half the size.
         densify: "error": new Gaussians where pixels are wrong; "mcmc": those of no use move to
-            where others are (Kheradmand et al. 2024); "none".
+            where others are (Kheradmand et al. 2024); "gradient": those whose images are pulled
+            are cloned or split (Kerbl et al. 2023); "none".
         most: Gaussians up to which densification adds more, if all photographs together have 8
             pixels for each.
         rounds: how often Gaussians are added and dropped, over the first `until` of the refinement.
@@ -80,8 +81,10 @@ class Settings:
         for name in shares:
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"refinement.{name}={getattr(self, name)}: give 0 to 1.")
-        if self.densify not in ("error", "mcmc", "none"):
-            raise InputError(f"refinement.densify={self.densify}: choose error, mcmc or none.")
+        if self.densify not in get_args(Densify):
+            raise InputError(
+                f"refinement.densify={self.densify}: choose {', '.join(get_args(Densify))}."
+            )
         if self.rates.unit not in ("pixel", "scene"):
             raise InputError(f"refinement.rates.unit={self.rates.unit}: choose pixel or scene.")
         if self.sh_degree not in (None, 0, 1, 2, 3):

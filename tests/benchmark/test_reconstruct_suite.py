@@ -25,6 +25,7 @@ MOST = 300  # Gaussians
 PROTOCOL = Protocol("test", False, "gaussian", "biased", "alex", "images", "none")
 BUDGETS = [0.01, 0.02]  # seconds: a step or some
 PARTS = {"none": {"densify": "none"}, "exposed": {"rates": {"exposure": 0.003}}}
+PARTS["elsewhere"] = {"init": "network", "densify": "none"}
 
 
 @pytest.fixture(scope="module")
@@ -91,11 +92,14 @@ def test_rows_are_complete_and_consistent(measured):
         ("all", "sweep", long),
         ("none", "sweep", short),
         ("exposed", "sweep", short),
+        ("start", "network", 0),
+        ("elsewhere", "network", short),
     ]
     assert "left out: init=points: " in said and "nowhere is left out: " in said
     for row in results["rows"]:
         assert row["scene"] == "room" and row["psnr"] > 5 and -1 < row["ssim"] < 1
-    start, *refined = results["rows"][2:]
+    refined = [row for row in results["rows"][2:] if row["variant"] != "start"]
+    start = results["rows"][2]
     assert start["gaussians"] <= MOST and start["start"] > 0
     for row in refined:
         assert row["steps"] >= 1 and row["gaussians"] <= MOST
@@ -103,7 +107,7 @@ def test_rows_are_complete_and_consistent(measured):
         assert row["seconds_a_step"] * row["steps"] >= row["budget"]
         ratio = row["step"]["median"] / row["renderer"]["median"]
         assert row["over_renderer"] == pytest.approx(ratio) and ratio > 1
-    assert [len(table.rows) for table in tables(results)] == [7, 5, 3]
+    assert [len(table.rows) for table in tables(results)] == [9, 7, 4]
 
 
 def test_a_row_is_what_a_refinement_of_so_many_steps_gives(scene):
@@ -133,6 +137,20 @@ def test_baselines_are_those_of_the_views_held_back(scene):
         [psnr(one.expand_as(targets.images), targets.images) for one in inputs.images]
     )
     assert every.amin(0).mean() < nearest["psnr"] < every.amax(0).mean() + 1e-4
+
+
+def test_a_goal_is_reached_at_the_first_look_that_is_as_good():
+    curve = [(1.0, 20.0), (1.5, 24.5), (2.0, 23.0), (3.0, 25.0)]
+    assert suite.seconds_to(24, 0.5, curve) == 2.0
+    assert suite.seconds_to(25.5, 0.5, curve) is None
+
+
+def test_looks_on_the_way_are_at_what_was_there_then(scene, monkeypatch):
+    monkeypatch.setattr("asysplat.benchmark.reconstruct.scene.FIRST_LOOK", 1e-4)
+    start, first = scene.start("sweep", MOST)
+    curve = scene.refined(start, Settings(most=MOST), 1, steps=12)["curve"]
+    assert len(curve) > 3 and [seconds for seconds, _ in curve] == sorted(s for s, _ in curve)
+    assert abs(curve[0][1] - first["psnr"]) < 1.5 and curve[0][1] != curve[-1][1]
 
 
 def row(scene, variant, budget=30, init="sweep", **metrics):
@@ -180,7 +198,7 @@ def test_what_was_measured_is_kept_when_it_is_stopped(make_options, monkeypatch,
         calls.append(limit)
         if len(calls) > finished:
             raise KeyboardInterrupt
-        numbers = {"psnr": 20.0, "gaussians": 3, "steps": 1, "seconds_a_step": 1.0}
+        numbers = {"psnr": 20.0, "gaussians": 3, "steps": 1, "seconds_a_step": 1.0, "curve": []}
         return numbers | {"renderer": {"median": 1.0, "iqr": 0.0}, "over_renderer": 1.0}
 
     monkeypatch.setattr(suite, "SIDE", SIDE)
@@ -215,6 +233,7 @@ MISTAKES = {
         {"variants": {"a": {"half_size": 2.0}}},
         r"variants\.a: refinement\.half_size=2\.0: ",
     ),
+    "another start": ({"variants": {"a": {"init": "dust"}}}, r"variants\.a\.init=dust is unknown"),
     "no settings": ({"variants": {"a": 3}}, r"variants\.a: 3 are no settings of a refinement\."),
 }
 

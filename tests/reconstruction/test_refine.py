@@ -19,7 +19,7 @@ from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 
 NAMES = [field.name for field in fields_of(Gaussians)]
-KINDS = ["error", "mcmc", "none"]
+KINDS = ["error", "mcmc", "gradient", "none"]
 
 
 def quality(gaussians, views):
@@ -56,7 +56,8 @@ def test_photographs_and_those_held_back_become_better(room, start, kind):
     assert quality(found, views) >= quality(start, views) + 4
     assert quality(found, held) >= quality(start, held) + 4
     more = found.num_gaussians - start.num_gaussians
-    assert {"error": 1000 <= more <= 1500, "mcmc": 0 < more <= 1500, "none": more == 0}[kind]
+    added = {"error": (1000, 1500), "mcmc": (1, 1500), "gradient": (1, 1500), "none": (0, 0)}
+    assert added[kind][0] <= more <= added[kind][1]
     assert found.sh.shape[1] == 4
 
 
@@ -411,7 +412,7 @@ def unchecked(kind, **options):
     {
         "half_size=1.5: give 0 to 1": {"half_size": 1.5},
         "growth=-0.1": {"growth": -0.1},
-        "densify=adc: choose error, mcmc or none": {"densify": "adc"},
+        "densify=adc: choose error, mcmc, gradient, none": {"densify": "adc"},
         "sh_degree=4: choose": {"sh_degree": 4},
         "unit=metre: choose pixel or scene": {"rates": unchecked(Rates, unit="metre")},
         "most=0, .*at least 1 Gaussian": {"most": 0},

@@ -22,6 +22,10 @@ from asysplat.scene import Gaussians, Views
 NEAREST = "nearest view"
 FOR_NOTHING = {NEAREST: nearest_view, "mean colour": mean_colour_images}
 SEED = 0
+FIRST_LOOK, LATER = (
+    1.0,
+    2**0.5,
+)  # seconds of refinement until the first look; so many times, the next
 CPU = torch.device("cpu")  # which refines
 
 
@@ -82,12 +86,16 @@ class MeasuredScene:
 
         Returns:
             "steps", "seconds_a_step" over the whole refinement, the number of Gaussians and the
-            metrics at its end; "step", "renderer" and "over_renderer", see `step_and_renderer`.
+            metrics at its end; "curve": seconds and PSNR on the way, which is measured later;
+            "step", "renderer" and "over_renderer", see `step_and_renderer`.
         """
         last: list[Progress] = []
+        looks: list[tuple[float, Gaussians]] = []
 
-        def watch(now: Progress, _: Refinement) -> bool:
+        def watch(now: Progress, refinement: Refinement) -> bool:
             last[:] = [now]
+            if now.seconds >= FIRST_LOOK * LATER ** len(looks):
+                looks.append((now.seconds, refinement.gaussians))
             return False
 
         inputs = self.photographs.inputs
@@ -102,12 +110,18 @@ class MeasuredScene:
         )
         (end,) = last
         found = {"steps": end.step, "seconds_a_step": end.seconds / end.step}
+        found["curve"] = [(seconds, self._psnr(then)) for seconds, then in looks]
         view = inputs.select([inputs.num_views // 2])
         return (
             found
             | self._measured(gaussians)
             | step_and_renderer(gaussians, view, settings, repeats)
         )
+
+    def _psnr(self, gaussians: Gaussians) -> float:
+        views = self.photographs.measured
+        found = measure_scene(gaussians, views, self._background, self._protocol, None)
+        return _means(found)["psnr"]
 
     def _measured(self, gaussians: Gaussians) -> Result:
         views = self.photographs.measured

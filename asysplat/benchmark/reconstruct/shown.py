@@ -34,6 +34,7 @@ def tables(results: Result) -> list[Table]:
     costs = {
         "Gaussians": number("gaussians", "{:,.0f}"),
         "start, s": number("start", "{:.1f}"),
+        f"s to\n{results['goal']:g} dB": number("to_goal", "{:.1f}"),
         "steps": number("steps", "{:,.0f}"),
         "ms / step": number("seconds_a_step", "{:.0f}", unit=1e-3),
         "renderer, ms": spread("renderer"),
@@ -67,7 +68,7 @@ def tables(results: Result) -> list[Table]:
 def compare_parts(results: Result) -> list[Result]:
     """Average the metrics of ALL over scenes, and those of each variant less those of ALL.
 
-    All have the variants' budget and start.
+    All have the variants' budget and first start.
     """
     runs: dict[str, dict[str, Result]] = {name: {} for name in (ALL, *results["variants"])}
     for row in results["rows"]:

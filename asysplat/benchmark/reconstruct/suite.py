@@ -1,6 +1,7 @@
 """Photographs held back, against the seconds of refinement: every start, and every part of it."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,8 @@ def measure(options: DictConfig, console: Console) -> Result:
 
     The whole refinement starts from each init and has each budget, a run of its own: what rates and
     sizes are follows the share of the budget. The variants start from the first init and have
-    `options.reconstruct.budget`. Ctrl-C ends the suite with what was measured so far.
+    `options.reconstruct.budget`, unless they name an `init` of their own. Ctrl-C ends the suite
+    with what was measured so far.
 
     Returns:
         "protocol": see `Protocol.sentences`; "complete": whether nothing was stopped; "scenes": the
@@ -46,10 +48,11 @@ def measure(options: DictConfig, console: Console) -> Result:
     """
     wanted = options.reconstruct
     variants = OmegaConf.to_container(wanted).get("variants") or {}
-    settings = find_settings(options.refinement, variants)
-    check_budgets([*wanted.budgets, wanted.budget])
     check_names("reconstruct.inits", wanted.inits, INITS)
-    network = load() if "network" in wanted.inits else None
+    runs = find_runs(options.refinement, variants, wanted.inits[0])
+    check_budgets([*wanted.budgets, wanted.budget])
+    inits = {*wanted.inits, *(run.init for run in runs.values())}
+    network = load() if "network" in inits else None
     protocol = instantiate(options.metrics)
     say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
     lpips = load_lpips(protocol.lpips_net, Path(wanted.shared) / "weights")
@@ -62,7 +65,7 @@ def measure(options: DictConfig, console: Console) -> Result:
             inputs, measured = photographs.inputs, photographs.measured
             scenes[name] = {"inputs": inputs.num_views, "measured": measured.num_views}
             scene = MeasuredScene(photographs, protocol, lpips)
-            for row in measure_scene(scene, settings, options, network, say):
+            for row in measure_scene(scene, runs, options, network, say):
                 rows.append({"scene": name} | row)
                 say(_line(rows[-1]))
         complete = True
@@ -77,54 +80,86 @@ def measure(options: DictConfig, console: Console) -> Result:
         "seed": SEED,
         "inits": list(wanted.inits),
         "budget": wanted.budget,
+        "goal": wanted.goal,
         "variants": variants,
         "scenes": scenes,
         "rows": rows,
     }
 
 
+@dataclass(frozen=True)
+class Run:
+    """What a refinement starts from, one of INITS, and its settings."""
+
+    init: str
+    settings: Settings
+
+
 def measure_scene(
     scene: MeasuredScene,
-    settings: Mapping[str, Settings],
+    runs: Mapping[str, Run],
     options: DictConfig,
     network: Network | None,
     say: Say,
 ) -> Iterator[Result]:
-    """Yield the rows of a scene; a start for which it lacks something is left out."""
+    """Yield the rows of a scene; a start for which it lacks something is left out.
+
+    Args:
+        scene: see `MeasuredScene`.
+        runs: ALL and the variants.
+        options: of the command.
+        network: of init=network.
+        say: is told what is left out.
+    """
     wanted = options.reconstruct
+    budgets = sorted({*wanted.budgets, wanted.budget})
     yield from scene.for_nothing()
-    for init in wanted.inits:
+    for init in dict.fromkeys([*wanted.inits, *(run.init for run in runs.values())]):
         try:
-            gaussians, row = scene.start(init, settings[ALL].most, network)
+            gaussians, row = scene.start(init, runs[ALL].settings.most, network)
         except InputError as error:
             say(f"left out: {error}")
             continue
         yield {"init": init, "variant": START, "budget": 0} | row
-        runs = [(ALL, budget) for budget in sorted({*wanted.budgets, wanted.budget})]
-        if init == wanted.inits[0]:
-            runs += [(name, wanted.budget) for name in settings if name != ALL]
-        for name, budget in runs:
-            row = scene.refined(gaussians, settings[name], options.repeats, seconds=float(budget))
-            yield {"init": init, "variant": name, "budget": budget} | row
+        planned = [(ALL, budget) for budget in budgets if init in wanted.inits]
+        planned += [
+            (name, wanted.budget) for name in runs if name != ALL and runs[name].init == init
+        ]
+        for name, budget in planned:
+            settings, seconds = runs[name].settings, float(budget)
+            found = scene.refined(gaussians, settings, options.repeats, seconds=seconds)
+            found["to_goal"] = seconds_to(wanted.goal, row["start"], found["curve"])
+            yield {"init": init, "variant": name, "budget": budget} | found
 
 
-def find_settings(refinement: DictConfig, variants: Mapping[str, Any]) -> dict[str, Settings]:
-    """Return the settings of the whole refinement, called ALL, and of each variant.
+def seconds_to(
+    goal: float | int, start: float, curve: Sequence[tuple[float, float]]
+) -> float | None:
+    """Return when the PSNR first was as high, with the seconds of the start; None if never."""
+    return next((start + seconds for seconds, psnr in curve if psnr >= goal), None)
+
+
+def find_runs(refinement: DictConfig, variants: Mapping[str, Any], init: str) -> dict[str, Run]:
+    """Return the runs: the whole refinement, called ALL, and each variant.
 
     Args:
         refinement: a file of conf/refinement.
-        variants: by name, what is different from it.
+        variants: by name, what is different from it, and `init`, where it starts, if elsewhere.
+        init: of the others.
 
     Raises:
-        InputError: an unknown setting or one out of range.
+        InputError: an unknown start or setting, or one out of range.
     """
     found = {}
     for name, different in ({ALL: {}} | variants).items():
         try:
-            found[name] = instantiate(OmegaConf.merge(refinement, different))
-        except (OmegaConfBaseException, InstantiationException, ValueError) as error:
+            parts = {**different}
+            start = parts.pop("init", init)
+            found[name] = Run(start, instantiate(OmegaConf.merge(refinement, parts)))
+        except (OmegaConfBaseException, InstantiationException, TypeError, ValueError) as error:
             said = input_error_behind(error) or f"{different} are no settings of a refinement."
             raise InputError(f"reconstruct.variants.{name}: {said}") from None
+        check_names(f"reconstruct.variants.{name}.init", [start], INITS)
     return found
 
 
