@@ -25,7 +25,7 @@ from asysplat.training.ranges import check_ranges
 from asysplat.training.revision import revision
 from asysplat.training.runs import Run, describe_run, find_run
 from asysplat.training.summary import print_summary, write_json
-from asysplat.training.tensorboard import log_choices, log_outcome, make_logger
+from asysplat.training.tensorboard import log_choices, log_outcome
 
 
 @hydra.main(config_path="conf", config_name="train", version_base="1.3")
@@ -95,8 +95,9 @@ def train(config: DictConfig) -> float | None:
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
     made = instantiate(config.get("callbacks") or {})
     callbacks = {name: callback for name, callback in made.items() if callback is not None}
-    logger = make_logger(folder)
-    log_choices(logger, config)
+    logger = instantiate(config.logger)
+    if logger is not None:
+        log_choices(logger, config)
     trainer = make_trainer(config, callbacks, logger)
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(module, data, verbose=False)
@@ -108,13 +109,14 @@ def train(config: DictConfig) -> float | None:
         results |= callbacks["metrics"].results
     if trainer.is_global_zero:
         write_json(folder / "metrics.json", results)
-        log_outcome(logger, results, data.name)
+        if logger is not None:
+            log_outcome(logger, results, data.name)
         print_summary(results, data.name, folder)
     return results.get(f"test/{data.name}/psnr")
 
 
 def make_trainer(
-    config: DictConfig, callbacks: dict[str, lightning.Callback], logger: Logger
+    config: DictConfig, callbacks: dict[str, lightning.Callback], logger: Logger | None
 ) -> lightning.Trainer:
     """Build Lightning's trainer.
 
@@ -125,7 +127,7 @@ def make_trainer(
         return instantiate(
             config.trainer,
             callbacks=list(callbacks.values()),
-            logger=logger,
+            logger=logger or False,
             # Otherwise Lightning adds its own in place of those that are left out.
             enable_checkpointing="checkpoints" in callbacks,
             enable_progress_bar="progress" in callbacks,

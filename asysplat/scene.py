@@ -181,6 +181,8 @@ class Views(TensorRecord):
         masks: [..., V, H, W], True where the pixel counts.
         point_depths: [..., V, H, W], as depths, of the scene's sparse points; 0 where there is
             none.
+        disparities: [..., V, H, W] estimated inverse depths, up to a scale and a shift of each
+            view; 0 where unknown.
     """
 
     cameras: Cameras
@@ -188,12 +190,13 @@ class Views(TensorRecord):
     depths: Float[Tensor, "*batch V H W"] | None = None
     masks: Bool[Tensor, "*batch V H W"] | None = None
     point_depths: Float[Tensor, "*batch V H W"] | None = None
+    disparities: Float[Tensor, "*batch V H W"] | None = None
 
     def __post_init__(self):
         batch = self.cameras.intrinsics.shape[:-2]
         size = (self.cameras.height, self.cameras.width)
         _check_exact("Views.images", self.images, (*batch, 3, *size))
-        for name in ("depths", "masks", "point_depths"):
+        for name in ("depths", "masks", "point_depths", "disparities"):
             if getattr(self, name) is not None:
                 _check_exact(f"Views.{name}", getattr(self, name), (*batch, *size))
 
@@ -215,6 +218,7 @@ class Views(TensorRecord):
             depths=pick(self.depths, -3),
             masks=pick(self.masks, -3),
             point_depths=pick(self.point_depths, -3),
+            disparities=pick(self.disparities, -3),
         )
 
     def masked(self, rendered: Float[Tensor, "*batch V 3 H W"]) -> Float[Tensor, "*batch V 3 H W"]:
@@ -236,15 +240,16 @@ class Views(TensorRecord):
             ((self.images >= 0) & (self.images <= 1)).all(-1).all(-1).all(-1),
             "has values outside [0, 1]: divide 8-bit images by 255",
         )
-        for field in ("depths", "point_depths"):
-            depths = getattr(self, field)
-            if depths is not None:
-                _check_finite(f"{name}.{field}", depths, 2)
+        distances = "distances along the camera's z axis"
+        meant = {"depths": distances, "point_depths": distances, "disparities": "inverse depths"}
+        for field, what in meant.items():
+            values = getattr(self, field)
+            if values is not None:
+                _check_finite(f"{name}.{field}", values, 2)
                 _check_all(
                     f"{name}.{field}",
-                    (depths >= 0).all(-1).all(-1),
-                    "has negative values: give distances along the camera's z axis, 0 where "
-                    "unknown",
+                    (values >= 0).all(-1).all(-1),
+                    f"has negative values: give {what}, 0 where unknown",
                 )
         return self
 

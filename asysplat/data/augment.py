@@ -121,4 +121,5 @@ def cropped(views: Views, share: float) -> Views:
         images=interpolate(images, (height, width), mode="bilinear"),
         depths=None if views.depths is None else views.depths[nearest],
         masks=None if views.masks is None else views.masks[nearest],
+        disparities=None if views.disparities is None else views.disparities[nearest],
     )

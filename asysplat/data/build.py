@@ -50,6 +50,7 @@ def files_data(
     layout: str = "auto",
     on_bad_frame: Policy = "fail",
     cache: ImageCache | None = None,
+    disparities: str | None = None,
     test_root: str | None = None,
     selection: str = "every_8th",
     index: str | None = None,
@@ -64,7 +65,13 @@ def files_data(
     root, layout, selection, index and size; one whose root is null is left out, with a warning.
     """
 
-    make_source = partial(FilesSource, window=window, on_bad_frame=on_bad_frame, cache=cache)
+    make_source = partial(
+        FilesSource,
+        window=window,
+        on_bad_frame=on_bad_frame,
+        cache=cache,
+        disparities=disparities,
+    )
     changeable = {
         "height": height,
         "width": width,

@@ -23,8 +23,10 @@ from asysplat.data.images import (
     load_photograph,
     resize_and_crop,
     resized_intrinsics,
+    same_proportions,
     undistort,
 )
+from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 
 Points = Float[ndarray, "P 3"]
@@ -66,6 +68,8 @@ class Photograph:
         cam_to_world: rigid, OpenCV axes.
         depth: one-channel integer image of distances along z, `depth_unit` scene units each.
         mask: image that is not 0 where the pixel counts.
+        disparity: one-channel integer image of inverse depths, up to a scale and a shift; 0 where
+            unknown.
     """
 
     image: ImageFile
@@ -74,6 +78,7 @@ class Photograph:
     depth: ImageFile | None = None
     depth_unit: float = 1.0
     mask: ImageFile | None = None
+    disparity: ImageFile | None = None
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ class PhotographCapture:
 
     Pixels are read when `views` asks for them: undistorted, resized until the shorter side fits,
     and cropped to the centre. If any photograph has a depth map, all views have depths (0 where
-    unknown); if any has a mask or a distorting lens, all have masks.
+    unknown), and likewise disparities; if any has a mask or a distorting lens, all have masks.
 
     Args:
         height, width: the size of every view, in pixels.
@@ -121,6 +126,7 @@ class PhotographCapture:
             width=width,
         )
         self._has_depths = any(photograph.depth for photograph in photographs)
+        self._has_disparities = any(photograph.disparity for photograph in photographs)
         self._has_masks = any(p.mask or p.lens.is_distorted for p in photographs)
 
     @property
@@ -139,11 +145,16 @@ class PhotographCapture:
             InputError: a file whose pixels are damaged.
         """
         chosen = [self.scene.photographs[frame] for frame in frames]
+
+        def stacked(there: bool, read: Callable[[Photograph], Tensor]) -> Tensor | None:
+            return torch.stack([read(photograph) for photograph in chosen]) if there else None
+
         return Views(
             cameras=self.cameras.select(frames),
-            images=torch.stack([self._image(p) for p in chosen]),
-            depths=torch.stack([self._depth(p) for p in chosen]) if self._has_depths else None,
-            masks=torch.stack([self._mask(p) for p in chosen]) if self._has_masks else None,
+            images=stacked(True, self._image),
+            depths=stacked(self._has_depths, self._depth),
+            masks=stacked(self._has_masks, self._mask),
+            disparities=stacked(self._has_disparities, self._disparity),
         )
 
     def without_damaged(self, bad: BadFrames) -> "PhotographCapture":
@@ -165,6 +176,25 @@ class PhotographCapture:
             return torch.zeros(self.cameras.height, self.cameras.width)
         stored = self._pixels(photograph.depth, load_depth, photograph.lens, nearest=True)
         return stored * photograph.depth_unit
+
+    def _disparity(self, photograph: Photograph) -> Float[Tensor, "H W"]:
+        if photograph.disparity is None:
+            return torch.zeros(self.cameras.height, self.cameras.width)
+        lens = photograph.lens
+
+        def load_disparity(file: ImageFile) -> ndarray:
+            stored = load_depth(file)
+            height, width = stored.shape
+            # Of a photograph that was since replaced by another.
+            if not same_proportions((width, height), (lens.width, lens.height)):
+                raise InputError(
+                    f"{file} is {width} x {height} and {photograph.image} {lens.width} x "
+                    f"{lens.height}: delete it, and estimate it again with python -m "
+                    "asysplat.data.disparity."
+                )
+            return stored
+
+        return self._pixels(photograph.disparity, load_disparity, lens, nearest=True)
 
     def _mask(self, photograph: Photograph) -> Bool[Tensor, "H W"]:
         lens = photograph.lens

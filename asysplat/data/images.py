@@ -78,6 +78,11 @@ def image_size(path: ImageFile) -> tuple[int, int]:
     return _read(path, _size_if_whole)
 
 
+def same_proportions(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Tell whether two (width, height) have the same proportions, to a pixel of `one`."""
+    return abs(one[0] * other[1] / other[0] - one[1]) <= 1
+
+
 def load_photograph(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
     """Read RGB in 0..255; transparent pixels are laid on white.
 

@@ -19,7 +19,7 @@ class SceneFolder(Sequence):
 
     Args:
         root: one scene, or a folder of scenes.
-        height, width, layout, on_bad_frame, cache: as `open_scene` takes them.
+        height, width, layout, on_bad_frame, cache, disparities: as `open_scene` takes them.
 
     Raises:
         InputError: no scene; and, when a scene is opened, files that cannot be used.
@@ -33,6 +33,7 @@ class SceneFolder(Sequence):
         layout: str = "auto",
         on_bad_frame: Policy = "fail",
         cache: ImageCache | None = None,
+        disparities: str | None = None,
     ):
         self.root = Path(root).absolute()
         self.layout, self.paths = find_scenes(root, layout)
@@ -42,6 +43,7 @@ class SceneFolder(Sequence):
             "layout": self.layout,
             "on_bad_frame": on_bad_frame,
             "cache": cache,
+            "disparities": disparities,
         }
         self._open: OrderedDict[int, PhotographCapture] = OrderedDict()
 

@@ -107,7 +107,7 @@ class FilesSource:
         root: one scene, or a folder of scenes.
         height, width: size of every view, in pixels.
         window: as for ProceduralSource.
-        layout, on_bad_frame, cache: as `open_scene` takes them.
+        layout, on_bad_frame, cache, disparities: as `open_scene` takes them.
         test_root: one scene, or a folder of scenes.
         selection: how the frames of a test are chosen: every_8th, kmeans (the paper's tests),
             first_96 (its ablations), uniform, or index.
@@ -130,6 +130,7 @@ class FilesSource:
         layout: str = "auto",
         on_bad_frame: Policy = "fail",
         cache: ImageCache | None = None,
+        disparities: str | None = None,
         test_root: str | None = None,
         selection: str = "every_8th",
         index: str | None = None,
@@ -138,7 +139,7 @@ class FilesSource:
     ):
         def scenes(option: str, folder: str) -> SceneFolder:
             try:
-                return SceneFolder(folder, height, width, layout, on_bad_frame, cache)
+                return SceneFolder(folder, height, width, layout, on_bad_frame, cache, disparities)
             except InputError as error:
                 raise InputError(f"data.{option}={folder}: {error}") from error
 

@@ -55,6 +55,13 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
     }
 
 
+def forward_flops(net: nn.Module, num_views: int, height: int, width: int) -> int:
+    """Count the `true_flops` of the forward pass of one scene, on the meta device."""
+    on_meta = copy.deepcopy(net).to("meta")
+    with torch.device("meta"), torch.no_grad():
+        return true_flops(lambda: on_meta(blank_views(num_views, height, width)))
+
+
 def activation_gb(net: nn.Module, num_views: int, height: int, width: int) -> float:
     """Count the memory that one scene's forward pass keeps for its backward, in 1e9 bytes.
 

@@ -1,7 +1,8 @@
 """The depth term of the loss (paper, Suppl. A), in two readings.
 
 The paper's "predicted disparity" is either rendered at the target views, or that of the Gaussians
-in the input views they are aligned with.
+in the input views they are aligned with. It is compared with a monocular network's where the data
+has that (`python -m asysplat.data.disparity`), else with the inverse of the data's depths.
 """
 
 import math
@@ -22,7 +23,7 @@ MIN_DEPTH = 1e-2  # smaller depths are raised to it, as in Long-LRM
 
 
 class RenderedDisparity:
-    """Compares the depth rendered at the target cameras with the targets' depths.
+    """Compares the depth rendered at the target cameras with the targets' disparities.
 
     This is the paper's formula, a mean over target views.
     """
@@ -30,19 +31,18 @@ class RenderedDisparity:
     renders_depth = True
 
     def __call__(self, outcome: Outcome, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
-        """Compute the term; None if the targets have no depths."""
-        rendering, targets = outcome.rendering, batch["targets"]
-        if targets.depths is None:
+        """Compute the term; None if the targets have neither disparities nor depths."""
+        rendering, known = outcome.rendering, known_disparities(batch["targets"])
+        if known is None:
             return None
         depth, alpha, target = (
-            maps[..., ::STRIDE, ::STRIDE]
-            for maps in (rendering.depth, rendering.alpha, targets.depths)
+            maps[..., ::STRIDE, ::STRIDE] for maps in (rendering.depth, rendering.alpha, known)
         )
         return disparity_distance(depth, target, (target > 0) & (alpha > MIN_ALPHA) & (depth > 0))
 
 
 class InputDisparity:
-    """Compares Gaussians, in the input views they are aligned with, with those views' depths.
+    """Compares Gaussians, in the input views they are aligned with, with those views' disparities.
 
     This is what Long-LRM's public code does (model/llrm.py). It also fits the paper's sentence
     "the scene geometry is modeled by pixel-aligned prediction".
@@ -51,21 +51,30 @@ class InputDisparity:
     renders_depth = False
 
     def __call__(self, outcome: Outcome, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
-        """Compute the term; None if the inputs have no depths.
+        """Compute the term; None if the inputs have neither disparities nor depths.
 
         Raises:
             InputError: the Gaussians are not a map for each input view, see `own_depths`.
         """
         inputs = batch["inputs"]
-        if inputs.depths is None:
+        known = known_disparities(inputs)
+        if known is None:
             return None
         depth = own_depths(outcome.gaussians, inputs)
         stride = inputs.cameras.height // depth.shape[-2]
-        target = inputs.depths[..., ::stride, ::stride]
+        target = known[..., ::stride, ::stride]
         valid = target > 0
         if inputs.masks is not None:
             valid = valid & inputs.masks[..., ::stride, ::stride]
         return disparity_distance(depth.clamp_min(MIN_DEPTH), target, valid)
+
+
+def known_disparities(views: Views) -> Float[Tensor, "*batch V H W"] | None:
+    """Return the views' disparities, else the inverse of their depths; 0 where unknown."""
+    if views.disparities is not None or views.depths is None:
+        return views.disparities
+    known = views.depths > 0
+    return torch.where(known, 1 / torch.where(known, views.depths, 1), 0)
 
 
 def own_depths(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "*batch V h w"]:
@@ -97,10 +106,15 @@ def disparity_distance(
     """Compute the mean over scenes of the mean SmoothL1 between normalised disparities.
 
     The inner mean is over a scene's valid pixels.
+
+    Args:
+        depth: as predicted.
+        target: disparities.
+        valid: where both are known.
     """
     found, expected = (
         normalised_disparity(maps.flatten(0, -3), valid.flatten(0, -3)).view_as(maps)
-        for maps in (depth, target)
+        for maps in (1 / torch.where(valid, depth, 1), target)
     )
     error = F.smooth_l1_loss(found, expected, reduction="none") * valid
     of_scene = (-3, -2, -1)
@@ -108,15 +122,15 @@ def disparity_distance(
 
 
 def normalised_disparity(
-    depth: Float[Tensor, "V H W"], valid: Bool[Tensor, "V H W"]
+    disparity: Float[Tensor, "V H W"], valid: Bool[Tensor, "V H W"]
 ) -> Float[Tensor, "V H W"]:
-    """Compute 1 / depth less its median, over its mean absolute deviation; 0 if not valid.
+    """Compute the disparity less its median, over its mean absolute deviation; 0 if not valid.
 
     The median and the deviation are those of each view's valid pixels.
     """
-    disparity = torch.where(valid, 1 / torch.where(valid, depth, 1), torch.nan).flatten(1)
-    median = disparity.nanmedian(dim=1, keepdim=True).values
-    centered = torch.where(valid.flatten(1), disparity - median.nan_to_num(), 0)
+    known = torch.where(valid, disparity, torch.nan).flatten(1)
+    median = known.nanmedian(dim=1, keepdim=True).values
+    centered = torch.where(valid.flatten(1), known - median.nan_to_num(), 0)
     count = valid.flatten(1).sum(1, keepdim=True).clamp_min(1)
     deviation = centered.abs().sum(1, keepdim=True) / count
-    return (centered / deviation.clamp_min(1e-6)).view_as(depth)
+    return (centered / deviation.clamp_min(1e-6)).view_as(disparity)

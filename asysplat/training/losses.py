@@ -15,14 +15,15 @@ from asysplat.training.perceptual import PerceptualDistance, vgg16
 
 
 class ReconstructionLoss(nn.Module):
-    """MSE + lambda_p perceptual + lambda_d normalised-disparity SmoothL1, and ours, 1 - SSIM.
+    """MSE + lambda_p perceptual + lambda_d normalised-disparity SmoothL1, and two more.
 
-    SSIM wants edges as the perceptual term does, at little cost and without weights to fetch.
+    Ours is 1 - SSIM, which wants edges as the perceptual term does, at little cost and without
+    weights to fetch; Long-LRM's the mean opacity, which wants Gaussians that do nothing gone.
 
     Args:
-        mse, perceptual, depth, ssim: weights of the terms; 0 turns a term off. The perceptual term
-            is also off if its network is not on this machine, the depth term if the data has no
-            depths; a warning says so once.
+        mse, perceptual, depth, ssim, opacity: weights of the terms; 0 turns a term off. The
+            perceptual term is also off if its network is not on this machine, the depth term if
+            the data has neither disparities nor depths; a warning says so once.
         perceptual_term, depth_term: constructors, called if the term's weight is not 0.
 
     Raises:
@@ -35,11 +36,13 @@ class ReconstructionLoss(nn.Module):
         perceptual: float,
         depth: float,
         ssim: float = 0.0,
+        opacity: float = 0.0,
         perceptual_term: Callable[[], PerceptualDistance | None] = vgg16,
         depth_term: Callable[[], RenderedDisparity | InputDisparity] = RenderedDisparity,
     ):
         super().__init__()
-        self.mse, self.perceptual, self.depth, self.ssim = mse, perceptual, depth, ssim
+        self.mse, self.perceptual, self.depth = mse, perceptual, depth
+        self.ssim, self.opacity = ssim, opacity
         distance = perceptual_term() if perceptual else None
         # A list hides the frozen network from checkpoints.
         self._perceptual_term = [] if distance is None else [distance]
@@ -72,6 +75,8 @@ class ReconstructionLoss(nn.Module):
             terms["ssim"] = 1 - ssim(image, targets.images).mean()
         for distance in self._perceptual_term:
             terms["perceptual"] = distance.to(image.device)(image, targets.images)
+        if self.opacity:
+            terms["opacity"] = outcome.gaussians.opacities.mean()
         if self._depth_term is not None:
             depth = self._depth_term(outcome, batch)
             if depth is not None:
@@ -79,7 +84,8 @@ class ReconstructionLoss(nn.Module):
             elif not self._warned_of_depth:
                 self._warned_of_depth = True
                 warnings.warn(
-                    "the data has no depths: training goes on without the depth term.",
+                    "the data has no depths: training goes on without the depth term; python -m "
+                    "asysplat.data.disparity estimates some.",
                     stacklevel=2,
                 )
         return {"loss": sum(getattr(self, name) * term for name, term in terms.items()), **terms}

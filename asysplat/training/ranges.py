@@ -30,7 +30,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         (
             *("steps", "validate_every", "state_size"),
             *("data.inputs", "data.targets", "data.height", "data.width", "data.batch_size"),
-            *("data.val_scenes", "data.test_scenes"),
+            *("data.val_scenes", "data.test_scenes", "callbacks.watch.every"),
         ),
     ),
     (
@@ -54,7 +54,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         (
             "training.optimizer.weight_decay",
             *("training.loss.mse", "training.loss.ssim"),
-            *("training.loss.perceptual", "training.loss.depth"),
+            *("training.loss.perceptual", "training.loss.depth", "training.loss.opacity"),
         ),
     ),
     (

@@ -16,6 +16,7 @@ from asysplat.models.network import Network
 from asysplat.rendering import render
 from asysplat.training.losses import ReconstructionLoss
 from asysplat.training.outcome import Outcome
+from asysplat.training.parts import Parts
 from asysplat.training.side_by_side import SideBySide
 
 
@@ -48,7 +49,8 @@ class Reconstruction(lightning.LightningModule):
         net.checkpoint_layers(checkpoint_layers)
         self.net, self.loss = net, loss
         self.optimizer, self.schedule = optimizer, schedule
-        self._side_by_side = SideBySide(net, self._terms)
+        self.parts = Parts()  # of a step, which a callback measures
+        self._side_by_side = SideBySide(net, self._terms, self.parts)
         fixed = None if background == "inputs" else torch.tensor(background)
         self.register_buffer("background", fixed, persistent=False)
 
@@ -62,10 +64,13 @@ class Reconstruction(lightning.LightningModule):
         return self._reconstruct(self.net, batch, depth)
 
     def _reconstruct(self, net: nn.Module, batch: dict[str, Any], depth: bool) -> Outcome:
-        gaussians = net(batch["inputs"])
-        targets = batch["targets"]
-        background = self.behind(batch)
-        rendering = render(gaussians, targets.cameras, background, depth=depth, masks=targets.masks)
+        with self.parts("network"), self.parts.of("prior", net.prior):
+            gaussians = net(batch["inputs"])
+        targets, background = batch["targets"], self.behind(batch)
+        with self.parts("rendering"):
+            rendering = render(
+                gaussians, targets.cameras, background, depth=depth, masks=targets.masks
+            )
         return Outcome(gaussians, rendering)
 
     def behind(self, batch: dict[str, Any]) -> Tensor:
@@ -93,7 +98,8 @@ class Reconstruction(lightning.LightningModule):
         outcome = self._reconstruct(net, batch, depth=self.loss.needs_depth)
         targets = batch["targets"]
         image = targets.masked(outcome.rendering.image.detach())
-        return {**self.loss(outcome, batch), "psnr": psnr(image, targets.images).mean()}
+        with self.parts("loss"):
+            return {**self.loss(outcome, batch), "psnr": psnr(image, targets.images).mean()}
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> Outcome:
         return self.reconstruct(batch, depth=True)

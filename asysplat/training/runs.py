@@ -22,9 +22,9 @@ RESULTS = "metrics.json"
 EVALUATION = "evaluation.json"  # added to a run by evaluate.py
 # Names, places on disk, callbacks, and keys that only other keys take their values from.
 NOT_HASHED = (
-    *("name", "ckpt_path", "rerun", "paths", "callbacks"),
+    *("name", "ckpt_path", "rerun", "paths", "callbacks", "logger"),
     *("stage", "stages", "selections", "more_inputs", "replica_size"),
-    *("data.root", "data.index", "data.cache", "data.test_sets"),
+    *("data.root", "data.index", "data.cache", "data.disparities", "data.test_sets"),
     *(f"training.loss.perceptual_term.{name}" for name in ("backbone_dir", "download")),
 )
 
@@ -61,7 +61,7 @@ def config_hash(config: DictConfig) -> str:
 
     Left out are:
 
-    - the seed, callbacks, the number of loader processes and the cache;
+    - the seed, callbacks, the logger, the number of loader processes and the cache;
     - places on disk: for the test root and a checkpoint to start from, only whether they are given
       counts; `data_of` names them;
     - further test sets, which do not change the numbers of the others; `data_of` names them too.

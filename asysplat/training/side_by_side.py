@@ -16,6 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from asysplat.training.parts import Parts
+
 Batch = dict[str, Any]
 Terms = dict[str, Tensor]
 
@@ -29,10 +31,16 @@ class SideBySide:
     Args:
         net: whose parameters are trained.
         compute: network, batch -> terms, "loss" among them.
+        parts: measures the backward pass of each scene.
     """
 
-    def __init__(self, net: nn.Module, compute: Callable[[nn.Module, Batch], Terms]):
-        self.net, self.compute = net, compute
+    def __init__(
+        self,
+        net: nn.Module,
+        compute: Callable[[nn.Module, Batch], Terms],
+        parts: Parts | None = None,
+    ):
+        self.net, self.compute, self.parts = net, compute, parts or Parts()
         self.copies: list[nn.Module] = []  # one a scene, with the parameters of `net`
 
     def __call__(self, batch: Batch) -> Terms:
@@ -52,7 +60,8 @@ class SideBySide:
         def differentiate(net: nn.Module, scene: Batch) -> tuple[Terms, tuple[Tensor, ...]]:
             with autocast():
                 terms = self.compute(net, scene)
-            grads = torch.autograd.grad(terms["loss"], parameters, materialize_grads=True)
+            with self.parts("backward"):
+                grads = torch.autograd.grad(terms["loss"], parameters, materialize_grads=True)
             return {name: term.detach() for name, term in terms.items()}, grads
 
         cores = torch.get_num_threads()

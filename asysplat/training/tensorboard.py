@@ -1,9 +1,9 @@
-"""TensorBoard: a first page of quality and training, and the hparams tab."""
+"""TensorBoard: a first page of quality, training and time, and the hparams tab."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
 CHOICES = (
@@ -24,8 +24,9 @@ CHOICES = (
     "training.loss.ssim",
     "training.loss.perceptual",
     "training.loss.depth",
+    "training.loss.opacity",
 )
-TERMS = ("mse", "ssim", "perceptual", "depth")
+TERMS = ("mse", "ssim", "perceptual", "depth", "opacity")
 HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
 
 PAGE = {
@@ -37,29 +38,34 @@ PAGE = {
     },
     "training": {
         "loss": ["Multiline", [f"train/{term}" for term in ("loss", *TERMS)]],
-        "gradient norm": ["Multiline", ["train/grad_norm"]],
+        "gradient norm": ["Multiline", ["train/grad_norm", "gradient/.*"]],
         "learning rate": ["Multiline", ["train/learning_rate"]],
+    },
+    "time": {
+        "share of a step": ["Multiline", ["time/share_.*"]],
+        "views a second": ["Multiline", ["time/views_per_second"]],
     },
 }
 
 
-def make_logger(folder: Path) -> TensorBoardLogger:
+def make_logger(folder: Path | str) -> TensorBoardLogger:
     """Make a logger whose "custom scalars" page shows quality first."""
     logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
     logger.experiment.add_custom_scalars(PAGE)
     return logger
 
 
-def log_choices(logger: TensorBoardLogger, config: DictConfig) -> None:
-    """Fill the hparams tab with options; its metrics must be named before they are known."""
+def log_choices(logger: Logger, config: DictConfig) -> None:
+    """Log options; for the hparams tab, metrics must be named before they are known."""
     choices = {key: OmegaConf.select(config, key) for key in CHOICES}
-    logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in HPARAMS_METRICS})
+    if isinstance(logger, TensorBoardLogger):
+        logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in HPARAMS_METRICS})
+    else:
+        logger.log_hyperparams(choices)
 
 
-def log_outcome(
-    logger: TensorBoardLogger, results: Mapping[str, str | int | float], data: str
-) -> None:
-    """Fill the hparams tab with the test's numbers."""
+def log_outcome(logger: Logger, results: Mapping[str, str | int | float], data: str) -> None:
+    """Log the test's numbers, for the hparams tab."""
     found = {f"hp/{name}": results.get(f"test/{data}/{name}") for name in HPARAMS_METRICS}
     logger.log_metrics({name: value for name, value in found.items() if value is not None})
     logger.save()

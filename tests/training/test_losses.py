@@ -1,6 +1,7 @@
 """Each term of the objective against its formula, and off where it has nothing to compare."""
 
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,7 +14,12 @@ from asysplat.errors import InputError
 from asysplat.rendering import Rendering
 from asysplat.scene import Cameras, Gaussians, Views
 from asysplat.training import InputDisparity, Outcome, ReconstructionLoss
-from asysplat.training.disparity import disparity_distance, normalised_disparity, own_depths
+from asysplat.training.disparity import (
+    disparity_distance,
+    known_disparities,
+    normalised_disparity,
+    own_depths,
+)
 from asysplat.training.perceptual import longlrm, vgg16
 
 MEAN = torch.tensor([0.485, 0.456, 0.406])[:, None, None]
@@ -58,16 +64,39 @@ def test_disparity_does_not_see_scale_and_shift():
     targets = pair()[1]["targets"]
     everywhere = torch.ones_like(targets.depths, dtype=torch.bool)
     other = 1 / (3 / targets.depths + 0.2)
-    assert disparity_distance(other, targets.depths, everywhere) < 1e-6
-    assert disparity_distance(targets.depths.flip(-1), targets.depths, everywhere) > 0.1
+    disparity = 1 / targets.depths
+    assert disparity_distance(other, disparity, everywhere) < 1e-6
+    assert disparity_distance(targets.depths.flip(-1), disparity, everywhere) > 0.1
 
 
 def test_normalised_disparity_by_hand():
-    depth = torch.tensor([[[1.0, 0.5], [0.25, 7.0]]])
+    disparity = torch.tensor([[[1.0, 2.0], [4.0, 7.0]]])
     valid = torch.tensor([[[True, True], [True, False]]])
     # Disparities 1, 2, 4: median 2, mean absolute deviation (1 + 0 + 2) / 3.
     expected = torch.tensor([[[-1.0, 0.0], [2.0, 0.0]]])
-    torch.testing.assert_close(normalised_disparity(depth, valid), expected)
+    torch.testing.assert_close(normalised_disparity(disparity, valid), expected)
+
+
+def test_disparities_come_before_depths():
+    views = pair()[1]["targets"]
+    views.depths[0, 0, 0] = 0
+    known = known_disparities(views)
+    assert known[0, 0, 0] == 0
+    torch.testing.assert_close(known[1], 1 / views.depths[1])
+    estimated = replace(views, disparities=torch.rand(2, 32, 32))
+    assert torch.equal(known_disparities(estimated), estimated.disparities)
+    assert known_disparities(replace(views, depths=None)) is None
+
+
+def test_opacity_is_a_term_and_off_by_default():
+    outcome, batch = pair()
+    gaussians = replace(outcome.gaussians, opacities=torch.rand(2048).requires_grad_())
+    outcome = Outcome(gaussians, outcome.rendering)
+    options = {"mse": 1.0, "perceptual": 0.0, "depth": 0.0}
+    terms = ReconstructionLoss(**options, opacity=0.1)(outcome, batch)
+    torch.testing.assert_close(terms["opacity"], gaussians.opacities.mean())
+    torch.testing.assert_close(terms["loss"], terms["mse"] + 0.1 * terms["opacity"])
+    assert "opacity" not in ReconstructionLoss(**options)(outcome, batch)
 
 
 # Disparities (1, 2, 4) against (1, 2, 3), normalised: (-1, 0, 2) against (-1.5, 0, 1.5), whose

@@ -31,7 +31,7 @@ def metrics(folder: Path) -> dict:
 def whole(tmp_path_factory, run_script, repository) -> Path:
     """The folder of a finished run of 6 steps."""
     train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
-    return run_folder(train("name=whole", "steps=6"))
+    return run_folder(train("name=whole", "steps=6", "callbacks.watch.every=2"))
 
 
 def test_a_run_leaves_what_is_promised(whole):
@@ -71,7 +71,7 @@ def test_a_run_leaves_what_is_promised(whole):
 
 
 def check_tensorboard(folder: Path, numbers: dict) -> None:
-    events = EventAccumulator(str(folder))
+    events = EventAccumulator(str(folder), size_guidance={"histograms": 0})
     events.Reload()
     tags = events.Tags()
     scalars = set(tags["scalars"])
@@ -83,6 +83,22 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
         "cost/parameters",
     ):
         assert name in scalars
+    for name in ("time/share_prior", "gradient/geometry", "gradient/head", "memory/peak_gb"):
+        assert [event.step for event in events.Scalars(name)] == [1, 3, 5]
+    shares = [tag for tag in scalars if tag.startswith("time/share_")]
+    assert len(shares) == 8
+    for step in range(3):
+        values = {tag: events.Scalars(tag)[step].value for tag in shares}
+        assert sum(values.values()) == pytest.approx(1, abs=1e-5)
+        parts = ("network", "rendering", "backward", "optimizer")
+        assert all(values[f"time/share_{part}"] > 0 for part in parts)
+    assert set(tags["histograms"]) == {
+        f"gaussians/{name}" for name in ("opacity", "log10_scale", "log10_depth")
+    }
+    counted = events.Histograms("gaussians/opacity")
+    assert [event.step for event in counted] == [2, 4, 6]
+    assert counted[-1].histogram_value.num == numbers["cost/gaussians"]
+    assert 0 < events.Scalars("gaussians/opacity_median")[-1].value < 1
     last = events.Scalars("hp/psnr")[-1].value
     assert abs(last - numbers["test/procedural/psnr"]) < 1e-3
     assert any(tag.startswith("val/") for tag in tags["images"])
@@ -104,7 +120,10 @@ def test_a_protocol_by_name(train, shared):
 
 LEFT_OUT = [
     ["~callbacks.metrics", "~callbacks.guard", "callbacks.pictures=null"],
-    ["~callbacks.costs", "~callbacks.curve", "~callbacks.checkpoints", "~callbacks.progress"],
+    [
+        *("~callbacks.costs", "~callbacks.curve", "~callbacks.checkpoints"),
+        *("~callbacks.progress", "~callbacks.watch"),
+    ],
 ]
 
 
@@ -114,9 +133,11 @@ def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, mo
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setenv("ASYSPLAT_SHARED", str(tmp_path))
     names = [key.partition(".")[2].removesuffix("=null") for key in overrides]
-    result = train(*overrides)
+    logged = "watch" not in names
+    result = train(*overrides, "callbacks.watch.every=2" if logged else "logger=none")
     folder = run_folder(result)
     numbers = metrics(folder)
+    assert (folder / "tensorboard").exists() == logged
     left = {
         "metrics": ("test/procedural/psnr" in numbers, (folder / "metrics.csv").exists()),
         "costs": ("cost/parameters" in numbers, "Gaussians a scene" in result.stdout),
@@ -128,6 +149,7 @@ def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, mo
             (folder / "checkpoints" / "best.ckpt").exists() or "metrics" in names,
         ),
         "progress": ("step 2 of 4" in result.stdout,),
+        "watch": ("a step took" in result.stdout,),
     }
     assert {name: set(there) for name, there in left.items()} == {
         name: {name not in names} for name in left

@@ -18,6 +18,7 @@ from types import ModuleType
 from asysplat.data.bad_frames import BadFrames, Policy
 from asysplat.data.cache import ImageCache
 from asysplat.data.capture import PhotographCapture
+from asysplat.data.disparity import with_disparities
 from asysplat.data.readers import (
     colmap,
     dl3dv,
@@ -73,6 +74,7 @@ def open_scene(
     layout: str = "auto",
     on_bad_frame: Policy = "fail",
     cache: ImageCache | None = None,
+    disparities: Path | str | None = None,
 ) -> PhotographCapture:
     """Open one scene, its images unread.
 
@@ -83,6 +85,7 @@ def open_scene(
         on_bad_frame: "fail" raises an error that names every frame whose files cannot be used;
             "skip" leaves them out, with a warning, for which each image is decoded once.
         cache: where decoded pixels are kept.
+        disparities: the folder of `python -m asysplat.data.disparity`; None reads none.
 
     Raises:
         InputError: files that cannot be used, or fewer than two frames.
@@ -95,6 +98,8 @@ def open_scene(
         path = scenes[0]
     bad = BadFrames(on_bad_frame)
     posed = LAYOUTS[layout].read_scene(path, bad)
+    if disparities is not None:
+        posed = with_disparities(posed, path, Path(disparities))
     capture = PhotographCapture(posed, height, width, cache)
     if on_bad_frame == "skip":
         capture = capture.without_damaged(bad)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from asysplat.data.images import Lens, image_size
+from asysplat.data.images import Lens, image_size, same_proportions
 from asysplat.errors import InputError
 from asysplat.scene import ORTHONORMAL_TOLERANCE
 
@@ -140,11 +140,6 @@ def beside(path: Path, size: tuple[int, int], where: str) -> Path:
             "give one with the image's proportions."
         )
     return path
-
-
-def same_proportions(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Tell whether two (width, height) have the same proportions, to a pixel of `one`."""
-    return abs(one[0] * other[1] / other[0] - one[1]) <= 1
 
 
 def rigid(stored: Any, where: str) -> Float[ndarray, "4 4"]:

@@ -1,12 +1,12 @@
-"""Pictures of every validation and of the test: in TensorBoard and as PNG files."""
+"""Pictures of every validation and of the test: for the logger and as PNG files."""
 
 from pathlib import Path
 from typing import Any
 
 import lightning
-from lightning.pytorch.loggers import TensorBoardLogger
 
 from asysplat.evaluation.pictures import comparison
+from asysplat.training.loggers import log_figure
 from asysplat.training.outcome import Outcome
 
 
@@ -57,7 +57,6 @@ class Pictures(lightning.Callback):
         self.folder.mkdir(parents=True, exist_ok=True)
         step = "" if split == "test" else f"-{trainer.global_step:06d}"
         figure.savefig(self.folder / f"{split}-{index}{step}.png", dpi=100)
+        name = f"{split}/{batch['scene'][0] if split == 'test' else index}"
         for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                name = f"{split}/{batch['scene'][0] if split == 'test' else index}"
-                logger.experiment.add_figure(name, figure, trainer.global_step)
+            log_figure(logger, name, figure, trainer.global_step)

@@ -1,0 +1,82 @@
+"""The monocular network: Depth Anything (Yang et al. 2024), by way of transformers."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+from torch import nn
+
+from asysplat.errors import InputError
+
+MODEL = "LiheYoung/depth-anything-small-hf"  # the weights that Long-LRM trains with; Apache-2.0
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, RGB
+SIDE = 518  # pixels of the shorter side that the network was trained at
+
+
+class DepthAnything:
+    """Estimates the disparity of a photograph, up to a scale and a shift.
+
+    Args:
+        network: pixel_values [1, 3, H, W], as ImageNet's, -> `.predicted_depth` [1, H, W]; its
+            `config.patch_size` divides H and W.
+        device: where it computes.
+    """
+
+    def __init__(self, network: nn.Module, device: torch.device):
+        self.network, self.device = network.to(device).eval(), device
+        self.mean, self.std = (
+            torch.tensor(rgb, device=device)[:, None, None] for rgb in (MEAN, STD)
+        )
+
+    @torch.inference_mode()
+    def __call__(self, photograph: UInt8[ndarray, "h w 3"]) -> Float[ndarray, "H W"]:
+        """Return the disparity of the whole photograph at the network's own size."""
+        # A copy, since arrays from Pillow are read-only.
+        pixels = torch.tensor(photograph, device=self.device).permute(2, 0, 1)[None] / 255
+        size = network_size(*photograph.shape[:2], self.network.config.patch_size)
+        pixels = F.interpolate(pixels, size, mode="bicubic", antialias=True)
+        found = self.network(pixel_values=(pixels - self.mean) / self.std)
+        return found.predicted_depth[0].float().cpu().numpy()
+
+
+def network_size(height: int, width: int, patch: int) -> tuple[int, int]:
+    """Return the size nearest to the photograph's proportions, in whole patches."""
+    scale = SIDE / min(height, width)
+    return tuple(max(1, round(scale * side / patch)) * patch for side in (height, width))
+
+
+def load_depth_anything(model: str, download: bool) -> DepthAnything:
+    """Load a network of relative depth with transformers.
+
+    Args:
+        model: a folder, or a name in Hugging Face's hub.
+        download: whether to fetch weights that are not on this machine.
+
+    Raises:
+        InputError: transformers is not installed, the weights are not there, or they are for
+            metric depth.
+    """
+    try:
+        from transformers import AutoModelForDepthEstimation
+    except ImportError as error:
+        raise InputError(
+            "python -m asysplat.data.disparity needs transformers: "
+            "pip install 'asysplat[disparity]'."
+        ) from error
+    try:
+        network = AutoModelForDepthEstimation.from_pretrained(
+            model, local_files_only=not download, use_safetensors=True
+        )
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"--model {model} cannot be loaded ({reason}): name a folder with config.json and "
+            "model.safetensors, or let --download fetch it."
+        ) from error
+    kind = getattr(network.config, "depth_estimation_type", "relative")
+    if kind != "relative":
+        raise InputError(
+            f"--model {model} estimates {kind} depth, and disparities are wanted: name a model of "
+            f"relative depth, such as {MODEL}."
+        )
+    return DepthAnything(network, torch.device("cuda" if torch.cuda.is_available() else "cpu"))
