@@ -1,4 +1,4 @@
-.PHONY: demo quick test hours style format
+.PHONY: demo quick test bench hours style format
 PYTHON ?= python3
 ENV := .venv/.ready
 # Two tests at a time, a thread each; who is done takes tests of the other.
@@ -13,6 +13,10 @@ quick: style ## style, and the tests that take seconds
 
 test: style ## style, and all tests but those of hours
 	$(PYTEST)
+
+bench: $(ENV) ## did a change make anything slower: ratios within one process, against docs/results/bench.json
+	OMP_NUM_THREADS=1 .venv/bin/python benchmark.py suite=bench repeats=11 \
+		output=logs/bench compare=docs/results/bench.json
 
 hours: $(ENV) ## what takes an hour or two: long runs on real scenes, two processes for every model
 	$(PYTEST) -m hours

@@ -1,9 +1,9 @@
 """Time against error, and quality against seconds, in one process.
 
 python benchmark.py suite=render scenes=[A,C]
+python benchmark.py suite=pareto compare=docs/results/pareto.json
 """
 
-import json
 import os
 import sys
 from pathlib import Path
@@ -14,37 +14,49 @@ import hydra
 from omegaconf import DictConfig
 from rich.console import Console
 
+from asysplat.benchmark.compare import compare, read_old
 from asysplat.benchmark.machine import describe_machine
 from asysplat.benchmark.options import check_repeats, find_suite
+from asysplat.benchmark.written import write_results
 from asysplat.errors import input_error_behind
 from asysplat.overrides import exit_at_unknown_overrides
+from asysplat.training.revision import revision
 
 
 @hydra.main(config_path="conf", config_name="benchmark", version_base="1.3")
 def main(options: DictConfig) -> None:
     try:
-        benchmark(options)
+        worse = benchmark(options)
     except Exception as error:
         known = input_error_behind(error)
         if known is None:
             raise
         sys.exit(f"error: {known}")
+    if worse:
+        sys.exit(1)
 
 
-def benchmark(options: DictConfig) -> None:
-    """Measure, print the tables, write <suite>.json and <suite>.png."""
+def benchmark(options: DictConfig) -> bool:
+    """Measure, print the tables, write all; return whether anything is worse than in `compare`."""
     suite = find_suite(options.suite)
     check_repeats(options.repeats)
+    path = Path(options.output) / options.suite
+    old = read_old(options.compare, path.with_suffix(".json"))
     console = Console()
-    results = {"machine": describe_machine(), **suite.measure(options, console)}
-    for table in suite.tables(results):
+    code = {"suite": options.suite, "revision": revision()}
+    results = code | {"machine": describe_machine()} | suite.measure(options, console)
+    tables = suite.tables(results)
+    for table in tables:
         console.print(table)
-    folder = Path(options.output)
-    folder.mkdir(parents=True, exist_ok=True)
-    numbers, picture = (folder / f"{options.suite}{end}" for end in (".json", ".png"))
-    numbers.write_text(json.dumps(results, indent=2) + "\n")
-    suite.plot(results).savefig(picture, dpi=150)
-    console.print(f"numbers: {numbers}\npicture: {picture}", soft_wrap=True)
+    written = write_results(results, tables, suite.plot(results), suite.WATCHED, path)
+    for name, place in zip(("numbers", "tables", "picture", "tensorboard"), written, strict=True):
+        console.print(f"{name}: {place}", soft_wrap=True)
+    if old is None:
+        return False
+    found = compare(old, results, suite.WATCHED)
+    for line in found.sentences():
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
+    return bool(found.worse)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ from rich.box import ROUNDED
 from rich.table import Table
 from rich.text import Text
 
-from asysplat.benchmark.timing import Result
+from asysplat.benchmark.timing import BUSY, Result, is_busy
+from asysplat.report.markdown import escape
 
 NOTHING = "-"  # for what was not measured
 Write = Callable[[Result], str | Text]
@@ -29,7 +30,22 @@ def make_table(
 def measured_on(results: Result) -> str:
     """Write the note that every suite begins with: the machine, and what ± means."""
     machine = ", ".join(f"{key} {value}" for key, value in results["machine"].items())
-    return f"{machine}\nmedian ± interquartile range"
+    return f"{machine}\nmedian ± interquartile range; busy: that is over {BUSY:.0%} of the median"
+
+
+def markdown(table: Table) -> str:
+    """Write a table as GitHub Markdown, its title above and its notes below."""
+    headings = [" ".join(str(column.header).split()) for column in table.columns]
+    rules = [":--" if column.justify == "left" else "--:" for column in table.columns]
+    cells = [[_plain(cell) for cell in column.cells] for column in table.columns]
+    rows = [[escape(cell) for cell in row] for row in (headings, *zip(*cells, strict=True))]
+    lines = [f"| {' | '.join(row)} |" for row in (rows[0], rules, *rows[1:])]
+    notes = [f"- {escape(line)}" for line in str(table.caption or "").splitlines()]
+    return "\n".join([f"## {escape(str(table.title))}", "", *lines, "", *notes]) + "\n"
+
+
+def _plain(cell: str | Text) -> str:
+    return cell.plain if isinstance(cell, Text) else cell
 
 
 def at(row: Result, path: str) -> Any:
@@ -50,9 +66,14 @@ def number(path: str, pattern: str, unit: float = 1.0) -> Write:
 
 
 def spread(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> Write:
-    """Write median ± interquartile range; seconds in milliseconds."""
-    names = ("median", "iqr")
-    return _cell(path, lambda value: " ± ".join(pattern.format(value[n] / unit) for n in names))
+    """Write median ± interquartile range, and where it was busy; seconds in milliseconds."""
+
+    def write(value: Result) -> str:
+        numbers = [value[name] for name in ("median", "iqr")]
+        words = " ± ".join(pattern.format(number / unit) for number in numbers)
+        return f"{words} busy" if is_busy(*numbers) else words
+
+    return _cell(path, write)
 
 
 def limited(path: str, limit: float) -> Write:

@@ -23,6 +23,8 @@ Run = Callable[[], object]
 Timer = Callable[[], Mapping[Hashable, float]]  # seconds by name
 Name = Callable[[FrameType], str | None]
 
+BUSY = 0.3  # interquartile range over median, above which the machine was busy with other things
+
 
 @dataclass
 class Measurement:
@@ -32,8 +34,8 @@ class Measurement:
     found: Result = field(default_factory=dict)  # results besides the times
     seconds: dict[Hashable, list[float]] = field(default_factory=dict)  # by `time_in_rounds`
 
-    def summary(self, name: Hashable) -> dict[str, float]:
-        """Return median and interquartile range of the seconds of this name."""
+    def summary(self, name: Hashable) -> Result:
+        """Summarise the seconds of this name."""
         return summary(self.seconds[name])
 
 
@@ -49,10 +51,15 @@ def time_in_rounds(measurements: Sequence[Measurement], repeats: int) -> None:
                     measurement.seconds.setdefault(name, []).append(seconds)
 
 
-def summary(values: Sequence[float]) -> dict[str, float]:
-    """Return median and interquartile range."""
+def summary(values: Sequence[float]) -> Result:
+    """Return median and interquartile range, and whether the machine was busy."""
     low, median, high = np.percentile(values, [25, 50, 75]).tolist()
-    return {"median": median, "iqr": high - low}
+    return {"median": median, "iqr": high - low, "busy": is_busy(median, high - low)}
+
+
+def is_busy(median: float, iqr: float) -> bool:
+    """Tell whether a measurement spreads too much to be relied on."""
+    return iqr > BUSY * median
 
 
 def ratios(one: Result, other: Result, names: Iterable[str]) -> dict[str, float | None]:

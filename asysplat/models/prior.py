@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from asysplat.ops import plane_sweep
-from asysplat.ops.plane_sweep import SweptDepth
+from asysplat.ops.plane_sweep import NEIGHBOURS, PLANES, SweptDepth
 from asysplat.ops.plane_sweep.agreement import Depths, fill, other_views, votes
 from asysplat.ops.plane_sweep.cameras import Projections, observed_range
 from asysplat.ops.plane_sweep.images import shrink
@@ -102,11 +102,21 @@ class SweepPrior(nn.Module):
 
     Large images are swept at a size that suits the number of planes. How far is swept follows from
     the cameras, and in views that see enough sparse points from those.
+
+    Args:
+        planes, neighbours: see `plane_sweep`.
+        longest_side: of the images that are swept, pixels.
     """
+
+    def __init__(
+        self, planes: int = PLANES, neighbours: int = NEIGHBOURS, longest_side: int = LONGEST_SIDE
+    ):
+        super().__init__()
+        self.planes, self.neighbours, self.longest_side = planes, neighbours, longest_side
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
         height, width, factor = views.cameras.height, views.cameras.width, 1
-        while max(height, width) > LONGEST_SIDE * factor:
+        while max(height, width) > self.longest_side * factor:
             factor *= 2
         multiple = factor * BLOCK
         small = views.cameras.resized(
@@ -114,7 +124,14 @@ class SweepPrior(nn.Module):
         )
         images = shrink(views.images, small.height, small.width)
         ranges = _ranges(views.point_depths, factor)
-        found = plane_sweep(images, small, stride=BLOCK, ranges=ranges)
+        found = plane_sweep(
+            images,
+            small,
+            stride=BLOCK,
+            planes=self.planes,
+            neighbours=self.neighbours,
+            ranges=ranges,
+        )
         return Prior.of_depths(found, views, size)
 
 

@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 
 from asysplat.report.cells import ARROWS
 from asysplat.report.filled import COMPUTED, FilledRow, FilledTable, Number, mean_and_spread
+from asysplat.report.front import Point, draw_front
 from asysplat.report.paper import Column
-from asysplat.report.style import FAINT, INK, OURS, PAPER, STYLE
+from asysplat.report.style import FAINT, OURS, PAPER, STYLE
 
 # Tables in which one quantity varies: what the first number in a row's name is.
 RATIOS = {
@@ -21,8 +22,6 @@ RATIOS = {
 COSTS = ("gflops", "inference_seconds", "parameters")
 # The dearest row over the cheapest: below it, cost does not tell rows apart.
 LEAST_RANGE = 1.1
-
-Point = tuple[str, float, float]
 
 
 def make_plots(filled: FilledTable) -> list[tuple[str, Figure]]:
@@ -124,19 +123,6 @@ def _ratio(row: FilledRow) -> int:
     return int(re.search(r"\d+", row.paper.name)[0])
 
 
-def pareto_front(points: Sequence[Point], better: str) -> list[Point]:
-    """Find the points (name, cost, quality) that no other equals or beats in both.
-
-    The cheapest is first.
-    """
-    sign = 1 if better == "higher" else -1
-    front: list[Point] = []
-    for point in sorted(points, key=lambda point: (point[1], -sign * point[2])):
-        if not front or sign * point[2] > sign * front[-1][2]:
-            front.append(point)
-    return front
-
-
 def _pareto_plot(filled: FilledTable, quality: Column) -> list[tuple[str, Figure]]:
     """Plot quality against cost; nothing below three rows, or where they cost the same."""
     costs = {column.key: column for column in filled.paper.columns if column.key in COSTS}
@@ -151,13 +137,14 @@ def _pareto_plot(filled: FilledTable, quality: Column) -> list[tuple[str, Figure
         return []
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _draw_front(left, ours, quality.better, OURS)
-    _draw_front(right, paper, quality.better, PAPER)
+    draw_front(left, ours, quality.better, OURS)
+    draw_front(right, paper, quality.better, PAPER)
     for axes, title, label in (
         (left, "ours", filled.our_title(quality)),
         (right, "paper", quality.title),
     ):
         axes.set(title=title, xlabel=cost.title, ylabel=label + ARROWS[quality.better])
+        axes.locator_params(nbins=5)
     caption = f"{quality.kind} against {cost.title}: no row beats those on the line in both."
     return [(caption, figure)]
 
@@ -180,32 +167,3 @@ def _point(
 def _range(points: Sequence[Point]) -> float:
     costs = [cost for _, cost, _ in points]
     return max(costs) / min(costs)
-
-
-def _draw_front(axes: Axes, points: Sequence[Point], better: str, colour: str) -> None:
-    front = pareto_front(points, better)
-    axes.plot([p[1] for p in front], [p[2] for p in front], "o-", color=colour, ms=7)
-    rest = [point for point in points if point not in front]
-    axes.plot([p[1] for p in rest], [p[2] for p in rest], "o", color=FAINT, ms=6, alpha=0.7)
-    for point in rest:
-        _label(axes, point, FAINT, "center", "top")
-    for point in front:
-        _label(axes, point, INK, "left" if point == front[-1] else "right", "bottom")
-    axes.margins(x=0.2, y=0.18)
-    axes.locator_params(nbins=5)
-
-
-def _label(axes: Axes, point: Point, colour: str, ha: str, va: str) -> None:
-    """Write a name above the front and away from its end, so that neighbours stay apart."""
-    name, cost, quality = point
-    offset = (0, 6 if va == "bottom" else -6)
-    axes.annotate(
-        name,
-        (cost, quality),
-        offset,
-        textcoords="offset points",
-        ha=ha,
-        va=va,
-        color=colour,
-        fontsize=9,
-    )

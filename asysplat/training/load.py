@@ -1,30 +1,34 @@
 """Load a trained network by the name of its file."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from asysplat.errors import InputError
 from asysplat.models.network import Network
+from asysplat.overrides import CONF, check_overrides
 from asysplat.training.checkpoints import load_weights
 
-CONF = Path(__file__).parents[2] / "conf"
 
-
-def load(checkpoint: str = "shipped") -> Network:
+def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> Network:
     """Load a network, ready to predict: `load("shipped")(views)`.
 
     Args:
         checkpoint: "shipped" for the model that comes with the project, or a .ckpt file of a run,
-            whose config.yaml says what it is; a .safetensors file has the shipped one's layout.
+            whose config.yaml says what it is; a .safetensors file has the shipped one's layout;
+            None: without training.
+        overrides: of train.py, which change its default model; a run's model stays as it is.
 
     Raises:
-        InputError: no such file, or the weights of another model.
+        InputError: no such file, the weights of another model, or an unknown override.
     """
+    if checkpoint is None:
+        return instantiate(_default_model(overrides)).eval()
     path = Path(checkpoint)
     configuration = path.parent.parent / "config.yaml"
     if path.suffix == ".ckpt" and path.is_file() and configuration.is_file():
@@ -35,15 +39,16 @@ def load(checkpoint: str = "shipped") -> Network:
             "folder of its run."
         )
     else:
-        model = _default_model()
+        model = _default_model(overrides)
     holder = nn.Module()
     holder.net = instantiate(model)
     load_weights(checkpoint, holder)
     return holder.net.eval()
 
 
-def _default_model():
+def _default_model(overrides: Sequence[str]) -> DictConfig:
+    check_overrides(overrides)
     if GlobalHydra.instance().is_initialized():
-        return compose("train").model
+        return compose("train", list(overrides)).model
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train").model
+        return compose("train", list(overrides)).model

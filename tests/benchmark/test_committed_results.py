@@ -16,6 +16,7 @@ CELLS = {
     "growth/model": ["10320.5 ± 0.0", "1.28", "192"],
     "parts/reconstruct": ["28.77", "0.039", "831", "34.7 ± 1.1", "1.27", "no_cool_down"],
     "budgets/reconstruct": ["29.51", "33.59", "mcmc"],
+    "bench": ["selective_scan", "its chunked", "its products"],
     "data": ["179.6 ± 6.0", "1329 ± 46", "33.1", "40 ± 5 frames / s"],
 }
 

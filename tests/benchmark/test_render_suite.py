@@ -77,7 +77,7 @@ def test_json_has_every_backend_and_skip(measured):
         assert row["error"]["gradients"].keys() == set(FIELDS)
         assert 0 <= row["error"]["image_p99"] <= row["error"]["image_max"]
         assert {"visible", "pairs", "tile_size"} <= row["stats"].keys() or backend == "gsplat"
-        assert row["forward"].keys() == row["backward"].keys() == {"median", "iqr"}
+        assert row["forward"].keys() == row["backward"].keys() == {"median", "iqr", "busy"}
         assert row["faster_than_reference"].keys() == {"forward", "backward"}
         if backend == "cpu":
             assert set(RASTER.values()) < row["stages"].keys()

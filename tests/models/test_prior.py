@@ -54,6 +54,18 @@ def test_a_wall_is_where_it_is(name):
     assert prior.confidence[inner].mean() > 0.8
 
 
+@pytest.mark.parametrize("knob", [{"planes": 8}, {"neighbours": 1}, {"longest_side": 16}])
+def test_a_coarser_sweep_finds_the_wall_less_exactly(knob):
+    views = wall()
+    length = views.cameras.resized(16, 16).pixel_directions().norm(dim=-1)
+
+    def error(**knobs):
+        found = SweepPrior(**knobs)(views, (16, 16)).distance / length
+        return (found[:, :, 2:-2, 4:-4] - 2).abs().mean()
+
+    assert 0 < error() < error(**knob) < 1
+
+
 @pytest.mark.parametrize("name", PRIORS)
 @pytest.mark.parametrize("case", ["one view", "one place", "black", "apart"])
 def test_what_cannot_be_known_is_unknown(name, case):

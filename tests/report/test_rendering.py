@@ -9,10 +9,11 @@ import pytest
 from rich.console import Console
 
 from asysplat.report.filled import COMPUTED, FilledRow, FilledTable
+from asysplat.report.front import pareto_front
 from asysplat.report.html import render_html
 from asysplat.report.markdown import escape, render_markdown
 from asysplat.report.paper import Column, PaperRow, PaperTable, Reading
-from asysplat.report.plots import make_plots, pareto_front
+from asysplat.report.plots import make_plots
 from asysplat.report.terminal import render_terminal
 
 COLUMNS = (

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
+from asysplat.benchmark.compare import RATE, Watched
 from asysplat.benchmark.data.photographs import write_photographs
 from asysplat.benchmark.model.workload import Workload, make_net, make_views
 from asysplat.benchmark.options import find_device
@@ -21,6 +22,7 @@ from asysplat.data import ImageCache, files_data, open_scene
 CPU = torch.device("cpu")  # which reads
 NO_CACHE, FIRST, LATER = CACHES = ("none", "filled meanwhile", "filled")
 MODEL = "asysplat_4m4s"
+WATCHED = Watched(names=("cache",), alike=(), kinds={"frames_per_second": RATE}, rows="loading")
 
 
 def measure(options: DictConfig, console: Console) -> Result:

@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
+from asysplat.benchmark.compare import RATIO, TIME, Watched
 from asysplat.benchmark.model.components import OPERATORS, PARTS, part_seconds, record_products
 from asysplat.benchmark.model.workload import Workload, make_net, make_views
 from asysplat.benchmark.options import PRECISIONS, check_names, find_device
@@ -26,6 +27,16 @@ from asysplat.evaluation.cost import GB, count_parameters
 from asysplat.evaluation.static_cost import GIGA
 
 PASSES = ("forward", "step")
+WATCHED = Watched(
+    names=("model", "views", "precision"),
+    alike=("parameters", "height", "width"),
+    kinds={
+        "forward": TIME,
+        "step": TIME,
+        "over_floor.forward": RATIO,
+        "over_floor.step": RATIO,
+    },
+)
 BACKWARD = 2  # products in the backward pass for each of the forward pass
 MOST_OVER_FLOOR = 2.5  # is asked of the forward pass
 NOTES = """\

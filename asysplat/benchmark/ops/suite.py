@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from asysplat.benchmark.compare import ERROR, TIME, Watched
 from asysplat.benchmark.ops.cases import SCANS, Case, find_cases
 from asysplat.benchmark.ops.paths import make_path
 from asysplat.benchmark.ops.sweep import SweepCase
@@ -32,6 +33,11 @@ from asysplat.errors import InputError
 
 PASSES = {"forward": "Forward", "forward_backward": "Forward and backward"}
 ERRORS = {"forward": "error.forward", "forward_backward": "error.gradients"}
+WATCHED = Watched(
+    names=("operator", "precision", "path"),
+    alike=("sizes", "loop_tokens", "error.measured_on"),
+    kinds=dict.fromkeys(PASSES, TIME) | dict.fromkeys(ERRORS.values(), ERROR),
+)
 LOOP, REFERENCE, MATMULS = "loop", "reference", "matmuls"
 MOST_OVER_MATMULS = 2.5  # is asked of ssd
 

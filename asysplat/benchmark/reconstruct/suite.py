@@ -1,7 +1,7 @@
 """Photographs held back, against the seconds of refinement: every start, and every part of it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
+from asysplat.benchmark.compare import DECIBELS, TIME, Watched
 from asysplat.benchmark.options import check_names
 from asysplat.benchmark.reconstruct.scene import SEED, MeasuredScene
 from asysplat.benchmark.reconstruct.shown import ALL, START, plot, tables
@@ -26,6 +27,15 @@ from asysplat.training.load import load
 
 SIDE = 256  # pixels of the crops
 Say = Callable[[str], None]
+WATCHED = Watched(
+    names=("scene", "init", "variant", "budget"),
+    alike=(),
+    kinds={
+        "step": TIME,
+        # How far a refinement comes in so many seconds depends on the machine, and on its load.
+        "psnr": replace(DECIBELS, least=0.5, anywhere=False),
+    },
+)
 
 __all__ = ["measure", "plot", "tables"]
 

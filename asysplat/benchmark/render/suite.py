@@ -11,6 +11,7 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
+from asysplat.benchmark.compare import ERROR, TIME, Watched
 from asysplat.benchmark.plot import time_against_error
 from asysplat.benchmark.render.floor import RASTER, compare_with_floor, row_seconds
 from asysplat.benchmark.render.run import (
@@ -28,6 +29,17 @@ from asysplat.benchmark.table import error, limited, make_table, measured_on, nu
 from asysplat.benchmark.timing import Measurement, Result, ratios, rise_gb, time_in_rounds
 from asysplat.rendering import Skips
 
+WATCHED = Watched(
+    names=("scene", "backend", "without"),
+    alike=("gaussians", "views", "height", "width", "error.measured_on"),
+    kinds={
+        "forward": TIME,
+        "backward": TIME,
+        "error.image_p99": ERROR,
+        "error.image_max": ERROR,
+        "error.gradients": ERROR,
+    },
+)
 # What is asked of the cpu backend with all its skips.
 MOST_OVER_FLOOR = 2.5
 MOST_WHOLE_OVER_RASTER = 2.0

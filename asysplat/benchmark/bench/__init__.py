@@ -1,0 +1,1 @@
+"""The regression watch: every kernel beside something that does the same without it."""

@@ -1,0 +1,1 @@
+"""Every knob that trades time for error, from photographs in memory to all test views drawn."""

@@ -1,0 +1,217 @@
+"""Two made-up files of a suite: what is named, and what the exit status says."""
+
+import json
+from copy import deepcopy
+from types import SimpleNamespace
+
+import pytest
+from matplotlib.figure import Figure
+
+from asysplat.benchmark import options
+from asysplat.benchmark.compare import (
+    DECIBELS,
+    ERROR,
+    RATE,
+    RATIO,
+    TIME,
+    Watched,
+    compare,
+    read_old,
+    watched_values,
+)
+from asysplat.benchmark.options import SUITES, find_suite
+from asysplat.benchmark.table import make_table, spread, text
+from asysplat.errors import InputError
+
+KINDS = {"seconds": TIME, "rate": RATE, "ratio": RATIO, "wrong": ERROR, "psnr": DECIBELS}
+WATCHED = Watched(("scene", "part"), ("size",), KINDS)
+MACHINE = {"cpu": "one", "cores": 2, "threads": 2, "torch": "2.11"}
+
+
+def summary(median, iqr=0.0):
+    return {"median": median, "iqr": iqr}
+
+
+def row(scene="a", **numbers):
+    kept = {"seconds": summary(2.0, 0.1), "wrong": {"x": 1e-7, "y": 1e-6}, "psnr": 30.0}
+    return {"scene": scene, "part": None, "size": [3, 4]} | kept | numbers
+
+
+def results(*rows, **machine):
+    return {"suite": "made", "revision": "r", "machine": MACHINE | machine, "rows": list(rows)}
+
+
+def said(old, new):
+    found = compare(results(old), results(new), WATCHED)
+    return found.worse, found.better
+
+
+CHANGES = {  # of a row: what is named, as worse or as better
+    "slower": ({"seconds": summary(3.0, 0.1)}, "slower: a, seconds: 3 ± 0.1 s, was 2 ± 0.1 s", ""),
+    "faster": ({"seconds": summary(1.0, 0.1)}, "", "faster: a, seconds: 1 ± 0.1 s, was 2 ± 0.1 s"),
+    "within noise": ({"seconds": summary(3.0, 1.0)}, "", ""),
+    "too little": ({"seconds": summary(2.3, 0.01)}, "", ""),
+    "less exact": ({"wrong": {"x": 5e-6, "y": 1e-7}}, "less exact: a, wrong: 5e-06, was 1e-06", ""),
+    "as exact": ({"wrong": {"x": 1.9e-6, "y": 0.0}}, "", ""),
+    "worse pictures": ({"psnr": 29.8}, "less exact: a, psnr: 29.8 dB, was 30 dB", ""),
+    "better pictures": ({"psnr": 30.2}, "", "more exact: a, psnr: 30.2 dB, was 30 dB"),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_changes_beyond_noise_are_named(case):
+    changes, worse, better = CHANGES[case]
+    assert said(row(), row(**changes)) == ([worse] if worse else [], [better] if better else [])
+
+
+def test_a_rate_is_better_where_it_is_higher():
+    worse, better = said(row(rate=summary(10.0)), row(rate=summary(5.0)))
+    assert worse == ["slower: a, rate: 5 / s, was 10 / s"] and better == []
+    assert said(row(rate=summary(5.0)), row(rate=summary(10.0)))[0] == []
+
+
+def test_an_error_where_there_was_none_is_less_exact():
+    assert said(row(wrong=0.0), row(wrong=1e-3))[0] == ["less exact: a, wrong: 0.001, was 0"]
+    assert said(row(wrong=0.0), row(wrong=0.0)) == ([], [])
+
+
+def test_what_is_missing_is_named_and_is_no_change():
+    old = results(row(), row("b", seconds=None))
+    new = results(row(psnr=None), row("c", seconds=summary(90.0)))
+    found = compare(old, new, WATCHED)
+    assert found.worse == found.better == []
+    assert found.missing == [
+        "a, psnr: was 30 dB",
+        "b, wrong: was 1e-06",
+        "b, psnr: was 30 dB",
+    ]
+    assert found.compared == 2
+    *_, verdict = found.sentences()
+    assert verdict.startswith("green: none of 2 numbers") and "any more" in found.sentences()[0]
+
+
+def test_other_sizes_are_other_rows():
+    with pytest.raises(InputError, match=r"^compare= has none of the rows"):
+        compare(results(row()), results(row(size=[3, 5])), WATCHED)
+
+
+def test_seconds_of_another_machine_are_not_compared():
+    old = results(row(ratio=summary(1.0)), cpu="other", torch="2.10")
+    new = results(row(seconds=summary(9.0), ratio=summary(2.0), psnr=20.0))
+    found = compare(old, new, WATCHED)
+    assert found.notes == ["another machine: cpu other then and one now; seconds are not compared."]
+    assert [sentence.partition(":")[0] for sentence in found.worse] == ["slower", "less exact"]
+    assert "ratio" in found.worse[0]
+
+
+@pytest.mark.parametrize("name", ["render", "ops", "model", "data"])
+def test_published_results_are_compared_with_themselves(name, repository):
+    suite = find_suite(name)
+    published = json.loads((repository / "docs" / "results" / f"{name}.json").read_text())
+    slower = deepcopy(published)
+    found = compare(published, published, suite.WATCHED)
+    assert found.compared > 2 and found.worse == found.better == found.missing == []
+    first = {"render": "forward", "ops": "forward", "model": "forward", "data": None}[name]
+    for each in slower[suite.WATCHED.rows]:
+        timed = each[first] if first else each["frames_per_second"]
+        if timed:
+            timed["median"] *= 10 if first else 0.1
+    worse = compare(published, slower, suite.WATCHED).worse
+    assert worse and all(sentence.startswith("slower: ") for sentence in worse)
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_every_suite_says_what_is_watched(name):
+    suite = find_suite(name)
+    assert callable(suite.measure) and callable(suite.tables) and callable(suite.plot)
+    assert suite.WATCHED.names and suite.WATCHED.kinds
+
+
+FILES = {
+    "none": (None, r"^compare=.*old\.json cannot be read"),
+    "no JSON": ("{", r"cannot be read"),
+    "no results": ("[1]", r"has no results"),
+    "another suite": ('{"machine": {}, "suite": "ops"}', r"is of suite=ops: name a file of"),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_files_that_cannot_be_compared_are_refused(case, tmp_path):
+    content, says = FILES[case]
+    if content is not None:
+        (tmp_path / "old.json").write_text(content)
+    with pytest.raises(InputError, match=says):
+        read_old(str(tmp_path / "old.json"), tmp_path / "made.json")
+    assert read_old(None, tmp_path / "made.json") is None
+
+
+@pytest.fixture
+def run(monkeypatch, run_script, tmp_path):
+    """benchmark.py with a suite that measures these rows."""
+
+    def script(*rows, **words):
+        columns = {"scene": text("{scene}"), "ms": spread("seconds")}
+        suite = SimpleNamespace(
+            measure=lambda *_: {"rows": list(rows)},
+            tables=lambda found: [make_table("Rows", columns, found["rows"])],
+            plot=lambda _: Figure(),
+            WATCHED=WATCHED,
+        )
+        monkeypatch.setattr(options, "find_suite", lambda _: suite)
+        told = {"suite": "made", "output": tmp_path} | words
+        return run_script("benchmark.py", *(f"{key}={value}" for key, value in told.items()))
+
+    return script
+
+
+def test_the_exit_status_says_whether_anything_became_worse(run, tmp_path):
+    old = tmp_path / "old" / "made.json"
+    assert run(row(), output=old.parent).returncode == 0
+    same = run(row(), compare=old)
+    assert same.returncode == 0 and "green: none of 3 numbers became slower" in same.stdout
+    worse = run(row(seconds=summary(9.0)), compare=old)
+    assert worse.returncode == 1 and "slower: a, seconds: 9 s, was 2 ± 0.1 s" in worse.stdout
+    assert "1 of 3 numbers became slower or less exact beyond noise." in worse.stdout
+
+
+def test_what_is_compared_with_is_not_written_over(run, tmp_path):
+    old = tmp_path / "made.json"
+    old.write_text(json.dumps(results(row())))
+    before = old.read_bytes()
+    refused = run(row(), compare=old)
+    assert refused.returncode == 1 and "would be written over: set output=" in refused.stderr
+    assert old.read_bytes() == before
+
+
+def test_numbers_tables_picture_and_tensorboard_say_the_same(run, tmp_path):
+    assert run(row(seconds=summary(2.0, 0.9)), row("b|")).returncode == 0
+    found = json.loads((tmp_path / "made.json").read_text(), parse_constant=pytest.fail)
+    assert found["suite"] == "made" and found["revision"] and found["machine"]["cores"]
+    lines = (tmp_path / "made.md").read_text().splitlines()
+    assert lines[:5] == [
+        "## Rows",
+        "",
+        "| scene | ms |",
+        "| :-- | --: |",
+        "| a | 2000.0 ± 900.0 busy |",
+    ]
+    assert lines[5] == r"| b\| | 2000.0 ± 100.0 |"
+    assert (tmp_path / "made.png").stat().st_size > 0
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path / "tensorboard" / "made" / found["revision"]))
+    events.Reload()
+    values = {
+        f"made/{key.name}/{key.path}": value
+        for key, value in watched_values(found, WATCHED).items()
+    }
+    assert values.keys() == set(events.Tags()["scalars"]) and "made" in events.Tags()["images"]
+    for name, value in values.items():
+        (event,) = events.Scalars(name)
+        assert event.value == pytest.approx(value.median)
+
+
+def test_numbers_that_json_does_not_have_are_refused(run, tmp_path):
+    refused = run(row(psnr=float("nan")))
+    assert refused.returncode == 1 and "not JSON compliant" in refused.stderr
+    assert not (tmp_path / "made.json").exists()
