@@ -17,15 +17,25 @@ from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
-from asysplat.errors import InputError, input_error_behind
+from asysplat.errors import InputError
 from asysplat.overrides import exit_at_unknown_overrides
-from asysplat.training.checkpoints import check_checkpoint, find_checkpoint, load_weights
+from asysplat.training.callbacks.checkpoints import WholeFiles
+from asysplat.training.checkpoints import (
+    check_checkpoint,
+    find_checkpoint,
+    has_checkpoints,
+    load_weights,
+    read_notes,
+    what_differs,
+)
+from asysplat.training.failures import sentence_of
 from asysplat.training.quiet import quiet_lightning
 from asysplat.training.ranges import check_ranges
 from asysplat.training.revision import revision
+from asysplat.training.run_folder import claimed, run_folder
 from asysplat.training.runs import Run, describe_run, find_run
 from asysplat.training.summary import print_summary, write_json
-from asysplat.training.tensorboard import log_choices, log_outcome
+from asysplat.training.tensorboard import cut_events, log_choices, log_outcome
 
 
 @hydra.main(config_path="conf", config_name="train", version_base="1.3")
@@ -37,10 +47,10 @@ def main(config: DictConfig) -> float | None:
     except KeyboardInterrupt:
         sys.exit("stopped.")  # before training or after the test; in between, Checkpoints prints it
     except Exception as error:
-        mistake = input_error_behind(error)
-        if mistake is None:
+        sentence = sentence_of(error)
+        if sentence is None:
             raise
-        sys.exit(f"error: {mistake}")
+        sys.exit(f"error: {sentence}")
 
 
 def train_in_sweep(config: DictConfig) -> float | None:
@@ -58,10 +68,10 @@ def train_in_sweep(config: DictConfig) -> float | None:
         print(f"job {job.num}: {finished_text(finished)}", flush=True)
         return finished.results.get(f"test/{config.data.name}/psnr")
     except Exception as error:
-        mistake = input_error_behind(error)
-        if mistake is None:
+        known = sentence_of(error)
+        if known is None:
             traceback.print_exc()
-        sentence = f"failed: job {job.num}: {job.override_dirname}: {mistake or repr(error)}"
+        sentence = f"failed: job {job.num}: {job.override_dirname}: {known or repr(error)}"
         print(sentence, file=sys.stderr, flush=True)
         raise CompactHydraException(sentence) from None
 
@@ -77,11 +87,18 @@ def train(config: DictConfig) -> float | None:
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
     check_ranges(config)
+    with claimed(Path(config.paths.run)):
+        return fit_and_test(config)
+
+
+def fit_and_test(config: DictConfig) -> float | None:
+    """Fit, from a checkpoint if there is one to go on from, then test; return the test PSNR."""
     quiet_lightning()
     folder = Path(config.paths.run)
     described = describe_run(config)  # now, since files may be edited while this trains
     lightning.seed_everything(config.seed, workers=True, verbose=False)
-    checkpoint = find_checkpoint(config.ckpt_path, Path(config.paths.logs) / config.name)
+    goes_on = has_checkpoints(folder)
+    checkpoint = find_checkpoint(config.ckpt_path, folder, Path(config.paths.logs) / config.name)
     data = instantiate(config.data)
     data.setup()
     net = instantiate(config.model)
@@ -93,10 +110,18 @@ def train(config: DictConfig) -> float | None:
     print(f"model: {net.describe()}")
 
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
+    options = OmegaConf.to_container(config, resolve=True)
+    module.save_hyperparameters(options, logger=False)
     made = instantiate(config.get("callbacks") or {})
     callbacks = {name: callback for name, callback in made.items() if callback is not None}
+    if checkpoint is not None:
+        notes = read_notes(checkpoint)
+        for difference in what_differs(notes, options, revision()):
+            print(f"not as before: {difference}")
+        if goes_on:
+            cut_events(folder, notes["event_files"])
     logger = instantiate(config.logger)
-    if logger is not None:
+    if logger is not None and not goes_on:
         log_choices(logger, config)
     trainer = make_trainer(config, callbacks, logger)
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
@@ -130,6 +155,7 @@ def make_trainer(
             logger=logger or False,
             # Otherwise Lightning adds its own in place of those that are left out.
             enable_checkpointing="checkpoints" in callbacks,
+            plugins=[WholeFiles()],
             enable_progress_bar="progress" in callbacks,
         )
     except InstantiationException as error:
@@ -139,4 +165,5 @@ def make_trainer(
 if __name__ == "__main__":
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     exit_at_unknown_overrides("train")
+    OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
     main()

@@ -6,6 +6,7 @@ data set.
 
 import os
 import tempfile
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
@@ -69,18 +70,20 @@ class ImageCache:
     def _store(self, key: str, array: ndarray) -> None:
         if self.folder is None:
             return
-        file = self._file(key)
-        file.parent.mkdir(parents=True, exist_ok=True)
         if self._on_disk is None:
             self._on_disk = sum(size for _, size, _ in self._files())
-        # Written aside and put in place whole: another process may be reading.
-        descriptor, aside = tempfile.mkstemp(dir=file.parent)
-        with os.fdopen(descriptor, "wb") as handle:
-            np.save(handle, array)
-            self._on_disk += handle.tell()
-        os.replace(aside, file)
-        if self._on_disk > self.disk_bytes:
-            self._clear()
+        try:
+            self._on_disk += _write(self._file(key), array)
+        except OSError as error:
+            warnings.warn(
+                f"{self.folder} takes no more photographs ({error.strerror}): they are decoded "
+                "again when they are needed.",
+                stacklevel=2,
+            )
+            self.folder = None
+        else:
+            if self._on_disk > self.disk_bytes:
+                self._clear()
 
     def _files(self) -> list[tuple[float, int, Path]]:
         """List the last use, the bytes and the path of every file on disk."""
@@ -101,3 +104,21 @@ class ImageCache:
                 break
             file.unlink(missing_ok=True)
             self._on_disk -= size
+
+
+def _write(file: Path, array: ndarray) -> int:
+    """Write a file aside and put it in place whole: another process may be reading.
+
+    Return its bytes.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, aside = tempfile.mkstemp(dir=file.parent)
+    try:
+        with os.fdopen(descriptor, "wb") as handle:
+            np.save(handle, array)
+            size = handle.tell()
+        os.replace(aside, file)
+    except OSError:
+        os.unlink(aside)
+        raise
+    return size

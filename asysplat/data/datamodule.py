@@ -8,10 +8,13 @@ from typing import Any
 
 import lightning
 import numpy as np
+import torch
 from torch.utils.data import DataLoader, Dataset, DistributedSampler, Subset
 
 from asysplat.data.augment import Augmentation, cropped
+from asysplat.data.bad_frames import Policy
 from asysplat.data.capture import Capture
+from asysplat.data.loader import EpochLoader, batches_done, outlive_notice
 from asysplat.data.normalise import normalise
 from asysplat.data.points import depths_of_points
 from asysplat.data.selection import Selection
@@ -19,6 +22,7 @@ from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
+DRAWS = 10  # of which one must give a task, where bad scenes are skipped
 KEPT_BYTES = 2**30  # of images that one set of fixed tasks keeps loaded
 Sample = dict[str, Any]  # scene: name, inputs: Views, targets: Views; a batch has lists of names
 
@@ -42,10 +46,12 @@ class SceneDataModule(lightning.LightningDataModule):
         test_sets: further test sets by name, each a function that makes its tasks.
         augmentation: how training tasks are varied; None leaves them as they are.
         points: whether the inputs come with the depths of the scene's sparse points.
+        on_bad_scene: of a training task whose files cannot be used: "fail", or "skip" to draw
+            another in its place. A batch's `skipped` lists what was passed over.
 
     Raises:
-        InputError: a task that cannot be loaded. `setup` tries one training task, and as many of
-            the fixed ones as are kept in memory.
+        InputError: another policy; a task that cannot be loaded. `setup` tries one training task,
+            and as many of the fixed ones as are kept in memory.
     """
 
     def __init__(
@@ -63,8 +69,12 @@ class SceneDataModule(lightning.LightningDataModule):
         test_sets: Mapping[str, Callable[[], list[Task]]] | None = None,
         augmentation: Augmentation | None = None,
         points: bool = False,
+        on_bad_scene: Policy = "fail",
     ):
         super().__init__()
+        if on_bad_scene not in ("fail", "skip"):
+            raise InputError(f"data.on_bad_scene is {on_bad_scene!r}: expected fail or skip.")
+        self.on_bad_scene = on_bad_scene
         self.name, self.source = name, source
         self.inputs, self.targets = inputs, targets
         self.height, self.width = height, width
@@ -104,21 +114,23 @@ class SceneDataModule(lightning.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader:
         per_epoch = self.steps_per_epoch * self.batch_size * self.trainer.world_size
-        return self.tasks(self.trainer.current_epoch * per_epoch, per_epoch)
+        start = self.trainer.current_epoch * per_epoch
+        return self.tasks(start, per_epoch, done=batches_done(self.trainer))
 
-    def tasks(self, start: int, count: int) -> DataLoader:
-        """Return batches of the training tasks `start` to `start + count`.
+    def tasks(self, start: int, count: int, done: int = 0) -> DataLoader:
+        """Return batches of the training tasks `start` to `start + count`, but the first `done`.
 
         Processes that train together take turns at the tasks, so that their steps are those of one
         process with larger batches.
         """
-        tasks, sampler = Subset(TrainingTasks(self), range(start, start + count)), None
-        if self.trainer is not None and self.trainer.world_size > 1:
+        world_size = 1 if self.trainer is None else self.trainer.world_size
+        left = range(start + done * self.batch_size * world_size, start + count)
+        tasks, sampler = Subset(TrainingTasks(self), left), None
+        if world_size > 1:
             # Lightning's own sampler would shuffle them.
-            sampler = DistributedSampler(
-                tasks, self.trainer.world_size, self.trainer.global_rank, shuffle=False
-            )
-        return DataLoader(
+            sampler = DistributedSampler(tasks, world_size, self.trainer.global_rank, shuffle=False)
+        return EpochLoader(
+            done,
             tasks,
             batch_size=self.batch_size,
             sampler=sampler,
@@ -128,6 +140,9 @@ class SceneDataModule(lightning.LightningDataModule):
             # The platform's own way: inside a joblib job the default is joblib's, which cannot
             # start these workers.
             multiprocessing_context=get_all_start_methods()[0] if self.num_workers else None,
+            worker_init_fn=outlive_notice,
+            # Of its own: starting it draws from one, and a run that goes on starts it once more.
+            generator=torch.Generator(),
         )
 
     def val_dataloader(self) -> DataLoader:
@@ -139,14 +154,30 @@ class SceneDataModule(lightning.LightningDataModule):
 
 
 class TrainingTasks(Dataset):
-    """An endless list of training tasks; task i is drawn with a generator of its own."""
+    """An endless list of training tasks; task i is drawn with a generator of its own.
+
+    Where bad scenes are skipped, `skipped` of a sample names them, as sentences.
+    """
 
     def __init__(self, data: SceneDataModule):
         self.source, self.seed, self.augmentation = data.source, data.seed, data.augmentation
         self.inputs, self.targets, self.points = data.inputs, data.targets, data.points
+        self.draws = DRAWS if data.on_bad_scene == "skip" else 1
 
     def __getitem__(self, index: int) -> Sample:
-        rng = np.random.default_rng((self.seed, index))
+        skipped: list[str] = []
+        while True:
+            # (seed, index, 0) gives what (seed, index) gives.
+            rng = np.random.default_rng((self.seed, index, len(skipped)))
+            try:
+                return self._sample(rng) | {"skipped": skipped}
+            except (InputError, OSError) as error:
+                skipped.append(str(error))
+                if len(skipped) == self.draws:
+                    row = f"{DRAWS} training scenes in a row cannot be used, the last because "
+                    raise InputError(f"{row if self.draws > 1 else ''}{error}") from error
+
+    def _sample(self, rng: np.random.Generator) -> Sample:
         task = self.source.training(self.inputs, self.targets, rng)
         inputs = self.augmentation.order(task.selection.inputs, rng)
         share = self.augmentation.share(rng)
@@ -224,4 +255,5 @@ def collate(samples: list[Sample]) -> Sample:
         "scene": [sample["scene"] for sample in samples],
         "inputs": Views.stack([sample["inputs"] for sample in samples]),
         "targets": Views.stack([sample["targets"] for sample in samples]),
+        "skipped": [sentence for sample in samples for sentence in sample.get("skipped", ())],
     }

@@ -3,8 +3,10 @@
 A checkpoint is what a run writes (.ckpt), or weights alone (.safetensors), as those that ship.
 """
 
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import safe_open
@@ -15,33 +17,114 @@ from asysplat.errors import InputError
 from asysplat.files import replaced
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_sweep.safetensors"
+LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # of a run, to go on from
 LISTED = 5  # differences between a file and a model
 
 
-def find_checkpoint(asked: str | None, runs: Path) -> Path | None:
-    """Find the checkpoint that `ckpt_path` names.
+def find_checkpoint(asked: str | None, run: Path, runs: Path) -> Path | None:
+    """Find the checkpoint that a run goes on from, and say which it is.
 
     Args:
-        asked: None, a file, or "last" for the newest `last.ckpt` below `runs`.
+        asked: None, a file, or "last" for the last one of the newest run below `runs`.
+        run: the run's own folder: if it has checkpoints, the run was cut off and goes on.
         runs: folder of all runs of one name.
 
     Raises:
-        InputError: there is no such file.
+        InputError: there is no such file, or it is damaged, and so is the one before it.
     """
-    if asked is None:
+    if has_checkpoints(run):
+        path = run / "checkpoints" / LAST
+    elif asked is None:
         return None
-    if asked != "last":
-        if not Path(asked).is_file():
-            raise InputError(f"ckpt_path={asked} does not exist: name a .ckpt file, or last.")
-        return Path(asked)
-    found = sorted(runs.rglob("checkpoints/last.ckpt"), key=lambda path: path.stat().st_mtime)
+    elif asked == "last":
+        path = newest_run(runs) / "checkpoints" / LAST
+    else:
+        path = Path(asked)
+    return _whole(path)
+
+
+def has_checkpoints(run: Path) -> bool:
+    """Return whether a run's folder has a checkpoint to go on from."""
+    return any((run / "checkpoints" / name).exists() for name in (LAST, PREVIOUS))
+
+
+def newest_run(runs: Path) -> Path:
+    """Return the folder below `runs` with the newest checkpoint to go on from.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = [path for name in (LAST, PREVIOUS) for path in runs.rglob(f"checkpoints/{name}")]
     if not found:
         raise InputError(
-            f"ckpt_path=last found no checkpoints/last.ckpt in {runs}: "
+            f"ckpt_path=last found no checkpoints/{LAST} in {runs}: "
             "leave ckpt_path out to start a new run, or set name= to that of the run."
         )
-    print(f"going on from {found[-1]}")
-    return found[-1]
+    return max(found, key=lambda path: path.stat().st_mtime).parents[1]
+
+
+def _whole(path: Path) -> Path:
+    """Return `path`, or the checkpoint before it if that of the name LAST is absent or damaged."""
+    trouble = _trouble(path)
+    before = path.with_name(PREVIOUS)
+    if trouble and path.name == LAST and _trouble(before) is None:
+        print(f"{path} {trouble}: going on from the one before it", flush=True)
+        path, trouble = before, None
+    if trouble:
+        raise InputError(
+            f"ckpt_path={path} {trouble}: name a .ckpt file that a run has written, or last."
+        )
+    print(f"going on from {path}", flush=True)
+    return path
+
+
+def _trouble(path: Path) -> str | None:
+    """Say what is wrong with a checkpoint; None if every byte is as it was written."""
+    if not path.is_file():
+        return "does not exist"
+    try:
+        with zipfile.ZipFile(path) as parts:
+            bad = parts.testzip()  # torch itself compares no checksums
+    except Exception:  # zipfile's are of many kinds
+        return "cannot be read as a checkpoint"
+    return None if bad is None else f"is damaged, at {bad}"
+
+
+def read_notes(path: Path) -> dict[str, Any]:
+    """Read what a run's checkpoint says beside its weights, which stay on the disk.
+
+    `hyper_parameters` is the configuration; see also `Checkpoints`.
+    """
+    return torch.load(path, map_location="meta", mmap=True, weights_only=True)
+
+
+def what_differs(notes: Mapping[str, Any], config: Mapping[str, Any], revision: str) -> list[str]:
+    """List how a run that goes on is not the one that wrote a checkpoint: its bits will differ.
+
+    Args:
+        notes: the checkpoint's, see `read_notes`.
+        config: the configuration, of plain values.
+        revision: of the code.
+    """
+    before, now = (_flat(options) for options in (notes.get("hyper_parameters", {}), config))
+    keys = [key for key in before.keys() & now.keys() if before[key] != now[key]]
+    options = [f"{k}={now[k]}, it was {before[k]}" for k in sorted(keys) if not _is_place(k)]
+    if notes.get("revision", revision) != revision:
+        options.append(f"the code is {revision}, it was {notes['revision']}")
+    return options
+
+
+def _flat(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values of nested options by their dotted keys."""
+    flat = {}
+    for key, value in options.items():
+        nested = isinstance(value, Mapping)
+        flat |= _flat(value, f"{prefix}{key}.") if nested else {prefix + key: value}
+    return flat
+
+
+def _is_place(key: str) -> bool:
+    return key == "ckpt_path" or key.startswith(("paths.", "callbacks."))
 
 
 def check_checkpoint(path: Path | None, module: nn.Module) -> None:
@@ -108,6 +191,22 @@ def save_weights(weights: Mapping[str, Tensor], path: Path) -> None:
     }
     with replaced(path) as partial:
         partial.write_bytes(save(halves))
+
+
+def write_whole(values: Any, path: Path) -> None:
+    """Write values with torch.save: the file is there whole or not at all.
+
+    Raises:
+        InputError: there is no room, or one may not write there.
+    """
+    with replaced(path) as partial, open(partial, "wb") as file:
+        try:
+            torch.save(values, file)
+        except RuntimeError as error:
+            # torch hides why it could not write.
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
 
 
 def _read_shapes(path: Path) -> dict[str, tuple[int, ...]]:

@@ -93,6 +93,10 @@ class Reconstruction(lightning.LightningModule):
         self.log("train/psnr", quality, prog_bar=True, batch_size=size)
         return terms["loss"]
 
+    def terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Compute what `training_step` minimises, "loss", and its parts, and log nothing."""
+        return self._terms(self.net, batch)
+
     def _terms(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Compute the loss, its terms and the PSNR: means over the scenes of the batch."""
         outcome = self._reconstruct(net, batch, depth=self.loss.needs_depth)

@@ -1,9 +1,11 @@
 """TensorBoard: a first page of quality, training and time, and the hparams tab."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 CHOICES = (
@@ -27,6 +29,7 @@ CHOICES = (
     "training.loss.opacity",
 )
 TERMS = ("mse", "ssim", "perceptual", "depth", "opacity")
+EVENTS = "events.out.tfevents.*"
 HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
 
 PAGE = {
@@ -49,16 +52,47 @@ PAGE = {
 
 
 def make_logger(folder: Path | str) -> TensorBoardLogger:
-    """Make a logger whose "custom scalars" page shows quality first."""
-    logger = TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
-    logger.experiment.add_custom_scalars(PAGE)
-    return logger
+    """Make a logger of a run."""
+    return TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
+
+
+def event_files(loggers: Sequence[Logger]) -> dict[str, int]:
+    """Write all that was logged to disk; return the name and bytes of each file of events."""
+    sizes = {}
+    for logger in loggers:
+        if isinstance(logger, TensorBoardLogger):
+            logger.experiment.flush()
+            found = Path(logger.log_dir).glob(EVENTS)
+            sizes |= {path.name: path.stat().st_size for path in found}
+    return sizes
+
+
+@rank_zero_only
+def cut_events(folder: Path, sizes: Mapping[str, int]) -> None:
+    """Drop what a run logged after a checkpoint, from which it logs it again.
+
+    `purge_step` would not do: the last validation before and the first step after the checkpoint
+    have the same step.
+
+    Args:
+        folder: of the run.
+        sizes: of its files of events when the checkpoint was written.
+    """
+    for path in (folder / "tensorboard").glob(EVENTS):
+        if path.name not in sizes:
+            path.unlink()
+        elif path.stat().st_size > sizes[path.name]:
+            os.truncate(path, sizes[path.name])
 
 
 def log_choices(logger: Logger, config: DictConfig) -> None:
-    """Log options; for the hparams tab, metrics must be named before they are known."""
+    """Write what a run logs once: a "custom scalars" page that shows quality first, and options.
+
+    The hparams tab has the options; its metrics must be named before they are known.
+    """
     choices = {key: OmegaConf.select(config, key) for key in CHOICES}
     if isinstance(logger, TensorBoardLogger):
+        logger.experiment.add_custom_scalars(PAGE)
         logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in HPARAMS_METRICS})
     else:
         logger.log_hyperparams(choices)

@@ -1,4 +1,4 @@
-"""Callbacks: metrics, pictures, curve, costs, watch, non-finite steps, checkpoints, progress."""
+"""Callbacks: what is measured and drawn, what may go wrong, checkpoints, progress."""
 
 from asysplat.training.callbacks.checkpoints import Checkpoints
 from asysplat.training.callbacks.costs import Costs
@@ -7,6 +7,7 @@ from asysplat.training.callbacks.guard import SkipNonFiniteSteps
 from asysplat.training.callbacks.metrics import Metrics
 from asysplat.training.callbacks.pictures import Pictures
 from asysplat.training.callbacks.progress import Progress
+from asysplat.training.callbacks.skipped_scenes import SkippedScenes
 from asysplat.training.callbacks.watch import Watch
 
 __all__ = [
@@ -17,5 +18,6 @@ __all__ = [
     "Pictures",
     "Progress",
     "SkipNonFiniteSteps",
+    "SkippedScenes",
     "Watch",
 ]

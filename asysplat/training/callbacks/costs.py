@@ -40,8 +40,11 @@ class Costs(lightning.Callback):
         self.batch_tokens = trainer.datamodule.batch_size * tokens
         costs = static_costs(module.net, scene.num_views, height, width)
         self.values = {f"cost/{name}": value for name, value in costs.items()}
-        for logger in trainer.loggers:
-            logger.log_metrics(self.values, step=0)
+
+    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        if trainer.global_step == 0:  # a run that goes on has logged them
+            for logger in trainer.loggers:
+                logger.log_metrics(self.values, step=0)
 
     def on_train_batch_start(self, *_: Any) -> None:
         self.step.start()
