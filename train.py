@@ -118,8 +118,7 @@ def fit_and_test(config: DictConfig) -> float | None:
         notes = read_notes(checkpoint)
         for difference in what_differs(notes, options, revision()):
             print(f"not as before: {difference}")
-        if goes_on:
-            cut_events(folder, notes["event_files"])
+    cut_events(folder, notes["event_files"] if goes_on else {})
     logger = instantiate(config.logger)
     if logger is not None and not goes_on:
         log_choices(logger, config)

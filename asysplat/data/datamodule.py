@@ -50,8 +50,8 @@ class SceneDataModule(lightning.LightningDataModule):
             another in its place. A batch's `skipped` lists what was passed over.
 
     Raises:
-        InputError: another policy; a task that cannot be loaded. `setup` tries one training task,
-            and as many of the fixed ones as are kept in memory.
+        InputError: a task that cannot be loaded. `setup` tries one training task, and as many of
+            the fixed ones as are kept in memory.
     """
 
     def __init__(
@@ -72,8 +72,6 @@ class SceneDataModule(lightning.LightningDataModule):
         on_bad_scene: Policy = "fail",
     ):
         super().__init__()
-        if on_bad_scene not in ("fail", "skip"):
-            raise InputError(f"data.on_bad_scene is {on_bad_scene!r}: expected fail or skip.")
         self.on_bad_scene = on_bad_scene
         self.name, self.source = name, source
         self.inputs, self.targets = inputs, targets
@@ -172,7 +170,7 @@ class TrainingTasks(Dataset):
             try:
                 return self._sample(rng) | {"skipped": skipped}
             except (InputError, OSError) as error:
-                skipped.append(str(error))
+                skipped.append(str(error).partition("\n")[0])
                 if len(skipped) == self.draws:
                     row = f"{DRAWS} training scenes in a row cannot be used, the last because "
                     raise InputError(f"{row if self.draws > 1 else ''}{error}") from error

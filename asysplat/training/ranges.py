@@ -30,13 +30,17 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         (
             *("steps", "validate_every", "state_size"),
             *("data.inputs", "data.targets", "data.height", "data.width", "data.batch_size"),
-            *("data.val_scenes", "data.test_scenes", "callbacks.watch.every"),
+            *("data.val_scenes", "data.test_scenes"),
+            *("callbacks.guard.budget", "callbacks.watch.every"),
         ),
     ),
     (
         "a whole number of at least 0",
         lambda value: is_whole(value) and value >= 0,
-        ("data.num_workers", "training.schedule.warmup_steps", "callbacks.pictures.scenes"),
+        (
+            *("data.num_workers", "training.schedule.warmup_steps"),
+            *("callbacks.pictures.scenes", "callbacks.skips.budget"),
+        ),
     ),
     (
         f"a whole number from 0 to {SEEDS - 1}",
@@ -62,6 +66,12 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         lambda value: value is None or (is_number(value) and 0 < value < 1),
         ("geometry_ratio",),
     ),
+    (
+        "a number of at least 0, or null",
+        lambda value: value is None or (is_number(value) and value >= 0),
+        ("callbacks.checkpoints.minutes",),
+    ),
+    ("fail or skip", lambda value: value in ("fail", "skip"), ("data.on_bad_scene",)),
     ("two whole numbers, such as [64,96]", is_window, ("data.window",)),
 )
 

@@ -1,5 +1,6 @@
 """Tasks: reproducible, disjoint between stages, normalised, and batched."""
 
+import lightning
 import numpy as np
 import pytest
 import torch
@@ -42,22 +43,25 @@ def with_test_sets(test_sets, **changes):
     return procedural_data(test_sets=test_sets, **(options | changes))
 
 
-class Trainer:
-    world_size = 1
-
-    def __init__(self, epoch):
-        self.current_epoch = epoch
-
-
-def epoch_of_scenes(data, epoch):
-    data.trainer = Trainer(epoch)
-    return [batch["scene"] for batch in data.train_dataloader()]
+def epoch_of_scenes(data, epoch, done=0):
+    """The scenes of an epoch, of which `done` batches were trained on before a checkpoint."""
+    trainer = lightning.Trainer(logger=False, accelerator="cpu", enable_checkpointing=False)
+    loop = trainer.fit_loop
+    loop.epoch_progress.current.processed = epoch
+    loop.epoch_progress.current.completed = epoch
+    loop.epoch_progress.current.ready = epoch + (done > 0)
+    loop.epoch_loop.batch_progress.current.completed = done
+    data.trainer = trainer
+    loader = data.train_dataloader()
+    assert len(loader) == 3
+    return [batch["scene"] for batch in loader]
 
 
 def test_an_epoch_is_the_same_however_one_gets_there():
     whole = [epoch_of_scenes(procedural(), epoch) for epoch in range(2)]
     assert epoch_of_scenes(procedural(), 1) == whole[1]
     assert len({name for epoch in whole for names in epoch for name in names}) == 12
+    assert epoch_of_scenes(procedural(), 1, done=2) == whole[1][2:]
 
 
 def test_another_seed_gives_other_tasks():
@@ -254,3 +258,42 @@ def test_a_test_set_in_another_folder(tmp_path):
     assert torch.equal(scene["targets"].images, expected["targets"].images)
     with pytest.raises(InputError, match=r"data\.test_sets\.lost: data\.root=.*nowhere"):
         files_data(test_sets={"lost": {"root": f"{tmp_path}/nowhere"}}, **options).setup()
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Scenes to train on, 3, 4 and 5, of which 4 has a photograph that is cut short, and a test."""
+    for name, seeds in {"train": (3, 4, 5), "test": (6,)}.items():
+        for seed in seeds:
+            scene = ProceduralScene(seed, 16, 16, num_frames=24)
+            write_transforms(scene.views(range(24)), tmp_path / name / str(seed))
+    for image in (tmp_path / "train" / "4" / "images").iterdir():
+        image.write_bytes(image.read_bytes()[:100])
+    return {"name": "files", "root": f"{tmp_path}/train", "test_root": f"{tmp_path}/test"}
+
+
+def test_another_scene_is_drawn_in_place_of_one_that_cannot_be_read(folders):
+    options = {"val_scenes": 1, **folders, **READ_WITH}
+    with pytest.raises(InputError, match=r"train/4/images/\S+ cannot be read as an image"):
+        for index in range(20):
+            TrainingTasks(files_data(**options))[index]
+
+    tasks = TrainingTasks(files_data(**options, on_bad_scene="skip"))
+    samples = [tasks[index] for index in range(20)]
+    skipped = [len(sample["skipped"]) for sample in samples]
+    assert {"4"}.isdisjoint(sample["scene"] for sample in samples)
+    assert 0 in skipped and sum(skipped) >= 5
+    assert all("train/4: 24 of 24" in each for sample in samples for each in sample["skipped"])
+    batch = collate(samples)
+    assert len(batch["skipped"]) == sum(skipped)
+    again = files_data(**options, on_bad_scene="skip")
+    for index, sample in enumerate(samples):
+        assert torch.equal(TrainingTasks(again)[index]["inputs"].images, sample["inputs"].images)
+
+
+def test_no_scene_that_can_be_read(folders, tmp_path):
+    for image in (tmp_path / "train").rglob("images/*"):
+        image.unlink()
+    data = files_data(val_scenes=1, **folders, **READ_WITH, on_bad_scene="skip")
+    with pytest.raises(InputError, match=r"^10 training scenes in a row cannot be used, .*/train/"):
+        TrainingTasks(data)[0]

@@ -25,9 +25,8 @@ def _train(said: Path, overrides: tuple[str, ...], environment: dict[str, str]) 
     os.chdir(REPO)
     os.environ.update(environment)
     descriptor = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    os.dup2(descriptor, 1)
-    os.dup2(descriptor, 2)
-    sys.stdout = open(1, "w", buffering=1, closefd=False)
-    sys.stderr = open(2, "w", buffering=1, closefd=False)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(descriptor, stream.fileno())
+        stream.reconfigure(line_buffering=True)
     sys.argv = [str(REPO / "train.py"), *overrides]
     runpy.run_path(str(REPO / "train.py"), run_name="__main__")

@@ -1,29 +1,67 @@
-"""What is kept of a run: the best by its validation, and the last whether it is the best or not."""
+"""What is kept of a run, and that a run goes on from it as if nothing had happened."""
+
+import os
+import signal
+import struct
+import zipfile
 
 import lightning
+import logged
 import pytest
 import torch
+from full_disk import largest_file
 from torch.utils.data import DataLoader
 
+from asysplat.data.loader import EpochLoader, batches_done
 from asysplat.errors import InputError
 from asysplat.training.callbacks import Checkpoints
+from asysplat.training.callbacks.checkpoints import WholeFiles
 from asysplat.training.checkpoints import (
     check_checkpoint,
+    find_checkpoint,
     load_weights,
+    read_notes,
     save_weights,
+    what_differs,
 )
+from asysplat.training.tensorboard import cut_events, make_logger
+
+PER_EPOCH = 3
+
+
+class Killed(Exception):
+    pass
+
+
+class Numbers(lightning.LightningDataModule):
+    """Task i is the number i."""
+
+    def train_dataloader(self):
+        done, start = batches_done(self.trainer), self.trainer.current_epoch * PER_EPOCH
+        tasks = torch.arange(start + done, start + PER_EPOCH)
+        return EpochLoader(done, tasks, batch_size=None, generator=torch.Generator())
+
+    def val_dataloader(self):
+        return DataLoader([0.0], generator=torch.Generator())
 
 
 class Module(lightning.LightningModule):
-    """One weight, worse with every validation."""
+    """One weight, worse with every validation; what befalls it in each step is `kill`."""
 
-    def __init__(self, measured):
+    def __init__(self, kill=None, measured=True):
         super().__init__()
-        self.measured = measured
+        self.kill, self.measured = kill, measured
         self.layer = torch.nn.Linear(2, 1, bias=False)
 
     def training_step(self, batch, index):
-        return self.layer(batch).sum()
+        if self.kill is not None:
+            self.kill(self.global_step)
+        loss = self.layer(torch.rand(2) + batch).sum()
+        self.log_dict({"task": batch.float(), "index": float(index), "loss": loss})
+        return loss
+
+    def on_train_epoch_end(self):
+        self.log("ended", float(self.current_epoch))
 
     def validation_step(self, batch, index):
         if self.measured:
@@ -33,10 +71,12 @@ class Module(lightning.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def steps_kept(folder, steps, measured=True) -> dict[str, int]:
-    """Train with two steps an epoch; return the step of each checkpoint that is left."""
+def fit(folder, module, steps=7, checkpoint=None, minutes=None):
+    """Train with PER_EPOCH steps an epoch, a validation after each."""
+    cut_events(folder, {} if checkpoint is None else read_notes(checkpoint)["event_files"])
     checkpoints = Checkpoints(
-        dirpath=folder,
+        dirpath=folder / "checkpoints",
+        minutes=minutes,
         filename="best",
         monitor="val/psnr",
         mode="max",
@@ -47,30 +87,191 @@ def steps_kept(folder, steps, measured=True) -> dict[str, int]:
         accelerator="cpu",
         max_steps=steps,
         max_epochs=-1,
+        reload_dataloaders_every_n_epochs=1,
         num_sanity_val_steps=0,
+        log_every_n_steps=1,
         callbacks=[checkpoints],
-        logger=False,
+        plugins=[WholeFiles()],
+        logger=make_logger(folder),
         enable_progress_bar=False,
         enable_model_summary=False,
     )
-    data = DataLoader(torch.zeros(2, 2))
-    trainer.fit(Module(measured), data, data)
-    return {
-        path.stem: torch.load(path, weights_only=True)["global_step"]
-        for path in folder.glob("*.ckpt")
-    }
+    trainer.fit(module, datamodule=Numbers(), ckpt_path=checkpoint, weights_only=True)
 
 
-def test_the_last_is_kept_though_an_earlier_one_is_the_best(tmp_path):
-    assert steps_kept(tmp_path, 6) == {"best": 2, "last": 6}
+def steps_kept(folder) -> dict[str, int]:
+    return {path.stem: read_notes(path)["global_step"] for path in folder.rglob("*.ckpt")}
+
+
+def test_the_last_two_are_kept_though_an_earlier_one_is_the_best(tmp_path):
+    fit(tmp_path, Module(), steps=9)
+    assert steps_kept(tmp_path) == {"best": 3, "previous": 6, "last": 9}
 
 
 def test_the_end_is_kept_though_it_is_within_an_epoch(tmp_path):
-    assert steps_kept(tmp_path, 5) == {"best": 2, "last": 5}
+    fit(tmp_path, Module(), steps=7)
+    assert steps_kept(tmp_path) == {"best": 3, "previous": 6, "last": 7}
+
+
+def test_between_validations_too(tmp_path):
+    fit(tmp_path, Module(), steps=5, minutes=0)
+    assert steps_kept(tmp_path) == {"best": 3, "previous": 4, "last": 5}
 
 
 def test_nothing_is_the_best_where_nothing_measures(tmp_path):
-    assert steps_kept(tmp_path, 4, measured=False) == {"last": 4}
+    fit(tmp_path, Module(measured=False), steps=4)
+    assert steps_kept(tmp_path) == {"previous": 3, "last": 4}
+
+
+@pytest.mark.parametrize("minutes", [None, 0])
+def test_killed_in_every_step_it_takes_the_same_steps_with_the_same_logs(tmp_path, minutes):
+    torch.manual_seed(0)
+    whole = Module()
+    fit(tmp_path / "whole", whole)
+    assert logged.scalars(tmp_path / "whole")["task"] == [(i, i) for i in range(7)]
+
+    folder = tmp_path / "killed"
+    torch.manual_seed(0)
+    last = None
+    for at in range(1, 7):  # the lives of a run, each killed a step later
+
+        def kill(step, at=at):
+            if step == at:
+                raise Killed
+
+        with pytest.raises(Killed):
+            fit(folder, Module(kill), checkpoint=last, minutes=minutes)
+        torch.manual_seed(0 if last is None else 7)  # another process has other numbers
+        found = folder / "checkpoints" / "last.ckpt"
+        last = found if found.exists() else None
+    killed = Module()
+    fit(folder, killed, checkpoint=last, minutes=minutes)
+    assert torch.equal(killed.layer.weight, whole.layer.weight)
+    assert logged.scalars(folder) == logged.scalars(tmp_path / "whole")
+
+
+def test_more_steps_go_on_where_the_end_was(tmp_path):
+    fit(tmp_path, Module(), steps=6)
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    fit(tmp_path, Module(), steps=9, checkpoint=last)
+    found = logged.scalars(tmp_path)
+    assert found["task"] == [(i, i) for i in range(9)]
+    assert found["ended"] == [(2, 0), (5, 1), (8, 2)]
+    assert [step for step, _ in found["val/psnr"]] == [2, 5, 8]
+
+
+@pytest.mark.parametrize("at", [1, 2, 4])
+def test_a_notice_saves_the_step_at_hand_and_ends_the_run(tmp_path, capsys, at):
+    """Within an epoch and in its last step, after which it is validated first."""
+
+    def notice(step):
+        if step == at:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as end:
+        fit(tmp_path, Module(notice))
+    assert end.value.code == 128 + signal.SIGTERM
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert steps_kept(tmp_path)["last"] == at + 1
+    said = capsys.readouterr().out
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    assert f"SIGTERM: saved at step {at + 1}\nstopped; to go on, add ckpt_path={last}" in said
+    fit(tmp_path, Module(), checkpoint=last)
+    assert logged.scalars(tmp_path)["task"] == [(i, i) for i in range(7)]
+
+
+def test_a_notice_that_another_handles_is_handed_on_with_the_step_saved(tmp_path):
+    """As submitit's, which asks for the job once more."""
+    told = []
+
+    def handler(number, _):
+        told.append((number, steps_kept(tmp_path)["last"]))
+
+    def notice(step):
+        if step == 4:
+            os.kill(os.getpid(), signal.SIGUSR2)
+
+    before = signal.signal(signal.SIGUSR2, handler)
+    try:
+        fit(tmp_path, Module(notice))
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+    assert told == [(signal.SIGUSR2, 5)]
+    assert steps_kept(tmp_path)["last"] == 7
+
+
+def test_a_full_disk_leaves_the_checkpoints_before(tmp_path, capsys):
+    fit(tmp_path, Module(), steps=6)
+    kept = steps_kept(tmp_path)
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    with (
+        pytest.raises(InputError, match=r"next\.ckpt cannot be written \(File too large\)"),
+        largest_file(last.stat().st_size // 2),
+    ):
+        fit(tmp_path, Module(), steps=9, checkpoint=last)
+    assert steps_kept(tmp_path) == kept
+    assert "stopped; to go on, add ckpt_path=" in capsys.readouterr().out
+    fit(tmp_path, Module(), steps=9, checkpoint=last)
+    assert logged.scalars(tmp_path)["task"] == [(i, i) for i in range(9)]
+
+
+@pytest.fixture
+def run(tmp_path):
+    fit(tmp_path / "run", Module(), steps=6)
+    return tmp_path / "run"
+
+
+def damage(path):
+    """Change one bit of the weights, which torch would not notice."""
+    content = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as parts:
+        (part,) = (each for each in parts.infolist() if each.filename.endswith("/data/0"))
+    lengths = struct.unpack_from("<HH", content, part.header_offset + 26)  # of its name and more
+    content[part.header_offset + 30 + sum(lengths)] ^= 1
+    path.write_bytes(content)
+
+
+def test_of_a_damaged_checkpoint_the_one_before_is_taken(tmp_path, run, capsys):
+    last, previous = (run / "checkpoints" / f"{name}.ckpt" for name in ("last", "previous"))
+    assert find_checkpoint("last", tmp_path / "new", tmp_path) == last
+    assert find_checkpoint(None, tmp_path / "new", tmp_path) is None
+    assert find_checkpoint(None, run, tmp_path) == last  # a run that was cut off
+    whole = last.read_bytes()
+    last.write_bytes(whole[: len(whole) // 2])
+    for asked in ("last", str(last)):
+        capsys.readouterr()
+        assert find_checkpoint(asked, tmp_path / "new", tmp_path) == previous
+        said = f"{last} cannot be read as a checkpoint: going on from the one before it\n"
+        assert capsys.readouterr().out == f"{said}going on from {previous}\n"
+    last.unlink()
+    assert find_checkpoint("last", tmp_path / "new", tmp_path) == previous
+    previous.write_bytes(whole[:100])
+    with pytest.raises(InputError, match=r"ckpt_path=\S+last\.ckpt does not exist: name a \.ckpt"):
+        find_checkpoint("last", tmp_path / "new", tmp_path)
+
+
+def test_a_bit_that_changed_on_the_disk_is_noticed(tmp_path, run, capsys):
+    damage(run / "checkpoints" / "last.ckpt")
+    found = find_checkpoint("last", tmp_path / "new", tmp_path)
+    assert found == run / "checkpoints" / "previous.ckpt"
+    assert "last.ckpt is damaged, at " in capsys.readouterr().out
+    damage(found)
+    with pytest.raises(
+        InputError, match=r"ckpt_path=\S+last\.ckpt is damaged, at archive/data/0: "
+    ):
+        find_checkpoint("last", tmp_path / "new", tmp_path)
+
+
+def test_what_differs_from_the_run_before():
+    notes = {"revision": "a", "hyper_parameters": {"steps": 6, "data": {"seed": 1, "root": "x"}}}
+    assert what_differs(notes, notes["hyper_parameters"] | {"ckpt_path": "last"}, "a") == []
+    options = {"steps": 9, "data": {"seed": 2, "root": "x"}, "paths": {"logs": "y"}}
+    assert what_differs(notes, options, "b") == [
+        "data.seed=2, it was 1",
+        "steps=9, it was 6",
+        "the code is b, it was a",
+    ]
 
 
 def test_a_file_that_is_none_is_one_sentence(tmp_path):

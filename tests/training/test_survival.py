@@ -3,14 +3,16 @@
 import csv
 import os
 import random
+import re
 import signal
 import time
 from pathlib import Path
 
 import lives
+import logged
 import pytest
 import torch
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from full_disk import largest_file
 
 OPTIONS = ["callbacks.checkpoints.minutes=0", "data.num_workers=1", "data.batch_size=2"]
 
@@ -72,36 +74,75 @@ def rows(path):
         ]
 
 
-def scalars(folder):
-    """What TensorBoard shows of a run, but times: steps and values by tag."""
-    events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0})
-    events.Reload()
-    tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith("cost/")]
-    return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in tags}
-
-
-def images(folder):
-    events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"images": 0})
-    events.Reload()
-    return {tag: [e.step for e in events.Images(tag)] for tag in events.Tags()["images"]}
-
-
 def check_same(whole, killed):
     weights, survived = last_weights(whole), last_weights(killed)
     assert weights.keys() == survived.keys()
     assert [name for name in weights if not torch.equal(weights[name], survived[name])] == []
     for name in ("curve.csv", "metrics.csv"):
         assert rows(whole / name) == rows(killed / name) != []
-    assert scalars(whole) == scalars(killed) != {}
-    assert images(whole) == images(killed) != {}
+    assert logged.scalars(whole) == logged.scalars(killed) != {}
+    for kind in ("scalars", "images", "tensors"):
+        assert logged.steps(whole, kind) == logged.steps(killed, kind) != {}
     assert (killed / "checkpoints" / "previous.ckpt").exists()
 
 
 @pytest.mark.slow
 def test_killed_three_times_it_ends_with_the_same_bits_and_logs(train):
     options = [*OPTIONS, "steps=8", "validate_every=4"]
-    process, said = live(train, "whole", *options)
-    process.join()
-    assert process.exitcode == 0, said.read_text()
+    result = train("name=whole", *options)
+    assert result.returncode == 0, result.stderr
     assert kill_at_random_moments(train, 3, 3, *options) > 0
     check_same(folder_of(train, "whole"), folder_of(train, "killed"))
+
+
+@pytest.mark.hours
+@pytest.mark.timeout(3600)
+def test_killed_twenty_times_it_ends_with_the_same_bits_and_logs(train):
+    options = [*OPTIONS, "steps=60", "validate_every=6"]
+    result = train("name=whole", *options)
+    assert result.returncode == 0, result.stderr
+    killed = kill_at_random_moments(train, 20, 6, *options)
+    print(f"killed {killed} times")
+    assert killed == 20
+    check_same(folder_of(train, "whole"), folder_of(train, "killed"))
+
+
+@pytest.mark.slow
+def test_a_notice_to_all_processes_and_then_a_lost_loader(train):
+    options = [*OPTIONS[1:], "steps=1000", "validate_every=3"]
+    process, said = live(train, "noticed", *options)
+    wait_for(lambda: said.exists() and "step 3 of 1000" in said.read_text(), process)
+    os.killpg(process.pid, signal.SIGTERM)
+    process.join()
+    text = said.read_text()
+    assert process.exitcode == 128 + signal.SIGTERM, text
+    saved = int(re.search(r"SIGTERM: saved at step (\d+)", text)[1])
+    last = folder_of(train, "noticed") / "checkpoints" / "last.ckpt"
+    assert torch.load(last, weights_only=True)["global_step"] == saved >= 3
+    assert f"stopped; to go on, add ckpt_path={last} to the same command" in text
+    assert "Traceback" not in text
+
+    process, said = live(train, "noticed", *options)
+    after = 3 * (saved // 3 + 1)
+    wait_for(lambda: f"step {after} of 1000" in said.read_text(), process)
+    for worker in workers(process):
+        os.kill(worker, signal.SIGKILL)
+    process.join()
+    text = said.read_text()
+    assert process.exitcode == 1, text
+    assert f"going on from {last}" in text and text.count("stopped; to go on") == 2
+    assert "error: a process that loads data was lost (DataLoader worker (pid" in text
+    assert "Traceback" not in text
+
+
+def workers(process):
+    return map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split())
+
+
+def test_a_full_disk_ends_a_run_with_a_sentence(train):
+    with largest_file(5_000_000):  # which the checkpoint exceeds
+        result = train("name=full", "steps=2")
+    assert result.returncode == 1
+    assert "next.ckpt cannot be written (File too large): name a folder" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert list(folder_of(train, "full").rglob("*.ckpt")) == []

@@ -173,34 +173,6 @@ def test_bfloat16_with_the_perceptual_term(train, shared):
 
 
 @pytest.mark.slow
-def test_killed_and_resumed_ends_with_the_same_bits(train, whole):
-    kill_and_resume(train, whole)
-
-
-@pytest.mark.slow
-def test_killed_and_resumed_with_scenes_side_by_side(train):
-    whole = run_folder(train("name=pairs", "steps=6", "data.batch_size=2"))
-    kill_and_resume(train, whole, "data.batch_size=2")
-
-
-def kill_and_resume(train, whole, *overrides):
-    """Kill a run of 6 steps, resume it, and expect the weights of `whole` to the bit."""
-    command = ("name=killed", "steps=6", *overrides)
-    with train.start(*command, until="killed/*/checkpoints/last.ckpt") as process:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    assert not list(train.logs.glob("killed/*/metrics.json"))
-    resumed = run_folder(train(*command, "ckpt_path=last"))
-    weights = [
-        torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
-        for folder in (whole, resumed)
-    ]
-    assert weights[0].keys() == weights[1].keys()
-    for name, tensor in weights[0].items():
-        assert torch.equal(tensor, weights[1][name]), name
-
-
-@pytest.mark.slow
 def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repository, tmp_path):
     environment = {k: v for k, v in train.environment.items() if k != "ASYSPLAT_SHARED"}
     environment["PYTHONFAULTHANDLER"] = "1"

@@ -39,12 +39,12 @@ class Checkpoints(ModelCheckpoint):
         options: Lightning's.
     """
 
-    def __init__(self, dirpath: str | Path, minutes: float | None = None, **options: Any):
+    def __init__(self, dirpath: str | Path, minutes: int | float | None = None, **options: Any):
         super().__init__(dirpath=dirpath, **options)
         self.minutes = minutes
         self.notice: int | None = None  # the signal's number
         self.resumed: list[RandomStates] = []
-        self.saved_step = 0
+        self.saved_step, self.due = 0, False
 
     @property
     def last(self) -> Path:
@@ -53,11 +53,7 @@ class Checkpoints(ModelCheckpoint):
     def on_save_checkpoint(
         self, trainer: lightning.Trainer, module: lightning.LightningModule, checkpoint: dict
     ) -> None:
-        # A batch that has been fetched and not trained on is fetched again.
-        progress = checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]
-        for count in (progress["total"], progress["current"]):
-            if count["ready"] > count["completed"]:
-                count["ready"], progress["is_last_batch"] = count["completed"], False
+        _begin_at_next_batch(checkpoint["loops"]["fit_loop"])
         states = [random_states()]
         if trainer.world_size > 1:
             states *= trainer.world_size
@@ -89,11 +85,13 @@ class Checkpoints(ModelCheckpoint):
     def on_train_batch_start(
         self, trainer: lightning.Trainer, module: lightning.LightningModule, _: Any, index: int
     ) -> None:
-        """Save here, where the step before is complete, its log too."""
+        """Save here, where the step before is complete, its validation and its log too."""
         if index % trainer.accumulate_grad_batches:
             return
-        due = self.minutes is not None and time.monotonic() - self.saved_at >= 60 * self.minutes
-        if trainer.strategy.reduce_boolean_decision(due or self.notice is not None, all=False):
+        waited = time.monotonic() - self.saved_at
+        if (self.minutes is not None and waited >= 60 * self.minutes) or self.notice is not None:
+            self.due = True
+        if trainer.strategy.reduce_boolean_decision(self.due, all=False):
             self._save_last(trainer)
         self._heed(trainer)
 
@@ -102,8 +100,7 @@ class Checkpoints(ModelCheckpoint):
     ) -> None:
         if self.monitor in trainer.callback_metrics:
             super().on_train_epoch_end(trainer, module)
-        self._save_last(trainer)
-        self._heed(trainer)
+        self.due = True
 
     def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         self._save_last(trainer)
@@ -117,7 +114,7 @@ class Checkpoints(ModelCheckpoint):
             if self.last.exists():
                 os.replace(self.last, self.last.with_name(PREVIOUS))
             os.replace(fresh, self.last)
-        self.saved_step, self.saved_at = trainer.global_step, time.monotonic()
+        self.saved_step, self.saved_at, self.due = trainer.global_step, time.monotonic(), False
 
     def _heed(self, trainer: lightning.Trainer) -> None:
         """Do what the scheduler's notice would have done, now that there is a checkpoint."""
@@ -137,6 +134,25 @@ class Checkpoints(ModelCheckpoint):
         if trainer.is_global_zero:
             said = f"to go on, add ckpt_path={self.last} to the same command"
             print(f"stopped; {said if self.last.exists() else 'there is no checkpoint yet'}.")
+
+
+def _begin_at_next_batch(loop: dict[str, Any]) -> None:
+    """Let a saved training loop go on with the batch after the last that was trained on.
+
+    Lightning would end an epoch once more that had ended, or count a batch that was only fetched.
+
+    Args:
+        loop: the state of the loop of epochs, changed in place.
+    """
+    epoch, batch = loop["epoch_progress"], loop["epoch_loop.batch_progress"]
+    if epoch["current"]["ready"] == epoch["current"]["processed"]:  # between two epochs
+        for count in (epoch["total"], epoch["current"]):
+            count["completed"] = count["processed"]
+            count["ready"] = count["started"] = count["processed"] + 1
+        batch["current"] = dict.fromkeys(batch["current"], 0)
+        batch["total"]["ready"] += 1
+    batch["is_last_batch"] = False
+    loop["epoch_loop.state_dict"]["_batches_that_stepped"] -= 1  # it adds 1 when it goes on
 
 
 class WholeFiles(TorchCheckpointIO):

@@ -115,6 +115,4 @@ class SkipNonFiniteSteps(lightning.Callback):
     def on_train_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
-        # Not by `module.log`, which writes after the checkpoint of this epoch.
-        for logger in trainer.loggers:
-            logger.log_metrics({"train/skipped_steps": self.skipped}, step=trainer.global_step)
+        module.log("train/skipped_steps", float(self.skipped))

@@ -3,7 +3,6 @@
 from typing import Any
 
 import lightning
-import torch
 
 from asysplat.errors import InputError
 
@@ -54,8 +53,5 @@ class SkippedScenes(lightning.Callback):
     def on_train_epoch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule
     ) -> None:
-        # Not by `module.log`, which writes after the checkpoint of this epoch.
-        count = torch.tensor(float(self.skipped), device=module.device)
-        total = trainer.strategy.reduce(count, reduce_op="sum").item()
-        for logger in trainer.loggers:
-            logger.log_metrics({"train/skipped_scenes": total}, step=trainer.global_step)
+        skipped = float(self.skipped)
+        module.log("train/skipped_scenes", skipped, sync_dist=True, reduce_fx="sum")

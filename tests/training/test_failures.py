@@ -1,0 +1,41 @@
+"""What ends a run and is no mistake of the code is a sentence; all else is not."""
+
+import errno
+import os
+
+import pytest
+
+from asysplat.errors import InputError
+from asysplat.training.failures import sentence_of
+
+
+def raised_from(error, cause):
+    try:
+        raise error from cause
+    except Exception as found:
+        return found
+
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "logs/events")
+LOST = RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. ")
+SENTENCES = {
+    "a mistake": (InputError("steps=0: give more."), "steps=0: give more."),
+    "a full disk": (FULL, "there is no room on the disk for logs/events (No space left on device)"),
+    "a full disk behind": (
+        raised_from(RuntimeError("write"), FULL),
+        "there is no room on the disk",
+    ),
+    "a quota": (OSError(errno.EDQUOT, "Disk quota exceeded"), "no room on the disk (Disk quota"),
+    "a lost loader": (LOST, "a process that loads data was lost (DataLoader worker (pid 12) is ki"),
+}
+
+
+@pytest.mark.parametrize("case", SENTENCES)
+def test_a_sentence(case):
+    error, sentence = SENTENCES[case]
+    assert sentence in sentence_of(error)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("shapes"), OSError(errno.EIO, "I/O"), KeyError(1)])
+def test_none(error):
+    assert sentence_of(error) is None

@@ -1,0 +1,59 @@
+"""Which folder a run has: its own again, if it was cut off, and of nobody else."""
+
+import subprocess
+import sys
+
+import pytest
+
+from asysplat.errors import InputError
+from asysplat.training.run_folder import claimed, run_folder
+
+
+@pytest.fixture
+def cut_off(tmp_path):
+    """A run that has a checkpoint and no results."""
+    last = tmp_path / "logs" / "1" / "checkpoints" / "last.ckpt"
+    last.parent.mkdir(parents=True)
+    last.touch()
+    return last
+
+
+def test_a_run_that_was_cut_off_goes_on_in_its_folder(cut_off):
+    run, logs = cut_off.parents[1], str(cut_off.parents[2])
+    for asked in ("last", str(cut_off)):
+        assert run_folder(asked, logs, "fresh") == str(run)
+    cut_off.rename(cut_off.with_name("previous.ckpt"))  # killed while the last was replaced
+    assert run_folder("last", logs, "fresh") == str(run)
+
+
+def test_all_else_starts_in_a_folder_of_its_own(cut_off, tmp_path):
+    logs = str(cut_off.parents[2])
+    best = cut_off.with_name("best.ckpt")
+    best.touch()
+    assert run_folder(None, logs, "fresh") == "fresh"
+    assert run_folder("last", str(tmp_path / "other"), "fresh") == "fresh"
+    assert run_folder(str(best), logs, "fresh") == "fresh"
+    (cut_off.parents[1] / "metrics.json").touch()  # more steps of a run that has its results
+    assert run_folder("last", logs, "fresh") == "fresh"
+
+
+def test_two_processes_do_not_train_in_one_folder(tmp_path):
+    script = (
+        "import sys; from asysplat.training.run_folder import claimed; from pathlib import Path"
+    )
+    script += "\nwith claimed(Path(sys.argv[1])): print('claimed', flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", script, tmp_path / "run"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as other:
+        assert other.stdout.readline() == "claimed\n"
+        with (
+            pytest.raises(InputError, match=r"run is a run that another process still trains"),
+            claimed(tmp_path / "run"),
+        ):
+            pass
+        other.kill()
+    with claimed(tmp_path / "run"):
+        assert (tmp_path / "run").is_dir()
