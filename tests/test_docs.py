@@ -6,7 +6,13 @@ import runpy
 import pytest
 
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/tables.md"]
-DOCUMENTS += ["docs/questions.md", "docs/benchmarks.md", "examples/README.md", "data/README.md"]
+DOCUMENTS += [
+    "docs/questions.md",
+    "docs/benchmarks.md",
+    "docs/scaling.md",
+    "examples/README.md",
+    "data/README.md",
+]
 PLACES = r"`((?:asysplat|conf|sweeps|tests|docs|examples|data)/[\w./-]*)`"
 
 
@@ -26,3 +32,10 @@ def test_the_picture_of_the_architecture_is_up_to_date(repository):
     assert (repository / "docs" / "architecture.svg").read_text() == drawn, (
         "run python docs/architecture.py"
     )
+
+
+def test_the_tables_of_scaling_are_those_of_the_results(repository):
+    page = (repository / "docs" / "scaling.md").read_text()
+    made = runpy.run_path(str(repository / "docs" / "scaling.py"))
+    assert made["filled"](page) == page, "run python docs/scaling.py"
+    assert all(f"<!-- {name} -->" in page for name in made["tables"]())

@@ -42,9 +42,11 @@ def test_select_and_stack_and_to():
         torch.rand(3, 3, 4, 6),
         torch.rand(3, 4, 6),
         point_depths=torch.rand(3, 4, 6),
+        disparities=torch.rand(3, 4, 6),
     )
     picked = views.select([2, 0])
     assert torch.equal(picked.point_depths, views.point_depths[[2, 0]])
+    assert torch.equal(picked.disparities, views.disparities[[2, 0]])
     assert torch.equal(picked.images[0], views.images[2])
     assert torch.equal(picked.depths[1], views.depths[0])
     batch = Views.stack([views, picked.select([0, 1, 1])])

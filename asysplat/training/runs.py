@@ -24,7 +24,7 @@ EVALUATION = "evaluation.json"  # added to a run by evaluate.py
 NOT_HASHED = (
     *("name", "ckpt_path", "rerun", "paths", "callbacks", "logger"),
     *("stage", "stages", "selections", "more_inputs", "replica_size"),
-    *("data.root", "data.index", "data.cache", "data.disparities", "data.test_sets"),
+    *("data.root", "data.index", "data.cache", "data.test_sets"),
     *(f"training.loss.perceptual_term.{name}" for name in ("backbone_dir", "download")),
 )
 
@@ -62,8 +62,8 @@ def config_hash(config: DictConfig) -> str:
     Left out are:
 
     - the seed, callbacks, the logger, the number of loader processes and the cache;
-    - places on disk: for the test root and a checkpoint to start from, only whether they are given
-      counts; `data_of` names them;
+    - places on disk: for the test root, disparities and a checkpoint to start from, only whether
+      they are given counts; `data_of` names the first and the last;
     - further test sets, which do not change the numbers of the others; `data_of` names them too.
 
     Runs of one hash, seed and data have the same numbers. Missing values (`???`) are allowed.
@@ -74,7 +74,8 @@ def config_hash(config: DictConfig) -> str:
         config.seed = config.data.num_workers = config.data.test_sets = None
     resolved = OmegaConf.to_container(config, resolve=True)
     resolved["init_path"] = resolved["init_path"] is not None
-    resolved["data"]["test_root"] = resolved["data"].get("test_root") is not None
+    for key in ("test_root", "disparities"):
+        resolved["data"][key] = resolved["data"].get(key) is not None
     for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)

@@ -26,6 +26,7 @@ def make_views(count=3) -> Views:
         images=image.repeat(count, 1, 1, 1),
         depths=torch.rand(count, HEIGHT, WIDTH, dtype=torch.float64) + 1,
         masks=torch.rand(count, HEIGHT, WIDTH) > 0.3,
+        disparities=torch.rand(count, HEIGHT, WIDTH, dtype=torch.float64),
     )
 
 
@@ -53,10 +54,11 @@ def test_depths_and_masks_are_those_under_each_pixel(share):
     x = (crop.images[0, 0, 20] * WIDTH).floor().long()
     y = (crop.images[0, 1, :, 40] * HEIGHT).floor().long()
     inner = (slice(None), slice(1, -1), slice(1, -1))
-    for maps, found in ((views.depths, crop.depths), (views.masks, crop.masks)):
+    for name in ("depths", "masks", "disparities"):
+        maps, found = getattr(views, name), getattr(crop, name)
         assert torch.equal(found[inner], maps[:, y[:, None], x][inner])
-    bare = cropped(replace(views, depths=None, masks=None), share)
-    assert bare.depths is None and bare.masks is None
+    bare = cropped(replace(views, depths=None, masks=None, disparities=None), share)
+    assert bare.depths is None and bare.masks is None and bare.disparities is None
     assert torch.equal(bare.images, crop.images)
 
 

@@ -29,6 +29,8 @@ REFUSED = {
     "training.optimizer.weight_decay=-1": "training.optimizer.weight_decay=-1: give a number",
     "training.schedule.warmup_steps=2.5": "training.schedule.warmup_steps=2.5: give a whole number",
     "training.loss.depth=-1": "training.loss.depth=-1: give a number of at least 0.",
+    "callbacks.watch.every=0": "callbacks.watch.every=0: give a whole number of at least 1.",
+    "training.loss.opacity=-1": "training.loss.opacity=-1: give a number of at least 0.",
     "data.val_scenes=0": "data.val_scenes=0: give a whole number of at least 1.",
     "data.window=12": "data.window=12: give two whole numbers, such as [64,96].",
     "data.window=[12]": "data.window=[12]: give two whole numbers, such as [64,96].",

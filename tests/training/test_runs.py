@@ -33,6 +33,8 @@ def write_run(tmp_path):
 SAME = {
     "moved data": ["data.root=/b/DL3DV", "data.test_root=/b/c/Benchmark/"],
     "another cache": ["data.cache.folder=/b/cache", "data.cache.memory_gb=2"],
+    "moved disparities": ["data.disparities=/b/disparities"],
+    "another logger": ["logger=none"],
     "moved weights": ["paths.weights=/b/weights", "training.loss.perceptual_term.backbone_dir=/c"],
     "another test set": ["test_sets=[mipnerf360]", "paths.mipnerf360=/b/360_v2"],
     "other names": ["name=other", "paths.logs=/b/logs", "rerun=true"],
@@ -48,6 +50,7 @@ OTHER = {
     "steps": ["steps=241"],
     "metrics": ["metrics=longlrm"],
     "weights to start from": ["init_path=/b/last.ckpt"],
+    "without disparities": ["data.disparities=null"],
     "frames instead of scenes": ["data.test_root=null"],
 }
 
