@@ -1,12 +1,29 @@
 """The points that no other beats in cost and in quality: found, and drawn before the rest."""
 
 from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 from matplotlib.axes import Axes
+from matplotlib.transforms import Bbox
 
 from asysplat.report.style import FAINT, INK
 
 Point = tuple[str, float, float]  # name, cost, quality
+
+
+class Place(NamedTuple):
+    """Where a name stands beside its point: offsets in typographic points, and alignment."""
+
+    x: float
+    y: float
+    ha: str
+    va: str
+
+
+ABOVE, BELOW = Place(0, 6, "center", "bottom"), Place(0, -6, "center", "top")
+LEFT, RIGHT = Place(-7, 0, "right", "center"), Place(7, 0, "left", "center")
+ABOVE_LEFT, ABOVE_RIGHT = Place(0, 6, "right", "bottom"), Place(0, 6, "left", "bottom")
+FONT = 9
 
 
 def pareto_front(points: Sequence[Point], better: str) -> list[Point]:
@@ -27,6 +44,8 @@ def draw_front(
 ) -> None:
     """Draw the front as a line, the other points faded; each has its name.
 
+    A name of a faded point for which there is no room is left out.
+
     Args:
         points: at least one.
         better: "higher" or "lower", of the quality.
@@ -40,24 +59,33 @@ def draw_front(
         own, alpha = (colour, 1.0) if point in front else (FAINT, 0.7)
         face = "none" if point[0] in hollow else own
         axes.plot(*point[1:], "o", color=own, mfc=face, ms=6 if point in rest else 7, alpha=alpha)
-    for point in rest:
-        _label(axes, point, FAINT, "center", "top")
-    for point in front:
-        _label(axes, point, INK, "left" if point == front[-1] else "right", "bottom")
     axes.margins(x=0.2, y=0.18)
+    axes.figure.draw_without_rendering()  # so that places in pixels are known
+    taken: list[Bbox] = []
+    for point in front:
+        first = ABOVE_RIGHT if point == front[-1] else ABOVE_LEFT
+        _label(axes, point, INK, (first, LEFT, RIGHT, BELOW, first), taken)
+    for point in rest:
+        _label(axes, point, FAINT, (BELOW, ABOVE, RIGHT, LEFT), taken)
 
 
-def _label(axes: Axes, point: Point, colour: str, ha: str, va: str) -> None:
-    """Write a name above the front and away from its end, so that neighbours stay apart."""
-    name, cost, quality = point
-    offset = (0, 6 if va == "bottom" else -6)
-    axes.annotate(
-        name,
-        (cost, quality),
-        offset,
-        textcoords="offset points",
-        ha=ha,
-        va=va,
-        color=colour,
-        fontsize=9,
-    )
+def _label(
+    axes: Axes, point: Point, colour: str, places: Sequence[Place], taken: list[Bbox]
+) -> None:
+    """Write a name at the first place that is free, or at the last if it is the first again."""
+    for number, place in enumerate(places):
+        text = axes.annotate(
+            point[0],
+            point[1:],
+            (place.x, place.y),
+            textcoords="offset points",
+            ha=place.ha,
+            va=place.va,
+            color=colour,
+            fontsize=FONT,
+        )
+        box = text.get_window_extent()
+        if not any(map(box.overlaps, taken)) or place in places[:number]:
+            taken.append(box)
+            return
+        text.remove()

@@ -238,7 +238,7 @@ MISTAKES = {
     "no scene": ({"scenes": ["fern"]}, r"^pareto\.scenes=\['fern'\]: none is a folder of"),
     "a setting": (
         {"feed_forward": {"knobs": {"a": {"precison": "bf16"}}}},
-        r"^pareto\.feed_forward\.a=precison is unknown: choose from checkpoint, ",
+        r"^pareto\.feed_forward\.a=precison is unknown: choose from views, side, checkpoint, ",
     ),
     "a value": (
         {"feed_forward": {"knobs": {"a": {"precision": "fp8"}}}},

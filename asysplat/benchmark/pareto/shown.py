@@ -129,27 +129,28 @@ def plot(results: Result) -> Figure:
         size = (1.0 + 5.2 * len(families), 0.8 + 4.2 * len(shown))
         figure = Figure(figsize=size, layout="constrained")
         grid = figure.subplots(len(shown), len(families), squeeze=False)
-        for column, ((family,), rows) in enumerate(families.items()):
+        for column, (family,) in enumerate(families):
+            for axes, quality in zip(grid[:, column], shown, strict=True):
+                axes.set(title=TITLES[family], xlabel="seconds", ylabel=QUALITIES[quality])
+        for column, rows in enumerate(families.values()):
             busy = [row["setting"] for row in rows if row["busy"]]
             for axes, quality in zip(grid[:, column], shown, strict=True):
-                axes.set(
-                    xscale="log", title=TITLES[family], xlabel="seconds", ylabel=QUALITIES[quality]
-                )
                 _draw(axes, points(rows, quality), busy)
-        figure.supxlabel("hollow: measured while the machine was busy", fontsize=9, color=FAINT)
+        note = "hollow: measured while the machine was busy; crowded names are left out"
+        figure.supxlabel(note, fontsize=9, color=FAINT)
     return figure
 
 
 def _draw(axes: Axes, found: Sequence[tuple[str, float, float]], busy: Sequence[str]) -> None:
     if not found:
-        axes.set_xscale("linear")
         axes.text(0.5, 0.5, "not measured", color=FAINT, ha="center", transform=axes.transAxes)
         axes.set_axis_off()
         return
-    draw_front(axes, found, "higher", OURS, busy)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
+    draw_front(axes, found, "higher", OURS, busy)
 
 
 ROWS: Columns = {
