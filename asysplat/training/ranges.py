@@ -63,6 +63,11 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         ("geometry_ratio",),
     ),
     ("two whole numbers, such as [64,96]", is_window, ("data.window",)),
+    (
+        "height and width in pixels, such as [64,96], or null for the size that trains",
+        lambda value: value is None or (is_window(value) and min(value) >= 1),
+        ("data.test_size",),
+    ),
 )
 
 

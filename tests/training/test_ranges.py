@@ -32,6 +32,8 @@ REFUSED = {
     "data.val_scenes=0": "data.val_scenes=0: give a whole number of at least 1.",
     "data.window=12": "data.window=12: give two whole numbers, such as [64,96].",
     "data.window=[12]": "data.window=[12]: give two whole numbers, such as [64,96].",
+    "data.test_size=64": "data.test_size=64: give height and width in pixels, such as [64,96]",
+    "data.test_size=[0,64]": "data.test_size=[0, 64]: give height and width in pixels",
     "geometry_ratio=1.5": "geometry_ratio=1.5: give a share between 0 and 1",
     "geometry_ratio=half": "geometry_ratio=half: give a share between 0 and 1",
 }
