@@ -5,6 +5,7 @@ A checkpoint is what a run writes (.ckpt), or weights alone (.safetensors), as t
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import safe_open
@@ -72,6 +73,21 @@ def _check_state(state: dict[str, tuple[int, ...]], path: Path, module: nn.Modul
         f"{', '.join(listed)}{', ...' if len(differing) > LISTED else ''}; give the options that "
         "it was trained with (a run's config.yaml, or the card beside a .safetensors file)."
     )
+
+
+def read_callbacks(path: Path) -> dict[str, Any]:
+    """Read what the callbacks of a run left in its checkpoint, by their names.
+
+    Raises:
+        InputError: the file cannot be read as a run's checkpoint.
+    """
+    try:
+        return torch.load(path, map_location="meta", weights_only=True)["callbacks"]
+    except Exception as error:
+        raise InputError(
+            f"{path} cannot be read as a checkpoint to resume from: name a .ckpt file that a run "
+            "has written."
+        ) from error
 
 
 def load_weights(path: str | None, module: nn.Module) -> None:
