@@ -64,7 +64,7 @@ def check_stages(stages: Sequence[DictConfig]) -> None:
             net.check_size(stage.data.height, stage.data.width)
         except InputError as error:
             raise InputError(f"{stage.stage}: {error}") from error
-    if (stages[-1].callbacks or {}).get("checkpoints") is None:
+    if (stages[-1].get("callbacks") or {}).get("checkpoints") is None:
         raise InputError(
             "callbacks.checkpoints is left out, by which a stage hands its weights to the next: "
             "leave it in, or train one stage alone with earlier_stages=[]."
@@ -115,7 +115,7 @@ def resume_point(checkpoint: Path | None, stages: Sequence[DictConfig]) -> tuple
     if stage not in names:
         raise InputError(
             f"ckpt_path={checkpoint} is of {stage}, and this run trains {', '.join(names)}: give "
-            f"stage={stage} to go on with it, or init_path in place of ckpt_path to start from it."
+            "the options of its run to go on with it, or init_path in its place to start from it."
         )
     return names.index(stage), record.get("earlier", {})
 

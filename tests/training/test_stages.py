@@ -100,7 +100,7 @@ def test_a_checkpoint_says_where_to_go_on(composed, tmp_path):
     assert resume_point(None, stages) == (0, {})
     assert resume_point(saved(stage="stage2", earlier=earlier), stages) == (1, earlier)
     assert resume_point(saved(), stages) == (0, {})
-    with pytest.raises(InputError, match=r"last\.ckpt is of ablation, and .* stage=ablation to go"):
+    with pytest.raises(InputError, match=r"last\.ckpt is of ablation, and this run trains"):
         resume_point(saved(stage="ablation", earlier={}), stages)
     path.write_text("a text")
     with pytest.raises(InputError, match=r"last\.ckpt cannot be read as a checkpoint to resume"):
