@@ -6,6 +6,7 @@ python train.py model=asysplat_4m4s scale=laptop
 import os
 import sys
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
@@ -15,6 +16,7 @@ from hydra.errors import CompactHydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError
@@ -30,11 +32,18 @@ from asysplat.training.checkpoints import (
 )
 from asysplat.training.failures import sentence_of
 from asysplat.training.quiet import quiet_lightning
-from asysplat.training.ranges import check_ranges
 from asysplat.training.revision import revision
 from asysplat.training.run_folder import claimed, run_folder
-from asysplat.training.runs import Run, describe_run, find_run
-from asysplat.training.summary import print_summary, write_json
+from asysplat.training.runs import RESULTS, Run, describe_run, find_run
+from asysplat.training.stages import (
+    StageRecord,
+    check_stages,
+    describe_stage,
+    results_of_stage,
+    resume_point,
+    stage_configs,
+)
+from asysplat.training.summary import Results, print_summary, write_json
 from asysplat.training.tensorboard import cut_events, log_choices, log_outcome
 
 
@@ -83,22 +92,51 @@ def finished_text(run: Run) -> str:
 
 
 def train(config: DictConfig) -> float | None:
-    """Train and test; return the test PSNR, which a sweep may optimise."""
+    """Train and test, stage by stage; return the test PSNR, which a sweep may optimise."""
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
-    check_ranges(config)
+    stages = stage_configs(config)
+    check_stages(stages)
     with claimed(Path(config.paths.run)):
-        return fit_and_test(config)
+        return train_stages(config, stages)
 
 
-def fit_and_test(config: DictConfig) -> float | None:
-    """Fit, from a checkpoint if there is one to go on from, then test; return the test PSNR."""
+def train_stages(config: DictConfig, stages: Sequence[DictConfig]) -> float | None:
+    """Train and test the stages of a run, from a checkpoint if there is one to go on from."""
     quiet_lightning()
     folder = Path(config.paths.run)
     described = describe_run(config)  # now, since files may be edited while this trains
-    lightning.seed_everything(config.seed, workers=True, verbose=False)
-    goes_on = has_checkpoints(folder)
     checkpoint = find_checkpoint(config.ckpt_path, folder, Path(config.paths.logs) / config.name)
+    first, earlier = resume_point(checkpoint, stages)
+    weights = config.init_path if checkpoint is None else None
+    for stage in stages[first:-1]:
+        stage.paths.run = str(folder / stage.stage)
+        found = train_stage(stage, weights, checkpoint, earlier)
+        if rank_zero_only.rank == 0:
+            print_summary(earlier | found, config.data.name, Path(stage.paths.run))
+        earlier = earlier | results_of_stage(stage.stage, found)
+        weights, checkpoint = f"{stage.paths.run}/checkpoints/last.ckpt", None
+    results = described | earlier | train_stage(config, weights, checkpoint, earlier)
+    if rank_zero_only.rank == 0:
+        write_json(folder / RESULTS, results)
+        print_summary(results, config.data.name, folder)
+    return results.get(f"test/{config.data.name}/psnr")
+
+
+def train_stage(
+    config: DictConfig, weights: str | None, checkpoint: Path | None, earlier: Results
+) -> Results:
+    """Train and test one stage; return what was measured.
+
+    Args:
+        config: of the stage.
+        weights: to start from, as `init_path` names them.
+        checkpoint: to resume from.
+        earlier: results of the stages before it.
+    """
+    folder = Path(config.paths.run)
+    folder.mkdir(parents=True, exist_ok=True)
+    lightning.seed_everything(config.seed, workers=True, verbose=False)
     data = instantiate(config.data)
     data.setup()
     net = instantiate(config.model)
@@ -106,7 +144,8 @@ def fit_and_test(config: DictConfig) -> float | None:
     data.check_sizes(instantiate(config.metrics).check_size)
     module = instantiate(config.training, net=net)
     check_checkpoint(checkpoint, module)
-    load_weights(config.init_path, module)
+    load_weights(weights, module)
+    print(f"{config.stage}: {describe_stage(config)}")
     print(f"model: {net.describe()}")
 
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
@@ -114,33 +153,33 @@ def fit_and_test(config: DictConfig) -> float | None:
     module.save_hyperparameters(options, logger=False)
     made = instantiate(config.get("callbacks") or {})
     callbacks = {name: callback for name, callback in made.items() if callback is not None}
-    if checkpoint is not None:
-        notes = read_notes(checkpoint)
-        for difference in what_differs(notes, options, revision()):
-            print(f"not as before: {difference}")
+    notes = {} if checkpoint is None else read_notes(checkpoint)
+    for difference in what_differs(notes, options, revision()):
+        print(f"not as before: {difference}")
+    goes_on = has_checkpoints(folder)
     cut_events(folder, notes["event_files"] if goes_on else {})
     logger = instantiate(config.logger)
     if logger is not None and not goes_on:
         log_choices(logger, config)
-    trainer = make_trainer(config, callbacks, logger)
+    trainer = make_trainer(config, callbacks, StageRecord(config.stage, earlier), logger)
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(module, data, verbose=False)
 
-    results = described
+    results = {}
     if "costs" in callbacks:
         results |= callbacks["costs"].values
     if "metrics" in callbacks:
         results |= callbacks["metrics"].results
-    if trainer.is_global_zero:
-        write_json(folder / "metrics.json", results)
-        if logger is not None:
-            log_outcome(logger, results, data.name)
-        print_summary(results, data.name, folder)
-    return results.get(f"test/{data.name}/psnr")
+    if trainer.is_global_zero and logger is not None:
+        log_outcome(logger, results, data.name)
+    return results
 
 
 def make_trainer(
-    config: DictConfig, callbacks: dict[str, lightning.Callback], logger: Logger | None
+    config: DictConfig,
+    callbacks: dict[str, lightning.Callback],
+    record: StageRecord,
+    logger: Logger | None,
 ) -> lightning.Trainer:
     """Build Lightning's trainer.
 
@@ -150,7 +189,7 @@ def make_trainer(
     try:
         return instantiate(
             config.trainer,
-            callbacks=list(callbacks.values()),
+            callbacks=[*callbacks.values(), record],
             logger=logger or False,
             # Otherwise Lightning adds its own in place of those that are left out.
             enable_checkpointing="checkpoints" in callbacks,

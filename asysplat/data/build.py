@@ -100,6 +100,7 @@ def scene_data(
     inputs: int,
     targets: int,
     test_sets: Mapping[str, Any] | None = None,
+    test_size: Sequence[int] | None = None,
     **options,
 ) -> SceneDataModule:
     """Build a data module that is tested on further sets as well.
@@ -110,6 +111,7 @@ def scene_data(
         changeable: the options in which test sets may differ from the data set, with the data
             set's values; height and width are among them.
         test_sets: name -> the options that differ: any of `changeable`, inputs and targets.
+        test_size: height and width of all tests, but of sets that have their own; None: as trained.
         name, inputs, targets, options: those of SceneDataModule.
 
     Raises:
@@ -117,6 +119,9 @@ def scene_data(
     """
     main = {"inputs": inputs, "targets": targets, **changeable}
     sets = {}
+    if test_size is not None:
+        main["height"], main["width"] = test_size
+        sets[name] = partial(_test_tasks, make_source, **main)
     for other, changes in (test_sets or {}).items():
         _check_test_set(other, changes, name, main)
         sets[other] = partial(_test_tasks, make_source, **{**main, **changes})

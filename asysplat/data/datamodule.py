@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_all_start_methods
 from typing import Any
 
@@ -17,7 +18,7 @@ from asysplat.data.capture import Capture
 from asysplat.data.loader import EpochLoader, batches_done, outlive_notice
 from asysplat.data.normalise import normalise
 from asysplat.data.points import depths_of_points
-from asysplat.data.selection import Selection
+from asysplat.data.selection import Selection, Split
 from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
@@ -37,13 +38,13 @@ class SceneDataModule(lightning.LightningDataModule):
         name: the data set's name in metrics.
         source: where tasks come from.
         inputs, targets: views given and views to predict, per scene.
-        height, width: size in pixels of every view that `source` gives; further test sets may
-            have another.
+        height, width: size in pixels of every view that `source` gives; test sets may have another.
         batch_size: scenes per step.
         num_workers: number of processes that load ahead; 0 loads in the training process.
         seed: of the training tasks.
         steps_per_epoch: steps between two validations.
-        test_sets: further test sets by name, each a function that makes its tasks.
+        test_sets: further test sets by name, each a function that makes its tasks; one of the data
+            set's own name takes the place of the source's test.
         augmentation: how training tasks are varied; None leaves them as they are.
         points: whether the inputs come with the depths of the scene's sparse points.
         on_bad_scene: of a training task whose files cannot be used: "fail", or "skip" to draw
@@ -88,18 +89,22 @@ class SceneDataModule(lightning.LightningDataModule):
         """Make the validation and test tasks, and try one training task."""
         if not self.evaluation:
             samples = {"training": TrainingTasks(self)[0]}
-            for name in ("val", "test"):
-                tasks = self.source.evaluation(name, self.inputs, self.targets)
-                self.evaluation[name] = FixedTasks(tasks, self.points)
-            self.tests[self.name] = self.evaluation["test"]
-            for name, make_tasks in self.test_sets.items():
+            self.evaluation["val"] = FixedTasks(self._own_tasks("val"), self.points)
+            own = {self.name: partial(self._own_tasks, "test")}
+            for name, make_tasks in (own | self.test_sets).items():
                 try:
                     self.tests[name] = FixedTasks(make_tasks(), self.points)
                 except InputError as error:
+                    if name == self.name:
+                        raise
                     raise InputError(f"data.test_sets.{name}: {error}") from error
+            self.evaluation["test"] = self.tests[self.name]
             samples |= {name: tasks[0] for name, tasks in self.tests.items()}
             if self.points:
                 _warn_of_no_points(samples)
+
+    def _own_tasks(self, split: Split) -> list[Task]:
+        return self.source.evaluation(split, self.inputs, self.targets)
 
     def check_sizes(self, check: Callable[[int, int], None]) -> None:
         """Call `check(height, width)` for every set; its InputError names the set."""
@@ -108,7 +113,8 @@ class SceneDataModule(lightning.LightningDataModule):
             try:
                 check(*tasks[0]["inputs"].images.shape[-2:])
             except InputError as error:
-                raise InputError(f"data.test_sets.{name}: {error}") from error
+                where = "data.test_size" if name == self.name else f"data.test_sets.{name}"
+                raise InputError(f"{where}: {error}") from error
 
     def train_dataloader(self) -> DataLoader:
         per_epoch = self.steps_per_epoch * self.batch_size * self.trainer.world_size

@@ -13,6 +13,7 @@ from asysplat.evaluation.static_cost import static_costs
 from asysplat.report.filled import Costs, FilledRow, FilledTable, Number
 from asysplat.report.paper import PaperRow, PaperTable, our_sets
 from asysplat.training.runs import Run, config_hash, data_of, find_runs
+from asysplat.training.stages import describe_stage, stage_configs
 
 # Overrides of train.py -> its configuration, the node `hydra` included.
 Compose = Callable[[Sequence[str]], DictConfig]
@@ -174,9 +175,11 @@ def _note(
 
 def _scale_text(config: DictConfig) -> str:
     data = config.data
+    height, width = data.test_size or (data.height, data.width)
+    stages = ", then ".join(describe_stage(stage) for stage in stage_configs(config))
     return (
-        f"{data.name} data, {data.inputs} input views of {data.height}x{data.width}, "
-        f"{config.steps} steps of batch {data.batch_size}, {config.width:g} of the paper's width"
+        f"{data.name} data, {data.inputs} input views of {height}x{width}, {stages}, "
+        f"{config.width:g} of the paper's width"
     )
 
 

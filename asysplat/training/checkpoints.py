@@ -26,30 +26,31 @@ def find_checkpoint(asked: str | None, run: Path, runs: Path) -> Path | None:
 
     Args:
         asked: None, a file, or "last" for the last one of the newest run below `runs`.
-        run: the run's own folder: if it has checkpoints, the run was cut off and goes on.
+        run: the run's own folder: if it or one of its stages has checkpoints, the run was cut off
+            and goes on.
         runs: folder of all runs of one name.
 
     Raises:
         InputError: there is no such file, or it is damaged, and so is the one before it.
     """
-    if has_checkpoints(run):
-        path = run / "checkpoints" / LAST
+    if any(has_checkpoints(folder) for folder in (run, *run.glob("*/"))):
+        path = newest_folder(run) / "checkpoints" / LAST
     elif asked is None:
         return None
     elif asked == "last":
-        path = newest_run(runs) / "checkpoints" / LAST
+        path = newest_folder(runs) / "checkpoints" / LAST
     else:
         path = Path(asked)
     return _whole(path)
 
 
-def has_checkpoints(run: Path) -> bool:
-    """Return whether a run's folder has a checkpoint to go on from."""
-    return any((run / "checkpoints" / name).exists() for name in (LAST, PREVIOUS))
+def has_checkpoints(folder: Path) -> bool:
+    """Return whether the folder of a run, or of one of its stages, has one to go on from."""
+    return any((folder / "checkpoints" / name).exists() for name in (LAST, PREVIOUS))
 
 
-def newest_run(runs: Path) -> Path:
-    """Return the folder below `runs` with the newest checkpoint to go on from.
+def newest_folder(runs: Path) -> Path:
+    """Return the folder, `runs` or below, with the newest checkpoint to go on from.
 
     Raises:
         InputError: there is none.
@@ -155,6 +156,21 @@ def _check_state(state: dict[str, tuple[int, ...]], path: Path, module: nn.Modul
         f"{', '.join(listed)}{', ...' if len(differing) > LISTED else ''}; give the options that "
         "it was trained with (a run's config.yaml, or the card beside a .safetensors file)."
     )
+
+
+def read_callbacks(path: Path) -> dict[str, Any]:
+    """Read what the callbacks of a run left in its checkpoint, by their names.
+
+    Raises:
+        InputError: the file cannot be read as a run's checkpoint.
+    """
+    try:
+        return torch.load(path, map_location="meta", weights_only=True)["callbacks"]
+    except Exception as error:
+        raise InputError(
+            f"{path} cannot be read as a checkpoint to resume from: name a .ckpt file that a run "
+            "has written."
+        ) from error
 
 
 def load_weights(path: str | None, module: nn.Module) -> None:

@@ -77,11 +77,12 @@ def _card(
         curve = [dict(row) for row in csv.DictReader(file)]
     columns = [name for name in ("step", "minutes", "psnr", "lpips", "absrel") if name in curve[0]]
     every = max(1, len(curve) // 10)
+    earlier = "".join(f"{name}, then " for name in config.get("earlier_stages") or ())
     return "\n".join(
         [
             f"# {name}",
             "",
-            f"`python train.py {' '.join(overrides)}`, {steps:,} steps of "
+            f"`python train.py {' '.join(overrides)}`, {earlier}{steps:,} steps of "
             f"{config.data.batch_size} scenes in {hours:.1f} hours on {results['run/machine']}, "
             f"seed {results['run/seed']}, revision {results['run/revision']}.",
             "",

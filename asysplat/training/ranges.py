@@ -73,6 +73,11 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
     ),
     ("fail or skip", lambda value: value in ("fail", "skip"), ("data.on_bad_scene",)),
     ("two whole numbers, such as [64,96]", is_window, ("data.window",)),
+    (
+        "height and width in pixels, such as [64,96], or null for the size that trains",
+        lambda value: value is None or (is_window(value) and min(value) >= 1),
+        ("data.test_size",),
+    ),
 )
 
 

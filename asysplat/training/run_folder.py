@@ -8,8 +8,10 @@ from pathlib import Path
 from lightning.pytorch.utilities import rank_zero_only
 
 from asysplat.errors import InputError
-from asysplat.training.checkpoints import LAST, has_checkpoints, newest_run
+from asysplat.training.checkpoints import LAST, has_checkpoints, newest_folder
 from asysplat.training.runs import RESULTS
+
+LOCK = ".lock"  # in the folder of each run
 
 
 def run_folder(asked: str | None, runs: str, fresh: str) -> str:
@@ -24,13 +26,14 @@ def run_folder(asked: str | None, runs: str, fresh: str) -> str:
         fresh: the folder of a new run.
     """
     try:
-        last = newest_run(Path(runs)) / "checkpoints" / LAST if asked == "last" else asked
+        last = newest_folder(Path(runs)) / "checkpoints" / LAST if asked == "last" else asked
     except InputError:  # which find_checkpoint tells the user
         return fresh
     if last is None or Path(last).name != LAST:
         return fresh
-    run = Path(last).parents[1]
-    return fresh if not has_checkpoints(run) or (run / RESULTS).exists() else str(run)
+    folder = Path(last).parents[1]
+    run = folder.parent if (folder.parent / LOCK).exists() else folder  # of an earlier stage
+    return fresh if not has_checkpoints(folder) or (run / RESULTS).exists() else str(run)
 
 
 @contextmanager
@@ -44,7 +47,7 @@ def claimed(folder: Path) -> Iterator[None]:
         yield
         return
     folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / ".lock", "w") as file:
+    with open(folder / LOCK, "w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -17,13 +17,14 @@ from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 from asysplat.data.build import tested_sets
 from asysplat.training.checkpoints import weights_file
 from asysplat.training.revision import revision
+from asysplat.training.stages import stage_configs
 
 RESULTS = "metrics.json"
 EVALUATION = "evaluation.json"  # added to a run by evaluate.py
 # Names, places on disk, callbacks, and keys that only other keys take their values from.
 NOT_HASHED = (
     *("name", "ckpt_path", "rerun", "paths", "callbacks", "logger"),
-    *("stage", "stages", "selections", "more_inputs", "replica_size"),
+    *("stage", "stages", "earlier_stages", "selections", "more_inputs", "replica_size"),
     *("data.root", "data.index", "data.cache", "data.test_sets"),
     *(f"training.loss.perceptual_term.{name}" for name in ("backbone_dir", "download")),
 )
@@ -59,7 +60,7 @@ class Run:
 def config_hash(config: DictConfig) -> str:
     """Hash the resolved configuration, without the keys that change no number.
 
-    Left out are:
+    The stages of a run before its last count as well. Left out are:
 
     - the seed, callbacks, the logger, the number of loader processes and the cache;
     - places on disk: for the test root, disparities and a checkpoint to start from, only whether
@@ -79,6 +80,7 @@ def config_hash(config: DictConfig) -> str:
     for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)
+    resolved["stages"] = [config_hash(stage) for stage in stage_configs(config)[:-1]]
     return hash_of(resolved)
 
 

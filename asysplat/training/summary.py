@@ -43,11 +43,17 @@ def test_sets(results: Results) -> list[str]:
 
 
 def quality_table(results: Results, data: str) -> Table:
-    """Make the table of one test set: a column for each metric, a row for each image source."""
+    """Make the table of one test set: a column for each metric, a row for each image source.
+
+    The stages of a training before the last have rows of their own, as metrics.json has them.
+    """
     shown = [name for name in METRICS if f"test/{data}/{name}" in results]
     title = f"test scenes: {data}, metrics: {results['protocol/name']}"
     table = Table("", *(METRICS[name] for name in shown), title=title)
-    for label, prefix in SOURCES.items():
+    ending = f"/test/{data}/psnr"
+    earlier = [key.removesuffix(ending) for key in results if key.endswith(ending)]
+    sources = {f"after {stage}": f"{stage}/test/{{}}" for stage in earlier} | SOURCES
+    for label, prefix in sources.items():
         values = [results.get(f"{prefix.format(data)}/{name}") for name in shown]
         table.add_row(label, *("" if v is None else f"{v:.3f}" for v in values))
     return table

@@ -90,7 +90,7 @@ def test_table_5_takes_the_frames_of_an_index(compose_train):
     config = compose_train(*overrides, "data.index=index.json")
     assert (config.metrics.name, config.data.inputs) == ("pixelsplat", 2)
     assert (config.data.selection, config.data.index) == ("index", "index.json")
-    assert (config.data.height, config.data.width) == (256, 256)
+    assert config.data.test_size == [256, 256]
     assert compose_train("data=realestate10k", *PLACES).data.selection == "every_8th"
 
 

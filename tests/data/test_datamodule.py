@@ -209,6 +209,30 @@ def test_a_test_set_has_a_size_of_its_own():
         data.check_sizes(check)
 
 
+def test_tests_may_have_a_size_that_is_not_trained(tmp_path):
+    """The same scenes and frames, larger; a test set keeps a size of its own."""
+    sets = {"rooms": {"places": "rooms"}, "wide": {"height": 16, "width": 32}}
+    data, small = with_test_sets(sets, test_size=[32, 48]), with_test_sets(sets)
+    data.setup()
+    small.setup()
+    sizes = {name: tasks[0]["inputs"].images.shape[-2:] for name, tasks in data.tests.items()}
+    assert sizes == {"procedural": (32, 48), "rooms": (32, 48), "wide": (16, 32)}
+    for sample in (TrainingTasks(data)[0], data.evaluation["val"][0]):
+        assert sample["inputs"].images.shape[-2:] == (16, 16)
+    for sample, expected in zip(data.tests["procedural"], small.tests["procedural"], strict=True):
+        assert sample["scene"] == expected["scene"]
+        for views in ("inputs", "targets"):
+            poses = (each[views].cameras.cam_to_world for each in (sample, expected))
+            assert torch.equal(*poses)
+
+    def refuse(height, width):
+        if width == 48:
+            raise InputError("too wide")
+
+    with pytest.raises(InputError, match=r"^data\.test_size: too wide"):
+        data.check_sizes(refuse)
+
+
 def test_which_test_sets_are_tested(tmp_path):
     scene = ProceduralScene(3, 16, 16, num_frames=24)
     write_transforms(scene.views(range(24)), tmp_path)
@@ -243,6 +267,24 @@ def test_a_test_set_beside_scenes_that_are_tested(tmp_path):
     drawn = {TrainingTasks(data)[index]["scene"] for index in range(20)}
     (validated,) = (sample["scene"] for sample in data.evaluation["val"])
     assert drawn | {validated} == {"3", "4", "5"} and validated not in drawn
+
+
+@pytest.mark.parametrize("test_root", [None, "3"], ids=["frames", "scenes"])
+def test_photographs_are_tested_on_the_same_frames_at_another_size(tmp_path, test_root):
+    for seed in (3, 4, 5):
+        scene = ProceduralScene(seed, 16, 16, num_frames=24)
+        write_transforms(scene.views(range(24)), tmp_path / str(seed))
+    options = {"name": "files", "root": str(tmp_path), "val_scenes": 1, **READ_WITH}
+    options["test_root"] = test_root and str(tmp_path / test_root)
+    data, plain = files_data(**options, test_size=[8, 8]), files_data(**options)
+    data.setup()
+    plain.setup()
+    assert len(data.tests["files"]) == (3 if test_root is None else 1)
+    for sample, expected in zip(data.tests["files"], plain.tests["files"], strict=True):
+        assert sample["targets"].images.shape[-2:] == (8, 8)
+        for views in ("inputs", "targets"):
+            poses = (each[views].cameras.cam_to_world for each in (sample, expected))
+            assert torch.equal(*poses)
 
 
 def test_a_test_set_in_another_folder(tmp_path):

@@ -159,6 +159,19 @@ def test_a_table_on_any_data(compose, data):
     assert f"{data} data" in filled.scale
 
 
+def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, tmp_path):
+    config = compose(["sweeps=state_of_the_art", "model=asysplat_4m4s"])
+    write_run(tmp_path / "run", config, {"test/rooms/psnr": 20.0, "cost/inference_gb": 0.5}, 0)
+    runs = finished_runs(tmp_path)
+    columns = {"replica": "replica/psnr", "inference_overhead": "inference_gb"}
+    for key, column in columns.items():
+        filled = fill_table(load_paper()[key], [], compose, runs)
+        assert [column in row.values for row in filled.rows].count(True) == 1
+    scale = fill_table(load_paper()["two_views"], [], compose, runs).scale
+    assert "2 input views of 64x64, " in scale
+    assert [words.split(" at ")[1] for words in scale.split(", then ")][:2] == ["64x64", "128x128"]
+
+
 def test_post_optimisation_is_not_run_until_evaluation_adds_it(compose, tmp_path):
     config = compose(["sweeps=state_of_the_art", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, {"test/procedural/psnr": 20.0}, 0)

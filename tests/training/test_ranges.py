@@ -34,10 +34,12 @@ REFUSED = {
     "data.val_scenes=0": "data.val_scenes=0: give a whole number of at least 1.",
     "data.window=12": "data.window=12: give two whole numbers, such as [64,96].",
     "data.window=[12]": "data.window=[12]: give two whole numbers, such as [64,96].",
-    "callbacks.checkpoints.minutes=-1": "callbacks.checkpoints.minutes=-1: give a number of at least",
+    "callbacks.checkpoints.minutes=-1": "callbacks.checkpoints.minutes=-1: give a number",
     "callbacks.guard.budget=0": "callbacks.guard.budget=0: give a whole number of at least 1.",
     "callbacks.skips.budget=few": "callbacks.skips.budget=few: give a whole number of at least 0.",
     "data.on_bad_scene=drop": "data.on_bad_scene=drop: give fail or skip.",
+    "data.test_size=64": "data.test_size=64: give height and width in pixels, such as [64,96]",
+    "data.test_size=[0,64]": "data.test_size=[0, 64]: give height and width in pixels",
     "geometry_ratio=1.5": "geometry_ratio=1.5: give a share between 0 and 1",
     "geometry_ratio=half": "geometry_ratio=half: give a share between 0 and 1",
 }

@@ -36,6 +36,15 @@ def test_what_was_not_measured_is_left_out(results, shown, hidden, tmp_path, cap
     assert printed.splitlines()[-1] == f"run: {tmp_path}"
 
 
+def test_stages_before_the_last_have_a_row_each(tmp_path, capsys):
+    earlier = {"stage1/test/rooms/psnr": 19.25, "stage2/test/rooms/psnr": 20.75}
+    print_summary(METRICS | earlier, "rooms", tmp_path)
+    printed = capsys.readouterr().out.splitlines()
+    rows = [[cell.strip() for cell in line.split("│")[1:3]] for line in printed if "│" in line]
+    assert rows[:2] == [["after stage1", "19.250"], ["after stage2", "20.750"]]
+    assert rows[2] == ["trained", "21.500"]
+
+
 def test_metrics_json_is_finite_and_says_how_seconds_are_taken(tmp_path):
     path = tmp_path / "metrics.json"
     write_json(path, METRICS | {"test/rooms/absrel": float("nan")})

@@ -1,0 +1,126 @@
+"""Stages of one run: each starts from the weights of the one before, and all are tested alike."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from asysplat.errors import InputError
+from asysplat.training.checkpoints import read_callbacks
+from asysplat.training.ranges import check_ranges
+from asysplat.training.summary import Results
+
+
+def stage_configs(config: DictConfig) -> list[DictConfig]:
+    """List the configurations of a run's stages, in their order; the last is the run's own.
+
+    Optimizer, schedule and random numbers start anew in each. Those before the last are tested at
+    its size, so that their numbers can be compared.
+
+    Raises:
+        InputError: `earlier_stages` names one that the scale does not have, or one twice.
+    """
+    names = [*(config.get("earlier_stages") or ()), config.stage]  # older runs have none
+    for index, name in enumerate(names):
+        if name not in config.stages:
+            raise InputError(
+                f"earlier_stages names {name}, which is unknown: choose of "
+                f"{', '.join(config.stages)}."
+            )
+        if name in names[:index]:
+            raise InputError(
+                f"{name} is twice among the stages of the run, {', '.join(names)}: leave it out of "
+                "earlier_stages; earlier_stages=[] trains one stage alone."
+            )
+    size = config.data.test_size or [config.data.height, config.data.width]
+    configs = []
+    for index, name in enumerate(names[:-1]):
+        earlier = config.copy()
+        earlier.stage, earlier.earlier_stages = name, names[:index]
+        earlier.data.test_size = size
+        configs.append(earlier)
+    return [*configs, config]
+
+
+def check_stages(stages: Sequence[DictConfig]) -> None:
+    """Check the options of every stage, so that none is refused after days of the one before.
+
+    Raises:
+        InputError: a value out of range, a size that the model does not take, or several stages
+            without the checkpoints by which they pass their weights on.
+    """
+    if len(stages) == 1:
+        check_ranges(stages[0])
+        return
+    for stage in stages:
+        try:
+            check_ranges(stage)
+            with torch.device("meta"):
+                net = instantiate(stage.model)
+            net.check_size(stage.data.height, stage.data.width)
+        except InputError as error:
+            raise InputError(f"{stage.stage}: {error}") from error
+    if (stages[-1].get("callbacks") or {}).get("checkpoints") is None:
+        raise InputError(
+            "callbacks.checkpoints is left out, by which a stage hands its weights to the next: "
+            "leave it in, or train one stage alone with earlier_stages=[]."
+        )
+
+
+def describe_stage(config: DictConfig) -> str:
+    """Write a stage's steps, batch and size as `240 steps of batch 2 at 64x64`."""
+    data = config.data
+    return f"{config.steps} steps of batch {data.batch_size} at {data.height}x{data.width}"
+
+
+class StageRecord(lightning.Callback):
+    """Has every checkpoint say which stage it is of, and what the stages before it measured.
+
+    A later stage writes its first checkpoint before its first step: what the stage before measured
+    is kept from then on.
+
+    Args:
+        stage: its name.
+        earlier: results of the stages before it, see `results_of_stage`.
+    """
+
+    def __init__(self, stage: str, earlier: Results):
+        self.stage, self.earlier = stage, earlier
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"stage": self.stage, "earlier": self.earlier}
+
+    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        if self.earlier and trainer.global_step == 0:
+            trainer.save_checkpoint(trainer.checkpoint_callback.last)
+
+
+def resume_point(checkpoint: Path | None, stages: Sequence[DictConfig]) -> tuple[int, Results]:
+    """Find where a run goes on: the index of the checkpoint's stage, and the results before it.
+
+    A checkpoint that says nothing of a stage counts as one of the first.
+
+    Raises:
+        InputError: the file cannot be read, or is of a stage that the run does not have.
+    """
+    if checkpoint is None:
+        return 0, {}
+    names = [stage.stage for stage in stages]
+    record = read_callbacks(checkpoint).get(StageRecord.__qualname__, {})
+    stage = record.get("stage", names[0])
+    if stage not in names:
+        raise InputError(
+            f"ckpt_path={checkpoint} is of {stage}, and this run trains {', '.join(names)}: give "
+            "the options of its run to go on with it, or init_path in its place to start from it."
+        )
+    return names.index(stage), record.get("earlier", {})
+
+
+def results_of_stage(name: str, results: Results) -> Results:
+    """Name a stage's tests and costs after it: `stage1/test/...`, as in the run's metrics.json."""
+    kinds = ("test/", "cost/")
+    return {f"{name}/{key}": value for key, value in results.items() if key.startswith(kinds)}

@@ -1,0 +1,225 @@
+"""Several stages in one run: what each is, what passes on, and where a stopped run goes on."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from hydra import compose, initialize_config_dir
+from tiny import NETWORK, SCENES
+
+from asysplat.errors import InputError
+from asysplat.training import Reconstruction
+from asysplat.training.runs import config_hash, find_run, find_runs
+from asysplat.training.stages import (
+    check_stages,
+    results_of_stage,
+    resume_point,
+    stage_configs,
+)
+
+NAMES = ["stage1", "stage2", "stage3"]
+THREE = ["experiment=three_stages", "paths.run=runs/a"]
+
+
+@pytest.fixture
+def composed(repository):
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        yield lambda *overrides: compose("train", [*THREE, *overrides])
+
+
+def test_the_papers_three_stages(composed):
+    """Sec. 4.2 and Suppl. A; 540 is 544 here, and the crop of the last is Long-LRM's."""
+    found = stage_configs(composed("scale=paper", "data=dl3dv"))
+    assert [config.stage for config in found] == NAMES
+    sizes = [(config.data.height, config.data.width) for config in found]
+    assert sizes == [(256, 256), (512, 512), (544, 960)]
+    assert [config.steps for config in found] == [60_000, 10_000, 10_000]
+    assert [config.training.optimizer.lr for config in found] == [4e-4, 4e-5, 4e-5]
+    assert [config.training.schedule.warmup_steps for config in found] == [2000, 0, 0]
+    assert [config.training.schedule.total_steps for config in found] == [60_000, 10_000, 10_000]
+    assert {config.training.optimizer.weight_decay for config in found} == {0.05}
+    assert [config.data.augmentation.crop for config in found] == [1.0, 1.0, 0.77]
+
+
+@pytest.mark.parametrize("scale", ["laptop", "gpu", "paper"])
+def test_every_scale_has_them_and_tests_them_alike(composed, scale):
+    config = composed(f"scale={scale}", "data=dl3dv")
+    found = stage_configs(config)
+    for name, stage in zip(NAMES, found, strict=True):
+        expected = config.stages[name]
+        assert (stage.data.height, stage.data.width) == (expected.height, expected.width)
+        assert (stage.steps, stage.data.batch_size) == (expected.steps, expected.batch_size)
+        assert stage.learning_rate == expected.learning_rate
+        assert stage.steps % stage.validate_every == 0  # its end is measured
+    tested = [stage.data.test_size for stage in found[:-1]]
+    assert tested == [[config.data.height, config.data.width]] * 2
+    assert found[-1] is config and config.data.test_size is None
+    check_stages(found)
+
+
+def test_one_stage_is_the_run_itself(composed):
+    config = composed("stage=stage1", "earlier_stages=[]")
+    assert stage_configs(config) == [config]
+
+
+def test_a_run_is_that_of_all_its_stages(composed):
+    runs = [[], ["stages.stage1.steps=7"], ["+stages.stage2.crop=0.5"], ["earlier_stages=[stage2]"]]
+    runs += [["earlier_stages=[stage2,stage1]"], ["earlier_stages=[]"], ["stage=ablation"]]
+    hashes = [config_hash(composed("scale=paper", *overrides)) for overrides in runs]
+    assert len(set(hashes)) == len(runs)
+    assert config_hash(composed("scale=paper", "stages.ablation.steps=7")) == hashes[0]
+
+
+REFUSED = {
+    "an unknown stage": (["earlier_stages=[stage1,stage4]"], "earlier_stages names stage4, which"),
+    "a stage twice": (["stage=stage1"], "stage1 is twice among the stages of the run, stage1, "),
+    "no steps": (["stages.stage2.steps=0"], "stage2: steps=0: give a whole number of at least 1"),
+    "a size between patches": (["stages.stage3.height=40"], r"stage3: .* 40x\d+, .* set 48x"),
+    "nothing to hand over": (["callbacks.checkpoints=null"], "leave it in, or train one stage"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_mistake_in_any_stage_is_told_at_once(composed, case):
+    overrides, message = REFUSED[case]
+    with pytest.raises(InputError, match=message):
+        check_stages(stage_configs(composed(*overrides)))
+
+
+def test_a_checkpoint_says_where_to_go_on(composed, tmp_path):
+    stages, path = stage_configs(composed()), tmp_path / "last.ckpt"
+
+    def saved(**record):
+        torch.save({"callbacks": {"StageRecord": record} if record else {}}, path)
+        return path
+
+    earlier = {"stage1/test/procedural/psnr": 20.0}
+    assert resume_point(None, stages) == (0, {})
+    assert resume_point(saved(stage="stage2", earlier=earlier), stages) == (1, earlier)
+    assert resume_point(saved(), stages) == (0, {})
+    with pytest.raises(InputError, match=r"last\.ckpt is of ablation, and this run trains"):
+        resume_point(saved(stage="ablation", earlier={}), stages)
+    path.write_text("a text")
+    with pytest.raises(InputError, match=r"last\.ckpt cannot be read as a checkpoint to resume"):
+        resume_point(path, stages)
+
+
+def test_tests_and_costs_of_a_stage_are_named_after_it():
+    results = {"test/rooms/psnr": 2.0, "cost/peak_gb": 1.0, "baseline/rooms/mean_colour/psnr": 0.0}
+    found = results_of_stage("stage1", results | {"protocol/name": "default"})
+    assert found == {"stage1/test/rooms/psnr": 2.0, "stage1/cost/peak_gb": 1.0}
+
+
+TINY = ["experiment=three_stages", *NETWORK, "steps=2", "validate_every=1", "data.inputs=3"]
+TINY += [*SCENES, "data.targets=2", "data.num_workers=0", "data.test_sets=null"]
+TINY += [f"stages.{name}.height=32" for name in NAMES]
+TINY += [f"stages.{name}.width={width}" for name, width in zip(NAMES, (32, 48, 64), strict=True)]
+TINY += ["stages.stage3.learning_rate=1e-12"]
+TINY += [f"callbacks.{name}=null" for name in ("costs", "pictures", "curve")]
+PREFIXES = ("stage1/", "stage2/", "")  # of folders and results
+
+
+def saved_in(folder: Path) -> dict:
+    return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+def run_folder(result) -> Path:
+    assert result.returncode == 0, result.stderr
+    return Path(result.stdout.strip().splitlines()[-1].removeprefix("run: "))
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    return tmp_path_factory.mktemp("logs")
+
+
+@pytest.fixture(scope="module")
+def train(logs, run_script):
+    return lambda *overrides: run_script("train.py", *TINY, f"paths.logs={logs}", *overrides)
+
+
+@pytest.fixture(scope="module")
+def whole(train) -> Path:
+    """The folder of a finished run of three stages, of two steps each."""
+    return run_folder(train("name=whole"))
+
+
+@pytest.mark.slow
+def test_a_run_of_three_stages_is_one_run(whole, logs, composed):
+    (run,) = find_runs(whole)
+    numbers, config = run.results, yaml.safe_load((whole / "config.yaml").read_text())
+    assert (config["stage"], config["earlier_stages"]) == ("stage3", NAMES[:2])
+    nearest = set()
+    for prefix, width in zip(PREFIXES, (32, 48, 64), strict=True):
+        folder = whole / prefix
+        assert yaml.safe_load((folder / "config.yaml").read_text())["data"]["width"] == width
+        with (folder / "metrics.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        psnrs = [float(row["psnr"]) for row in rows]
+        psnr = numbers[f"{prefix}test/procedural/psnr"]
+        assert abs(sum(psnrs) / len(psnrs) - psnr) < 1e-4
+        # Of the same images in every stage: what needs no training is the same.
+        nearest.add(tuple(row["nearest_view/psnr"] for row in rows))
+        assert list((folder / "tensorboard").glob("events.*"))
+    assert len(nearest) == 1
+    assert find_run(logs, composed(*TINY[1:])).folder == whole
+
+
+@pytest.mark.slow
+def test_weights_pass_on_and_the_optimizer_starts_anew(whole):
+    first, second, third = (saved_in(whole / name) for name in ("stage1", "stage2", "."))
+    for stage in (first, second, third):
+        steps = {int(state["step"]) for state in stage["optimizer_states"][0]["state"].values()}
+        assert steps == {stage["global_step"]} == {2}
+    groups = [stage["optimizer_states"][0]["param_groups"][0] for stage in (first, third)]
+    assert [group["initial_lr"] for group in groups] == [1e-3, 1e-12]
+    names = [name for name in second["state_dict"] if name.endswith("weight")]
+    moved = [not torch.equal(first["state_dict"][n], second["state_dict"][n]) for n in names]
+    assert any(moved)
+    for name in names:  # its rate moves nothing
+        torch.testing.assert_close(third["state_dict"][name], second["state_dict"][name])
+
+
+@pytest.mark.slow
+def test_stopped_twice_in_the_second_stage_and_resumed_it_has_the_same_bits(
+    train, whole, monkeypatch
+):
+    """First before its first step, then between its two."""
+    step = Reconstruction.training_step
+
+    def stopped_after(steps: int, *overrides: str) -> None:
+        taken = []
+
+        def stopping(module, batch, index):
+            if len(taken) == steps:
+                raise InputError("stopped")
+            taken.append(index)
+            return step(module, batch, index)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Reconstruction, "training_step", stopping)
+            assert "error: stopped" in train("name=stopped", *overrides).stderr
+
+    stopped_after(2)
+    stopped_after(1, "ckpt_path=last")
+    resumed = run_folder(train("name=stopped", "ckpt_path=last"))
+    assert not (resumed / "stage1").exists()
+    for name in ("stage2", "."):
+        found, expected = (saved_in(at / name)["state_dict"] for at in (resumed, whole))
+        assert found.keys() == expected.keys()
+        assert all(torch.equal(found[key], expected[key]) for key in expected)
+    results, expected = (json.loads((at / "metrics.json").read_text()) for at in (resumed, whole))
+    tests = {key for key in expected if "test/" in key}
+    assert {f"{prefix}test/procedural/psnr" for prefix in PREFIXES} <= tests
+    assert {key: results.get(key) for key in tests} == {key: expected[key] for key in tests}
+
+
+@pytest.mark.slow
+def test_weights_of_another_model_are_refused_before_a_step(train, whole, logs):
+    path = whole / "stage1" / "checkpoints" / "last.ckpt"
+    result = train("name=other", "width=0.25", f"init_path={path}")
+    assert result.returncode != 0 and f"{path} does not fit this model" in result.stderr
+    assert not list(logs.glob("other/**/*.ckpt"))
