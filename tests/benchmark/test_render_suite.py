@@ -43,6 +43,7 @@ def measured(repository, tmp_path_factory):
     folder = tmp_path_factory.mktemp("benchmark")
     script = runpy.run_path(str(repository / "benchmark.py"))
     options = {"suite": "render", "scenes": ["tiny", "twin"], "repeats": 2, "output": folder}
+    options["compare"] = None
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(SCENES, "tiny", partial(random_scene, 500, 24, 40))
         patch.setitem(SCENES, "twin", partial(pixel_aligned_scene, 16, 32, 32))
@@ -147,7 +148,7 @@ def test_peak_memory_is_the_rise():
 
 
 def test_unknown_options_are_named():
-    known = "render, ops, model, data, reconstruct"
+    known = "render, ops, model, data, reconstruct, pareto, bench"
     with pytest.raises(InputError, match=rf"^suite=rendr is unknown: choose from {known}\.$"):
         find_suite("rendr")
     with pytest.raises(InputError, match=r"^scenes=D is unknown: .*A, B, C, 524k, 4M"):
