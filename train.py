@@ -98,6 +98,10 @@ def train(config: DictConfig) -> float | None:
     logger = make_logger(folder)
     log_choices(logger, config)
     trainer = make_trainer(config, callbacks, logger)
+    split = data.split(trainer.world_size)
+    trainer.accumulate_grad_batches = split.accumulated
+    if trainer.is_global_zero:
+        print(split)
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(module, data, verbose=False)
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import lightning
 import numpy as np
-from torch.utils.data import DataLoader, Dataset, DistributedSampler, Subset
+from torch.utils.data import DataLoader, Dataset, Subset
 
 from asysplat.data.augment import Augmentation, cropped
+from asysplat.data.batches import BatchSplit, split_batch
 from asysplat.data.capture import Capture
 from asysplat.data.normalise import normalise
 from asysplat.data.points import depths_of_points
@@ -27,7 +28,9 @@ class SceneDataModule(lightning.LightningDataModule):
     """Lightning's data module of reconstruction tasks: random for training, fixed for evaluation.
 
     An epoch is the steps between two validations. Task i of a run is a pure function of the seed
-    and i, and an epoch reads the tasks after those of the epochs before it.
+    and i, and an epoch reads the tasks after those of the epochs before it. Processes that train
+    together take turns at the tasks of each step, and at the scenes of each evaluation: Lightning
+    must add no samplers of its own (use_distributed_sampler=False).
 
     Args:
         name: the data set's name in metrics.
@@ -35,13 +38,14 @@ class SceneDataModule(lightning.LightningDataModule):
         inputs, targets: views given and views to predict, per scene.
         height, width: size in pixels of every view that `source` gives; further test sets may
             have another.
-        batch_size: scenes per step.
+        batch_size: scenes of an optimizer step, of all processes together.
         num_workers: number of processes that load ahead; 0 loads in the training process.
         seed: of the training tasks.
         steps_per_epoch: steps between two validations.
         test_sets: further test sets by name, each a function that makes its tasks.
         augmentation: how training tasks are varied; None leaves them as they are.
         points: whether the inputs come with the depths of the scene's sparse points.
+        micro_batch: the most scenes that a process holds at a time; None: all of its share.
 
     Raises:
         InputError: a task that cannot be loaded. `setup` tries one training task, and as many of
@@ -63,12 +67,14 @@ class SceneDataModule(lightning.LightningDataModule):
         test_sets: Mapping[str, Callable[[], list[Task]]] | None = None,
         augmentation: Augmentation | None = None,
         points: bool = False,
+        micro_batch: int | None = None,
     ):
         super().__init__()
         self.name, self.source = name, source
         self.inputs, self.targets = inputs, targets
         self.height, self.width = height, width
-        self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
+        self.batch_size, self.micro_batch = batch_size, micro_batch
+        self.num_workers, self.seed = num_workers, seed
         self.steps_per_epoch = steps_per_epoch
         self.test_sets = test_sets or {}
         self.augmentation = augmentation or Augmentation()
@@ -102,26 +108,30 @@ class SceneDataModule(lightning.LightningDataModule):
             except InputError as error:
                 raise InputError(f"data.test_sets.{name}: {error}") from error
 
+    def split(self, processes: int) -> BatchSplit:
+        """Divide the scenes of an optimizer step among processes; see `split_batch`."""
+        return split_batch(self.batch_size, self.micro_batch, processes)
+
+    @property
+    def _process(self) -> tuple[int, int]:
+        """Which process this is, and how many there are."""
+        trainer = self.trainer
+        return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
+
     def train_dataloader(self) -> DataLoader:
-        per_epoch = self.steps_per_epoch * self.batch_size * self.trainer.world_size
+        per_epoch = self.steps_per_epoch * self.batch_size
         return self.tasks(self.trainer.current_epoch * per_epoch, per_epoch)
 
     def tasks(self, start: int, count: int) -> DataLoader:
-        """Return batches of the training tasks `start` to `start + count`.
+        """Return micro-batches of this process's turns at the tasks `start` to `start + count`.
 
-        Processes that train together take turns at the tasks, so that their steps are those of one
-        process with larger batches.
+        The steps are those of one process, whatever the number of processes.
         """
-        tasks, sampler = Subset(TrainingTasks(self), range(start, start + count)), None
-        if self.trainer is not None and self.trainer.world_size > 1:
-            # Lightning's own sampler would shuffle them.
-            sampler = DistributedSampler(
-                tasks, self.trainer.world_size, self.trainer.global_rank, shuffle=False
-            )
+        rank, processes = self._process
+        tasks = Subset(TrainingTasks(self), range(start + rank, start + count, processes))
         return DataLoader(
             tasks,
-            batch_size=self.batch_size,
-            sampler=sampler,
+            batch_size=self.split(processes).micro_batch,
             num_workers=self.num_workers,
             collate_fn=collate,
             prefetch_factor=4 if self.num_workers else None,
@@ -131,11 +141,23 @@ class SceneDataModule(lightning.LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(self.evaluation["val"], collate_fn=collate)
+        return self._evaluated(self.evaluation["val"])
 
     def test_dataloader(self) -> list[DataLoader]:
         """Return one loader a test set, in the order of `tests`."""
-        return [DataLoader(scenes, collate_fn=collate) for scenes in self.tests.values()]
+        return [self._evaluated(scenes) for scenes in self.tests.values()]
+
+    def _evaluated(self, scenes: "FixedTasks") -> DataLoader:
+        """Return this process's turns at the scenes, one a batch.
+
+        All processes take equally many turns, or they would wait for each other: one with fewer
+        scenes takes its last again.
+        """
+        rank, processes = self._process
+        turns = range(-(-len(scenes) // processes))
+        last = max(range(rank, len(scenes), processes), default=0)
+        own = [min(turn * processes + rank, last) for turn in turns]
+        return DataLoader(Subset(scenes, own), collate_fn=collate)
 
 
 class TrainingTasks(Dataset):
