@@ -1,4 +1,4 @@
-"""How the scenes of an optimizer step are divided among processes, and among their micro-batches."""
+"""How the scenes of an optimizer step are divided: among processes, then into micro-batches."""
 
 from dataclasses import dataclass
 

@@ -2,7 +2,7 @@
 
 import copy
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor, UntypedStorage, nn
@@ -31,17 +31,17 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
 
     Returns:
         parameters; geometry_share, of 1; gflops as the paper counts them (`module_flops`) and
-        gflops_true (`true_flops`), in 1e9; gaussians, their number; activation_gb and
-        checkpointed_gb (`Activations`).
+        gflops_true (`true_flops`), in 1e9; gaussians, their number, and gaussians_gb, their fields;
+        activation_gb and checkpointed_gb (`Activations`).
     """
     on_meta = copy.deepcopy(net).to("meta")
     with torch.device("meta"):
         views = blank_views(num_views, height, width)
-    modules, gaussians = 0, 0
+    modules, gaussians = 0, None
 
     def forward() -> None:
         nonlocal gaussians
-        gaussians = on_meta(views).num_gaussians
+        gaussians = on_meta(views)
 
     def counted_forward() -> None:
         nonlocal modules
@@ -55,7 +55,8 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
         "geometry_share": net.geometry_share(),
         "gflops": modules / GIGA,
         "gflops_true": everything / GIGA,
-        "gaussians": gaussians,
+        "gaussians": gaussians.num_gaussians,
+        "gaussians_gb": sum(getattr(gaussians, f.name).nbytes for f in fields(gaussians)) / GB,
         "activation_gb": activations.kept,
         "checkpointed_gb": activations.checkpointed,
     }
