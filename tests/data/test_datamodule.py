@@ -76,7 +76,7 @@ def scenes_of_steps(processes, micro_batch):
         data.trainer = Trainer(1, rank, processes)
         names = [batch["scene"] for batch in data.train_dataloader()]
         assert all(len(micro) == micro_batch for micro in names)
-        flat, share = sum(names, []), 4 // processes
+        flat, share = [name for micro in names for name in micro], 4 // processes
         shares.append([flat[at : at + share] for at in range(0, len(flat), share)])
     return shares
 

@@ -5,7 +5,9 @@ import torch
 from test_reconstruction import make_module
 from test_side_by_side import make_batch
 
+from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
 from asysplat.evaluation.static_cost import Activations
+from asysplat.rendering import render
 from asysplat.training import ReconstructionLoss
 from asysplat.training.memory import Held, Sizes
 
@@ -36,15 +38,29 @@ def step(module):
     return grads, sum(storage.nbytes() for storage in kept.values())
 
 
-@pytest.mark.parametrize("saving", ["views", "layers", "both"])
-def test_the_same_gradients_in_less_memory(module, saving):
+def test_the_same_gradients_in_less_memory(module):
     expected, whole = step(module)
-    module.views_at_once = None if saving == "layers" else 1
-    module.net.checkpoint_layers(saving != "views")
-    found, less = step(module)
-    assert (found - expected).norm() <= 1e-6 * expected.norm() > 0
-    # What the renderer keeps autograd does not see: tests/stress/test_memory_and_types.py measures.
-    assert less < whole if saving == "views" else less < 0.8 * whole
+    # What the renderer keeps autograd does not see: the next test measures it.
+    for views_at_once, checkpointing, most in ((1, False, 1.0), (None, True, 0.8), (1, True, 0.8)):
+        module.views_at_once = views_at_once
+        module.net.checkpoint_layers(checkpointing)
+        found, less = step(module)
+        assert (found - expected).norm() <= 1e-6 * expected.norm() > 0
+        assert less < most * whole
+
+
+@pytest.mark.skipif(not reset_peak_memory("cpu"), reason="the peak cannot be reset")
+def test_views_at_once_bound_the_memory_of_rendering(make_scene):
+    gaussians, cameras = make_scene(count=40_000, views=8, dtype=torch.float32)
+    risen = {}
+    for views_at_once in (1, None):
+        leaves = gaussians.map(lambda tensor: tensor.clone().requires_grad_())
+        reset_peak_memory("cpu")
+        before = peak_memory_gb("cpu")
+        render(leaves, cameras, views_at_once=views_at_once).image.sum().backward()
+        risen[views_at_once] = peak_memory_gb("cpu") - before
+    print(f"\nGB to render 8 views: {risen[None]:.3f}, one at a time {risen[1]:.3f}")
+    assert risen[1] < 0.6 * risen[None]
 
 
 # The paper's first stage, in bf16.

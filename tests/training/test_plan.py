@@ -2,8 +2,6 @@
 
 import re
 
-import pytest
-
 from asysplat.training import plan
 from asysplat.training.plan import Plan
 
