@@ -162,6 +162,10 @@ def train_stage(
     if logger is not None and not goes_on:
         log_choices(logger, config)
     trainer = make_trainer(config, callbacks, StageRecord(config.stage, earlier), logger)
+    split = data.split(trainer.world_size)
+    trainer.accumulate_grad_batches = split.accumulated
+    if trainer.is_global_zero:
+        print(split)
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
     trainer.test(module, data, verbose=False)
 

@@ -10,10 +10,11 @@ from typing import Any
 import lightning
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, DistributedSampler, Subset
+from torch.utils.data import DataLoader, Dataset, Subset
 
 from asysplat.data.augment import Augmentation, cropped
 from asysplat.data.bad_frames import Policy
+from asysplat.data.batches import BatchSplit, split_batch
 from asysplat.data.capture import Capture
 from asysplat.data.loader import EpochLoader, batches_done, outlive_notice
 from asysplat.data.normalise import normalise
@@ -32,14 +33,16 @@ class SceneDataModule(lightning.LightningDataModule):
     """Lightning's data module of reconstruction tasks: random for training, fixed for evaluation.
 
     An epoch is the steps between two validations. Task i of a run is a pure function of the seed
-    and i, and an epoch reads the tasks after those of the epochs before it.
+    and i, and an epoch reads the tasks after those of the epochs before it. Processes that train
+    together take turns at the tasks of each step, and at the scenes of each evaluation: Lightning
+    must add no samplers of its own (use_distributed_sampler=False).
 
     Args:
         name: the data set's name in metrics.
         source: where tasks come from.
         inputs, targets: views given and views to predict, per scene.
         height, width: size in pixels of every view that `source` gives; test sets may have another.
-        batch_size: scenes per step.
+        batch_size: scenes of an optimizer step, of all processes together.
         num_workers: number of processes that load ahead; 0 loads in the training process.
         seed: of the training tasks.
         steps_per_epoch: steps between two validations.
@@ -49,6 +52,7 @@ class SceneDataModule(lightning.LightningDataModule):
         points: whether the inputs come with the depths of the scene's sparse points.
         on_bad_scene: of a training task whose files cannot be used: "fail", or "skip" to draw
             another in its place. A batch's `skipped` lists what was passed over.
+        micro_batch: the most scenes that a process holds at a time; None: all of its share.
 
     Raises:
         InputError: a task that cannot be loaded. `setup` tries one training task, and as many of
@@ -71,13 +75,15 @@ class SceneDataModule(lightning.LightningDataModule):
         augmentation: Augmentation | None = None,
         points: bool = False,
         on_bad_scene: Policy = "fail",
+        micro_batch: int | None = None,
     ):
         super().__init__()
         self.on_bad_scene = on_bad_scene
         self.name, self.source = name, source
         self.inputs, self.targets = inputs, targets
         self.height, self.width = height, width
-        self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
+        self.batch_size, self.micro_batch = batch_size, micro_batch
+        self.num_workers, self.seed = num_workers, seed
         self.steps_per_epoch = steps_per_epoch
         self.test_sets = test_sets or {}
         self.augmentation = augmentation or Augmentation()
@@ -116,28 +122,36 @@ class SceneDataModule(lightning.LightningDataModule):
                 where = "data.test_size" if name == self.name else f"data.test_sets.{name}"
                 raise InputError(f"{where}: {error}") from error
 
+    def split(self, processes: int) -> BatchSplit:
+        """Divide the scenes of an optimizer step among processes; see `split_batch`."""
+        return split_batch(self.batch_size, self.micro_batch, processes)
+
+    @property
+    def _process(self) -> tuple[int, int]:
+        """Which process this is, and how many there are."""
+        trainer = self.trainer
+        return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
+
     def train_dataloader(self) -> DataLoader:
-        per_epoch = self.steps_per_epoch * self.batch_size * self.trainer.world_size
+        per_epoch = self.steps_per_epoch * self.batch_size
         start = self.trainer.current_epoch * per_epoch
         return self.tasks(start, per_epoch, done=batches_done(self.trainer))
 
     def tasks(self, start: int, count: int, done: int = 0) -> DataLoader:
-        """Return batches of the training tasks `start` to `start + count`, but the first `done`.
+        """Return micro-batches of this process's turns at the tasks `start` to `start + count`.
 
-        Processes that train together take turns at the tasks, so that their steps are those of one
-        process with larger batches.
+        The first `done` of them are left out.
+
+        The steps are those of one process, whatever the number of processes.
         """
-        world_size = 1 if self.trainer is None else self.trainer.world_size
-        left = range(start + done * self.batch_size * world_size, start + count)
-        tasks, sampler = Subset(TrainingTasks(self), left), None
-        if world_size > 1:
-            # Lightning's own sampler would shuffle them.
-            sampler = DistributedSampler(tasks, world_size, self.trainer.global_rank, shuffle=False)
+        rank, processes = self._process
+        micro_batch = self.split(processes).micro_batch
+        first = start + rank + done * micro_batch * processes
+        tasks = Subset(TrainingTasks(self), range(first, start + count, processes))
         return EpochLoader(
             done,
             tasks,
-            batch_size=self.batch_size,
-            sampler=sampler,
+            batch_size=micro_batch,
             num_workers=self.num_workers,
             collate_fn=collate,
             prefetch_factor=4 if self.num_workers else None,
@@ -150,11 +164,23 @@ class SceneDataModule(lightning.LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(self.evaluation["val"], collate_fn=collate)
+        return self._evaluated(self.evaluation["val"])
 
     def test_dataloader(self) -> list[DataLoader]:
         """Return one loader a test set, in the order of `tests`."""
-        return [DataLoader(scenes, collate_fn=collate) for scenes in self.tests.values()]
+        return [self._evaluated(scenes) for scenes in self.tests.values()]
+
+    def _evaluated(self, scenes: "FixedTasks") -> DataLoader:
+        """Return this process's turns at the scenes, one a batch.
+
+        All processes take equally many turns, or they would wait for each other: one with fewer
+        scenes takes its last again.
+        """
+        rank, processes = self._process
+        turns = range(-(-len(scenes) // processes))
+        last = max(range(rank, len(scenes), processes), default=0)
+        own = [min(turn * processes + rank, last) for turn in turns]
+        return DataLoader(Subset(scenes, own), collate_fn=collate)
 
 
 class TrainingTasks(Dataset):

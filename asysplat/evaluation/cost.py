@@ -1,6 +1,7 @@
 """Count parameters and FLOPs, read peak memory."""
 
 import math
+import os
 import re
 import resource
 import sys
@@ -68,6 +69,13 @@ def true_flops(run: Callable[[], object]) -> int:
     with FlopCounterMode(display=False) as counter:
         run()
     return counter.get_total_flops()
+
+
+def memory_gb(device: torch.device | str) -> float:
+    """Return the memory of the device in 1e9 bytes: a CPU's is that of the machine."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_properties(device).total_memory / GB
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GB
 
 
 def reset_peak_memory(device: torch.device | str) -> bool:

@@ -1,12 +1,15 @@
 """Costs of a forward pass, counted without data and without running it."""
 
 import copy
+from collections import Counter
+from dataclasses import dataclass, fields
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, UntypedStorage, nn
 from torch._subclasses import FakeTensorMode
 
 from asysplat.evaluation.cost import GB, count_parameters, module_flops, true_flops
+from asysplat.models.layers import Layers
 from asysplat.scene import Cameras, Views
 
 GIGA = 1e9
@@ -28,16 +31,17 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
 
     Returns:
         parameters; geometry_share, of 1; gflops as the paper counts them (`module_flops`) and
-        gflops_true (`true_flops`), in 1e9; gaussians, their number; activation_gb (the function).
+        gflops_true (`true_flops`), in 1e9; gaussians, their number, and gaussians_gb, their fields;
+        activation_gb and checkpointed_gb (`Activations`).
     """
     on_meta = copy.deepcopy(net).to("meta")
     with torch.device("meta"):
         views = blank_views(num_views, height, width)
-    modules, gaussians = 0, 0
+    modules, gaussians = 0, None
 
     def forward() -> None:
         nonlocal gaussians
-        gaussians = on_meta(views).num_gaussians
+        gaussians = on_meta(views)
 
     def counted_forward() -> None:
         nonlocal modules
@@ -45,13 +49,16 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
 
     with torch.no_grad():
         everything = true_flops(counted_forward)
+    activations = count_activations(on_meta, num_views, height, width)
     return {
         "parameters": count_parameters(net),
         "geometry_share": net.geometry_share(),
         "gflops": modules / GIGA,
         "gflops_true": everything / GIGA,
-        "gaussians": gaussians,
-        "activation_gb": activation_gb(on_meta, num_views, height, width),
+        "gaussians": gaussians.num_gaussians,
+        "gaussians_gb": sum(getattr(gaussians, f.name).nbytes for f in fields(gaussians)) / GB,
+        "activation_gb": activations.kept,
+        "checkpointed_gb": activations.checkpointed,
     }
 
 
@@ -62,27 +69,77 @@ def forward_flops(net: nn.Module, num_views: int, height: int, width: int) -> in
         return true_flops(lambda: on_meta(blank_views(num_views, height, width)))
 
 
-def activation_gb(net: nn.Module, num_views: int, height: int, width: int) -> float:
-    """Count the memory that one scene's forward pass keeps for its backward, in 1e9 bytes.
+@dataclass(frozen=True)
+class Activations:
+    """The memory that one scene's forward pass keeps for its backward pass, in 1e9 bytes.
 
-    In fp32, without gradient checkpointing, without the parameters, with attention that keeps no
-    scores. Counted on fake tensors of the CPU, which have no content.
+    Args:
+        kept: of everything.
+        checkpointed: with every layer computed again in the backward pass: what is kept outside the
+            layers and between them, and within the largest layer.
     """
-    kept: dict[int, torch.UntypedStorage] = {}
-    with FakeTensorMode():
-        tensors = dict([*net.named_parameters(), *net.named_buffers()])
-        state = {name: torch.empty(t.shape, dtype=t.dtype) for name, t in tensors.items()}
-        for name, _ in net.named_parameters():
-            state[name].requires_grad_()
-        own = {tensor.untyped_storage()._cdata for tensor in state.values()}
 
-        def keep(tensor: Tensor) -> Tensor:
-            storage = tensor.untyped_storage()
-            if storage._cdata not in own:
-                kept[storage._cdata] = storage
-            return tensor
+    kept: float
+    checkpointed: float
 
-        views = blank_views(num_views, height, width)
-        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-            torch.func.functional_call(net, state, (views,))
-        return sum(storage.nbytes() for storage in kept.values()) / GB
+
+def activation_gb(net: nn.Module, num_views: int, height: int, width: int) -> float:
+    """Count one scene's activations as the network is set, with or without checkpointing."""
+    found = count_activations(net, num_views, height, width)
+    checkpointing = any(isinstance(m, Layers) and m.checkpointing for m in net.modules())
+    return found.checkpointed if checkpointing else found.kept
+
+
+def count_activations(net: nn.Module, num_views: int, height: int, width: int) -> Activations:
+    """Count one scene's activations, on fake tensors of the CPU, which have no content.
+
+    In fp32, or in the caller's autocast; without the parameters, with attention that keeps no
+    scores.
+    """
+    kept: dict[int, tuple[int, nn.Module | None]] = {}  # storage -> its bytes, the layer it is of
+    inputs: dict[int, int] = {}  # storage -> bytes, of the layers' inputs
+    storages: list[UntypedStorage] = []  # as long as they live, none has the address of another
+    within: list[nn.Module] = []  # the layer that computes now
+
+    def enter(layer: nn.Module, arguments: tuple[Tensor]) -> None:
+        storage = arguments[0].untyped_storage()
+        storages.append(storage)
+        inputs[storage._cdata] = storage.nbytes()
+        within.append(layer)
+
+    def keep(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        if storage._cdata not in own:
+            storages.append(storage)
+            kept.setdefault(storage._cdata, (storage.nbytes(), within[-1] if within else None))
+        return tensor
+
+    groups = [module for module in net.modules() if isinstance(module, Layers)]
+    layers = [layer for group in groups for layer in group]
+    hooks = [layer.register_forward_pre_hook(enter) for layer in layers]
+    hooks += [layer.register_forward_hook(lambda *_: within.pop() and None) for layer in layers]
+    checkpointing = [group.checkpointing for group in groups]
+    try:
+        for group in groups:
+            group.checkpointing = False
+        with FakeTensorMode():
+            tensors = dict([*net.named_parameters(), *net.named_buffers()])
+            state = {name: torch.empty(t.shape, dtype=t.dtype) for name, t in tensors.items()}
+            for name, _ in net.named_parameters():
+                state[name].requires_grad_()
+            own = {tensor.untyped_storage()._cdata for tensor in state.values()}
+            views = blank_views(num_views, height, width)
+            with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+                torch.func.functional_call(net, state, (views,))
+    finally:
+        for hook in hooks:
+            hook.remove()
+        for group, was in zip(groups, checkpointing, strict=True):
+            group.checkpointing = was
+    by_layer = Counter()
+    for size, layer in kept.values():
+        by_layer[layer] += size
+    outside = by_layer.pop(None, 0)
+    between = sum(size for at, size in inputs.items() if kept.get(at, (0, at))[1] is not None)
+    again = outside + between + max(by_layer.values(), default=0)
+    return Activations((outside + by_layer.total()) / GB, again / GB)

@@ -4,6 +4,7 @@ from asysplat.training.disparity import InputDisparity, RenderedDisparity
 from asysplat.training.losses import ReconstructionLoss
 from asysplat.training.outcome import Outcome
 from asysplat.training.reconstruction import Reconstruction
+from asysplat.training.sharded import ShardedStrategy
 
 __all__ = [
     "InputDisparity",
@@ -11,4 +12,5 @@ __all__ = [
     "Reconstruction",
     "ReconstructionLoss",
     "RenderedDisparity",
+    "ShardedStrategy",
 ]

@@ -30,9 +30,14 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         (
             *("steps", "validate_every", "state_size"),
             *("data.inputs", "data.targets", "data.height", "data.width", "data.batch_size"),
-            *("data.val_scenes", "data.test_scenes"),
+            *("data.val_scenes", "data.test_scenes", "data.micro_batch", "trainer.num_nodes"),
             *("callbacks.guard.budget", "callbacks.watch.every"),
         ),
+    ),
+    (
+        "a whole number of at least 1, or null for all at once",
+        lambda value: value is None or (is_whole(value) and value >= 1),
+        ("training.views_at_once",),
     ),
     (
         "a whole number of at least 0",

@@ -7,17 +7,20 @@ from typing import Any, Literal
 import lightning
 import torch
 from torch import Tensor, nn
+from torch.distributed.fsdp import FSDPModule, fully_shard
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from asysplat.evaluation.metrics import psnr
 from asysplat.evaluation.static_cost import blank_views
+from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.rendering import render
 from asysplat.training.losses import ReconstructionLoss
 from asysplat.training.outcome import Outcome
 from asysplat.training.parts import Parts
 from asysplat.training.side_by_side import SideBySide
+from asysplat.training.step_means import StepMeans
 
 
 class Reconstruction(lightning.LightningModule):
@@ -33,6 +36,8 @@ class Reconstruction(lightning.LightningModule):
             views; while it trains black or white, whichever is less like it, so that being
             transparent never pays.
         checkpoint_layers: compute each layer again in the backward pass, to save memory.
+        views_at_once: render this many targets of each scene at a time, and again in the backward
+            pass, to save memory; None: all at once. See `render`.
     """
 
     def __init__(
@@ -43,16 +48,27 @@ class Reconstruction(lightning.LightningModule):
         schedule: Callable[[Optimizer], LRScheduler],
         background: Sequence[float] | Literal["inputs"],
         checkpoint_layers: bool = False,
+        views_at_once: int | None = None,
     ):
         super().__init__()
         freeze_unused(net)
         net.checkpoint_layers(checkpoint_layers)
         self.net, self.loss = net, loss
         self.optimizer, self.schedule = optimizer, schedule
+        self.views_at_once = views_at_once
         self.parts = Parts()  # of a step, which a callback measures
         self._side_by_side = SideBySide(net, self._terms, self.parts)
+        self._step_means = StepMeans(net)
         fixed = None if background == "inputs" else torch.tensor(background)
         self.register_buffer("background", fixed, persistent=False)
+
+    def configure_model(self) -> None:
+        """Divide the parameters among the processes, layer by layer, if the strategy is FSDP's."""
+        if self.device_mesh is None or isinstance(self.net, FSDPModule):
+            return
+        groups = [module for module in self.net.modules() if isinstance(module, Layers)]
+        for block in (*(layer for layers in groups for layer in layers), self.net):
+            fully_shard(block, mesh=self.device_mesh["data_parallel"])
 
     def reconstruct(self, batch: dict[str, Any], depth: bool) -> Outcome:
         """Predict the Gaussians of the inputs and render them at the target cameras.
@@ -69,7 +85,12 @@ class Reconstruction(lightning.LightningModule):
         targets, background = batch["targets"], self.behind(batch)
         with self.parts("rendering"):
             rendering = render(
-                gaussians, targets.cameras, background, depth=depth, masks=targets.masks
+                gaussians,
+                targets.cameras,
+                background,
+                depth=depth,
+                masks=targets.masks,
+                views_at_once=self.views_at_once,
             )
         return Outcome(gaussians, rendering)
 
@@ -82,16 +103,25 @@ class Reconstruction(lightning.LightningModule):
         return colour.expand(-1, batch["targets"].cameras.num_views, -1)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
-        size = len(batch["scene"])
-        if self.device.type == "cpu" and size > 1:
-            terms = self._side_by_side(batch)
-        else:
-            terms = self._terms(self.net, batch)
-        quality = terms.pop("psnr")
-        self.log_dict({f"train/{name}": term for name, term in terms.items()}, batch_size=size)
-        self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])
-        self.log("train/psnr", quality, prog_bar=True, batch_size=size)
+        """Compute the loss of a micro-batch; log the means of a step at its last."""
+        accumulated = self.trainer.accumulate_grad_batches
+        if batch_idx % accumulated == 0:
+            self._step_means.start()
+        terms = self.compute_terms(batch)
+        self._step_means.add(terms)
+        if (batch_idx + 1) % accumulated == 0:
+            means = self._step_means.finish(self.trainer.strategy.reduce)
+            self.log("train/psnr", means.pop("psnr"), prog_bar=True)
+            self.log_dict({f"train/{name}": term for name, term in means.items()})
+            self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])
         return terms["loss"]
+
+    def compute_terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Compute "loss", which has gradients, its terms and "psnr": means over the scenes."""
+        # The copies of a network whose parameters are divided (FSDP) could not gather them.
+        if self.device.type == "cpu" and len(batch["scene"]) > 1 and self.device_mesh is None:
+            return self._side_by_side(batch)
+        return self.terms(batch)
 
     def terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Compute what `training_step` minimises, "loss", and its parts, and log nothing."""

@@ -21,11 +21,14 @@ from asysplat.training.stages import stage_configs
 
 RESULTS = "metrics.json"
 EVALUATION = "evaluation.json"  # added to a run by evaluate.py
-# Names, places on disk, callbacks, and keys that only other keys take their values from.
+# Names, places on disk, callbacks, keys that only other keys take their values from, and how a
+# global batch is divided.
 NOT_HASHED = (
     *("name", "ckpt_path", "rerun", "paths", "callbacks", "logger"),
     *("stage", "stages", "earlier_stages", "selections", "more_inputs", "replica_size"),
     *("data.root", "data.index", "data.cache", "data.test_sets"),
+    *(f"trainer.{name}" for name in ("devices", "num_nodes", "strategy")),
+    *("data.micro_batch", "training.checkpoint_layers", "training.views_at_once"),
     *(f"training.loss.perceptual_term.{name}" for name in ("backbone_dir", "download")),
 )
 
@@ -63,6 +66,7 @@ def config_hash(config: DictConfig) -> str:
     The stages of a run before its last count as well. Left out are:
 
     - the seed, callbacks, the logger, the number of loader processes and the cache;
+    - how many devices share a step, how many scenes and views each holds at a time;
     - places on disk: for the test root, disparities and a checkpoint to start from, only whether
       they are given counts; `data_of` names the first and the last;
     - further test sets, which do not change the numbers of the others; `data_of` names them too.

@@ -7,6 +7,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from asysplat.data.batches import split_batch
 from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
 from asysplat.report.paper import load_paper
@@ -126,6 +127,20 @@ def test_the_command_for_a_cluster(compose_train):
         assert (row.data.height, row.data.width, row.steps) == (256, 256, 10000)
         assert row.data.selection == "first_96" and f"seed={row.seed}" in chosen
         assert f"model={row.hydra.runtime.choices.model}" in chosen
+
+
+def test_the_options_for_several_nodes(compose_train):
+    """As docs/tables.md has them, they go together."""
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    printed = (ROOT / "docs" / "tables.md").read_text().replace("\\\n", "").splitlines()
+    (line,) = (line for line in printed if "trainer.num_nodes" in line)
+    config = compose_train("scale=paper", "hydra/launcher=submitit_slurm", *line.split())
+    trainer, launcher = config.trainer, config.hydra.launcher
+    assert trainer.strategy._target_ == "lightning.pytorch.strategies.DDPStrategy"
+    assert trainer.num_nodes == launcher.nodes == 2
+    assert trainer.devices == launcher.tasks_per_node == launcher.gpus_per_node == 8
+    split = split_batch(config.data.batch_size, config.data.micro_batch, 16)
+    assert f"`{split}`" in " ".join(printed)
 
 
 def test_a_test_set_that_is_none_is_named():

@@ -1,5 +1,7 @@
 """Tasks: reproducible, disjoint between stages, normalised, and batched."""
 
+from types import SimpleNamespace
+
 import lightning
 import numpy as np
 import pytest
@@ -57,11 +59,58 @@ def epoch_of_scenes(data, epoch, done=0):
     return [batch["scene"] for batch in loader]
 
 
+class Trainer:
+    def __init__(self, epoch, global_rank=0, world_size=1):
+        self.current_epoch, self.global_rank, self.world_size = epoch, global_rank, world_size
+        epochs, batches = SimpleNamespace(ready=0, processed=0), SimpleNamespace(completed=0)
+        self.fit_loop = SimpleNamespace(
+            epoch_progress=SimpleNamespace(current=epochs),
+            epoch_loop=SimpleNamespace(batch_progress=SimpleNamespace(current=batches)),
+        )
+
+
 def test_an_epoch_is_the_same_however_one_gets_there():
     whole = [epoch_of_scenes(procedural(), epoch) for epoch in range(2)]
     assert epoch_of_scenes(procedural(), 1) == whole[1]
     assert len({name for epoch in whole for names in epoch for name in names}) == 12
     assert epoch_of_scenes(procedural(), 1, done=2) == whole[1][2:]
+
+
+def test_the_steps_of_several_processes_are_those_of_one():
+    """Whatever a process holds at a time: two steps of 4 scenes, in the second epoch."""
+    (whole,) = scenes_of_steps(processes=1, micro_batch=4)
+    assert len({name for step in whole for name in step}) == 8
+    for processes, micro_batch in ((2, 2), (2, 1)):
+        shares = scenes_of_steps(processes, micro_batch)
+        together = [sorted(name for share in shares for name in share[step]) for step in range(2)]
+        assert together == [sorted(step) for step in whole]
+
+
+def scenes_of_steps(processes, micro_batch):
+    """The names of each step's scenes, of every process."""
+    shares = []
+    for rank in range(processes):
+        data = procedural(batch_size=4, micro_batch=micro_batch, steps_per_epoch=2)
+        data.trainer = Trainer(1, rank, processes)
+        names = [batch["scene"] for batch in data.train_dataloader()]
+        assert all(len(micro) == micro_batch for micro in names)
+        flat, share = [name for micro in names for name in micro], 4 // processes
+        shares.append([flat[at : at + share] for at in range(0, len(flat), share)])
+    return shares
+
+
+@pytest.mark.parametrize(("scenes", "processes"), [(3, 1), (3, 2), (5, 4), (2, 3)])
+def test_no_scene_is_evaluated_by_two_processes(scenes, processes):
+    """All take equally many turns; who has fewer scenes repeats one of its own, if it has any."""
+    source = ProceduralSource(16, 16, 24, (12, 24), val_scenes=scenes, test_scenes=1)
+    data, turns = procedural(source=source), []
+    data.setup()
+    for rank in range(processes):
+        data.trainer = Trainer(0, rank, processes)
+        turns.append([batch["scene"][0] for batch in data.val_dataloader()])
+    assert len({len(own) for own in turns}) == 1
+    having = [set(own) for own in turns[:scenes]]
+    assert sum(map(len, having)) == len(set().union(*having)) == scenes
 
 
 def test_another_seed_gives_other_tasks():

@@ -8,6 +8,7 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader
 
+from asysplat.data.batches import BatchSplit
 from asysplat.evaluation import measured_cost
 from asysplat.evaluation.cost import reset_peak_memory
 from asysplat.evaluation.measured_cost import CostMeter
@@ -98,6 +99,7 @@ def test_seconds_leave_the_longest_out(monkeypatch):
 
 def test_seconds_of_steps_leave_the_longest_out(monkeypatch):
     costs = Costs()
+    costs.split = BatchSplit(processes=1, micro_batch=1, accumulated=1)
     costs.step = CostMeter(torch.device("cpu"))
     costs.step.seconds = [30.0, 1.0, 3.0]
     monkeypatch.setattr(costs, "_render_seconds", lambda *_: 0.5)

@@ -148,8 +148,8 @@ def first_moments(train, *overrides):
 
 
 def test_the_script_with_two_devices(train):
-    """The run of one process on batches as large as theirs together."""
-    two = first_moments(train, "name=two", "trainer.devices=2", "data.batch_size=1")
+    """The run of one process on the same batches."""
+    two = first_moments(train, "name=two", "trainer.devices=2", "data.batch_size=2")
     one = first_moments(train, "name=one", "trainer.devices=1", "data.batch_size=2")
     other = first_moments(train, "name=other", "trainer.devices=1", "data.batch_size=1")
     assert (two - one).norm() < 1e-4 * one.norm() < 1e-3 * (other - one).norm()

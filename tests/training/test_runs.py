@@ -40,6 +40,8 @@ SAME = {
     "other names": ["name=other", "paths.logs=/b/logs", "rerun=true"],
     "other processes": ["data.num_workers=3", "callbacks.pictures.scenes=0"],
     "another seed": ["seed=5"],
+    "other devices": ["trainer=ddp", "trainer.devices=4", "trainer.num_nodes=2"],
+    "less at a time": ["data.micro_batch=1", "training.checkpoint_layers=true"],
     "size of a test that is not made": ["replica_size.width=96"],
 }
 OTHER = {

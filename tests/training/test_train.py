@@ -242,6 +242,10 @@ REFUSED = {
     ),
     "an unusable layer mix": (["model.layers=4q"], "such as 4m4s"),
     "a ratio out of reach": (["geometry_ratio=1.5"], "geometry_ratio=1.5: give a share"),
+    "a batch that does not divide": (
+        ["trainer.accelerator=cpu", "trainer.devices=2", "data.batch_size=3"],
+        "error: data.batch_size=3 scenes do not divide among 2 processes",
+    ),
     "a missing folder": (["data=transforms", "data.root=nowhere"], "data.root=nowhere"),
     "no folder": (["data=transforms"], "add data.root=..."),
     "no checkpoint": (["ckpt_path=last", "name=new"], "leave ckpt_path out"),

@@ -1,6 +1,5 @@
 """A network of conf/model and an input for it: the passes that are measured."""
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -11,7 +10,7 @@ from hydra.utils import instantiate
 
 from asysplat.benchmark.options import PRECISIONS
 from asysplat.benchmark.scenes import on_an_arc, random_scene
-from asysplat.evaluation.cost import GB, count_parameters
+from asysplat.evaluation.cost import GB, count_parameters, memory_gb
 from asysplat.evaluation.static_cost import activation_gb
 from asysplat.models.network import Network
 from asysplat.overrides import check_overrides
@@ -65,7 +64,7 @@ class Workload:
 
     @property
     def step_fits(self) -> bool:
-        return self.step_gb < FILLED * _memory_gb(self.device)
+        return self.step_gb < FILLED * memory_gb(self.device)
 
     def _autocast(self, device: str) -> torch.autocast:
         dtype = PRECISIONS[self.precision]
@@ -94,10 +93,3 @@ def make_views(views: int, height: int, width: int, device: torch.device) -> Vie
     _, camera = random_scene(1, height, width)
     images = torch.rand(views, 3, height, width, generator=torch.Generator().manual_seed(0))
     return Views(on_an_arc(camera, views), images).to(device)
-
-
-def _memory_gb(device: torch.device) -> float:
-    """Return the memory of the device in 1e9 bytes."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_properties(device).total_memory / GB
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GB

@@ -9,16 +9,18 @@ from asysplat.data.datamodule import collate
 from asysplat.evaluation.cost import GB, peak_memory_gb, reset_peak_memory
 from asysplat.evaluation.measured_cost import CostMeter, mean_but_longest, render_seconds
 from asysplat.evaluation.static_cost import static_costs
+from asysplat.training.plan import make_plan
 
 
 class Costs(lightning.Callback):
     """Fills `values`, "cost/..." -> number.
 
-    Before the first step: the `static_costs` of one scene at the run's views and resolution.
-    Measured by `CostMeter`, seconds as the mean of all but the longest, memory as the peak:
+    Before the first step: the `static_costs` of one scene at the run's views and resolution; and it
+    prints the training's plan (`make_plan`), or refuses a training that does not fit. Measured by
+    `CostMeter`, seconds as the mean of all but the longest, memory as the peak:
 
     - a training step: seconds_per_step, peak_gb, and peak_bytes_per_token: the rise of the peak
-      over the memory before the first step, for each token of the largest patch in a batch.
+      over the memory before the first step, for each token of the largest patch in a micro-batch.
     - the rendering of a step's targets, with its gradients: render_seconds_per_step.
     - the network's forward pass over the test's scenes: inference_seconds, inference_gb.
     - the rest of the test step, which renders the targets with depth: render_seconds, render_gb.
@@ -30,16 +32,28 @@ class Costs(lightning.Callback):
     def __init__(self):
         self.values: dict[str, float | int] = {}
 
-    def on_fit_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        self.step = CostMeter(module.device)
+    def setup(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str
+    ) -> None:
+        """Count and plan, while every process still has all weights."""
+        if stage != "fit":
+            return
+        module.to(trainer.strategy.root_device)
         reset_peak_memory(module.device)
         self.gb_before = peak_memory_gb(module.device)
         scene = trainer.datamodule.evaluation["val"][0]["inputs"]
         height, width = scene.images.shape[-2:]
-        tokens = scene.num_views * height * width // module.net.patch**2
-        self.batch_tokens = trainer.datamodule.batch_size * tokens
+        self.split = trainer.datamodule.split(trainer.world_size)
+        self.batch_tokens = self.split.micro_batch * scene.num_views * height * width
+        self.batch_tokens //= module.net.patch**2
         costs = static_costs(module.net, scene.num_views, height, width)
+        plan = make_plan(trainer, module, costs, self.gb_before)
+        if trainer.is_global_zero:
+            print(plan, flush=True)
         self.values = {f"cost/{name}": value for name, value in costs.items()}
+
+    def on_fit_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        self.step = CostMeter(module.device)
 
     def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         if trainer.global_step == 0:  # a run that goes on has logged them
@@ -54,8 +68,12 @@ class Costs(lightning.Callback):
 
     def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         if self.step.seconds:
-            self.values["cost/seconds_per_step"] = mean_but_longest(self.step.seconds)
-            self.values["cost/render_seconds_per_step"] = self._render_seconds(trainer, module)
+            micro_batches = self.split.accumulated
+            seconds = {
+                "seconds_per_step": mean_but_longest(self.step.seconds),
+                "render_seconds_per_step": self._render_seconds(trainer, module),
+            }
+            self.values |= {f"cost/{name}": micro_batches * s for name, s in seconds.items()}
         if self.step.gb:
             peak = max(self.step.gb)
             per_token = GB * (peak - self.gb_before) / self.batch_tokens
@@ -63,11 +81,11 @@ class Costs(lightning.Callback):
         for logger in trainer.loggers:
             logger.log_metrics(self.values, step=trainer.global_step)
 
-    @staticmethod
-    def _render_seconds(trainer: lightning.Trainer, module: lightning.LightningModule) -> float:
-        """Measure rendering a training batch, with copies of a validation scene in its place."""
-        data = trainer.datamodule
-        scene = collate([data.evaluation["val"][0]] * data.batch_size)
+    def _render_seconds(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule
+    ) -> float:
+        """Measure rendering a micro-batch, with copies of a validation scene in its place."""
+        scene = collate([trainer.datamodule.evaluation["val"][0]] * self.split.micro_batch)
         inputs, targets = scene["inputs"].to(module.device), scene["targets"].to(module.device)
         was_training = module.net.training
         module.net.eval()  # keeps the running means of batch norms as they are

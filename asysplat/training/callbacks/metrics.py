@@ -129,6 +129,6 @@ def gather(trainer: lightning.Trainer, rows: list[ImageRow]) -> list[ImageRow]:
         return rows
     per_process: list[list[ImageRow]] = [[] for _ in range(trainer.world_size)]
     torch.distributed.all_gather_object(per_process, rows)
-    # Scenes given to two processes, so that all have equally many, count once.
+    # A scene that a process measured again, so that all take equally many turns, counts once.
     images = {tuple(row[key] for key in IMAGE): row for part in per_process for row in part}
     return list(images.values())

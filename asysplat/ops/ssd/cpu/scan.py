@@ -113,7 +113,7 @@ def _segment(inputs: ScanInputs, batch: int, tokens: slice, reverse: bool) -> Se
         A=inputs.A.numpy(),
         B=B.numpy(),
         C=C.numpy(),
-        D=inputs.D.numpy(),
+        D=inputs.D.clone().numpy(),  # a weight, whose own storage FSDP could then not free
         scores=(C @ B.mT).numpy(),
         decays=sum_decays(dt.unflatten(0, (-1, CHUNK)), inputs.A, reverse),
         reverse=reverse,

@@ -1,0 +1,58 @@
+"""How the scenes of an optimizer step are divided: among processes, then into micro-batches."""
+
+from dataclasses import dataclass
+
+from asysplat.errors import InputError
+
+
+@dataclass(frozen=True)
+class BatchSplit:
+    """A global batch of `processes` x `micro_batch` x `accumulated` scenes.
+
+    Args:
+        processes: that train together, on all nodes.
+        micro_batch: scenes that a process holds at a time.
+        accumulated: micro-batches whose gradients make an optimizer step.
+    """
+
+    processes: int
+    micro_batch: int
+    accumulated: int
+
+    def __str__(self) -> str:
+        total = self.processes * self.micro_batch * self.accumulated
+        factors = f"{_count(self.processes, 'process', 'es')} x {_count(self.micro_batch, 'scene')}"
+        return f"global batch {total} = {factors} x {self.accumulated} accumulated"
+
+
+def split_batch(batch_size: int, micro_batch: int | None, processes: int) -> BatchSplit:
+    """Divide a global batch evenly.
+
+    Args:
+        batch_size: scenes of an optimizer step.
+        micro_batch: the most scenes that a process may hold at a time; fewer where these do not
+            divide its share; None: all of its share.
+        processes: that train together.
+
+    Raises:
+        InputError: the batch does not divide among the processes.
+    """
+    share, left = divmod(batch_size, processes)
+    if left:
+        fewer = largest_divisor(batch_size, processes)
+        raise InputError(
+            f"data.batch_size={batch_size} scenes do not divide among {processes} processes "
+            f"(trainer.devices x trainer.num_nodes): take {fewer} of them, or set "
+            f"data.batch_size={processes * (share + 1)}."
+        )
+    held = largest_divisor(share, micro_batch or share)
+    return BatchSplit(processes, held, share // held)
+
+
+def _count(number: int, name: str, plural: str = "s") -> str:
+    return f"{number} {name}{plural if number > 1 else ''}"
+
+
+def largest_divisor(number: int, most: int) -> int:
+    """Return the largest divisor of `number` that is not above `most`."""
+    return next(d for d in range(min(number, most), 0, -1) if number % d == 0)

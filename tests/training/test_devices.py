@@ -1,0 +1,94 @@
+"""The same global batch on several processes and in micro-batches: the curve of one process."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import make_train
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+FEW = [
+    *("trainer.accelerator=cpu", "steps=2", "validate_every=1", "data.batch_size=4"),
+    *("data.val_scenes=3", "data.test_scenes=3", "data.test_sets=null"),  # odd, of two processes
+    *("~callbacks.costs", "~callbacks.pictures", "~callbacks.progress"),
+]
+TWO = "trainer.devices=2"
+
+
+class Outcome:
+    """What a run left: its curves, its test, its weights."""
+
+    def __init__(self, printed: str):
+        (line,) = [line for line in printed.splitlines() if line.startswith("run: ")]
+        folder = Path(line.removeprefix("run: "))
+        self.checkpoint = folder / "checkpoints" / "last.ckpt"
+        events = EventAccumulator(str(folder / "tensorboard"))
+        events.Reload()
+        names = [name for name in events.Tags()["scalars"] if name.startswith(("train/", "val/"))]
+        self.curves = {n: [event.value for event in events.Scalars(n)] for n in sorted(names)}
+        results = json.loads((folder / "metrics.json").read_text())
+        self.test = {k: v for k, v in results.items() if k.startswith(("test/", "baseline/"))}
+        self.rows = len((folder / "metrics.csv").read_text().splitlines()) - 1
+        state = torch.load(self.checkpoint, weights_only=True)["state_dict"]
+        state = {name: t for name, t in state.items() if t.is_floating_point()}  # counters are not
+        self.weights = torch.cat([state[name].flatten().double() for name in sorted(state)])
+
+
+@pytest.fixture(scope="module")
+def train(tmp_path_factory, run_script, repository):
+    return make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
+
+
+def outcome(result) -> Outcome:
+    assert result.returncode == 0, result.stderr
+    return Outcome(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def one(train):
+    return outcome(train("name=one", "trainer.devices=1", "data.micro_batch=4", *FEW))
+
+
+def check_the_same(found: Outcome, expected: Outcome) -> None:
+    """The norm of all gradients is summed in fp32, and by process."""
+    assert found.curves.keys() == expected.curves.keys()
+    assert {"train/loss", "train/psnr", "train/grad_norm", "val/psnr"} <= found.curves.keys()
+    for name, values in expected.curves.items():
+        rel = 1e-4 if name == "train/grad_norm" else 1e-5
+        assert len(values) == 2 and found.curves[name] == pytest.approx(values, rel=rel), name
+    assert found.test == pytest.approx(expected.test, rel=1e-5) and found.test
+    assert found.rows == expected.rows == 3 * 2
+    assert (found.weights - expected.weights).norm() < 1e-6 * expected.weights.norm()
+
+
+@pytest.mark.slow
+def test_accumulated(train, one):
+    result = train("name=accumulated", "trainer.devices=1", "data.micro_batch=1", *FEW)
+    assert "global batch 4 = 1 process x 1 scene x 4 accumulated" in result.stdout
+    check_the_same(outcome(result), one)
+
+
+@pytest.mark.slow
+def test_two_processes(train, one):
+    """Each accumulates, and validates and tests a share of three scenes."""
+    result = train.alone("name=two", "trainer=ddp", TWO, "data.micro_batch=1", *FEW)
+    assert "global batch 4 = 2 processes x 1 scene x 2 accumulated" in result.stdout
+    check_the_same(outcome(result), one)
+
+
+@pytest.mark.hours
+def test_divided_weights(train, one):
+    """FSDP takes the same steps, and one process goes on from its checkpoint."""
+    saving = ["training.checkpoint_layers=true", "training.views_at_once=1"]
+    result = train.alone("name=fsdp", "trainer=fsdp", TWO, "data.micro_batch=1", *saving, *FEW)
+    fsdp = outcome(result)
+    check_the_same(fsdp, one)
+    more = ["steps=3", "trainer.devices=1", "data.micro_batch=4", *FEW[2:]]
+    again = [
+        outcome(train(f"ckpt_path={run.checkpoint}", "trainer.accelerator=cpu", *more))
+        for run in (fsdp, one)
+    ]
+    assert again[0].curves["train/loss"] == pytest.approx(again[1].curves["train/loss"], rel=1e-5)
+    assert (again[0].weights - again[1].weights).norm() < 1e-6 * again[1].weights.norm()
+    assert not torch.equal(again[0].weights, fsdp.weights)
