@@ -32,7 +32,7 @@ REFUSED = {
     "data.val_scenes=0": "data.val_scenes=0: give a whole number of at least 1.",
     "data.window=12": "data.window=12: give two whole numbers, such as [64,96].",
     "data.window=[12]": "data.window=[12]: give two whole numbers, such as [64,96].",
-    "callbacks.checkpoints.minutes=-1": "callbacks.checkpoints.minutes=-1: give a number of at least",
+    "callbacks.checkpoints.minutes=-1": "callbacks.checkpoints.minutes=-1: give a number of",
     "callbacks.guard.budget=0": "callbacks.guard.budget=0: give a whole number of at least 1.",
     "callbacks.skips.budget=few": "callbacks.skips.budget=few: give a whole number of at least 0.",
     "data.on_bad_scene=drop": "data.on_bad_scene=drop: give fail or skip.",
