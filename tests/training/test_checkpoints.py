@@ -257,9 +257,7 @@ def test_a_bit_that_changed_on_the_disk_is_noticed(tmp_path, run, capsys):
     assert found == run / "checkpoints" / "previous.ckpt"
     assert "last.ckpt is damaged, at " in capsys.readouterr().out
     damage(found)
-    with pytest.raises(
-        InputError, match=r"ckpt_path=\S+last\.ckpt is damaged, at archive/data/0: "
-    ):
+    with pytest.raises(InputError, match=r"last\.ckpt is damaged, at archive/data/0: "):
         find_checkpoint("last", tmp_path / "new", tmp_path)
 
 

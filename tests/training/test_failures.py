@@ -23,7 +23,7 @@ SENTENCES = {
     "a full disk": (FULL, "there is no room on the disk for logs/events (No space left on device)"),
     "a full disk behind": (
         raised_from(RuntimeError("write"), FULL),
-        "there is no room on the disk",
+        "no room on the disk",
     ),
     "a quota": (OSError(errno.EDQUOT, "Disk quota exceeded"), "no room on the disk (Disk quota"),
     "a lost loader": (LOST, "a process that loads data was lost (DataLoader worker (pid 12) is ki"),

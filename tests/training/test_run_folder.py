@@ -1,8 +1,5 @@
 """Which folder a run has: its own again, if it was cut off, and of nobody else."""
 
-import subprocess
-import sys
-
 import pytest
 
 from asysplat.errors import InputError
@@ -37,23 +34,13 @@ def test_all_else_starts_in_a_folder_of_its_own(cut_off, tmp_path):
     assert run_folder("last", logs, "fresh") == "fresh"
 
 
-def test_two_processes_do_not_train_in_one_folder(tmp_path):
-    script = (
-        "import sys; from asysplat.training.run_folder import claimed; from pathlib import Path"
-    )
-    script += "\nwith claimed(Path(sys.argv[1])): print('claimed', flush=True); input()"
-    with subprocess.Popen(
-        [sys.executable, "-c", script, tmp_path / "run"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as other:
-        assert other.stdout.readline() == "claimed\n"
-        with (
-            pytest.raises(InputError, match=r"run is a run that another process still trains"),
-            claimed(tmp_path / "run"),
-        ):
-            pass
-        other.kill()
-    with claimed(tmp_path / "run"):
-        assert (tmp_path / "run").is_dir()
+def test_no_two_train_in_one_folder(tmp_path):
+    folder = tmp_path / "run"
+    with (
+        claimed(folder),
+        pytest.raises(InputError, match=r"run is a run that another process still trains"),
+        claimed(folder),
+    ):
+        pytest.fail("both train there")
+    with claimed(folder):
+        assert folder.is_dir()
