@@ -150,7 +150,7 @@ def test_a_step_that_does_not_fit_is_left_out(workload, monkeypatch):
     assert workload.step_fits and workload.step_gb > 0
     workload.forward()  # in evaluation mode, in which the network would keep less
     assert replace(workload).step_gb == workload.step_gb
-    monkeypatch.setattr(workloads, "_memory_gb", lambda device: workload.step_gb / 2)
+    monkeypatch.setattr(workloads, "memory_gb", lambda device: workload.step_gb / 2)
     assert not workload.step_fits
 
 

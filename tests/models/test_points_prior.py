@@ -63,9 +63,9 @@ def test_a_sweep_looks_where_the_points_are(monkeypatch):
     """As far as they say in a view with enough of them, and as the cameras say in the other."""
     given = []
 
-    def spy(images, cameras, stride, ranges):
+    def spy(images, cameras, stride, ranges, **options):
         given.append(ranges)
-        return plane_sweep(images, cameras, stride, backend="reference", ranges=ranges)
+        return plane_sweep(images, cameras, stride, backend="reference", ranges=ranges, **options)
 
     monkeypatch.setattr(prior_module, "plane_sweep", spy)
     points = torch.zeros(1, 2, 32, 32)

@@ -16,7 +16,7 @@ def test_overrides_of_the_sweeps_reach_the_configuration(run_script, tmp_path):
     result = run_script("report.py", *given, 'overrides=["steps=7"]')
     assert result.returncode == 0, result.stderr
     text = (tmp_path / "report" / "report.md").read_text()
-    assert "dl3dv data, 32 input views of 256x256, 7 steps of batch 8" in text
+    assert "dl3dv data, 32 input views of 256x256, 7 steps of batch 24" in text
     command = "python train.py sweeps=layers data=dl3dv scale=paper data.root=/a/DL3DV steps=7"
     assert f"`{command}`" in text
     assert "protocol longlrm" in text

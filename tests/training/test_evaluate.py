@@ -101,7 +101,8 @@ def test_files_have_every_image_and_every_scene(whole, evaluated):
 
 
 def test_the_report_has_rows_with_post_optimisation(whole, evaluated, repository):
-    tiny = [*SIZE, *VIEWS, *TINY_SCENES, *TRAINING]
+    one_stage = ["stage=stage1", "earlier_stages=[]"]
+    tiny = [*SIZE, *VIEWS, *TINY_SCENES, *TRAINING, *one_stage]
     with initialize_config_dir(str(repository / "conf"), version_base=None):
         filled = fill_table(
             load_paper()["state_of_the_art"],

@@ -34,12 +34,13 @@ def tables(results: Result) -> list[Table]:
     costs = {
         "Gaussians": number("gaussians", "{:,.0f}"),
         "start, s": number("start", "{:.1f}"),
-        f"s to\n{results['goal']:g} dB": number("to_goal", "{:.1f}"),
         "steps": number("steps", "{:,.0f}"),
         "ms / step": number("seconds_a_step", "{:.0f}", unit=1e-3),
         "renderer, ms": spread("renderer"),
         "step\n/ renderer": number("over_renderer", "{:.2f}"),
     }
+    if "goal" in results:  # not in older ones
+        costs[f"s to\n{results['goal']:g} dB"] = number("to_goal", "{:.1f}")
     views = ", ".join(
         f"{n} {v['inputs']} and {v['measured']}" for n, v in results["scenes"].items()
     )
