@@ -32,7 +32,7 @@ def main(options: DictConfig) -> None:
 
 
 def benchmark(options: DictConfig) -> None:
-    """Measure, print the tables, write <suite>.json and <suite>.png."""
+    """Measure, print the tables, write <suite>.json, <suite>.png and, if it has one, its page."""
     suite = find_suite(options.suite)
     check_repeats(options.repeats)
     console = Console()
@@ -42,9 +42,13 @@ def benchmark(options: DictConfig) -> None:
     folder = Path(options.output)
     folder.mkdir(parents=True, exist_ok=True)
     numbers, picture = (folder / f"{options.suite}{end}" for end in (".json", ".png"))
-    numbers.write_text(json.dumps(results, indent=2) + "\n")
+    numbers.write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
     suite.plot(results).savefig(picture, dpi=150)
     console.print(f"numbers: {numbers}\npicture: {picture}", soft_wrap=True)
+    if hasattr(suite, "page"):
+        (folder / f"{options.suite}.md").write_text(suite.page(results))
+    if hasattr(suite, "verdict") and (complaint := suite.verdict(results)):
+        sys.exit(complaint)
 
 
 if __name__ == "__main__":

@@ -5,4 +5,9 @@ A suite is a folder named in `options.SUITES`; its suite.py has three functions:
 measure(options, console) -> results    plain numbers, words, lists and dictionaries
 tables(results) -> rich tables          by `table.make_table`
 plot(results) -> figure                 by `plot.time_against_error`, `bars` or `against_seconds`
+
+It may have two more:
+
+page(results) -> Markdown               written as <suite>.md
+verdict(results) -> sentence or None    a complaint, printed at the end; the exit status is 1
 """
