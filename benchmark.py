@@ -51,6 +51,10 @@ def benchmark(options: DictConfig) -> bool:
     written = write_results(results, tables, suite.plot(results), suite.WATCHED, path)
     for name, place in zip(("numbers", "tables", "picture", "tensorboard"), written, strict=True):
         console.print(f"{name}: {place}", soft_wrap=True)
+    if hasattr(suite, "page"):
+        path.with_suffix(".md").write_text(suite.page(results))
+    if hasattr(suite, "verdict") and (complaint := suite.verdict(results)):
+        sys.exit(complaint)
     if old is None:
         return False
     found = compare(old, results, suite.WATCHED)

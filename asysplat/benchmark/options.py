@@ -8,7 +8,7 @@ import torch
 
 from asysplat.errors import InputError
 
-SUITES = ("render", "ops", "model", "data", "reconstruct", "pareto", "bench")
+SUITES = ("render", "ops", "model", "data", "reconstruct", "pareto", "bench", "stability")
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
 

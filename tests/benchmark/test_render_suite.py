@@ -148,7 +148,7 @@ def test_peak_memory_is_the_rise():
 
 
 def test_unknown_options_are_named():
-    known = "render, ops, model, data, reconstruct, pareto, bench"
+    known = "render, ops, model, data, reconstruct, pareto, bench, stability"
     with pytest.raises(InputError, match=rf"^suite=rendr is unknown: choose from {known}\.$"):
         find_suite("rendr")
     with pytest.raises(InputError, match=r"^scenes=D is unknown: .*A, B, C, 524k, 4M"):

@@ -7,10 +7,10 @@ from functools import cache
 import pytest
 import torch
 from backends import EXACT, FIELDS, INPUTS, Backend, both_ways, random_gradient, relative_error
-from band import boundary_band
 from torch import Tensor
 
 from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
+from asysplat.benchmark.stability.band import boundary_band
 from asysplat.rendering.interface import Settings
 
 OTHERS = tuple(name for name in INPUTS if name not in FIELDS)

@@ -56,6 +56,8 @@ def match(
     exposure changes; the mean of the best two neighbours, averaged over blocks of `stride`.
     """
     B, V, H, W = images.shape
+    # An image's small variances would be lost beside large squares.
+    images = images - images.mean((-2, -1), keepdim=True)
     costs = images.new_empty(B, V, H // stride, W // stride, planes)
     y, x = torch.meshgrid(
         torch.arange(H, device=images.device) + 0.5,

@@ -15,8 +15,11 @@ ROWS = 8  # of pixels at a time
 
 @torch.no_grad()
 def boundary_band(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Tensor:
-    """[V, H, W] True where some alpha is within rounding of alpha_min or alpha_max, or some
-    transmittance of transmittance_min or, for the median depth, of a half; in float64."""
+    """Find the pixels where rounding may decide, in float64: [V, H, W].
+
+    There some alpha is within rounding of alpha_min or alpha_max, or some transmittance of
+    transmittance_min or, for the median depth, of a half.
+    """
     convention = settings.convention
     scene = gaussians.map(lambda t: t[None].double())
     splats = project(scene, cameras.map(lambda t: t[None].double()), settings)

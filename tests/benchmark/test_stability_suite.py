@@ -1,0 +1,244 @@
+"""The page of stability is green, and a fault that is planted turns it red."""
+
+import inspect
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+from importlib import import_module
+from io import StringIO
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from rich.console import Console
+
+from asysplat.benchmark.stability import prior, renderer
+from asysplat.benchmark.stability.judge import Case, Comparison, judge, unit
+from asysplat.benchmark.stability.suite import AREAS, measure, page, plot, tables, verdict
+from asysplat.benchmark.stability.views import PHOTOGRAPHS, POSES, Hostile
+from asysplat.errors import InputError
+from asysplat.models import head
+from asysplat.rendering.reference import tiles
+
+TINY = {"scale": "laptop", "width": 0.125, "state_size": 8, "model.layers": "1m1s"}
+FEW = {
+    "areas": ["renderer", "refinement"],
+    "models": ["asysplat_sweep"],
+    "overrides": TINY,
+    "views": [1],
+    "training_steps": 3,
+    "refinement_steps": 3,
+}
+
+
+@pytest.fixture(scope="module")
+def options(repository):
+    """The options of conf/benchmark.yaml, made small."""
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        found = compose("benchmark", ["suite=stability"])
+    OmegaConf.set_struct(found.stability, False)
+    found.stability.merge_with(FEW)
+    return found
+
+
+@pytest.fixture
+def configured(repository):
+    """Lets networks be composed."""
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        yield
+
+
+@pytest.fixture
+def measured(options, configured):
+    """The function below."""
+
+    def rows(area, *names, **changes):
+        """The rows of an area that are in fp32 and named so."""
+        wanted = OmegaConf.merge(options.stability, changes)
+        cases = [case for case in AREAS[area](wanted) if case.precision == "fp32"]
+        found = [case.row() for case in cases if case.name.endswith(names)]
+        assert len(found) == len(names)
+        return found
+
+    return rows
+
+
+def without(function, text, instead=""):
+    """The function, with another text in its source."""
+    function = inspect.unwrap(function)
+    source = textwrap.dedent(inspect.getsource(function))
+    assert source.count(text) == 1
+    source = re.sub(r"^@.*\n", "", source.replace(text, instead))
+    names: dict = {}
+    exec(
+        compile("from __future__ import annotations\n" + source, "fault", "exec"),
+        function.__globals__,
+        names,
+    )
+    return names[function.__name__]
+
+
+def cubed(tensors):
+    return {"y": tensors["x"] ** 3}
+
+
+def compare(fast, **inputs):
+    return judge(Comparison(fast, cubed, inputs or {"x": torch.rand(9) + 1}, leaves=("x",)))
+
+
+def test_rounding_is_green_and_more_is_red():
+    assert compare(cubed)["green"]
+    for factor in (1 + 100 * unit(torch.float32), 1 - 1e-3):
+        assert not compare(lambda t: {"y": factor * cubed(t)["y"]})["green"]  # noqa: B023
+    nearly = compare(lambda t: {"y": (1 + 4 * unit(torch.float32)) * cubed(t)["y"]})
+    assert nearly["green"] and nearly["error"] > unit(torch.float32)
+
+
+def test_tolerances_follow_what_is_badly_conditioned():
+    """Of a difference of large numbers that nearly agree, few digits are known."""
+    inputs = {"x": torch.tensor([1.0, 2.0]), "z": torch.tensor([1.00001, 2.00002])}
+    row = judge(
+        Comparison(lambda t: {"y": t["x"] - t["z"]}, lambda t: {"y": t["x"] - t["z"]}, inputs)
+    )
+    assert row["green"] and row["tolerance"] > 0.05
+    assert compare(cubed)["tolerance"] < 1e-5
+
+
+@pytest.mark.parametrize("value, count", [(math.nan, "nan"), (math.inf, "inf")])
+def test_what_is_not_finite_is_red_and_counted(value, count):
+    row = compare(lambda t: {"y": cubed(t)["y"].where(torch.arange(9) < 7, value)})
+    assert not row["green"] and row[count] == 2 and row["gradients"]
+    assert row["error"] is row["tolerance"] is None
+
+
+def test_a_case_that_raises_is_red():
+    def fails():
+        raise InputError("no.")
+
+    row = Case("area", "name", "fp32", fails).row()
+    assert not row["green"] and row["compared"] == "raised InputError: no."
+
+
+def test_hostile_views_can_be_used():
+    for photographs in PHOTOGRAPHS:
+        Hostile(photographs).views().validate()
+    for poses in POSES:
+        for count in (1, 3):
+            Hostile(poses=poses, count=count).views().validate()
+
+
+@pytest.mark.slow
+def test_a_small_page_is_green(options, configured):
+    console = Console(width=300, file=StringIO())
+    results = {"machine": {"cpu": "some"}, **measure(options, console)}
+    text = json.dumps(results, allow_nan=False)
+    assert json.loads(text) == results
+    assert verdict(results) is None
+    areas = [row["area"] for row in results["rows"]]
+    assert list(dict.fromkeys(areas)) == FEW["areas"]
+    assert areas.count("refinement") == len(renderer.GAUSSIANS)
+    for row in results["rows"]:
+        assert row["green"], row
+        assert row["area"] != "renderer" or 0 <= row["error"] <= row["tolerance"]
+    for table in tables(results):
+        console.print(table)
+    assert "RED" not in console.file.getvalue()
+    written = page(results)
+    assert f"**all {len(areas)} cases are green.**" in written and "RED" not in written
+    assert written.count("\n| ") >= len(areas)
+    assert plot(results).axes
+
+
+def test_a_red_page_says_so_and_the_command_fails(tmp_path, run_script, monkeypatch):
+    monkeypatch.setitem(AREAS, "prior", lambda _: [Case("prior", "dark", "fp32", lambda: 1 / 0)])
+    small = [f"output={tmp_path}", "stability.areas=[prior]"]
+    done = run_script("benchmark.py", "suite=stability", *small)
+    assert done.returncode == 1
+    assert "red: 1 of 1 cases are not stable: prior: dark (fp32)" in done.stderr
+    assert "raised ZeroDivisionError" in (tmp_path / "stability.md").read_text()
+    assert json.loads((tmp_path / "stability.json").read_text())["rows"][0]["green"] is False
+    assert (tmp_path / "stability.png").stat().st_size > 0
+
+
+@pytest.mark.slow
+def test_priors_of_views_that_say_nothing_are_green():
+    names = ("black photographs", "white photographs", "views: 1")
+    rows = [case.row() for case in prior.cases([1]) if case.name in names]
+    assert len(rows) == 3 and all(row["green"] for row in rows)
+
+
+@pytest.mark.slow
+def test_an_exponential_without_its_clamp_is_red(measured, monkeypatch):
+    wild = ("network", "wild weights")
+    (row,) = measured(*wild, models=["asysplat_4m4s"])
+    assert row["green"]
+    fault = without(head.PhotographHead.activate, ".clamp(-5, 3)")
+    monkeypatch.setattr(head.PhotographHead, "activate", fault)
+    (row,) = measured(*wild, models=["asysplat_4m4s"])
+    assert not row["green"] and row["inf"] > 0
+
+
+def test_a_box_that_is_a_tile_short_is_red(measured, monkeypatch):
+    """Of the reference's: the page holds each to the other."""
+    fault = without(tiles.list_tiles, "last - first + 1", "last - first")
+    monkeypatch.setattr(import_module("asysplat.rendering.reference.draw"), "list_tiles", fault)
+    for row in measured("renderer", "Gaussians needles", "poses in a line", "views: 1"):
+        assert not row["green"] and row["error"] > 1e-3 and row["nan"] == row["inf"] == 0
+
+
+@pytest.mark.hours
+def test_a_box_of_the_kernels_that_is_a_tile_short_is_red(repository, tmp_path):
+    """In a copy of the project, which compiles the kernels with the fault."""
+    hidden = shutil.ignore_patterns("__pycache__", "results", ".*")
+    for name in ("asysplat", "conf"):
+        shutil.copytree(repository / name, tmp_path / name, ignore=hidden)
+    shutil.copy(repository / "benchmark.py", tmp_path)
+    kernels = tmp_path / "asysplat" / "rendering" / "cpu" / "tiles.py"
+    right, fault = (
+        "return first // TILE, last // TILE if",
+        "return first // TILE, last // TILE - 1 if",
+    )
+    assert kernels.read_text().count(right) == 1
+    kernels.write_text(kernels.read_text().replace(right, fault))
+    command = [sys.executable, "benchmark.py", "suite=stability", "stability.views=[1]"]
+    command += ["stability.areas=[renderer]", f"output={tmp_path / 'out'}"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    rows = json.loads((tmp_path / "out" / "stability.json").read_text())["rows"]
+    assert sum(not row["green"] for row in rows) > len(rows) / 2
+
+
+def nan_gradient(values, bound):
+    """`head.bounded`, of which the values are right and the gradients are not."""
+    return bound * (values / bound).tanh() + 0 * (values - values.detach()).sqrt()
+
+
+@pytest.mark.slow
+def test_a_gradient_that_is_nan_is_red(measured, monkeypatch):
+    noise = ("network", "noise photographs")
+    assert measured(*noise)[0]["green"]
+    training = ("training", "3 steps on hostile batches")
+    assert measured(*training)[0]["green"]
+    monkeypatch.setattr(head, "bounded", nan_gradient)
+    for what in (noise, training):
+        (row,) = measured(*what)
+        assert not row["green"] and row["gradients"] is False and row["nan"] > 0
+
+
+def test_unknown_options_are_named(options):
+    wrong = {
+        r"^stability\.areas=weather is unknown: .*operators, prior": {"areas": ["weather"]},
+        r"^stability\.views=\[0\] cannot be": {"views": [0]},
+        r"^stability\.training_steps=1.5 cannot be": {"training_steps": 1.5},
+        "nothing": {"models": ["nothing"]},
+    }
+    for sentence, changes in wrong.items():
+        with pytest.raises(InputError, match=sentence):
+            measure(OmegaConf.merge(options, {"stability": changes}), Console(file=StringIO()))
