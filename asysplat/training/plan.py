@@ -38,7 +38,7 @@ class Plan:
         held_gb: memory that the process held before.
         capacity_gb: of the device, for each process.
         tried_gb: by how much memory rose as a micro-batch was tried, without an optimizer.
-        seconds: of an optimizer step, without what processes say to each other.
+        seconds: of the micro-batches of a step, without optimizer and communication.
         disk_gb, free_gb: of a run's checkpoints, and of their disk.
     """
 
