@@ -94,6 +94,7 @@ def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
     if init == "network":
         try:
             network = load(config.checkpoint)
+            network.skips = instantiate(config.speed)
         except InputError as error:
             if config.init is not None:
                 raise
@@ -105,6 +106,9 @@ def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
     else:
         gaussians = starting_gaussians(init, photographs, most, network)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
+    if network is not None and network.skipped:
+        shares = (f"{share:.0%} of {name}" for name, share in network.skipped.items())
+        print(f"skipped by the network: {', '.join(shares)}")
     return gaussians
 
 

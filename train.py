@@ -85,6 +85,8 @@ def train(config: DictConfig) -> float | None:
     data = instantiate(config.data)
     data.setup()
     net = instantiate(config.model)
+    skips = instantiate(config.speed)
+    net.check_skips(skips)
     data.check_sizes(net.check_size)
     data.check_sizes(instantiate(config.metrics).check_size)
     module = instantiate(config.training, net=net)
@@ -99,13 +101,15 @@ def train(config: DictConfig) -> float | None:
     log_choices(logger, config)
     trainer = make_trainer(config, callbacks, logger)
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
+    net.skips = skips
     trainer.test(module, data, verbose=False)
 
     results = described
     if "costs" in callbacks:
         results |= callbacks["costs"].values
-    if "metrics" in callbacks:
-        results |= callbacks["metrics"].results
+    for name in ("metrics", "skipped"):
+        if name in callbacks:
+            results |= callbacks[name].results
     if trainer.is_global_zero:
         write_json(folder / "metrics.json", results)
         log_outcome(logger, results, data.name)

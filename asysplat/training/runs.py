@@ -75,6 +75,9 @@ def config_hash(config: DictConfig) -> str:
     resolved = OmegaConf.to_container(config, resolve=True)
     resolved["init_path"] = resolved["init_path"] is not None
     resolved["data"]["test_root"] = resolved["data"].get("test_root") is not None
+    speed = resolved.get("speed") or {}
+    if not any(value for key, value in speed.items() if key != "_target_"):
+        resolved.pop("speed", None)  # exact, as every run was before there was a choice
     for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)

@@ -1,4 +1,4 @@
-"""Callbacks: metrics, pictures, learning curve, costs, non-finite steps, checkpoints, progress."""
+"""Callbacks: metrics, pictures, learning curve, costs, skips, guard, checkpoints, progress."""
 
 from asysplat.training.callbacks.checkpoints import Checkpoints
 from asysplat.training.callbacks.costs import Costs
@@ -7,6 +7,7 @@ from asysplat.training.callbacks.guard import SkipNonFiniteSteps
 from asysplat.training.callbacks.metrics import Metrics
 from asysplat.training.callbacks.pictures import Pictures
 from asysplat.training.callbacks.progress import Progress
+from asysplat.training.callbacks.skipped import Skipped
 
 __all__ = [
     "Checkpoints",
@@ -16,4 +17,5 @@ __all__ = [
     "Pictures",
     "Progress",
     "SkipNonFiniteSteps",
+    "Skipped",
 ]
