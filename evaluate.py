@@ -25,6 +25,8 @@ from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scene_results import image_rows, scene_rows, set_results
 from asysplat.evaluation.scenes import measure_scenes
 from asysplat.export import read_gaussians
+from asysplat.models.network import Network
+from asysplat.models.skips import EXACT
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
@@ -60,12 +62,14 @@ def evaluate(options: DictConfig) -> None:
     data.setup()
     data.check_sizes(measure.protocol.check_size)
     if options.scene is None:
-        predict = network(config, data, fabric)
+        net = network(config, data, fabric)
+        predict, skipped = predictions(net, fabric), net.skipped
     else:
-        predict = gaussians_of_file(options.scene, data, fabric.device)
+        predict, skipped = gaussians_of_file(options.scene, data, fabric.device), {}
 
     tests = data.tests if options.scene is None else {data.name: data.tests[data.name]}
-    scenes = measure_scenes(tests, predict, measure, fabric.device, subject.folder, subject.kept)
+    folders = subject.folder, subject.kept
+    scenes = measure_scenes(tests, predict, measure, fabric.device, *folders, skipped)
     sentences = {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
     how = {"evaluation/post_optimisation": HOW}
     if options.run is None:  # which has one
@@ -106,13 +110,20 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
     return PostOptimisation(steps, protocol, lpips, background)
 
 
-def network(config: DictConfig, data: SceneDataModule, fabric: lightning.Fabric) -> Predict:
+def network(config: DictConfig, data: SceneDataModule, fabric: lightning.Fabric) -> Network:
     """Build the model and load its weights."""
     net = instantiate(config.model)
     data.check_sizes(net.check_size)
     load_weights(config.init_path, nn.ModuleDict({"net": net}))  # as a checkpoint names them
     net.to(fabric.device).eval()
+    net.skips = instantiate(config.get("speed")) or EXACT  # runs of before have no speed
+    net.check_skips(net.skips)
     print(f"model: {net.describe()}")
+    return net
+
+
+def predictions(net: Network, fabric: lightning.Fabric) -> Predict:
+    """Return what predicts the Gaussians of one scene, as train.py's test does."""
 
     def predict(inputs: Views) -> Gaussians:
         with torch.no_grad(), fabric.autocast():

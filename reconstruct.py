@@ -27,6 +27,7 @@ from asysplat.reconstruction.begin import INITS, best_init, starting_gaussians
 from asysplat.reconstruction.photographs import Photographs, open_photographs
 from asysplat.scene import Gaussians
 from asysplat.training.load import load
+from asysplat.training.ranges import check_ranges
 
 
 @hydra.main(config_path="conf", config_name="reconstruct", version_base="1.3")
@@ -48,6 +49,7 @@ def reconstruct(config: DictConfig) -> None:
     """Start, refine, hand over."""
     if OmegaConf.is_missing(config, "path"):
         raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
+    check_ranges(OmegaConf.masked_copy(config, "speed"))
     limits = limits_of(config)
     settings = instantiate(config.refinement)
     results = Results(Path(config.paths.run), config)
@@ -94,6 +96,7 @@ def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
     if init == "network":
         try:
             network = load(config.checkpoint)
+            network.skips = instantiate(config.speed)
         except InputError as error:
             if config.init is not None:
                 raise
@@ -105,6 +108,9 @@ def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
     else:
         gaussians = starting_gaussians(init, photographs, most, network)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
+    if network is not None and network.skipped:
+        shares = (f"{share:.0%} of {name}" for name, share in network.skipped.items())
+        print(f"skipped by the network: {', '.join(shares)}")
     return gaussians
 
 

@@ -140,6 +140,8 @@ def train_stage(
     data = instantiate(config.data)
     data.setup()
     net = instantiate(config.model)
+    skips = instantiate(config.speed)
+    net.check_skips(skips)
     data.check_sizes(net.check_size)
     data.check_sizes(instantiate(config.metrics).check_size)
     module = instantiate(config.training, net=net)
@@ -167,13 +169,15 @@ def train_stage(
     if trainer.is_global_zero:
         print(split)
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
+    net.skips = skips
     trainer.test(module, data, verbose=False)
 
     results = {}
     if "costs" in callbacks:
         results |= callbacks["costs"].values
-    if "metrics" in callbacks:
-        results |= callbacks["metrics"].results
+    for name in ("metrics", "skipped"):
+        if name in callbacks:
+            results |= callbacks[name].results
     if trainer.is_global_zero and logger is not None:
         log_outcome(logger, results, data.name)
     return results

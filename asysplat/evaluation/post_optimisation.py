@@ -38,12 +38,14 @@ class SceneResult:
             it can be measured, their peak memory, gb.
         rows: one for each image, with `images` (targets or inputs), `view`, `source` (what drew it:
             post<steps>, nearest_view or mean_colour) and its metrics.
+        skipped: the shares that its prediction left out, see `Network`.
     """
 
     scene: str
     gaussians: int = 0
     costs: dict[str, dict[str, float]] = field(default_factory=dict)
     rows: list[ImageRow] = field(default_factory=list)
+    skipped: dict[str, float] = field(default_factory=dict)
 
     def add(self, images: str, source: str, values: dict[str, Float[Tensor, "V"]]) -> None:
         """Add a row for each view; `values` has one or more metrics."""

@@ -60,7 +60,8 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
     Returns:
         test/<set>/post<steps>/<metric>, of the input views inputs/<set>/post<steps>/psnr,
         baseline/<set>/<baseline>/<metric>, and cost/gaussians, cost/post<steps>/seconds (the
-        `mean_but_longest`) and /gb (the largest); of further sets under cost/<set>/.
+        `mean_but_longest`) and /gb (the largest); of further sets under cost/<set>/. Where
+        something was left out, skip/<set>/<what>.
     """
     found: dict[str, float] = {}
     main = next(iter(scenes))
@@ -68,6 +69,8 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
         rows = image_rows({test_set: results})
         costs = "cost" if test_set == main else f"cost/{test_set}"
         found[f"{costs}/gaussians"] = sum(r.gaussians for r in results) / len(results)
+        for name, share in average([dict(r.skipped) for r in results], "images").items():
+            found[f"skip/{test_set}/{name}"] = share
         for source in dict.fromkeys(row["source"] for row in rows):
             kind = "test" if source in results[0].costs else "baseline"
             for name, value in _means(rows, "targets", source, over).items():

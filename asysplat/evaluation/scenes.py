@@ -21,6 +21,7 @@ def measure_scenes(
     device: torch.device,
     folder: Path,
     kept: Path,
+    skipped: Mapping[str, float],
 ) -> dict[str, list[SceneResult]]:
     """Measure every scene that has no result yet, under a progress bar, and draw the first.
 
@@ -32,6 +33,7 @@ def measure_scenes(
         folder: for pictures/evaluation-post<steps>.png: the first scene at the first and the last
             of the steps.
         kept: the folder that has the results of scenes, and to which more are added.
+        skipped: the shares that the last prediction left out, see `Network`.
     """
     kept.mkdir(parents=True, exist_ok=True)
     (folder / "pictures").mkdir(exist_ok=True)
@@ -53,6 +55,7 @@ def measure_scenes(
                         comparison(inputs, targets, rendering).savefig(partial, dpi=100)
 
             result = measure(sample["scene"], predict, inputs, targets, watch)
+            result.skipped.update(skipped)
             bars.console.print(_told(name, result), soft_wrap=True, highlight=False)
             return result
 

@@ -9,6 +9,7 @@ from asysplat.models.mamba_vision import MambaVision
 from asysplat.models.prior import DepthPrior, PointsPrior, SweepPrior
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.single_branch import SingleBranch, build_single_branch
+from asysplat.models.skips import SceneSkips
 from asysplat.models.source import CoarseSource, FineSource, MergedSource
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "NoLink",
     "PhotographHead",
     "PointsPrior",
+    "SceneSkips",
     "SingleBranch",
     "SparseAttention",
     "StageShape",

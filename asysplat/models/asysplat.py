@@ -1,18 +1,19 @@
 """AsySplat: posed photographs to Gaussians through two asymmetric branches (paper, Sec. 3.2)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.models.geometry_ratio import solve_widths
 from asysplat.models.layers import Layers
+from asysplat.models.mamba2 import BiMamba2
 from asysplat.models.network import Network
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.stage import Component, Stage
 from asysplat.models.tokenizer import Tokenizer
-from asysplat.scene import Gaussians, Views
 
 APPEARANCE_MLP_RATIO = 4
 
@@ -95,9 +96,9 @@ class AsySplat(Network):
         self.source = source(widths.stages[-1], widths.fine, patch_coarse // patch_fine)
         self.head = head(widths.stages[-1], patch_coarse, patch_fine)
 
-    def predict(self, views: Views) -> Gaussians:
-        """Predict Gaussians [B, N] from views [B, V]; N = V H W (p_f / p_c)^2."""
-        pixels, prior = self.look(views, self.head.stride)
+    def tokens(
+        self, pixels: Float[Tensor, "B V H W c"], without: Collection[nn.Module] = ()
+    ) -> Float[Tensor, "B V h w d"]:
         coarse = self.geometry["tokenizer"](pixels)
         fine = self.appearance["tokenizer"](pixels)
         branches = zip(
@@ -108,10 +109,20 @@ class AsySplat(Network):
             strict=True,
         )
         for geometry, appearance, coarse_reads_fine, fine_reads_coarse in branches:
-            coarse, fine = geometry(coarse), appearance(fine)
+            coarse, fine = geometry(coarse, without), appearance(fine)
             # Both links read the values from before the exchange (Eq. 3).
             coarse, fine = coarse_reads_fine(coarse, fine), fine_reads_coarse(fine, coarse)
-        return self.head(self.source(coarse, fine), views, prior)
+        return self.source(coarse, fine)
+
+    @property
+    def dispensable(self) -> Collection[nn.Module]:
+        """The geometry branch's scans, and all layers of its middle stages.
+
+        Without them the shipped model loses nothing (docs/results/skips.json).
+        """
+        stages = [stage.layers for stage in self.geometry["stages"]]
+        scans = (layer for stage in stages for layer in stage if isinstance(layer, BiMamba2))
+        return {*scans, *(layer for stage in stages[1:-1] for layer in stage)}
 
     def geometry_share(self) -> float:
         """Return the share of parameters outside the appearance branch (paper: about 0.9)."""

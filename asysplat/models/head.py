@@ -53,25 +53,21 @@ class GaussianHead(nn.Module, ABC):
         self.opacity_bias = opacity_bias
         self.patch, self.stride = patch_fine, patch_coarse // patch_fine
         # position, quaternion, scale, opacity, SH
-        self.splits = (3, 4, 3, 1, 3 * (sh_degree + 1) ** 2)
+        self.sh_bands = (sh_degree + 1) ** 2
+        self.splits = (3, 4, 3, 1, 3 * self.sh_bands)
         self.norm = nn.LayerNorm(width, bias=False)
         self.decode = nn.Linear(width, patch_fine**2 * sum(self.splits), bias=False)
         nn.init.normal_(self.decode.weight, std=std)
 
     def forward(
-        self, features: Float[Tensor, "B V h w d"], views: Views, prior: Prior | None = None
+        self, features: Float[Tensor, "B V h w d"] | None, views: Views, prior: Prior | None = None
     ) -> Gaussians:
         """Decode Gaussians [B, V h p_f w p_f], row by row of view after view.
 
         With a prior, distances are corrections of its own, smaller where it is sure, and opacities
-        of its own.
+        of its own; without features nothing is corrected.
         """
-        raw = rearrange(
-            self.decode(self.norm(features)),
-            "b v h w (p q z) -> b v (h p) (w q) z",
-            p=self.patch,
-            q=self.patch,
-        )
+        raw = self._nothing(views) if features is None else self._decoded(features)
         with without_autocast(raw):
             raw = raw.to(views.images.dtype)
             position, quats, scales, opacities, sh = raw.split(self.splits, dim=-1)
@@ -92,6 +88,18 @@ class GaussianHead(nn.Module, ABC):
                 depth_logit.sigmoid(), quats, scales, opacities.sigmoid(), sh, views
             )
             return gaussians.map(lambda field: field.flatten(1, 3))
+
+    def _decoded(self, features: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h2 w2 z"]:
+        return rearrange(
+            self.decode(self.norm(features)),
+            "b v h w (p q z) -> b v (h p) (w q) z",
+            p=self.patch,
+            q=self.patch,
+        )
+
+    def _nothing(self, views: Views) -> Float[Tensor, "B V h2 w2 z"]:
+        size = (views.cameras.height // self.stride, views.cameras.width // self.stride)
+        return views.images.new_zeros(()).expand(*views.images.shape[:2], *size, sum(self.splits))
 
     @abstractmethod
     def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:

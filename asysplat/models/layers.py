@@ -1,6 +1,6 @@
 """Layers one after the other; the backward pass keeps what they compute, or computes it again."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, nullcontext
 
 import torch
@@ -18,8 +18,13 @@ class Layers(nn.Sequential):
 
     checkpointing = False
 
-    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
+    def forward(
+        self, tokens: Float[Tensor, "B V h w d"], without: Collection[nn.Module] = ()
+    ) -> Float[Tensor, "B V h w d"]:
+        """Apply the layers but those that are left out."""
         for layer in self:
+            if layer in without:
+                continue
             if self.checkpointing and torch.is_grad_enabled():
                 contexts = (nullcontext(), _without_running_means(layer))
                 tokens = checkpoint(

@@ -1,7 +1,7 @@
 """Models of one branch: the paper's single-branch ablation, and Long-LRM, its baseline."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from einops import rearrange
@@ -14,7 +14,6 @@ from asysplat.models.network import Network
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.stage import Component, build_layers, to_width
 from asysplat.models.tokenizer import Tokenizer
-from asysplat.scene import Gaussians, Views
 
 
 class SingleBranch(Network):
@@ -79,16 +78,16 @@ class SingleBranch(Network):
             self.global_tokens = nn.Parameter(start)
         self.head = head(widths.stages[-1], self.patch, self.patch)
 
-    def predict(self, views: Views) -> Gaussians:
-        """Predict Gaussians [B, N] from views [B, V]; N = V H W."""
-        pixels, prior = self.look(views, self.head.stride)
+    def tokens(
+        self, pixels: Float[Tensor, "B V H W c"], without: Collection[nn.Module] = ()
+    ) -> Float[Tensor, "B V h w d"]:
         tokens = self.tokenizer(pixels)
         extra = None
         if self.global_tokens is not None:
             extra = self.tokenizer.norm(self.global_tokens).expand(len(tokens), -1, -1)
         for stage in self.stages:
-            tokens, extra = stage(tokens, extra)
-        return self.head(tokens, views, prior)
+            tokens, extra = stage(tokens, extra, without)
+        return tokens
 
     def geometry_share(self) -> float:
         """Return 1: there is no appearance branch."""
@@ -126,14 +125,17 @@ class MergingStage(nn.Module):
         self.layers = build_layers(shape, layers, blocks)
 
     def forward(
-        self, tokens: Float[Tensor, "B V h w d"], extra: Float[Tensor, "B G d"] | None
+        self,
+        tokens: Float[Tensor, "B V h w d"],
+        extra: Float[Tensor, "B G d"] | None,
+        without: Collection[nn.Module] = (),
     ) -> tuple[Float[Tensor, "B V h2 w2 e"], Float[Tensor, "B G e"] | None]:
         tokens = self.project(tokens) if self.merge is None else self.merge(tokens)
         if extra is None:
-            return self.layers(tokens), None
+            return self.layers(tokens, without), None
         sequence = torch.cat((self.project(extra), tokens.flatten(1, 3)), dim=1)
         # As one row of one frame: none of these layers looks at places.
-        sequence = self.layers(sequence[:, None, None])[:, 0, 0]
+        sequence = self.layers(sequence[:, None, None], without)[:, 0, 0]
         count = extra.shape[1]
         return sequence[:, count:].reshape(tokens.shape), sequence[:, :count]
 

@@ -1,7 +1,7 @@
 """One network stage: tokens to its width, then its layer mix (paper, Eq. 1 and Table 6b)."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -37,8 +37,10 @@ class Stage(nn.Module):
         self.project = to_width(previous_width, shape.width)
         self.layers = build_layers(shape, layers, blocks)
 
-    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w e"]:
-        return self.layers(self.project(tokens))
+    def forward(
+        self, tokens: Float[Tensor, "B V h w d"], without: Collection[nn.Module] = ()
+    ) -> Float[Tensor, "B V h w e"]:
+        return self.layers(self.project(tokens), without)
 
 
 def to_width(previous_width: int, width: int) -> nn.Module:

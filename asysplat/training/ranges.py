@@ -72,6 +72,11 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         ("geometry_ratio",),
     ),
     (
+        "a number above 0 and up to 1, or null to leave nothing out",
+        lambda value: value is None or (is_number(value) and 0 < value <= 1),
+        ("speed.coverage", "speed.sure", "speed.known", "speed.faint"),
+    ),
+    (
         "a number of at least 0, or null",
         lambda value: value is None or (is_number(value) and value >= 0),
         ("callbacks.checkpoints.minutes",),

@@ -81,6 +81,9 @@ def config_hash(config: DictConfig) -> str:
     resolved["init_path"] = resolved["init_path"] is not None
     for key in ("test_root", "disparities"):
         resolved["data"][key] = resolved["data"].get(key) is not None
+    speed = resolved.get("speed") or {}
+    if not any(value for key, value in speed.items() if key != "_target_"):
+        resolved.pop("speed", None)  # exact, as every run was before there was a choice
     for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)

@@ -15,6 +15,7 @@ from asysplat.report.filled import check, fits
 from asysplat.report.paper import find_tables, load_ours, load_paper
 from asysplat.training.revision import revision
 from asysplat.training.runs import describe_run, find_run
+from asysplat.training.stages import stage_configs
 
 OVERRIDES = ["steps=7"]
 
@@ -169,7 +170,9 @@ def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, t
         assert [column in row.values for row in filled.rows].count(True) == 1
     scale = fill_table(load_paper()["two_views"], [], compose, runs).scale
     assert "2 input views of 64x64, " in scale
-    assert [words.split(" at ")[1] for words in scale.split(", then ")][:2] == ["64x64", "128x128"]
+    sizes = [f"{stage.data.height}x{stage.data.width}" for stage in stage_configs(config)]
+    assert [words.split(" at ")[1] for words in scale.split(", then ")][:2] == sizes[:2]
+    assert sizes[0] != sizes[1]
 
 
 def test_post_optimisation_is_not_run_until_evaluation_adds_it(compose, tmp_path):

@@ -7,6 +7,7 @@ from asysplat.training.callbacks.guard import SkipNonFiniteSteps
 from asysplat.training.callbacks.metrics import Metrics
 from asysplat.training.callbacks.pictures import Pictures
 from asysplat.training.callbacks.progress import Progress
+from asysplat.training.callbacks.skipped import Skipped
 from asysplat.training.callbacks.skipped_scenes import SkippedScenes
 from asysplat.training.callbacks.watch import Watch
 
@@ -18,6 +19,7 @@ __all__ = [
     "Pictures",
     "Progress",
     "SkipNonFiniteSteps",
+    "Skipped",
     "SkippedScenes",
     "Watch",
 ]
