@@ -309,12 +309,13 @@ def process(repository, photographs, tmp_path):
 
 
 @pytest.mark.slow
-def test_interrupted_at_any_moment_there_is_a_whole_file_or_none(process, tmp_path):
+@pytest.mark.parametrize("times", [2, pytest.param(10, marks=pytest.mark.hours)])
+def test_interrupted_at_any_moment_there_is_a_whole_file_or_none(process, tmp_path, times):
     clock = time.monotonic()
     said, _ = (running := process("seconds=2")).communicate(timeout=200)
     assert running.returncode == 0, said
     lasts, moments = time.monotonic() - clock, random.Random(0)
-    for number in 5 * (signal.SIGINT, signal.SIGTERM):
+    for number in times // 2 * (signal.SIGINT, signal.SIGTERM):
         running = process("seconds=2", f"seed={moments.randrange(1000)}")
         time.sleep(moments.uniform(0.1, 1.0) * lasts)
         running.send_signal(number)

@@ -90,7 +90,7 @@ def test_rows_are_complete_and_consistent(measured):
 
 
 def test_steps_are_left_out_where_they_are_not_asked_for(run_suite):
-    results, _ = run_suite(names=NAMES, views=[2], steps=False)
+    results, _ = run_suite(names=NAMES[:1], views=[2], steps=False)
     for row in results["rows"]:
         assert row["step"] is None and row["over_floor"]["step"] is None
         assert row["over_first"]["step"] is None and row["over_first"]["forward"] > 0

@@ -1,6 +1,6 @@
 """The model that ships: what it is, and real photographs beside what one gets for nothing.
 
-pytest tests/training/test_shipped.py -s prints the numbers of the README.
+pytest tests/training/test_shipped.py -m hours -s prints the numbers of the README.
 """
 
 import itertools
@@ -53,7 +53,8 @@ def measure(module, lpips, batch):
 
 
 @pytest.mark.slow
-def test_real_photographs(module, shared):
+@pytest.mark.parametrize("most", [8, pytest.param(32, marks=pytest.mark.hours)])
+def test_real_photographs(module, shared, most):
     """PSNR above the nearest view's and the mean colour's everywhere, LPIPS on half the scenes."""
     lpips = load_lpips("alex", shared / "weights")
     if lpips is None:
@@ -64,7 +65,7 @@ def test_real_photographs(module, shared):
         if not folder.is_dir():
             pytest.skip(f"{folder} is absent")
         distances = []
-        for size, views in itertools.product((128, 256), numbers):
+        for size, views in itertools.product((128, 256), (n for n in numbers if n <= most)):
             source = FilesSource(str(folder), size, size, window=(24, 96))
             batch = collate([load(task) for task in source.evaluation("test", views, TARGETS)])
             model, nearest, mean = measure(module, lpips, batch)

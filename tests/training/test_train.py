@@ -196,11 +196,11 @@ def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repositor
 @pytest.mark.slow
 def test_geometry_ratio_sweep(train, tmp_path):
     size = ["model.layers=4m4s", "width=0.25", "steps=1", "data.test_sets=null"]
-    result = train("-m", "geometry_ratio=0.5,0.7,0.9", *size)
+    result = train("-m", "geometry_ratio=0.5,0.9", *size)
     assert result.returncode == 0, result.stderr
     found = [metrics(path.parent) for path in sorted(tmp_path.rglob("metrics.json"))]
-    assert len(found) == 3
-    for asked, numbers in zip((0.5, 0.7, 0.9), found, strict=True):
+    assert len(found) == 2
+    for asked, numbers in zip((0.5, 0.9), found, strict=True):
         assert abs(numbers["cost/geometry_share"] - asked) < 0.02
     totals = [numbers["cost/parameters"] for numbers in found]
     assert max(totals) / min(totals) < 1.02
