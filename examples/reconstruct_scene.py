@@ -19,7 +19,7 @@ def reconstruct(folder: Path, scene: Path, picture: Path) -> None:
     photographs = open_photographs(folder, height=128, width=128, views=8)
     with torch.no_grad():
         start = load("shipped")(photographs.inputs)
-    gaussians = refine(start, photographs.inputs, seconds=30.0)
+    gaussians = refine(start, photographs.inputs, seconds=10.0)
     write_gaussians(scene, photographs.frame.undo(gaussians))  # in the world of the files
 
     background = mean_colour(photographs.inputs)

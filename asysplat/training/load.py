@@ -22,33 +22,42 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
         checkpoint: "shipped" for the model that comes with the project, or a .ckpt file of a run,
             whose config.yaml says what it is; a .safetensors file has the shipped one's layout;
             None: without training.
-        overrides: of train.py, which change its default model; a run's model stays as it is.
+        overrides: of train.py, which change its default model, and what it leaves out
+            (`speed=fast`); a run's model stays as it is.
 
     Raises:
         InputError: no such file, the weights of another model, or an unknown override.
     """
     if checkpoint is None:
-        return instantiate(_default_model(overrides)).eval()
+        return _default_network(overrides).eval()
     path = Path(checkpoint)
     configuration = path.parent.parent / "config.yaml"
     if path.suffix == ".ckpt" and path.is_file() and configuration.is_file():
-        model = OmegaConf.load(configuration).model
+        net = instantiate(OmegaConf.load(configuration).model)
     elif path.suffix == ".ckpt" and path.is_file():
         raise InputError(
             f"{checkpoint} has no {configuration}, which says what model it is: leave it in the "
             "folder of its run."
         )
     else:
-        model = _default_model(overrides)
+        net = _default_network(overrides)
     holder = nn.Module()
-    holder.net = instantiate(model)
+    holder.net = net
     load_weights(checkpoint, holder)
-    return holder.net.eval()
+    return net.eval()
 
 
-def _default_model(overrides: Sequence[str]) -> DictConfig:
+def _default_network(overrides: Sequence[str]) -> Network:
+    config = _default_config(overrides)
+    net = instantiate(config.model)
+    net.skips = instantiate(config.speed)
+    net.check_skips(net.skips)
+    return net
+
+
+def _default_config(overrides: Sequence[str]) -> DictConfig:
     check_overrides(overrides)
     if GlobalHydra.instance().is_initialized():
-        return compose("train", list(overrides)).model
+        return compose("train", list(overrides))
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", list(overrides)).model
+        return compose("train", list(overrides))

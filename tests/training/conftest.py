@@ -10,7 +10,9 @@ from contextlib import contextmanager
 import pytest
 from tiny import NETWORK, SCENES, STEPS, VIEWS
 
-TINY = [*NETWORK, *STEPS, *VIEWS]
+COSTS = "callbacks.costs={_target_: asysplat.training.callbacks.Costs}"
+# Costs and plan take longer than the steps of most tests: who needs them asks with COSTS.
+TINY = [*NETWORK, *STEPS, *VIEWS, "callbacks.costs=null"]
 TINY_SCENES = [*SCENES, "data.test_scenes=2"]
 
 

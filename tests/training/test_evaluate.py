@@ -8,7 +8,7 @@ from pathlib import Path
 import hydra
 import pytest
 import torch
-from conftest import TINY_SCENES, make_train
+from conftest import COSTS, TINY_SCENES, make_train
 from hydra import initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -34,7 +34,7 @@ MODEL = ["model=asysplat_4m4s", "metrics=longlrm", *SIZE]  # of Table 2
 def whole(tmp_path_factory, run_script, repository) -> Path:
     """The folder of a finished run of the model of Table 2."""
     train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
-    result = train(*MODEL, "model.layers=4m4s", "~callbacks.pictures", "~callbacks.curve")
+    result = train(*MODEL, "model.layers=4m4s", "~callbacks.pictures", "~callbacks.curve", COSTS)
     assert result.returncode == 0, result.stderr
     return Path(result.stdout.strip().splitlines()[-1].removeprefix("run: "))
 

@@ -2,10 +2,12 @@
 
 import re
 
+from conftest import COSTS
+
 from asysplat.training import plan
 from asysplat.training.plan import Plan
 
-FEW = ["steps=1", "validate_every=1", "data.test_sets=null", "data.batch_size=2"]
+FEW = [COSTS, "steps=1", "validate_every=1", "data.test_sets=null", "data.batch_size=2"]
 
 
 def test_a_plan_in_words():

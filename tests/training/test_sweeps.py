@@ -73,7 +73,9 @@ def test_a_failure_is_named_and_the_others_go_on(train, tmp_path):
     assert finished_seeds(tmp_path) == [0]
 
 
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+@pytest.mark.parametrize(
+    "launcher", [pytest.param("joblib", marks=pytest.mark.hours), "submitit_local"]
+)
 def test_launchers(train, finish, tmp_path, launcher):
     """Two of three jobs are still to be run."""
     plugin = launcher.partition("_")[0]

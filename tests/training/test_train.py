@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from conftest import make_train
+from conftest import COSTS, make_train
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 
@@ -31,7 +31,7 @@ def metrics(folder: Path) -> dict:
 def whole(tmp_path_factory, run_script, repository) -> Path:
     """The folder of a finished run of 6 steps."""
     train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
-    return run_folder(train("name=whole", "steps=6", "callbacks.watch.every=2"))
+    return run_folder(train("name=whole", "steps=6", "callbacks.watch.every=2", COSTS))
 
 
 def test_a_run_leaves_what_is_promised(whole):
@@ -134,7 +134,8 @@ def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, mo
     monkeypatch.setenv("ASYSPLAT_SHARED", str(tmp_path))
     names = [key.partition(".")[2].removesuffix("=null") for key in overrides]
     logged = "watch" not in names
-    result = train(*overrides, "callbacks.watch.every=2" if logged else "logger=none")
+    costs = [] if "costs" in names else [COSTS]
+    result = train(*overrides, *costs, "callbacks.watch.every=2" if logged else "logger=none")
     folder = run_folder(result)
     numbers = metrics(folder)
     assert (folder / "tensorboard").exists() == logged
@@ -196,7 +197,7 @@ def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repositor
 @pytest.mark.slow
 def test_geometry_ratio_sweep(train, tmp_path):
     size = ["model.layers=4m4s", "width=0.25", "steps=1", "data.test_sets=null"]
-    result = train("-m", "geometry_ratio=0.5,0.9", *size)
+    result = train("-m", "geometry_ratio=0.5,0.9", *size, COSTS)
     assert result.returncode == 0, result.stderr
     found = [metrics(path.parent) for path in sorted(tmp_path.rglob("metrics.json"))]
     assert len(found) == 2

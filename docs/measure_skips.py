@@ -1,11 +1,10 @@
-"""Measure what skips cost and save, on made-up test scenes and on photographs: skips.json and .png.
+"""Measure what skips cost and save, on made-up test scenes and on photographs.
 
-python -m asysplat.report.skips docs/results
+python docs/measure_skips.py    writes docs/results/skips.json and skips.png
 """
 
 import json
 import os
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -29,6 +28,7 @@ from asysplat.rendering import render
 from asysplat.training.load import CONF
 from asysplat.training.load import load as load_network
 
+RESULTS = Path(__file__).parent / "results"
 Batch = dict[str, Any]
 Row = dict[str, Any]
 
@@ -133,7 +133,7 @@ def plot(results: dict[str, Any]) -> Figure:
     return figure
 
 
-def main(folder: Path, shared: Path) -> None:
+def main(shared: Path) -> None:
     """Measure all scenes, print a line for each setting, write both files."""
     torch.set_num_threads(1)
     net = load_network("shipped")
@@ -147,12 +147,12 @@ def main(folder: Path, shared: Path) -> None:
         results["scenes"][name] = {"confidence": confidence(net, batches), "settings": rows}
         for setting, row in rows.items():
             print(f"{name}: {setting}: x{row['times_as_fast']:.2f}, {row['gain']:+.2f} dB")
-    with replaced(folder / "skips.json") as path:
+    with replaced(RESULTS / "skips.json") as path:
         path.write_text(json.dumps(results, indent=2) + "\n")
-    with replaced(folder / "skips.png") as path:
+    with replaced(RESULTS / "skips.png") as path:
         plot(results).savefig(path, dpi=120)
 
 
 if __name__ == "__main__":
-    beside = Path(__file__).resolve().parents[3] / "shared"
-    main(Path(sys.argv[1]), Path(os.environ.get("ASYSPLAT_SHARED", beside)))
+    beside = Path(__file__).resolve().parents[2] / "shared"
+    main(Path(os.environ.get("ASYSPLAT_SHARED", beside)))
