@@ -32,7 +32,7 @@ RESULTS = Path(__file__).parent / "results"
 Batch = dict[str, Any]
 Row = dict[str, Any]
 
-WHERE_KNOWN = 0.25  # less confidence than in any scene measured here
+WHERE_KNOWN = 0.1  # less confidence than in any scene measured here
 SURE, KNOWN = SceneSkips(sure=WHERE_KNOWN), SceneSkips(known=WHERE_KNOWN)
 SETTINGS = {
     "exact": EXACT,

@@ -124,7 +124,7 @@ class Reconstruction(lightning.LightningModule):
         return self.terms(batch)
 
     def terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Compute what `training_step` minimises, "loss", and its parts, and log nothing."""
+        """Do what `compute_terms` does, always in the network itself, whose hooks see it all."""
         return self._terms(self.net, batch)
 
     def _terms(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
