@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from conftest import COSTS
 from safetensors.torch import load_file
 
 from asysplat.errors import InputError
@@ -12,7 +13,7 @@ from asysplat.training.publish import publish
 @pytest.fixture
 def run(train):
     """The folder of a finished run."""
-    result = train("steps=2")
+    result = train("steps=2", COSTS)
     assert result.returncode == 0, result.stderr
     return next(path.parent for path in train.logs.rglob("metrics.json"))
 

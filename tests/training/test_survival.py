@@ -100,7 +100,7 @@ def test_killed_twice_it_ends_with_the_same_bits_and_logs(train):
 @pytest.mark.hours
 @pytest.mark.timeout(3600)
 def test_killed_twenty_times_it_ends_with_the_same_bits_and_logs(train):
-    options = [*OPTIONS, "steps=60", "validate_every=6"]
+    options = [*OPTIONS, "steps=150", "validate_every=10"]
     result = train("name=whole", *options)
     assert result.returncode == 0, result.stderr
     killed = kill_at_random_moments(train, 20, 6, *options)
