@@ -1,9 +1,16 @@
 """Which folder a run has: its own again, if it was cut off, and of nobody else."""
 
+import multiprocessing
+import os
+import signal
+import time
+
 import pytest
 
 from asysplat.errors import InputError
 from asysplat.training.run_folder import claimed, run_folder
+
+FORK = multiprocessing.get_context("fork")
 
 
 @pytest.fixture
@@ -34,13 +41,29 @@ def test_all_else_starts_in_a_folder_of_its_own(cut_off, tmp_path):
     assert run_folder("last", logs, "fresh") == "fresh"
 
 
-def test_no_two_train_in_one_folder(tmp_path):
+def hold(folder, pipe):
+    """Claim the folder, as a run with a process that loads data, which outlives it."""
+    with claimed(folder):
+        loader = FORK.Process(target=time.sleep, args=(600,))
+        loader.start()
+        pipe.send(loader.pid)
+        time.sleep(600)
+
+
+def test_no_two_train_in_one_folder_until_one_is_killed(tmp_path):
     folder = tmp_path / "run"
+    ours, theirs = FORK.Pipe()
+    run = FORK.Process(target=hold, args=(folder, theirs))
+    run.start()
+    loader = ours.recv()
     with (
-        claimed(folder),
         pytest.raises(InputError, match=r"run is a run that another process still trains"),
         claimed(folder),
     ):
         pytest.fail("both train there")
+    run.kill()
+    run.join()
+    os.kill(loader, 0)  # it lives
     with claimed(folder):
         assert folder.is_dir()
+    os.kill(loader, signal.SIGKILL)
