@@ -136,13 +136,15 @@ class Results:
             "nearest_view": nearest_view(inputs, measured),
             "mean_colour": mean_colour_images(inputs, measured),
         }
-        return {
-            f"baseline/{name}/{metric}": _mean(values.tolist())
-            for name, images in drawn.items()
-            for metric, values in self._protocol.image_metrics(
-                images, measured, self._lpips
-            ).items()
-        }
+        found: dict[str, list[float]] = {}
+        for name, images in drawn.items():
+            for view in range(measured.num_views):  # SSIM of all at once takes much memory
+                one = self._protocol.image_metrics(
+                    images[[view]], measured.select([view]), self._lpips
+                )
+                for metric, value in one.items():
+                    found.setdefault(f"baseline/{name}/{metric}", []).append(value.item())
+        return {name: _mean(values) for name, values in found.items()}
 
     def _video(
         self, gaussians: Gaussians, cameras: Cameras, background: Float[Tensor, "3"]

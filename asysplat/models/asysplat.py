@@ -109,20 +109,21 @@ class AsySplat(Network):
             strict=True,
         )
         for geometry, appearance, coarse_reads_fine, fine_reads_coarse in branches:
-            coarse, fine = geometry(coarse, without), appearance(fine)
+            coarse, fine = geometry(coarse, without), appearance(fine, without)
             # Both links read the values from before the exchange (Eq. 3).
             coarse, fine = coarse_reads_fine(coarse, fine), fine_reads_coarse(fine, coarse)
         return self.source(coarse, fine)
 
     @property
     def dispensable(self) -> Collection[nn.Module]:
-        """The geometry branch's scans, and all layers of its middle stages.
+        """All scans of both branches, and all layers of the geometry branch's middle stages.
 
-        Without them the shipped model loses nothing (docs/results/skips.json).
+        Without them the shipped model loses next to nothing (docs/results/skips.json).
         """
         stages = [stage.layers for stage in self.geometry["stages"]]
         scans = (layer for stage in stages for layer in stage if isinstance(layer, BiMamba2))
-        return {*scans, *(layer for stage in stages[1:-1] for layer in stage)}
+        fine = (layer for stage in self.appearance["stages"] for layer in stage)
+        return {*scans, *fine, *(layer for stage in stages[1:-1] for layer in stage)}
 
     def geometry_share(self) -> float:
         """Return the share of parameters outside the appearance branch (paper: about 0.9)."""
