@@ -26,7 +26,7 @@ def test_it_draws_a_picture(repository, tmp_path, monkeypatch, capsys, name):
     assert str(picture) in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.hours  # the notebook does the same
 def test_a_scene_is_reconstructed(repository, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["reconstruct_scene"])
     monkeypatch.chdir(tmp_path)

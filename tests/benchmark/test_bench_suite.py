@@ -15,7 +15,7 @@ NAMES = ["ssd", "selective_scan", "plane_sweep", "render", "refinement", "image_
 NAMES += ["asysplat_sweep"]
 
 
-@pytest.mark.slow
+@pytest.mark.hours  # CI runs them by make bench
 def test_every_pair_runs(repository):
     with initialize_config_dir(str(repository / "conf"), version_base=None):
         pairs = list(make_pairs())

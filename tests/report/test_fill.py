@@ -10,6 +10,8 @@ import hydra
 import pytest
 from hydra import initialize_config_dir
 
+from asysplat.evaluation import static_cost
+from asysplat.evaluation.static_cost import Activations
 from asysplat.report.fill import fill_table, finished_runs, with_costs
 from asysplat.report.filled import check, fits
 from asysplat.report.paper import find_tables, load_ours, load_paper
@@ -45,7 +47,9 @@ def write_run(folder: Path, config, numbers: dict, seed: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("table", load_paper())
-def test_costs_of_every_row_are_the_papers_or_flagged(compose, table):
+def test_costs_of_every_row_are_the_papers_or_flagged(compose, table, monkeypatch):
+    # The paper prints none, and they take longer than all else.
+    monkeypatch.setattr(static_cost, "count_activations", lambda *_: Activations(0.0, 0.0))
     filled = with_costs(fill_table(load_paper()[table], [], compose, {}), compose)
     for row in filled.networks:
         if row.paper.quoted:

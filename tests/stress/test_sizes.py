@@ -38,7 +38,7 @@ def test_case_16_more_tiles_than_16_bits_count(backend, make_scene):
         assert torch.equal(result.outputs[name][64:], output), name
 
 
-@pytest.mark.slow
+@pytest.mark.hours
 def test_case_17_pairs_that_no_list_can_number_are_refused():
     """2^31 and more of them, on the CPU: 33000 giants over 65536 tiles."""
     count = 33000
