@@ -1,12 +1,10 @@
 """Seconds, memory and errors: how every suite measures them."""
 
-import ctypes
-import gc
 import inspect
 import sys
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
@@ -15,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
+from asysplat.evaluation.cost import memory_before_gb, peak_memory_gb
 from asysplat.evaluation.measured_cost import wait_for
 
 Result = dict[str, Any]  # plain values, as JSON has them
@@ -120,11 +118,7 @@ def rise_gb(run: Run, device: torch.device) -> float:
     Linux.
     """
     run()
-    gc.collect()
-    with suppress(OSError, AttributeError):  # memory that a run gets again would not show as a rise
-        ctypes.CDLL(None).malloc_trim(0)
-    reset_peak_memory(device)
-    before = peak_memory_gb(device)
+    before = memory_before_gb(device)
     run()
     wait_for(device)
     return peak_memory_gb(device) - before

@@ -1,11 +1,14 @@
 """Count parameters and FLOPs, read peak memory."""
 
+import ctypes
+import gc
 import math
 import os
 import re
 import resource
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -92,6 +95,18 @@ def reset_peak_memory(device: torch.device | str) -> bool:
     except OSError:
         return False
     return True
+
+
+def memory_before_gb(device: torch.device | str) -> float:
+    """Give freed memory back to the system and reset the peak; return it, the memory in use now.
+
+    Work that gets freed memory again would not show as a rise of the peak above this.
+    """
+    gc.collect()
+    with suppress(OSError, AttributeError):  # glibc alone can be asked
+        ctypes.CDLL(None).malloc_trim(0)
+    reset_peak_memory(device)
+    return peak_memory_gb(device)
 
 
 def peak_memory_gb(device: torch.device | str) -> float:

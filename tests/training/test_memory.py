@@ -1,13 +1,11 @@
 """What saves memory changes no gradient, and what needs too much is told what would do."""
 
-import ctypes
-
 import pytest
 import torch
 from test_reconstruction import make_module
 from test_side_by_side import make_batch
 
-from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
+from asysplat.evaluation.cost import memory_before_gb, peak_memory_gb, reset_peak_memory
 from asysplat.evaluation.static_cost import Activations
 from asysplat.rendering import render
 from asysplat.training import ReconstructionLoss
@@ -57,9 +55,7 @@ def test_views_at_once_bound_the_memory_of_rendering(make_scene):
     risen = {}
     for views_at_once in (1, None):
         leaves = gaussians.map(lambda tensor: tensor.clone().requires_grad_())
-        ctypes.CDLL(None).malloc_trim(0)  # what earlier tests freed would be used first
-        reset_peak_memory("cpu")
-        before = peak_memory_gb("cpu")
+        before = memory_before_gb("cpu")
         render(leaves, cameras, views_at_once=views_at_once).image.sum().backward()
         risen[views_at_once] = peak_memory_gb("cpu") - before
     print(f"\nGB to render 8 views: {risen[None]:.3f}, one at a time {risen[1]:.3f}")

@@ -94,7 +94,15 @@ def test_killed_twice_it_ends_with_the_same_bits_and_logs(train):
     result = train("name=whole", *options)
     assert result.returncode == 0, result.stderr
     assert kill_at_random_moments(train, 2, 3, *options) > 0
-    check_same(folder_of(train, "whole"), folder_of(train, "killed"))
+    whole = folder_of(train, "whole")
+    check_same(whole, folder_of(train, "killed"))
+
+    before = logged.scalars(whole)
+    (whole / "metrics.json").unlink()  # as if killed after its training, while it is measured
+    result = train("name=whole", *options, "ckpt_path=last")
+    assert result.returncode == 0, result.stderr
+    assert logged.scalars(whole) == before
+    check_same(whole, folder_of(train, "killed"))
 
 
 @pytest.mark.hours

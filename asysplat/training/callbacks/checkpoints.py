@@ -105,6 +105,11 @@ class Checkpoints(ModelCheckpoint):
     def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         self._save_last(trainer)
 
+    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        # What follows is logged at this step, which Lightning has one lower where it went on from
+        # the end of a training: see `_begin_at_next_batch`.
+        trainer.fit_loop.epoch_loop._batches_that_stepped = trainer.global_step
+
     def _save_last(self, trainer: lightning.Trainer) -> None:
         if trainer.global_step == self.saved_step:
             return

@@ -6,7 +6,7 @@ import lightning
 import torch
 
 from asysplat.data.datamodule import collate
-from asysplat.evaluation.cost import GB, peak_memory_gb, reset_peak_memory
+from asysplat.evaluation.cost import GB, memory_before_gb
 from asysplat.evaluation.measured_cost import CostMeter, mean_but_longest, render_seconds
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.training.plan import make_plan
@@ -39,8 +39,7 @@ class Costs(lightning.Callback):
         if stage != "fit":
             return
         module.to(trainer.strategy.root_device)
-        reset_peak_memory(module.device)
-        self.gb_before = peak_memory_gb(module.device)
+        self.gb_before = memory_before_gb(module.device)
         scene = trainer.datamodule.evaluation["val"][0]["inputs"]
         height, width = scene.images.shape[-2:]
         self.split = trainer.datamodule.split(trainer.world_size)
