@@ -66,7 +66,7 @@ def reconstruct(config: DictConfig) -> None:
     gaussians = start(config, photographs, settings.most)
     background = mean_colour(photographs.inputs)
     results.first_picture(gaussians, photographs, background)
-    with Watch(photographs.inputs, config.view, **limits) as watch:
+    with Watch(photographs.inputs, config.view) as watch:
         gaussians = refine(
             gaussians,
             photographs.inputs,

@@ -27,16 +27,11 @@ class Watch:
     Args:
         views: the photographs.
         view: whether to open a viewer in the browser.
-        seconds, steps: how long the refinement is.
     """
 
-    def __init__(
-        self, views: Views, view: bool, seconds: float | None = None, steps: int | None = None
-    ):
+    def __init__(self, views: Views, view: bool):
         self.last: Progress | None = None
         self.stopped = False
-        self._total = steps if seconds is None else seconds
-        self._in_steps = seconds is None
         self._console = Console()
         self._told = self._shown = time.monotonic()
         self._viewer = None
@@ -54,7 +49,7 @@ class Watch:
             console=self._console,
             disable=not self._console.is_terminal,
         )
-        self._task = self._bar.add_task("", total=self._total, text="")
+        self._task = self._bar.add_task("", total=1.0, text="")
         self._bar.start()
         return self
 
@@ -73,8 +68,7 @@ class Watch:
         """Show how far it is; return whether to stop."""
         self.last = now
         text = f"step {now.step}, PSNR {now.psnr:.2f} dB, {now.gaussians:,} Gaussians"
-        done = now.step if self._in_steps else min(now.seconds, self._total)
-        self._bar.update(self._task, completed=done, text=text)
+        self._bar.update(self._task, completed=now.share, text=text)
         clock = time.monotonic()
         if not self._console.is_terminal and clock - self._told > TOLD_EVERY:
             self._told = clock

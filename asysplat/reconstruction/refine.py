@@ -5,7 +5,6 @@ The paper's post-optimisation is one setting of it, `PAPER`.
 
 import math
 import time
-from bisect import bisect
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -27,43 +26,8 @@ from asysplat.reconstruction.start import footprints
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
-LATE = 0.75  # of the time, since which a gain is measured
 PIXELS_EACH = 8  # of the photographs, at least, for each Gaussian: with fewer they learn noise
 VIEWS_A_ROUND = 8  # in which wrong pixels are looked for
-
-
-class Gains:
-    """How the PSNR of the photographs rises with what has passed, seconds or steps.
-
-    Args:
-        num_views: photographs: the last step at each of them counts.
-    """
-
-    def __init__(self, num_views: int):
-        self._errors: deque[float] = deque(maxlen=num_views)
-        self._records: list[tuple[float, float]] = []
-
-    @property
-    def psnr(self) -> float:
-        """The PSNR in dB of the mean squared error of the last steps."""
-        return -10 * math.log10(max(sum(self._errors) / len(self._errors), 1e-10))
-
-    def add(self, passed: float, error: float) -> None:
-        """Note the squared error of a step."""
-        self._errors.append(error)
-        self._records.append((passed, self.psnr))
-
-    def of_a_tenth(self) -> float:
-        """Return what 10 % more time gave of late, in dB; infinity before that can be told.
-
-        The PSNR rises about with the logarithm of time, so the rise since LATE of it tells.
-        """
-        passed, psnr = self._records[-1]
-        since = bisect(self._records, (LATE * passed, math.inf)) - 1
-        if since < len(self._errors) or len(self._records) - since < len(self._errors):
-            return math.inf
-        then, before = self._records[since]
-        return (psnr - before) / math.log(passed / then) * math.log(1.1)
 
 
 @dataclass(frozen=True)
@@ -252,7 +216,7 @@ def refine(
     seed: int = 0,
     watch: Callable[[Progress, Refinement], bool] | None = None,
 ) -> Gaussians:
-    """Refine Gaussians until the seconds or the steps are used.
+    """Refine Gaussians until the seconds or the steps are used, or more would fit noise.
 
     With `steps`, the same inputs and seed give the same bits.
 
@@ -269,30 +233,33 @@ def refine(
     refinement = Refinement(gaussians, views, background, settings, seed)
     if seconds is not None:
         _compile_kernels(gaussians, views, settings)
-    gains = Gains(views.num_views)
+    most = _most_steps(settings, views.num_views)
+    errors: deque[float] = deque(maxlen=views.num_views)  # the last at each photograph
+    step, rounds, share = 0, 0, 0.0
     clock = time.perf_counter()
-    total, step, rounds, half = float(seconds or steps), 0, 0, True
-    while True:
-        passed = float(step) if seconds is None else time.perf_counter() - clock
-        share = passed / total
-        if share >= 1:
-            return refinement.gaussians
-        if half and share >= settings.half_size:
-            half, gains = False, Gains(views.num_views)  # whole photographs are harder
+    while share < 1:
         if settings.densify != "none" and share < settings.until:
             due = int(share / settings.until * (settings.rounds + 1))
             if due > rounds:
                 refinement.densify(share)
                 rounds = due
-        gains.add(passed, refinement.step(share))
+        errors.append(refinement.step(share))
         step += 1
-        before_cool_down = not half and share < 1 - settings.cool_down
-        if settings.pays > 0 and before_cool_down and gains.of_a_tenth() < settings.pays:
-            total = passed / (1 - settings.cool_down)
-        now = time.perf_counter() - clock
-        progress = Progress(step, share, now, gains.psnr, len(refinement.fields))
+        passed = time.perf_counter() - clock
+        used = step / steps if seconds is None else passed / seconds
+        share = min(1.0, max(used, step / most))
+        psnr = -10 * math.log10(max(sum(errors) / len(errors), 1e-10))
+        progress = Progress(step, share, passed, psnr, len(refinement.fields))
         if watch is not None and watch(progress, refinement):
-            return refinement.gaussians
+            break
+    return refinement.gaussians
+
+
+def _most_steps(settings: Settings, num_views: int) -> float:
+    """Return the steps after which every photograph has been looked at often enough."""
+    if settings.looks is None:
+        return math.inf
+    return settings.looks * num_views / (settings.views_a_step or num_views)
 
 
 def _compile_kernels(gaussians: Gaussians, views: Views, settings: Settings) -> None:

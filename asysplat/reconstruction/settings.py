@@ -55,7 +55,8 @@ class Settings:
         growth: share of the Gaussians that a round adds, at most.
         decay: of all rates over the last `cool_down` of the refinement.
         cool_down: see `decay`.
-        pays: gain of PSNR in dB for 10 % more time, below which the cool-down begins; 0 never.
+        looks: steps at each photograph after which a refinement ends, whatever time is left: more
+            of them fit its noise. None: no such end.
 
     Raises:
         InputError: a number out of range.
@@ -73,7 +74,7 @@ class Settings:
     growth: float = 0.15
     decay: float = 0.05
     cool_down: float = 0.5
-    pays: float = 0.0
+    looks: int | None = 400
 
     def __post_init__(self):
         """Check the ranges."""
@@ -95,6 +96,8 @@ class Settings:
                 f"refinement has most={self.most}, rounds={self.rounds} and "
                 f"views_a_step={self.views_a_step}: give at least 1 Gaussian, 0 rounds and 1 view."
             )
+        if self.looks is not None and self.looks < 1:
+            raise InputError(f"refinement.looks={self.looks}: give at least 1, or null.")
 
 
 # Suppl. A, "Post optimization": as Long-LRM does.
@@ -108,4 +111,5 @@ PAPER = Settings(
     half_size=0.0,
     densify="none",
     cool_down=0.0,
+    looks=None,
 )

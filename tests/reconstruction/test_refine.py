@@ -13,7 +13,7 @@ from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
 from asysplat.reconstruction import PAPER, Rates, Refinement, Settings, mean_colour, refine
 from asysplat.reconstruction.densify import LEAST_OPACITY
-from asysplat.reconstruction.refine import Gains, half_size
+from asysplat.reconstruction.refine import half_size
 from asysplat.reconstruction.start import footprints, round_gaussians
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
@@ -292,7 +292,7 @@ def test_a_watch_sees_each_step_and_may_end_all():
 
     refine(small_scene(), views, Settings(densify="none"), steps=10, watch=watch)
     assert [progress.step for progress in seen] == [1, 2, 3]
-    assert [progress.share for progress in seen] == [0, 0.1, 0.2]
+    assert [progress.share for progress in seen] == [0.1, 0.2, 0.3]
     assert all(b.seconds >= a.seconds >= 0 for a, b in pairwise(seen))
 
 
@@ -320,7 +320,7 @@ def test_seconds_end_a_refinement():
 
     found = refine(start, small_views(), seconds=0.3, watch=watch)
     assert steps and not same_bits(found, start)
-    assert all(progress.share < 1 for progress in steps)
+    assert all(progress.share < 1 for progress in steps[:-1]) and steps[-1].share == 1
     assert steps[-1].seconds >= 0.3
 
 
@@ -418,6 +418,7 @@ def unchecked(kind, **options):
         "most=0, .*at least 1 Gaussian": {"most": 0},
         "rounds=-1": {"rounds": -1},
         "views_a_step=0": {"views_a_step": 0},
+        "looks=0: give at least 1, or null": {"looks": 0},
     }.items(),
 )
 def test_settings_that_cannot_be_are_named(sentence, options):
@@ -425,35 +426,32 @@ def test_settings_that_cannot_be_are_named(sentence, options):
         unchecked(Settings, **options)
 
 
-def test_gains_follow_the_logarithm_of_time():
-    gains = Gains(2)
-    for step in range(400):
-        gains.add(float(step), 0.1 * (step + 1) ** -0.5)  # 5 dB for ten times as long
-    assert gains.psnr == pytest.approx(-10 * math.log10(0.1 * 399.5**-0.5), abs=1e-3)
-    assert gains.of_a_tenth() == pytest.approx(5 * math.log10(1.1), rel=0.01)
-
-
-def test_a_gain_is_told_after_two_rounds_of_photographs():
-    gains = Gains(8)
-    for step in range(60):
-        told = math.isfinite(gains.of_a_tenth()) if step else False
-        assert told == (step - 1 >= 25)  # of the last quarter a round
-        gains.add(float(step), 0.01)
-
-
-def test_it_cools_down_where_time_does_not_pay():
-    """An hour's worth of steps ends early, as if it had been asked for fewer."""
-    taken = []
-    never = Settings(densify="none", half_size=0.0)
-    for pays in (0.0, 100.0):
-        seen = []
-        refine(
-            small_scene(),
-            small_views(),
-            replace(never, pays=pays),
-            steps=120,
-            watch=lambda progress, _, seen=seen: seen.append(progress.share) and False,
+def test_it_ends_when_the_photographs_were_looked_at_often_enough():
+    """Many steps end early, with the bits of as many as are worth it."""
+    scene, views = small_scene(), small_views(count=2)
+    found, taken = {}, {}
+    for looks, asked in ((None, 6), (3, 200), (3, 4)):
+        shares = []
+        found[asked] = refine(
+            scene,
+            views,
+            Settings(looks=looks),
+            steps=asked,
+            watch=lambda progress, _, shares=shares: shares.append(progress.share) and False,
         )
-        taken.append(len(seen))
-    assert taken[0] == 120
-    assert taken[1] < 60
+        taken[asked] = len(shares)
+        assert shares == pytest.approx([(n + 1) / len(shares) for n in range(len(shares))])
+    assert taken == {6: 6, 200: 6, 4: 4}
+    assert same_bits(found[6], found[200]) and not same_bits(found[6], found[4])
+
+
+def test_all_views_a_step_are_a_look_at_each():
+    taken = []
+    refine(
+        small_scene(),
+        small_views(),
+        Settings(looks=5, views_a_step=None, densify="none"),
+        seconds=1000,
+        watch=lambda progress, _: taken.append(progress.step) and False,
+    )
+    assert taken[-1] == 5
