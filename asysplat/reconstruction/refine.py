@@ -142,10 +142,11 @@ class Refinement:
         lost = self._steps - self._last_seen > 2 * views.num_views
         useful = (opacities > LEAST_OPACITY) & ~lost
         useful[opacities.argmax()] = True  # one is left
+        most = min(self._room, int((1 + settings.growth) * len(self.fields)))
         kept = torch.nonzero(useful)[:, 0]
         self.fields.keep(kept)
         self._last_seen = self._last_seen[kept]
-        count = min(self._room - len(self.fields), int(settings.growth * len(self.fields)))
+        count = most - len(self.fields)
         if count > 0:
             order = torch.randperm(views.num_views, generator=self._generator)
             some = views.select(order[:VIEWS_A_ROUND])

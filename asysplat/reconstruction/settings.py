@@ -52,7 +52,7 @@ class Settings:
             pixels for each.
         rounds: how often Gaussians are added and dropped, over the first `until` of the refinement.
         until: see `rounds`.
-        growth: share of the Gaussians that a round adds, at most.
+        growth: share of the Gaussians that a round adds, at most, beside as many as it drops.
         decay: of all rates over the last `cool_down` of the refinement.
         cool_down: see `decay`.
         looks: steps at each photograph after which a refinement ends, whatever time is left: more

@@ -196,7 +196,7 @@ def test_what_is_faint_or_lost_is_dropped():
     start = small_scene()
     start.opacities[2] = LEAST_OPACITY / 2
     start.means[5, 2] = -3  # behind both cameras
-    refinement = Refinement(start, small_views(), settings=Settings(growth=0.0))
+    refinement = Refinement(start, small_views(), settings=Settings(most=1))
     refinement.densify(0.0)
     kept = torch.arange(20) != 2
     assert same_bits(refinement.gaussians.keep(torch.ones(19) > 0), padded(start.keep(kept)))
@@ -232,6 +232,17 @@ def test_no_more_than_most_and_growth(kind):
     refine(small_scene(), small_views(), settings, steps=20, watch=watch)
     assert counts[0] == 20 and max(counts) == 40
     assert all(b <= 1.25 * a for a, b in pairwise(counts))
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.25])
+def test_what_is_dropped_is_replaced(growth):
+    """In a long refinement more would be lost between two rounds than one adds."""
+    start = small_scene()
+    start.opacities[:] = torch.where(torch.arange(20) < 10, LEAST_OPACITY / 2, 0.95)
+    refinement = Refinement(start, small_views(), settings=Settings(growth=growth, most=40))
+    refinement.densify(0.0)
+    assert len(refinement.fields) == 20 * (1 + growth)
+    assert (refinement.gaussians.opacities > LEAST_OPACITY).all()
 
 
 @pytest.mark.parametrize("kind", ["error", "mcmc"])
