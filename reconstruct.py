@@ -76,6 +76,8 @@ def reconstruct(config: DictConfig) -> None:
             watch=watch,
             **limits,
         )
+        if watch.last.step >= settings.most_steps(photographs.inputs.num_views):
+            print(f"refinement.looks={settings.looks} steps at each photograph: that is enough")
         results.hand_over(gaussians, photographs, background, watch.last)
         watch.show(gaussians)
 

@@ -143,6 +143,14 @@ def test_the_same_steps_and_seed_give_the_same_bytes(run_script, photographs, tm
 
 
 @pytest.mark.slow
+def test_it_says_why_it_ends_before_the_seconds(command, photographs, tmp_path):
+    overrides = ("views=3", "refinement.looks=2", "seconds=600", "steps=null", "video.path=none")
+    said = finished(command(photographs, *overrides))
+    assert "refinement.looks=2 steps at each photograph: that is enough" in said
+    assert numbers_of(tmp_path / "run")["steps"] == 6
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("init", ["network", "depth", "points", "file"])
 def test_what_it_starts_from(command, views, photographs, tmp_path, monkeypatch, init):
     folder = tmp_path / "run"
@@ -169,6 +177,7 @@ def test_where_there_is_no_network_it_starts_from_the_sweep(command, photographs
     overrides = ("views=4", "checkpoint=absent.safetensors", "steps=2")
     said = finished(command(photographs, "init=null", *overrides))
     assert "absent.safetensors does not exist" in said and "by init=sweep" in said
+    assert "refinement.looks" not in said
     asked = command(photographs, "init=network", *overrides)
     assert asked.returncode == 1 and "absent.safetensors does not exist" in asked.stderr
 

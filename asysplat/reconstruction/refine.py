@@ -234,7 +234,7 @@ def refine(
     refinement = Refinement(gaussians, views, background, settings, seed)
     if seconds is not None:
         _compile_kernels(gaussians, views, settings)
-    most = _most_steps(settings, views.num_views)
+    most = settings.most_steps(views.num_views)
     errors: deque[float] = deque(maxlen=views.num_views)  # the last at each photograph
     step, rounds, share = 0, 0, 0.0
     clock = time.perf_counter()
@@ -254,13 +254,6 @@ def refine(
         if watch is not None and watch(progress, refinement):
             break
     return refinement.gaussians
-
-
-def _most_steps(settings: Settings, num_views: int) -> float:
-    """Return the steps after which every photograph has been looked at often enough."""
-    if settings.looks is None:
-        return math.inf
-    return settings.looks * num_views / (settings.views_a_step or num_views)
 
 
 def _compile_kernels(gaussians: Gaussians, views: Views, settings: Settings) -> None:

@@ -1,5 +1,6 @@
 """What a refinement may change, how fast, and when."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -98,6 +99,12 @@ class Settings:
             )
         if self.looks is not None and self.looks < 1:
             raise InputError(f"refinement.looks={self.looks}: give at least 1, or null.")
+
+    def most_steps(self, num_views: int) -> float:
+        """Return the steps after which each photograph has been looked at `looks` times."""
+        if self.looks is None:
+            return math.inf
+        return self.looks * num_views / (self.views_a_step or num_views)
 
 
 # Suppl. A, "Post optimization": as Long-LRM does.
