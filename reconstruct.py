@@ -77,7 +77,7 @@ def reconstruct(config: DictConfig) -> None:
             **limits,
         )
         if watch.last.step >= settings.most_steps(photographs.inputs.num_views):
-            print(f"refinement.looks={settings.looks} steps at each photograph: that is enough")
+            print(f"ended: each photograph was looked at refinement.looks={settings.looks} times")
         results.hand_over(gaussians, photographs, background, watch.last)
         watch.show(gaussians)
 

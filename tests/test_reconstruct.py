@@ -146,7 +146,7 @@ def test_the_same_steps_and_seed_give_the_same_bytes(run_script, photographs, tm
 def test_it_says_why_it_ends_before_the_seconds(command, photographs, tmp_path):
     overrides = ("views=3", "refinement.looks=2", "seconds=600", "steps=null", "video.path=none")
     said = finished(command(photographs, *overrides))
-    assert "refinement.looks=2 steps at each photograph: that is enough" in said
+    assert "ended: each photograph was looked at refinement.looks=2 times" in said
     assert numbers_of(tmp_path / "run")["steps"] == 6
 
 
