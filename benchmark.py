@@ -19,6 +19,7 @@ from asysplat.benchmark.machine import describe_machine
 from asysplat.benchmark.options import check_repeats, find_suite
 from asysplat.benchmark.written import write_results
 from asysplat.errors import input_error_behind
+from asysplat.interrupts import keep_interrupts
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.training.revision import revision
 
@@ -64,6 +65,7 @@ def benchmark(options: DictConfig) -> bool:
 
 
 if __name__ == "__main__":
+    keep_interrupts()
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     exit_at_unknown_overrides("benchmark")
     main()

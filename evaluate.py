@@ -25,6 +25,7 @@ from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scene_results import image_rows, scene_rows, set_results
 from asysplat.evaluation.scenes import measure_scenes
 from asysplat.export import read_gaussians
+from asysplat.interrupts import keep_interrupts
 from asysplat.models.network import Network
 from asysplat.models.skips import EXACT
 from asysplat.overrides import exit_at_unknown_overrides
@@ -157,6 +158,7 @@ def gaussians_of_file(path: str, data: SceneDataModule, device: torch.device) ->
 
 
 if __name__ == "__main__":
+    keep_interrupts()
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     exit_at_unknown_overrides("evaluate")
     main()

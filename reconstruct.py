@@ -20,6 +20,7 @@ from asysplat.errors import InputError, input_error_behind
 from asysplat.export.gaussians import read_gaussians
 from asysplat.export.results import Results
 from asysplat.export.watch import SIGNALS, Watch
+from asysplat.interrupts import keep_interrupts
 from asysplat.motion import moved
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.reconstruction import mean_colour, refine
@@ -129,6 +130,7 @@ def as_overrides(words: list[str]) -> list[str]:
 
 if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at which pycolmap prints a stack trace
+    keep_interrupts()
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     sys.argv[1:] = as_overrides(sys.argv[1:])
     exit_at_unknown_overrides("reconstruct")

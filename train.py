@@ -20,6 +20,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError
+from asysplat.interrupts import keep_interrupts
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.training.callbacks.checkpoints import WholeFiles
 from asysplat.training.checkpoints import (
@@ -209,6 +210,7 @@ def make_trainer(
 
 
 if __name__ == "__main__":
+    keep_interrupts()
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     exit_at_unknown_overrides("train")
     OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)

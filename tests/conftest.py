@@ -78,6 +78,7 @@ def _run_script(name: str, *overrides: str) -> subprocess.CompletedProcess:
         warnings.filterwarnings("ignore", module="beartype")  # of types, when it first reads them
         patch.setattr(warnings, "formatwarning", warnings.formatwarning)
         patch.setattr(warnings, "showwarning", show)
+        patch.setattr(sys, "unraisablehook", sys.unraisablehook)
         patch.setattr(sys, "argv", [str(script), *map(str, overrides)])
         patch.chdir(REPO)
         try:

@@ -1,0 +1,56 @@
+"""An interruption at a moment at which Python can raise nothing."""
+
+import ctypes
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from asysplat.interrupts import keep_interrupts
+
+SWALLOWED = {
+    "a callback of C code": "ctypes.CFUNCTYPE(None)(interrupted)()",
+    "a finaliser": "type('Ends', (), {'__del__': lambda self: interrupted()})()",
+    "several, one after the other": "[ctypes.CFUNCTYPE(None)(interrupted)() for _ in range(3)]",
+}
+
+
+@pytest.mark.parametrize("case", SWALLOWED)
+@pytest.mark.parametrize("kept", [True, False])
+def test_an_interrupt_that_python_would_ignore_arrives(repository, case, kept):
+    script = f"""
+        import ctypes, signal, sys, time
+        from asysplat.interrupts import keep_interrupts
+
+        def interrupted():
+            signal.raise_signal(signal.SIGINT)
+
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if {kept}:
+            keep_interrupts()
+        try:
+            {SWALLOWED[case]}
+            time.sleep({60 if kept else 0.2})
+            print("went on")
+        except KeyboardInterrupt:
+            print("stopped")
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        cwd=repository,
+        capture_output=True,
+        text=True,
+        timeout=50,
+    )
+    assert done.stdout == ("stopped\n" if kept else "went on\n")
+    assert ("Traceback" in done.stderr) is not kept, done.stderr
+    assert done.returncode == 0
+
+
+def test_other_errors_are_printed_as_before(monkeypatch):
+    told = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    keep_interrupts()
+    ctypes.CFUNCTYPE(None)(lambda: 1 / 0)()
+    assert [one.exc_type for one in told] == [ZeroDivisionError]
