@@ -16,10 +16,10 @@ def keep_interrupts() -> None:
     otherwise = sys.unraisablehook
 
     def again(ignored: "sys.UnraisableHookArgs") -> None:
-        if isinstance(ignored.exc_value, KeyboardInterrupt):
+        if not isinstance(ignored.exc_value, KeyboardInterrupt):
+            otherwise(ignored)
+        elif not sys.is_finalizing():  # then all is done, and no thread starts any more
             main = threading.main_thread().ident
             threading.Timer(AGAIN_AFTER, signal.pthread_kill, (main, signal.SIGINT)).start()
-        else:
-            otherwise(ignored)
 
     sys.unraisablehook = again
