@@ -91,7 +91,8 @@ def plot(rows: list[dict[str, Any]]) -> Figure:
         outside = [f"{name}: {value:.4g}" for name, _, value in points if not low <= value <= high]
         axes.set(xlabel="seconds of training", ylabel=f"{label}, {better} is better", xscale="log")
         draw_front(axes, inside, better, "tab:blue")
-        axes.set_title(f"not shown: {'; '.join(outside)}")
+        if outside:
+            axes.set_title(f"not shown: {'; '.join(outside)}")
     return figure
 
 
