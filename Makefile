@@ -1,4 +1,4 @@
-.PHONY: demo quick test bench hours style format
+.PHONY: demo quick test bench slow style format
 PYTHON ?= python3
 ENV := .venv/.ready
 # Two tests at a time, a thread each; who is done takes tests of the other.
@@ -9,7 +9,7 @@ demo: $(ENV) ## train a small model on synthetic scenes, measure it, draw what i
 	@echo "to go on with commands of your own: source .venv/bin/activate"
 
 quick: style ## style, and the tests that take seconds
-	$(PYTEST) -m "not slow and not hours"
+	$(PYTEST) -m "not medium and not slow"
 
 test: style ## style, and all tests but those of hours
 	$(PYTEST)
@@ -18,8 +18,8 @@ bench: $(ENV) ## did a change make anything slower: ratios within one process, a
 	OMP_NUM_THREADS=1 .venv/bin/python benchmark.py suite=bench repeats=11 \
 		output=logs/bench compare=docs/results/bench.json
 
-hours: $(ENV) ## what takes an hour or two: long runs on real scenes, two processes for every model
-	$(PYTEST) -m hours
+slow: $(ENV) ## what takes an hour or two: long runs on real scenes, two processes for every model
+	$(PYTEST) -m slow
 
 style: $(ENV)
 	.venv/bin/ruff check .

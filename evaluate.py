@@ -1,4 +1,4 @@
-"""A model or a file of Gaussians, before and after the paper's post-optimisation.
+"""A model or a file of Gaussians, before and after the paper's post-optimization.
 
 python evaluate.py run=last
 """
@@ -20,14 +20,14 @@ from torch import nn
 from asysplat.data import SceneDataModule
 from asysplat.errors import InputError, input_error_behind
 from asysplat.evaluation.lpips import load_lpips
-from asysplat.evaluation.post_optimisation import HOW, PostOptimisation, Predict
+from asysplat.evaluation.post_optimization import HOW, PostOptimization, Predict
 from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scene_results import image_rows, scene_rows, set_results
 from asysplat.evaluation.scenes import measure_scenes
 from asysplat.export import read_gaussians
 from asysplat.interrupts import keep_interrupts
+from asysplat.models.early_exit import EXACT
 from asysplat.models.network import Network
-from asysplat.models.skips import EXACT
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
@@ -72,7 +72,7 @@ def evaluate(options: DictConfig) -> None:
     folders = subject.folder, subject.kept
     scenes = measure_scenes(tests, predict, measure, fabric.device, *folders, skipped)
     sentences = {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
-    how = {"evaluation/post_optimisation": HOW}
+    how = {"evaluation/post_optimization": HOW}
     if options.run is None:  # which has one
         OmegaConf.save(options, subject.folder / "config.yaml", resolve=True)
     results = subject.described | sentences | how | set_results(scenes, measure.protocol.mean_over)
@@ -96,7 +96,7 @@ def make_fabric(trainer: DictConfig) -> lightning.Fabric:
         raise InputError(f"trainer: {error}") from error
 
 
-def make_measure(config: DictConfig, options: DictConfig, device: torch.device) -> PostOptimisation:
+def make_measure(config: DictConfig, options: DictConfig, device: torch.device) -> PostOptimization:
     """Build what measures a scene; without LPIPS, and a warning, where its backbone is missing."""
     protocol = instantiate(config.metrics)
     paths = options.paths
@@ -106,9 +106,9 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
     else:
         lpips.to(device)
     steps = tuple(options.steps) if isinstance(options.steps, ListConfig) else (options.steps,)
-    colour = config.training.background
-    background = None if colour == "inputs" else torch.tensor(colour, device=device)
-    return PostOptimisation(steps, protocol, lpips, background)
+    color = config.training.background
+    background = None if color == "inputs" else torch.tensor(color, device=device)
+    return PostOptimization(steps, protocol, lpips, background)
 
 
 def network(config: DictConfig, data: SceneDataModule, fabric: lightning.Fabric) -> Network:
@@ -117,8 +117,8 @@ def network(config: DictConfig, data: SceneDataModule, fabric: lightning.Fabric)
     data.check_sizes(net.check_size)
     load_weights(config.init_path, nn.ModuleDict({"net": net}))  # as a checkpoint names them
     net.to(fabric.device).eval()
-    net.skips = instantiate(config.get("speed")) or EXACT  # runs of before have no speed
-    net.check_skips(net.skips)
+    net.early_exit = instantiate(config.get("speed")) or EXACT  # runs of before have no speed
+    net.check_early_exit(net.early_exit)
     print(f"model: {net.describe()}")
     return net
 
@@ -147,7 +147,7 @@ def gaussians_of_file(path: str, data: SceneDataModule, device: torch.device) ->
             "of that scene as data.root."
         )
     sample = scenes[0]
-    gaussians = sample["frame"].bring(read_gaussians(path)).to(device)
+    gaussians = sample["frame"].to_network(read_gaussians(path)).to(device)
     if not render(gaussians, sample["inputs"].cameras.to(device), depth=False).alpha.any():
         raise InputError(
             f"scene={path} has {gaussians.num_gaussians} Gaussians, and the input views of "

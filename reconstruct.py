@@ -19,13 +19,13 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.errors import InputError, input_error_behind
 from asysplat.export.gaussians import read_gaussians
 from asysplat.export.results import Results
-from asysplat.export.watch import SIGNALS, Watch
+from asysplat.export.watch import SIGNALS, RefinementDisplay
 from asysplat.interrupts import keep_interrupts
-from asysplat.motion import moved
+from asysplat.motion import transform
 from asysplat.overrides import exit_at_unknown_overrides
-from asysplat.reconstruction import mean_colour, refine
-from asysplat.reconstruction.begin import INITS, best_init, starting_gaussians
-from asysplat.reconstruction.photographs import Photographs, open_photographs
+from asysplat.refinement import mean_color, refine
+from asysplat.refinement.init import INITS, best_init, initial_gaussians
+from asysplat.refinement.photographs import Photographs, open_photographs
 from asysplat.scene import Gaussians
 from asysplat.training.load import load
 from asysplat.training.ranges import check_ranges
@@ -59,15 +59,15 @@ def reconstruct(config: DictConfig) -> None:
         config.height,
         config.width,
         config.views,
-        config.held_back,
-        config.most_measured,
+        config.held_out_every,
+        config.max_held_out,
         config.layout,
-        config.on_bad_frame,
+        config.on_bad_image,
     )
     gaussians = start(config, photographs, settings.most)
-    background = mean_colour(photographs.inputs)
+    background = mean_color(photographs.inputs)
     results.first_picture(gaussians, photographs, background)
-    with Watch(photographs.inputs, config.view) as watch:
+    with RefinementDisplay(photographs.inputs, config.view) as watch:
         gaussians = refine(
             gaussians,
             photographs.inputs,
@@ -79,7 +79,7 @@ def reconstruct(config: DictConfig) -> None:
         )
         if watch.last.step >= settings.most_steps(photographs.inputs.num_views):
             print(f"ended: each photograph was looked at refinement.looks={settings.looks} times")
-        results.hand_over(gaussians, photographs, background, watch.last)
+        results.save(gaussians, photographs, background, watch.last)
         watch.show(gaussians)
 
 
@@ -99,17 +99,17 @@ def start(config: DictConfig, photographs: Photographs, most: int) -> Gaussians:
     if init == "network":
         try:
             network = load(config.checkpoint)
-            network.skips = instantiate(config.speed)
+            network.early_exit = instantiate(config.speed)
         except InputError as error:
             if config.init is not None:
                 raise
-            print(f"warning: {error} Starting from the plane sweep, init=sweep.")
+            print(f"warning: {error} Starting from the plane sweep, init=plane_sweep.")
             init = "sweep"
     if init not in INITS and Path(init).suffix:
         frame = photographs.frame
-        gaussians = moved(read_gaussians(init), frame.world_to_mean).scale_by(frame.scale)
+        gaussians = transform(read_gaussians(init), frame.world_to_mean).scale_by(frame.scale)
     else:
-        gaussians = starting_gaussians(init, photographs, most, network)
+        gaussians = initial_gaussians(init, photographs, most, network)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
     if network is not None and network.skipped:
         shares = (f"{share:.0%} of {name}" for name, share in network.skipped.items())

@@ -22,19 +22,19 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.errors import InputError
 from asysplat.interrupts import keep_interrupts
 from asysplat.overrides import exit_at_unknown_overrides
-from asysplat.training.callbacks.checkpoints import WholeFiles
+from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
 from asysplat.training.checkpoints import (
     check_checkpoint,
+    config_diff,
     find_checkpoint,
     has_checkpoints,
     load_weights,
     read_notes,
-    what_differs,
 )
 from asysplat.training.failures import sentence_of
 from asysplat.training.quiet import quiet_lightning
 from asysplat.training.revision import revision
-from asysplat.training.run_folder import claimed, run_folder
+from asysplat.training.run_folder import locked, run_folder
 from asysplat.training.runs import RESULTS, Run, describe_run, find_run
 from asysplat.training.stages import (
     StageRecord,
@@ -93,12 +93,12 @@ def finished_text(run: Run) -> str:
 
 
 def train(config: DictConfig) -> float | None:
-    """Train and test, stage by stage; return the test PSNR, which a sweep may optimise."""
+    """Train and test, stage by stage; return the test PSNR, which a sweep may optimize."""
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
     stages = stage_configs(config)
     check_stages(stages)
-    with claimed(Path(config.paths.run)):
+    with locked(Path(config.paths.run)):
         return train_stages(config, stages)
 
 
@@ -142,7 +142,7 @@ def train_stage(
     data.setup()
     net = instantiate(config.model)
     skips = instantiate(config.speed)
-    net.check_skips(skips)
+    net.check_early_exit(skips)
     data.check_sizes(net.check_size)
     data.check_sizes(instantiate(config.metrics).check_size)
     module = instantiate(config.training, net=net)
@@ -157,7 +157,7 @@ def train_stage(
     made = instantiate(config.get("callbacks") or {})
     callbacks = {name: callback for name, callback in made.items() if callback is not None}
     notes = {} if checkpoint is None else read_notes(checkpoint)
-    for difference in what_differs(notes, options, revision()):
+    for difference in config_diff(notes, options, revision()):
         print(f"not as before: {difference}")
     goes_on = has_checkpoints(folder)
     cut_events(folder, notes["event_files"] if goes_on else {})
@@ -170,7 +170,7 @@ def train_stage(
     if trainer.is_global_zero:
         print(split)
     trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
-    net.skips = skips
+    net.early_exit = skips
     trainer.test(module, data, verbose=False)
 
     results = {}
@@ -202,7 +202,7 @@ def make_trainer(
             logger=logger or False,
             # Otherwise Lightning adds its own in place of those that are left out.
             enable_checkpointing="checkpoints" in callbacks,
-            plugins=[WholeFiles()],
+            plugins=[AtomicCheckpointIO()],
             enable_progress_bar="progress" in callbacks,
         )
     except InstantiationException as error:

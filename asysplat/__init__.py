@@ -27,9 +27,9 @@ from asysplat.scene import Cameras, Gaussians, Views
 # Imported when first asked for: they bring Hydra, image readers and plots along.
 LATER = {
     "load": "asysplat.training.load",
-    "mean_colour": "asysplat.reconstruction",
-    "open_photographs": "asysplat.reconstruction.photographs",
-    "refine": "asysplat.reconstruction",
+    "mean_color": "asysplat.refinement",
+    "open_photographs": "asysplat.refinement.photographs",
+    "refine": "asysplat.refinement",
 }
 
 __all__ = [
@@ -37,7 +37,7 @@ __all__ = [
     "Gaussians",
     "Views",
     "load",
-    "mean_colour",
+    "mean_color",
     "open_photographs",
     "read_gaussians",
     "refine",

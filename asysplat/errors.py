@@ -5,7 +5,7 @@ class InputError(ValueError):
     """Something the user gave cannot be used.
 
     The message is one sentence that names the field or file, says what was found and what was
-    expected, and how to mend it. Scripts print it alone, without a traceback.
+    expected, and how to fix it. Scripts print it alone, without a traceback.
     """
 
 

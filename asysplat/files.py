@@ -11,7 +11,7 @@ from asysplat.errors import InputError
 
 
 @contextmanager
-def replaced(path: str | Path) -> Iterator[Path]:
+def atomic_write(path: str | Path) -> Iterator[Path]:
     """Give a temporary path to write to, in the same folder; move it to `path` at the end.
 
     The file is on the disk before it is moved. Whatever is raised meanwhile, a KeyboardInterrupt

@@ -31,7 +31,7 @@ class _Again:
 def keep_interrupts() -> None:
     """Raise a KeyboardInterrupt again where Python could only print it.
 
-    In a callback of C code, such as Numba's when it loads a kernel, and in a finaliser, Python
+    In a callback of C code, such as Numba's when it loads a kernel, and in a finalizer, Python
     prints what is raised and goes on: Ctrl-C at such a moment would stop nothing.
     """
     sys.unraisablehook = _Again(sys.unraisablehook)

@@ -11,7 +11,7 @@ from asysplat.rendering.reference.math import sh_basis
 from asysplat.scene import Gaussians
 
 
-def moved(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
+def transform(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
     """Apply a rigid motion to Gaussians: cameras moved alike render the same images.
 
     Computed in float64; the fields keep their types.
@@ -36,7 +36,7 @@ def moved(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
 def sh_rotation(rotation: Float[Tensor, "3 3"], count: int) -> Float[Tensor, "{count} {count}"]:
     """Return the matrix that rotates SH coefficients.
 
-    The colour that `count` (1, 4, 9 or 16) coefficients give along d is the one that the rotated
+    The color that `count` (1, 4, 9 or 16) coefficients give along d is the one that the rotated
     coefficients give along R d. A rotated SH function is a sum of SH functions of its degree, so
     its values in enough directions determine the matrix exactly.
     """

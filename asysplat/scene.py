@@ -64,7 +64,7 @@ class TensorRecord:
 class Cameras(TensorRecord):
     """Pinhole cameras, OpenCV axes: x right, y down, z forward.
 
-    The centre of the top left pixel is (0.5, 0.5).
+    The center of the top left pixel is (0.5, 0.5).
 
     Args:
         intrinsics: [..., V, 3, 3] in pixels.
@@ -116,7 +116,7 @@ class Cameras(TensorRecord):
         )
 
     def pixel_directions(self) -> Float[Tensor, "*batch V H W 3"]:
-        """Return the camera-space directions through every pixel centre, with z = 1."""
+        """Return the camera-space directions through every pixel center, with z = 1."""
         options = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
         y, x = torch.meshgrid(
             torch.arange(self.height, **options) + 0.5,
@@ -129,7 +129,7 @@ class Cameras(TensorRecord):
         return torch.stack((x, y, z), dim=-1)
 
     def rays(self) -> tuple[Float[Tensor, "*batch V H W 3"], Float[Tensor, "*batch V H W 3"]]:
-        """Return the world-space origins and unit directions of every pixel centre's ray."""
+        """Return the world-space origins and unit directions of every pixel center's ray."""
         # Not a matrix product: autocast would round those to half precision.
         rotation = self.cam_to_world[..., None, None, :3, :3]
         directions = (rotation * self.pixel_directions()[..., None, :]).sum(-1)
@@ -260,10 +260,10 @@ class Gaussians(TensorRecord):
 
     Args:
         means: [..., N, 3] in scene units.
-        quats: [..., N, 4] rotations, wxyz; normalised by the renderer.
+        quats: [..., N, 4] rotations, wxyz; normalized by the renderer.
         scales: [..., N, 3] standard deviations > 0, in scene units.
         opacities: [..., N] in (0, 1).
-        sh: [..., N, K, 3] spherical harmonics, K = 1, 4, 9 or 16; colour = 0.5 + sum_k sh_k Y_k.
+        sh: [..., N, K, 3] spherical harmonics, K = 1, 4, 9 or 16; color = 0.5 + sum_k sh_k Y_k.
     """
 
     means: Float[Tensor, "*batch N 3"]

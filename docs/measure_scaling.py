@@ -57,11 +57,11 @@ def count(views: int, height: int, width: int) -> dict[str, Any]:
 def weigh(name: str) -> dict[str, Any]:
     """Measure the bytes of a scene's files, and of its photographs as JPEG of 256x256."""
     shared = Path(os.environ.get("ASYSPLAT_SHARED", REPO.parent / "shared"))
-    capture = open_scene(shared / "data" / name, 256, 256)
-    every = range(0, capture.num_frames, max(1, capture.num_frames // 20))
-    photographs = [capture.scene.photographs[frame] for frame in every]
+    sequence = open_scene(shared / "data" / name, 256, 256)
+    every = range(0, sequence.num_frames, max(1, sequence.num_frames // 20))
+    photographs = [sequence.scene.photographs[frame] for frame in every]
     encoded = []
-    for image in capture.views(list(every)).images:
+    for image in sequence.views(list(every)).images:
         stream = io.BytesIO()
         pixels = (255 * image.permute(1, 2, 0)).round().byte().numpy()
         Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "JPEG", quality=QUALITY)
@@ -82,10 +82,10 @@ def read_seconds() -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         scene = write_photographs(Path(folder) / "scene", 48, 540, 960)
         for height, width in ((64, 64), *SIZES):
-            capture, seconds = open_scene(scene, height, width), []
-            for frame in range(capture.num_frames):
+            sequence, seconds = open_scene(scene, height, width), []
+            for frame in range(sequence.num_frames):
                 start = time.process_time()
-                capture.views([frame])
+                sequence.views([frame])
                 seconds.append(time.process_time() - start)
             found.append({"height": height, "width": width, "seconds": median(seconds[8:])})
     return found

@@ -1,4 +1,4 @@
-"""Measure what skips cost and save, on made-up test scenes and on photographs.
+"""Measure what skips cost and save, on synthetic test scenes and on photographs.
 
 python docs/measure_skips.py    writes docs/results/skips.json and skips.png
 """
@@ -19,11 +19,11 @@ from matplotlib.figure import Figure
 
 from asysplat.data.datamodule import collate, load
 from asysplat.data.sources import FilesSource
-from asysplat.evaluation.baselines import mean_colour
+from asysplat.evaluation.baselines import mean_color
 from asysplat.evaluation.metrics import psnr
-from asysplat.files import replaced
+from asysplat.files import atomic_write
+from asysplat.models.early_exit import EXACT, EarlyExit
 from asysplat.models.network import Network
-from asysplat.models.skips import EXACT, SceneSkips
 from asysplat.rendering import render
 from asysplat.training.load import CONF
 from asysplat.training.load import load as load_network
@@ -33,13 +33,13 @@ Batch = dict[str, Any]
 Row = dict[str, Any]
 
 WHERE_KNOWN = 0.1  # less confidence than in any scene measured here
-SURE, KNOWN = SceneSkips(sure=WHERE_KNOWN), SceneSkips(known=WHERE_KNOWN)
+SURE, KNOWN = EarlyExit(sure=WHERE_KNOWN), EarlyExit(known=WHERE_KNOWN)
 SETTINGS = {
     "exact": EXACT,
     "sure": SURE,
     **{f"sure, coverage {share}": replace(SURE, coverage=share) for share in (0.9, 0.8, 0.6)},
     "known": KNOWN,
-    **{f"faint {opacity}": SceneSkips(faint=opacity) for opacity in (0.02, 0.05, 0.1)},
+    **{f"faint {opacity}": EarlyExit(faint=opacity) for opacity in (0.02, 0.05, 0.1)},
 }
 MADE_UP = ((8, 64, 6), (8, 128, 3), (32, 64, 2), (8, 256, 1))  # views, side of an image, scenes
 PHOTOGRAPHS = ("fern", "fox", "hololens-000", "mydesk")
@@ -67,7 +67,7 @@ def photographs(folder: Path, views: int, side: int) -> list[Batch]:
 def scenes(shared: Path) -> Iterator[tuple[str, list[Batch]]]:
     """Yield what is measured, by name; photographs that are absent are left out."""
     for views, side, count in MADE_UP:
-        yield f"made-up, {views} of {side}x{side}", made_up(views, side, count)
+        yield f"synthetic, {views} of {side}x{side}", made_up(views, side, count)
     for name in PHOTOGRAPHS:
         if (shared / "data" / name).is_dir():
             for views, side in SEEN:
@@ -87,11 +87,11 @@ def measure(net: Network, batches: list[Batch]) -> dict[str, Row]:
     seconds: dict[str, list[float]] = {name: [] for name in SETTINGS}
     rows: dict[str, Row] = {}
     for number in range(ROUNDS + 1):
-        for name, net.skips in SETTINGS.items():
+        for name, net.early_exit in SETTINGS.items():
             clock, qualities, skipped = 0.0, [], []
             for batch in batches:
                 inputs, targets = batch["inputs"], batch["targets"]
-                background = mean_colour(inputs, targets)[..., 0, 0]
+                background = mean_color(inputs, targets)[..., 0, 0]
                 clock -= time.process_time()
                 image = render(net(inputs), targets.cameras, background, depth=False).image
                 clock += time.process_time()
@@ -129,7 +129,7 @@ def plot(results: dict[str, Any]) -> Figure:
         axis.axvline(1, color="0.6", lw=0.8)
         axis.set_xlabel("times as fast as exact, photographs to all test views")
         axis.legend(frameon=False, fontsize=8)
-    axes[0].set_ylabel("gain in PSNR (dB); grey: 0.1 dB lost")
+    axes[0].set_ylabel("gain in PSNR (dB); gray: 0.1 dB lost")
     return figure
 
 
@@ -147,9 +147,9 @@ def main(shared: Path) -> None:
         results["scenes"][name] = {"confidence": confidence(net, batches), "settings": rows}
         for setting, row in rows.items():
             print(f"{name}: {setting}: x{row['times_as_fast']:.2f}, {row['gain']:+.2f} dB")
-    with replaced(RESULTS / "skips.json") as path:
+    with atomic_write(RESULTS / "skips.json") as path:
         path.write_text(json.dumps(results, indent=2) + "\n")
-    with replaced(RESULTS / "skips.png") as path:
+    with atomic_write(RESULTS / "skips.png") as path:
         plot(results).savefig(path, dpi=120)
 
 

@@ -16,7 +16,7 @@ import torch
 from matplotlib.figure import Figure
 
 from asysplat.benchmark.machine import describe_machine
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 from asysplat.report.front import draw_front
 
 REPO = Path(__file__).resolve().parents[1]
@@ -51,7 +51,7 @@ def run(name: str, overrides: list[str]) -> dict[str, Any]:
     """Train, unless that was done; return what the run measured."""
     runs = REPO / "logs" / f"training_{name.replace(' ', '_')}"
     if not list(runs.glob("*/metrics.json")):
-        chosen = {"steps": str(STEPS), "name": runs.name, "~callbacks.pictures": ""}
+        chosen = {"steps": str(STEPS), "name": runs.name, "~callbacks.figures": ""}
         chosen |= dict(override.split("=", 1) for override in overrides)
         # Validated once, at the end.
         chosen["validate_every"] = chosen["steps"]
@@ -101,9 +101,9 @@ def main() -> None:
         run(name, overrides)
     rows = [measure(name, overrides) for name, overrides in SETTINGS.items()]
     machine = describe_machine() | {"threads": torch.get_num_threads()}
-    with replaced(RESULTS / "training.json") as path:
+    with atomic_write(RESULTS / "training.json") as path:
         path.write_text(json.dumps({"machine": machine, "rows": rows}, indent=2) + "\n")
-    with replaced(RESULTS / "training.png") as path:
+    with atomic_write(RESULTS / "training.png") as path:
         plot(rows).savefig(path, dpi=100)
 
 

@@ -12,7 +12,7 @@ from hydra.utils import instantiate
 
 from asysplat import render
 from asysplat.data import ProceduralScene
-from asysplat.evaluation.pictures import comparison
+from asysplat.evaluation.figures import comparison
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import torch
 
-from asysplat import load, mean_colour, open_photographs, refine, render, write_gaussians
+from asysplat import load, mean_color, open_photographs, refine, render, write_gaussians
 from asysplat.data import ProceduralScene
 from asysplat.data.write import write_transforms
-from asysplat.evaluation.pictures import comparison
+from asysplat.evaluation.figures import comparison
 
 
 def reconstruct(folder: Path, scene: Path, picture: Path) -> None:
@@ -20,9 +20,9 @@ def reconstruct(folder: Path, scene: Path, picture: Path) -> None:
     with torch.no_grad():
         start = load("shipped")(photographs.inputs)
     gaussians = refine(start, photographs.inputs, seconds=10.0)
-    write_gaussians(scene, photographs.frame.undo(gaussians))  # in the world of the files
+    write_gaussians(scene, photographs.frame.to_world(gaussians))  # in the world of the files
 
-    background = mean_colour(photographs.inputs)
+    background = mean_color(photographs.inputs)
     rendering = render(gaussians, photographs.measured.cameras, background)
     comparison(photographs.inputs, photographs.measured, rendering).savefig(picture, dpi=110)
     print(f"{gaussians.num_gaussians:,} Gaussians; scene: {scene}; picture: {picture}")

@@ -10,9 +10,9 @@ import torch
 
 from asysplat import Gaussians, Views, render
 from asysplat.data import ProceduralScene
-from asysplat.evaluation.pictures import comparison
+from asysplat.evaluation.figures import comparison
 
-SH_0 = 0.28209479177387814  # the constant SH basis function: colour = 0.5 + SH_0 sh[0]
+SH_0 = 0.28209479177387814  # the constant SH basis function: color = 0.5 + SH_0 sh[0]
 
 
 def gaussians_of(views: Views) -> Gaussians:
@@ -22,14 +22,14 @@ def gaussians_of(views: Views) -> Gaussians:
     directions = (rotations @ cameras.pixel_directions()[..., None]).squeeze(-1)
     means = cameras.centers[:, None, None] + views.depths[..., None] * directions
     pixel = views.depths / cameras.intrinsics[:, 0, 0, None, None]  # its side there, scene units
-    colours = views.images.movedim(1, -1)
+    colors = views.images.movedim(1, -1)
     num = pixel.numel()
     return Gaussians(
         means=means.reshape(num, 3),
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1),
         scales=0.6 * pixel.reshape(num, 1).repeat(1, 3),
         opacities=torch.full((num,), 0.95),
-        sh=((colours - 0.5) / SH_0).reshape(num, 1, 3),
+        sh=((colors - 0.5) / SH_0).reshape(num, 1, 3),
     )
 
 

@@ -26,7 +26,7 @@ def test_it_draws_a_picture(repository, tmp_path, monkeypatch, capsys, name):
     assert str(picture) in capsys.readouterr().out
 
 
-@pytest.mark.hours  # the notebook does the same
+@pytest.mark.slow  # the notebook does the same
 def test_a_scene_is_reconstructed(repository, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["reconstruct_scene"])
     monkeypatch.chdir(tmp_path)
@@ -36,7 +36,7 @@ def test_a_scene_is_reconstructed(repository, tmp_path, monkeypatch, capsys):
     assert cv2.imread("reconstructed.png").std() > 20
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_the_notebook_runs_and_holds_no_outputs(repository, tmp_path):
     notebook = nbformat.read(repository / "examples" / "reconstruct_scene.ipynb", as_version=4)
     nbformat.validate(notebook)
@@ -52,7 +52,7 @@ def test_the_notebook_runs_and_holds_no_outputs(repository, tmp_path):
     assert read_gaussians(scene).num_gaussians > 1000
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_names_that_bring_much_along_are_imported_when_asked_for(repository):
     heavy = ["lightning", "hydra", "cv2", "matplotlib", "pycolmap"]
     program = (
@@ -68,14 +68,14 @@ def test_names_that_bring_much_along_are_imported_when_asked_for(repository):
     assert before == [] and found == names
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_photographs_are_checked_and_trained_on(repository, tmp_path, monkeypatch):
     scene = tmp_path / "my_scene"
     monkeypatch.setattr("sys.argv", ["write_scene", str(scene)])
     runpy.run_path(str(repository / "examples" / "write_scene.py"), run_name="__main__")
     assert open_scene(scene, 64, 64).num_frames == 48
     tiny = [*NETWORK, *VIEWS, "steps=1", "validate_every=1", "data.cache.folder=null"]
-    tiny += [f"paths.logs={tmp_path}/logs", "~callbacks.pictures"]
+    tiny += [f"paths.logs={tmp_path}/logs", "~callbacks.figures"]
     said = subprocess.run(
         ["bash", repository / "examples" / "train_on_photographs.sh", scene, *tiny],
         env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},

@@ -5,7 +5,7 @@ import pytest
 from full_disk import largest_file
 
 from asysplat.errors import InputError
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def assert_untouched(file):
 def test_a_new_file_and_one_in_place_of_another(tmp_path):
     file = tmp_path / "scene.ply"
     for content in ("first", "second"):
-        with replaced(file) as partial:
+        with atomic_write(file) as partial:
             assert partial.parent == tmp_path and partial.suffix == ".ply"
             partial.write_text(content)
             assert not file.exists() or file.read_text() == "first"
@@ -33,7 +33,7 @@ def test_a_new_file_and_one_in_place_of_another(tmp_path):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError, InputError])
 def test_what_interrupts_leaves_the_old_file(old, error):
-    with pytest.raises(error), replaced(old) as partial:
+    with pytest.raises(error), atomic_write(old) as partial:
         partial.write_text("half")
         raise error
     assert_untouched(old)
@@ -43,7 +43,7 @@ def test_a_full_disk_leaves_the_old_file(old):
     with (
         largest_file(1000),
         pytest.raises(InputError, match=r"scene\.ply cannot be written \(File too large\)"),
-        replaced(old) as partial,
+        atomic_write(old) as partial,
     ):
         partial.write_bytes(bytes(2000))
     assert_untouched(old)
@@ -54,13 +54,13 @@ def test_a_disk_that_is_full_only_when_flushed_leaves_the_old_file(old, monkeypa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(InputError, match="No space left"), replaced(old) as partial:
+    with pytest.raises(InputError, match="No space left"), atomic_write(old) as partial:
         partial.write_text("new")
     assert_untouched(old)
 
 
 def test_a_file_that_cannot_be_read_meanwhile_is_named_itself(old, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"photo\.png"), replaced(old):
+    with pytest.raises(FileNotFoundError, match=r"photo\.png"), atomic_write(old):
         (tmp_path / "photo.png").read_bytes()
     assert_untouched(old)
 
@@ -68,14 +68,14 @@ def test_a_file_that_cannot_be_read_meanwhile_is_named_itself(old, tmp_path):
 def test_no_folder_is_said_in_one_sentence(tmp_path):
     with (
         pytest.raises(InputError, match=r"absent/scene\.ply cannot be written \(No such file"),
-        replaced(tmp_path / "absent" / "scene.ply") as partial,
+        atomic_write(tmp_path / "absent" / "scene.ply") as partial,
     ):
         partial.write_text("new")
 
 
 @pytest.mark.parametrize("path", ["", "/dev/null"])
 def test_folders_and_devices_are_refused(tmp_path, path):
-    with pytest.raises(InputError, match="is a folder or a device"), replaced(tmp_path / path):
+    with pytest.raises(InputError, match="is a folder or a device"), atomic_write(tmp_path / path):
         raise AssertionError("never reached")
 
 
@@ -83,7 +83,7 @@ def test_links_and_permissions_stay(old, tmp_path):
     old.chmod(0o640)
     link = tmp_path / "link.ply"
     link.symlink_to(old)
-    with replaced(link) as partial:
+    with atomic_write(link) as partial:
         partial.write_text("new")
     assert link.is_symlink() and old.read_text() == "new"
     assert old.stat().st_mode & 0o777 == 0o640

@@ -11,7 +11,7 @@ from asysplat.interrupts import keep_interrupts
 
 SWALLOWED = {
     "a callback of C code": "ctypes.CFUNCTYPE(None)(interrupted)()",
-    "a finaliser": "type('Ends', (), {'__del__': lambda self: interrupted()})()",
+    "a finalizer": "type('Ends', (), {'__del__': lambda self: interrupted()})()",
     "several, one after the other": "[ctypes.CFUNCTYPE(None)(interrupted)() for _ in range(3)]",
 }
 

@@ -1,11 +1,11 @@
-"""Gaussians that move keep their shapes, and their colours as seen from cameras that move along."""
+"""Gaussians that move keep their shapes, and their colors as seen from cameras that move along."""
 
 import math
 
 import pytest
 import torch
 
-from asysplat.motion import moved, sh_rotation
+from asysplat.motion import sh_rotation, transform
 from asysplat.rendering.reference.math import sh_basis
 
 
@@ -51,7 +51,7 @@ def test_means_and_orientations(make_scene):
     turn = torch.eye(4, dtype=torch.float64)
     turn[:3, :3] = torch.tensor([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])
     turn[:3, 3] = torch.tensor([1.0, 2, 3])
-    found = moved(gaussians, turn)
+    found = transform(gaussians, turn)
     x, y, z = gaussians.means.unbind(-1)
     torch.testing.assert_close(found.means, torch.stack((1 - y, 2 + x, 3 + z), -1))
     w, x, y, z = gaussians.quats.unbind(-1)
@@ -64,7 +64,7 @@ def test_means_and_orientations(make_scene):
 def test_there_and_back_is_where_it_was(make_scene):
     gaussians, _ = make_scene(degree=3)
     there = motion(1)
-    back = moved(moved(gaussians, there), torch.linalg.inv(there))
+    back = transform(transform(gaussians, there), torch.linalg.inv(there))
     for name in ("means", "sh"):
         torch.testing.assert_close(
             getattr(back, name), getattr(gaussians, name), atol=1e-12, rtol=0

@@ -47,7 +47,7 @@ UNKNOWN = {
     "stage=stage1,stage4": "stage=stage4 is unknown: choose stage1, stage2, stage3 or ablation.",
     "experiment=stage1": "experiment=stage1 is unknown: did you mean",
     "batch_sizes=2,4": "did you mean data.batch_size?",
-    "callbacks.pictres.scenes=1": "did you mean callbacks.pictures.scenes?",
+    "callbacks.pictres.scenes=1": "did you mean callbacks.figures.scenes?",
     "~callbacks.cots": "callbacks.cots is unknown: did you mean callbacks.costs?",
     "data.root=my_scene": "data.root is unknown: it is an option of data=colmap, ",
     "qqq=1": "qqq is unknown: python train.py --cfg job shows all.",
@@ -80,7 +80,7 @@ def test_options_of_the_other_scripts():
         check_overrides(["repeat=3"], "benchmark")
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_script_says_it_from_any_folder(repository, tmp_path):
     command = [sys.executable, repository / "report.py", "cots=true"]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
@@ -108,7 +108,7 @@ def printed_commands(repository) -> list[tuple[str, str]]:
     return sorted(found)
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_every_printed_command_names_what_is_there(repository):
     printed = printed_commands(repository)
     assert len(printed) > 100

@@ -22,7 +22,7 @@ def gaussians(count=5):
     )
 
 
-def test_rays_go_through_pixel_centres():
+def test_rays_go_through_pixel_centers():
     origins, directions = cameras().rays()
     assert origins.shape == directions.shape == (2, 4, 6, 3)
     expected = torch.tensor([(0.5 - 3) / 5, (3.5 - 2) / 6, 1.0])

@@ -14,15 +14,15 @@ from asysplat.benchmark.table import worst
 from asysplat.benchmark.timing import Result
 from asysplat.report.style import FAINT, INK, OURS, PAPER, STYLE
 
-COLOURS = {"cpu": OURS, "cuda": INK, "reference": FAINT, "loop": FAINT}
-COLOURS |= dict.fromkeys(("chunked", "sdpa", "gsplat"), PAPER)
+COLORS = {"cpu": OURS, "cuda": INK, "reference": FAINT, "loop": FAINT}
+COLORS |= dict.fromkeys(("chunked", "sdpa", "gsplat"), PAPER)
 MARKS = "osD^vPX*"
 
 
 def time_against_error(
     rows: Sequence[Result], errors: Mapping[str, tuple[str, str]], backend: str, case: str
 ) -> Figure:
-    """Plot a point for each row: its colour is its backend, its mark its case, hollow in bf16.
+    """Plot a point for each row: its color is its backend, its mark its case, hollow in bf16.
 
     Args:
         errors: for each timed pass, what its error is, and its path in a row.
@@ -37,7 +37,7 @@ def time_against_error(
             for row, hollow in zip(rows, in_bf16, strict=True):
                 if not row[name]:
                     continue
-                look = _look(marks[row[case]], COLOURS[row[backend]], hollow)
+                look = _look(marks[row[case]], COLORS[row[backend]], hollow)
                 axes.plot(1000 * row[name]["median"], worst(row, path), **look)
             title = name.replace("_", " and ")
             axes.set(title=title, xlabel="milliseconds", xscale="log", yscale="log", ylabel=label)
@@ -48,7 +48,7 @@ def time_against_error(
                 axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             for axis in (axes.xaxis, axes.yaxis):
                 axis.set_minor_formatter(NullFormatter())
-        keys = {name: _look("o", COLOURS[name]) for name in dict.fromkeys(r[backend] for r in rows)}
+        keys = {name: _look("o", COLORS[name]) for name in dict.fromkeys(r[backend] for r in rows)}
         keys |= {f"{case} {name}": _look(mark, INK) for name, mark in marks.items()}
         if any(in_bf16):
             keys["in bf16"] = _look("o", INK, hollow=True)
@@ -72,14 +72,14 @@ def bars(
         label: of the lengths.
         spread: the interquartile range of each bar's length, drawn about its end.
     """
-    colours = matplotlib.colormaps["tab10"].colors
+    colors = matplotlib.colormaps["tab10"].colors
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(9, 1.6 + 0.5 * len(names)), layout="constrained")
         axes = figure.subplots()
         starts = [0.0] * len(names)
-        for (part, lengths), colour in zip(parts.items(), colours, strict=False):
+        for (part, lengths), color in zip(parts.items(), colors, strict=False):
             if any(lengths):
-                axes.barh(names, lengths, left=starts, color=colour, label=part)
+                axes.barh(names, lengths, left=starts, color=color, label=part)
             starts = [start + length for start, length in zip(starts, lengths, strict=True)]
         if spread is not None:
             axes.errorbar(starts, names, xerr=[iqr / 2 for iqr in spread], fmt="none", color=INK)
@@ -103,11 +103,11 @@ def against_seconds(
     timed: dict[str, set[float]] = {}
     for name, rows in (item for panel in panels.values() for item in panel.items()):
         timed.setdefault(name, set()).update(row["budget"] for row in rows if row.get("budget"))
-    looks, colours = {}, (f"C{number}" for number in count())  # matplotlib's own, in turns
+    looks, colors = {}, (f"C{number}" for number in count())  # matplotlib's own, in turns
     for (name, budgets), mark in zip(timed.items(), cycle(MARKS), strict=False):
         looks[name] = {"color": FAINT, "ls": "--"}  # of what has no budget at all
         if budgets:
-            looks[name] = _look(mark, next(colours)) | {"ls": "-" if len(budgets) > 1 else ""}
+            looks[name] = _look(mark, next(colors)) | {"ls": "-" if len(budgets) > 1 else ""}
     with matplotlib.rc_context(STYLE):
         size = (2.2 + 2.8 * len(panels), 0.8 + 2.6 * len(metrics))
         figure = Figure(figsize=size, layout="constrained")
@@ -137,6 +137,6 @@ def _plot_rows(axes: Axes, rows: Sequence[Result], metric: str, look: Mapping[st
             axes.axhline(row[metric], color=look["color"], ls="--", zorder=1)
 
 
-def _look(mark: str, colour: str, hollow: bool = False) -> dict[str, Any]:
-    face = "none" if hollow else colour
-    return {"ls": "", "marker": mark, "color": colour, "mfc": face, "ms": 8, "alpha": 0.8}
+def _look(mark: str, color: str, hollow: bool = False) -> dict[str, Any]:
+    face = "none" if hollow else color
+    return {"ls": "", "marker": mark, "color": color, "mfc": face, "ms": 8, "alpha": 0.8}

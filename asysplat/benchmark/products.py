@@ -153,7 +153,7 @@ def sweep_sizes(pairs: int, planes: int, height: int, width: int) -> list[Size]:
     It has none itself; images are compared twice, first at half the size.
 
     Args:
-        pairs: of a view and a neighbour.
+        pairs: of a view and a neighbor.
     """
     pixels = height * width
     return [(pairs, size, SWEEP_TERMS, planes) for size in (pixels, pixels // 4)]

@@ -33,7 +33,7 @@ class Measurement:
     seconds: dict[Hashable, list[float]] = field(default_factory=dict)  # by `time_in_rounds`
 
     def summary(self, name: Hashable) -> Result:
-        """Summarise the seconds of this name."""
+        """Summarize the seconds of this name."""
         return summary(self.seconds[name])
 
 

@@ -11,7 +11,7 @@ from torch.utils.tensorboard import SummaryWriter
 from asysplat.benchmark.compare import Watched, watched_values
 from asysplat.benchmark.table import markdown
 from asysplat.benchmark.timing import Result
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 
 
 def write_results(
@@ -28,11 +28,11 @@ def write_results(
     numbers, text, picture = (path.with_suffix(end) for end in (".json", ".md", ".png"))
     written = json.dumps(results, indent=2, allow_nan=False) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replaced(numbers) as partial:
+    with atomic_write(numbers) as partial:
         partial.write_text(written)
-    with replaced(text) as partial:
+    with atomic_write(text) as partial:
         partial.write_text("\n".join(map(markdown, tables)))
-    with replaced(picture) as partial:
+    with atomic_write(picture) as partial:
         figure.savefig(partial, dpi=150)
     board = path.parent / "tensorboard" / path.name / results["revision"]
     with SummaryWriter(board, purge_step=0) as writer:

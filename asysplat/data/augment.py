@@ -108,7 +108,7 @@ def cropped(views: Views, share: float) -> Views:
     top, left = (height - rows) // 2, (width - columns) // 2
 
     images = views.images[..., top : top + rows, left : left + columns]
-    # The pixel under each new centre.
+    # The pixel under each new center.
     y = top + (torch.arange(height) + 0.5) * rows // height
     x = left + (torch.arange(width) + 0.5) * columns // width
     nearest = (..., y.long()[:, None], x.long())

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from asysplat.data.bad_frames import Policy
+from asysplat.data.bad_images import Policy
 from asysplat.data.cache import ImageCache
 from asysplat.data.datamodule import SceneDataModule
 from asysplat.data.sources import FilesSource, ProceduralSource, Source, Task
@@ -48,7 +48,7 @@ def files_data(
     width: int,
     window: Sequence[int],
     layout: str = "auto",
-    on_bad_frame: Policy = "fail",
+    on_bad_image: Policy = "fail",
     cache: ImageCache | None = None,
     disparities: str | None = None,
     test_root: str | None = None,
@@ -68,7 +68,7 @@ def files_data(
     make_source = partial(
         FilesSource,
         window=window,
-        on_bad_frame=on_bad_frame,
+        on_bad_image=on_bad_image,
         cache=cache,
         disparities=disparities,
     )

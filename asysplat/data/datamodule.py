@@ -13,13 +13,13 @@ import torch
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from asysplat.data.augment import Augmentation, cropped
-from asysplat.data.bad_frames import Policy
+from asysplat.data.bad_images import Policy
 from asysplat.data.batches import BatchSplit, split_batch
-from asysplat.data.capture import Capture
-from asysplat.data.loader import EpochLoader, batches_done, outlive_notice
-from asysplat.data.normalise import normalise
+from asysplat.data.loader import EpochLoader, batches_done, ignore_first_sigterm
+from asysplat.data.normalize import normalize
 from asysplat.data.points import depths_of_points
 from asysplat.data.selection import Selection, Split
+from asysplat.data.sequence import ImageSequence
 from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
@@ -158,7 +158,7 @@ class SceneDataModule(lightning.LightningDataModule):
             # The platform's own way: inside a joblib job the default is joblib's, which cannot
             # start these workers.
             multiprocessing_context=get_all_start_methods()[0] if self.num_workers else None,
-            worker_init_fn=outlive_notice,
+            worker_init_fn=ignore_first_sigterm,
             # Of its own: starting it draws from one, and a run that goes on starts it once more.
             generator=torch.Generator(),
         )
@@ -211,7 +211,7 @@ class TrainingTasks(Dataset):
         task = self.source.training(self.inputs, self.targets, rng)
         inputs = self.augmentation.order(task.selection.inputs, rng)
         share = self.augmentation.share(rng)
-        task = Task(task.capture, Selection(inputs, task.selection.targets))
+        task = Task(task.sequence, Selection(inputs, task.selection.targets))
         sample = load(task, share, self.points)
         inputs, targets = self.augmentation.expose(sample["inputs"], sample["targets"], rng)
         return {"scene": sample["scene"], "inputs": inputs, "targets": targets}
@@ -240,27 +240,27 @@ class FixedTasks(Dataset):
 
 
 def load(task: Task, share: float = 1.0, points: bool = False) -> Sample:
-    """Read a task's views, validate, crop to `share` of their sides, and normalise them.
+    """Read a task's views, validate, crop to `share` of their sides, and normalize them.
 
-    With `points`, the inputs have the depths of the capture's sparse points, if it has any. The
-    sample's `frame` says how it was normalised.
+    With `points`, the inputs have the depths of the sequence's sparse points, if it has any. The
+    sample's `frame` says how it was normalized.
     """
     inputs, targets = task.selection.inputs, task.selection.targets
     # A frame that is both input and target is decoded once.
     frames = list(dict.fromkeys(inputs + targets))
-    views = cropped(task.capture.views(frames).validate(task.capture.name), share)
+    views = cropped(task.sequence.views(frames).validate(task.sequence.name), share)
     inputs, targets = (
         views.select([frames.index(frame) for frame in chosen]) for chosen in (inputs, targets)
     )
     if points:
-        inputs = with_points(inputs, task.capture)
-    inputs, targets, frame = normalise(inputs, targets)
-    return {"scene": task.capture.name, "inputs": inputs, "targets": targets, "frame": frame}
+        inputs = with_points(inputs, task.sequence)
+    inputs, targets, frame = normalize(inputs, targets)
+    return {"scene": task.sequence.name, "inputs": inputs, "targets": targets, "frame": frame}
 
 
-def with_points(views: Views, capture: Capture) -> Views:
-    """Return the views with the depths of their capture's sparse points, if it has any."""
-    points = getattr(capture, "points", None)  # synthetic scenes have none
+def with_points(views: Views, sequence: ImageSequence) -> Views:
+    """Return the views with the depths of their sequence's sparse points, if it has any."""
+    points = getattr(sequence, "points", None)  # synthetic scenes have none
     if points is None:
         return views
     return replace(views, point_depths=depths_of_points(points, views.cameras))

@@ -1,6 +1,6 @@
 """Photographs, depth maps and masks from files, without lens distortion and at the asked size.
 
-Pixel positions count from the image's corner: the first pixel's centre is at +0.5. Nothing is ever
+Pixel positions count from the image's corner: the first pixel's center is at +0.5. Nothing is ever
 written. The exif orientation is not applied, since calibrations are for the pixels as stored.
 """
 
@@ -87,7 +87,7 @@ def load_photograph(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
     """Read RGB in 0..255; transparent pixels are laid on white.
 
     Raises:
-        InputError: the file is damaged, or holds more than 8 bits of grey (a depth map).
+        InputError: the file is damaged, or holds more than 8 bits of gray (a depth map).
     """
     return _read(path, _to_rgb)
 
@@ -135,18 +135,18 @@ def undistort(
 def resize_and_crop(
     pixels: Shaped[ndarray, "h w *channels"], height: int, width: int, nearest: bool = False
 ) -> Shaped[ndarray, "height width *channels"]:
-    """Crop to the largest centred part with the asked proportions; resample to `height` x `width`.
+    """Crop to the largest centerd part with the asked proportions; resample to `height` x `width`.
 
-    Antialiased (Lanczos), or the pixel under each new centre with `nearest`.
+    Antialiased (Lanczos), or the pixel under each new center with `nearest`.
     """
-    _, *box = _centred_box(pixels.shape[1], pixels.shape[0], height, width)
+    _, *box = _centerd_box(pixels.shape[1], pixels.shape[0], height, width)
     method = Image.Resampling.NEAREST if nearest else Image.Resampling.LANCZOS
     return np.asarray(Image.fromarray(pixels).resize((width, height), method, tuple(box)))
 
 
 def resized_intrinsics(lens: Lens, height: int, width: int) -> Float[ndarray, "3 3"]:
     """Return the pinhole matrix that belongs to the output of `resize_and_crop`."""
-    scale, left, top, _, _ = _centred_box(lens.width, lens.height, height, width)
+    scale, left, top, _, _ = _centerd_box(lens.width, lens.height, height, width)
     return np.array(
         [
             [lens.fx * scale, 0.0, (lens.cx - left) * scale],
@@ -156,12 +156,12 @@ def resized_intrinsics(lens: Lens, height: int, width: int) -> Float[ndarray, "3
     )
 
 
-def _centred_box(
+def _centerd_box(
     old_width: int, old_height: int, height: int, width: int
 ) -> tuple[float, float, float, float, float]:
     """Return the scale, and left, top, right, bottom in old pixels.
 
-    Fractions of pixels keep the box exactly centred.
+    Fractions of pixels keep the box exactly centerd.
     """
     scale = max(width / old_width, height / old_height)
     left = max(0.0, (old_width - width / scale) / 2)
@@ -175,7 +175,7 @@ def _undistortion_maps(
 ) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
     """Return x and y in the distorted image for each undistorted pixel."""
     scale_x, scale_y = width / lens.width, height / lens.height
-    # OpenCV puts the first pixel's centre at 0.
+    # OpenCV puts the first pixel's center at 0.
     matrix = np.array(
         [
             [lens.fx * scale_x, 0.0, lens.cx * scale_x - 0.5],

@@ -25,7 +25,7 @@ def batches_done(trainer: lightning.Trainer) -> int:
     return loop.epoch_loop.batch_progress.current.completed if began else 0
 
 
-def outlive_notice(_: int) -> None:
+def ignore_first_sigterm(_: int) -> None:
     """Ignore the first SIGTERM: a scheduler sends it to the loaders too, of a run that then saves.
 
     The second ends the process, so that it can be ended.

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.data.capture import Points
+from asysplat.data.sequence import Points
 from asysplat.scene import Cameras
 
 IN_A_WINDOW = 4  # points, on average: enough to meet the surface that hides a point

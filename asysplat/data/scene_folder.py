@@ -4,10 +4,10 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 
-from asysplat.data.bad_frames import Policy
+from asysplat.data.bad_images import Policy
 from asysplat.data.cache import ImageCache
-from asysplat.data.capture import PhotographCapture
 from asysplat.data.readers import find_scenes, open_scene
+from asysplat.data.sequence import FileSequence
 
 MOST_OPEN = 64
 
@@ -19,7 +19,7 @@ class SceneFolder(Sequence):
 
     Args:
         root: one scene, or a folder of scenes.
-        height, width, layout, on_bad_frame, cache, disparities: as `open_scene` takes them.
+        height, width, layout, on_bad_image, cache, disparities: as `open_scene` takes them.
 
     Raises:
         InputError: no scene; and, when a scene is opened, files that cannot be used.
@@ -31,7 +31,7 @@ class SceneFolder(Sequence):
         height: int,
         width: int,
         layout: str = "auto",
-        on_bad_frame: Policy = "fail",
+        on_bad_image: Policy = "fail",
         cache: ImageCache | None = None,
         disparities: str | None = None,
     ):
@@ -41,16 +41,16 @@ class SceneFolder(Sequence):
             "height": height,
             "width": width,
             "layout": self.layout,
-            "on_bad_frame": on_bad_frame,
+            "on_bad_image": on_bad_image,
             "cache": cache,
             "disparities": disparities,
         }
-        self._open: OrderedDict[int, PhotographCapture] = OrderedDict()
+        self._open: OrderedDict[int, FileSequence] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self.paths)
 
-    def __getitem__(self, index: int) -> PhotographCapture:
+    def __getitem__(self, index: int) -> FileSequence:
         if index not in self._open:
             self._open[index] = open_scene(self.paths[index], **self._options)
         self._open.move_to_end(index)

@@ -1,4 +1,4 @@
-"""Sources of tasks: which captures train, validate and test, and which of their frames."""
+"""Sources of tasks: which sequences train, validate and test, and which of their frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,9 +7,8 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from asysplat.data.bad_frames import Policy
+from asysplat.data.bad_images import Policy
 from asysplat.data.cache import ImageCache
-from asysplat.data.capture import Capture, PhotographCapture
 from asysplat.data.procedural import ProceduralScene, split_seed
 from asysplat.data.scene_folder import SceneFolder
 from asysplat.data.selection import (
@@ -22,14 +21,15 @@ from asysplat.data.selection import (
     uniform_selection,
 )
 from asysplat.data.selection.index import read_index
+from asysplat.data.sequence import FileSequence, ImageSequence
 from asysplat.errors import InputError
 
 
 @dataclass(frozen=True)
 class Task:
-    """One reconstruction: the frames of a capture that are given and those to predict."""
+    """One reconstruction: the frames of a sequence that are given and those to predict."""
 
-    capture: Capture
+    sequence: ImageSequence
     selection: Selection
 
 
@@ -107,7 +107,7 @@ class FilesSource:
         root: one scene, or a folder of scenes.
         height, width: size of every view, in pixels.
         window: as for ProceduralSource.
-        layout, on_bad_frame, cache, disparities: as `open_scene` takes them.
+        layout, on_bad_image, cache, disparities: as `open_scene` takes them.
         test_root: one scene, or a folder of scenes.
         selection: how the frames of a test are chosen: every_8th, kmeans (the paper's tests),
             first_96 (its ablations), uniform, or index.
@@ -128,7 +128,7 @@ class FilesSource:
         width: int,
         window: Sequence[int],
         layout: str = "auto",
-        on_bad_frame: Policy = "fail",
+        on_bad_image: Policy = "fail",
         cache: ImageCache | None = None,
         disparities: str | None = None,
         test_root: str | None = None,
@@ -139,7 +139,7 @@ class FilesSource:
     ):
         def scenes(option: str, folder: str) -> SceneFolder:
             try:
-                return SceneFolder(folder, height, width, layout, on_bad_frame, cache, disparities)
+                return SceneFolder(folder, height, width, layout, on_bad_image, cache, disparities)
             except InputError as error:
                 raise InputError(f"data.{option}={folder}: {error}") from error
 
@@ -155,24 +155,24 @@ class FilesSource:
                 f"data.selection is {selection} and data.index is {index}: give both "
                 "data.selection=index and data.index=path, or neither."
             )
-        if selection == "index" and on_bad_frame == "skip":
+        if selection == "index" and on_bad_image == "skip":
             raise InputError(
-                "data.on_bad_frame=skip changes the numbers of the frames that data.index names: "
-                "set it to fail, and mend the frames."
+                "data.on_bad_image=skip changes the numbers of the frames that data.index names: "
+                "set it to fail, and fix the frames."
             )
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
-        capture = self.scenes[self._trained[rng.integers(len(self._trained))]]
+        sequence = self.scenes[self._trained[rng.integers(len(self._trained))]]
         frames = (
-            range(capture.num_frames)
+            range(sequence.num_frames)
             if self.split_by_scenes
-            else training_frames(capture.num_frames)
+            else training_frames(sequence.num_frames)
         )
         drawn = training_selection(
             len(frames), inputs, targets, self.window, rng, self.targets_may_be_inputs
         )
         chosen = Selection([frames[i] for i in drawn.inputs], [frames[i] for i in drawn.targets])
-        return Task(capture, chosen)
+        return Task(sequence, chosen)
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
         if split == "test" and self.selection == "index":
@@ -180,12 +180,12 @@ class FilesSource:
         selection = "every_8th" if self.selection == "index" else self.selection
         validated = (self.scenes[scene] for scene in self._validated)
         return [
-            Task(capture, named_selection(selection, capture.cameras, inputs, targets, split))
-            for capture in (self._tested if split == "test" else validated)
+            Task(sequence, named_selection(selection, sequence.cameras, inputs, targets, split))
+            for sequence in (self._tested if split == "test" else validated)
         ]
 
     @cached_property
-    def _tested(self) -> list[PhotographCapture]:
+    def _tested(self) -> list[FileSequence]:
         return list(self.tested)
 
     @cached_property
@@ -194,7 +194,7 @@ class FilesSource:
         scenes = range(len(self.scenes))
         if not self.split_by_scenes:
             return list(scenes)
-        names = {capture.name for capture in self._tested}
+        names = {sequence.name for sequence in self._tested}
         return [scene for scene in scenes if names.isdisjoint(self.scenes.folders(scene))]
 
     @cached_property
@@ -221,11 +221,11 @@ class FilesSource:
     def _indexed(self, inputs: int) -> list[Task]:
         index = read_index(self.index, inputs)
         tasks = [
-            Task(capture, index.selection(capture.name, capture.cameras, inputs))
-            for capture in self._tested
-            if capture.name in index.entries
+            Task(sequence, index.selection(sequence.name, sequence.cameras, inputs))
+            for sequence in self._tested
+            if sequence.name in index.entries
         ]
-        lacking = set(index.entries) - {task.capture.name for task in tasks}
+        lacking = set(index.entries) - {task.sequence.name for task in tasks}
         if lacking:
             raise InputError(
                 f"data.index={self.index} names {len(lacking)} scenes that are not there, such as "

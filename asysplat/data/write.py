@@ -20,7 +20,7 @@ def write_transforms(views: Views, folder: Path) -> None:
     """Write one scene: transforms.json, images/NNNNN.png, and depth/NNNNN.png where known.
 
     Matrices are camera-to-world with OpenGL axes (x right, y up, z backward). cx and cy are in
-    pixels with the first pixel's centre at +0.5, as in `Cameras`. Depths are 16-bit PNG of
+    pixels with the first pixel's center at +0.5, as in `Cameras`. Depths are 16-bit PNG of
     thousandths of a scene unit along the camera's z axis, 0 where unknown. Format:
     https://docs.nerf.studio/quickstart/data_conventions.html
 

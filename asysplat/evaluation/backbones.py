@@ -93,7 +93,7 @@ class VGGFeatures(nn.Module):
         name: of the network.
         weights: what `find_backbone(name, ...)` returned.
         taps: indices of the layers of torchvision's `features` whose outputs are returned.
-        std: RGB; images, less ImageNet's mean colour, are divided by it.
+        std: RGB; images, less ImageNet's mean color, are divided by it.
         mean_pooling: whether to pool by the mean in place of the maximum.
     """
 

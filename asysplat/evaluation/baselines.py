@@ -7,19 +7,19 @@ from torch import Tensor
 from asysplat.scene import Cameras, Views
 
 
-def mean_colour(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
-    """Fill every target with one colour: the mean of all input pixels of its scene."""
-    colour = inputs.images.mean((-4, -2, -1))
-    return colour[..., None, :, None, None].expand_as(targets.images)
+def mean_color(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
+    """Fill every target with one color: the mean of all input pixels of its scene."""
+    color = inputs.images.mean((-4, -2, -1))
+    return color[..., None, :, None, None].expand_as(targets.images)
 
 
 def nearest_view(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
     """Copy for every target the input view nearest to it; all images have one size.
 
     The nearest has the smallest distance / spread + angle / pi: the distance between the camera
-    centres, the spread (the largest distance between two input centres), and the angle between the
+    centers, the spread (the largest distance between two input centers), and the angle between the
     viewing directions.
-    Where all inputs share one centre, the angle alone decides.
+    Where all inputs share one center, the angle alone decides.
     """
     nearest = _dissimilarity(targets.cameras, inputs.cameras).argmin(-1)
     return inputs.images.take_along_dim(nearest[..., None, None, None], dim=-4)

@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 
 ImageRow = dict[str, str | float]
 # What a row is of: its other columns are numbers that have a mean.
@@ -39,7 +39,7 @@ def write_csv(path: Path, rows: Sequence[ImageRow]) -> None:
 
     The file appears complete or not at all.
     """
-    with replaced(path) as partial, partial.open("w", newline="") as file:
+    with atomic_write(path) as partial, partial.open("w", newline="") as file:
         columns = dict.fromkeys(name for row in rows for name in row)
         writer = csv.DictWriter(file, fieldnames=list(columns))
         writer.writeheader()

@@ -7,21 +7,21 @@ from pathlib import Path
 from typing import Literal
 
 from asysplat.evaluation.measured_cost import mean_but_longest
-from asysplat.evaluation.post_optimisation import SceneResult
+from asysplat.evaluation.post_optimization import SceneResult
 from asysplat.evaluation.rows import ImageRow, average
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 
 Scenes = Mapping[str, Sequence[SceneResult]]  # by test set, the data set's own first
 
 
-def keep_scene(path: Path, result: SceneResult) -> None:
+def save_result(path: Path, result: SceneResult) -> None:
     """Write what was measured of a scene, whole or not at all."""
-    with replaced(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(json.dumps(asdict(result)))
 
 
-def kept_scene(path: Path) -> SceneResult | None:
-    """Read what `keep_scene` has written; None if there is no such file."""
+def load_result(path: Path) -> SceneResult | None:
+    """Read what `save_result` has written; None if there is no such file."""
     return SceneResult(**json.loads(path.read_text())) if path.exists() else None
 
 

@@ -7,17 +7,17 @@ import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from torch.utils.data import Dataset
 
-from asysplat.evaluation.pictures import comparison
-from asysplat.evaluation.post_optimisation import PostOptimisation, Predict, SceneResult
-from asysplat.evaluation.scene_results import keep_scene, kept_scene, scene_rows
-from asysplat.files import replaced
+from asysplat.evaluation.figures import comparison
+from asysplat.evaluation.post_optimization import PostOptimization, Predict, SceneResult
+from asysplat.evaluation.scene_results import load_result, save_result, scene_rows
+from asysplat.files import atomic_write
 from asysplat.rendering import Rendering
 
 
 def measure_scenes(
     tests: Mapping[str, Dataset],
     predict: Predict,
-    measure: PostOptimisation,
+    measure: PostOptimization,
     device: torch.device,
     folder: Path,
     kept: Path,
@@ -28,7 +28,7 @@ def measure_scenes(
     Args:
         tests: by test set, that of the data itself first, its scenes: their name, `scene`, and
             `inputs` and `targets`.
-        predict, measure: see `PostOptimisation`.
+        predict, measure: see `PostOptimization`.
         device: where to work.
         folder: for pictures/evaluation-post<steps>.png: the first scene at the first and the last
             of the steps.
@@ -51,7 +51,7 @@ def measure_scenes(
             def watch(step: int, rendering: Rendering | None) -> None:
                 bars.update(steps, completed=step)
                 if (name, index) == (main, 0) and step in (measure.steps[0], last):
-                    with replaced(drawn[step]) as partial:
+                    with atomic_write(drawn[step]) as partial:
                         comparison(inputs, targets, rendering).savefig(partial, dpi=100)
 
             result = measure(sample["scene"], predict, inputs, targets, watch)
@@ -64,10 +64,10 @@ def measure_scenes(
             found[name] = []
             for index in range(len(samples)):
                 path = kept / f"{name}-{index}.json"
-                result = kept_scene(path)
+                result = load_result(path)
                 if result is None:
                     result = measured(name, index)
-                    keep_scene(path, result)
+                    save_result(path, result)
                 found[name].append(result)
                 bars.advance(scenes)
     return found
@@ -76,4 +76,4 @@ def measure_scenes(
 def _told(name: str, result: SceneResult) -> str:
     rows = [row for row in scene_rows({name: [result]}) if row["source"] in result.costs]
     steps = ", ".join(f"{row['source'].removeprefix('post')}: {row['psnr']:.2f}" for row in rows)
-    return f"{name} {result.scene}, PSNR after steps of post-optimisation: {steps}"
+    return f"{name} {result.scene}, PSNR after steps of post-optimization: {steps}"

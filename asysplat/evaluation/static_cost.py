@@ -16,7 +16,7 @@ GIGA = 1e9
 
 
 def blank_views(num_views: int, height: int, width: int) -> Views:
-    """Make one scene's views with uninitialised content, on torch's default device."""
+    """Make one scene's views with uninitialized content, on torch's default device."""
     intrinsics, poses = torch.empty(1, num_views, 3, 3), torch.empty(1, num_views, 4, 4)
     images = torch.empty(1, num_views, 3, height, width)
     return Views(Cameras(intrinsics, poses, height, width), images)

@@ -36,7 +36,7 @@ class Frame:
         centers = cameras.centers.double().cpu()
         center = centers.mean(0)
         radius = (centers - center).norm(dim=-1).max()
-        # Smaller differences between the centres are rounding.
+        # Smaller differences between the centers are rounding.
         if radius > 1e-6 * centers.abs().max():
             return cls(center, radius.item())
         if gaussians is None:

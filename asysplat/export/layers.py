@@ -1,4 +1,4 @@
-"""A scene as the viewer shows it, from any camera: colours, depths, alphas or errors."""
+"""A scene as the viewer shows it, from any camera: colors, depths, alphas or errors."""
 
 from dataclasses import dataclass, replace
 
@@ -10,11 +10,11 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from asysplat.evaluation.pictures import ERROR_RANGE, disparity
+from asysplat.evaluation.figures import ERROR_RANGE, disparity
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 
-LAYERS = ("colour", "depth", "alpha", "error")
+LAYERS = ("color", "depth", "alpha", "error")
 THUMBNAIL = 96  # longer side, in pixels
 SAMPLED = 10_000  # pixels from which the range of depths is found
 
@@ -24,14 +24,14 @@ class Look:
     """Which layer of a scene is drawn, and from what of its Gaussians.
 
     Args:
-        layer: "colour"; "depth": its inverse, the nearest bright; "alpha"; or "error": how far the
-            colour is from a photograph's, black where nothing was photographed.
+        layer: "color"; "depth": its inverse, the nearest bright; "alpha"; or "error": how far the
+            color is from a photograph's, black where nothing was photographed.
         sh_degree: SH of higher degrees are left out.
         least_opacity: Gaussians of lower opacity are left out.
         size: factor of the scales, > 0.
     """
 
-    layer: str = "colour"
+    layer: str = "color"
     sh_degree: int = 3
     least_opacity: float = 0.0
     size: float = 1.0
@@ -41,13 +41,13 @@ class Look:
 def draw(
     gaussians: Gaussians, camera: Cameras, look: Look, photograph: Tensor | None = None
 ) -> UInt8[ndarray, "H W 3"]:
-    """Render one layer of a scene, as colours.
+    """Render one layer of a scene, as colors.
 
     Args:
         gaussians: [N].
         camera: one view.
         photograph: RGB [3, H, W] in [0, 1] that the camera should see, NaN where that is unknown;
-            without one the layer "error" shows the colour.
+            without one the layer "error" shows the color.
     """
     opacities = gaussians.opacities
     shown = replace(
@@ -71,9 +71,9 @@ def draw(
 
 
 def _mapped(values: Float[Tensor, "H W"], name: str) -> UInt8[ndarray, "H W 3"]:
-    """Give values in [0, 1] the colours of a matplotlib map; what is above has the last one."""
-    colours = colormaps[name](np.arange(256), bytes=True)[:, :3]
-    return colours[(255 * values.clamp(0, 1)).round().byte().cpu().numpy()]
+    """Give values in [0, 1] the colors of a matplotlib map; what is above has the last one."""
+    colors = colormaps[name](np.arange(256), bytes=True)[:, :3]
+    return colors[(255 * values.clamp(0, 1)).round().byte().cpu().numpy()]
 
 
 def photograph_at(
@@ -101,14 +101,14 @@ def photograph_at(
     directions = camera.rays()[1] @ taken.cameras.cam_to_world[0, :3, :3]
     x, y, z = (directions @ taken.cameras.intrinsics[0].mT).unbind(-1)
     place = torch.stack((x / z / taken.cameras.width, y / z / taken.cameras.height), -1) * 2 - 1
-    colours = grid_sample(taken.images, place, padding_mode="border", align_corners=False)[0]
+    colors = grid_sample(taken.images, place, padding_mode="border", align_corners=False)[0]
     known = ((z > 0) & (place.abs() <= 1).all(-1))[0]
     if taken.masks is not None:
         counts = grid_sample(
             taken.masks[None].to(place), place, mode="nearest", align_corners=False
         )
         known = known & (counts[0, 0] > 0)
-    return colours.where(known, torch.nan)
+    return colors.where(known, torch.nan)
 
 
 def thumbnail(image: Float[Tensor, "3 H W"]) -> UInt8[ndarray, "h w 3"]:

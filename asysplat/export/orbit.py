@@ -10,7 +10,7 @@ from asysplat.scene import Cameras
 PARALLEL = 0.01  # mean square of the angles between axes and their mean: 6 degrees
 AHEAD = 4.0  # times the cameras' spread: how far what they show is, where axes do not tell
 MOST_TILTED = 0.5  # the cosine between the world's up and the cameras' mean up: 60 degrees
-WIDEST_GAP = np.radians(90)  # between neighbours on a circle that is seen from all around
+WIDEST_GAP = np.radians(90)  # between neighbors on a circle that is seen from all around
 LEAST_SWING = np.radians(5)  # to either side
 STEEPEST = 10.0  # times the radius: a distance from which no camera looks straight down
 

@@ -45,7 +45,7 @@ def smoothed_path(cameras: Cameras, frames: int) -> Cameras:
 
 
 def _short_order(features: Float[ndarray, "V 12"]) -> Int[ndarray, " V"]:
-    """Return the given order, or that of nearest neighbours if it is far shorter.
+    """Return the given order, or that of nearest neighbors if it is far shorter.
 
     This starts with the view that is farthest from the mean: an end of the way.
     """
@@ -69,7 +69,7 @@ def _smoothed(
         way: from the first pose to each, increasing.
 
     Returns:
-        centres and quaternions wxyz of any length, close together.
+        centers and quaternions wxyz of any length, close together.
     """
     # Here, as these would slow down import asysplat.
     from scipy.interpolate import CubicSpline
@@ -80,7 +80,7 @@ def _smoothed(
     centers = CubicSpline(way, poses[:, :3, 3])(samples)
     quats = RotationSpline(way, Rotation.from_matrix(poses[:, :3, :3]))(samples)
     quats = quats.as_quat(scalar_first=True)
-    # q and -q are the same rotation: neighbours get the same sign.
+    # q and -q are the same rotation: neighbors get the same sign.
     flips = (quats[1:] * quats[:-1]).sum(1) < 0
     quats[1:] *= np.where(flips, -1, 1).cumprod()[:, None]
     states = np.concatenate((centers, quats), 1)

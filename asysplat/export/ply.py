@@ -1,7 +1,7 @@
 """Gaussians as PLY, in the layout of Kerbl et al. 2023 that trainers and viewers share.
 
 A vertex is a Gaussian, its properties are float32: the mean, a normal that nobody uses, SH (of
-degree 0, then all others of one colour after another), the logit of the opacity, the logarithms of
+degree 0, then all others of one color after another), the logit of the opacity, the logarithms of
 the scales, and a quaternion wxyz.
 """
 
@@ -14,7 +14,7 @@ from numpy.lib.recfunctions import structured_to_unstructured
 from asysplat.errors import InputError
 from asysplat.export.checks import TINY, as_read, as_written, existing
 from asysplat.export.ply_table import read_vertices
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 
 MEAN, NORMAL, COLOR = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -27,7 +27,7 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     """Write one scene as binary little-endian PLY.
 
     Args:
-        gaussians: without batch dimension; quaternions are normalised, and an opacity of 1 is
+        gaussians: without batch dimension; quaternions are normalized, and an opacity of 1 is
             written as 1 - 1e-7.
 
     Raises:
@@ -54,7 +54,7 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
         *(f"property float {name}" for name in names),
         "end_header\n",
     ]
-    with replaced(path) as partial, open(partial, "wb") as file:
+    with atomic_write(path) as partial, open(partial, "wb") as file:
         file.write("\n".join(header).encode())
         file.write(table.data)
 

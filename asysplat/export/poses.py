@@ -39,7 +39,7 @@ def with_poses(cameras: Cameras, poses: Float[ndarray, "T 4 4"]) -> Cameras:
 
 
 def spread(poses: Float[ndarray, "V 4 4"]) -> float:
-    """Return the centres' distance from their mean (root mean square), 0 where it is rounding."""
+    """Return the centers' distance from their mean (root mean square), 0 where it is rounding."""
     centers = poses[:, :3, 3]
     size = float(np.sqrt(np.square(centers - centers.mean(0)).sum(1).mean()))
     return size if size > SAME * np.abs(centers).max() else 0.0

@@ -15,19 +15,19 @@ from rich.table import Table
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.evaluation.baselines import mean_colour as mean_colour_images
+from asysplat.evaluation.baselines import mean_color as mean_color_images
 from asysplat.evaluation.baselines import nearest_view
+from asysplat.evaluation.figures import comparison
 from asysplat.evaluation.lpips import load_lpips
-from asysplat.evaluation.pictures import comparison
 from asysplat.evaluation.scene import measure_scene
 from asysplat.export.orbit import orbit
 from asysplat.export.path import smoothed_path
 from asysplat.export.ply import write_ply
 from asysplat.export.tensors import write_safetensors
 from asysplat.export.video import write_video
-from asysplat.files import replaced
-from asysplat.reconstruction.photographs import Photographs
-from asysplat.reconstruction.refine import Progress
+from asysplat.files import atomic_write
+from asysplat.refinement.photographs import Photographs
+from asysplat.refinement.refine import RefinementProgress
 from asysplat.rendering import Rendering, render
 from asysplat.scene import Cameras, Gaussians, Views
 from asysplat.training.summary import write_json
@@ -81,18 +81,18 @@ class Results:
         self._save("start.png", contact_sheet(gaussians, photographs, background))
         print(f"picture: {self.folder / 'start.png'}")
 
-    def hand_over(
+    def save(
         self,
         gaussians: Gaussians,
         photographs: Photographs,
         background: Float[Tensor, "3"],
-        progress: Progress | None,
+        progress: RefinementProgress | None,
     ) -> None:
         """Write the scene first, then pictures, numbers and the video."""
-        world = photographs.frame.undo(gaussians)
+        world = photographs.frame.to_world(gaussians)
         write_ply(self.folder / "scene.ply", world)
-        colour = " ".join(f"{value:.6f}" for value in background.tolist())
-        write_safetensors(self.folder / "scene.safetensors", world, {"background": colour})
+        color = " ".join(f"{value:.6f}" for value in background.tolist())
+        write_safetensors(self.folder / "scene.safetensors", world, {"background": color})
         OmegaConf.save(self._config, self.folder / "config.yaml", resolve=True)
         self._save("contact.png", contact_sheet(gaussians, photographs, background))
         self._numbers(gaussians, photographs, background, progress)
@@ -105,7 +105,7 @@ class Results:
         gaussians: Gaussians,
         photographs: Photographs,
         background: Float[Tensor, "3"],
-        progress: Progress | None,
+        progress: RefinementProgress | None,
     ) -> None:
         """Write metrics.json and metrics.csv, and print the table."""
         results: dict[str, float | int | str] = {"gaussians": gaussians.num_gaussians}
@@ -115,26 +115,26 @@ class Results:
         inputs, rows = photographs.inputs, []
         sets = {"inputs": (inputs, photographs.input_files)}
         if photographs.measured is not None:
-            sets["held_back"] = (photographs.measured, photographs.measured_files)
+            sets["held_out"] = (photographs.measured, photographs.measured_files)
         for name, (views, files) in sets.items():
             found = measure_scene(gaussians, views, background, self._protocol, self._lpips)
             results |= {f"{name}/{metric}": _mean(values) for metric, values in found.items()}
             for view, file in enumerate(files):
                 rows.append({"set": name, "file": file, **{m: v[view] for m, v in found.items()}})
         if photographs.measured is not None:
-            results |= self._for_nothing(inputs, photographs.measured)
+            results |= self._baselines(inputs, photographs.measured)
         write_json(self.folder / "metrics.json", results)
-        with replaced(self.folder / "metrics.csv") as path, open(path, "w", newline="") as file:
+        with atomic_write(self.folder / "metrics.csv") as path, open(path, "w", newline="") as file:
             writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
             writer.writeheader()
             writer.writerows(rows)
         _print_table(results)
 
-    def _for_nothing(self, inputs: Views, measured: Views) -> dict[str, float]:
+    def _baselines(self, inputs: Views, measured: Views) -> dict[str, float]:
         """Measure what one gets without a reconstruction."""
         drawn = {
             "nearest_view": nearest_view(inputs, measured),
-            "mean_colour": mean_colour_images(inputs, measured),
+            "mean_color": mean_color_images(inputs, measured),
         }
         found: dict[str, list[float]] = {}
         for name, images in drawn.items():
@@ -159,7 +159,7 @@ class Results:
         write_video(self.folder / "path.mp4", frames(), video.fps)
 
     def _save(self, name: str, figure: Figure) -> None:
-        with replaced(self.folder / name) as path:
+        with atomic_write(self.folder / name) as path:
             figure.savefig(path, dpi=DPI)
 
 
@@ -167,7 +167,7 @@ class Results:
 def contact_sheet(
     gaussians: Gaussians, photographs: Photographs, background: Float[Tensor, "3"]
 ) -> Figure:
-    """Draw some views, held back ones if there are any: photograph, rendering, error, depth."""
+    """Draw some views, held out ones if there are any: photograph, rendering, error, depth."""
     views = photographs.inputs if photographs.measured is None else photographs.measured
     chosen = torch.linspace(0, views.num_views - 1, min(ROWS, views.num_views)).round().long()
     views = views.select(chosen)
@@ -187,10 +187,10 @@ def _mean(values: list[float]) -> float:
 
 def _print_table(results: dict[str, float | int | str]) -> None:
     rows = {
-        "held_back": "held back",
+        "held_out": "held out",
         "inputs": "inputs",
         "baseline/nearest_view": "nearest view, copied",
-        "baseline/mean_colour": "mean colour",
+        "baseline/mean_color": "mean color",
     }
     metrics = ("psnr", "ssim", "lpips", "absrel", "delta1")
     shown = [m for m in metrics if any(f"{row}/{m}" in results for row in rows)]

@@ -14,7 +14,7 @@ ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("qu
 
 
 def read_splat(path: str | Path) -> Gaussians:
-    """Read a .splat file: N Gaussians with SH of degree 0, colours and rotations of 8 bits.
+    """Read a .splat file: N Gaussians with SH of degree 0, colors and rotations of 8 bits.
 
     Scales are stored as they are, alpha is the opacity, rotations are (v - 128) / 128, wxyz.
     Format: https://github.com/antimatter15/splat

@@ -8,7 +8,7 @@ from safetensors.torch import save
 
 from asysplat.errors import InputError
 from asysplat.export.checks import as_read, as_written, existing
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 
 NAMES = tuple(field.name for field in fields(Gaussians))
@@ -28,7 +28,7 @@ def write_safetensors(
     """
     gaussians = as_written(gaussians)
     content = save({name: getattr(gaussians, name).contiguous() for name in NAMES}, metadata)
-    with replaced(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_bytes(content)
 
 

@@ -10,7 +10,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 
 ENCODING = {"crf": "18"}  # x264's quality: hardly to be told from the images
 BT709 = 1  # its number in H.264
@@ -42,7 +42,7 @@ def write_video(
     if not fps > 0:
         raise InputError(f"fps is {fps}: give frames a second, more than 0.")
     stream = None
-    with replaced(path) as partial, av.open(partial, "w", options=INDEX_FIRST) as container:
+    with atomic_write(path) as partial, av.open(partial, "w", options=INDEX_FIRST) as container:
         for index, image in enumerate(images):
             pixels = _pixels(image, f"image {index} of {path}")
             if stream is None:
@@ -68,7 +68,7 @@ def write_video(
 def _pixels(image: Float[Tensor, "3 H W"], where: str) -> UInt8[ndarray, "H2 W2 3"]:
     """Return an image in 8 bits, its height and width even."""
     if image.isnan().any():
-        raise InputError(f"{where} holds NaN: render finite colours.")
+        raise InputError(f"{where} holds NaN: render finite colors.")
     height, width = image.shape[1:]
     levels = (image.detach().cpu().clamp(0, 1) * 255).round()
     padding = (0, width % 2, 0, height % 2)

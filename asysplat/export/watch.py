@@ -9,7 +9,7 @@ from rich import progress
 from rich.console import Console
 
 from asysplat.export.viewer import Viewer
-from asysplat.reconstruction.refine import Progress, Refinement
+from asysplat.refinement.refine import Refinement, RefinementProgress
 from asysplat.scene import Gaussians, Views
 
 SHOWN_EVERY = 1.0  # seconds between two states that the viewer is given
@@ -18,7 +18,7 @@ STDERR = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class Watch:
+class RefinementDisplay:
     """A progress bar, and a viewer if wanted; Ctrl-C ends the refinement after its step.
 
     Use it as a context: the signals are its own until its end, and from the first one on those of
@@ -30,7 +30,7 @@ class Watch:
     """
 
     def __init__(self, views: Views, view: bool):
-        self.last: Progress | None = None
+        self.last: RefinementProgress | None = None
         self.stopped = False
         self._console = Console()
         self._told = self._shown = time.monotonic()
@@ -39,7 +39,7 @@ class Watch:
             self._viewer = Viewer(views)
             print(f"viewer: {self._viewer.url}")
 
-    def __enter__(self) -> "Watch":
+    def __enter__(self) -> "RefinementDisplay":
         self._before = {number: signal.signal(number, self._stop) for number in SIGNALS}
         self._bar = progress.Progress(
             progress.TextColumn("refining"),
@@ -64,7 +64,7 @@ class Watch:
         if self._viewer is not None:
             self._viewer.close()
 
-    def __call__(self, now: Progress, refinement: Refinement) -> bool:
+    def __call__(self, now: RefinementProgress, refinement: Refinement) -> bool:
         """Show how far it is; return whether to stop."""
         self.last = now
         text = f"step {now.step}, PSNR {now.psnr:.2f} dB, {now.gaussians:,} Gaussians"

@@ -3,13 +3,13 @@
 from asysplat.models.asysplat import AsySplat, build_asysplat
 from asysplat.models.attention import FullAttention, SparseAttention
 from asysplat.models.bilateral import CoarseReadsFine, FineReadsCoarse, NoLink
+from asysplat.models.early_exit import EarlyExit
 from asysplat.models.head import GaussianHead, LongLRMHead, PhotographHead
 from asysplat.models.mamba2 import BiMamba2
 from asysplat.models.mamba_vision import MambaVision
-from asysplat.models.prior import DepthPrior, PointsPrior, SweepPrior
+from asysplat.models.prior import DepthPrior, PlaneSweepPrior, PointsPrior
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.single_branch import SingleBranch, build_single_branch
-from asysplat.models.skips import SceneSkips
 from asysplat.models.source import CoarseSource, FineSource, MergedSource
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "CoarseReadsFine",
     "CoarseSource",
     "DepthPrior",
+    "EarlyExit",
     "FineReadsCoarse",
     "FineSource",
     "FullAttention",
@@ -27,12 +28,11 @@ __all__ = [
     "MergedSource",
     "NoLink",
     "PhotographHead",
+    "PlaneSweepPrior",
     "PointsPrior",
-    "SceneSkips",
     "SingleBranch",
     "SparseAttention",
     "StageShape",
-    "SweepPrior",
     "Widths",
     "build_asysplat",
     "build_single_branch",

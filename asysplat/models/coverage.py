@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from asysplat.models.early_exit import EarlyExit
 from asysplat.models.prior import Prior
-from asysplat.models.skips import SceneSkips
 from asysplat.scene import Cameras
 
 SAMPLES = 16  # of a view's pixels along a side: what is covered is counted on these
@@ -13,7 +13,7 @@ SURE = 0.5  # confidence of a sample that another view may stand for
 SAME = 0.1  # relative difference of two distances to one surface
 
 
-def views_to_look_at(skips: SceneSkips, prior: Prior, cameras: Cameras) -> list[int]:
+def views_to_look_at(skips: EarlyExit, prior: Prior, cameras: Cameras) -> list[int]:
     """Return the numbers of the views that a network has to look at, ascending; perhaps none.
 
     Args:

@@ -23,14 +23,14 @@ SURE = 0.3  # times that where it is
 UNBOUNDED = 10.0  # in scenes of which it knows nothing
 MOST_OPACITY = 0.5
 MOST_SIZE = 1.0
-SH_C0 = 0.28209479177387814  # Y_0, so that colour = 0.5 + SH_C0 * sh_0
+SH_C0 = 0.28209479177387814  # Y_0, so that color = 0.5 + SH_C0 * sh_0
 
 
 class GaussianHead(nn.Module, ABC):
     """LayerNorm and Linear: each token gives p_f x p_f Gaussians.
 
     There is one for each pixel of the image downsampled by p_c / p_f, on the ray through that
-    pixel's centre.
+    pixel's center.
 
     Args:
         width: d_3.
@@ -128,13 +128,13 @@ class GaussianHead(nn.Module, ABC):
 class PhotographHead(GaussianHead):
     """Our own head: an untrained model draws its input photographs at a middle distance.
 
-    Training therefore starts from pictures. Colours are residuals to the downsampled photograph,
+    Training therefore starts from pictures. Colors are residuals to the downsampled photograph,
     sizes are in units of the pixel's footprint, distances logarithmic. The photograph bypasses both
-    branches: what the appearance branch adds is less than with colours of its own.
+    branches: what the appearance branch adds is less than with colors of its own.
 
     Args:
         width, patch_coarse, patch_fine, sh_degree, opacity_bias: of GaussianHead.
-        near, far: distances along the ray lie between them, in units of the normalised scene.
+        near, far: distances along the ray lie between them, in units of the normalized scene.
         scale_bias: log of an untrained size, in pixel footprints.
     """
 
@@ -188,15 +188,15 @@ class PhotographHead(GaussianHead):
 class LongLRMHead(GaussianHead):
     """The head of Long-LRM (Ziwen et al. 2025), with the values of its configs/7m1t_tm.yaml.
 
-    Colours and sizes are direct, sizes in units of the scene and at most e^largest; the distance
-    along the ray is linear from 0 to `farthest`. Lengths are those of the normalised scene, whose
-    input cameras stand within radius 1 (`asysplat.data.normalise`); Long-LRM's stand in the box
+    Colors and sizes are direct, sizes in units of the scene and at most e^largest; the distance
+    along the ray is linear from 0 to `farthest`. Lengths are those of the normalized scene, whose
+    input cameras stand within radius 1 (`asysplat.data.normalize`); Long-LRM's stand in the box
     [-1, 1]^3, so its scenes are up to sqrt(3) times larger. It draws with a near
     plane at 0.01, as `asysplat.rendering` does, and a far one at 1e6, beyond all that is predicted.
 
     Args:
         width, patch_coarse, patch_fine, sh_degree, opacity_bias: of GaussianHead.
-        farthest: distance, in units of the normalised scene.
+        farthest: distance, in units of the normalized scene.
         scale_bias: log of an untrained size.
         largest: log of the largest size.
     """

@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.models.coverage import views_to_look_at
+from asysplat.models.early_exit import EXACT, EarlyExit
 from asysplat.models.head import GaussianHead
 from asysplat.models.layers import Layers
 from asysplat.models.prior import PRIOR_CHANNELS, Prior
 from asysplat.models.shapes import Widths
-from asysplat.models.skips import EXACT, SceneSkips
 from asysplat.models.tokenizer import PIXEL_CHANNELS, pixel_features
 from asysplat.ops.precision import without_autocast
 from asysplat.scene import Gaussians, Views
@@ -39,7 +39,7 @@ class Network(nn.Module, ABC):
     def __init__(self, widths: Widths, patch: int, prior: nn.Module | None):
         super().__init__()
         self.widths, self.patch, self.prior = widths, patch, prior
-        self.skips: SceneSkips = EXACT
+        self.early_exit: EarlyExit = EXACT
         self.skipped: dict[str, float] = {}
 
     def forward(self, views: Views) -> Gaussians:
@@ -51,7 +51,7 @@ class Network(nn.Module, ABC):
         """
         self.check_size(views.cameras.height, views.cameras.width)
         batch = views.images.shape[:-4]
-        exact = self.training or self.skips == EXACT
+        exact = self.training or self.early_exit == EXACT
         predict = self.predict if exact else self.predict_needed
         self.skipped.clear()
         gaussians = predict(with_one_batch_dimension(views))
@@ -64,13 +64,13 @@ class Network(nn.Module, ABC):
 
     def predict_needed(self, views: Views) -> Gaussians:
         """Predict Gaussians [1, N] from views [1, V] as far as the scene needs it; see `skips`."""
-        self.check_skips(self.skips)
+        self.check_early_exit(self.early_exit)
         if len(views.images) != 1:
             raise InputError(
                 f"the network's skips got {len(views.images)} scenes at a time: each has Gaussians "
                 "of another number; give one, or set speed=exact."
             )
-        skips, prior = self.skips, self.ask(views)
+        skips, prior = self.early_exit, self.ask(views)
         looked, without = views_to_look_at(skips, prior, views.cameras), ()
         if skips.sure is not None and prior.confidence.mean() >= skips.sure:
             without = self.dispensable
@@ -145,12 +145,12 @@ class Network(nn.Module, ABC):
             if isinstance(module, Layers):
                 module.checkpointing = checkpointing
 
-    def check_skips(self, skips: SceneSkips) -> None:
+    def check_early_exit(self, skips: EarlyExit) -> None:
         """Raise InputError for skips that this network cannot take: they look at its prior."""
         if skips != EXACT and self.prior is None:
             raise InputError(
                 "speed: this model has no prior, by which skips judge a scene: set speed=exact, or "
-                "model/prior=sweep."
+                "model/prior=plane_sweep."
             )
 
     @property

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from asysplat.ops import plane_sweep
-from asysplat.ops.plane_sweep import NEIGHBOURS, PLANES, SweptDepth
+from asysplat.ops.plane_sweep import NEIGHBORS, PLANES, SweptDepth
 from asysplat.ops.plane_sweep.agreement import Depths, fill, other_views, votes
 from asysplat.ops.plane_sweep.cameras import Projections, observed_range
 from asysplat.ops.plane_sweep.images import shrink
@@ -97,22 +97,22 @@ class Prior(TensorRecord):
         )
 
 
-class SweepPrior(nn.Module):
-    """Depth from a plane sweep over each view's neighbours (`asysplat.ops.plane_sweep`).
+class PlaneSweepPrior(nn.Module):
+    """Depth from a plane sweep over each view's neighbors (`asysplat.ops.plane_sweep`).
 
     Large images are swept at a size that suits the number of planes. How far is swept follows from
     the cameras, and in views that see enough sparse points from those.
 
     Args:
-        planes, neighbours: see `plane_sweep`.
+        planes, neighbors: see `plane_sweep`.
         longest_side: of the images that are swept, pixels.
     """
 
     def __init__(
-        self, planes: int = PLANES, neighbours: int = NEIGHBOURS, longest_side: int = LONGEST_SIDE
+        self, planes: int = PLANES, neighbors: int = NEIGHBORS, longest_side: int = LONGEST_SIDE
     ):
         super().__init__()
-        self.planes, self.neighbours, self.longest_side = planes, neighbours, longest_side
+        self.planes, self.neighbors, self.longest_side = planes, neighbors, longest_side
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
         height, width, factor = views.cameras.height, views.cameras.width, 1
@@ -129,7 +129,7 @@ class SweepPrior(nn.Module):
             small,
             stride=BLOCK,
             planes=self.planes,
-            neighbours=self.neighbours,
+            neighbors=self.neighbors,
             ranges=ranges,
         )
         return Prior.of_depths(found, views, size)

@@ -14,8 +14,8 @@ PIXEL_CHANNELS = 9
 def pixel_features(views: Views, prior: Prior | None) -> Float[Tensor, "B V H W c"]:
     """Return RGB in [-1, 1], ray moment o x d, unit direction d and the prior of every pixel."""
     origins, directions = views.cameras.rays()
-    colours = rearrange(views.images, "b v c h w -> b v h w c") * 2 - 1
-    features = [colours, torch.linalg.cross(origins, directions), directions]
+    colors = rearrange(views.images, "b v c h w -> b v h w c") * 2 - 1
+    features = [colors, torch.linalg.cross(origins, directions), directions]
     if prior is not None:
         features.append(prior.features(views.cameras.height, views.cameras.width))
     return torch.cat(features, dim=-1)

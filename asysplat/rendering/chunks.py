@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
-from asysplat.rendering.interface import RenderOutputs, Settings
+from asysplat.rendering.interface import RenderOutputs, RenderSettings
 from asysplat.scene import Cameras, Gaussians
 
-Draw = Callable[[Gaussians, Cameras, Settings, Tensor | None], RenderOutputs]
+Draw = Callable[[Gaussians, Cameras, RenderSettings, Tensor | None], RenderOutputs]
 PER_VIEW = ("cam_to_world", "intrinsics")
 NAMES = (*(field.name for field in dataclasses.fields(Gaussians)), *PER_VIEW)
 SAME_IN_ALL = ("tile_size",)  # statistics that do not add up
@@ -22,7 +22,7 @@ def draw_in_chunks(
     draw: Draw,
     gaussians: Gaussians,
     cameras: Cameras,
-    settings: Settings,
+    settings: RenderSettings,
     masks: Tensor | None,
     views_at_once: int | None,
 ) -> RenderOutputs:
@@ -54,7 +54,7 @@ def _draw(
     draw: Draw,
     gaussians: Gaussians,
     cameras: Cameras,
-    settings: Settings,
+    settings: RenderSettings,
     masks: Tensor | None,
     views_at_once: int,
 ) -> RenderOutputs:
@@ -72,7 +72,7 @@ class _Job:
     """How to draw some of the views; `stats` is filled on the way."""
 
     draw: Draw
-    settings: Settings
+    settings: RenderSettings
     masks: Tensor | None
     height: int
     width: int

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from asysplat.rendering.interface import Convention
 
-# Columns of a camera's row: its axes and centre in the world; intrinsics in pixels; the least and
+# Columns of a camera's row: its axes and center in the world; intrinsics in pixels; the least and
 # the greatest x / z and y / z that the Jacobian is taken at. Only the first 16 have a gradient.
 RIGHT, DOWN, FORWARD, CENTER, FX, FY, CX, CY = 0, 3, 6, 9, 12, 13, 14, 15
 LOW_X, HIGH_X, LOW_Y, HIGH_Y = range(16, 20)
@@ -24,7 +24,7 @@ WHITEN_TO_LOG2 = math.sqrt(0.5 / math.log(2))  # exp(-x^2 / 2) = 2^-(WHITEN_TO_L
 EXPONENT_MARGIN = 1e-3  # of log2 alpha
 PIXEL_MARGIN = 1e-3
 
-FARTHEST = 2.0**30  # pixels; a centre farther outside the image is kept as an offset from here
+FARTHEST = 2.0**30  # pixels; a center farther outside the image is kept as an offset from here
 
 # Factors of the spherical harmonics (SH), by degree and order.
 Y0 = 0.5 / math.sqrt(math.pi)

@@ -57,14 +57,14 @@ CONVENTIONS = {"inria": INRIA, "gsplat-1.5": GSPLAT_1_5}
 
 
 @dataclass(frozen=True)
-class Skips:
+class Culling:
     """Work that is left out without changing a bit of the image or of a gradient.
 
     Each skip can be switched off.
 
     Args:
         opacity: Gaussians below alpha_min are culled before they are projected.
-        frustum: Gaussians that show in no pixel of the image are culled before their colour is
+        frustum: Gaussians that show in no pixel of the image are culled before their color is
             computed.
         extent: a splat ends where its own alpha falls below alpha_min, not where that of an opaque
             one does.
@@ -83,20 +83,20 @@ class Skips:
     rows: bool = True
     opaque: bool = True
 
-    def without(self, name: str) -> "Skips":
+    def without(self, name: str) -> "Culling":
         """Return these skips with `name` switched off."""
-        return Skips(**{f.name: getattr(self, f.name) and f.name != name for f in fields(self)})
+        return Culling(**{f.name: getattr(self, f.name) and f.name != name for f in fields(self)})
 
 
 @dataclass(frozen=True)
-class Settings:
+class RenderSettings:
     """How to draw.
 
     Args:
         convention: cut-offs of alpha compositing.
         antialiased: opacity is lowered by what eps2d adds to a splat's area (Yu et al. 2024).
         depth: one of DEPTHS, or None.
-        skips: work to leave out.
+        culling: work to leave out.
 
     Raises:
         InputError: an unknown depth.
@@ -105,7 +105,7 @@ class Settings:
     convention: Convention = INRIA
     antialiased: bool = False
     depth: str | None = "expected"
-    skips: Skips = Skips()
+    culling: Culling = Culling()
 
     def __post_init__(self):
         """Check the name of the depth."""

@@ -13,7 +13,7 @@ from asysplat.ops.dispatch import pick_backend
 from asysplat.ops.precision import without_autocast
 from asysplat.rendering import cpu, reference
 from asysplat.rendering.chunks import draw_in_chunks
-from asysplat.rendering.interface import INRIA, Convention, RenderOutputs, Settings, Skips
+from asysplat.rendering.interface import INRIA, Convention, Culling, RenderOutputs, RenderSettings
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
 DEPTH_SWITCH = {True: "expected", False: None}  # what depth=True and depth=False stand for
@@ -21,7 +21,7 @@ ALPHA_TINY = 1e-6  # an alpha below 1/255 is exactly 0, so any value between wil
 
 
 def _draw_by_cuda(
-    gaussians: Gaussians, cameras: Cameras, settings: Settings, masks: Tensor | None = None
+    gaussians: Gaussians, cameras: Cameras, settings: RenderSettings, masks: Tensor | None = None
 ) -> RenderOutputs:
     """Import Triton at the first call only: a machine without a GPU may lack it."""
     try:
@@ -62,7 +62,7 @@ def render(
     antialiased: bool = False,
     sh_degree: int | None = None,
     convention: Convention = INRIA,
-    skips: Skips = Skips(),  # noqa: B008
+    culling: Culling = Culling(),  # noqa: B008
     masks: Bool[Tensor, "*batch V H W"] | None = None,
     views_at_once: int | None = None,
     validate: bool = False,
@@ -85,7 +85,7 @@ def render(
         antialiased: lower opacities by what the dilation adds to a splat's area (Yu et al. 2024).
         sh_degree: leave SH of higher degrees out.
         convention: cut-offs of alpha compositing; see `CONVENTIONS`.
-        skips: exact skips, each of which can be switched off.
+        culling: exact culling, each of which can be switched off.
         masks: True where a pixel counts; the others show the background, and tiles without a pixel
             that counts cost nothing.
         views_at_once: draw this many views of each scene at a time, keep nothing but the inputs,
@@ -106,7 +106,7 @@ def render(
     batch = _check(gaussians, cameras, background, masks)
     dtype = torch.promote_types(gaussians.means.dtype, cameras.cam_to_world.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    settings = Settings(convention, antialiased, DEPTH_SWITCH.get(depth, depth), skips)
+    settings = RenderSettings(convention, antialiased, DEPTH_SWITCH.get(depth, depth), culling)
     with without_autocast(gaussians.means):
         scenes = gaussians.map(lambda t: _one_batch(t.to(dtype), batch))
         if sh_degree is not None:
@@ -132,7 +132,7 @@ def render(
         return Rendering(image, alpha, distance, out.stats)
 
 
-def _depth(out: RenderOutputs, settings: Settings) -> Tensor:
+def _depth(out: RenderOutputs, settings: RenderSettings) -> Tensor:
     """Compute the depth [I, H, W] of the kind that was asked for."""
     if settings.depth == "median":
         return out.depth

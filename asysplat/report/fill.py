@@ -19,8 +19,8 @@ from asysplat.training.stages import describe_stage, stage_configs
 Compose = Callable[[Sequence[str]], DictConfig]
 Runs = dict[str, list[Run]]  # by config_hash, oldest first
 
-BASELINES = ("mean_colour", "nearest_view")
-# Columns that every run measures: their keys in metrics.json, without and with post-optimisation.
+BASELINES = ("mean_color", "nearest_view")
+# Columns that every run measures: their keys in metrics.json, without and with post-optimization.
 MEASURED = {
     "seconds_per_step": ("cost/seconds_per_step", None),
     "train_gb": ("cost/peak_gb", None),
@@ -88,7 +88,7 @@ def with_costs(filled: FilledTable, compose: Compose) -> FilledTable:
 
     rows = [
         row
-        if row.paper.quoted or row.paper.post_optimisation
+        if row.paper.quoted or row.paper.post_optimization
         else replace(
             row,
             costs=costs(row.paper.run, row.paper),
@@ -149,11 +149,11 @@ def _measured_row(
 
 def _result_key(column: str, row: PaperRow, sets: dict[str, str]) -> str | None:
     """Return the key of a number in metrics.json or evaluation.json; None where no run has it."""
-    steps = row.post_optimisation
+    steps = row.post_optimization
     if column in MEASURED:
-        plain, optimised = MEASURED[column]
+        plain, optimized = MEASURED[column]
         if steps:
-            return optimised and optimised.format(steps)
+            return optimized and optimized.format(steps)
         return plain.replace("cost/", f"cost/{row.test_set}/") if row.test_set else plain
     paper_set, _, metric = column.partition("/")
     if not metric:
@@ -165,8 +165,8 @@ def _result_key(column: str, row: PaperRow, sets: dict[str, str]) -> str | None:
 def _note(
     row: PaperRow, values: dict[str, list[Number]], runs: dict[int, Run], wanted: Sequence[int]
 ) -> str:
-    if row.post_optimisation and not values:
-        return "not run: python evaluate.py run=... adds post-optimisation to a finished run"
+    if row.post_optimization and not values:
+        return "not run: python evaluate.py run=... adds post-optimization to a finished run"
     missing = [str(seed) for seed in wanted if seed not in runs]
     if values and missing:
         return f"seeds still to run: {', '.join(missing)}"

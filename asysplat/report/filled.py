@@ -92,8 +92,8 @@ class FilledTable:
 
     @property
     def networks(self) -> list[FilledRow]:
-        """List the rows without post-optimisation, which changes no cost of the network."""
-        return [row for row in self.rows if row.paper.post_optimisation == 0]
+        """List the rows without post-optimization, which changes no cost of the network."""
+        return [row for row in self.rows if row.paper.post_optimization == 0]
 
     def our_title(self, column: Column) -> str:
         """Return the title of our numbers: a set that stands for the paper's has its own name."""

@@ -40,7 +40,7 @@ def pareto_front(points: Sequence[Point], better: str) -> list[Point]:
 
 
 def draw_front(
-    axes: Axes, points: Sequence[Point], better: str, colour: str, hollow: Collection[str] = ()
+    axes: Axes, points: Sequence[Point], better: str, color: str, hollow: Collection[str] = ()
 ) -> None:
     """Draw the front as a line, the other points faded; each has its name.
 
@@ -49,14 +49,14 @@ def draw_front(
     Args:
         points: at least one.
         better: "higher" or "lower", of the quality.
-        colour: of the front.
+        color: of the front.
         hollow: names of points to leave unfilled.
     """
     front = pareto_front(points, better)
     rest = [point for point in points if point not in front]
-    axes.plot([p[1] for p in front], [p[2] for p in front], "-", color=colour)
+    axes.plot([p[1] for p in front], [p[2] for p in front], "-", color=color)
     for point in points:
-        own, alpha = (colour, 1.0) if point in front else (FAINT, 0.7)
+        own, alpha = (color, 1.0) if point in front else (FAINT, 0.7)
         face = "none" if point[0] in hollow else own
         axes.plot(*point[1:], "o", color=own, mfc=face, ms=6 if point in rest else 7, alpha=alpha)
     axes.margins(x=0.2, y=0.18)
@@ -70,7 +70,7 @@ def draw_front(
 
 
 def _label(
-    axes: Axes, point: Point, colour: str, places: Sequence[Place], taken: list[Bbox]
+    axes: Axes, point: Point, color: str, places: Sequence[Place], taken: list[Bbox]
 ) -> None:
     """Write a name at the first place that is free, or at the last if it is the first again."""
     for number, place in enumerate(places):
@@ -81,7 +81,7 @@ def _label(
             textcoords="offset points",
             ha=place.ha,
             va=place.va,
-            color=colour,
+            color=color,
             fontsize=FONT,
         )
         box = text.get_window_extent()

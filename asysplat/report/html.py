@@ -24,7 +24,7 @@ TEMPLATES = Environment(
 )
 
 
-# In a page the colours are the page's variables, so that a dark page has light ink.
+# In a page the colors are the page's variables, so that a dark page has light ink.
 VARIABLES = {INK: "--ink", FAINT: "--faint", OURS: "--ours", PAPER: "--paper"}
 
 
@@ -60,6 +60,6 @@ def inline_svg(figure: Figure, salt: str) -> str:
     text = re.sub(r'<svg width="[^"]*" height="[^"]*"', "<svg", text)
     text = re.sub(r"font-family: [^;\"]*;", "", text)
     text = re.sub(r'<g id="[^"]*"', "<g", text)
-    for colour, variable in VARIABLES.items():
-        text = text.replace(colour, f"var({variable})")
+    for color, variable in VARIABLES.items():
+        text = text.replace(color, f"var({variable})")
     return text

@@ -4,7 +4,7 @@ from asysplat.report.filled import CLEAR_SIGNAL, FilledTable, RankAgreement, ran
 from asysplat.report.paper import kind_titles, set_titles
 from asysplat.report.sheet import Note
 
-BASELINES = {"mean_colour": "mean colour", "nearest_view": "nearest view, copied"}
+BASELINES = {"mean_color": "mean color", "nearest_view": "nearest view, copied"}
 
 
 def notes(filled: FilledTable) -> list[Note]:

@@ -77,7 +77,7 @@ class PaperRow:
         run: overrides of train.py that give it; None for a method that is only quoted.
         views, size: input views, height and width that its costs are computed at.
         bounds: column key -> what the paper prints where it gives only a bound: "<1".
-        post_optimisation: steps on the Gaussians; such rows need evaluate.py.
+        post_optimization: steps on the Gaussians; such rows need evaluate.py.
         test_set: of the run, in the place of the stand-in; None for the stand-in.
         unverified: why the architecture of this row is not known to be the paper's; None where it
             is.
@@ -90,7 +90,7 @@ class PaperRow:
     views: int
     size: tuple[int, int]
     bounds: dict[str, str] = field(default_factory=dict)
-    post_optimisation: int = 0
+    post_optimization: int = 0
     test_set: str | None = None
     unverified: str | None = None
     readings: tuple[Reading, ...] = ()
@@ -230,7 +230,7 @@ def _row(row: dict, table: dict) -> PaperRow:
         views=row.get("views", table["views"]),
         size=tuple(row.get("size", table["size"])),
         bounds={k: v for k, v in printed.items() if isinstance(v, str)},
-        post_optimisation=row.get("post_optimisation", 0),
+        post_optimization=row.get("post_optimization", 0),
         test_set=row.get("test_set"),
         unverified=row.get("unverified"),
         readings=tuple(

@@ -106,8 +106,8 @@ def _our_line(axes: Axes, rows: Sequence[FilledRow], column: Column) -> None:
     axes.errorbar([_ratio(row) for row in run], means, spreads, fmt="o-", color=OURS, capsize=3)
 
 
-def _dots(axes: Axes, x: Sequence[Number], y: Sequence[Number], colour: str) -> None:
-    axes.plot(x, y, "o", color=colour, ms=6, alpha=0.45, mew=0)
+def _dots(axes: Axes, x: Sequence[Number], y: Sequence[Number], color: str) -> None:
+    axes.plot(x, y, "o", color=color, ms=6, alpha=0.45, mew=0)
 
 
 def _first_metrics(filled: FilledTable) -> list[Column]:

@@ -30,7 +30,7 @@ class Grid:
     rows: tuple[tuple[Cell, ...], ...]
 
     def groups(self) -> list[tuple[str, list[int]]]:
-        """Group neighbouring columns by title: each title and the numbers of its columns."""
+        """Group neighboring columns by title: each title and the numbers of its columns."""
         found: list[tuple[str, list[int]]] = []
         for number, heading in enumerate(self.headings):
             if heading.part and found and found[-1][0] == heading.title:

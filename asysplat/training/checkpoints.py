@@ -14,9 +14,9 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from asysplat.errors import InputError
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 
-SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_sweep.safetensors"
+SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_plane_sweep.safetensors"
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # of a run, to go on from
 LISTED = 5  # differences between a file and a model
 
@@ -99,7 +99,7 @@ def read_notes(path: Path) -> dict[str, Any]:
     return torch.load(path, map_location="meta", mmap=True, weights_only=True)
 
 
-def what_differs(notes: Mapping[str, Any], config: Mapping[str, Any], revision: str) -> list[str]:
+def config_diff(notes: Mapping[str, Any], config: Mapping[str, Any], revision: str) -> list[str]:
     """List how a run that goes on is not the one that wrote a checkpoint: its bits will differ.
 
     Args:
@@ -205,7 +205,7 @@ def save_weights(weights: Mapping[str, Tensor], path: Path) -> None:
         name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
         for name, tensor in weights.items()
     }
-    with replaced(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_bytes(save(halves))
 
 
@@ -215,7 +215,7 @@ def write_whole(values: Any, path: Path) -> None:
     Raises:
         InputError: there is no room, or one may not write there.
     """
-    with replaced(path) as partial, open(partial, "wb") as file:
+    with atomic_write(path) as partial, open(partial, "wb") as file:
         try:
             torch.save(values, file)
         except RuntimeError as error:

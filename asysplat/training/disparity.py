@@ -103,7 +103,7 @@ def disparity_distance(
     target: Float[Tensor, "*batch V H W"],
     valid: Bool[Tensor, "*batch V H W"],
 ) -> Float[Tensor, ""]:
-    """Compute the mean over scenes of the mean SmoothL1 between normalised disparities.
+    """Compute the mean over scenes of the mean SmoothL1 between normalized disparities.
 
     The inner mean is over a scene's valid pixels.
 
@@ -113,7 +113,7 @@ def disparity_distance(
         valid: where both are known.
     """
     found, expected = (
-        normalised_disparity(maps.flatten(0, -3), valid.flatten(0, -3)).view_as(maps)
+        normalized_disparity(maps.flatten(0, -3), valid.flatten(0, -3)).view_as(maps)
         for maps in (1 / torch.where(valid, depth, 1), target)
     )
     error = F.smooth_l1_loss(found, expected, reduction="none") * valid
@@ -121,7 +121,7 @@ def disparity_distance(
     return (error.sum(of_scene) / valid.sum(of_scene).clamp_min(1)).mean()
 
 
-def normalised_disparity(
+def normalized_disparity(
     disparity: Float[Tensor, "V H W"], valid: Bool[Tensor, "V H W"]
 ) -> Float[Tensor, "V H W"]:
     """Compute the disparity less its median, over its mean absolute deviation; 0 if not valid.

@@ -50,8 +50,8 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
 def _default_network(overrides: Sequence[str]) -> Network:
     config = _default_config(overrides)
     net = instantiate(config.model)
-    net.skips = instantiate(config.speed)
-    net.check_skips(net.skips)
+    net.early_exit = instantiate(config.speed)
+    net.check_early_exit(net.early_exit)
     return net
 
 

@@ -14,8 +14,8 @@ from asysplat.training.outcome import Outcome
 from asysplat.training.perceptual import PerceptualDistance, vgg16
 
 
-class ReconstructionLoss(nn.Module):
-    """MSE + lambda_p perceptual + lambda_d normalised-disparity SmoothL1, and two more.
+class SplattingLoss(nn.Module):
+    """MSE + lambda_p perceptual + lambda_d normalized-disparity SmoothL1, and two more.
 
     Ours is 1 - SSIM, which wants edges as the perceptual term does, at little cost and without
     weights to fetch; Long-LRM's the mean opacity, which wants Gaussians that do nothing gone.

@@ -19,7 +19,7 @@ class Held:
 
     Args:
         micro_batch: scenes.
-        checkpoint_layers, views_at_once: see `Reconstruction`.
+        checkpoint_layers, views_at_once: see `SplattingModule`.
     """
 
     micro_batch: int

@@ -32,7 +32,7 @@ def first_non_finite(module: LightningModule, batch: Batch) -> str | None:
     first, and gradients of parameters.
 
     Args:
-        module: has `terms(batch)`, of which "loss" is minimised. It is left as it was.
+        module: has `terms(batch)`, of which "loss" is minimized. It is left as it was.
         batch: inputs and targets, both Views.
     """
     found: list[str] = []

@@ -42,7 +42,7 @@ class PerceptualDistance(nn.Module):
 def vgg16(backbone_dir: str | None = None, download: bool = False) -> PerceptualDistance | None:
     """Build the mean over VGG16's ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016).
 
-    Images are normalised as ImageNet's are.
+    Images are normalized as ImageNet's are.
 
     Args:
         backbone_dir: folder that may hold the network's weights.

@@ -20,7 +20,7 @@ from asysplat.evaluation.cost import GB, memory_gb, peak_memory_gb
 from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.evaluation.static_cost import Activations, count_activations
 from asysplat.training.memory import IMAGE_BYTES, PERCEPTUAL_BYTES, Held, Sizes
-from asysplat.training.reconstruction import Reconstruction
+from asysplat.training.module import SplattingModule
 from asysplat.training.sharded import ShardedStrategy
 
 SAVED_BYTES = 12  # of a parameter in a checkpoint, which has no gradients
@@ -67,7 +67,7 @@ class Plan:
 
 def make_plan(
     trainer: lightning.Trainer,
-    module: Reconstruction,
+    module: SplattingModule,
     costs: Mapping[str, float | int],
     held_gb: float,
 ) -> Plan:
@@ -124,7 +124,7 @@ def make_plan(
 
 def _sizes(
     trainer: lightning.Trainer,
-    module: Reconstruction,
+    module: SplattingModule,
     costs: Mapping[str, float | int],
     sample: Sample,
 ) -> Sizes:
@@ -148,7 +148,7 @@ def _sizes(
 
 
 def _try(
-    trainer: lightning.Trainer, module: Reconstruction, sample: Sample, split: BatchSplit
+    trainer: lightning.Trainer, module: SplattingModule, sample: Sample, split: BatchSplit
 ) -> tuple[float, float]:
     """Return the seconds of a step, and by how many GB a micro-batch lets the memory rise."""
     batch = collate([sample] * split.micro_batch)

@@ -1,6 +1,6 @@
 """Turn a run into a model to ship: its weights in half precision, and a card that says what it is.
 
-python -m asysplat.training.publish logs/asysplat/2026-01-31_12-00-00 checkpoints/asysplat_sweep
+python -m asysplat.training.publish logs/asysplat/2026-01-31_12-00-00 checkpoints/my_model
 """
 
 import csv
@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 from asysplat.training.checkpoints import save_weights
 from asysplat.training.summary import METRICS
 
@@ -53,7 +53,7 @@ def publish(run: Path, target: Path) -> None:
     before = card.read_text() if card.exists() else ""
     limits = before[before.index(LIMITS) :] if LIMITS in before else ""
     text = _card(target.name, run, results, saved["global_step"], size) + limits
-    with replaced(card) as partial:
+    with atomic_write(card) as partial:
         partial.write_text(text)
 
 
@@ -70,7 +70,7 @@ def _card(
         for label, source in (
             ("this model", f"test/{data}"),
             ("nearest input view, copied", f"baseline/{data}/nearest_view"),
-            ("mean colour of the inputs", f"baseline/{data}/mean_colour"),
+            ("mean color of the inputs", f"baseline/{data}/mean_color"),
         )
     ]
     with open(run / "curve.csv", newline="") as file:

@@ -31,7 +31,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
             *("steps", "validate_every", "state_size"),
             *("data.inputs", "data.targets", "data.height", "data.width", "data.batch_size"),
             *("data.val_scenes", "data.test_scenes", "data.micro_batch", "trainer.num_nodes"),
-            *("callbacks.guard.budget", "callbacks.watch.every"),
+            *("callbacks.guard.budget", "callbacks.monitor.every"),
         ),
     ),
     (
@@ -44,7 +44,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         lambda value: is_whole(value) and value >= 0,
         (
             *("data.num_workers", "training.schedule.warmup_steps"),
-            *("callbacks.pictures.scenes", "callbacks.skips.budget"),
+            *("callbacks.figures.scenes", "callbacks.bad_scenes.budget"),
         ),
     ),
     (

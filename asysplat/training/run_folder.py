@@ -37,7 +37,7 @@ def run_folder(asked: str | None, runs: str, fresh: str) -> str:
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[None]:
     """Keep a run's folder to this process, and those that it trains with, until the end.
 
     Raises:

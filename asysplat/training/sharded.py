@@ -6,7 +6,7 @@ from lightning.pytorch.strategies import ModelParallelStrategy
 class ShardedStrategy(ModelParallelStrategy):
     """Divides weights and batches among all processes of all nodes (FSDP2, also on CPUs).
 
-    `Reconstruction.configure_model` divides the weights. A checkpoint is one file with all of them,
+    `configure_model` of the module divides the weights. A checkpoint is one file with all of them,
     which one process reads as well.
     """
 

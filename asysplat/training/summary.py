@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from asysplat.evaluation.measured_cost import SECONDS
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 
 Results = dict[str, float | int | str]  # flat, as in metrics.json
 
@@ -17,7 +17,7 @@ METRICS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "absrel": "Abs
 METRICS["delta1"] = "delta<1.25"
 BASELINES = {
     "nearest view, copied": "baseline/{}/nearest_view",
-    "mean colour": "baseline/{}/mean_colour",
+    "mean color": "baseline/{}/mean_color",
 }
 SOURCES = {"trained": "test/{}"} | BASELINES
 
@@ -32,7 +32,7 @@ def write_json(path: Path, results: Results) -> None:
         for key, value in results.items()
     }
     finite["protocol/seconds"] = SECONDS
-    with replaced(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
 
 
@@ -68,8 +68,8 @@ def psnr_table(results: Results, names: list[str]) -> Table:
     return table
 
 
-def post_optimisation_table(results: Results, name: str, costs: str) -> Table:
-    """Make the table of one test set after steps of post-optimisation, and of its inputs' PSNR.
+def post_optimization_table(results: Results, name: str, costs: str) -> Table:
+    """Make the table of one test set after steps of post-optimization, and of its inputs' PSNR.
 
     Args:
         results: as in evaluation.json.
@@ -145,7 +145,7 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
     console = Console()
     for name in sets:
         costs = "cost" if name == sets[0] else f"cost/{name}"
-        console.print(post_optimisation_table(results, name, costs))
+        console.print(post_optimization_table(results, name, costs))
     for picture in sorted((folder / "pictures").glob("evaluation-*.png")):
         console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"evaluation: {folder}", soft_wrap=True)

@@ -12,10 +12,10 @@ from asysplat.benchmark.compare import compare
 from asysplat.benchmark.machine import describe_machine
 
 NAMES = ["ssd", "selective_scan", "plane_sweep", "render", "refinement", "image_loss", "adam"]
-NAMES += ["asysplat_sweep"]
+NAMES += ["asysplat_plane_sweep"]
 
 
-@pytest.mark.hours  # CI runs them by make bench
+@pytest.mark.slow  # CI runs them by make bench
 def test_every_pair_runs(repository):
     with initialize_config_dir(str(repository / "conf"), version_base=None):
         pairs = list(make_pairs())

@@ -1,4 +1,4 @@
-"""Two made-up files of a suite: what is named, and what the exit status says."""
+"""Two synthetic files of a suite: what is named, and what the exit status says."""
 
 import json
 from copy import deepcopy

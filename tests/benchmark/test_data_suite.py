@@ -12,7 +12,7 @@ from asysplat.benchmark.data.suite import CACHES, plot, tables
 from asysplat.data import open_scene
 from asysplat.data.images import content_hash
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.medium
 
 OVERRIDES = {"scale": "laptop", "width": 0.125, "state_size": 8}
 

@@ -19,7 +19,7 @@ from asysplat.errors import InputError
 from asysplat.evaluation.cost import true_flops
 from asysplat.evaluation.static_cost import blank_views
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.medium
 
 CPU = torch.device("cpu")
 OVERRIDES = {"scale": "laptop", "width": 0.125, "state_size": 8}

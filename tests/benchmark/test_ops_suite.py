@@ -27,7 +27,7 @@ from asysplat.errors import InputError
 from asysplat.evaluation.cost import true_flops
 from asysplat.scene import Cameras
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.medium
 
 CPU = torch.device("cpu")
 BOUNDS = {"fp32": 2e-6, "bf16": 1e-2}
@@ -52,7 +52,7 @@ TINY = {
         "width": 32,
         "stride": 2,
         "planes": 20,
-        "neighbours": 2,
+        "neighbors": 2,
     },
     "loop_tokens": LOOP_TOKENS,
     "exact": {
@@ -227,7 +227,7 @@ def test_a_wrong_size_is_not_taken_for_a_path_that_is_not_there():
 
 def test_a_sweep_is_of_a_wall_that_can_be_found():
     sizes = {"batch": 2, "views": 4, "height": 24, "width": 32}
-    case = SweepCase("plane_sweep", sizes | {"stride": 2, "planes": 24, "neighbours": 3})
+    case = SweepCase("plane_sweep", sizes | {"stride": 2, "planes": 24, "neighbors": 3})
     tensors = case.tensors()
     assert tensors["images"].min() >= 0 and tensors["images"].max() <= 1
     found = case.run({name: tensor.float() for name, tensor in tensors.items()}, "cpu")
@@ -245,7 +245,7 @@ def test_a_sweep_is_of_a_wall_that_can_be_found():
 
 def test_products_of_a_sweep_multiply_as_often_as_its_costs():
     sizes = {"batch": 1, "views": 3, "height": 16, "width": 24, "stride": 2, "planes": 20}
-    case = SweepCase("plane_sweep", sizes | {"neighbours": 2})
+    case = SweepCase("plane_sweep", sizes | {"neighbors": 2})
     counts = products(case.products(), torch.float32, CPU)
     costs = 3 * 2 * 20 * (16 * 24 + 8 * 12)
     assert flops_of(counts) == 2 * SWEEP_TERMS * costs

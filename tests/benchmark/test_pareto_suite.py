@@ -13,10 +13,10 @@ from asysplat.benchmark.pareto import suite
 from asysplat.benchmark.pareto.measured import picture_error
 from asysplat.benchmark.pareto.scenes import find_scenes
 from asysplat.benchmark.pareto.settings import BASE, FAMILIES, find_settings
-from asysplat.benchmark.pareto.shown import plot, summarise, tables
+from asysplat.benchmark.pareto.shown import plot, summarize, tables
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
-from asysplat.reconstruction import mean_colour
+from asysplat.refinement import mean_color
 from asysplat.rendering import render
 from asysplat.training.load import load
 
@@ -72,7 +72,7 @@ def room(tmp_path_factory):
     return scenes["room"]()
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_rows_are_complete_and_strict(measured):
     options, results = measured
     json.dumps(results, allow_nan=False)
@@ -97,7 +97,7 @@ def test_rows_are_complete_and_strict(measured):
         assert (ratio["median"], ratio["iqr"]) == (1, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_what_is_absent_is_not_measured(measured):
     _, results = measured
     absent = results["not_measured"]
@@ -108,7 +108,7 @@ def test_what_is_absent_is_not_measured(measured):
     assert "not measured: fern, " in captions[-1]
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_errors_grow_with_what_is_left_out(measured):
     _, results = measured
     errors = {(r["family"], r["setting"]): r["error"] for r in results["rows"] if r["error"]}
@@ -120,7 +120,7 @@ def test_errors_grow_with_what_is_left_out(measured):
     assert min(decibels["networks", BASE], decibels["networks", "8m"]) > 70
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_row_is_what_the_network_and_the_renderer_give(measured, room):
     _, results = measured
     row = results["rows"][0]
@@ -128,7 +128,7 @@ def test_a_row_is_what_the_network_and_the_renderer_give(measured, room):
     assert inputs.num_views == 3 and room.inputs.num_views > 3
     with torch.no_grad():
         gaussians = load()(inputs)
-        image = render(gaussians, targets.cameras, mean_colour(inputs), depth=False).image
+        image = render(gaussians, targets.cameras, mean_color(inputs), depth=False).image
     assert row["psnr"] == pytest.approx(psnr(image, targets.images).mean().item(), abs=1e-4)
 
 
@@ -189,7 +189,7 @@ MADE_UP = [
 
 
 def test_means_are_over_scenes():
-    found = {(row["family"], row["setting"]): row for row in summarise(MADE_UP)}
+    found = {(row["family"], row["setting"]): row for row in summarize(MADE_UP)}
     quick = found["refined", "quick"]
     assert (quick["scenes"], quick["seconds"], quick["psnr"]) == (2, 2.5, 24.25)
     assert quick["over_base"] == pytest.approx(0.5)
@@ -209,7 +209,7 @@ def test_means_are_over_scenes():
 
 def test_tables_and_picture_have_every_setting():
     results = {"machine": {"cpu": "one"}, "rows": MADE_UP, "not_measured": {}}
-    results |= {"settings": summarise(MADE_UP)}
+    results |= {"settings": summarize(MADE_UP)}
     shown = tables(results)
     assert [len(table.rows) for table in shown] == [4, 3, 3, 4, 3]
     cells = {row[0]: row for row in zip(*(c.cells for c in shown[3].columns), strict=True)}

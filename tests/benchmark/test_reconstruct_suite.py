@@ -17,8 +17,8 @@ from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.scene import measure_scene
-from asysplat.reconstruction import Settings, mean_colour, refine
-from asysplat.reconstruction.photographs import open_photographs
+from asysplat.refinement import RefinementSettings, mean_color, refine
+from asysplat.refinement.photographs import open_photographs
 
 SIDE = 32
 MOST = 300  # Gaussians
@@ -47,7 +47,7 @@ def make_options(repository, shared_folder):
             )
         found.refinement.most = MOST
         OmegaConf.set_struct(found.reconstruct, False)
-        small = {"shared": str(shared_folder), "scenes": ["room"], "inits": ["sweep"]}
+        small = {"shared": str(shared_folder), "scenes": ["room"], "inits": ["plane_sweep"]}
         small |= {"budgets": BUDGETS, "budget": BUDGETS[0], "variants": PARTS}
         found.reconstruct.merge_with(small | changes)
         return found
@@ -61,7 +61,7 @@ def measured(repository, make_options, tmp_path_factory):
     folder = tmp_path_factory.mktemp("benchmark")
     script = runpy.run_path(str(repository / "benchmark.py"))
     console = Console(record=True, width=200)
-    options = make_options(scenes=["room", "nowhere"], inits=["sweep", "points"])
+    options = make_options(scenes=["room", "nowhere"], inits=["plane_sweep", "points"])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(suite, "SIDE", SIDE)
         patch.setitem(script["benchmark"].__globals__, "Console", lambda: console)
@@ -77,7 +77,7 @@ def scene(shared_folder):
     return MeasuredScene(photographs, PROTOCOL, None)
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_rows_are_complete_and_consistent(measured):
     results, said = measured
     assert results["complete"] and results["variants"] == PARTS
@@ -86,12 +86,12 @@ def test_rows_are_complete_and_consistent(measured):
     short, long = BUDGETS
     assert rows == [
         ("nearest view", None, None),
-        ("mean colour", None, None),
-        ("start", "sweep", 0),
-        ("all", "sweep", short),
-        ("all", "sweep", long),
-        ("none", "sweep", short),
-        ("exposed", "sweep", short),
+        ("mean color", None, None),
+        ("start", "plane_sweep", 0),
+        ("all", "plane_sweep", short),
+        ("all", "plane_sweep", long),
+        ("none", "plane_sweep", short),
+        ("exposed", "plane_sweep", short),
         ("start", "network", 0),
         ("elsewhere", "network", short),
     ]
@@ -113,12 +113,12 @@ def test_rows_are_complete_and_consistent(measured):
 def test_a_row_is_what_a_refinement_of_so_many_steps_gives(scene):
     photographs = scene.photographs
     inputs, targets = photographs.inputs, photographs.measured
-    background = mean_colour(inputs)
-    start, first = scene.start("sweep", MOST)
+    background = mean_color(inputs)
+    start, first = scene.start("plane_sweep", MOST)
     fields = [field.clone() for field in vars(start).values()]
-    row = scene.refined(start, Settings(most=MOST), 1, steps=6)
+    row = scene.refined(start, RefinementSettings(most=MOST), 1, steps=6)
     assert all(map(torch.equal, fields, vars(start).values()))
-    gaussians = refine(start, inputs, Settings(most=MOST), steps=6, background=background)
+    gaussians = refine(start, inputs, RefinementSettings(most=MOST), steps=6, background=background)
     assert (row["steps"], row["gaussians"]) == (6, gaussians.num_gaussians)
     for found, of in ((first, start), (row, gaussians)):
         expected = measure_scene(of, targets, background, PROTOCOL)
@@ -126,12 +126,12 @@ def test_a_row_is_what_a_refinement_of_so_many_steps_gives(scene):
             assert found[name] == pytest.approx(sum(expected[name]) / 3, abs=1e-5)
 
 
-def test_baselines_are_those_of_the_views_held_back(scene):
+def test_baselines_are_those_of_the_views_held_out(scene):
     nearest, mean = scene.for_nothing()
-    assert (nearest["variant"], mean["variant"]) == ("nearest view", "mean colour")
+    assert (nearest["variant"], mean["variant"]) == ("nearest view", "mean color")
     inputs, targets = scene.photographs.inputs, scene.photographs.measured
-    colour = inputs.images.mean((0, 2, 3))[:, None, None]
-    flat = psnr(colour.expand_as(targets.images), targets.images).mean().item()
+    color = inputs.images.mean((0, 2, 3))[:, None, None]
+    flat = psnr(color.expand_as(targets.images), targets.images).mean().item()
     assert mean["psnr"] == pytest.approx(flat, abs=1e-4)
     every = torch.stack(
         [psnr(one.expand_as(targets.images), targets.images) for one in inputs.images]
@@ -147,13 +147,13 @@ def test_a_goal_is_reached_at_the_first_look_that_is_as_good():
 
 def test_looks_on_the_way_are_at_what_was_there_then(scene, monkeypatch):
     monkeypatch.setattr("asysplat.benchmark.reconstruct.scene.FIRST_LOOK", 1e-4)
-    start, first = scene.start("sweep", MOST)
-    curve = scene.refined(start, Settings(most=MOST), 1, steps=12)["curve"]
+    start, first = scene.start("plane_sweep", MOST)
+    curve = scene.refined(start, RefinementSettings(most=MOST), 1, steps=12)["curve"]
     assert len(curve) > 3 and [seconds for seconds, _ in curve] == sorted(s for s, _ in curve)
     assert abs(curve[0][1] - first["psnr"]) < 1.5 and curve[0][1] != curve[-1][1]
 
 
-def row(scene, variant, budget=30, init="sweep", **metrics):
+def row(scene, variant, budget=30, init="plane_sweep", **metrics):
     return {"scene": scene, "variant": variant, "init": init, "budget": budget, **metrics}
 
 
@@ -166,7 +166,7 @@ def test_parts_are_compared_with_the_whole_scene_by_scene():
         row("a", "all", init="points", psnr=50.0),
         row("b", "all", psnr=30.0, lpips=0.4),
     ]
-    results = {"rows": rows, "inits": ["sweep", "points"], "budget": 30}
+    results = {"rows": rows, "inits": ["plane_sweep", "points"], "budget": 30}
     whole, part, other = compare_parts(results | {"variants": {"part": {}, "other": {}}})
     nothing = dict.fromkeys(METRICS)
     means = {"psnr": 25.0, "lpips": pytest.approx(0.3)}
@@ -175,7 +175,7 @@ def test_parts_are_compared_with_the_whole_scene_by_scene():
     assert other == {"variant": "other", "scenes": 0} | nothing
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_the_picture_has_curves_levels_and_marks(measured):
     results, _ = measured
     (axes,) = plot(results).axes  # LPIPS needs weights that are not here
@@ -187,7 +187,7 @@ def test_the_picture_has_curves_levels_and_marks(measured):
         assert [level, level] in drawn
     for name in PARTS:
         assert [by_name[name, BUDGETS[0]]] in drawn
-    assert [by_name["mean colour", None]] * 2 not in drawn
+    assert [by_name["mean color", None]] * 2 not in drawn
 
 
 @pytest.mark.parametrize("finished", [0, 1])
@@ -247,15 +247,15 @@ def test_mistakes_are_named(make_options, mistake):
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_photographs_with_depths(shared):
     folder = shared / "data" / "hololens-000"
     if not folder.is_dir():
         pytest.skip(f"{folder} is absent")
     scene = MeasuredScene(open_photographs(folder, 64, 64), PROTOCOL, None)
     nearest, _ = scene.for_nothing()
-    sweep, found = scene.start("sweep", 20_000)
+    sweep, found = scene.start("plane_sweep", 20_000)
     _, true = scene.start("depth", 20_000)
-    refined = scene.refined(sweep, Settings(most=20_000), 1, steps=64)
+    refined = scene.refined(sweep, RefinementSettings(most=20_000), 1, steps=64)
     assert refined["psnr"] > found["psnr"] > nearest["psnr"]
     assert true["absrel"] < found["absrel"] and true["delta1"] > found["delta1"]

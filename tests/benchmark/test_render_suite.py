@@ -15,8 +15,8 @@ from omegaconf import OmegaConf
 from asysplat.benchmark.options import find_suite
 from asysplat.benchmark.render.floor import COUNT, RASTER, SIDE, hot_scene
 from asysplat.benchmark.render.run import (
+    CULLING,
     FIELDS,
-    SKIPS,
     errors,
     find_backends,
     flips,
@@ -34,7 +34,7 @@ from asysplat.benchmark.scenes import (
 from asysplat.benchmark.timing import rise_gb
 from asysplat.errors import InputError
 from asysplat.evaluation.cost import CLEAR_PEAK
-from asysplat.rendering import INRIA, Skips
+from asysplat.rendering import INRIA, Culling
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def numbers(value):
     return [value] if isinstance(value, int | float) else []
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_json_has_every_backend_and_skip(measured):
     results, folder = measured
     assert {"cpu", "cores", "threads", "torch", "numba"} <= results["machine"].keys()
@@ -69,7 +69,7 @@ def test_json_has_every_backend_and_skip(measured):
     assert len(rows) == len(results["rows"])
     for scene in ("tiny", "twin"):
         assert (scene, "reference", None) in rows
-        assert all((scene, "cpu", off) in rows for off in (None, *SKIPS))
+        assert all((scene, "cpu", off) in rows for off in (None, *CULLING))
     for (scene, backend, _), row in rows.items():
         size = {"tiny": (500, 24, 40), "twin": (512, 32, 32)}[scene]
         assert (row["gaussians"], row["height"], row["width"]) == size and row["views"] == 1
@@ -92,7 +92,7 @@ def test_json_has_every_backend_and_skip(measured):
     assert (folder / "render.png").stat().st_size > 0
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_skip_leaves_the_error_as_it_is(measured):
     results, _ = measured
     for scene in ("tiny", "twin"):
@@ -105,8 +105,8 @@ def test_a_skip_leaves_the_error_as_it_is(measured):
 def test_hot_rows_are_all_rows_of_all_tiles():
     """What the floor is made of: nothing is skipped, and the kernels take nearly all the time."""
     (backend,) = [backend for backend in find_backends() if backend.name == "cpu"]
-    run(backend, Skips(), hot_scene())  # kernels are loaded, or compiled, when first used
-    outputs = run(backend, Skips(), hot_scene())
+    run(backend, Culling(), hot_scene())  # kernels are loaded, or compiled, when first used
+    outputs = run(backend, Culling(), hot_scene())
     seconds = outputs.kernels
     tiles = (SIDE // outputs.stats["tile_size"]) ** 2
     assert outputs.stats["visible"] == COUNT and outputs.stats["pairs"] == COUNT * tiles
@@ -120,7 +120,7 @@ def test_hot_rows_are_all_rows_of_all_tiles():
 def test_errors_are_those_of_image_and_gradients():
     scene = random_scene(200, 20, 20)
     exact = truth(scene, INRIA)
-    found = run(find_backends()[0], Skips(), prepare(scene, "cpu"))
+    found = run(find_backends()[0], Culling(), prepare(scene, "cpu"))
     none = flips(exact, exact)
     close = errors(found, exact, none)
     assert (
@@ -159,7 +159,7 @@ def test_unknown_options_are_named():
     assert find_scenes(["C", "A"]) == ["C", "A"] and find_scenes("4M") == ["4M"]
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_mistake_is_one_sentence(repository, tmp_path):
     command = [sys.executable, "benchmark.py", "scenes=[A,D]", f"output={tmp_path}"]
     result = subprocess.run(command, cwd=repository, capture_output=True, text=True)

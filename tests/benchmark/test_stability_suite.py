@@ -29,7 +29,7 @@ from asysplat.rendering.reference import tiles
 TINY = {"scale": "laptop", "width": 0.125, "state_size": 8, "model.layers": "1m1s"}
 FEW = {
     "areas": ["renderer", "refinement"],
-    "models": ["asysplat_sweep"],
+    "models": ["asysplat_plane_sweep"],
     "overrides": TINY,
     "views": [1],
     "training_steps": 3,
@@ -133,7 +133,7 @@ def test_hostile_views_can_be_used():
             Hostile(poses=poses, count=count).views().validate()
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_small_page_is_green(options, configured):
     console = Console(width=300, file=StringIO())
     results = {"machine": {"cpu": "some"}, **measure(options, console)}
@@ -166,14 +166,14 @@ def test_a_red_page_says_so_and_the_command_fails(tmp_path, run_script, monkeypa
     assert (tmp_path / "stability.png").stat().st_size > 0
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_priors_of_views_that_say_nothing_are_green():
     names = ("black photographs", "white photographs", "views: 1")
     rows = [case.row() for case in prior.cases([1]) if case.name in names]
     assert len(rows) == 3 and all(row["green"] for row in rows)
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_an_exponential_without_its_clamp_is_red(measured, monkeypatch):
     wild = ("network", "wild weights")
     (row,) = measured(*wild, models=["asysplat_4m4s"])
@@ -192,7 +192,7 @@ def test_a_box_that_is_a_tile_short_is_red(measured, monkeypatch):
         assert not row["green"] and row["error"] > 1e-3 and row["nan"] == row["inf"] == 0
 
 
-@pytest.mark.hours
+@pytest.mark.slow
 def test_a_box_of_the_kernels_that_is_a_tile_short_is_red(repository, tmp_path):
     """In a copy of the project, which compiles the kernels with the fault."""
     hidden = shutil.ignore_patterns("__pycache__", "results", ".*")
@@ -220,7 +220,7 @@ def nan_gradient(values, bound):
     return bound * (values / bound).tanh() + 0 * (values - values.detach()).sqrt()
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_gradient_that_is_nan_is_red(measured, monkeypatch):
     noise = ("network", "noise photographs")
     assert measured(*noise)[0]["green"]

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from tiny import SCENES, SIZE, VIEWS
 
 from asysplat.data.datamodule import TrainingTasks, collate
-from asysplat.reconstruction import PAPER, Settings
+from asysplat.refinement import PAPER, RefinementSettings
 from asysplat.report.paper import find_tables
 
 ROOT = Path(__file__).parents[2]
@@ -52,12 +52,12 @@ def test_composes_and_builds_its_model(group):
 def test_refinements_are_the_defaults_of_the_code():
     known = {path.stem for path in (CONF / "refinement").glob("*.yaml")}
     assert known == {"default", "paper"}
-    for name, expected in (("default", Settings()), ("paper", PAPER)):
+    for name, expected in (("default", RefinementSettings()), ("paper", PAPER)):
         config = compose_train(f"refinement={name}", script="reconstruct")
         assert instantiate(config.refinement) == expected
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize("path", sorted(SWEEPS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_row_of_a_sweep_builds_its_model(path):
     config = compose_train(f"sweeps={path.stem}")
@@ -73,7 +73,7 @@ def test_every_row_of_a_sweep_builds_its_model(path):
                 instantiate(row.model)
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize("choice", sorted(set(TRAINED) - PARTS), ids="/".join)
 def test_trains_a_step_at_a_tiny_size(choice):
     overrides = ["=".join(choice), *TINY]

@@ -47,7 +47,7 @@ def test_the_same_point_meets_the_same_content(share):
     assert (seen - directions).abs().max() < 0.5 / 66
 
 
-@pytest.mark.parametrize("share", [0.6, 0.77])  # no centre on a border between pixels
+@pytest.mark.parametrize("share", [0.6, 0.77])  # no center on a border between pixels
 def test_depths_and_masks_are_those_under_each_pixel(share):
     views = make_views()
     crop = cropped(views, share)

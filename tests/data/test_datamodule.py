@@ -1,4 +1,4 @@
-"""Tasks: reproducible, disjoint between stages, normalised, and batched."""
+"""Tasks: reproducible, disjoint between stages, normalized, and batched."""
 
 import lightning
 import numpy as np
@@ -140,7 +140,7 @@ def test_augmented_tasks_are_repeated_by_their_seed():
 
 
 class Counting:
-    """A capture that remembers which frames were decoded."""
+    """A sequence that remembers which frames were decoded."""
 
     def __init__(self, scene):
         self.scene, self.name, self.num_frames = scene, scene.name, scene.num_frames
@@ -152,23 +152,23 @@ class Counting:
 
 
 def test_an_input_that_is_a_target_is_decoded_once():
-    capture = Counting(ProceduralScene(3, 16, 16, num_frames=24))
-    sample = load(Task(capture, Selection([9, 2, 5], [5, 7, 9])))
-    assert sorted(capture.decoded) == [2, 5, 7, 9]
-    images = capture.scene.views([9, 2, 5, 7]).images
+    sequence = Counting(ProceduralScene(3, 16, 16, num_frames=24))
+    sample = load(Task(sequence, Selection([9, 2, 5], [5, 7, 9])))
+    assert sorted(sequence.decoded) == [2, 5, 7, 9]
+    images = sequence.scene.views([9, 2, 5, 7]).images
     assert torch.equal(sample["inputs"].images, images[:3])
     assert torch.equal(sample["targets"].images, images[[2, 3, 0]])
 
 
 def test_fixed_tasks_stay_loaded_as_long_as_there_is_room(monkeypatch):
-    captures = [Counting(ProceduralScene(seed, 16, 16, num_frames=24)) for seed in range(3)]
-    tasks = [Task(capture, Selection([0, 1], [2])) for capture in captures]
+    sequences = [Counting(ProceduralScene(seed, 16, 16, num_frames=24)) for seed in range(3)]
+    tasks = [Task(sequence, Selection([0, 1], [2])) for sequence in sequences]
     monkeypatch.setattr(datamodule, "KEPT_BYTES", 1.5 * 3 * 3 * 16 * 16 * 4)
     fixed = FixedTasks(tasks)
-    assert [len(capture.decoded) for capture in captures] == [3, 3, 0]
+    assert [len(sequence.decoded) for sequence in sequences] == [3, 3, 0]
     for _ in range(2):
-        assert [sample["scene"] for sample in fixed] == [capture.name for capture in captures]
-    assert [len(capture.decoded) for capture in captures] == [3, 3, 6]
+        assert [sample["scene"] for sample in fixed] == [sequence.name for sequence in sequences]
+    assert [len(sequence.decoded) for sequence in sequences] == [3, 3, 6]
 
 
 def test_evaluation_scenes_are_never_trained_on():
@@ -179,7 +179,7 @@ def test_evaluation_scenes_are_never_trained_on():
     assert len(evaluated) == 2 and not evaluated & trained_on
 
 
-def test_inputs_are_normalised_and_batches_stack():
+def test_inputs_are_normalized_and_batches_stack():
     tasks = TrainingTasks(procedural())
     batch = collate([tasks[0], tasks[1]])
     centers = batch["inputs"].cameras.centers
@@ -211,9 +211,9 @@ def test_a_set_of_one_kind_of_place(places):
     tasks = source.evaluation("val", 3, 2) + source.evaluation("test", 3, 2)
     tasks += [source.training(3, 2, np.random.default_rng(seed)) for seed in range(3)]
     # Nothing in a room is as far as 12 m, and the sky is 60 m away.
-    farthest = [task.capture.views(task.selection.targets).depths.max() for task in tasks]
+    farthest = [task.sequence.views(task.selection.targets).depths.max() for task in tasks]
     assert all((depth < 12) == (places == "rooms") for depth in farthest)
-    seeds = [int(task.capture.name.removeprefix(f"{places}-")) for task in tasks]
+    seeds = [int(task.sequence.name.removeprefix(f"{places}-")) for task in tasks]
     assert [seed % 3 for seed in seeds] == 2 * [1] + 3 * [2] + 3 * [0]
 
 
@@ -281,7 +281,7 @@ def test_which_test_sets_are_tested(tmp_path):
     write_transforms(scene.views(range(24)), tmp_path)
     sets = {"here": {"root": str(tmp_path), "selection": "kmeans"}, "nowhere": {"root": None}}
     assert not with_test_sets(sets).test_sets
-    own = {"root": str(tmp_path), "name": "own", "on_bad_frame": "fail"} | READ_WITH
+    own = {"root": str(tmp_path), "name": "own", "on_bad_image": "fail"} | READ_WITH
     same = {"own": {"root": "elsewhere"}, "more": {"inputs": 5}}
     with pytest.warns(UserWarning, match=r"Not tested for want of a path: nowhere\. .* paths\.no"):
         data = files_data(test_sets=sets | same, **own)

@@ -116,13 +116,13 @@ def test_a_photograph_that_cannot_be_read(command, scene, tmp_path):
 
 def test_a_map_of_another_photograph_is_refused(command, scene, tmp_path):
     command(scene)
-    capture = open_scene(scene, HEIGHT, WIDTH, disparities=tmp_path / "maps")
-    image = capture.scene.photographs[2].image
+    sequence = open_scene(scene, HEIGHT, WIDTH, disparities=tmp_path / "maps")
+    image = sequence.scene.photographs[2].image
     path = map_folder(scene, tmp_path / "maps") / map_name(image, scene)
     Image.fromarray(np.ones((20, 40), np.uint16)).save(path)
     with pytest.raises(InputError, match=r"is 40 x 20 and .* 32 x 24: delete it, and estimate"):
-        capture.views([2])
-    assert capture.views([1]).disparities is not None
+        sequence.views([2])
+    assert sequence.views([1]).disparities is not None
 
 
 def test_an_estimate_that_is_not_finite(command, scene, tmp_path):
@@ -210,7 +210,7 @@ class Network(torch.nn.Module):
 
 
 def test_what_the_network_is_given():
-    """Whole patches, normalised as ImageNet's, and its answer as it is."""
+    """Whole patches, normalized as ImageNet's, and its answer as it is."""
     network = Network()
     photograph = np.full((100, 150, 3), (255, 0, 128), np.uint8)
     found = DepthAnything(network, torch.device("cpu"))(photograph)

@@ -39,37 +39,37 @@ def distort(points: np.ndarray, lens: Lens) -> np.ndarray:
     return np.stack((x * lens.fx + lens.cx, y * lens.fy + lens.cy), -1)
 
 
-def pixel_centres(width: int, height: int) -> np.ndarray:
+def pixel_centers(width: int, height: int) -> np.ndarray:
     return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
 
 
-def blob(centres: np.ndarray, position: np.ndarray) -> np.ndarray:
-    return np.exp(-((centres - position) ** 2).sum(-1) / (2 * 2.0**2))
+def blob(centers: np.ndarray, position: np.ndarray) -> np.ndarray:
+    return np.exp(-((centers - position) ** 2).sum(-1) / (2 * 2.0**2))
 
 
 def centroid(image: np.ndarray) -> np.ndarray:
-    centres = pixel_centres(image.shape[1], image.shape[0])
-    return (centres * image[..., None]).sum((0, 1)) / image.sum()
+    centers = pixel_centers(image.shape[1], image.shape[0])
+    return (centers * image[..., None]).sum((0, 1)) / image.sum()
 
 
 @pytest.mark.parametrize("lens", [BARREL, FISHEYE], ids=["opencv", "fisheye"])
 def test_undistorted_dots_stand_on_the_straight_grid(lens):
-    centres = pixel_centres(lens.width, lens.height)
+    centers = pixel_centers(lens.width, lens.height)
     for dot in [(20, 20), (140, 20), (82, 57.5), (25, 100), (140, 95)]:
         seen = distort(np.array(dot, dtype=float), lens)
-        photograph = blob(centres, seen).astype(np.float32)
+        photograph = blob(centers, seen).astype(np.float32)
         found = centroid(undistort(photograph, lens) ** 2)
         assert np.abs(found - dot).max() < 0.1
     assert np.abs(distort(np.array([20.0, 20.0]), lens) - 20).max() > 2
 
 
 def test_a_photograph_of_straight_lines_has_straight_lines_again():
-    position = distort(pixel_centres(160, 120), BARREL)
+    position = distort(pixel_centers(160, 120), BARREL)
     # What a distorting camera sees of a vertical edge at x = 30.5, inverted by fixed-point steps.
-    straight = pixel_centres(160, 120)
+    straight = pixel_centers(160, 120)
     for _ in range(30):
-        straight = straight - (distort(straight, BARREL) - pixel_centres(160, 120))
-    assert np.abs(position - pixel_centres(160, 120)).max() > 4
+        straight = straight - (distort(straight, BARREL) - pixel_centers(160, 120))
+    assert np.abs(position - pixel_centers(160, 120)).max() > 4
     photograph = np.clip(straight[..., 0] - 30, 0, 1).astype(np.float32)
     found = undistort(photograph, BARREL)
     edges = np.array([np.interp(0.5, row[:60], np.arange(60) + 0.5) for row in found[10:-10]])
@@ -98,7 +98,7 @@ def test_content_and_intrinsics_move_together(height, width):
     for point in [(0.1, 0.05, 1.0), (-0.2, -0.1, 1.2), (0.15, -0.12, 0.9)]:
         x, y, z = point
         before = np.array([lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy])
-        image = blob(pixel_centres(160, 120), before).astype(np.float32)
+        image = blob(pixel_centers(160, 120), before).astype(np.float32)
         after = (matrix @ point)[:2] / z
         found = centroid(np.maximum(resize_and_crop(image, height, width), 0))
         assert np.abs(found - after).max() < 0.05
@@ -117,7 +117,7 @@ def test_the_own_size_changes_nothing():
     assert np.array_equal(resized_intrinsics(Lens(**WIDE), 120, 160), expected)
 
 
-def test_nearest_takes_the_pixel_under_each_centre():
+def test_nearest_takes_the_pixel_under_each_center():
     depth = np.arange(36, dtype=np.float32).reshape(6, 6)
     assert np.array_equal(resize_and_crop(depth, 2, 2, nearest=True), depth[[1, 4]][:, [1, 4]])
 

@@ -25,7 +25,7 @@ def wall(z: float, right: int, first: int) -> np.ndarray:
     return np.stack(((x - 16) / 32 * z, (y - 16) / 32 * z, np.full_like(x, z)), -1).reshape(-1, 3)
 
 
-class CaptureWithPoints:
+class SequenceWithPoints:
     """A synthetic scene and sparse points of the surfaces that one of its frames sees."""
 
     def __init__(self, frame: int):
@@ -79,8 +79,8 @@ def test_a_slanted_surface_keeps_its_points():
 
 
 def test_inputs_come_with_the_points_in_their_own_frame():
-    capture = CaptureWithPoints(frame=5)
-    task = Task(capture, Selection([9, 5, 1], [7]))
+    sequence = SequenceWithPoints(frame=5)
+    task = Task(sequence, Selection([9, 5, 1], [7]))
     plain = load(task, share=0.8)
     sample = load(task, share=0.8, points=True)
     inputs = sample["inputs"].validate()
@@ -100,8 +100,8 @@ def test_inputs_come_with_the_points_in_their_own_frame():
 
 
 class OneTask:
-    def __init__(self, capture):
-        self.task = Task(capture, Selection([1, 5, 9], [3]))
+    def __init__(self, sequence):
+        self.task = Task(sequence, Selection([1, 5, 9], [3]))
 
     def training(self, inputs, targets, rng):
         return self.task
@@ -110,15 +110,15 @@ class OneTask:
         return [self.task]
 
 
-def make_data(capture, points: bool) -> SceneDataModule:
+def make_data(sequence, points: bool) -> SceneDataModule:
     size = {"inputs": 3, "targets": 1, "height": SIZE, "width": SIZE, "batch_size": 1}
     options = {"num_workers": 0, "seed": 0, "steps_per_epoch": 1, "points": points}
-    return SceneDataModule("data", OneTask(capture), **size, **options)
+    return SceneDataModule("data", OneTask(sequence), **size, **options)
 
 
 def test_only_data_that_is_asked_for_points_gives_them():
     for asked in (True, False):
-        data = make_data(CaptureWithPoints(5), points=asked)
+        data = make_data(SequenceWithPoints(5), points=asked)
         data.setup()
         samples = [TrainingTasks(data)[0], data.evaluation["test"][0]]
         given = [sample["inputs"].point_depths is not None for sample in samples]

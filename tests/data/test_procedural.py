@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 
-from asysplat.data.capture import Capture
 from asysplat.data.procedural import ProceduralScene, split_seed
 from asysplat.data.procedural.geometry import Boxes, Cone, Room, Spheres, Terrain
 from asysplat.data.procedural.path import hand_held_path
+from asysplat.data.sequence import ImageSequence
 from asysplat.errors import InputError
 
 SEEDS = range(8)
@@ -67,7 +67,7 @@ def test_scenes_that_measure_models_never_change(split, index):
 
 def test_it_is_a_capture():
     short = ProceduralScene(3, 8, 8, num_frames=10)
-    assert isinstance(short, Capture)
+    assert isinstance(short, ImageSequence)
     assert (short.name, short.num_frames, short.cameras.num_views) == ("procedural-3", 10, 10)
     views = short.views([7, 2]).validate()
     assert torch.equal(views.cameras.cam_to_world, short.cameras.cam_to_world[[7, 2]])
@@ -189,7 +189,7 @@ def test_a_guess_right_on_the_terrain_is_kept():
 
 @pytest.mark.parametrize("varied", [False, True])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_neighbouring_frames_reproject_onto_each_other(seed, varied):
+def test_neighboring_frames_reproject_onto_each_other(seed, varied):
     views = scene(seed, varied).views([40, 43])
     agree, error = reprojection(views)
     assert agree > (0.75 if varied else 0.85)  # thin and near things hide more
@@ -205,7 +205,7 @@ def test_wrong_depths_do_not_reproject():
 
 
 def reprojection(views) -> tuple[float, float]:
-    """Of the first view's pixels that the second could see: agreeing share, mean colour error."""
+    """Of the first view's pixels that the second could see: agreeing share, mean color error."""
     size = views.cameras.height
     y, x = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
     pixels = torch.stack((x, y, torch.ones_like(x))).flatten(1)

@@ -18,7 +18,7 @@ from asysplat.data.selection import (
 )
 from asysplat.data.selection.__main__ import main as index_command
 from asysplat.data.selection.index import Entry, camera_hash, read_index, write_index
-from asysplat.data.selection.kmeans import nearest_to_centres, pose_features
+from asysplat.data.selection.kmeans import nearest_to_centers, pose_features
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
@@ -241,7 +241,7 @@ def test_kmeans_of_a_circle_and_of_a_walk():
 def test_no_frame_is_chosen_twice(count):
     """Four places, at each of which eight cameras stand and look alike."""
     features = np.repeat(np.eye(4, 6), 8, axis=0)
-    rows = nearest_to_centres(features, count)
+    rows = nearest_to_centers(features, count)
     assert len(set(rows)) == len(rows) == count
     if count >= 4:
         assert {row // 8 for row in rows} == set(range(4))

@@ -61,7 +61,7 @@ def drawn(source, count=60, inputs=4, targets=2):
 
 
 def names(tasks):
-    return {task.capture.name for task in tasks}
+    return {task.sequence.name for task in tasks}
 
 
 def frames(tasks):
@@ -71,7 +71,7 @@ def frames(tasks):
 def test_a_written_scene_trains_like_the_scene_itself(folder):
     source = FilesSource(folder("one", 3), *SIZE, (12, 24))
     (task,) = source.evaluation("test", 4, 2)
-    read = task.capture.views(task.selection.targets)
+    read = task.sequence.views(task.selection.targets)
     views = made(3).views(task.selection.targets)
     assert (read.images - views.images).abs().max() < 1 / 255
     assert (read.depths - views.depths).abs().max() < 1e-3
@@ -92,7 +92,7 @@ def test_scenes_are_opened_when_they_are_drawn(folder, opened):
     source = FilesSource(folder("many", *range(6)), *SIZE, (12, 24), val_scenes=2)
     assert opened == []
     (task,) = drawn(source, 1)
-    assert opened == [task.capture.name]
+    assert opened == [task.sequence.name]
     drawn(source)
     assert sorted(opened) == [f"s{seed}" for seed in range(6)]
 
@@ -137,12 +137,12 @@ def test_a_damaged_scene_is_never_another_scene(folder):
     for seed in range(20):
         rngs = [np.random.default_rng(seed) for _ in range(2)]
         expected = whole.training(4, 2, rngs[0])
-        found.add(expected.capture.name)
-        if expected.capture.name == "s1":
+        found.add(expected.sequence.name)
+        if expected.sequence.name == "s1":
             with pytest.raises(InputError, match=r"s1/images/00003\.png cannot be read"):
                 source.training(4, 2, rngs[1])
         else:
-            assert source.training(4, 2, rngs[1]).capture.name == expected.capture.name
+            assert source.training(4, 2, rngs[1]).sequence.name == expected.sequence.name
     assert found == {"s0", "s1", "s2"}
 
 
@@ -162,7 +162,7 @@ def test_the_selection_is_that_of_the_test(folder):
     root = folder("two", 3, 4)
     source = FilesSource(root, *SIZE, (12, 24), selection="kmeans")
     for task in source.evaluation("test", 4, 2):
-        cameras = made(int(task.capture.name[1:])).cameras
+        cameras = made(int(task.sequence.name[1:])).cameras
         assert task.selection == kmeans_selection(cameras, 4, 2, "test")
         assert task.selection.targets == [0, 8, 16]
     assert not frames(drawn(source)) & {0, 8, 16}
@@ -190,7 +190,7 @@ def test_an_index_names_the_scenes_and_frames_of_the_test(folder, index):
         val_scenes=2,
     )
     (task,) = source.evaluation("test", 2, 7)
-    assert task.capture.name == "s2" and task.selection == Selection([3, 20], [3, 9])
+    assert task.sequence.name == "s2" and task.selection == Selection([3, 20], [3, 9])
     assert len(source.evaluation("val", 2, 2)) == 2
     assert not names(drawn(source)) & {"s2", "s5"}
 
@@ -206,5 +206,5 @@ def test_an_index_that_does_not_fit(folder, index):
         drawn(source)
     with pytest.raises(InputError, match=r"data\.selection is kmeans and data\.index is"):
         FilesSource(root, *SIZE, (12, 24), **(options | {"selection": "kmeans"}))
-    with pytest.raises(InputError, match=r"data\.on_bad_frame=skip changes the numbers"):
-        FilesSource(root, *SIZE, (12, 24), on_bad_frame="skip", **options)
+    with pytest.raises(InputError, match=r"data\.on_bad_image=skip changes the numbers"):
+        FilesSource(root, *SIZE, (12, 24), on_bad_image="skip", **options)

@@ -31,18 +31,18 @@ def test_only_scenes_that_train_are_varied():
     source = ProceduralSource(16, 16, 24, (12, 24), val_scenes=1, test_scenes=1, varied=True)
     rng = np.random.default_rng(0)
     focals = [
-        source.training(3, 1, rng).capture.cameras.intrinsics[0, 0, 0].item() for _ in range(40)
+        source.training(3, 1, rng).sequence.cameras.intrinsics[0, 0, 0].item() for _ in range(40)
     ]
     degrees = np.degrees(2 * np.arctan(8 / np.array(focals)))
     assert 25 <= degrees.min() < 35 and 70 < degrees.max() <= 80
     for split in ("val", "test"):
         (task,) = source.evaluation(split, 3, 1)
         plain = ProceduralScene(split_seed(split, 0), 16, 16, 24)
-        assert torch.equal(task.capture.views([5]).images, plain.views([5]).images)
+        assert torch.equal(task.sequence.views([5]).images, plain.views([5]).images)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_pixel_at_an_edge_lies_between_its_neighbours(seed):
+def test_a_pixel_at_an_edge_lies_between_its_neighbors(seed):
     scene = ProceduralScene(seed, 48, 48, varied=True)
     smooth = scene.views([0, 60])
     scene._smooth_edges = False
@@ -81,18 +81,18 @@ def test_a_pixel_is_as_bright_as_it_is_covered():
 @pytest.mark.parametrize("gloss", [0.0, 1.0])
 def test_gloss_is_brightest_where_the_light_is_mirrored(gloss):
     """The floor of a room right between eye and lamp, which are equally high."""
-    grey = Material((0.5, 0.5, 0.5), (0.5, 0.5, 0.5), gloss=gloss, shininess=30.0)
+    gray = Material((0.5, 0.5, 0.5), (0.5, 0.5, 0.5), gloss=gloss, shininess=30.0)
     plan = FloorPlan(
         walk=np.zeros((1, 2)),
         light=np.array([2.0, 0.0, 2.0]),
-        light_colour=np.ones(3),
+        light_color=np.ones(3),
         falloff=3.0,
         ambient=0.1 * np.ones(3),
-        shell=[grey] * 6,
+        shell=[gray] * 6,
         room=(np.array([-4.0, -4.0, 0.0]), np.array([4.0, 4.0, 4.0])),
     )
-    plan.add_box((3.5, 3.5, 0.2), (0.2, 0.2, 0.2), 0.0, grey)
-    plan.add_sphere((-3.5, 3.5, 0.2), 0.2, grey)
+    plan.add_box((3.5, 3.5, 0.2), (0.2, 0.2, 0.2), 0.0, gray)
+    plan.add_sphere((-3.5, 3.5, 0.2), 0.2, gray)
     world = World(plan, np.random.default_rng(0), torch.device("cpu"))
     mirrored, aside, back = (
         world.trace(eye[:, None], -eye[:, None], pixel=0.01)[0].mean()

@@ -2,12 +2,12 @@ import math
 
 import torch
 
-from asysplat.evaluation.baselines import mean_colour, nearest_view
+from asysplat.evaluation.baselines import mean_color, nearest_view
 from asysplat.scene import Cameras, Views
 
 
 def make_views(positions, yaws_in_degrees, images=None):
-    """Level cameras: yaw 0 looks along +z, positive yaw turns towards +x."""
+    """Level cameras: yaw 0 looks along +z, positive yaw turns toward +x."""
     poses = []
     for position, yaw in zip(positions, yaws_in_degrees, strict=True):
         c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
@@ -26,20 +26,20 @@ def chosen(inputs, targets):
     return (nearest_view(inputs, targets)[..., 0, 0, 0] * 10).round().int().tolist()
 
 
-def test_mean_colour_is_of_all_inputs_of_the_scene():
+def test_mean_color_is_of_all_inputs_of_the_scene():
     images = torch.zeros(2, 3, 2, 3)
     images[0, 0], images[1, 1, 0] = 1.0, 1.0
     a = make_views([[0, 0, 0], [1, 0, 0]], [0, 0], images)
     b = make_views([[0, 0, 0], [1, 0, 0]], [0, 0])
     inputs = Views.stack([a, b])
     targets = Views.stack([make_views([[0, 0, 0]] * 3, [0] * 3)] * 2)
-    found = mean_colour(inputs, targets)
+    found = mean_color(inputs, targets)
     assert found.shape == (2, 3, 3, 2, 3)
     expected = torch.tensor([[0.5, 0.25, 0.0], [0.05, 0.05, 0.05]])
     torch.testing.assert_close(found, expected[:, None, :, None, None].expand_as(found))
 
 
-def test_nearest_by_centre_then_by_direction():
+def test_nearest_by_center_then_by_direction():
     inputs = make_views([[0, 0, 0], [4, 0, 0], [4, 0, 0]], [0, 0, 90])
     targets = make_views([[1, 0, 0], [3, 0, 0], [3, 0, 0], [4, 9, 0]], [0, 10, 80, 50])
     assert chosen(inputs, targets) == [0, 1, 2, 2]
@@ -52,7 +52,7 @@ def test_the_rule_weighs_distance_by_spread_and_angle_by_pi():
     assert chosen(make_views([[0, 0, 0], [4, 0, 0], [10, 0, 0]], [0, 73, 180]), target) == [0]
 
 
-def test_coincident_centres_are_told_apart_by_direction():
+def test_coincident_centers_are_told_apart_by_direction():
     inputs = make_views([[5, 0, 0]] * 3, [0, 60, 120])
     assert chosen(inputs, make_views([[0, 0, 0], [0, 7, 0]], [100, 20])) == [2, 0]
     single = make_views([[5, 0, 0]], [0])

@@ -2,11 +2,11 @@
 
 import pytest
 
-from asysplat.evaluation.post_optimisation import SceneResult
+from asysplat.evaluation.post_optimization import SceneResult
 from asysplat.evaluation.scene_results import (
     image_rows,
-    keep_scene,
-    kept_scene,
+    load_result,
+    save_result,
     scene_rows,
     set_results,
 )
@@ -19,7 +19,7 @@ def result(scene, psnrs, seconds):
         for view, psnr in enumerate(psnrs):
             rows.append({"images": "targets", "view": view, "source": source, "psnr": psnr + gain})
         rows.append({"images": "inputs", "view": 0, "source": source, "psnr": psnrs[0] + gain + 1})
-    rows.append({"images": "targets", "view": 0, "source": "mean_colour", "psnr": 5.0})
+    rows.append({"images": "targets", "view": 0, "source": "mean_color", "psnr": 5.0})
     costs = {
         "post0": {"seconds": seconds, "gb": 1.0},
         "post3": {"seconds": 2 * seconds, "gb": seconds},
@@ -35,9 +35,9 @@ SCENES = {
 
 def test_a_scene_is_read_as_it_was_kept(tmp_path):
     path = tmp_path / "main-0.json"
-    assert kept_scene(path) is None
-    keep_scene(path, SCENES["main"][0])
-    assert kept_scene(path) == SCENES["main"][0]
+    assert load_result(path) is None
+    save_result(path, SCENES["main"][0])
+    assert load_result(path) == SCENES["main"][0]
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -46,7 +46,7 @@ def test_numbers_of_a_set():
     assert found["test/main/post0/psnr"] == pytest.approx(25)
     assert found["test/main/post3/psnr"] == pytest.approx(27)
     assert found["inputs/main/post3/psnr"] == pytest.approx((13 + 33 + 43) / 3)
-    assert found["baseline/main/mean_colour/psnr"] == 5
+    assert found["baseline/main/mean_color/psnr"] == 5
     # The longest of three does not count, as the one that may have compiled.
     assert (found["cost/post0/seconds"], found["cost/post3/seconds"]) == (2, 4)
     assert (found["cost/post3/gb"], found["cost/gaussians"]) == (9, 100)
@@ -68,4 +68,4 @@ def test_rows_of_images_and_of_scenes():
         "inputs/psnr": 13.0,
         "psnr": 17.0,
     }
-    assert "seconds" not in rows["a", "mean_colour"]
+    assert "seconds" not in rows["a", "mean_color"]

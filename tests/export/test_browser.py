@@ -61,7 +61,7 @@ def arrive(tab, viewer, client, view, folder):
     until(lambda: apart() < 0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_person_sees_what_is_rendered_and_flies_by_clicks(chromium, viewer, tmp_path):
     cameras = viewer._views.cameras
     viewer._cameras_shown.value = False

@@ -19,7 +19,7 @@ def test_the_suffix_names_the_format(scene, tmp_path, name):
     write_gaussians(tmp_path / name, scene)
     read = read_gaussians(str(tmp_path / name))
     for field in fields(Gaussians):
-        if field.name != "quats":  # normalised in PLY
+        if field.name != "quats":  # normalized in PLY
             torch.testing.assert_close(getattr(read, field.name), getattr(scene, field.name))
 
 

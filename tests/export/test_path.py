@@ -84,7 +84,7 @@ def test_views_in_a_jumble_are_brought_in_order(seed):
 
 
 def test_a_good_order_is_kept():
-    """Neighbours at crossings of the way are nearer than the next view, and are not taken."""
+    """Neighbors at crossings of the way are nearer than the next view, and are not taken."""
     angles = np.linspace(0, 2 * np.pi, 61)
     eight = np.stack((np.sin(angles), np.sin(2 * angles), np.zeros(61)), 1)
     way = np.append(0, np.linalg.norm(np.diff(eight, axis=0), axis=1).cumsum())

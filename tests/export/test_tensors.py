@@ -16,7 +16,7 @@ def scene(make_scene):
 
 @pytest.fixture
 def written(scene, tmp_path):
-    write_safetensors(tmp_path / "scene.safetensors", scene, {"unit": "metres"})
+    write_safetensors(tmp_path / "scene.safetensors", scene, {"unit": "meters"})
     return tmp_path / "scene.safetensors"
 
 
@@ -24,7 +24,7 @@ def test_all_bits_come_back(written, scene):
     read, metadata = read_safetensors(written)
     for field in fields(Gaussians):
         assert torch.equal(getattr(read, field.name), getattr(scene, field.name))
-    assert metadata == {"unit": "metres"}
+    assert metadata == {"unit": "meters"}
     assert set(load_file(written)) == {field.name for field in fields(Gaussians)}
 
 

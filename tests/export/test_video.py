@@ -15,7 +15,7 @@ av = pytest.importorskip("av")
 
 
 def image(index: int, height: int, width: int) -> torch.Tensor:
-    """Smooth colours that change from frame to frame."""
+    """Smooth colors that change from frame to frame."""
     y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
     return 0.25 + 0.5 * torch.stack((x, y, torch.full_like(x, index / 20)))
 
@@ -57,7 +57,7 @@ def test_browsers_play_it(tmp_path):
 
 
 @pytest.mark.parametrize("color", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.2, 0.7, 0.4), (2, -1, 0.5)])
-def test_colours_are_right_and_clamped(tmp_path, color):
+def test_colors_are_right_and_clamped(tmp_path, color):
     color = torch.tensor(color, dtype=torch.float32)[:, None, None]
     write_video(tmp_path / "way.mp4", [color.expand(3, 16, 16)])
     found = frames_of(tmp_path / "way.mp4")[0].astype(float)

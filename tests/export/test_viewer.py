@@ -115,7 +115,7 @@ def test_the_panel_changes_what_is_sent(scene, viewer):
     gaussians, cameras = inside(viewer, scene[0])
     camera = cameras.select([1])
     photograph = photograph_at(viewer._views, camera, IN_ONE_PLACE)
-    looks = [*map(Look, LAYERS), Look("colour", 0, 0.5, 0.5)]
+    looks = [*map(Look, LAYERS), Look("color", 0, 0.5, 0.5)]
     expected = [draw(gaussians, camera, look, photograph) for look in looks]
     for one, other in combinations(expected, 2):
         assert np.abs(one.astype(int) - other).mean() > 2 * TOLERANCE
@@ -214,9 +214,9 @@ def test_what_goes_wrong_is_told_in_the_panel_and_mended_by_the_next_scene(scene
         page.stand(cameras, 0)
         viewer.show(gaussians.map(lambda tensor: tensor.to("meta")))
         until(lambda: viewer._text.content.startswith("**"))
-        viewer.show(gaussians, "mended")
+        viewer.show(gaussians, "fixed")
         page.picture_like(draw(shown, cameras.select([0]), Look()))
-        until(lambda: "mended" in viewer._text.content)
+        until(lambda: "fixed" in viewer._text.content)
 
 
 def test_a_page_that_leaves_is_dropped(scene, viewer):

@@ -19,13 +19,13 @@ def bytes_of(image):
     return (255 * image.clamp(0, 1)).round().byte().numpy()
 
 
-def test_colour_and_alpha_are_those_of_the_renderer(scene):
+def test_color_and_alpha_are_those_of_the_renderer(scene):
     rendering = render(*scene)
-    colour, alpha = draw(*scene, Look()), draw(*scene, Look(layer="alpha"))
-    np.testing.assert_array_equal(colour, bytes_of(rendering.image[0]).transpose(1, 2, 0))
+    color, alpha = draw(*scene, Look()), draw(*scene, Look(layer="alpha"))
+    np.testing.assert_array_equal(color, bytes_of(rendering.image[0]).transpose(1, 2, 0))
     for channel in range(3):
         np.testing.assert_array_equal(alpha[..., channel], bytes_of(rendering.alpha[0]))
-    assert colour.std() > 20 and alpha.std() > 20
+    assert color.std() > 20 and alpha.std() > 20
 
 
 @pytest.mark.parametrize("layer", LAYERS)
@@ -95,12 +95,12 @@ def test_error_is_dark_where_right_and_where_nothing_is_known(scene):
     np.testing.assert_array_equal(error[12:], black[12:])
 
 
-def test_without_a_photograph_error_shows_the_colour(scene):
+def test_without_a_photograph_error_shows_the_color(scene):
     np.testing.assert_array_equal(draw(*scene, Look(layer="error")), draw(*scene, Look()))
 
 
 def sky(cameras):
-    """Images of something endlessly far away: its colour is that of the direction."""
+    """Images of something endlessly far away: its color is that of the direction."""
     return 0.5 + 0.5 * cameras.rays()[1].movedim(-1, -3)
 
 

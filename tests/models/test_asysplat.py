@@ -60,7 +60,7 @@ def test_geometry_share_of_the_paper(build):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("width", "ratio"), [(0.125, 0.5), (0.125, 0.95), (0.25, 0.7), (1.0, 0.3), (1.0, 0.9)]
 )
@@ -76,7 +76,7 @@ def test_geometry_ratio(build, ratio, width):
     assert f"stages {stages} wide" in net.describe() and f"{net.widths.fine} wide" in net.describe()
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_parameter_budget(build):
     base = build(device="meta")
     net = build("geometry_ratio=0.8", "parameter_budget=0.5", device="meta")
@@ -99,7 +99,7 @@ def test_what_a_model_refuses(build, overrides, complaint):
     assert complaint in str(input_error_behind(caught.value))
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("ratio", "complaint"), [(1.2, "between 0 and 1"), (0.01, "closest come stages ")]
 )
@@ -127,7 +127,7 @@ def test_one_gaussian_per_output_pixel_at_its_ray(build):
     torch.testing.assert_close(pixels[..., 1], y.expand(2, 3, 16, 32), atol=1e-3, rtol=0)
 
 
-def test_untrained_colours_are_the_photographs(build):
+def test_untrained_colors_are_the_photographs(build):
     views = make_views()
     dc = build("model=asysplat_4m4s", *TINY)(views).sh[..., 0, :] * 0.28209479 + 0.5
     photographs = torch.nn.functional.avg_pool2d(views.images.flatten(0, 1), 2)

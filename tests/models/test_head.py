@@ -51,9 +51,9 @@ def test_untrained_photograph():
     torch.testing.assert_close(gaussians.scales, torch.full_like(gaussians.scales, size))
     assert (gaussians.opacities == 0.5).all()
     assert (gaussians.quats == torch.tensor([1.0, 0, 0, 0])).all()
-    colours = gaussians.sh[0, :, 0].reshape(2, 8, 8, 3) * 0.28209479 + 0.5
+    colors = gaussians.sh[0, :, 0].reshape(2, 8, 8, 3) * 0.28209479 + 0.5
     photographs = torch.nn.functional.avg_pool2d(views.images[0], 2).permute(0, 2, 3, 1)
-    torch.testing.assert_close(colours, photographs)
+    torch.testing.assert_close(colors, photographs)
     assert (gaussians.sh[0, :, 1:] == 0).all()
 
 
@@ -65,11 +65,11 @@ def test_untrained_longlrm():
     torch.testing.assert_close(gaussians.scales, size)
     opacity = torch.full_like(gaussians.opacities, 1 / (1 + math.exp(2)))
     torch.testing.assert_close(gaussians.opacities, opacity)
-    assert (gaussians.sh == 0).all()  # grey, whatever the photograph
+    assert (gaussians.sh == 0).all()  # gray, whatever the photograph
 
 
 def test_longlrm_by_hand():
-    """Position 3, quaternion 4, scale 3, opacity 1, colours: all as they are decoded."""
+    """Position 3, quaternion 4, scale 3, opacity 1, colors: all as they are decoded."""
     views = make_views()
     numbers = torch.arange(59.0) / 10 - 2
     gaussians, _ = decode("longlrm", numbers, views)

@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from asysplat.models import PointsPrior, SweepPrior
+from asysplat.models import PlaneSweepPrior, PointsPrior
 from asysplat.models import prior as prior_module
 from asysplat.models.prior import UNKNOWN
 from asysplat.ops import plane_sweep
 from asysplat.scene import Cameras, Views
 
 SIZE = (16, 16)
-TINY = ["model=asysplat_sweep", "model/prior=points", "width=0.125", "state_size=8"]
+TINY = ["model=asysplat_plane_sweep", "model/prior=points", "width=0.125", "state_size=8"]
 
 
 def make_views(point_depths=None):
@@ -74,16 +74,16 @@ def test_a_sweep_looks_where_the_points_are(monkeypatch):
     points[0, 1, 3, 3:6] = 1.0  # too few
     views = make_views(points)
     views.cameras.cam_to_world[0, 1, 0, 3] = 0.5
-    known = SweepPrior()(views, SIZE)
+    known = PlaneSweepPrior()(views, SIZE)
     assert given[0][0, 0].tolist() == pytest.approx([1 / 6, 3 / 4], rel=0.05)
     assert given[0][0, 1].tolist() == [0, 0]
-    unknown = SweepPrior()(replace(views, point_depths=torch.zeros_like(points)), SIZE)
-    cameras = SweepPrior()(replace(views, point_depths=None), SIZE)
+    unknown = PlaneSweepPrior()(replace(views, point_depths=torch.zeros_like(points)), SIZE)
+    cameras = PlaneSweepPrior()(replace(views, point_depths=None), SIZE)
     assert given[2] is None and torch.equal(unknown.distance, cameras.distance)
     assert not torch.equal(known.distance, cameras.distance)
 
 
 def test_a_sweep_of_one_view_with_points_is_unknown():
     views = make_views(torch.full((1, 2, 32, 32), 2.0)).map(lambda tensor: tensor[:, :1])
-    prior = SweepPrior()(views, SIZE)
+    prior = PlaneSweepPrior()(views, SIZE)
     assert prior.confidence.max() == 0 and prior.distance.isfinite().all()

@@ -10,13 +10,13 @@ from hydra.utils import instantiate
 from test_head import make_views
 
 from asysplat.evaluation.static_cost import static_costs
-from asysplat.models import DepthPrior, LongLRMHead, PhotographHead, SweepPrior
+from asysplat.models import DepthPrior, LongLRMHead, PhotographHead, PlaneSweepPrior
 from asysplat.models.head import FARTHEST, SURE
 from asysplat.models.prior import COVER, UNKNOWN, Prior
 from asysplat.scene import Cameras, Views
 
 MODELS = ["asysplat_4m4s", "longlrm", "single_branch", "asysplat_pred_fine"]
-PRIORS = {"sweep": SweepPrior, "depth": DepthPrior}
+PRIORS = {"sweep": PlaneSweepPrior, "depth": DepthPrior}
 
 
 def wall(views=4, size=32, depth=2.0, step=0.15):
@@ -54,13 +54,13 @@ def test_a_wall_is_where_it_is(name):
     assert prior.confidence[inner].mean() > 0.8
 
 
-@pytest.mark.parametrize("knob", [{"planes": 8}, {"neighbours": 1}, {"longest_side": 16}])
+@pytest.mark.parametrize("knob", [{"planes": 8}, {"neighbors": 1}, {"longest_side": 16}])
 def test_a_coarser_sweep_finds_the_wall_less_exactly(knob):
     views = wall()
     length = views.cameras.resized(16, 16).pixel_directions().norm(dim=-1)
 
     def error(**knobs):
-        found = SweepPrior(**knobs)(views, (16, 16)).distance / length
+        found = PlaneSweepPrior(**knobs)(views, (16, 16)).distance / length
         return (found[:, :, 2:-2, 4:-4] - 2).abs().mean()
 
     assert 0 < error() < error(**knob) < 1
@@ -171,7 +171,7 @@ def test_what_one_view_alone_sees_is_opaque():
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_takes_a_prior(model):
     views = wall(2)
-    plain, swept = (make_net(f"model={model}", f"model/prior={p}") for p in ("none", "sweep"))
+    plain, swept = (make_net(f"model={model}", f"model/prior={p}") for p in ("none", "plane_sweep"))
     gaussians = swept(views)
     assert gaussians.num_gaussians == plain(views).num_gaussians
     sum(field.sum() for field in vars(gaussians).values()).backward()
@@ -186,7 +186,7 @@ def test_every_model_takes_a_prior(model):
 
 
 def test_costs_are_counted_without_content():
-    costs = static_costs(make_net("model=asysplat_sweep"), 3, 32, 32)
+    costs = static_costs(make_net("model=asysplat_plane_sweep"), 3, 32, 32)
     assert costs["gaussians"] == 3 * 32 * 32 and costs["activation_gb"] > 0
 
 

@@ -9,7 +9,7 @@ from asysplat.models.single_branch import TokenMerge
 
 
 @pytest.mark.parametrize(("width", "new_width", "group"), [(2, 6, 1), (4, 6, 2)])
-def test_merge_takes_a_place_and_its_three_neighbours(width, new_width, group):
+def test_merge_takes_a_place_and_its_three_neighbors(width, new_width, group):
     """As published each channel makes its own new ones; else groups that divide both widths."""
     merge = TokenMerge(width, new_width)
     tokens = torch.randn(1, 3, 4, 6, width)
@@ -49,7 +49,7 @@ def test_a_gaussian_for_every_pixel(build, model, patch):
     views.cameras.cam_to_world[..., :, :] = torch.eye(4)
     gaussians = net(views).validate()
     assert gaussians.num_gaussians == 2 * 32 * 64
-    # One stands on the ray through each pixel's centre.
+    # One stands on the ray through each pixel's center.
     first = gaussians.means[0, 0]
     torch.testing.assert_close(
         first[:2] / first[2], torch.tensor([(0.5 - 32) / 50, (0.5 - 16) / 50])

@@ -162,7 +162,7 @@ def test_long_sequences_are_those_of_the_chunked_form_and_the_same_every_time(na
     assert all(map(torch.equal, first, again))
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
 def test_kernels_in_the_interpreter():
     pytest.importorskip("triton")

@@ -11,7 +11,7 @@ from asysplat.ops import selective_scan, ssd
 
 triton = pytest.importorskip("triton")
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.medium
 
 SCANS = {"ssd": ssd, "selective_scan": selective_scan}
 KERNELS = {

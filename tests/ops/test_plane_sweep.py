@@ -15,7 +15,7 @@ from swept import cameras_at, depth_of_plane, four_cameras, slanted_plane, textu
 
 from asysplat.ops import plane_sweep
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.cameras import Projections, choose_neighbours, inverse_depth_range
+from asysplat.ops.plane_sweep.cameras import Projections, choose_neighbors, inverse_depth_range
 from asysplat.scene import Cameras
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -24,7 +24,7 @@ FAST = [
     pytest.param("cuda", marks=[] if INTERPRETED else pytest.mark.gpu),
 ]
 DEVICE = {"cpu": "cpu", "cuda": "cpu" if INTERPRETED else "cuda"}
-# height, width, scenes, views, neighbours, planes, stride
+# height, width, scenes, views, neighbors, planes, stride
 SIZES = [
     (6, 8, 1, 3, 2, 16, 1),
     (9, 6, 1, 2, 4, 5, 3),
@@ -36,7 +36,7 @@ if not INTERPRETED:
     SIZES += LARGER
 
 
-def match_arguments(height, width, scenes, views, neighbours, planes, stride):
+def match_arguments(height, width, scenes, views, neighbors, planes, stride):
     """What `match` is given, in float32: noise that cameras turned a little look at."""
     centers = [(0.2 * v, 0.1 * (v % 2), 0.05 * v) for v in range(views)]
     cameras = cameras_at(centers, height=height, width=width, scenes=scenes)
@@ -44,7 +44,7 @@ def match_arguments(height, width, scenes, views, neighbours, planes, stride):
     cameras.cam_to_world[..., :3, :3] = torch.linalg.matrix_exp(angles - angles.mT)
     cameras = cameras.to(torch.float32)
     between = Projections.between(cameras)
-    chosen = choose_neighbours(cameras, between, neighbours)
+    chosen = choose_neighbors(cameras, between, neighbors)
     ranges = inverse_depth_range(cameras, between, chosen)
     images = torch.rand(scenes, views, height, width)
     return images, chosen, between.into(chosen, height, width), ranges, planes, stride
@@ -196,7 +196,7 @@ def test_scenes_of_a_batch_do_not_meet():
         torch.testing.assert_close(together.confidence[scene], alone.confidence[0])
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
 def test_kernels_in_the_interpreter():
     pytest.importorskip("triton")

@@ -7,7 +7,7 @@ from compiler import compiled
 
 triton = pytest.importorskip("triton")
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.medium
 
 
 @pytest.mark.parametrize("architecture", [80, 90], ids="sm_{}".format)
@@ -25,9 +25,9 @@ def test_all_kernels_compile(monkeypatch, architecture):
             kernels[name] = compiled(kernel, arguments, architecture)
 
     monkeypatch.setattr(JITFunction, "run", run)
-    neighbours = torch.tensor([[[1, -1, -1, -1], [0, -1, -1, -1]]])
+    neighbors = torch.tensor([[[1, -1, -1, -1], [0, -1, -1, -1]]])
     costs = cuda.match(
-        *(torch.zeros(1, 2, 8, 12), neighbours, torch.zeros(1, 2, 4, 3, 4), torch.zeros(1, 2, 2)),
+        *(torch.zeros(1, 2, 8, 12), neighbors, torch.zeros(1, 2, 4, 3, 4), torch.zeros(1, 2, 2)),
         planes=48,
         stride=2,
     )

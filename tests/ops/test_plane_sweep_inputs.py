@@ -16,7 +16,7 @@ def test_smaller_images_are_means_over_areas(size):
     torch.testing.assert_close(shrink(images, *size), F.interpolate(images, size, mode="area"))
 
 
-def test_edges_are_where_the_colour_changes():
+def test_edges_are_where_the_color_changes():
     images = torch.zeros(1, 1, 3, 4, 5)
     images[..., 2:] = torch.tensor([0.3, 0.6, 0.9])[:, None, None]
     left, above = edges(images)[0, 0]

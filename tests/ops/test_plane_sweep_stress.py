@@ -149,7 +149,7 @@ def test_shapes_on_a_device_without_content():
         ({"stride": 5}, "stride=5 for images of 24x32: give a number that divides both"),
         ({"stride": 0}, "stride=0"),
         ({"planes": 3}, "planes=3 .* at least 4 planes"),
-        ({"neighbours": 0}, "neighbours=0: give at least 4 planes and one neighbour"),
+        ({"neighbors": 0}, "neighbors=0: give at least 4 planes and one neighbor"),
         ({"backend": "fast"}, "backend='fast': expected one of auto, reference, cpu, cuda"),
         (
             {"images": torch.zeros(1, 4, 3, 24, 32).double(), "backend": "cpu"},

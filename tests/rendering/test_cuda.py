@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from asysplat.errors import InputError
-from asysplat.rendering import GSPLAT_1_5, Skips, cpu, reference
-from asysplat.rendering.interface import Settings
+from asysplat.rendering import GSPLAT_1_5, Culling, cpu, reference
+from asysplat.rendering.interface import RenderSettings
 from asysplat.rendering.render import BACKENDS
 from asysplat.scene import Cameras, Gaussians
 
@@ -74,11 +74,14 @@ def errors(got, exact):
 
 
 CASES = {
-    "batch": ({"scenes": 2, "views": 2, "count": 4}, Settings(depth=None)),
-    "antialiased": ({"height": 17, "width": 31}, Settings(antialiased=True)),
-    "opaque": ({"opaque": True}, Settings(depth="accumulated")),
-    "median": ({"opaque": True, "degree": 0}, Settings(depth="median", convention=GSPLAT_1_5)),
-    "a pixel": ({"height": 1, "width": 1, "degree": 3}, Settings(depth="median")),
+    "batch": ({"scenes": 2, "views": 2, "count": 4}, RenderSettings(depth=None)),
+    "antialiased": ({"height": 17, "width": 31}, RenderSettings(antialiased=True)),
+    "opaque": ({"opaque": True}, RenderSettings(depth="accumulated")),
+    "median": (
+        {"opaque": True, "degree": 0},
+        RenderSettings(depth="median", convention=GSPLAT_1_5),
+    ),
+    "a pixel": ({"height": 1, "width": 1, "degree": 3}, RenderSettings(depth="median")),
 }
 
 
@@ -118,9 +121,9 @@ def test_skips_leave_the_bits(make_scene):
     gaussians.opacities[:, 6:8] = 0.9999
     masks = torch.ones(1, 1, cameras.height, cameras.width, dtype=torch.bool, device=DEVICE)
     masks[..., :9, :9] = False
-    images, grads, stats = run(draw_by_cuda, gaussians, cameras, Settings(), masks)
+    images, grads, stats = run(draw_by_cuda, gaussians, cameras, RenderSettings(), masks)
     for name, gain in GAINS.items():
-        settings = Settings(skips=Skips().without(name))
+        settings = RenderSettings(culling=Culling().without(name))
         other = run(draw_by_cuda, gaussians, cameras, settings, masks)
         assert all(map(torch.equal, [*images, *grads], [*other[0], *other[1]])), name
         assert other[2][gain] != stats[gain], name
@@ -131,7 +134,7 @@ def test_skips_leave_the_bits(make_scene):
 def test_nothing_to_see(make_scene, count):
     gaussians, cameras = make_batch(make_scene, scenes=2, views=2, count=count, device=DEVICE)
     gaussians.means[..., 2] -= 20
-    images, grads, stats = run(draw_by_cuda, gaussians, cameras, Settings())
+    images, grads, stats = run(draw_by_cuda, gaussians, cameras, RenderSettings())
     assert all((tensor == 0).all() for tensor in (*images, *grads))
     assert stats["visible"] == 0 and stats["pairs"] == 0
 
@@ -140,10 +143,10 @@ def test_nothing_to_see(make_scene, count):
 def test_float64_is_projected_as_it_is_and_drawn_in_float32(make_scene):
     scene = make_batch(make_scene, count=3, height=8, width=8, device=DEVICE)
     scene = [part.to(torch.float64) for part in scene]
-    images, grads, _ = run(draw_by_cuda, *scene, Settings())
+    images, grads, _ = run(draw_by_cuda, *scene, RenderSettings())
     assert {image.dtype for image in images} == {torch.float32}
     assert {grad.dtype for grad in grads} == {torch.float64}
-    exact = run(reference.draw, *scene, Settings())
+    exact = run(reference.draw, *scene, RenderSettings())
     assert max(errors((images, grads), exact)[0]) <= 1e-6
 
 
@@ -152,10 +155,10 @@ def test_float64_is_projected_as_it_is_and_drawn_in_float32(make_scene):
 def test_a_large_scene_is_the_same_every_time_and_that_of_the_cpu(make_scene):
     scene = make_batch(make_scene, views=3, count=20_000, height=256, width=240, device=DEVICE)
     scene[0].scales.mul_(0.1)
-    first = run(draw_by_cuda, *scene, Settings())
-    again = run(draw_by_cuda, *scene, Settings())
+    first = run(draw_by_cuda, *scene, RenderSettings())
+    again = run(draw_by_cuda, *scene, RenderSettings())
     assert all(map(torch.equal, [*first[0], *first[1]], [*again[0], *again[1]]))
-    images, grads, _ = run(cpu.draw, *(part.to("cpu") for part in scene), Settings())
+    images, grads, _ = run(cpu.draw, *(part.to("cpu") for part in scene), RenderSettings())
     for got, image in zip(first[0], images, strict=True):
         off = (got.cpu() - image).abs() > 1e-4 * (1 + image.abs())
         assert off.float().mean() < 1e-3  # at the cut-offs
@@ -164,7 +167,7 @@ def test_a_large_scene_is_the_same_every_time_and_that_of_the_cpu(make_scene):
 
 
 def needles(scene):
-    """Thin and long, the centres of most far outside the image."""
+    """Thin and long, the centers of most far outside the image."""
     gaussians, cameras = scene
     gaussians.scales.mul_(torch.tensor([100, 0.05, 0.05]))
     gaussians.means[..., :2].mul_(20)
@@ -185,7 +188,7 @@ def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch
     list_tiles = module._list_tiles
     monkeypatch.setattr(module, "_list_tiles", keep)
     scene = change(make_batch(make_scene, views=2, count=60, height=45, width=50))
-    stats = draw_by_cuda(*(part.to(DEVICE) for part in scene), Settings()).stats
+    stats = draw_by_cuda(*(part.to(DEVICE) for part in scene), RenderSettings()).stats
     ((depths, (lists, _)),) = found
     splats = lists.splats
     rows, columns, size = 6, 7, 8
@@ -202,7 +205,7 @@ def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch
     ranks = lists.pairs - lists.first_pair[entries]
     assert (ranks >= 0).all() and (ranks < counts[entries]).all()
 
-    # On a grid eight times as fine as pixels, between the outermost pixel centres of each tile.
+    # On a grid eight times as fine as pixels, between the outermost pixel centers of each tile.
     offsets = torch.arange(0, size - 0.9, 1 / 8, dtype=torch.float64) + 0.5
     fine_x, fine_y = (
         (torch.arange(0, n * size, size)[:, None] + offsets).clamp_max(pixels - 0.5).flatten()
@@ -227,14 +230,14 @@ def test_too_many_pairs_are_an_error(make_scene, monkeypatch):
     scene = make_batch(make_scene, device=DEVICE)
     monkeypatch.setattr("asysplat.rendering.interface.MOST_PAIRS", 3)
     with pytest.raises(InputError, match=r"\d+ pairs.* 3: set views_at_once"):
-        draw_by_cuda(*scene, Settings())
+        draw_by_cuda(*scene, RenderSettings())
 
 
 @pytest.mark.skipif(INTERPRETED, reason="a CPU will do there")
 def test_tensors_on_a_cpu_are_an_error(make_scene):
     pytest.importorskip("triton")
     with pytest.raises(InputError, match=r"'cuda'.* cpu: choose 'auto'.*to\('cuda'\)"):
-        draw_by_cuda(*make_batch(make_scene), Settings())
+        draw_by_cuda(*make_batch(make_scene), RenderSettings())
 
 
 def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
@@ -243,10 +246,10 @@ def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "triton", None)
     with pytest.raises(InputError, match="'cuda' needs triton: pip install triton"):
-        draw_by_cuda(*make_batch(make_scene), Settings())
+        draw_by_cuda(*make_batch(make_scene), RenderSettings())
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
 def test_kernels_in_the_interpreter():
     pytest.importorskip("triton")

@@ -8,7 +8,7 @@ from asysplat.rendering import render
 
 triton = pytest.importorskip("triton")
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.medium
 
 TYPES = {torch.float32: "fp32", torch.float64: "fp64", torch.int16: "i16", torch.int32: "i32"}
 TYPES |= {torch.int64: "i64", torch.bool: "i1"}

@@ -79,9 +79,9 @@ def test_matches_a_loop_over_pixels(make_scene, opaque, height, width):
     torch.testing.assert_close(out.depth[0], depth, rtol=0, atol=1e-9)
 
 
-def test_one_gaussian_at_its_centre():
+def test_one_gaussian_at_its_center():
     gaussians = Gaussians(
-        means=torch.tensor([[0.5, 0.5, 2.0]]),  # projects to the centre of pixel (5, 5)
+        means=torch.tensor([[0.5, 0.5, 2.0]]),  # projects to the center of pixel (5, 5)
         quats=torch.tensor([[2.0, 0, 0, 0]]),
         scales=torch.tensor([[0.1, 0.2, 0.3]]),
         opacities=torch.tensor([0.6]),

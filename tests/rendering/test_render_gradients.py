@@ -25,7 +25,7 @@ def test_gradients_equal_finite_differences(make_scene, name):
     alphas = torch.stack([out.alpha for out in single])
     assert alphas.min() > 1.1 / 255 and alphas.max() < 0.9
     assert (1 - alphas).prod(0).min() > 1e-3
-    assert all((out.image / out.alpha[:, None]).min() > 0.05 for out in single)  # colours
+    assert all((out.image / out.alpha[:, None]).min() > 0.05 for out in single)  # colors
 
     tensors = {
         "means": gaussians.means,

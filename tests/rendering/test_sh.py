@@ -53,7 +53,7 @@ def test_colors_depend_on_the_direction_alone_and_are_not_negative():
     assert (sh_colors(sh - 20 * torch.eye(9)[0, :, None], offsets) == 0).all()
 
 
-def test_no_direction_gives_a_finite_colour_and_gradient():
+def test_no_direction_gives_a_finite_color_and_gradient():
     sh = torch.randn(1, 4, 3)
     offsets = torch.zeros(1, 3, requires_grad=True)
     color = sh_colors(sh, offsets)

@@ -45,7 +45,7 @@ def write_run(folder: Path, config, numbers: dict, seed: int) -> None:
     (folder / "metrics.json").write_text(json.dumps(describe_run(config) | numbers))
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize("table", load_paper())
 def test_costs_of_every_row_are_the_papers_or_flagged(compose, table, monkeypatch):
     # The paper prints none, and they take longer than all else.
@@ -67,7 +67,7 @@ def test_costs_of_every_row_are_the_papers_or_flagged(compose, table, monkeypatc
 def logs(compose, tmp_path):
     for seed, psnr in ((0, 20.0), (2, 21.0)):
         config = compose(["sweeps=layers", "model=asysplat_7m1t", *OVERRIDES])
-        numbers = {"test/procedural/psnr": psnr, "baseline/procedural/mean_colour/psnr": 13.0}
+        numbers = {"test/procedural/psnr": psnr, "baseline/procedural/mean_color/psnr": 13.0}
         numbers["baseline/procedural/nearest_view/psnr"] = 16.0
         write_run(tmp_path / "a" / str(seed), config, numbers, seed)
     other = compose(["sweeps=layers", "model=asysplat_7m1t", "steps=8"])
@@ -84,7 +84,7 @@ def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
     assert row.seeds == (0, 2) and row.missing == (1,)
     assert "1" in row.note
     assert not rows[("model=asysplat_8t",)].values
-    assert filled.baselines == {"procedural": {"mean_colour": 13.0, "nearest_view": 16.0}}
+    assert filled.baselines == {"procedural": {"mean_color": 13.0, "nearest_view": 16.0}}
     assert filled.command == "python train.py sweeps=layers steps=7"
 
 
@@ -179,14 +179,14 @@ def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, t
     assert sizes[0] != sizes[1]
 
 
-def test_post_optimisation_is_not_run_until_evaluation_adds_it(compose, tmp_path):
+def test_post_optimization_is_not_run_until_evaluation_adds_it(compose, tmp_path):
     config = compose(["sweeps=state_of_the_art", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, {"test/procedural/psnr": 20.0}, 0)
     table = load_paper()["state_of_the_art"]
 
     def ours():
         filled = fill_table(table, [], compose, finished_runs(tmp_path))
-        return {row.paper.post_optimisation: row for row in filled.rows if "AsySplat" in row.name}
+        return {row.paper.post_optimization: row for row in filled.rows if "AsySplat" in row.name}
 
     assert ours()[0].values["dl3dv/psnr"] == [20.0]
     assert not ours()[10].values and "evaluate.py" in ours()[10].note

@@ -22,8 +22,8 @@ def draw(points, hollow=()):
 def test_the_front_is_a_line_and_the_rest_is_faded():
     line, *dots = draw(POINTS, hollow=["base", "worse"]).lines
     assert list(line.get_xdata()) == [1.0, 2.0, 3.0]
-    colours = {dot.get_xdata()[0]: dot.get_color() for dot in dots}
-    assert colours == {3.0: "blue", 1.0: "blue", 2.0: "blue", 2.5: FAINT}
+    colors = {dot.get_xdata()[0]: dot.get_color() for dot in dots}
+    assert colors == {3.0: "blue", 1.0: "blue", 2.0: "blue", 2.5: FAINT}
     faces = {dot.get_xdata()[0]: dot.get_markerfacecolor() for dot in dots}
     assert faces == {3.0: "blue", 1.0: "blue", 2.0: "none", 2.5: "none"}
 

@@ -17,8 +17,8 @@ from asysplat.report.paper import (
 # What the cells before a row's numbers are, where it is more than the name.
 LEADING = {
     "training_overhead": ("size", "name"),
-    "state_of_the_art": ("name", "post_optimisation"),
-    "replica": ("name", "post_optimisation"),
+    "state_of_the_art": ("name", "post_optimization"),
+    "replica": ("name", "post_optimization"),
     "inference_overhead": ("size", "name"),
     "more_views": ("name", "views", "poses"),
     "mamba_ratio": ("mamba", "attention", "name"),
@@ -82,8 +82,8 @@ def check_row(table: PaperTable, row: PaperRow, cells: list[str]) -> None:
     assert cell["name"] in row.name
     if "views" in cell:
         assert int(cell["views"]) == row.views
-    if "post_optimisation" in cell:
-        assert read_number(cell["post_optimisation"], 1) in (("=", row.post_optimisation), None)
+    if "post_optimization" in cell:
+        assert read_number(cell["post_optimization"], 1) in (("=", row.post_optimization), None)
     numbers = dict(zip([c.key for c in table.columns], cells[len(leading) :], strict=True))
     printed = {k: read_number(v, HEADER_UNITS.get((table.key, k), 1)) for k, v in numbers.items()}
     assert printed == {key: recorded(row, key) for key in numbers}
@@ -102,7 +102,7 @@ def test_rows_of_a_table_have_their_own_names_and_runs():
         assert len({row.name for row in table.rows}) == len(table.rows)
         ours = [row for row in table.rows if not row.quoted]
         # What tells two rows of one run apart, beside their sizes, is what is tested.
-        tested = {(row.run, row.size, row.post_optimisation, row.test_set) for row in ours}
+        tested = {(row.run, row.size, row.post_optimization, row.test_set) for row in ours}
         assert len(tested) == len(ours)
         assert table.rank_by is None or all(table.rank_by in row.numbers for row in table.rows)
 
@@ -128,9 +128,9 @@ def test_unverified_rows_have_another_reading():
 
 def test_text_is_in_the_unit_of_the_title():
     overhead = load_paper()["inference_overhead"]
-    feed_forward, post_optimised = overhead.rows[:2]
+    feed_forward, post_optimized = overhead.rows[:2]
     assert [feed_forward.text(c) for c in overhead.columns] == ["142.0", "<1", "20,200", "26", "8"]
-    assert [post_optimised.text(c) for c in overhead.columns] == ["142.0", "50", "", "31", "8"]
+    assert [post_optimized.text(c) for c in overhead.columns] == ["142.0", "50", "", "31", "8"]
     assert load_paper()["layers"].columns[1].title == "DL3DV-140 PSNR"
 
 

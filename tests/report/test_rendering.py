@@ -91,7 +91,7 @@ def table() -> FilledTable:
         "python train.py sweeps=layers",
         {"dl3dv": "my_rooms"},
         ({"name": "longlrm", "psnr": "mean of *all* images", "absrel": "of depths"},),
-        {"my_rooms": {"mean_colour": 13.2, "nearest_view": 14.5}},
+        {"my_rooms": {"mean_color": 13.2, "nearest_view": 14.5}},
         "2 cores",
     )
 
@@ -176,7 +176,7 @@ def test_notes_under_a_table(table):
         "**Paper**: 32 views",
         "**Ours**: laptop: 8 views of 64x64",
         "**Stand-ins**: DL3DV-140 by our test set my\\_rooms",
-        "**For nothing**: my\\_rooms: mean colour 13.20 dB, nearest view, copied 14.50 dB",
+        "**For nothing**: my\\_rooms: mean color 13.20 dB, nearest view, copied 14.50 dB",
         "**Seeds**: 0, 1, 2: mean ± sample standard deviation over them",
         # Means 22, 20.6, 21.5: 0.71 between rows; sqrt((2 + 0.02) / 3) = 0.82 between seeds,
         # of which there are two a row on average.

@@ -18,8 +18,8 @@ from asysplat.ops import image_loss, plane_sweep, selective_scan, ssd
 from asysplat.ops.cpu.gathers import gather_pairs, gather_squares
 from asysplat.ops.cpu.kernel import kernel
 from asysplat.ops.cpu.vectors import load, load_some, store, zeros
-from asysplat.reconstruction.adam import VisibleAdam
-from asysplat.rendering import Skips
+from asysplat.refinement.adam import VisibleAdam
+from asysplat.rendering import Culling
 from asysplat.rendering.cpu.math import take_sum
 from asysplat.scene import Cameras, Gaussians
 
@@ -54,14 +54,14 @@ def wild_scene(seed: int, height: int, width: int, degree: int) -> tuple[Gaussia
 
 def check_renderer() -> int:
     """How many scenes were drawn; each in all memories, forward and backward."""
-    skips = Skips()
+    culling = Culling()
     cases = [(tangent_scene(30_000, 256, 256, seed), {}) for seed in range(3)]
     sizes = [(1, 1, 0), (13, 17, 3), (16, 16, 1), (33, 300, 2), (300, 15, 0)]
     for seed, (height, width, degree) in enumerate(sizes):
         scene = wild_scene(seed, height, width, degree)
         cases += [(scene, {"antialiased": True}), (scene, {"depth": "median"})]
         for name in ("ellipse", "extent", "frustum", "rows", "opaque"):
-            cases.append((scene, {"skips": skips.without(name)}))
+            cases.append((scene, {"culling": culling.without(name)}))
         masks = torch.zeros(2, 2, height, width, dtype=torch.bool)
         masks[..., : height // 2] = True
         cases.append((scene, {"masks": masks}))

@@ -1,4 +1,4 @@
-"""A scene optimised for long, as a user would: all fields of 60,000 Gaussians, on photographs.
+"""A scene optimized for long, as a user would: all fields of 60,000 Gaussians, on photographs.
 
 python tests/stress/soak.py path/to/scene 1000
 NUMBA_BOUNDSCHECK=1 python tests/stress/soak.py path/to/scene 1000, with memory poisoned too
@@ -16,7 +16,7 @@ from rich.progress import track
 from torch import Tensor
 
 from asysplat import Cameras, Gaussians, Views, render
-from asysplat.data.normalise import normalise
+from asysplat.data.normalize import normalize
 from asysplat.data.readers import open_scene
 from asysplat.evaluation.metrics import psnr
 from asysplat.export import read_splat
@@ -32,10 +32,10 @@ def photographs(scene: Path) -> Views:
     """Views of a scene in the frame of networks; of a .splat file, renderings on a circle."""
     if scene.suffix == ".splat":
         return circle_around(read_splat(scene))
-    capture = open_scene(scene, SIDE, SIDE)
-    count = min(MOST_VIEWS, capture.num_frames)
-    views = capture.views(np.linspace(0, capture.num_frames - 1, count).astype(int).tolist())
-    return normalise(views, views)[0]
+    sequence = open_scene(scene, SIDE, SIDE)
+    count = min(MOST_VIEWS, sequence.num_frames)
+    views = sequence.views(np.linspace(0, sequence.num_frames - 1, count).astype(int).tolist())
+    return normalize(views, views)[0]
 
 
 def circle_around(gaussians: Gaussians, views: int = 16, radius: float = 1.6) -> Views:
@@ -53,7 +53,7 @@ def circle_around(gaussians: Gaussians, views: int = 16, radius: float = 1.6) ->
 
 
 def start(views: Views) -> dict[str, Tensor]:
-    """Gaussians on the rays of all views, at a distance of about 2, in the photographs' colours."""
+    """Gaussians on the rays of all views, at a distance of about 2, in the photographs' colors."""
     side = round((COUNT / views.num_views) ** 0.5)
     origins, directions = views.cameras.resized(side, side).rays()
     distance = 2 * (0.3 * torch.randn(*directions.shape[:-1], 1)).exp()

@@ -35,7 +35,7 @@ MODES = {
 
 
 def soft_scene(make_scene, mode: Mode, dtype=torch.float64) -> tuple[Gaussians, Cameras]:
-    """Wide Gaussians on few pixels: no alpha near a cut-off, no colour near 0."""
+    """Wide Gaussians on few pixels: no alpha near a cut-off, no color near 0."""
     gaussians, cameras = make_scene(3, 2, 5, 6, mode.degree)
     gaussians = Gaussians(
         gaussians.means * torch.tensor([0.2, 0.2, 1], dtype=torch.float64),

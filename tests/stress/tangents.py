@@ -8,7 +8,7 @@ from asysplat.benchmark.scenes import random_scene
 from asysplat.rendering import INRIA
 from asysplat.rendering.cpu.splat import TILE
 from asysplat.rendering.formulas import EXPONENT_MARGIN, PIXEL_MARGIN
-from asysplat.rendering.interface import Settings
+from asysplat.rendering.interface import RenderSettings
 from asysplat.rendering.reference.project import find_footprint
 from asysplat.scene import Cameras, Gaussians
 
@@ -40,11 +40,11 @@ def tangent_scene(
     for _ in range(2):
         footprint = find_footprint(
             gaussians.means, gaussians.quats, gaussians.scales, pose, pinhole, (width, height),
-            Settings(),
+            RenderSettings(),
         )  # fmt: skip
         room = (gaussians.opacities / INRIA.alpha_min).log2() + EXPONENT_MARGIN
         extent = (2 * math.log(2) * room).sqrt()[:, None] * footprint.deviations
-        # First and last pixel centre of its extent: where one is whole, its tile may change.
+        # First and last pixel center of its extent: where one is whole, its tile may change.
         last = footprint.xy + extent - 0.5 + PIXEL_MARGIN
         first = footprint.xy - extent - 0.5 - PIXEL_MARGIN
         to_last = (last / tile).round() * tile - last

@@ -1,4 +1,4 @@
-"""Bad input: an error that names the field, the index and the mend."""
+"""Bad input: an error that names the field, the index and the fix."""
 
 import math
 from dataclasses import replace

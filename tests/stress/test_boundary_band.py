@@ -11,7 +11,7 @@ from torch import Tensor
 
 from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
 from asysplat.benchmark.stability.band import boundary_band
-from asysplat.rendering.interface import Settings
+from asysplat.rendering.interface import RenderSettings
 
 OTHERS = tuple(name for name in INPUTS if name not in FIELDS)
 SCENES = {
@@ -39,7 +39,7 @@ class Comparison:
 def compare(backend: Backend, scene: str, mode: str) -> Comparison:
     gaussians, cameras = SCENES[scene](backend.many)
     outputs, options = MODES[mode]
-    settings = Settings(antialiased=options.get("antialiased", False))
+    settings = RenderSettings(antialiased=options.get("antialiased", False))
     band = boundary_band(gaussians, cameras, settings)
 
     def grad_output(name, output):

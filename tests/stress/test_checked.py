@@ -9,7 +9,7 @@ import pytest
 from backends import INTERPRETED
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.skipif(INTERPRETED, reason="kernels for GPUs are interpreted there")
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is poisoned by glibc")
 def test_kernels_with_bounds_checks_and_in_poisoned_memory():

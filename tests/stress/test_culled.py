@@ -88,7 +88,7 @@ def test_case_09_a_zero_quaternion_is_culled(backend, make_scene, quat):
 
 
 @pytest.mark.parametrize("length", [2.0**-60, 2.0**-30, 2.0**30, 2.0**60], ids="{:.0e}".format)
-def test_case_09_any_other_length_is_normalised(backend, make_scene, length):
+def test_case_09_any_other_length_is_normalized(backend, make_scene, length):
     gaussians, cameras = make_scene(dtype=torch.float32)
     exact = both_ways(backend, gaussians, cameras)
     gaussians.quats[3] *= length
@@ -106,7 +106,7 @@ def test_case_14_nothing_to_see_is_the_background(backend, make_scene, what, dep
         gaussians = gaussians.keep(torch.zeros(12, dtype=torch.bool))
     elif what == "none visible":
         gaussians.means[:, 2] -= 20
-    else:  # between the centres of four pixels, and too faint to reach one
+    else:  # between the centers of four pixels, and too faint to reach one
         cameras.intrinsics[:, 0, 2] = 8
         cameras.intrinsics[:, 1, 2] = 6
         gaussians.means[:, :2] = 0

@@ -9,7 +9,7 @@ from backends import BACKGROUND, EXACT, FIELDS, assert_close, both_ways, random_
 from soft import FLOOR, MODES, soft_scene
 
 from asysplat.rendering import INRIA, render
-from asysplat.rendering.interface import Settings
+from asysplat.rendering.interface import RenderSettings
 from asysplat.rendering.reference.project import project
 from asysplat.scene import Gaussians
 
@@ -22,7 +22,7 @@ def test_a_soft_scene_has_no_jump(make_scene, mode):
     for i in range(3):
         out = render(gaussians.keep(torch.arange(3) == i), cameras, **mode.options)
         assert out.alpha.min() > 1.1 / 255 and out.alpha.max() < 0.9
-        assert (out.image / out.alpha[:, None]).min() > 0.05  # colours
+        assert (out.image / out.alpha[:, None]).min() > 0.05  # colors
         left = left * (1 - out.alpha)
         if mode.options.get("depth") == "median":
             assert (left - 0.5).abs().min() > 1e-4  # where it jumps
@@ -31,7 +31,7 @@ def test_a_soft_scene_has_no_jump(make_scene, mode):
         one = project(
             gaussians.map(lambda t: t[None]),
             cameras.map(lambda t: t[None]),
-            Settings(FLOOR, antialiased=True),
+            RenderSettings(FLOOR, antialiased=True),
         )
         lowered = one.opacities.sort().values / gaussians.opacities.repeat(2).sort().values
         at_floor = (lowered - 0.5).abs() < 1e-9

@@ -33,7 +33,7 @@ SOME = {
 HALVES = [list(SOME)[:3], list(SOME)[3:]]
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
 @pytest.mark.parametrize("names", HALVES, ids=" ".join)
 def test_cases_in_the_interpreter(names):

@@ -12,11 +12,11 @@ from asysplat.errors import InputError
 from asysplat.rendering import CONVENTIONS, INRIA, render
 from asysplat.scene import Cameras, Gaussians
 
-CENTRE = (4, 5)  # of the pixel that the stack stands at
+CENTER = (4, 5)  # of the pixel that the stack stands at
 
 
 def stack(opacities, dtype=torch.float32):
-    """Points of one pixel, one behind the other, dead centre."""
+    """Points of one pixel, one behind the other, dead center."""
     count = len(opacities)
     depths = torch.linspace(2, 3, count, dtype=dtype)
     gaussians = Gaussians(
@@ -43,12 +43,12 @@ def test_case_20_stacks_of_opaque_splats(backend, count, opacity, convention):
     assert_close(backend, result, exact, slack=50)  # rounding, times 1 / (1 - alpha) < 100
     assert result.alpha.max() <= 1 - convention.transmittance_min * (1 - 1e-3)
 
-    def centre(_, output):
+    def center(_, output):
         grad = torch.zeros_like(output)
-        grad[..., CENTRE[0], CENTRE[1]] = 1
+        grad[..., CENTER[0], CENTER[1]] = 1
         return grad
 
-    result = both_ways(backend, gaussians, cameras, grad_output=centre, convention=convention)
+    result = both_ways(backend, gaussians, cameras, grad_output=center, convention=convention)
     assert (result.grads["sh"][0] != 0).all()
     assert (result.grads["sh"][10:] == 0).all() and (result.grads["opacities"][10:] == 0).all()
 
@@ -58,7 +58,7 @@ def test_case_21_a_single_opaque_gaussian_is_drawn(backend, convention):
     gaussians, cameras = stack([1.0])
     convention = CONVENTIONS[convention]
     result = both_ways(backend, gaussians, cameras, convention=convention)
-    row, column = CENTRE
+    row, column = CENTER
     assert float(result.alpha[0, row, column]) == pytest.approx(convention.alpha_max, abs=1e-6)
     beside = math.exp(-0.5 / (INRIA.eps2d + 0.01))
     assert float(result.alpha[0, row, column + 1]) == pytest.approx(beside, abs=1e-3)
@@ -74,7 +74,7 @@ def test_case_22_opacities_out_of_range_are_refused(backend, opacity):
 
 def test_case_22_opacity_at_the_cut_off_is_exact(backend):
     """At 1/255 one pixel shows, at the next number below it none."""
-    row, column = CENTRE
+    row, column = CENTER
     at = torch.tensor(INRIA.alpha_min, dtype=backend.dtype)
     below = torch.nextafter(at, torch.zeros_like(at))
     for opacity, pixels in ((at, 1), (below, 0)):
@@ -88,7 +88,7 @@ def test_case_22_opacity_at_the_cut_off_is_exact(backend):
 
 
 def test_case_23_both_passes_take_identical_decisions(backend):
-    """Where colours are not clamped, an image is linear in them: gradient times colours is gradient
+    """Where colors are not clamped, an image is linear in them: gradient times colors is gradient
     times image. A pixel that one pass draws and the other does not adds more than 1/255 to the
     difference."""
     gaussians, cameras = random_scene(backend.many, 96, 128)

@@ -10,8 +10,8 @@ from asysplat.rendering import INRIA
 from asysplat.rendering.reference.math import sh_basis
 
 
-def test_case_10_no_direction_shows_the_dc_colour(backend, make_scene):
-    """At 1e-12 from the camera's centre its direction is lost; near is 0, or it were culled."""
+def test_case_10_no_direction_shows_the_dc_color(backend, make_scene):
+    """At 1e-12 from the camera's center its direction is lost; near is 0, or it were culled."""
     gaussians, cameras = make_scene(count=1, degree=3, dtype=torch.float32)
     cameras = facing(cameras)
     gaussians.means[:] = torch.tensor([0.0, 0.0, 1e-12])

@@ -6,7 +6,7 @@ import torch
 from backends import EXACT, assert_close, both_ways, facing
 
 from asysplat.errors import InputError
-from asysplat.rendering import Skips, render
+from asysplat.rendering import Culling, render
 from asysplat.rendering.cpu.draw import _starts
 from asysplat.rendering.render import BACKENDS
 from asysplat.scene import Cameras, Gaussians
@@ -38,7 +38,7 @@ def test_case_16_more_tiles_than_16_bits_count(backend, make_scene):
         assert torch.equal(result.outputs[name][64:], output), name
 
 
-@pytest.mark.hours
+@pytest.mark.slow
 def test_case_17_pairs_that_no_list_can_number_are_refused():
     """2^31 and more of them, on the CPU: 33000 giants over 65536 tiles."""
     count = 33000
@@ -52,7 +52,7 @@ def test_case_17_pairs_that_no_list_can_number_are_refused():
     intrinsics = torch.tensor([[[100.0, 0, 2**19], [0, 100, 0.5], [0, 0, 1]]])
     cameras = Cameras(intrinsics, torch.eye(4)[None], 1, 2**20)
     with pytest.raises(InputError, match=rf"{count * 2**16} pairs.*2147483647.*views_at_once"):
-        render(giants, cameras, backend="cpu", skips=Skips().without("ellipse"))
+        render(giants, cameras, backend="cpu", culling=Culling().without("ellipse"))
 
 
 def test_case_17_too_little_memory_is_met_by_fewer_views(backend, make_scene, monkeypatch):

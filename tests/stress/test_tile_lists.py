@@ -8,7 +8,7 @@ import pytest
 import torch
 from tangents import tangent_scene
 
-from asysplat.rendering import Skips, render
+from asysplat.rendering import Culling, render
 from asysplat.rendering.cpu import splat as col
 from asysplat.rendering.cpu.splat import TILE, Frame, ProjectSettings, load_ellipse
 from asysplat.rendering.cpu.tiles import find_box, list_tiles, place
@@ -86,7 +86,7 @@ def check_lists(lists, height: int, width: int) -> int:
     assert (tile // tiles == owner // num).all()
     assert len(np.unique(owner.astype(np.int64) * len(lists.first_entry) + tile)) == pairs
 
-    # Each tile has something of its splat between its outermost pixel centres.
+    # Each tile has something of its splat between its outermost pixel centers.
     ellipses = Ellipses(lists.splats[owner])
     left, top = tile % tiles % columns * TILE + 0.5, tile % tiles // columns * TILE + 0.5
     right = np.minimum(left + TILE - 1, width - 0.5)
@@ -121,7 +121,7 @@ def check_lists(lists, height: int, width: int) -> int:
     return pairs
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize("size", [(256, 256), (250, 256), (64, 300), (256, 17)], ids=str)
 def test_a_million_splats_that_end_where_tiles_begin(lists_of, size):
     """Two scenes of each size: 2^20 splats in all."""
@@ -138,7 +138,7 @@ def test_boxes_and_several_views(lists_of):
     views.intrinsics[1, 0, 2] += 7.3
     exact = lists_of(gaussians, views)
     check_lists(exact, 100, 120)
-    boxes = lists_of(gaussians, views, skips=Skips(ellipse=False))
+    boxes = lists_of(gaussians, views, culling=Culling(ellipse=False))
     assert len(boxes.entries) > len(exact.entries)
     assert (np.bincount(boxes.entries[:, 1]) == 1).all()
 

@@ -15,14 +15,14 @@ from torch.utils.data import DataLoader
 from asysplat.data.loader import EpochLoader, batches_done
 from asysplat.errors import InputError
 from asysplat.training.callbacks import Checkpoints
-from asysplat.training.callbacks.checkpoints import WholeFiles
+from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
 from asysplat.training.checkpoints import (
     check_checkpoint,
+    config_diff,
     find_checkpoint,
     load_weights,
     read_notes,
     save_weights,
-    what_differs,
 )
 from asysplat.training.tensorboard import cut_events, make_logger
 
@@ -91,7 +91,7 @@ def fit(folder, module, steps=7, checkpoint=None, minutes=None):
         num_sanity_val_steps=0,
         log_every_n_steps=1,
         callbacks=[checkpoints],
-        plugins=[WholeFiles()],
+        plugins=[AtomicCheckpointIO()],
         logger=make_logger(folder),
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -263,9 +263,9 @@ def test_a_bit_that_changed_on_the_disk_is_noticed(tmp_path, run, capsys):
 
 def test_what_differs_from_the_run_before():
     notes = {"revision": "a", "hyper_parameters": {"steps": 6, "data": {"seed": 1, "root": "x"}}}
-    assert what_differs(notes, notes["hyper_parameters"] | {"ckpt_path": "last"}, "a") == []
+    assert config_diff(notes, notes["hyper_parameters"] | {"ckpt_path": "last"}, "a") == []
     options = {"steps": 9, "data": {"seed": 2, "root": "x"}, "paths": {"logs": "y"}}
-    assert what_differs(notes, options, "b") == [
+    assert config_diff(notes, options, "b") == [
         "data.seed=2, it was 1",
         "steps=9, it was 6",
         "the code is b, it was a",

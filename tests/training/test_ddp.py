@@ -13,7 +13,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from asysplat.scene import Cameras, Views
 
-pytestmark = [pytest.mark.hours, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 CONF = Path(__file__).parents[2] / "conf"
 PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models

@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 FEW = [
     *("trainer.accelerator=cpu", "steps=2", "validate_every=1", "data.batch_size=4"),
     *("data.val_scenes=3", "data.test_scenes=3", "data.test_sets=null"),  # odd, of two processes
-    *("~callbacks.costs", "~callbacks.pictures", "~callbacks.progress"),
+    *("~callbacks.costs", "~callbacks.figures", "~callbacks.progress"),
 ]
 TWO = "trainer.devices=2"
 
@@ -62,14 +62,14 @@ def check_the_same(found: Outcome, expected: Outcome) -> None:
     assert (found.weights - expected.weights).norm() < 1e-6 * expected.weights.norm()
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_accumulated(train, one):
     result = train("name=accumulated", "trainer.devices=1", "data.micro_batch=1", *FEW)
     assert "global batch 4 = 1 process x 1 scene x 4 accumulated" in result.stdout
     check_the_same(outcome(result), one)
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_two_processes(train, one):
     """Each accumulates, and validates and tests a share of three scenes."""
     result = train.alone("name=two", "trainer=ddp", TWO, "data.micro_batch=1", *FEW)
@@ -77,7 +77,7 @@ def test_two_processes(train, one):
     check_the_same(outcome(result), one)
 
 
-@pytest.mark.hours
+@pytest.mark.slow
 def test_divided_weights(train, one):
     """FSDP takes the same steps, and one process goes on from its checkpoint."""
     saving = ["training.checkpoint_layers=true", "training.views_at_once=1"]

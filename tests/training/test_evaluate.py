@@ -24,7 +24,7 @@ from asysplat.report.paper import load_paper
 from asysplat.scene import Views
 from asysplat.training.checkpoints import load_weights
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.medium
 
 STEPS = "steps=[0,3,10]"
 MODEL = ["model=asysplat_4m4s", "metrics=longlrm", *SIZE]  # of Table 2
@@ -34,7 +34,7 @@ MODEL = ["model=asysplat_4m4s", "metrics=longlrm", *SIZE]  # of Table 2
 def whole(tmp_path_factory, run_script, repository) -> Path:
     """The folder of a finished run of the model of Table 2."""
     train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
-    result = train(*MODEL, "model.layers=4m4s", "~callbacks.pictures", "~callbacks.curve", COSTS)
+    result = train(*MODEL, "model.layers=4m4s", "~callbacks.figures", "~callbacks.curve", COSTS)
     assert result.returncode == 0, result.stderr
     return Path(result.stdout.strip().splitlines()[-1].removeprefix("run: "))
 
@@ -100,7 +100,7 @@ def test_files_have_every_image_and_every_scene(whole, evaluated):
         assert len(list(csv.DictReader(file))) == 3 * 2 * (3 + 2)
 
 
-def test_the_report_has_rows_with_post_optimisation(whole, evaluated, repository):
+def test_the_report_has_rows_with_post_optimization(whole, evaluated, repository):
     one_stage = ["stage=stage1", "earlier_stages=[]"]
     tiny = [*SIZE, *VIEWS, *TINY_SCENES, *TRAINING, *one_stage]
     with initialize_config_dir(str(repository / "conf"), version_base=None):
@@ -110,7 +110,7 @@ def test_the_report_has_rows_with_post_optimisation(whole, evaluated, repository
             lambda overrides: hydra.compose("train", list(overrides), return_hydra_config=True),
             finished_runs(whole.parents[1]),
         )
-    rows = {r.paper.post_optimisation: r for r in filled.rows if r.name.startswith("AsySplat")}
+    rows = {r.paper.post_optimization: r for r in filled.rows if r.name.startswith("AsySplat")}
     for steps in (3, 10):
         values = rows[steps].values
         assert values["dl3dv/psnr"] == [evaluated[f"test/procedural/post{steps}/psnr"]]
@@ -130,7 +130,7 @@ def test_a_checkpoint_by_path_has_the_numbers_of_its_run(whole, evaluated, evalu
 def test_interrupted_it_goes_on_where_it_was(whole, evaluated, evaluate, tmp_path, monkeypatch):
     weights = f"init_path={whole}/checkpoints/last.ckpt"
     command = [weights, *MODEL, *VIEWS, *TINY_SCENES]
-    keep = scenes.keep_scene
+    keep = scenes.save_result
 
     def interrupted(path, result):
         if path.name == "rooms-0.json":
@@ -138,14 +138,14 @@ def test_interrupted_it_goes_on_where_it_was(whole, evaluated, evaluate, tmp_pat
         keep(path, result)
 
     with monkeypatch.context() as patch:
-        patch.setattr(scenes, "keep_scene", interrupted)
+        patch.setattr(scenes, "save_result", interrupted)
         stopped = evaluate(*command, STEPS)
     assert stopped.returncode != 0 and "the same command goes on" in stopped.stderr
     assert not list(tmp_path.rglob("evaluation.json"))
     kept = {path: path.read_bytes() for path in tmp_path.rglob("procedural-*.json")}
     assert len(kept) == 2
     measured = []
-    monkeypatch.setattr(scenes, "keep_scene", lambda p, r: (measured.append(p.stem), keep(p, r)))
+    monkeypatch.setattr(scenes, "save_result", lambda p, r: (measured.append(p.stem), keep(p, r)))
     _, results = outcome(evaluate(*command, STEPS))
     assert measured == ["rooms-0", "rooms-1", "outdoors-0", "outdoors-1"]
     assert {path: path.read_bytes() for path in kept} == kept
@@ -186,12 +186,12 @@ def test_a_file_of_gaussians_in_the_worlds_units(whole, photographs, evaluate, t
     with torch.no_grad():
         gaussians = module.net.eval()(Views.stack([sample["inputs"]])).map(lambda t: t[0])
     path = tmp_path / "scene.ply"
-    write_gaussians(path, sample["frame"].undo(gaussians))
+    write_gaussians(path, sample["frame"].to_world(gaussians))
     _, found = outcome(evaluate(f"scene={path}", "metrics=longlrm", *data))
     assert qualities(found) == pytest.approx(qualities(expected), abs=0.01)
 
     behind = replace(gaussians, means=gaussians.means - torch.tensor([0.0, 0.0, 1000.0]))
-    write_gaussians(path, sample["frame"].undo(behind))
+    write_gaussians(path, sample["frame"].to_world(behind))
     assert "see none of them" in refusal(evaluate(f"scene={path}", *data))
     synthetic = evaluate(f"scene={path}", *VIEWS, *TINY_SCENES)
     assert "is one scene, and the data has 2" in refusal(synthetic)
@@ -214,7 +214,7 @@ REFUSED = {
     "no folder": (["init_path=shipped", "data=files"], "add data.root=..."),
     "another model": (
         ["init_path=shipped", "width=0.125"],
-        "asysplat_sweep.safetensors does not fit this model, ",
+        "asysplat_plane_sweep.safetensors does not fit this model, ",
     ),
     "steps that do not increase": (["init_path=shipped", "steps=[3,3]"], "above the one before"),
     "a size out of range": (["init_path=shipped", "data.height=0"], "data.height=0: give a whole"),

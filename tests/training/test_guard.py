@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader
 from asysplat.data.datamodule import collate
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
-from asysplat.training.callbacks import SkipNonFiniteSteps
+from asysplat.training.callbacks import NonFiniteSteps
 from asysplat.training.non_finite import first_non_finite, main, replay
 
 KEPT = ("model", "training", "trainer")  # of the configuration, what a step needs
@@ -61,7 +61,7 @@ class Module(lightning.LightningModule):
 
 
 def fit(module, folder, loader=None, **options):
-    guard = SkipNonFiniteSteps(folder, **options)
+    guard = NonFiniteSteps(folder, **options)
     trainer = lightning.Trainer(
         accelerator="cpu",
         max_epochs=1,
@@ -121,7 +121,7 @@ def test_the_first_tensor_is_named_wherever_it_is():
     assert first(broken) == "the output of layer"
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_kept_step_of_the_network_is_taken_again(repository, tmp_path, capsys, monkeypatch):
     with initialize_config_dir(str(repository / "conf"), version_base=None):
         config = compose("train", [*NETWORK, *STEPS, *VIEWS, "training.loss.depth=0.0"])

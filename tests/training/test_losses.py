@@ -13,11 +13,11 @@ from torchvision.models import vgg19 as torchvision_vgg19
 from asysplat.errors import InputError
 from asysplat.rendering import Rendering
 from asysplat.scene import Cameras, Gaussians, Views
-from asysplat.training import InputDisparity, Outcome, ReconstructionLoss
+from asysplat.training import InputDisparity, Outcome, SplattingLoss
 from asysplat.training.disparity import (
     disparity_distance,
     known_disparities,
-    normalised_disparity,
+    normalized_disparity,
     own_depths,
 )
 from asysplat.training.perceptual import longlrm, vgg16
@@ -54,7 +54,7 @@ def pair(size=32, depths=True):
 
 def test_mean_squared_error():
     outcome, batch = pair()
-    terms = ReconstructionLoss(mse=2.0, perceptual=0.0, depth=0.0)(outcome, batch)
+    terms = SplattingLoss(mse=2.0, perceptual=0.0, depth=0.0)(outcome, batch)
     expected = (outcome.rendering.image - batch["targets"].images).square().mean()
     torch.testing.assert_close(terms["loss"], 2 * expected)
     assert set(terms) == {"loss", "mse"}
@@ -69,12 +69,12 @@ def test_disparity_does_not_see_scale_and_shift():
     assert disparity_distance(targets.depths.flip(-1), disparity, everywhere) > 0.1
 
 
-def test_normalised_disparity_by_hand():
+def test_normalized_disparity_by_hand():
     disparity = torch.tensor([[[1.0, 2.0], [4.0, 7.0]]])
     valid = torch.tensor([[[True, True], [True, False]]])
     # Disparities 1, 2, 4: median 2, mean absolute deviation (1 + 0 + 2) / 3.
     expected = torch.tensor([[[-1.0, 0.0], [2.0, 0.0]]])
-    torch.testing.assert_close(normalised_disparity(disparity, valid), expected)
+    torch.testing.assert_close(normalized_disparity(disparity, valid), expected)
 
 
 def test_disparities_come_before_depths():
@@ -93,13 +93,13 @@ def test_opacity_is_a_term_and_off_by_default():
     gaussians = replace(outcome.gaussians, opacities=torch.rand(2048).requires_grad_())
     outcome = Outcome(gaussians, outcome.rendering)
     options = {"mse": 1.0, "perceptual": 0.0, "depth": 0.0}
-    terms = ReconstructionLoss(**options, opacity=0.1)(outcome, batch)
+    terms = SplattingLoss(**options, opacity=0.1)(outcome, batch)
     torch.testing.assert_close(terms["opacity"], gaussians.opacities.mean())
     torch.testing.assert_close(terms["loss"], terms["mse"] + 0.1 * terms["opacity"])
-    assert "opacity" not in ReconstructionLoss(**options)(outcome, batch)
+    assert "opacity" not in SplattingLoss(**options)(outcome, batch)
 
 
-# Disparities (1, 2, 4) against (1, 2, 3), normalised: (-1, 0, 2) against (-1.5, 0, 1.5), whose
+# Disparities (1, 2, 4) against (1, 2, 3), normalized: (-1, 0, 2) against (-1.5, 0, 1.5), whose
 # SmoothL1 are 0.5^2 / 2, 0 and 0.5^2 / 2; the fourth pixel's depth is unknown.
 DEPTHS, TARGET = [[1, 1 / 2], [1 / 4, 7]], [[1, 1 / 2], [1 / 3, 0]]
 BY_HAND = 2 * 0.5**2 / 2 / 3
@@ -114,7 +114,7 @@ def test_rendered_disparity_by_hand():
     views = Views(cameras(4, views=1), torch.rand(1, 3, 4, 4), target)
     rendering = Rendering(torch.rand(1, 3, 4, 4), torch.ones(1, 4, 4), depth, {})
     outcome = Outcome(gaussians_at(torch.ones(4, 3)), rendering)
-    loss = ReconstructionLoss(mse=0.0, perceptual=0.0, depth=1.0)
+    loss = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0)
     assert loss.needs_depth
     terms = loss(outcome, {"inputs": None, "targets": views})
     torch.testing.assert_close(terms["depth"].item(), BY_HAND)
@@ -145,7 +145,7 @@ def test_input_disparity_by_hand():
     gaussians = gaussians_at(means)
     torch.testing.assert_close(own_depths(gaussians, inputs), depth)
 
-    loss = ReconstructionLoss(mse=0.0, perceptual=0.0, depth=1.0, depth_term=InputDisparity)
+    loss = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0, depth_term=InputDisparity)
     assert not loss.needs_depth
     rendering = Rendering(torch.rand(1, 3, 4, 4), torch.ones(1, 4, 4), None, {})
     targets = Views(cameras(4, views=1), torch.rand(1, 3, 4, 4))
@@ -184,7 +184,7 @@ def test_gaussians_that_are_no_map_of_the_views():
 def test_pixels_without_depth_do_not_count():
     outcome, batch = pair()
     batch["targets"].depths[:, :8] = 0
-    terms = ReconstructionLoss(mse=0.0, perceptual=0.0, depth=1.0)(outcome, batch)
+    terms = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0)(outcome, batch)
     terms["loss"].backward()
     grad = outcome.rendering.depth.grad
     assert (grad[:, :8] == 0).all()
@@ -194,7 +194,7 @@ def test_pixels_without_depth_do_not_count():
 def test_no_known_depth_at_all_gives_zero_and_no_nan():
     outcome, batch = pair()
     batch["targets"].depths.zero_()
-    terms = ReconstructionLoss(mse=0.0, perceptual=0.0, depth=1.0)(outcome, batch)
+    terms = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0)(outcome, batch)
     terms["loss"].backward()
     assert terms["loss"] == 0
     assert (outcome.rendering.depth.grad == 0).all()
@@ -203,7 +203,7 @@ def test_no_known_depth_at_all_gives_zero_and_no_nan():
 @pytest.mark.parametrize("reading", [{}, {"depth_term": InputDisparity}])
 def test_data_without_depth_turns_the_term_off_and_is_said_once(reading):
     outcome, batch = pair(depths=False)
-    loss = ReconstructionLoss(mse=1.0, perceptual=0.0, depth=1.0, **reading)
+    loss = SplattingLoss(mse=1.0, perceptual=0.0, depth=1.0, **reading)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         for _ in range(3):
@@ -215,7 +215,7 @@ def test_data_without_depth_turns_the_term_off_and_is_said_once(reading):
 def test_missing_backbone_is_said_and_the_term_is_off(tmp_path, monkeypatch, term, name):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     with pytest.warns(UserWarning, match=f"{name} is neither .* paths.weights"):
-        loss = ReconstructionLoss(
+        loss = SplattingLoss(
             mse=1.0, perceptual=0.5, depth=0.0, perceptual_term=lambda: term(str(tmp_path))
         )
     assert set(loss(*pair())) == {"loss", "mse"}
@@ -294,7 +294,7 @@ def test_perceptual_term_has_the_same_bits_under_autocast(distances, name):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_perceptual_term(distances, name):
     distance, _ = distances[name]
-    loss = ReconstructionLoss(mse=0.0, perceptual=1.0, depth=0.0, perceptual_term=lambda: distance)
+    loss = SplattingLoss(mse=0.0, perceptual=1.0, depth=0.0, perceptual_term=lambda: distance)
     outcome, batch = pair()
     terms = loss(outcome, batch)
     terms["loss"].backward()

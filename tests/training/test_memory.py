@@ -2,13 +2,13 @@
 
 import pytest
 import torch
-from test_reconstruction import make_module
+from test_module import make_module
 from test_side_by_side import make_batch
 
 from asysplat.evaluation.cost import memory_before_gb, peak_memory_gb, reset_peak_memory
 from asysplat.evaluation.static_cost import Activations
 from asysplat.rendering import render
-from asysplat.training import ReconstructionLoss
+from asysplat.training import SplattingLoss
 from asysplat.training.memory import Held, Sizes
 
 
@@ -16,7 +16,7 @@ from asysplat.training.memory import Held, Sizes
 def module(build):
     torch.manual_seed(0)
     module = make_module(build("width=0.125", "state_size=8", "model.layers=1m1s"))
-    module.loss = ReconstructionLoss(mse=1.0, perceptual=0.0, depth=0.1, ssim=0.1)
+    module.loss = SplattingLoss(mse=1.0, perceptual=0.0, depth=0.1, ssim=0.1)
     return module
 
 

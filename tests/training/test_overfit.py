@@ -10,19 +10,19 @@ from asysplat.data.procedural import ProceduralScene
 from asysplat.data.selection import uniform_selection
 from asysplat.data.sources import Task
 from asysplat.evaluation.metrics import psnr
-from asysplat.training import Reconstruction, ReconstructionLoss
+from asysplat.training import SplattingLoss, SplattingModule
 from asysplat.training.schedule import cosine
 
 STEPS = 250
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_one_scene_overfitted_passes_30_db(build):
     scene = ProceduralScene(3, 32, 32)
     batch = collate([load(Task(scene, uniform_selection(96, 4, 2)))])
-    module = Reconstruction(
+    module = SplattingModule(
         net=build("width=0.25", "state_size=32", "model.layers=1m1s"),
-        loss=ReconstructionLoss(mse=1.0, perceptual=0.0, depth=0.0),
+        loss=SplattingLoss(mse=1.0, perceptual=0.0, depth=0.0),
         optimizer=partial(
             torch.optim.AdamW, lr=1e-3, betas=(0.9, 0.95), weight_decay=0.0, fused=True
         ),

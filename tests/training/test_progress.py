@@ -8,7 +8,7 @@ import torch
 from rich.console import Console
 from torch.utils.data import DataLoader
 
-from asysplat.training.callbacks import Progress, progress
+from asysplat.training.callbacks import TrainingProgressBar, progress
 
 
 class Module(lightning.LightningModule):
@@ -43,7 +43,7 @@ def fit(tmp_path, steps, checkpoint=None):
         max_steps=steps,
         max_epochs=-1,
         num_sanity_val_steps=0,
-        callbacks=[Progress()],
+        callbacks=[TrainingProgressBar()],
         logger=False,
         enable_checkpointing=False,
         enable_model_summary=False,

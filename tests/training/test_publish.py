@@ -18,7 +18,7 @@ def run(train):
     return next(path.parent for path in train.logs.rglob("metrics.json"))
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_run_is_published(run, tmp_path, monkeypatch):
     target = tmp_path / "checkpoints" / "net"
     publish(run, target)

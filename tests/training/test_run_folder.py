@@ -8,7 +8,7 @@ import time
 import pytest
 
 from asysplat.errors import InputError
-from asysplat.training.run_folder import claimed, run_folder
+from asysplat.training.run_folder import locked, run_folder
 
 FORK = multiprocessing.get_context("fork")
 
@@ -43,7 +43,7 @@ def test_all_else_starts_in_a_folder_of_its_own(cut_off, tmp_path):
 
 def hold(folder, pipe):
     """Claim the folder, as a run with a process that loads data, which outlives it."""
-    with claimed(folder):
+    with locked(folder):
         loader = FORK.Process(target=time.sleep, args=(600,))
         loader.start()
         pipe.send(loader.pid)
@@ -58,12 +58,12 @@ def test_no_two_train_in_one_folder_until_one_is_killed(tmp_path):
     loader = ours.recv()
     with (
         pytest.raises(InputError, match=r"run is a run that another process still trains"),
-        claimed(folder),
+        locked(folder),
     ):
         pytest.fail("both train there")
     run.kill()
     run.join()
     os.kill(loader, 0)  # it lives
-    with claimed(folder):
+    with locked(folder):
         assert folder.is_dir()
     os.kill(loader, signal.SIGKILL)

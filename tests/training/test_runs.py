@@ -38,7 +38,7 @@ SAME = {
     "moved weights": ["paths.weights=/b/weights", "training.loss.perceptual_term.backbone_dir=/c"],
     "another test set": ["test_sets=[mipnerf360]", "paths.mipnerf360=/b/360_v2"],
     "other names": ["name=other", "paths.logs=/b/logs", "rerun=true"],
-    "other processes": ["data.num_workers=3", "callbacks.pictures.scenes=0"],
+    "other processes": ["data.num_workers=3", "callbacks.figures.scenes=0"],
     "another seed": ["seed=5"],
     "other devices": ["trainer=ddp", "trainer.devices=4", "trainer.num_nodes=2"],
     "less at a time": ["data.micro_batch=1", "training.checkpoint_layers=true"],

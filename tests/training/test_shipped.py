@@ -1,6 +1,6 @@
 """The model that ships: what it is, and real photographs beside what one gets for nothing.
 
-pytest tests/training/test_shipped.py -m hours -s prints the numbers of the README.
+pytest tests/training/test_shipped.py -m slow -s prints the numbers of the README.
 """
 
 import itertools
@@ -12,7 +12,7 @@ from hydra.utils import instantiate
 
 from asysplat.data.datamodule import collate, load
 from asysplat.data.sources import FilesSource
-from asysplat.evaluation.baselines import mean_colour, nearest_view
+from asysplat.evaluation.baselines import mean_color, nearest_view
 from asysplat.evaluation.lpips import load_lpips, lpips_distance
 from asysplat.evaluation.metrics import psnr
 from asysplat.training.checkpoints import SHIPPED, load_weights
@@ -38,11 +38,11 @@ def test_it_is_small_and_has_a_card():
 
 
 def measure(module, lpips, batch):
-    """PSNR and LPIPS of the model, of the nearest view and of the mean colour."""
+    """PSNR and LPIPS of the model, of the nearest view and of the mean color."""
     inputs, targets = batch["inputs"], batch["targets"]
     with torch.no_grad():
         image = module.reconstruct(batch, depth=False).rendering.image.clamp(0, 1)
-    drawn = (image, nearest_view(inputs, targets), mean_colour(inputs, targets))
+    drawn = (image, nearest_view(inputs, targets), mean_color(inputs, targets))
     return [
         (
             psnr(each, targets.images).mean().item(),
@@ -52,10 +52,10 @@ def measure(module, lpips, batch):
     ]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("most", [8, pytest.param(32, marks=pytest.mark.hours)])
+@pytest.mark.medium
+@pytest.mark.parametrize("most", [8, pytest.param(32, marks=pytest.mark.slow)])
 def test_real_photographs(module, shared, most):
-    """PSNR above the nearest view's and the mean colour's everywhere, LPIPS on half the scenes."""
+    """PSNR above the nearest view's and the mean color's everywhere, LPIPS on half the scenes."""
     lpips = load_lpips("alex", shared / "weights")
     if lpips is None:
         pytest.skip(f"{shared} has no weights of LPIPS")

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from test_reconstruction import make_module
+from test_module import make_module
 from torch import nn
 
 from asysplat.scene import Cameras, Views
-from asysplat.training import ReconstructionLoss, side_by_side
+from asysplat.training import SplattingLoss, side_by_side
 from asysplat.training.side_by_side import SideBySide, split
 
 SCENES = 3
@@ -30,7 +30,7 @@ def make_batch():
 def module(build):
     torch.manual_seed(0)
     module = make_module(build("width=0.125", "state_size=8", "model.layers=1m1s"))
-    module.loss = ReconstructionLoss(mse=1.0, perceptual=0.0, depth=0.1)
+    module.loss = SplattingLoss(mse=1.0, perceptual=0.0, depth=0.1)
     return module
 
 

@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from tiny import NETWORK, SCENES
 
 from asysplat.errors import InputError
-from asysplat.training import Reconstruction
+from asysplat.training import SplattingModule
 from asysplat.training.runs import config_hash, find_run, find_runs
 from asysplat.training.stages import (
     check_stages,
@@ -108,7 +108,7 @@ def test_a_checkpoint_says_where_to_go_on(composed, tmp_path):
 
 
 def test_tests_and_costs_of_a_stage_are_named_after_it():
-    results = {"test/rooms/psnr": 2.0, "cost/peak_gb": 1.0, "baseline/rooms/mean_colour/psnr": 0.0}
+    results = {"test/rooms/psnr": 2.0, "cost/peak_gb": 1.0, "baseline/rooms/mean_color/psnr": 0.0}
     found = results_of_stage("stage1", results | {"protocol/name": "default"})
     assert found == {"stage1/test/rooms/psnr": 2.0, "stage1/cost/peak_gb": 1.0}
 
@@ -147,7 +147,7 @@ def whole(train) -> Path:
     return run_folder(train("name=whole"))
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_run_of_three_stages_is_one_run(whole, logs, composed):
     (run,) = find_runs(whole)
     numbers, config = run.results, yaml.safe_load((whole / "config.yaml").read_text())
@@ -168,7 +168,7 @@ def test_a_run_of_three_stages_is_one_run(whole, logs, composed):
     assert find_run(logs, composed(*TINY[1:])).folder == whole
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_weights_pass_on_and_the_optimizer_starts_anew(whole):
     first, second, third = (saved_in(whole / name) for name in ("stage1", "stage2", "."))
     for stage in (first, second, third):
@@ -183,12 +183,12 @@ def test_weights_pass_on_and_the_optimizer_starts_anew(whole):
         torch.testing.assert_close(third["state_dict"][name], second["state_dict"][name])
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_stopped_twice_in_the_second_stage_and_resumed_it_has_the_same_bits(
     train, whole, monkeypatch
 ):
     """First before its first step, then between its two."""
-    step = Reconstruction.training_step
+    step = SplattingModule.training_step
 
     def stopped_after(steps: int, *overrides: str) -> None:
         taken = []
@@ -200,7 +200,7 @@ def test_stopped_twice_in_the_second_stage_and_resumed_it_has_the_same_bits(
             return step(module, batch, index)
 
         with monkeypatch.context() as patch:
-            patch.setattr(Reconstruction, "training_step", stopping)
+            patch.setattr(SplattingModule, "training_step", stopping)
             assert "error: stopped" in train("name=stopped", *overrides).stderr
 
     stopped_after(2)
@@ -217,7 +217,7 @@ def test_stopped_twice_in_the_second_stage_and_resumed_it_has_the_same_bits(
     assert {key: results.get(key) for key in tests} == {key: expected[key] for key in tests}
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_weights_of_another_model_are_refused_before_a_step(train, whole, logs):
     path = whole / "stage1" / "checkpoints" / "last.ckpt"
     result = train("name=other", "width=0.25", f"init_path={path}")

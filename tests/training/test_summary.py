@@ -10,7 +10,7 @@ METRICS = {
     "protocol/name": "longlrm",
     "test/rooms/psnr": 21.5,
     "baseline/rooms/nearest_view/psnr": 16.0,
-    "baseline/rooms/mean_colour/psnr": 13.0,
+    "baseline/rooms/mean_color/psnr": 13.0,
 }
 STATIC = {"cost/parameters": 2e6, "cost/geometry_share": 0.7, "cost/gaussians": 10}
 STEP = {"cost/seconds_per_step": 2.0, "cost/render_seconds_per_step": 0.5}

@@ -88,7 +88,7 @@ def check_same(whole, killed):
     assert (killed / "checkpoints" / "previous.ckpt").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_killed_twice_it_ends_with_the_same_bits_and_logs(train):
     options = [*OPTIONS, "steps=6", "validate_every=3"]
     result = train("name=whole", *options)
@@ -105,7 +105,7 @@ def test_killed_twice_it_ends_with_the_same_bits_and_logs(train):
     check_same(whole, folder_of(train, "killed"))
 
 
-@pytest.mark.hours
+@pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_killed_twenty_times_it_ends_with_the_same_bits_and_logs(train):
     options = [*OPTIONS, "steps=150", "validate_every=10"]
@@ -117,7 +117,7 @@ def test_killed_twenty_times_it_ends_with_the_same_bits_and_logs(train):
     check_same(folder_of(train, "whole"), folder_of(train, "killed"))
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_notice_to_all_processes_and_then_a_lost_loader(train):
     options = [*OPTIONS, "steps=1000", "validate_every=1000"]
     process, said = live(train, "noticed", *options)
@@ -151,7 +151,7 @@ def kill_workers(process):
         os.kill(int(worker), signal.SIGKILL)
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_full_disk_ends_a_run_with_a_sentence(train):
     with largest_file(5_000_000):  # which the checkpoint exceeds
         result = train("name=full", "steps=2")

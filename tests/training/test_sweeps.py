@@ -8,10 +8,10 @@ from hydra import compose, initialize_config_dir
 
 from asysplat.training.runs import describe_run
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.medium
 
 SWEEP = ["sweeps=layers", "model=asysplat_7m1s", "model.layers=1m1s", "steps=1"]
-SWEEP += ["data.test_sets=null", "callbacks.pictures=null"]
+SWEEP += ["data.test_sets=null", "callbacks.figures=null"]
 
 
 def finished_seeds(logs) -> list[int]:
@@ -74,7 +74,7 @@ def test_a_failure_is_named_and_the_others_go_on(train, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "launcher", [pytest.param("joblib", marks=pytest.mark.hours), "submitit_local"]
+    "launcher", [pytest.param("joblib", marks=pytest.mark.slow), "submitit_local"]
 )
 def test_launchers(train, finish, tmp_path, launcher):
     """Two of three jobs are still to be run."""

@@ -11,11 +11,11 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from tiny import NETWORK, SCENES, VIEWS
 
-from asysplat.training.callbacks import Costs, Metrics, Pictures
+from asysplat.training.callbacks import Costs, Figures, Metrics
 from asysplat.training.callbacks.metrics import gather
 from asysplat.training.summary import print_summary
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.medium
 
 TINY = [*NETWORK, *VIEWS, *SCENES, "paths.run=unused"]
 
@@ -41,7 +41,7 @@ def measure(repository, tmp_path_factory):
             trainer = lightning.Trainer(
                 accelerator="cpu",
                 logger=False,
-                callbacks=[costs, metrics, Pictures(str(folder), scenes=2)],
+                callbacks=[costs, metrics, Figures(str(folder), scenes=2)],
                 enable_progress_bar=False,
                 enable_model_summary=False,
             )
@@ -121,7 +121,7 @@ def test_the_summary_shows_every_set(together, capsys):
         for kind in (
             "test/{}/psnr",
             "baseline/{}/nearest_view/psnr",
-            "baseline/{}/mean_colour/psnr",
+            "baseline/{}/mean_color/psnr",
         ):
             assert f"{results[kind.format(name)]:.3f}" in line
 

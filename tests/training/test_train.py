@@ -31,7 +31,7 @@ def metrics(folder: Path) -> dict:
 def whole(tmp_path_factory, run_script, repository) -> Path:
     """The folder of a finished run of 6 steps."""
     train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
-    return run_folder(train("name=whole", "steps=6", "callbacks.watch.every=2", COSTS))
+    return run_folder(train("name=whole", "steps=6", "callbacks.monitor.every=2", COSTS))
 
 
 def test_a_run_leaves_what_is_promised(whole):
@@ -39,7 +39,7 @@ def test_a_run_leaves_what_is_promised(whole):
     numbers = metrics(folder)
     for name in ("psnr", "ssim", "absrel", "delta1"):
         assert isinstance(numbers[f"test/procedural/{name}"], float)
-    assert numbers["baseline/procedural/mean_colour/psnr"] < 30
+    assert numbers["baseline/procedural/mean_color/psnr"] < 30
     assert numbers["baseline/procedural/nearest_view/psnr"] < 30
     expected = {"parameters", "geometry_share", "gflops", "gflops_true", "gaussians"}
     expected |= {"peak_gb", "peak_bytes_per_token", "seconds_per_step", "render_seconds_per_step"}
@@ -107,7 +107,7 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     assert "_hparams_/session_start_info" in plugins
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_protocol_by_name(train, shared):
     result = train("metrics=longlrm", "steps=2", f"paths.shared={shared}")
     numbers = metrics(run_folder(result))
@@ -119,15 +119,15 @@ def test_a_protocol_by_name(train, shared):
 
 
 LEFT_OUT = [
-    ["~callbacks.metrics", "~callbacks.guard", "callbacks.pictures=null"],
+    ["~callbacks.metrics", "~callbacks.guard", "callbacks.figures=null"],
     [
         *("~callbacks.costs", "~callbacks.curve", "~callbacks.checkpoints"),
-        *("~callbacks.progress", "~callbacks.watch"),
+        *("~callbacks.progress", "~callbacks.monitor"),
     ],
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize("overrides", LEFT_OUT, ids=" ".join)
 def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, monkeypatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
@@ -135,7 +135,7 @@ def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, mo
     names = [key.partition(".")[2].removesuffix("=null") for key in overrides]
     logged = "watch" not in names
     costs = [] if "costs" in names else [COSTS]
-    result = train(*overrides, *costs, "callbacks.watch.every=2" if logged else "logger=none")
+    result = train(*overrides, *costs, "callbacks.monitor.every=2" if logged else "logger=none")
     folder = run_folder(result)
     numbers = metrics(folder)
     assert (folder / "tensorboard").exists() == logged
@@ -161,19 +161,19 @@ def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, mo
     assert "Epoch" not in result.stdout + result.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_bfloat16_with_the_perceptual_term(train, shared):
     perceptual = ["training.loss.perceptual=0.5", f"paths.shared={shared}"]
     folder = run_folder(train("trainer.precision=bf16-mixed", "steps=2", *perceptual))
     numbers = metrics(folder)
-    assert numbers["test/procedural/psnr"] > numbers["baseline/procedural/mean_colour/psnr"]
+    assert numbers["test/procedural/psnr"] > numbers["baseline/procedural/mean_color/psnr"]
     assert 0 < numbers["test/procedural/lpips"] < 1
     weights = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
     assert not any("vgg" in name for name in weights)
     assert all(tensor.dtype != torch.bfloat16 for tensor in weights.values())
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repository, tmp_path):
     environment = {k: v for k, v in train.environment.items() if k != "ASYSPLAT_SHARED"}
     environment["PYTHONFAULTHANDLER"] = "1"
@@ -194,7 +194,7 @@ def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repositor
     assert paths["shared"] == str(repository.parent / "shared")
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_geometry_ratio_sweep(train, tmp_path):
     size = ["model.layers=4m4s", "width=0.25", "steps=1", "data.test_sets=null"]
     result = train("-m", "geometry_ratio=0.5,0.9", *size, COSTS)
@@ -207,7 +207,7 @@ def test_geometry_ratio_sweep(train, tmp_path):
     assert max(totals) / min(totals) < 1.02
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["fern", "fox", "mydesk", "hololens-000"])
 def test_a_real_scene(train, shared, name):
     scene = shared / "data" / name
@@ -264,7 +264,7 @@ def test_mistakes_are_one_clear_sentence(train, case, tmp_path):
     check_refusal(train(*overrides), message, tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize("case", ALONE)
 def test_mistakes_are_one_clear_sentence_to_a_user(train, case, tmp_path):
     overrides, message = REFUSED[case]

@@ -14,11 +14,10 @@ from asysplat.benchmark.ops.sweep import SweepCase
 from asysplat.benchmark.render.run import Backend, prepare, run
 from asysplat.benchmark.scenes import random_scene
 from asysplat.ops.adam.cpu import adam_step_cpu
-from asysplat.ops.adam.reference import Rows, adam_step_reference
-from asysplat.ops.adam.reference import Settings as AdamSettings
+from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 from asysplat.ops.image_loss import image_loss
-from asysplat.reconstruction import Refinement
-from asysplat.rendering import Skips
+from asysplat.refinement import Refinement
+from asysplat.rendering import Culling
 from asysplat.scene import Views
 
 CPU = torch.device("cpu")
@@ -37,14 +36,14 @@ CASES = {
                 "width": 32,
                 "stride": 2,
                 "planes": 48,
-                "neighbours": 3,
+                "neighbors": 3,
             },
         ),
     ),
 }
 GAUSSIANS, SIDE = 5000, 96  # of the renderer's scene
 ROWS = 20_000  # that Adam updates half of
-NETWORK, VIEWS, VIEW_SIDE = "asysplat_sweep", 4, 64
+NETWORK, VIEWS, VIEW_SIDE = "asysplat_plane_sweep", 4, 64
 
 Run = Callable[[], object]
 
@@ -75,7 +74,7 @@ def _renderer() -> Iterator[Pair]:
     gaussians, camera = random_scene(GAUSSIANS, SIDE, SIDE)
     inputs = prepare((gaussians, camera), "cpu")
     fast, reference = (
-        partial(run, Backend(name, "cpu"), Skips(), inputs) for name in ("cpu", "reference")
+        partial(run, Backend(name, "cpu"), Culling(), inputs) for name in ("cpu", "reference")
     )
     yield Pair("render", "reference", fast, reference)
     generator = torch.Generator().manual_seed(0)

@@ -46,9 +46,9 @@ def measure(options: DictConfig, console: Console) -> Result:
         made = Path(folder) / "scene"
         root = wanted.root or write_photographs(made, wanted.frames, *wanted.photographs)
         open_views = partial(open_scene, root, height, width)
-        capture = open_views()
-        lens = capture.scene.photographs[0].lens
-        count = max(1, capture.num_frames // frames)
+        sequence = open_views()
+        lens = sequence.scene.photographs[0].lens
+        count = max(1, sequence.num_frames // frames)
         make_data = partial(
             files_data,
             **size,
@@ -82,7 +82,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     rates = {name: summary([1 / s for s in scene.seconds[name]]) for name in (*CACHES, "network")}
     return {
         "scene": {
-            "frames": capture.num_frames,
+            "frames": sequence.num_frames,
             "photographs": [lens.height, lens.width],
             "views": [height, width],
             "workers": wanted.num_workers,

@@ -81,7 +81,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     results, first = [], {}
     for i, row in enumerate(rows):
         floors = {part: products.summary((i, part)) for part in parts}
-        result = row.found | _summarise(row, floors, counts[i]["forward"], products)
+        result = row.found | _summarize(row, floors, counts[i]["forward"], products)
         same_input = first.setdefault((result["views"], result["precision"]), result)
         results.append(result | {"over_first": ratios(result, same_input, PASSES)})
     return {"rows": results}
@@ -115,10 +115,10 @@ def _prepare(workload: Workload, steps: bool) -> Measurement:
     return Measurement(seconds, found)
 
 
-def _summarise(
+def _summarize(
     row: Measurement, floors: Mapping[str, Result], counts: Counts, products: Measurement
 ) -> Result:
-    """Summarise the rounds of a network, and of the products of its forward pass."""
+    """Summarize the rounds of a network, and of the products of its forward pass."""
     times = {name: row.summary(name) for name in row.seconds}
     forward, step, floor = times["forward"], times.get("step"), floors["forward"]
     return {

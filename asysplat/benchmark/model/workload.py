@@ -45,7 +45,7 @@ class Workload:
             return self.net(self.views)
 
     def step(self) -> None:
-        """Run a training step without renderer and optimiser: the loss is a mean of the outputs."""
+        """Run a training step without renderer and optimizer: the loss is a mean of the outputs."""
         self.net.train()
         with self._autocast(self.device.type):
             gaussians = self.net(self.views)

@@ -13,8 +13,8 @@ from asysplat.ops import plane_sweep
 from asysplat.scene import Cameras
 
 SLANT = 0.3  # by which the wall is farther away, a unit to the right
-WAVES = 20  # of each colour
-OPTIONS = ("stride", "planes", "neighbours")
+WAVES = 20  # of each color
+OPTIONS = ("stride", "planes", "neighbors")
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class SweepCase(Case):
 
     def products(self) -> list[Size]:
         """List products with as many multiplications as the sweep's costs."""
-        batch, views, neighbours, planes, height, width = (
+        batch, views, neighbors, planes, height, width = (
             self.sizes[side]
-            for side in ("batch", "views", "neighbours", "planes", "height", "width")
+            for side in ("batch", "views", "neighbors", "planes", "height", "width")
         )
-        return sweep_sizes(batch * views * neighbours, planes, height, width)
+        return sweep_sizes(batch * views * neighbors, planes, height, width)
 
 
 def _photographs(cameras: Cameras) -> Tensor:

@@ -1,4 +1,4 @@
-"""Photographs in memory: scenes made up here, and real ones where they are."""
+"""Photographs in memory: scenes synthetic here, and real ones where they are."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,19 +8,19 @@ from pathlib import Path
 import torch.nn.functional as F
 
 from asysplat.benchmark.options import check_names
-from asysplat.data.normalise import normalise
+from asysplat.data.normalize import normalize
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.procedural.scene import split_seed
 from asysplat.data.selection import spread, uniform_selection
 from asysplat.errors import InputError
-from asysplat.reconstruction.photographs import open_photographs
+from asysplat.refinement.photographs import open_photographs
 from asysplat.scene import Views
 
 INPUTS, TARGETS = 16, 4  # most views of a scene to start from, and to draw
-FRAMES = 96  # of a scene that is made up
+FRAMES = 96  # of a scene that is synthetic
 MADE_UP = {"room": "rooms", "outdoors": "outdoors"}  # test scenes, by what they show
 REAL = ("fern", "fox", "hololens-000", "mydesk")  # folders of data/; others may be there, too
-SETS_ASIDE = 8  # one photograph in so many is drawn
+HELD_OUT_EVERY = 8  # one photograph in so many is drawn
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class PosedScene:
         if side != cameras.height:
             images = F.interpolate(inputs.images, (side, side), mode="area")
             inputs = Views(inputs.cameras.resized(side, side), images)
-        return normalise(inputs, self.targets)[:2]
+        return normalize(inputs, self.targets)[:2]
 
 
 def find_scenes(
@@ -103,8 +103,8 @@ def _read(name: str, path: Path, side: int) -> PosedScene:
         side,
         side,
         views=INPUTS,
-        held_back=SETS_ASIDE,
-        most_measured=TARGETS,
+        held_out=HELD_OUT_EVERY,
+        max_held_out=TARGETS,
         say=lambda _: None,  # that cameras fit cannot be told at so few pixels
     )
     return PosedScene(name, _plain(found.inputs), _plain(found.measured))

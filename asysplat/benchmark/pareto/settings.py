@@ -15,12 +15,12 @@ from torch import Tensor
 
 from asysplat.benchmark.options import PRECISIONS, check_names
 from asysplat.benchmark.pareto.scenes import PosedScene
-from asysplat.data.normalise import Normalisation
+from asysplat.data.normalize import Normalization
 from asysplat.errors import InputError, input_error_behind
 from asysplat.models.network import Network
-from asysplat.reconstruction import Settings, mean_colour, refine, thinned
-from asysplat.reconstruction.begin import INITS, starting_gaussians
-from asysplat.reconstruction.photographs import Photographs
+from asysplat.refinement import RefinementSettings, mean_color, refine, thinned
+from asysplat.refinement.init import INITS, initial_gaussians
+from asysplat.refinement.photographs import Photographs
 from asysplat.rendering import INRIA, render
 from asysplat.scene import Cameras, Gaussians
 from asysplat.training.load import load
@@ -45,7 +45,7 @@ class FeedForward:
         least_opacity: below which Gaussians are dropped.
         cell: side of the cells whose Gaussians are merged, in pixels; None: none are.
         most: Gaussians, until which cells grow; None: any number.
-        sh_degree: up to which colours are drawn; None: all.
+        sh_degree: up to which colors are drawn; None: all.
         views_at_once: that are drawn; None: all.
         convention: cut-offs of the renderer that differ, see `Convention`.
     """
@@ -99,7 +99,7 @@ class FeedForward:
         out = render(
             gaussians,
             targets.cameras,
-            mean_colour(inputs),
+            mean_color(inputs),
             depth=False,
             sh_degree=self.sh_degree,
             convention=replace(INRIA, **self.convention),
@@ -123,7 +123,7 @@ class Refined:
         views: photographs that are fitted to.
         side: of these, pixels.
         steps: of the refinement: in place of seconds, so that every round gives the same bits.
-        init: see `starting_gaussians`; the network is the shipped one.
+        init: see `initial_gaussians`; the network is the shipped one.
         refinement: what differs from `refinement`, a file of conf/refinement.
     """
 
@@ -157,12 +157,12 @@ class Refined:
         net = _network("shipped", ()) if self.init == "network" else None
         return lambda scene: self._draw(scene, settings, net)
 
-    def _draw(self, scene: PosedScene, settings: Settings, net: Network | None) -> Tensor:
+    def _draw(self, scene: PosedScene, settings: RefinementSettings, net: Network | None) -> Tensor:
         inputs, targets = scene.given(self.views, self.side)
-        frame = Normalisation(torch.eye(4, dtype=torch.float64), 1.0)
+        frame = Normalization(torch.eye(4, dtype=torch.float64), 1.0)
         photographs = Photographs(scene.name, inputs, targets, [], [], frame, None)
-        start = starting_gaussians(self.init, photographs, settings.most, net)
-        background = mean_colour(inputs)
+        start = initial_gaussians(self.init, photographs, settings.most, net)
+        background = mean_color(inputs)
         gaussians = refine(start, inputs, settings, steps=self.steps, background=background)
         with torch.no_grad():
             return render(gaussians, targets.cameras, background, depth=False).image

@@ -31,7 +31,7 @@ error: of pictures in [0, 1] against the base in float64, of other layers agains
 refinements against the base"""
 
 
-def summarise(rows: Sequence[Result]) -> list[Result]:
+def summarize(rows: Sequence[Result]) -> list[Result]:
     """Average each setting of each family over its scenes.
 
     Returns:

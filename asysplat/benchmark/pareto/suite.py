@@ -16,7 +16,7 @@ from asysplat.benchmark.options import check_names, find_device
 from asysplat.benchmark.pareto.measured import Meter
 from asysplat.benchmark.pareto.scenes import find_scenes
 from asysplat.benchmark.pareto.settings import BASE, FAMILIES, Setting, find_settings
-from asysplat.benchmark.pareto.shown import plot, summarise, tables
+from asysplat.benchmark.pareto.shown import plot, summarize, tables
 from asysplat.benchmark.timing import Result
 from asysplat.evaluation.lpips import load_lpips
 
@@ -47,7 +47,7 @@ def measure(options: DictConfig, console: Console) -> Result:
         same round "over_base", "peak_gb" above what was held before, "error" of the pictures
         against the exact ones ("decibels", "max"), and "psnr", "ssim" and "lpips" against the
         photographs; None for what was not measured. "settings": the means over scenes, see
-        `summarise`. "not_measured": what, and why.
+        `summarize`. "not_measured": what, and why.
 
     Raises:
         InputError: an unknown family, scene or knob, or one out of range.
@@ -84,7 +84,7 @@ def measure(options: DictConfig, console: Console) -> Result:
         "protocol": protocol.sentences(),
         "not_measured": absent,
         "rows": rows,
-        "settings": summarise(rows),
+        "settings": summarize(rows),
     }
 
 

@@ -8,19 +8,25 @@ from lpips import LPIPS
 
 from asysplat.benchmark.render.run import Backend, prepare, run
 from asysplat.benchmark.timing import Measurement, Result, seconds_of, time_in_rounds
-from asysplat.evaluation.baselines import mean_colour as mean_colour_images
+from asysplat.evaluation.baselines import mean_color as mean_color_images
 from asysplat.evaluation.baselines import nearest_view
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.scene import measure_scene
 from asysplat.models.network import Network
-from asysplat.reconstruction import Progress, Refinement, Settings, mean_colour, refine
-from asysplat.reconstruction.begin import starting_gaussians
-from asysplat.reconstruction.photographs import Photographs
-from asysplat.rendering import Skips
+from asysplat.refinement import (
+    Refinement,
+    RefinementProgress,
+    RefinementSettings,
+    mean_color,
+    refine,
+)
+from asysplat.refinement.init import initial_gaussians
+from asysplat.refinement.photographs import Photographs
+from asysplat.rendering import Culling
 from asysplat.scene import Gaussians, Views
 
 NEAREST = "nearest view"
-FOR_NOTHING = {NEAREST: nearest_view, "mean colour": mean_colour_images}
+FOR_NOTHING = {NEAREST: nearest_view, "mean color": mean_color_images}
 SEED = 0
 FIRST_LOOK, LATER = (
     1.0,
@@ -30,17 +36,17 @@ CPU = torch.device("cpu")  # which refines
 
 
 class MeasuredScene:
-    """The photographs of a scene, and how those held back are measured.
+    """The photographs of a scene, and how those held out are measured.
 
     Args:
-        photographs: some of them are held back.
+        photographs: some of them are held out.
         protocol: of the metrics.
         lpips: see `load_lpips`; None for no LPIPS.
     """
 
     def __init__(self, photographs: Photographs, protocol: Protocol, lpips: LPIPS | None):
         self.photographs, self._protocol, self._lpips = photographs, protocol, lpips
-        self._background = mean_colour(photographs.inputs)
+        self._background = mean_color(photographs.inputs)
 
     def for_nothing(self) -> list[Result]:
         """Measure what one gets without a reconstruction: a row for each of FOR_NOTHING."""
@@ -59,7 +65,7 @@ class MeasuredScene:
         They are made twice, of which the second counts: kernels are compiled when first used.
 
         Args:
-            init, most, network: see `starting_gaussians`.
+            init, most, network: see `initial_gaussians`.
 
         Returns:
             The Gaussians; their number, the metrics, and "start": seconds until they were made.
@@ -67,14 +73,14 @@ class MeasuredScene:
         Raises:
             InputError: the photographs lack what `init` needs.
         """
-        starting_gaussians(init, self.photographs, most, network)
+        initial_gaussians(init, self.photographs, most, network)
         clock = time.perf_counter()
-        gaussians = starting_gaussians(init, self.photographs, most, network)
+        gaussians = initial_gaussians(init, self.photographs, most, network)
         seconds = time.perf_counter() - clock
         return gaussians, {"start": seconds} | self._measured(gaussians)
 
     def refined(
-        self, gaussians: Gaussians, settings: Settings, repeats: int, **limit: float | int
+        self, gaussians: Gaussians, settings: RefinementSettings, repeats: int, **limit: float | int
     ) -> Result:
         """Refine Gaussians, then measure them: no measurement takes of the refinement's time.
 
@@ -89,10 +95,10 @@ class MeasuredScene:
             metrics at its end; "curve": seconds and PSNR on the way, which is measured later;
             "step", "renderer" and "over_renderer", see `step_and_renderer`.
         """
-        last: list[Progress] = []
+        last: list[RefinementProgress] = []
         looks: list[tuple[float, Gaussians]] = []
 
-        def watch(now: Progress, refinement: Refinement) -> bool:
+        def watch(now: RefinementProgress, refinement: Refinement) -> bool:
             last[:] = [now]
             if now.seconds >= FIRST_LOOK * LATER ** len(looks):
                 looks.append((now.seconds, refinement.gaussians))
@@ -130,7 +136,7 @@ class MeasuredScene:
 
 
 def step_and_renderer(
-    gaussians: Gaussians, view: Views, settings: Settings, repeats: int
+    gaussians: Gaussians, view: Views, settings: RefinementSettings, repeats: int
 ) -> Result:
     """Compare a step of a refinement with the renderer, on the same Gaussians and view, in turns.
 
@@ -151,7 +157,7 @@ def step_and_renderer(
     def seconds() -> dict[str, float]:
         return {
             "step": seconds_of(lambda: refinement.step(1.0), CPU),
-            "renderer": sum(run(renderer, Skips(), inputs).seconds.values()),
+            "renderer": sum(run(renderer, Culling(), inputs).seconds.values()),
         }
 
     timed = Measurement(seconds)

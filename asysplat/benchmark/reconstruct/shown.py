@@ -45,7 +45,7 @@ def tables(results: Result) -> list[Table]:
         f"{n} {v['inputs']} and {v['measured']}" for n, v in results["scenes"].items()
     )
     notes = (
-        f"{'x'.join(map(str, results['size']))}; views fitted to, and held back: {views}\n"
+        f"{'x'.join(map(str, results['size']))}; views fitted to, and held out: {views}\n"
         "each row is one run of so many seconds; all: with all parts of the refinement"
     )
     if not results["complete"]:
@@ -56,7 +56,7 @@ def tables(results: Result) -> list[Table]:
     )
     refined = [row for row in rows if row["variant"] not in FOR_NOTHING]
     found = [
-        make_table("Photographs held back", names | metrics, rows, notes, names=3),
+        make_table("Photographs held out", names | metrics, rows, notes, names=3),
         make_table("What it took", names | costs, refined, cost_notes, names=3),
     ]
     written = {heading: _more(name, pattern) for name, (heading, pattern) in shown.items()}

@@ -1,4 +1,4 @@
-"""Photographs held back, against the seconds of refinement: every start, and every part of it."""
+"""Photographs held out, against the seconds of refinement: every start, and every part of it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +20,9 @@ from asysplat.benchmark.timing import Result
 from asysplat.errors import InputError, input_error_behind
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.models.network import Network
-from asysplat.reconstruction import Settings
-from asysplat.reconstruction.begin import INITS
-from asysplat.reconstruction.photographs import open_photographs
+from asysplat.refinement import RefinementSettings
+from asysplat.refinement.init import INITS
+from asysplat.refinement.photographs import open_photographs
 from asysplat.training.load import load
 
 SIDE = 256  # pixels of the crops
@@ -102,7 +102,7 @@ class Run:
     """What a refinement starts from, one of INITS, and its settings."""
 
     init: str
-    settings: Settings
+    settings: RefinementSettings
 
 
 def measure_scene(

@@ -6,7 +6,7 @@ import torch
 
 from asysplat.benchmark.render.run import Backend, Inputs, prepare, run
 from asysplat.benchmark.timing import Measurement, Result
-from asysplat.rendering import Skips
+from asysplat.rendering import Culling
 from asysplat.scene import Cameras, Gaussians
 
 RASTER = {"forward": "rasterize", "backward": "rasterize_backward"}  # the kernels
@@ -21,7 +21,7 @@ def row_seconds(cpu: Backend) -> dict[str, float]:
 
     It is the time of a core while all threads are busy so.
     """
-    runs = [run(cpu, Skips(), hot_scene()) for _ in range(REPEATS)]
+    runs = [run(cpu, Culling(), hot_scene()) for _ in range(REPEATS)]
     rows = runs[0].stats["rows"] / torch.get_num_threads()
     return {name: min(r.kernels[kernel] for r in runs) / rows for name, kernel in RASTER.items()}
 

@@ -12,11 +12,11 @@ from torch import Tensor
 from asysplat.benchmark.scenes import Scene
 from asysplat.benchmark.timing import now, relative_l2
 from asysplat.ops.cpu.threads import time_kernels
-from asysplat.rendering import GSPLAT_1_5, INRIA, Convention, Skips, render
+from asysplat.rendering import GSPLAT_1_5, INRIA, Convention, Culling, render
 from asysplat.scene import Cameras, Gaussians
 
-SKIPS = tuple(field.name for field in fields(Skips))
-SKIPS_OF_CUDA = tuple(name for name in SKIPS if name != "rows")
+CULLING = tuple(field.name for field in fields(Culling))
+SKIPS_OF_CUDA = tuple(name for name in CULLING if name != "rows")
 FIELDS = tuple(field.name for field in fields(Gaussians))
 FLIP = 1e-4  # a difference that rounding alone does not make; a flip makes up to 1/255
 
@@ -26,7 +26,7 @@ class Backend(NamedTuple):
 
     name: str  # as the tables have it
     device: str  # where its tensors are
-    skips: tuple[str, ...] = ()  # names of those that it can switch off
+    culling: tuple[str, ...] = ()  # names of those that it can switch off
     convention: Convention = INRIA  # its cut-offs
 
 
@@ -50,7 +50,7 @@ class Outputs(NamedTuple):
 
 def find_backends() -> list[Backend]:
     """List the reference, which every table has, then the fast ones that can run here."""
-    found = [Backend("reference", "cpu"), Backend("cpu", "cpu", SKIPS)]
+    found = [Backend("reference", "cpu"), Backend("cpu", "cpu", CULLING)]
     if torch.cuda.is_available():
         found.append(Backend("cuda", "cuda", SKIPS_OF_CUDA))
         if importlib.util.find_spec("gsplat"):
@@ -58,12 +58,12 @@ def find_backends() -> list[Backend]:
     return found
 
 
-def _draw(backend: Backend, skips: Skips, inputs: Inputs) -> tuple[Tensor, dict[str, int]]:
+def _draw(backend: Backend, culling: Culling, inputs: Inputs) -> tuple[Tensor, dict[str, int]]:
     """Draw the image [V, 3, H, W] without background; return also counts."""
     gaussians, cameras, _ = inputs
     if backend.name == "gsplat":
         return _draw_by_gsplat(gaussians, cameras)
-    choices = {"backend": backend.name, "skips": skips, "convention": backend.convention}
+    choices = {"backend": backend.name, "culling": culling, "convention": backend.convention}
     out = render(gaussians, cameras, depth=False, **choices)
     return out.image, out.stats
 
@@ -103,13 +103,13 @@ def prepare(scene: Scene, device: str, ignored: Tensor | None = None) -> Inputs:
     return Inputs(leaves, cameras, weights.to(gaussians.means))
 
 
-def run(backend: Backend, skips: Skips, inputs: Inputs) -> Outputs:
+def run(backend: Backend, culling: Culling, inputs: Inputs) -> Outputs:
     """Draw, and take the gradients."""
     leaves = [getattr(inputs.gaussians, name) for name in FIELDS]
     device = torch.device(backend.device)
     with time_kernels() as kernels:
         start = now(device)
-        image, stats = _draw(backend, skips, inputs)
+        image, stats = _draw(backend, culling, inputs)
         middle = now(device)
         gradients = torch.autograd.grad(image, leaves, inputs.weights)
         seconds = {"forward": middle - start, "backward": now(device) - middle}
@@ -120,7 +120,7 @@ def truth(scene: Scene, convention: Convention, ignored: Tensor | None = None) -
     """Draw the scene in float64."""
     exact = tuple(part.to(torch.float64) for part in scene)
     reference = Backend("reference", "cpu", convention=convention)
-    return run(reference, Skips(), prepare(exact, "cpu", ignored))
+    return run(reference, Culling(), prepare(exact, "cpu", ignored))
 
 
 def flips(found: Outputs, exact: Outputs) -> Tensor:

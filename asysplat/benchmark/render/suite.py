@@ -27,7 +27,7 @@ from asysplat.benchmark.render.run import (
 from asysplat.benchmark.scenes import SCENES, SMALLER, Scene, describe, find_scenes
 from asysplat.benchmark.table import error, limited, make_table, measured_on, number, spread, text
 from asysplat.benchmark.timing import Measurement, Result, ratios, rise_gb, time_in_rounds
-from asysplat.rendering import Skips
+from asysplat.rendering import Culling
 
 WATCHED = Watched(
     names=("scene", "backend", "without"),
@@ -40,7 +40,7 @@ WATCHED = Watched(
         "error.gradients": ERROR,
     },
 )
-# What is asked of the cpu backend with all its skips.
+# What is asked of the cpu backend with all its culling.
 MOST_OVER_FLOOR = 2.5
 MOST_WHOLE_OVER_RASTER = 2.0
 
@@ -70,10 +70,10 @@ def _measure_scene(name: str, repeats: int) -> list[Result]:
         exact = truth(small, backend.convention, ignored)
         inputs = prepare(scene, backend.device)
         small_inputs = prepare(small, backend.device, ignored)
-        for off in (None, *backend.skips):
-            skips = Skips().without(off) if off else Skips()
-            wrong = errors(run(backend, skips, small_inputs), exact, ignored)
-            run_whole = partial(run, backend, skips, inputs)
+        for off in (None, *backend.culling):
+            culling = Culling().without(off) if off else Culling()
+            wrong = errors(run(backend, culling, small_inputs), exact, ignored)
+            run_whole = partial(run, backend, culling, inputs)
             found = {
                 "scene": name,
                 "backend": backend.name,
@@ -101,7 +101,7 @@ def _measure_scene(name: str, repeats: int) -> list[Result]:
 def _flips_of_any(backends: Sequence[Backend], scene: Scene) -> Tensor:
     """Find the pixels [V, H, W] where any backend flips: there more than rounding differs."""
     pairs = [
-        (run(b, Skips(), prepare(scene, b.device)), truth(scene, b.convention)) for b in backends
+        (run(b, Culling(), prepare(scene, b.device)), truth(scene, b.convention)) for b in backends
     ]
     return torch.stack([flips(found, exact) for found, exact in pairs]).any(0)
 
@@ -161,7 +161,7 @@ def tables(results: Result) -> list[Table]:
 
 
 def plot(results: Result) -> Figure:
-    """Plot the forward and the backward pass, of every backend with all its skips."""
+    """Plot the forward and the backward pass, of every backend with all its culling."""
     errors = {
         "forward": ("image against float64, 99th percentile", "error.image_p99"),
         "backward": ("worst gradient against float64, relative L2", "error.gradients"),

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from asysplat.rendering.interface import Settings
+from asysplat.rendering.interface import RenderSettings
 from asysplat.rendering.reference.project import project
 from asysplat.scene import Cameras, Gaussians
 
@@ -14,7 +14,7 @@ ROWS = 8  # of pixels at a time
 
 
 @torch.no_grad()
-def boundary_band(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Tensor:
+def boundary_band(gaussians: Gaussians, cameras: Cameras, settings: RenderSettings) -> Tensor:
     """Find the pixels where rounding may decide, in float64: [V, H, W].
 
     There some alpha is within rounding of alpha_min or alpha_max, or some transmittance of

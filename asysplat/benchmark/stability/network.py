@@ -26,7 +26,7 @@ from asysplat.scene import Cameras, Gaussians, Views
 
 AREA = "network"
 WILD = 1e4  # by which the decoder's weights are too large, as after a training gone wrong
-HALF = ("black photographs", "noise photographs", "poses kilometres apart")  # also in 16 bits
+HALF = ("black photographs", "noise photographs", "poses kilometers apart")  # also in 16 bits
 HALF += ("fisheye-like focal lengths", "telescopic focal lengths")
 # Of the 3,600 operations that round, in both passes of the laptop's network; in half precision
 # products alone do.

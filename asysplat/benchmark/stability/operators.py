@@ -11,7 +11,7 @@ from asysplat.benchmark.stability.judge import ALL_PRECISIONS, Case, Comparison,
 from asysplat.benchmark.stability.views import PHOTOGRAPHS, make_photographs
 from asysplat.benchmark.timing import Result
 from asysplat.ops.adam import adam_step
-from asysplat.ops.adam.reference import Rows, Settings, adam_step_reference
+from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 
 AREA = "operators"
 HUGE = 1e18  # its square is still a float32
@@ -25,7 +25,7 @@ SPREAD = {"dt": (1e-8, 1e3), "-A": (1e-4, 1e4)}
 ATTENDED = {"zero": 0.0, "noise": 1.0, "noise times 10": 10.0}
 MAPS = (1, 3, 4, 6, 2, 8)  # [B, V, h, w, H, P]
 SIDE = 24  # pixels of an image whose loss is computed
-ADAM = Settings(beta1=0.9, beta2=0.99, eps=1e-15)
+ADAM = AdamSettings(beta1=0.9, beta2=0.99, eps=1e-15)
 ADAM_STEPS, ROWS = 20, 50
 
 

@@ -16,7 +16,7 @@ GREEN, RED = "#1a7f37", "#cf222e"
 LEAST = 1e-6  # share of a tolerance at which the picture ends
 
 
-def _colour(green: bool) -> Text:
+def _color(green: bool) -> Text:
     return Text("green", "green") if green else Text("RED", "bold red")
 
 
@@ -30,7 +30,7 @@ COLUMNS: Columns = {
     "Inf": number("inf", "{:,.0f}"),
     "gradients": lambda row: {True: "finite", False: "not finite", None: NOTHING}[row["gradients"]],
     "compared with": text("{compared}"),
-    "": lambda row: _colour(row["green"]),
+    "": lambda row: _color(row["green"]),
 }
 SUMMARY: Columns = {
     "area": text("{area}"),
@@ -39,7 +39,7 @@ SUMMARY: Columns = {
     "error / tolerance, at most": number("share", "{:.2g}"),
     "NaN": number("nan", "{:,.0f}"),
     "Inf": number("inf", "{:,.0f}"),
-    "": lambda row: _colour(row["red"] == 0),
+    "": lambda row: _color(row["red"] == 0),
 }
 
 
@@ -128,7 +128,7 @@ def plot(results: Result) -> Figure:
         axes = figure.subplots()
         for number_of_row, row in enumerate(rows):
             share = share_of(row)
-            # A case of which no error can be told stands where its colour puts it.
+            # A case of which no error can be told stands where its color puts it.
             place = max(share, LEAST) if share is not None else LEAST if row["green"] else 1e2
             height = areas[row["area"]] + 0.3 * ((number_of_row * 0.618) % 1 - 0.5)
             mark = {"marker": "o" if share is not None else "|", "ms": 4, "alpha": 0.7}

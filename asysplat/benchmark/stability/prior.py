@@ -6,7 +6,7 @@ from functools import partial
 from asysplat.benchmark.stability.judge import Case, Comparison, Function, Tensors, judge
 from asysplat.benchmark.stability.views import Hostile, hostile_views
 from asysplat.benchmark.timing import Result
-from asysplat.models.prior import SweepPrior
+from asysplat.models.prior import PlaneSweepPrior
 from asysplat.ops import plane_sweep
 from asysplat.scene import Cameras, Views
 
@@ -52,7 +52,7 @@ def _sweep(tensors: Tensors) -> Tensors:
 
 def _prior(tensors: Tensors) -> Tensors:
     images = tensors["images"]
-    found = SweepPrior()(Views(_cameras(tensors), images), tuple(images.shape[-2:]))
+    found = PlaneSweepPrior()(Views(_cameras(tensors), images), tuple(images.shape[-2:]))
     return {
         "confidence": found.confidence,
         "confidence x log distance": found.confidence * found.distance.log(),

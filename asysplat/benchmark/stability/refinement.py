@@ -10,7 +10,7 @@ from asysplat.benchmark.stability.judge import Case, line
 from asysplat.benchmark.stability.renderer import FIELDS, GAUSSIANS, Change, gaussians_before
 from asysplat.benchmark.stability.views import Hostile
 from asysplat.benchmark.timing import Result
-from asysplat.reconstruction import Progress, Refinement, refine
+from asysplat.refinement import Refinement, RefinementProgress, refine
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
@@ -31,7 +31,7 @@ def _measure(change: Change, steps: int) -> Result:
     start = change(gaussians, cameras)
     skipped: list[int] = []
 
-    def watch(_: Progress, refinement: Refinement) -> bool:
+    def watch(_: RefinementProgress, refinement: Refinement) -> bool:
         skipped[:] = [refinement.fields.skipped]
         return False
 

@@ -13,7 +13,7 @@ from asysplat.benchmark.stability.judge import Case, Comparison, Tensors, judge
 from asysplat.benchmark.stability.views import Hostile, hostile_views
 from asysplat.benchmark.timing import Result
 from asysplat.rendering import render
-from asysplat.rendering.interface import Settings
+from asysplat.rendering.interface import RenderSettings
 from asysplat.scene import Cameras, Gaussians
 
 AREA = "renderer"
@@ -54,7 +54,7 @@ def compare(scene: Scene) -> Result:
     gaussians, cameras = scene
     inputs = {name: getattr(gaussians, name) for name in FIELDS}
     inputs |= {name: getattr(cameras, name) for name in CAMERA}
-    inside = ~boundary_band(gaussians, cameras, Settings())
+    inside = ~boundary_band(gaussians, cameras, RenderSettings())
     size = (cameras.height, cameras.width)
 
     def draw(backend: str, tensors: Tensors) -> Tensors:

@@ -15,7 +15,7 @@ from asysplat.benchmark.stability.judge import ALL_PRECISIONS, Case, line
 from asysplat.benchmark.stability.views import FOCALS, PHOTOGRAPHS, POSES, Hostile
 from asysplat.benchmark.timing import Result
 from asysplat.scene import Views
-from asysplat.training.reconstruction import Reconstruction
+from asysplat.training.module import SplattingModule
 
 AREA = "training"
 TINY = ("width=0.125", "state_size=8", "model.layers=1m1s")
@@ -39,7 +39,7 @@ def _measure(model: str, precision: str, steps: int) -> Result:
     overrides = [f"model={model}", "scale=laptop", f"steps={steps}", *TINY]
     config = hydra.compose("train", overrides)
     torch.manual_seed(0)
-    module: Reconstruction = instantiate(config.training, net=instantiate(config.model)).train()
+    module: SplattingModule = instantiate(config.training, net=instantiate(config.model)).train()
     made = module.configure_optimizers()
     optimizer, schedule = made["optimizer"], made["lr_scheduler"]["scheduler"]
     losses, norms = [], []

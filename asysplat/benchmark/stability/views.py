@@ -9,10 +9,10 @@ from torch import Tensor
 from asysplat.benchmark.scenes import FOCAL, on_an_arc
 from asysplat.scene import Cameras, Views
 
-SPACING = 1000.0  # between cameras that are kilometres apart, where the unit is a metre
+SPACING = 1000.0  # between cameras that are kilometers apart, where the unit is a meter
 MANY = 8  # more views than that have half as many pixels along a side: time
-PHOTOGRAPHS = ("black", "white", "one colour", "noise")
-POSES = ("on an arc", "all equal", "in a line", "kilometres apart", "upside down")
+PHOTOGRAPHS = ("black", "white", "one color", "noise")
+POSES = ("on an arc", "all equal", "in a line", "kilometers apart", "upside down")
 FOCALS = {"fisheye-like": 0.15, "wide": 0.4, "telescopic": 50.0}  # in image widths
 
 
@@ -61,8 +61,8 @@ def make_photographs(kind: str, count: int, side: int) -> Tensor:
     """Make photographs [count, 3, side, side] of one of PHOTOGRAPHS."""
     if kind == "noise":
         return torch.rand(count, 3, side, side, generator=torch.Generator().manual_seed(0))
-    colour = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "one colour": (0.8, 0.1, 0.3)}
-    return torch.tensor(colour[kind])[:, None, None].expand(count, 3, side, side).clone()
+    color = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "one color": (0.8, 0.1, 0.3)}
+    return torch.tensor(color[kind])[:, None, None].expand(count, 3, side, side).clone()
 
 
 def _in_a_line(camera: Cameras, count: int, spacing: float = 0.3) -> Cameras:
@@ -80,7 +80,7 @@ def _upside_down(camera: Cameras, count: int) -> Cameras:
 
 
 def _by_hand(camera: Cameras, count: int) -> Cameras:
-    """Place cameras on an arc, a little off it: at equal distances rounding chooses neighbours."""
+    """Place cameras on an arc, a little off it: at equal distances rounding chooses neighbors."""
     cameras = on_an_arc(camera, count)
     poses = cameras.cam_to_world.clone()
     poses[:, :3, 3] += 0.02 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
@@ -91,6 +91,6 @@ PLACED: dict[str, Callable[[Cameras, int], Cameras]] = {
     "on an arc": _by_hand,
     "all equal": lambda camera, count: _in_a_line(camera, count, 0.0),
     "in a line": _in_a_line,
-    "kilometres apart": lambda camera, count: _in_a_line(camera, count, SPACING),
+    "kilometers apart": lambda camera, count: _in_a_line(camera, count, SPACING),
     "upside down": _upside_down,
 }

@@ -15,7 +15,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from asysplat.data.bad_frames import BadFrames, Policy
+from asysplat.data.bad_images import BadFrames, Policy
 from asysplat.data.check.matches import PLACES
 from asysplat.data.check.report import Report, check_scene
 from asysplat.data.check.show import draw_report, print_report
@@ -62,8 +62,8 @@ def check(options: Namespace, console: Console) -> int:
         console.print(f"checking {len(chosen)} of {len(scenes)} scenes{more}", highlight=False)
     all_fit = True
     for path in chosen:
-        report = check_one(layout, path, options.on_bad_frame, console)
-        title = f"{report.capture.name}, layout {layout}"
+        report = check_one(layout, path, options.on_bad_image, console)
+        title = f"{report.sequence.name}, layout {layout}"
         picture = save_picture(report, title, options.out)
         print_report(report, title, console)
         console.print(f"picture: {picture}\n", soft_wrap=True, highlight=False)
@@ -71,9 +71,9 @@ def check(options: Namespace, console: Console) -> int:
     return 0 if all_fit else 1
 
 
-def check_one(layout: str, path: Path, on_bad_frame: Policy, console: Console) -> Report:
+def check_one(layout: str, path: Path, on_bad_image: Policy, console: Console) -> Report:
     """Make the report of one scene, under progress bars."""
-    bad = BadFrames(on_bad_frame)
+    bad = BadFrames(on_bad_image)
     scene = LAYOUTS[layout].read_scene(path, bad)
     with Progress(console=console, transient=True) as progress, warnings.catch_warnings():
         # The report lists the frames that are left out.
@@ -87,7 +87,7 @@ def check_one(layout: str, path: Path, on_bad_frame: Policy, console: Console) -
 
 def save_picture(report: Report, title: str, out: Path) -> Path:
     """Save the report's picture under the first free name: check.png, check-2.png, ..."""
-    folder = out / report.capture.name.replace("/", "-")
+    folder = out / report.sequence.name.replace("/", "-")
     folder.mkdir(parents=True, exist_ok=True)
     names = chain(["check.png"], (f"check-{number}.png" for number in count(2)))
     file = next(folder / name for name in names if not (folder / name).exists())

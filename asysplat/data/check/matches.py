@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 from torch import Tensor
 
-from asysplat.data.capture import Capture
+from asysplat.data.sequence import ImageSequence
 from asysplat.scene import Cameras
 
 PLACES = 12  # in the sequence, at each of which one pair of frames starts
@@ -34,7 +34,7 @@ class Matches:
 
     Args:
         frames: numbers of the two frames of each match.
-        points: x, y in either, in pixels, the first pixel's centre at +0.5.
+        points: x, y in either, in pixels, the first pixel's center at +0.5.
     """
 
     frames: Int[Tensor, "M 2"]
@@ -62,7 +62,7 @@ class Keypoints:
     descriptors: Float32[ndarray, "K 128"]
 
 
-def find_matches(capture: Capture, step: Callable[[], None] = lambda: None) -> Matches:
+def find_matches(sequence: ImageSequence, step: Callable[[], None] = lambda: None) -> Matches:
     """Match up to PLACES pairs of frames, evenly over the sequence.
 
     The gap between the frames of a pair is doubled as long as enough points are matched, and halved
@@ -72,17 +72,17 @@ def find_matches(capture: Capture, step: Callable[[], None] = lambda: None) -> M
     Args:
         step: called after each place.
     """
-    keypoints = cache(partial(_keypoints, capture))
+    keypoints = cache(partial(_keypoints, sequence))
 
     def matched(first: int, gap: int) -> Matches:
-        second = first + gap if first + gap < capture.num_frames else first - gap
+        second = first + gap if first + gap < sequence.num_frames else first - gap
         points = np.empty((0, 2, 2))
         if second >= 0:
             points = _match(keypoints(first), keypoints(second))
         return Matches(torch.tensor([[first, second]]).repeat(len(points), 1), torch.tensor(points))
 
     gap, pairs = FIRST_GAP, []
-    starts = np.linspace(0, capture.num_frames - 1, PLACES, endpoint=False).astype(int)
+    starts = np.linspace(0, sequence.num_frames - 1, PLACES, endpoint=False).astype(int)
     for first in starts.tolist():
         pair = matched(first, gap)
         while len(pair) < ENOUGH and gap > 1:
@@ -118,17 +118,17 @@ def _has_moved(pair: Matches) -> bool:
     return float(np.quantile(distances, 0.9)) > PARALLAX
 
 
-def _keypoints(capture: Capture, frame: int) -> Keypoints:
-    views = capture.views([frame])
-    grey = views.images[0].mean(0).numpy()
+def _keypoints(sequence: ImageSequence, frame: int) -> Keypoints:
+    views = sequence.views([frame])
+    gray = views.images[0].mean(0).numpy()
     # Stretched, since SIFT finds little in dark photographs.
-    low, high = np.quantile(grey, (0.01, 0.99))
-    grey = np.clip((grey - low) / max(high - low, 1e-3) * 255, 0, 255).astype(np.uint8)
+    low, high = np.quantile(gray, (0.01, 0.99))
+    gray = np.clip((gray - low) / max(high - low, 1e-3) * 255, 0, 255).astype(np.uint8)
     mask = None if views.masks is None else views.masks[0].numpy().astype(np.uint8)
-    points, descriptors = cv2.SIFT_create(KEYPOINTS).detectAndCompute(grey, mask)
+    points, descriptors = cv2.SIFT_create(KEYPOINTS).detectAndCompute(gray, mask)
     if not points:
         return Keypoints(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32))
-    # OpenCV puts the first pixel's centre at 0.
+    # OpenCV puts the first pixel's center at 0.
     return Keypoints(cv2.KeyPoint_convert(points) + np.float32(0.5), descriptors)
 
 
@@ -163,7 +163,7 @@ def epipolar_lines(cameras: Cameras, matches: Matches) -> Float[Tensor, "M 2 3"]
     rotations = cameras.cam_to_world[..., :3, :3]
     centers = cameras.centers[matches.frames]
     baseline = centers[:, 1] - centers[:, 0]
-    # The plane through a ray of one view and the centre of the other is a line in the other view.
+    # The plane through a ray of one view and the center of the other is a line in the other view.
     normals = torch.linalg.cross(baseline[:, None].expand(-1, 2, -1), _rays(cameras, matches))
     to_pixels = torch.linalg.inv(cameras.intrinsics).mT @ rotations.mT
     lines = (to_pixels[matches.frames] @ normals.flip(1)[..., None])[..., 0]

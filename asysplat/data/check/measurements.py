@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import Capture, PhotographCapture
+from asysplat.data.bad_images import BadFrames
+from asysplat.data.sequence import ImageSequence, FileSequence
 from asysplat.data.check.matches import Matches, epipolar_distances, triangulate
 from asysplat.scene import Cameras
 
-SAMPLED = 97  # one depth in so many is looked at; a prime, so that no pixel column is favoured
+SAMPLED = 97  # one depth in so many is looked at; a prime, so that no pixel column is favored
 SAME = 1e-6  # poses differ by less: as a share of the path's extent, and in a rotation's entries
 PRECISE = 1.0  # pixels: greatest distance to the epipolar line of a match that is triangulated
 WIDE = 1.5  # degrees: least angle between its rays
@@ -25,7 +25,7 @@ class Pixels:
     """What the pixels of all frames that can be decoded show.
 
     Args:
-        brightness: mean colours, in [0, 1], of the darkest and of the brightest image.
+        brightness: mean colors, in [0, 1], of the darkest and of the brightest image.
         depth_known: share of the pixels whose depth is known; None without depth maps.
         depths: quartiles of those depths, in scene units.
         counted: share of the pixels that count; None without masks.
@@ -38,21 +38,21 @@ class Pixels:
 
 
 def read_pixels(
-    capture: PhotographCapture, bad: BadFrames, step: Callable[[], None] = lambda: None
-) -> tuple[PhotographCapture, Pixels]:
+    sequence: FileSequence, bad: BadFrames, step: Callable[[], None] = lambda: None
+) -> tuple[FileSequence, Pixels]:
     """Decode every frame once.
 
     Args:
-        bad: notes the frames that cannot be decoded; the capture that is returned lacks them.
+        bad: notes the frames that cannot be decoded; the sequence that is returned lacks them.
         step: called after each frame.
 
     Raises:
         InputError: too few frames can be used, or some cannot and must not be skipped.
     """
     whole, brightness, known, counted, depths = [], [], [], [], []
-    for frame, photograph in enumerate(capture.scene.photographs):
+    for frame, photograph in enumerate(sequence.scene.photographs):
         with bad.caught():
-            views = capture.views([frame])
+            views = sequence.views([frame])
             whole.append(photograph)
             brightness.append(float(views.images.mean()))
             if views.depths is not None:
@@ -61,10 +61,10 @@ def read_pixels(
             if views.masks is not None:
                 counted.append(float(views.masks.double().mean()))
         step()
-    bad.settle(capture.name, len(whole))
-    scene = replace(capture.scene, photographs=whole)
+    bad.settle(sequence.name, len(whole))
+    scene = replace(sequence.scene, photographs=whole)
     sampled = torch.cat(depths) if depths else torch.empty(0)
-    return PhotographCapture(scene, capture.cameras.height, capture.cameras.width), Pixels(
+    return FileSequence(scene, sequence.cameras.height, sequence.cameras.width), Pixels(
         brightness=(min(brightness), max(brightness)),
         depth_known=_mean(known),
         depths=quartiles(sampled[sampled > 0]),
@@ -166,12 +166,12 @@ class DepthScale:
     points: int
 
 
-def compare_depths(capture: Capture, matches: Matches) -> DepthScale | None:
+def compare_depths(sequence: ImageSequence, matches: Matches) -> DepthScale | None:
     """Compare depth maps with the depths of matches that are triangulated precisely.
 
     None if no depth is known at any of these.
     """
-    cameras = capture.cameras.to(torch.float64)
+    cameras = sequence.cameras.to(torch.float64)
     depths, angles = triangulate(cameras, matches)
     sure = (angles > WIDE) & (epipolar_distances(cameras, matches) < PRECISE) & (depths > 0).all(-1)
     ratios = [torch.empty(0, dtype=torch.float64)]
@@ -180,7 +180,7 @@ def compare_depths(capture: Capture, matches: Matches) -> DepthScale | None:
     )
     for frame in frames.unique().tolist():
         here = frames == frame
-        stored = capture.views([frame]).depths[0].double()
+        stored = sequence.views([frame]).depths[0].double()
         column, row = points[here].long().unbind(-1)
         ratios.append(stored[row, column] / depths[here])
     ratios = torch.cat(ratios)

@@ -1,4 +1,4 @@
-"""The usual mistakes in poses and intrinsics, each with what undoes it and how to mend it."""
+"""The usual mistakes in poses and intrinsics, each with what undoes it and how to fix it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,12 +37,12 @@ class Mistake:
 
     Args:
         name: what was done, as a sentence without its end.
-        mend: what to do about it.
+        fix: what to do about it.
         undo: turns the cameras as read into what they should be.
     """
 
     name: str
-    mend: str
+    fix: str
     undo: Callable[[Cameras], Cameras]
 
 
@@ -86,9 +86,9 @@ def _swapped_intrinsics() -> list[Mistake]:
         "fx and fy": lambda focal, middle: (focal.flip(-1), middle),
         "fx and fy, cx and cy": lambda focal, middle: (focal.flip(-1), middle.flip(-1)),
     }
-    mend = "exchange them, and look whether the photographs were turned to stand upright"
+    fix = "exchange them, and look whether the photographs were turned to stand upright"
     return [
-        Mistake(f"{name} are exchanged", mend, partial(_with_lens, change=change))
+        Mistake(f"{name} are exchanged", fix, partial(_with_lens, change=change))
         for name, change in changes.items()
     ]
 
@@ -124,14 +124,14 @@ def _axes(order: tuple[int, ...], signs: tuple[int, ...], columns: tuple[str, ..
     else:
         turned = [axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0]
         name = f"the cameras' {' and '.join(turned)} point the wrong way"
-    mend = (
+    fix = (
         f"the columns of cam_to_world as read point {', '.join(columns)}; make them "
         f"{', '.join(EXPECTED)}"
     )
     if mirror < 0:
-        mend += ", and mirror the positions as well, since the world is left-handed"
+        fix += ", and mirror the positions as well, since the world is left-handed"
     return Mistake(
-        name, mend, partial(_with_poses, change=lambda r, c: (mirror * r @ turn, mirror * c))
+        name, fix, partial(_with_poses, change=lambda r, c: (mirror * r @ turn, mirror * c))
     )
 
 
@@ -142,7 +142,7 @@ def _inverse(axes: Mistake | None = None) -> Mistake:
         return Mistake(name, "invert them", invert)
     return Mistake(
         f"{name}, and {axes.name}",
-        f"invert them; then {axes.mend}",
+        f"invert them; then {axes.fix}",
         lambda cameras: axes.undo(invert(cameras)),
     )
 

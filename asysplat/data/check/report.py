@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 import torch
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import PhotographCapture, PosedScene
+from asysplat.data.bad_images import BadFrames
+from asysplat.data.sequence import FileSequence, PosedScene
 from asysplat.data.check.matches import Matches, epipolar_distances, find_matches, triangulate
 from asysplat.data.check.measurements import (
     CameraPath,
@@ -142,7 +142,7 @@ def _differ(one: Cameras, other: Cameras) -> bool:
 
 
 def _explained(mistake: Mistake, undone: Fit) -> str:
-    return f"{mistake.name} (undone, the error is {undone.error:.2f} px): {mistake.mend}"
+    return f"{mistake.name} (undone, the error is {undone.error:.2f} px): {mistake.fix}"
 
 
 def _unexplained(read: Fit) -> str:
@@ -164,7 +164,7 @@ class Report:
     """All that was found out about a scene; lengths are in scene units.
 
     Args:
-        capture: the frames that can be used, at the size at which they were compared.
+        sequence: the frames that can be used, at the size at which they were compared.
         damaged: a sentence for each frame that cannot be used.
         lenses: every kind of lens and the number of photographs that it took.
         identical: number of photographs whose file equals an earlier one.
@@ -173,7 +173,7 @@ class Report:
         matches: the points by which the cameras are judged.
     """
 
-    capture: PhotographCapture
+    sequence: FileSequence
     damaged: list[str]
     lenses: list[tuple[Lens, int]]
     identical: int
@@ -198,15 +198,15 @@ def check_scene(
     Raises:
         InputError: too few frames can be used, or some cannot and must not be skipped.
     """
-    capture = PhotographCapture(scene, *_size(scene, bad))
-    capture, pixels = read_pixels(capture, bad, partial(step, "decode"))
-    photographs, cameras = capture.scene.photographs, capture.cameras
-    matches = find_matches(capture, partial(step, "match"))
-    points = capture.scene.points
+    sequence = FileSequence(scene, *_size(scene, bad))
+    sequence, pixels = read_pixels(sequence, bad, partial(step, "decode"))
+    photographs, cameras = sequence.scene.photographs, sequence.cameras
+    matches = find_matches(sequence, partial(step, "match"))
+    points = sequence.scene.points
     files = {content_hash(photograph.image) for photograph in photographs}
     has_depths = pixels.depth_known is not None
     return Report(
-        capture=capture,
+        sequence=sequence,
         damaged=list(bad.sentences),
         lenses=Counter(photograph.lens for photograph in photographs).most_common(),
         identical=len(photographs) - len(files),
@@ -214,7 +214,7 @@ def check_scene(
         path=measure_path(cameras),
         points=None if points is None else count_points(cameras, torch.tensor(points).double()),
         matches=matches,
-        depth_scale=compare_depths(capture, matches) if has_depths else None,
+        depth_scale=compare_depths(sequence, matches) if has_depths else None,
         verdict=judge(cameras, matches, [str(photograph.image) for photograph in photographs]),
     )
 

@@ -50,9 +50,9 @@ def print_report(report: Report, title: str, console: Console) -> None:
 
 
 def _lines(report: Report) -> Iterator[tuple[str, str]]:
-    capture, pixels, path = report.capture, report.pixels, report.path
+    sequence, pixels, path = report.sequence, report.pixels, report.path
     same = f", {report.identical} with the same file as another" if report.identical else ""
-    yield "frames", f"{capture.num_frames}{same}"
+    yield "frames", f"{sequence.num_frames}{same}"
     for lens, count in report.lenses[:MOST_LENSES]:
         yield "images", f"{count} of {_lens(lens)}"
     if len(report.lenses) > MOST_LENSES:
@@ -81,8 +81,8 @@ def _lines(report: Report) -> Iterator[tuple[str, str]]:
 
 def _lens(lens: Lens) -> str:
     across, down = (
-        degrees(atan(centre / focal) + atan((size - centre) / focal))
-        for centre, focal, size in (
+        degrees(atan(center / focal) + atan((size - center) / focal))
+        for center, focal, size in (
             (lens.cx, lens.fx, lens.width),
             (lens.cy, lens.fy, lens.height),
         )
@@ -121,7 +121,7 @@ def _depths(report: Report) -> str:
 
 
 def _fits(report: Report) -> Iterator[tuple[str, str]]:
-    verdict, matches, cameras = report.verdict, report.matches, report.capture.cameras
+    verdict, matches, cameras = report.verdict, report.matches, report.sequence.cameras
     pairs = matches.pairs
     if not pairs:
         yield "matches", "none"
@@ -152,7 +152,7 @@ def draw_report(report: Report, title: str) -> Figure:
     A pair's frames are one above the other, with matched points and their epipolar lines: where
     the cameras put each point, given its place in the other frame.
     """
-    cameras = report.capture.cameras
+    cameras = report.sequence.cameras
     tall = min(WIDTH / PAIRS * cameras.height / cameras.width, TALLEST) + TITLE
     figure = Figure(figsize=(WIDTH, PATH + 2 * tall), layout="constrained")
     figure.suptitle(f"{title}: {report.verdict.sentence}", wrap=True)
@@ -168,7 +168,7 @@ def draw_report(report: Report, title: str) -> Figure:
 
 
 def _draw_path(report: Report, above: Axes, side: Axes) -> None:
-    cameras, points = report.capture.cameras, report.capture.scene.points
+    cameras, points = report.sequence.cameras, report.sequence.scene.points
     axes = _upright(cameras)
     centers = cameras.centers.double().numpy() @ axes
     ahead = cameras.cam_to_world[:, :3, 2].double().numpy() @ axes
@@ -189,28 +189,28 @@ def _draw_path(report: Report, above: Axes, side: Axes) -> None:
 
 
 def _draw_pair(report: Report, pair: tuple[int, int], plots: Sequence[Axes]) -> None:
-    capture = report.capture
-    height, width = capture.cameras.height, capture.cameras.width
+    sequence = report.sequence
+    height, width = sequence.cameras.height, sequence.cameras.width
     matches = report.matches.of(pair)
     matches = matches.select(
         torch.tensor(_spread(matches.points[:, 0, 0].argsort().tolist(), LINES))
     )
-    lines = epipolar_lines(capture.cameras.to(torch.float64), matches)
-    images = capture.views(pair).images.permute(0, 2, 3, 1).numpy()
+    lines = epipolar_lines(sequence.cameras.to(torch.float64), matches)
+    images = sequence.views(pair).images.permute(0, 2, 3, 1).numpy()
     for view, plot in enumerate(plots):
-        # The first pixel's centre is at +0.5.
+        # The first pixel's center is at +0.5.
         plot.imshow(images[view], extent=(0, width, height, 0))
         plot.set_title(f"frame {pair[view]}")
         plot.set_axis_off()
         for number in range(len(matches)):
             a, b, c = lines[number, view].tolist()
             x, y = matches.points[number, view].tolist()
-            colour = f"C{number}"
+            color = f"C{number}"
             if np.isfinite(c):
                 distance = a * x + b * y + c
                 foot = (x - distance * a, y - distance * b)
-                plot.axline(foot, (foot[0] - b, foot[1] + a), color=colour, lw=0.8)
-            plot.plot(x, y, "o", color=colour, ms=5, mec="white", mew=0.7)
+                plot.axline(foot, (foot[0] - b, foot[1] + a), color=color, lw=0.8)
+            plot.plot(x, y, "o", color=color, ms=5, mec="white", mew=0.7)
         plot.set_xlim(0, width)
         plot.set_ylim(height, 0)
 

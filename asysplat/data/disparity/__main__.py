@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import track
 from torch.nn.functional import interpolate
 
-from asysplat.data.bad_frames import BadFrames
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.disparity.maps import BESIDE, map_folder, map_name, write_map
 from asysplat.data.disparity.network import MODEL, load_depth_anything
 from asysplat.data.images import load_photograph
@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None, estimate: Estimate | None = None) -
         console = Console(stderr=True)
         for scene in scenes:
             folder = _folder(scene, options)
-            made, kept = write_maps(layout, scene, folder, estimate, options.on_bad_frame, console)
+            made, kept = write_maps(layout, scene, folder, estimate, options.on_bad_image, console)
             print(f"{scene.name}: {made} maps written, {kept} were there: {folder}", flush=True)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -63,7 +63,7 @@ def parse(arguments: list[str] | None) -> Namespace:
 
 
 def write_maps(
-    layout: str, scene: Path, folder: Path, estimate: Estimate, on_bad_frame: str, console: Console
+    layout: str, scene: Path, folder: Path, estimate: Estimate, on_bad_image: str, console: Console
 ) -> tuple[int, int]:
     """Write the maps of one scene that are not there yet.
 
@@ -73,7 +73,7 @@ def write_maps(
     Raises:
         InputError: files that cannot be read or written; the maps written before stay.
     """
-    bad = BadFrames(on_bad_frame)
+    bad = BadFrames(on_bad_image)
     posed = LAYOUTS[layout].read_scene(scene, bad)
     _make(folder)
     files = {folder / map_name(p.image, scene): p.image for p in posed.photographs}

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
 
-from asysplat.data.capture import PosedScene
 from asysplat.data.images import ImageFile
+from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
-from asysplat.files import replaced
+from asysplat.files import atomic_write
 
 BESIDE = "disparities"  # the folder in a scene's own, where a user wants them there
 LEVELS = 4095  # of a map: finer than any network is right, and PNG packs 12 bits well
@@ -64,7 +64,7 @@ def write_map(path: Path, disparity: Float[ndarray, "h w"]) -> None:
     low, high = float(disparity.min()), float(disparity.max())
     share = (disparity - low) / max(high - low, np.finfo(np.float32).tiny)
     levels = (1 + np.round(share * (LEVELS - 1))).astype(np.uint16)
-    with replaced(path) as partial:
+    with atomic_write(path) as partial:
         Image.fromarray(levels).save(partial)
 
 

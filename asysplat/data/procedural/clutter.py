@@ -9,7 +9,7 @@ from asysplat.data.procedural import textures
 from asysplat.data.procedural.floor_plan import TRIES, FloorPlan, any_material, scatter
 from asysplat.data.procedural.textures import Material
 
-BELOW = 0.5  # metres by which poles reach under the floor, as ground outdoors is not level
+BELOW = 0.5  # meters by which poles reach under the floor, as ground outdoors is not level
 GLOSSY = 0.5  # share of the materials
 
 
@@ -48,7 +48,7 @@ def _near_walk(plan: FloorPlan, rng: np.random.Generator) -> Float[np.ndarray, "
 
 
 def pole(plan: FloorPlan, x: float, y: float, top: float, half: float, material: Material) -> None:
-    """Add an upright pole, `half` its width in metres."""
+    """Add an upright pole, `half` its width in meters."""
     plan.add_box((x, y, (top - BELOW) / 2), (half, half, (top + BELOW) / 2), 0.0, material)
 
 

@@ -1,6 +1,6 @@
 """Smooth edges: several rays a pixel where two surfaces meet (adaptive multisampling).
 
-The rays only tell which surface they meet; its colour is that of the nearest pixel that shows it.
+The rays only tell which surface they meet; its color is that of the nearest pixel that shows it.
 """
 
 import torch
@@ -9,8 +9,8 @@ from torch import Tensor
 
 # A rotated grid: an edge at any angle is met by the four rays one after the other.
 SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
-# From a pixel to itself and its neighbours (x, y).
-NEIGHBOURS = ((0, 0), (0, -1), (-1, 0), (1, 0), (0, 1))
+# From a pixel to itself and its neighbors (x, y).
+NEIGHBORS = ((0, 0), (0, -1), (-1, 0), (1, 0), (0, 1))
 
 
 def edge_pixels(surfaces: Int[Tensor, "H W"]) -> Int[Tensor, " E"]:
@@ -25,7 +25,7 @@ def edge_pixels(surfaces: Int[Tensor, "H W"]) -> Int[Tensor, " E"]:
 
 
 def samples(directions: Float[Tensor, "3 E"], pixel: float) -> Float[Tensor, "3 SE"]:
-    """Return directions around those of pixel centres, all of one sample after those of another.
+    """Return directions around those of pixel centers, all of one sample after those of another.
 
     Args:
         directions: in camera axes, with z = 1.
@@ -47,18 +47,18 @@ def mixed(
     A surface that none of them shows counts as the pixel's own.
 
     Args:
-        light, surfaces: of every pixel's centre.
+        light, surfaces: of every pixel's center.
         pixels: numbers, row by row.
         seen: surface that each ray of `samples` meets.
     """
     height, width = surfaces.shape
-    x, y = torch.tensor(NEIGHBOURS, device=pixels.device).T[..., None]
+    x, y = torch.tensor(NEIGHBORS, device=pixels.device).T[..., None]
     around = ((pixels // width + y).clamp(0, height - 1)) * width
     around += (pixels % width + x).clamp(0, width - 1)
     shown = surfaces.flatten()[around]
     seen = seen.view(len(SAMPLES), -1)
-    # Of the neighbours that show the surface, the first has the largest countdown.
-    countdown = torch.arange(len(NEIGHBOURS), 0, -1, device=pixels.device)[:, None, None]
+    # Of the neighbors that show the surface, the first has the largest countdown.
+    countdown = torch.arange(len(NEIGHBORS), 0, -1, device=pixels.device)[:, None, None]
     latest = torch.where(shown[:, None] == seen, countdown, 0).amax(0)
-    first = (len(NEIGHBOURS) - latest) % len(NEIGHBOURS)
+    first = (len(NEIGHBORS) - latest) % len(NEIGHBORS)
     return light[:, around.gather(0, first)].mean(1)

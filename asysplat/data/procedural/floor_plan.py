@@ -1,6 +1,6 @@
 """Floor plans: what stands where in a room, or in a place outdoors, around a walk.
 
-All in metres, z up, the floor at about 0, the walk around the origin.
+All in meters, z up, the floor at about 0, the walk around the origin.
 """
 
 from collections.abc import Callable
@@ -24,13 +24,13 @@ class FloorPlan:
 
     Args:
         walk: [T, 2] camera positions seen from above, from which things keep clear.
-        boxes: (centre, half sizes, yaw in radians, material).
-        spheres: (centre, radius, material).
+        boxes: (center, half sizes, yaw in radians, material).
+        spheres: (center, radius, material).
         room: lower and upper corner; None outdoors.
         shell: materials of the walls at +-x, +-y, ceiling and floor; outdoors that of the ground.
         heights: [N, N] of the terrain; None in a room.
         light: position of the lamp or sun, [3].
-        light_colour: of a white surface that faces it from near by, linear RGB [3].
+        light_color: of a white surface that faces it from near by, linear RGB [3].
         falloff: distance at which the light is half as strong.
         ambient: light from everywhere, linear RGB [3].
         taken: (spot, radius) of what stands on the ground.
@@ -38,7 +38,7 @@ class FloorPlan:
 
     walk: Float[np.ndarray, "T 2"]
     light: np.ndarray
-    light_colour: np.ndarray
+    light_color: np.ndarray
     falloff: float
     ambient: np.ndarray
     shell: list[Material]
@@ -181,7 +181,7 @@ def furnished_room(
     plan = FloorPlan(
         walk=walk,
         light=lamp,
-        light_colour=np.array([1.0, 0.9, 0.78]),
+        light_color=np.array([1.0, 0.9, 0.78]),
         falloff=rng.uniform(1.5, 3.0),
         ambient=rng.uniform(0.15, 0.3) * np.array([0.9, 0.95, 1.0]),
         shell=[wallpaper, other, wallpaper, wallpaper, textures.plaster(rng), floor],
@@ -198,7 +198,7 @@ def furnished_room(
 
 
 def hills(rng: np.random.Generator) -> Float[np.ndarray, "N N"]:
-    """Draw heights that are gentle near the origin and rise towards the horizon."""
+    """Draw heights that are gentle near the origin and rise toward the horizon."""
     axis = np.linspace(-SKY_RADIUS, SKY_RADIUS, TERRAIN_SAMPLES)
     distance = np.hypot(axis[:, None], axis)
     height = np.zeros_like(distance)
@@ -218,7 +218,7 @@ def outdoor_place(rng: np.random.Generator, walk: Float[np.ndarray, "T 2"]) -> F
     plan = FloorPlan(
         walk=walk,
         light=1e3 * sun,
-        light_colour=np.array([1.0, 0.92, 0.8]),
+        light_color=np.array([1.0, 0.92, 0.8]),
         falloff=1e6,
         ambient=rng.uniform(0.2, 0.4) * np.array([0.8, 0.9, 1.0]),
         shell=[(textures.grass, textures.grass, textures.stone)[rng.integers(3)](rng)],

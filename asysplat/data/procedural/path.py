@@ -1,6 +1,6 @@
 """Hand-held camera paths, with the sway and tremble of a person.
 
-Positions and look-at targets are in metres, z up, around the origin.
+Positions and look-at targets are in meters, z up, around the origin.
 """
 
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 UP = np.array([0.0, 0.0, 1.0])
-AHEAD = 3.0  # metres from a camera to its target, where the target moves with it
+AHEAD = 3.0  # meters from a camera to its target, where the target moves with it
 
 Path = Callable[
     [np.random.Generator, int, float], tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3"]]

@@ -44,10 +44,10 @@ def split_seed(split: Literal["train", "val", "test"], index: int) -> int:
 
 
 class ProceduralScene:
-    """A `Capture` of a synthetic place: textured boxes, spheres, walls or hills, along a walk.
+    """An `ImageSequence` of a synthetic place: textured boxes, spheres, walls or hills along a walk.
 
     Training draws varied ones; validation and test are on plain ones, so that their numbers stay
-    comparable. One unit is a metre, z is up. The same seed gives the same place and walk on every
+    comparable. One unit is a meter, z is up. The same seed gives the same place and walk on every
     device, and the same bits on a CPU.
 
     Args:
@@ -97,7 +97,7 @@ class ProceduralScene:
         self._expose()
 
     def views(self, frames: Sequence[int]) -> Views:
-        """Return the named frames, with the exact depth of every pixel centre's ray."""
+        """Return the named frames, with the exact depth of every pixel center's ray."""
         cameras = self.cameras.select(list(frames))
         light, depths = self._shoot(cameras)
         return Views(cameras, self._develop(light), depths)
@@ -149,7 +149,7 @@ class ProceduralScene:
 
 
 def _cameras(poses: np.ndarray, fov: float, height: int, width: int) -> Cameras:
-    """Make cameras with square pixels, centred, with `fov` degrees along the longer side."""
+    """Make cameras with square pixels, centerd, with `fov` degrees along the longer side."""
     focal = max(height, width) / 2 / np.tan(np.radians(fov) / 2)
     matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     intrinsics = torch.as_tensor(matrix, dtype=torch.float32)

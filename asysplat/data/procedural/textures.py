@@ -1,7 +1,7 @@
 """Surfaces that look like plaster, brick, planks, tiles, cloth or grass, from one formula.
 
 A material is a grid of cells (bricks, planks, checks; one huge cell for plain ones) with joints,
-over fractal noise that blends two colours. Everything is band-limited by the pixel's footprint.
+over fractal noise that blends two colors. Everything is band-limited by the pixel's footprint.
 """
 
 import colorsys
@@ -17,21 +17,21 @@ OCTAVES = 6
 PERSISTENCE = 0.75  # 1 would be the 1/f amplitude spectrum of photographs; our edges add the rest
 PLAIN = 1e6  # a cell so large that its joints are never seen
 
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Material:
-    """How one surface looks; lengths in metres, colours linear RGB."""
+    """How one surface looks; lengths in meters, colors linear RGB."""
 
-    base: Colour
-    accent: Colour
+    base: Color
+    accent: Color
     cell: tuple[float, float] = (PLAIN, PLAIN)
     shift: float = 0.0  # offset of each row of cells from the one below, in cells
     joint: float = 0.0  # width of the joints
     variation: float = 0.0  # brightness differences between cells
     checker: float = 0.0  # brightness difference of a chequered pattern
-    grain: tuple[float, float] = (1.0, 1.0)  # lattice points of the coarsest noise a metre
+    grain: tuple[float, float] = (1.0, 1.0)  # lattice points of the coarsest noise a meter
     gloss: float = 0.0  # brightness of a highlight's middle
     shininess: float = 1.0  # how narrow highlights are: exponent of Blinn and Phong
 
@@ -41,7 +41,7 @@ class Material:
         return [*self.base, *self.accent, *self.cell, *plain, *self.grain, *film]
 
 
-def hsv(hue: float, saturation: float, value: float) -> Colour:
+def hsv(hue: float, saturation: float, value: float) -> Color:
     return colorsys.hsv_to_rgb(hue % 1.0, saturation, value)
 
 
@@ -167,7 +167,7 @@ def cell_pattern(
 ) -> tuple[Float[Tensor, " R"], Float[Tensor, " R"], Float[Tensor, " R"]]:
     """Evaluate a grid of cells: a random tone a cell, a chequered tone, and joint coverage.
 
-    Tones are in [-1, 1], and fade towards a cell's edge over the footprint, so that edges do not
+    Tones are in [-1, 1], and fade toward a cell's edge over the footprint, so that edges do not
     alias.
     """
     in_cells = uv / cell
@@ -190,12 +190,12 @@ def albedo(
     uv: Float[Tensor, "2 R"],
     footprint: Float[Tensor, " R"],
 ) -> Float[Tensor, "3 R"]:
-    """Compute the linear colour of each hit.
+    """Compute the linear color of each hit.
 
     Args:
         rows: `Material.row` of each hit's surface; its gloss is not looked at.
-        uv: place on the surface, metres.
-        footprint: width of the pixel on the surface, metres.
+        uv: place on the surface, meters.
+        footprint: width of the pixel on the surface, meters.
     """
     base, accent, cell, (shift, joint, variation, checker), grain, _ = rows.split(
         (3, 3, 2, 4, 2, 2)

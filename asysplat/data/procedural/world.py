@@ -9,9 +9,9 @@ from asysplat.data.procedural.floor_plan import SKY_RADIUS, FloorPlan
 from asysplat.data.procedural.geometry import TINY, Boxes, Cone, Room, Spheres, Terrain
 from asysplat.data.procedural.textures import Material, albedo, fractal_noise, noise_lattice
 
-CORNER_DISTANCE = 0.4  # metres over which a near surface takes away ambient light
+CORNER_DISTANCE = 0.4  # meters over which a near surface takes away ambient light
 CORNER_LIGHT = 0.25  # share of ambient light that is left in a corner
-OFF_SURFACE = 2e-3  # metres by which shadow rays start above the surface
+OFF_SURFACE = 2e-3  # meters by which shadow rays start above the surface
 SLANT = ((0.8, 0.1, 0.6), (-0.2, 0.95, 0.25))  # texture axes of spheres
 ZENITH = (0.25, 0.45, 0.9)
 HORIZON = (0.85, 0.9, 1.0)
@@ -45,33 +45,33 @@ class World:
         self._lattice = tensor(noise_lattice(rng))
         self._light = tensor(plan.light)[:, None]
         self._falloff = plan.falloff
-        self._light_colour = tensor(plan.light_colour)[:, None]
+        self._light_color = tensor(plan.light_color)[:, None]
         self._ambient = tensor(plan.ambient)[:, None]
         self._sky = tensor((HORIZON, ZENITH))[..., None]
 
     def trace(
         self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"], pixel: float
     ) -> tuple[Float[Tensor, "3 R"], Float[Tensor, " R"], Int[Tensor, " R"]]:
-        """Return linear colour, t and surface of the nearest hit of rays origin + t * direction.
+        """Return linear color, t and surface of the nearest hit of rays origin + t * direction.
 
         Args:
-            pixel: width of a pixel at t = 1, metres.
+            pixel: width of a pixel at t = 1, meters.
         """
         cone = Cone.around(origins, directions)
         boxes, spheres = self._boxes.within(cone), self._spheres.within(cone)
         t, surface = self._nearest(origins, directions, boxes, spheres, REFINE_STEPS)
         points = origins + t * directions
-        colour = torch.empty_like(points)
+        color = torch.empty_like(points)
         sky, solid = _rays_where(surface == SKY), _rays_where(surface != SKY)
         if len(sky):
-            colour[:, sky] = self._sky_colour(points[:, sky])
+            color[:, sky] = self._sky_color(points[:, sky])
         if len(solid):
-            colour[:, solid] = self._surface_colour(
+            color[:, solid] = self._surface_color(
                 points[:, solid], directions[:, solid], surface[solid], pixel * t[solid], cone
             )
-        return colour, t, surface
+        return color, t, surface
 
-    def _surface_colour(
+    def _surface_color(
         self,
         points: Float[Tensor, "3 R"],
         directions: Float[Tensor, "3 R"],
@@ -79,10 +79,10 @@ class World:
         widths: Float[Tensor, " R"],
         cone: Cone,
     ) -> Float[Tensor, "3 R"]:
-        """Compute the linear colour of points, seen along rays of one cone.
+        """Compute the linear color of points, seen along rays of one cone.
 
         Args:
-            widths: of a pixel at each point, metres.
+            widths: of a pixel at each point, meters.
         """
         rows = self._surfaces.index_select(1, surface)
         along_u, along_v, offset, flat, curvature, material = rows.split((3, 3, 2, 3, 1, 16))
@@ -95,13 +95,13 @@ class World:
         # A slanted pixel covers more of the surface; with the root, the mean of its two widths.
         footprint = widths / cosine.abs().clamp(0.1, 1).sqrt()
         direct = self._direct(points, normals)
-        light = self._light_colour * direct + self._ambient * self._openness(points, normals, cone)
-        colour = albedo(self._lattice, material, uv, footprint) * light
+        light = self._light_color * direct + self._ambient * self._openness(points, normals, cone)
+        color = albedo(self._lattice, material, uv, footprint) * light
         if self._glossy:
             gloss, shininess = material[-2:]
             highlight = gloss * self._facing_half(points, normals, directions) ** shininess
-            colour = colour + self._light_colour * (direct * highlight)
-        return colour
+            color = color + self._light_color * (direct * highlight)
+        return color
 
     def surfaces(
         self,
@@ -210,7 +210,7 @@ class World:
         things = torch.minimum(boxes.distance(points), spheres.distance(points))
         return torch.minimum(shell, things)
 
-    def _sky_colour(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 R"]:
+    def _sky_color(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 R"]:
         """Blend from a pale horizon to a blue zenith, with clouds."""
         elevation = (points[2] / SKY_RADIUS).clamp(0, 1)
         horizon, zenith = self._sky
@@ -240,7 +240,7 @@ def _surface_rows(
 ) -> Float[np.ndarray, "S K"]:
     """Return a row for each box's three pairs of faces, each sphere, and the walls or the ground.
 
-    Columns: the texture's two axes and its offset; normal and 0 for flat surfaces, centre and
+    Columns: the texture's two axes and its offset; normal and 0 for flat surfaces, center and
     1 / radius for spheres; the material.
     """
     rows = []

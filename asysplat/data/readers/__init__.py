@@ -15,9 +15,8 @@ needs no code: see conf/data/mipnerf360.yaml.
 from pathlib import Path
 from types import ModuleType
 
-from asysplat.data.bad_frames import BadFrames, Policy
+from asysplat.data.bad_images import BadFrames, Policy
 from asysplat.data.cache import ImageCache
-from asysplat.data.capture import PhotographCapture
 from asysplat.data.disparity import with_disparities
 from asysplat.data.readers import (
     colmap,
@@ -30,6 +29,7 @@ from asysplat.data.readers import (
     scannetpp,
     transforms,
 )
+from asysplat.data.sequence import FileSequence
 from asysplat.errors import InputError
 
 # Where a folder fits several, the first of them reads it.
@@ -72,17 +72,17 @@ def open_scene(
     height: int,
     width: int,
     layout: str = "auto",
-    on_bad_frame: Policy = "fail",
+    on_bad_image: Policy = "fail",
     cache: ImageCache | None = None,
     disparities: Path | str | None = None,
-) -> PhotographCapture:
+) -> FileSequence:
     """Open one scene, its images unread.
 
     Args:
         scene: its folder, or a path that `find_scenes` returned.
         height, width: size of every view, in pixels.
         layout: a name in LAYOUTS, or auto.
-        on_bad_frame: "fail" raises an error that names every frame whose files cannot be used;
+        on_bad_image: "fail" raises an error that names every frame whose files cannot be used;
             "skip" leaves them out, with a warning, for which each image is decoded once.
         cache: where decoded pixels are kept.
         disparities: the folder of `python -m asysplat.data.disparity`; None reads none.
@@ -96,12 +96,12 @@ def open_scene(
         if len(scenes) != 1:
             raise InputError(f"{path} holds {len(scenes)} scenes: name one, such as {scenes[0]}.")
         path = scenes[0]
-    bad = BadFrames(on_bad_frame)
+    bad = BadFrames(on_bad_image)
     posed = LAYOUTS[layout].read_scene(path, bad)
     if disparities is not None:
         posed = with_disparities(posed, path, Path(disparities))
-    capture = PhotographCapture(posed, height, width, cache)
-    if on_bad_frame == "skip":
-        capture = capture.without_damaged(bad)
-    bad.settle(str(path), capture.num_frames)
-    return capture
+    sequence = FileSequence(posed, height, width, cache)
+    if on_bad_image == "skip":
+        sequence = sequence.without_damaged(bad)
+    bad.settle(str(path), sequence.num_frames)
+    return sequence

@@ -17,8 +17,7 @@ import pycolmap
 from jaxtyping import Float
 from numpy import ndarray
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import Photograph, Points, PosedScene
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.common import (
     folders_with,
@@ -28,6 +27,7 @@ from asysplat.data.readers.common import (
     rigid,
     scaled,
 )
+from asysplat.data.sequence import Photograph, Points, PosedScene
 from asysplat.errors import InputError
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")

@@ -18,7 +18,7 @@ from asysplat.scene import ORTHONORMAL_TOLERANCE
 
 DEPTH = 3  # levels below the named folder that are searched; DL3DV has parts and hashes
 SUFFIXES = (".png", ".jpg", ".jpeg")
-MILLIMETRES = 0.001  # metres: the usual unit of stored depths
+MILLIMETERS = 0.001  # meters: the usual unit of stored depths
 
 
 def folders_with(root: Path, *marks: str, depth: int = DEPTH) -> list[Path]:

@@ -9,10 +9,10 @@ https://huggingface.co/datasets/DL3DV/DL3DV-Benchmark
 
 from pathlib import Path
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import PosedScene
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.readers.common import folders_with
 from asysplat.data.readers.transforms import read_frames, read_photographs
+from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
 
 TRANSFORMS = "transforms.json"

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import Photograph, PosedScene
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.colmap import points_beside
 from asysplat.data.readers.common import folders_with, images_in, rigid, scaled
+from asysplat.data.sequence import Photograph, PosedScene
 from asysplat.errors import InputError
 
 POSES = "poses_bounds.npy"
@@ -33,7 +33,7 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
     Row i of the array belongs to the i-th image in sorted order: a row-major 3x5 matrix, whose
     first four columns are camera-to-world with axes down, right, backward and whose fifth is
     height, width and focal length of the full-size image, then the nearest and farthest depth. The
-    principal point is the centre. Images are taken from the first of `images`, `images_2`,
+    principal point is the center. Images are taken from the first of `images`, `images_2`,
     `images_4` and `images_8` that holds one a row: the largest that are all there.
 
     Raises:

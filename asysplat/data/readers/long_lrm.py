@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import Photograph, PosedScene
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.colmap import points_beside
 from asysplat.data.readers.common import folders_with, inverted, rigid, scaled
 from asysplat.data.readers.transforms import read_frames
+from asysplat.data.sequence import Photograph, PosedScene
 from asysplat.errors import InputError
 
 CAMERAS = "opencv_cameras.json"

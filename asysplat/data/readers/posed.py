@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import Photograph, PosedScene
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.colmap import points_beside
-from asysplat.data.readers.common import MILLIMETRES, beside, folders_with, images_in, rigid, scaled
+from asysplat.data.readers.common import MILLIMETERS, beside, folders_with, images_in, rigid, scaled
+from asysplat.data.sequence import Photograph, PosedScene
 from asysplat.errors import InputError
 
 POSES = ("poses_refined.txt", "poses.txt")  # the first that is there is read
@@ -29,9 +29,9 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
     """Read a folder with `K.txt`, `poses.txt`, `images/` and, perhaps, `depth/`.
 
     `K.txt` is the 3x3 pinhole matrix for the images as they are. Line i of `poses.txt` belongs to
-    the i-th image in sorted order: camera-to-world 4x4, row-major, OpenCV axes, metres;
+    the i-th image in sorted order: camera-to-world 4x4, row-major, OpenCV axes, meters;
     `poses_refined.txt` is taken in its place where there is one. Depth maps have the images' names,
-    as one-channel PNG of millimetres along z, 0 where unknown.
+    as one-channel PNG of millimeters along z, 0 where unknown.
 
     Raises:
         InputError: text that cannot be used, or not one pose an image.
@@ -64,7 +64,7 @@ def _photograph(
         lens=scaled(Lens(*size, fx, fy, cx, cy), size, str(image)),
         cam_to_world=cam_to_world,
         depth=beside(depth, size, str(image)) if depths.is_dir() else None,
-        depth_unit=MILLIMETRES,
+        depth_unit=MILLIMETERS,
     )
 
 

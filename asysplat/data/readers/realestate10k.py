@@ -21,10 +21,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import Photograph, PosedScene
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.images import EncodedImage, Lens, image_size
 from asysplat.data.readers.common import inverted, read_json, rigid
+from asysplat.data.sequence import Photograph, PosedScene
 from asysplat.errors import InputError
 
 CHUNK = ".torch"

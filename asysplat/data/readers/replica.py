@@ -1,6 +1,6 @@
 """Reader of Replica as published with NICE-SLAM: images, depths and a trajectory of each room.
 
-root/cam_params.json           intrinsics, image size, and depth steps a metre (6553.5)
+root/cam_params.json           intrinsics, image size, and depth steps a meter (6553.5)
 root/<scene>/traj.txt          row i: 16 numbers, camera-to-world of frame i, row-major, OpenCV axes
 root/<scene>/results/          frame000000.jpg, depth000000.png (16 bits, along z)
 
@@ -9,15 +9,15 @@ https://github.com/cvg/nice-slam (scripts/download_replica.sh, src/utils/dataset
 
 from pathlib import Path
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import Photograph, PosedScene
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.common import beside, folders_with, number, read_json, rigid
+from asysplat.data.sequence import Photograph, PosedScene
 from asysplat.errors import InputError
 
 TRAJECTORY = "traj.txt"
 PARAMETERS = "cam_params.json"
-HALF_A_PIXEL = 0.5  # cx is 599.5 of 1200: these files put the first pixel's centre at 0
+HALF_A_PIXEL = 0.5  # cx is 599.5 of 1200: these files put the first pixel's center at 0
 
 
 def find_scenes(root: Path) -> list[Path]:
@@ -78,7 +78,7 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
 
 
 def _camera(file: Path) -> tuple[Lens, float]:
-    """Read the lens of all frames, and metres a depth step."""
+    """Read the lens of all frames, and meters a depth step."""
     content = read_json(file)
     camera = content.get("camera") if isinstance(content, dict) else None
     if not isinstance(camera, dict):

@@ -8,8 +8,8 @@ A scene is named by one of these files of poses; a folder stands for the first t
 <scene>/iphone/nerfstudio/transforms.json            COLMAP's, some frames: rgb, rgb_masks, depth
 <scene>/iphone/pose_intrinsic_imu.json               ARKit's, every frame: the same folders
 
-Depths are 16-bit PNG, millimetres along z (256 x 192 for the iPhone's 1920 x 1440). Masks are 0
-where a pixel was made anonymous. The world is the laser scan's, in metres: the transforms files
+Depths are 16-bit PNG, millimeters along z (256 x 192 for the iPhone's 1920 x 1440). Masks are 0
+where a pixel was made anonymous. The world is the laser scan's, in meters: the transforms files
 turn its axes, which is undone, so that both cameras, the sparse points and the mesh agree.
 
 https://kaldir.vc.in.tum.de/scannetpp/documentation
@@ -24,11 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import Photograph, Points, PosedScene
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.images import Lens, image_size
-from asysplat.data.readers.common import MILLIMETRES, beside, folders_with, read_json, rigid
+from asysplat.data.readers.common import MILLIMETERS, beside, folders_with, read_json, rigid
 from asysplat.data.readers.transforms import read_frames, read_photographs
+from asysplat.data.sequence import Photograph, Points, PosedScene
 from asysplat.errors import InputError
 
 
@@ -195,7 +195,7 @@ def _arkit(file: Path, folder: Path, part: Part, bad: BadFrames) -> list[Photogr
                     lens=_pinhole(entry.get("intrinsic"), size, f"{where}: intrinsic"),
                     cam_to_world=rigid(entry.get("aligned_pose"), f"{where}: aligned_pose"),
                     depth=depths and beside(depths / f"{name}.png", size, where),
-                    depth_unit=MILLIMETRES,
+                    depth_unit=MILLIMETERS,
                     mask=masks and beside(masks / f"{name}.png", size, where),
                 )
             )

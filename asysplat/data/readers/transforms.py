@@ -10,12 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import Photograph, PosedScene
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.colmap import points_beside
 from asysplat.data.readers.common import (
-    MILLIMETRES,
+    MILLIMETERS,
     beside,
     folders_with,
     natural_order,
@@ -25,6 +24,7 @@ from asysplat.data.readers.common import (
     rigid,
     scaled,
 )
+from asysplat.data.sequence import Photograph, PosedScene
 from asysplat.errors import InputError
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -115,7 +115,7 @@ def _photograph(
             rigid(settings.get("transform_matrix"), f"{where}: transform_matrix")
         ),
         depth=_beside(folder, settings, "depth_file_path", size, where),
-        depth_unit=number(settings, "depth_unit_scale_factor", where, default=MILLIMETRES),
+        depth_unit=number(settings, "depth_unit_scale_factor", where, default=MILLIMETERS),
         mask=_beside(folder, settings, "mask_path", size, where),
     )
 

@@ -45,11 +45,11 @@ def index_entries(
     layout, scenes = find_scenes(root, layout)
     entries: dict[str, Entry] = {}
     for scene in scenes:
-        capture = open_scene(scene, 1, 1, layout)  # cameras alone: no pixel is read
-        if capture.name in entries:
-            raise InputError(f"{root} holds two scenes called {capture.name}: rename one.")
-        chosen = named_selection(selection, capture.cameras, num_inputs, num_targets, "test")
-        entries[capture.name] = Entry(chosen, camera_hash(capture.cameras))
+        sequence = open_scene(scene, 1, 1, layout)  # cameras alone: no pixel is read
+        if sequence.name in entries:
+            raise InputError(f"{root} holds two scenes called {sequence.name}: rename one.")
+        chosen = named_selection(selection, sequence.cameras, num_inputs, num_targets, "test")
+        entries[sequence.name] = Entry(chosen, camera_hash(sequence.cameras))
     return entries
 
 

@@ -25,7 +25,7 @@ class Selection:
 
 
 def uniform_selection(num_frames: int, num_inputs: int, num_targets: int) -> Selection:
-    """Select inputs evenly over the whole sequence, targets midway between neighbouring inputs.
+    """Select inputs evenly over the whole sequence, targets midway between neighboring inputs.
 
     Deterministic. If there are fewer gaps than targets, the targets are spread over all frames that
     are not inputs.
@@ -39,7 +39,7 @@ def uniform_selection(num_frames: int, num_inputs: int, num_targets: int) -> Sel
     candidates = [(before + after) // 2 for before, after in gaps if after - before > 1]
     if len(candidates) < num_targets:
         candidates = sorted(set(range(num_frames)) - set(inputs))
-    # The middles of equal parts, so that neither end of the sequence is favoured.
+    # The middles of equal parts, so that neither end of the sequence is favored.
     chosen = [(2 * i + 1) * len(candidates) // (2 * num_targets) for i in range(num_targets)]
     return Selection(inputs, [candidates[index] for index in chosen])
 

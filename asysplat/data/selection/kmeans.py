@@ -18,7 +18,7 @@ def kmeans_selection(
 ) -> Selection:
     """Select as the paper's tests do: inputs by k-means on positions and viewing directions.
 
-    Every 8th frame is a target; of the others, those nearest to the centres are inputs.
+    Every 8th frame is a target; of the others, those nearest to the centers are inputs.
     Deterministic, on every machine.
 
     Raises:
@@ -26,7 +26,7 @@ def kmeans_selection(
     """
     frames, targets = paper_frames(cameras.num_views, num_targets, split)
     check_held_out(cameras.num_views, len(frames), num_inputs, split)
-    chosen = nearest_to_centres(pose_features(cameras.select(frames)), num_inputs)
+    chosen = nearest_to_centers(pose_features(cameras.select(frames)), num_inputs)
     return Selection([frames[index] for index in chosen], targets)
 
 
@@ -46,10 +46,10 @@ def pose_features(cameras: Cameras) -> Float[ndarray, "V 6"]:
     return features.round(DECIMALS) + 0.0  # without -0
 
 
-def nearest_to_centres(features: Float[ndarray, "V d"], count: int) -> list[int]:
-    """Choose `count` different rows, each near a centre of k-means; sorted.
+def nearest_to_centers(features: Float[ndarray, "V d"], count: int) -> list[int]:
+    """Choose `count` different rows, each near a center of k-means; sorted.
 
-    The nearest pair of a centre and a row is taken first, and neither is used again; of equally
+    The nearest pair of a center and a row is taken first, and neither is used again; of equally
     near rows, the first is taken.
     """
     from sklearn.cluster import KMeans  # slow to import
@@ -57,15 +57,15 @@ def nearest_to_centres(features: Float[ndarray, "V d"], count: int) -> list[int]
     model = KMeans(count, init="k-means++", n_init=1, random_state=0)
     # With one thread, numbers are always summed in the same order.
     with threadpool_limits(1), warnings.catch_warnings():
-        # With fewer different rows than centres, some centres coincide and take the next rows.
+        # With fewer different rows than centers, some centers coincide and take the next rows.
         warnings.filterwarnings("ignore", message="Number of distinct clusters")
-        centres = model.fit(features).cluster_centers_
-    distances = np.linalg.norm(features[:, None] - centres, axis=-1).round(DECIMALS)
+        centers = model.fit(features).cluster_centers_
+    distances = np.linalg.norm(features[:, None] - centers, axis=-1).round(DECIMALS)
     rows, free = [], set(range(count))
     # Row-major, and stable: of equal distances the first row comes first.
     for place in np.argsort(distances, axis=None, kind="stable"):
-        row, centre = divmod(int(place), count)
-        if centre in free and row not in rows:
-            free.remove(centre)
+        row, center = divmod(int(place), count)
+        if center in free and row not in rows:
+            free.remove(center)
             rows.append(row)
     return sorted(rows)

@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from asysplat.ops.adam.reference import Rows, Settings, adam_step_reference
+from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 
 
 @torch.no_grad()
-def adam_step(tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: Settings) -> int:
+def adam_step(tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: AdamSettings) -> int:
     """Update the rows that were seen, in place: float32 on a CPU by a kernel, else by torch.
 
     A row that was not seen, or whose gradient is not finite in all of the tensors, stays as it is

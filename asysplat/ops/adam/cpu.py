@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
-from asysplat.ops.adam.reference import Rows, Settings
+from asysplat.ops.adam.reference import AdamSettings, Rows
 from asysplat.ops.cpu.gathers import gather_pairs
 from asysplat.ops.cpu.kernel import inline, kernel
 from asysplat.ops.cpu.threads import even_bounds, run_blocks
@@ -48,7 +48,7 @@ class FlatRows(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """Settings, 1 - beta as `new`; [steps, 2] what a step's mean and root are multiplied by."""
+    """AdamSettings, 1 - beta as `new`; [steps, 2] what a step's mean and root are multiplied by."""
 
     beta2: np.float32
     new1: np.float32
@@ -57,7 +57,7 @@ class Constants(NamedTuple):
     corrections: np.ndarray
 
 
-def adam_step_cpu(tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: Settings) -> int:
+def adam_step_cpu(tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: AdamSettings) -> int:
     """Update the rows that were seen; see `asysplat.ops.adam.adam_step`."""
     flat = tuple(
         FlatRows(
@@ -78,7 +78,7 @@ def _rows_of_numbers(numbers: int) -> np.ndarray:
 
 
 @cache
-def _constants(settings: Settings) -> Constants:
+def _constants(settings: AdamSettings) -> Constants:
     """Tabulate 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t), up to a step from where they are 1."""
     slowest = max(settings.beta1, settings.beta2, ROUNDING)
     t = np.arange(2 + math.ceil(math.log(ROUNDING) / math.log(slowest)))

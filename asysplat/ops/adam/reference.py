@@ -13,7 +13,7 @@ class Rows(NamedTuple):
 
     Args:
         parameter: is changed, as `mean`, `square` and `steps` are.
-        gradient: of what is minimised.
+        gradient: of what is minimized.
         mean, square: the decaying averages of the gradient and of its square.
         steps: how often each row was updated.
         rates: of each number of a row, >= 0.
@@ -27,7 +27,7 @@ class Rows(NamedTuple):
     rates: Float[Tensor, "K"]
 
 
-class Settings(NamedTuple):
+class AdamSettings(NamedTuple):
     """How fast both averages decay, each in [0, 1), and what is added to the square's root, > 0."""
 
     beta1: float
@@ -36,7 +36,7 @@ class Settings(NamedTuple):
 
 
 def adam_step_reference(
-    tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: Settings
+    tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: AdamSettings
 ) -> int:
     """Update the rows that were seen; see `asysplat.ops.adam.adam_step`."""
     finite = torch.stack([rows.gradient.isfinite().all(1) for rows in tensors]).all(0)

@@ -1,4 +1,4 @@
-"""Numbers at sixteen places of an image at once, two neighbours in one read."""
+"""Numbers at sixteen places of an image at once, two neighbors in one read."""
 
 import numba
 from llvmlite import ir

@@ -19,7 +19,7 @@ _timed: ContextVar[dict[str, float] | None] = ContextVar("_timed", default=None)
 
 
 def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:
-    """Run `kernel(start, stop, *args)` for neighbouring numbers of `bounds`, in any order.
+    """Run `kernel(start, stop, *args)` for neighboring numbers of `bounds`, in any order.
 
     The results are returned in the order of `bounds`.
     What a kernel writes must depend on its range alone: then the number of threads changes no bit.

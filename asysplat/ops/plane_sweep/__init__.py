@@ -1,7 +1,7 @@
-"""Depth from posed photographs alone: a plane sweep over each view's neighbours (Collins 1996).
+"""Depth from posed photographs alone: a plane sweep over each view's neighbors (Collins 1996).
 
 What is swept and how far follows from the cameras (`cameras.py`). Each pixel is compared with its
-neighbours' at every plane (`match`), the costs are smoothed along the image's rows and columns as
+neighbors' at every plane (`match`), the costs are smoothed along the image's rows and columns as
 in semi-global matching (`smooth`, Hirschmueller 2008), and what the views say of each other's
 depths gives the confidence (`agreement.py`). A first sweep of images of half the size finds the
 range in which the second places its planes: surfaces take a tenth of what cameras could see.
@@ -19,16 +19,16 @@ from asysplat.ops.plane_sweep.agreement import CONTRADICTION, Depths, fill, othe
 from asysplat.ops.plane_sweep.backends import choose, load
 from asysplat.ops.plane_sweep.cameras import (
     Projections,
-    choose_neighbours,
+    choose_neighbors,
     inverse_depth_range,
     least_step,
     observed_range,
 )
-from asysplat.ops.plane_sweep.images import edges, grey, shrink
+from asysplat.ops.plane_sweep.images import edges, gray, shrink
 from asysplat.scene import Cameras, TensorRecord
 
 PLANES = 48
-NEIGHBOURS = 4
+NEIGHBORS = 4
 SURE = 0.5  # by which the best plane's costs, of four paths, are less than the mean
 AGREED = 0.5  # agreement of a depth that counts for the range of the second sweep
 
@@ -39,7 +39,7 @@ class SweptDepth(TensorRecord):
 
     Args:
         inverse_depth: 1 / depth along the camera's z axis, > 0; 0 where nothing is known.
-        confidence: in [0, 1]; 0 where no neighbour sees the same.
+        confidence: in [0, 1]; 0 where no neighbor sees the same.
         same: how many other views find the same, each counted as far as it is trusted.
         within: in how many other views it would be, seen or hidden.
     """
@@ -55,7 +55,7 @@ def plane_sweep(
     cameras: Cameras,
     stride: int = 1,
     planes: int = PLANES,
-    neighbours: int = NEIGHBOURS,
+    neighbors: int = NEIGHBORS,
     backend: str = "auto",
     ranges: Float[Tensor, "B V 2"] | None = None,
 ) -> SweptDepth:
@@ -71,7 +71,7 @@ def plane_sweep(
         cameras: of the images, [B, V].
         stride: divides H and W; costs are compared at every pixel and averaged over blocks.
         planes: number of inverse depths, at least 4.
-        neighbours: number of views that each is compared with, at most.
+        neighbors: number of views that each is compared with, at most.
         backend: "reference" (torch, any device and float type), "cpu" or "cuda", or "auto", which
             is the fast one for the device, and "reference" for float64.
         ranges: least and greatest inverse depth of each view; the cameras decide for a view with
@@ -80,12 +80,12 @@ def plane_sweep(
     Raises:
         InputError: sizes that do not go together, or an unknown backend.
     """
-    _check(images, cameras, stride, planes, neighbours)
+    _check(images, cameras, stride, planes, neighbors)
     backend = choose(backend, images)
     images = images if images.dtype == torch.float64 else images.float()
     poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
     return SweptDepth(
-        *_sweep(images, intrinsics, poses, stride, planes, neighbours, backend, ranges=ranges)
+        *_sweep(images, intrinsics, poses, stride, planes, neighbors, backend, ranges=ranges)
     )
 
 
@@ -96,14 +96,14 @@ def _sweep(
     cam_to_world: Tensor,
     stride: int,
     planes: int,
-    neighbours: int,
+    neighbors: int,
     backend: str,
     ranges: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Sweep: one operator for torch, so that devices without content know its shapes."""
     cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
     projections = Projections.between(cameras)
-    chosen = choose_neighbours(cameras, projections, neighbours)
+    chosen = choose_neighbors(cameras, projections, neighbors)
     seen = inverse_depth_range(cameras, projections, chosen)
     ranges = seen if ranges is None else torch.where(ranges[..., 1:] > 0, ranges.to(seen), seen)
     sweep = _Sweep(projections, chosen, least_step(cameras, chosen), planes, stride, backend)
@@ -121,7 +121,7 @@ def _sweep(
 
 
 @_sweep.register_fake
-def _(images, intrinsics, cam_to_world, stride, planes, neighbours, backend, ranges):
+def _(images, intrinsics, cam_to_world, stride, planes, neighbors, backend, ranges):
     shape = (*images.shape[:2], images.shape[-2] // stride, images.shape[-1] // stride)
     return tuple(images.new_empty(shape) for _ in range(4))
 
@@ -140,15 +140,15 @@ class _Sweep:
     def depths(
         self, images: Float[Tensor, "B V 3 H W"], ranges: Float[Tensor, "B V 2"], smoothings: int
     ) -> tuple[Depths, Float[Tensor, "B V h w"]]:
-        """Return the depths of all views, and how far their neighbours agree with them.
+        """Return the depths of all views, and how far their neighbors agree with them.
 
-        After the first smoothing a pixel's costs count as much as its neighbours agreed with it.
+        After the first smoothing a pixel's costs count as much as its neighbors agreed with it.
         """
         form = load(self.backend, images)
         height, width = images.shape[-2:]
         h, w = height // self.stride, width // self.stride
         projections = self.projections.into(self.chosen, height, width)
-        costs = form.match(grey(images), self.chosen, projections, ranges, self.planes, self.stride)
+        costs = form.match(gray(images), self.chosen, projections, ranges, self.planes, self.stride)
         borders = edges(shrink(images, h, w))
         least, greatest = ranges[..., None, None, :].unbind(-1)
         plane = (greatest - least) / (self.planes - 1)
@@ -168,7 +168,7 @@ def _narrowed(
     agreement: Float[Tensor, "B V h w"],
     shortest: Float[Tensor, "B V"],
 ) -> Float[Tensor, "B V 2"]:
-    """Return the ranges of what neighbours agree on, within those given; few depths change none."""
+    """Return the ranges of what neighbors agree on, within those given; few depths change none."""
     observed = observed_range(found.inverse.flatten(2), agreement.flatten(2) > AGREED)
     half_step = found.step / 2
     least = torch.maximum(ranges[..., 0], observed[..., 0] - half_step)
@@ -177,7 +177,7 @@ def _narrowed(
     return torch.where(observed[..., 1:] > 0, narrowed, ranges)
 
 
-def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbours: int) -> None:
+def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbors: int) -> None:
     expected = (*cameras.intrinsics.shape[:-2], 3, cameras.height, cameras.width)
     if images.ndim != 5 or tuple(images.shape) != expected:
         raise InputError(
@@ -189,8 +189,8 @@ def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbour
             f"plane_sweep got stride={stride} for images of {cameras.height}x{cameras.width}: give "
             "a number that divides both."
         )
-    if planes < 4 or neighbours < 1:
+    if planes < 4 or neighbors < 1:
         raise InputError(
-            f"plane_sweep got planes={planes} and neighbours={neighbours}: give at least 4 planes "
-            "and one neighbour."
+            f"plane_sweep got planes={planes} and neighbors={neighbors}: give at least 4 planes "
+            "and one neighbor."
         )

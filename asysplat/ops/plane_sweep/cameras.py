@@ -11,7 +11,7 @@ from asysplat.scene import Cameras
 SAMPLES = 6  # points along each side of a view that stand for all its pixels
 USEFUL_PARALLAX = 0.1  # in image widths: more adds nothing,
 WIDE_PARALLAX = 0.5  # and from here on two views look too different
-LEAST_SHARE = 0.2  # of a view that a neighbour sees at the nearest plane
+LEAST_SHARE = 0.2  # of a view that a neighbor sees at the nearest plane
 OUTLIERS = 0.02  # share of the depths that are known, at either end, that do not count for a range,
 FEWEST = 16  # how many it takes to tell one
 MARGIN = 1.5  # and how much wider it is: surfaces without texture are not known
@@ -57,7 +57,7 @@ class Projections:
         return (self.unit.gather(2, index) * factors).to(self.dtype)
 
 
-def choose_neighbours(
+def choose_neighbors(
     cameras: Cameras, projections: Projections, count: int
 ) -> Int[Tensor, "B V K"]:
     """Return the views that see most of what a view sees, from elsewhere; -1 for none.
@@ -77,7 +77,7 @@ def choose_neighbours(
     parallax = focal[:, :, None, None] * apart[..., None] * inverse[:, None, None]
     useful = (parallax / USEFUL_PARALLAX).clamp_max(1) / (1 + (parallax / WIDE_PARALLAX) ** 2)
     score = (seen * useful).sum(-1)
-    # Nearer than this, two centres differ by rounding.
+    # Nearer than this, two centers differ by rounding.
     score = score.masked_fill(apart < 1e-5 * cameras.centers.abs().amax((-1, -2))[:, None, None], 0)
     score.diagonal(dim1=-2, dim2=-1).fill_(0)
     # Stable, so that equal scores give the same views on every machine.
@@ -86,17 +86,17 @@ def choose_neighbours(
 
 
 def inverse_depth_range(
-    cameras: Cameras, projections: Projections, neighbours: Int[Tensor, "B V K"]
+    cameras: Cameras, projections: Projections, neighbors: Int[Tensor, "B V K"]
 ) -> Float[Tensor, "B V 2"]:
-    """Return the least and the greatest inverse depth at which neighbours see enough of a view.
+    """Return the least and the greatest inverse depth at which neighbors see enough of a view.
 
-    Both are 0 for a view without neighbours; the least is 0 where infinity is seen.
+    Both are 0 for a view without neighbors; the least is 0 where infinity is seen.
     """
-    distance = _farthest(cameras, neighbours)
+    distance = _farthest(cameras, neighbors)
     steps = torch.logspace(-2, 2, 97, base=10.0).to(distance)
     focal = cameras.intrinsics[..., 0, 0] / cameras.width
     inverse = steps / (distance.clamp_min(1e-12) * focal)[..., None]
-    share = _sees(projections, neighbours, inverse).amax(2).mean(-2)
+    share = _sees(projections, neighbors, inverse).amax(2).mean(-2)
     enough = share >= LEAST_SHARE
     first = enough.int().argmax(-1, keepdim=True)
     last = enough.shape[-1] - 1 - enough.flip(-1).int().argmax(-1, keepdim=True)
@@ -108,9 +108,9 @@ def inverse_depth_range(
     return ranges.masked_fill((distance == 0)[..., None], 0)
 
 
-def least_step(cameras: Cameras, neighbours: Int[Tensor, "B V K"]) -> Float[Tensor, "B V"]:
-    """Return the inverse depth that moves a pixel by SUBPIXEL in the farthest neighbour's image."""
-    pixels = cameras.intrinsics[..., 0, 0] * _farthest(cameras, neighbours)
+def least_step(cameras: Cameras, neighbors: Int[Tensor, "B V K"]) -> Float[Tensor, "B V"]:
+    """Return the inverse depth that moves a pixel by SUBPIXEL in the farthest neighbor's image."""
+    pixels = cameras.intrinsics[..., 0, 0] * _farthest(cameras, neighbors)
     return torch.where(pixels > 0, SUBPIXEL / pixels.clamp_min(1e-30), 0)
 
 
@@ -126,12 +126,12 @@ def observed_range(
     return torch.where(count >= FEWEST, ranges, 0)
 
 
-def _farthest(cameras: Cameras, neighbours: Int[Tensor, "B V K"]) -> Float[Tensor, "B V"]:
-    """Return the distance of the farthest neighbour, 0 without any."""
+def _farthest(cameras: Cameras, neighbors: Int[Tensor, "B V K"]) -> Float[Tensor, "B V"]:
+    """Return the distance of the farthest neighbor, 0 without any."""
     centers = cameras.centers
     scene = torch.arange(len(centers), device=centers.device)[:, None, None]
-    distance = (centers[scene, neighbours.clamp_min(0)] - centers[:, :, None]).norm(dim=-1)
-    return distance.masked_fill(neighbours < 0, 0).amax(-1)
+    distance = (centers[scene, neighbors.clamp_min(0)] - centers[:, :, None]).norm(dim=-1)
+    return distance.masked_fill(neighbors < 0, 0).amax(-1)
 
 
 def _sees(

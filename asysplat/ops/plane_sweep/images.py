@@ -1,4 +1,4 @@
-"""What is made of images before they are swept: grey and smaller ones, and their edges.
+"""What is made of images before they are swept: gray and smaller ones, and their edges.
 
 Sums of shifted maps: on a CPU, torch's pooling takes several times as long.
 """
@@ -13,7 +13,7 @@ from torch import Tensor
 LUMA = (0.299, 0.587, 0.114)
 
 
-def grey(images: Float[Tensor, "*more 3 H W"]) -> Float[Tensor, "*more H W"]:
+def gray(images: Float[Tensor, "*more 3 H W"]) -> Float[Tensor, "*more H W"]:
     """Return the luma of RGB images."""
     return (images * images.new_tensor(LUMA)[:, None, None]).sum(-3)
 
@@ -34,7 +34,7 @@ def shrink(
 
 
 def edges(images: Float[Tensor, "B V 3 h w"]) -> Float[Tensor, "B V 2 h w"]:
-    """Return the mean absolute colour difference to the pixel on the left, and to that above."""
+    """Return the mean absolute color difference to the pixel on the left, and to that above."""
     left = torch.zeros_like(images[:, :, 0])
     above = torch.zeros_like(left)
     left[..., 1:] = images.diff(dim=-1).abs().mean(2)

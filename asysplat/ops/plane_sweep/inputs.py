@@ -16,21 +16,21 @@ class MatchInputs(NamedTuple):
     Args:
         images: [n, H, W], less the mean of each.
         padded: the same, [n, H + 1, W + 1]: the last row and column are there twice.
-        neighbours: [n, K], counted as n is; -1 for none.
+        neighbors: [n, K], counted as n is; -1 for none.
         projections: [n, K, 3, 4].
         inverse: [n, planes and more, to whole vectors], inverse depths.
     """
 
     images: Tensor
     padded: Tensor
-    neighbours: Tensor
+    neighbors: Tensor
     projections: Tensor
     inverse: Tensor
 
 
 def prepare(
     images: Float[Tensor, "B V H W"],
-    neighbours: Int[Tensor, "B V K"],
+    neighbors: Int[Tensor, "B V K"],
     projections: Float[Tensor, "B V K 3 4"],
     ranges: Float[Tensor, "B V 2"],
     planes: int,
@@ -45,7 +45,7 @@ def prepare(
     return MatchInputs(
         images=flat.contiguous(),
         padded=F.pad(flat[:, None], (0, 1, 0, 1), mode="replicate")[:, 0].contiguous(),
-        neighbours=torch.where(neighbours >= 0, neighbours + first, -1).flatten(0, 1).contiguous(),
+        neighbors=torch.where(neighbors >= 0, neighbors + first, -1).flatten(0, 1).contiguous(),
         projections=projections.flatten(0, 1).contiguous(),
         inverse=(ranges[..., :1] + places * steps).flatten(0, 1),
     )

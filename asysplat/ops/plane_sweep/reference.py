@@ -11,12 +11,12 @@ from torch import Tensor
 from asysplat.ops.plane_sweep.cameras import FRONT
 
 WINDOW = 5  # pixels along a side of the patches that are compared
-BEST = 2  # neighbours that count at each plane: in the others the point may be hidden
+BEST = 2  # neighbors that count at each plane: in the others the point may be hidden
 UNSEEN = 1.0  # the cost where fewer see it: that of patches that have nothing in common
 NOISE = 3e-4  # variance of a patch that says nothing
 SMALL_STEP = 0.1  # the penalty for one plane more or less than the pixel before
 LARGE_STEP = 0.6  # for more than that,
-EDGE = 0.05  # half of it where the colour changes by this
+EDGE = 0.05  # half of it where the color changes by this
 LEAST_WEIGHT = 0.05  # of a pixel's own costs
 FLATTEST = 1e-9  # bend of a parabola that has a minimum
 TOLERANCE = 0.01  # of an inverse depth, or half a step if that is more: two views agree
@@ -44,16 +44,16 @@ class Votes(NamedTuple):
 
 def match(
     images: Float[Tensor, "B V H W"],
-    neighbours: Int[Tensor, "B V K"],
+    neighbors: Int[Tensor, "B V K"],
     projections: Float[Tensor, "B V K 3 4"],
     ranges: Float[Tensor, "B V 2"],
     planes: int,
     stride: int,
 ) -> Float[Tensor, "B V h w D"]:
-    """Compute how little a pixel looks like its neighbours' pixels at each plane, from 0 to 2.
+    """Compute how little a pixel looks like its neighbors' pixels at each plane, from 0 to 2.
 
-    1 - the zero-mean normalised cross-correlation of patches, which neither gain nor offset of an
-    exposure changes; the mean of the best two neighbours, averaged over blocks of `stride`.
+    1 - the zero-mean normalized cross-correlation of patches, which neither gain nor offset of an
+    exposure changes; the mean of the best two neighbors, averaged over blocks of `stride`.
     """
     B, V, H, W = images.shape
     # An image's small variances would be lost beside large squares.
@@ -70,7 +70,7 @@ def match(
             inverse = _planes(ranges[b, v], planes)
             found = [
                 _compare(images[b, v], images[b, other], matrix, pixels, inverse)
-                for other, matrix in zip(neighbours[b, v].tolist(), projections[b, v], strict=True)
+                for other, matrix in zip(neighbors[b, v].tolist(), projections[b, v], strict=True)
                 if other >= 0
             ]
             unseen = images.new_full((planes, H, W), UNSEEN)
@@ -93,7 +93,7 @@ def _compare(
     pixels: Float[Tensor, "3 H W"],
     inverse: Float[Tensor, "D"],
 ) -> Float[Tensor, "D H W"]:
-    """Return the cost of one neighbour at every plane; UNSEEN, or more, outside its image."""
+    """Return the cost of one neighbor at every plane; UNSEEN, or more, outside its image."""
     H, W = image.shape
     flat = torch.einsum("ij,jyx->iyx", matrix[:, :3], pixels)
     points = flat + inverse[:, None, None, None] * matrix[:, 3, None, None]
@@ -129,8 +129,8 @@ def smooth(
 ) -> Lowest:
     """Find the plane of least smoothed cost.
 
-    The costs are added up along rows and columns, both ways; a step between neighbouring pixels
-    costs less where the colour changes (`edges`, to the left and above).
+    The costs are added up along rows and columns, both ways; a step between neighboring pixels
+    costs less where the color changes (`edges`, to the left and above).
     """
     costs = costs * weights[..., None].clamp_min(LEAST_WEIGHT)
     penalty = LARGE_STEP / (1 + edges / EDGE)

@@ -34,7 +34,7 @@ from asysplat.rendering.cpu.splat import (
 )
 from asysplat.rendering.cpu.tiles import Lists, place, start_positions
 from asysplat.rendering.formulas import CAMERA_GRADIENT, Inputs, camera_gradients, camera_rows
-from asysplat.rendering.interface import RenderOutputs, Settings, check_pairs
+from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs
 from asysplat.scene import Cameras, Gaussians
 
 MOST_SPLATS = 2**25  # in memory at a time: 2 GiB
@@ -45,7 +45,7 @@ MOST_BLOCKS = 64
 def draw(
     gaussians: Gaussians,
     cameras: Cameras,
-    settings: Settings,
+    settings: RenderSettings,
     masks: Bool[Tensor, "B V H W"] | None = None,
 ) -> RenderOutputs:
     """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
@@ -69,7 +69,7 @@ def draw(
     poses = (cameras.cam_to_world, cameras.intrinsics)
     size = (cameras.height, cameras.width)
     stats: dict[str, int] = {}
-    masks = masks if settings.skips.masks else None
+    masks = masks if settings.culling.masks else None
     *images, origins = _Draw.apply(settings, size, masks, stats, *fields, *poses)
     return RenderOutputs(*images, stats, origins)
 
@@ -118,14 +118,14 @@ class _Draw(torch.autograd.Function):
         return (None,) * 4 + _project_backward(frame, inputs, needs, pairs, tensors)
 
 
-def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: Settings) -> Frame:
+def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Frame:
     """Gather what the kernels are told."""
     means, intrinsics = tensors[0], tensors[-1]
     (scenes, num), views = means.shape[:2], intrinsics.shape[1]
     height, width = size
     blocks = max(1, min(-(-num // BLOCK), MOST_BLOCKS))
     columns = -(-width // TILE)
-    convention, skips = settings.convention, settings.skips
+    convention, culling = settings.convention, settings.culling
     return Frame(
         images=scenes * views,
         views=views,
@@ -143,22 +143,22 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: Settings)
             near=convention.near,
             compensation_min=convention.compensation_min,
             antialiased=settings.antialiased,
-            skip_opacity=skips.opacity,
-            skip_frustum=skips.frustum,
-            own_extent=skips.extent,
-            exact=skips.ellipse,
+            cull_opacity=culling.opacity,
+            cull_frustum=culling.frustum,
+            own_extent=culling.extent,
+            exact=culling.ellipse,
         ),
         raster=RasterSettings(
             alpha_min=np.float32(convention.alpha_min),
             alpha_max=np.float32(convention.alpha_max),
             transmittance_min=np.float32(convention.transmittance_min),
-            skip_rows=skips.rows,
-            skip_opaque=skips.opaque,
+            cull_rows=culling.rows,
+            cull_opaque=culling.opaque,
         ),
     )
 
 
-def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: Settings) -> Inputs:
+def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Inputs:
     """Turn the fields of Gaussians, poses and intrinsics into arrays."""
     *fields, cam_to_world, intrinsics = tensors
     cameras = camera_rows(cam_to_world, intrinsics, size, settings.convention)

@@ -59,7 +59,7 @@ def clamp(value, low, high):
 
 
 class Camera(NamedTuple):
-    """A row of `camera_rows`: axes and centre in the world, intrinsics, limits of the tangents."""
+    """A row of `camera_rows`: axes and center in the world, intrinsics, limits of the tangents."""
 
     right: tuple[float, float, float]
     down: tuple[float, float, float]
@@ -97,7 +97,7 @@ def load_camera(cameras, image):
 class InCamera(NamedTuple):
     """A mean as a camera sees it.
 
-    The offset is from the camera's centre, in world axes; tangents are x / z and y / z; inside are
+    The offset is from the camera's center, in world axes; tangents are x / z and y / z; inside are
     those that the Jacobian is taken at; rows are the Jacobian's, in world axes.
     """
 
@@ -114,7 +114,7 @@ class InCamera(NamedTuple):
 
 @inline
 def in_camera(camera, mean):
-    """Project a mean and linearise the projection around it."""
+    """Project a mean and linearize the projection around it."""
     # Relative to the camera first: exact for scenes far from the origin.
     offset = plus(mean, -1.0, camera.center)
     z = dot(camera.forward, offset)

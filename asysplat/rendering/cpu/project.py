@@ -1,7 +1,7 @@
 """Gaussians to splats, in float64 whatever the inputs: a splat is rounded once, at the end.
 
 Where a Gaussian's ellipse lies is computed for a batch at a time, without a branch, so that the
-compiler makes vectors of it; colours and tiles follow for what can be seen.
+compiler makes vectors of it; colors and tiles follow for what can be seen.
 """
 
 import math
@@ -94,7 +94,7 @@ def project(start, stop, inputs, frame, out):
         opacities=np.empty(BATCH, inputs.opacities.dtype),
         chosen=np.empty(BATCH, np.int32),
     )
-    least = settings.alpha_min if settings.skip_opacity else -np.inf
+    least = settings.alpha_min if settings.cull_opacity else -np.inf
     for index in range(start, stop):
         image, block = index // frame.blocks, index % frame.blocks
         camera = load_camera(inputs.cameras, image)
@@ -206,13 +206,13 @@ def _find_ellipses(count, batch, camera, frame, found):
         found[WHITEN_C + i] = c * WHITEN_TO_LOG2
         found[LOG_OPACITY + i] = log_opacity
         found[EXTENT_X + i], found[EXTENT_Y + i] = extent_x, extent_y
-        shown = 1.0 if inside | (not settings.skip_frustum) else OUT_OF_IMAGE
+        shown = 1.0 if inside | (not settings.cull_frustum) else OUT_OF_IMAGE
         found[SEEN + i] = shown if seen else 0.0
 
 
 @inline
 def _store_found(found, i, splats, bases, d):
-    """Round what was found to splat d; all but the colour."""
+    """Round what was found to splat d; all but the color."""
     ellipse = Ellipse(
         x=found[CENTER_X + i],
         y=found[CENTER_Y + i],
@@ -226,7 +226,7 @@ def _store_found(found, i, splats, bases, d):
 
 @inline
 def _store_color(inputs, g, image, functions, splats, d):
-    """Store the colour of Gaussian g seen from the camera; return whether it is a usable one."""
+    """Store the color of Gaussian g seen from the camera; return whether it is a usable one."""
     sh = inputs.sh
     count = sh.shape[1]
     x = y = z = 0.0

@@ -205,7 +205,7 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
     g_row_x = plus(plus(scaled(h_x[0], axis0), h_x[1], axis1), h_x[2], axis2)
     g_row_y = plus(plus(scaled(h_y[0], axis0), h_y[1], axis1), h_y[2], axis2)
 
-    # The Jacobian's rows and the centre to the camera and the mean.
+    # The Jacobian's rows and the center to the camera and the mean.
     g_x, g_y = LOG_2 * splat_grads[G_X], LOG_2 * splat_grads[G_Y]
     g_z = splat_grads[G_DEPTH]
     g_z -= inverse_z * (dot(row_x, g_row_x) + dot(row_y, g_row_y))
@@ -229,7 +229,7 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
     g_u, g_v = g_tangent_x * inverse_z, g_tangent_y * inverse_z
     g_offset = plus(plus(scaled(g_u, right), g_v, down), g_z, forward)
 
-    # Colour.
+    # Color.
     square = dot(offset, offset)
     length = math.sqrt(max(square, TINY))
     direction = scaled(1 / length, offset)

@@ -44,7 +44,7 @@ ROWS, ROWS_IN_EXTENT = range(2)
 COUNTERS = 2
 
 # Planes of a tile's state in the forward pass: what passes through, at 0; what passed where nothing
-# may any more, and 1 + the rank in the list at which that was; alpha; colour; depths, and 1 + the
+# may any more, and 1 + the rank in the list at which that was; alpha; color; depths, and 1 + the
 # rank of the median's.
 REST, STOP, ALPHA, RED, GREEN, BLUE, DEPTH, ORIGIN, MEDIAN, HALVED = (
     plane * PLANE for plane in range(1, 11)
@@ -199,12 +199,12 @@ def rasterize(start, stop, lists, frame, images, saved, blended, median):
         while position < end and live:
             d = entries[position, 0]
             prefetch(splats, entries[min(position + AHEAD, end - 1), 0])
-            look = settings.skip_opaque and position & CHECK == CHECK
+            look = settings.cull_opaque and position & CHECK == CHECK
             rank = np.float32(position - first_entry[tile])
             position += 1
             splat = load_splat(splats, bases, d, window)
             first, last = 0, rows - 1
-            if settings.skip_rows:
+            if settings.cull_rows:
                 first, last = shown_rows(splats, d, splat.y, rows)
             in_extent += last - first + 1
             for index in range(first, last + 1):
@@ -323,10 +323,10 @@ def rasterize_backward(start, stop, lists, frame, saved, grads, blended, median)
             rank = np.float32(position - begin)
             splat = load_splat(splats, bases, d, window)
             first, last = 0, rows - 1
-            if settings.skip_rows:
+            if settings.cull_rows:
                 first, last = shown_rows(splats, d, splat.y, rows)
             for index in range(first, last + 1):
-                if settings.skip_opaque and rank >= row_stops[index]:
+                if settings.cull_opaque and rank >= row_stops[index]:
                     continue
                 row = in_row(splat, index)
                 draw_row_backward(state, row, rank, splat, settings, blended, median)
@@ -336,7 +336,7 @@ def rasterize_backward(start, stop, lists, frame, saved, grads, blended, median)
                 )
             a, c = splat.a, splat.c
             eu, ey = take_sum(state, SUM_EU), take_sum(state, SUM_EY)
-            # The exponent is LOG_OPACITY - u^2 - v^2, u = A x + B y, v = C y, of minus the centre.
+            # The exponent is LOG_OPACITY - u^2 - v^2, u = A x + B y, v = C y, of minus the center.
             grad = grads.pairs[pair]
             grad[col.G_X] = 2 * a * eu
             grad[col.G_Y] = np.float32(2 * splat.b) * eu + 2 * c * c * ey

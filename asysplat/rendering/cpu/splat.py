@@ -14,8 +14,8 @@ from asysplat.ops.cpu.vectors import LANES, fma
 from asysplat.rendering.formulas import FARTHEST, PIXEL_MARGIN
 
 # A splat [16] float32, one cache line; BASE_* hold int32, *_REST the rounding error of the float32.
-# alpha = 2^(LOG_OPACITY - (A dx + B dy)^2 - (C dy)^2), the centre at (BASE_X + X, BASE_Y + Y);
-# it shows nothing beyond EXTENT_Y above and below its centre.
+# alpha = 2^(LOG_OPACITY - (A dx + B dy)^2 - (C dy)^2), the center at (BASE_X + X, BASE_Y + Y);
+# it shows nothing beyond EXTENT_Y above and below its center.
 X, Y, A, B, C, LOG_OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
 BASE_X, BASE_Y, A_REST, B_REST, DEPTH_REST, EXTENT_Y = range(10, 16)
 SPLAT = 16
@@ -38,8 +38,8 @@ class ProjectSettings(NamedTuple):
     near: float
     compensation_min: float
     antialiased: bool
-    skip_opacity: bool
-    skip_frustum: bool
+    cull_opacity: bool
+    cull_frustum: bool
     own_extent: bool
     exact: bool  # leave out the tiles of a box that the ellipse does not touch
 
@@ -50,8 +50,8 @@ class RasterSettings(NamedTuple):
     alpha_min: np.float32
     alpha_max: np.float32
     transmittance_min: np.float32
-    skip_rows: bool
-    skip_opaque: bool
+    cull_rows: bool
+    cull_opaque: bool
 
 
 class Frame(NamedTuple):
@@ -94,8 +94,8 @@ class Window(NamedTuple):
 class TileSplat(NamedTuple):
     """A splat as a tile sees it.
 
-    x, y lead from its centre to the middle of the tile's first row; u is A x + B y there and grows
-    by b a row. These are float64: far from its centre a needle's two terms nearly cancel.
+    x, y lead from its center to the middle of the tile's first row; u is A x + B y there and grows
+    by b a row. These are float64: far from its center a needle's two terms nearly cancel.
     """
 
     x: float
@@ -116,14 +116,14 @@ class Row(NamedTuple):
     """A splat in a row of a tile."""
 
     base: int  # where the row begins in a plane of the tile's state
-    dy: np.float32  # how far it is below the splat's centre
+    dy: np.float32  # how far it is below the splat's center
     exponent: np.float32  # of 2 in alpha where u is 0
     middle: np.float32  # u in the middle of the row
 
 
 @inline
 def store_ellipse(splats, bases, d, ellipse, log_opacity, z):
-    """Round a splat's ellipse, opacity and depth to float32; all but the colour."""
+    """Round a splat's ellipse, opacity and depth to float32; all but the color."""
     x, y, a, b, c, extent_y = ellipse
     base_x = min(max(np.floor(x), -FARTHEST), FARTHEST)
     base_y = min(max(np.floor(y), -FARTHEST), FARTHEST)
@@ -188,7 +188,7 @@ def load_splat(splats, bases, d, window):
 def shown_rows(splats, d, y, rows):
     """Return the first and the last of a tile's rows that splat d can show in.
 
-    y leads from its centre to the first row, as in `TileSplat`.
+    y leads from its center to the first row, as in `TileSplat`.
     """
     extent = float(splats[d, EXTENT_Y]) + PIXEL_MARGIN
     first = math.ceil(max(-y - extent, 0.0))

@@ -36,7 +36,7 @@ class Lists(NamedTuple):
 
 @inline
 def tile_range(center, start, stop, size):
-    """Return the first and the last tile that has a pixel centre in center + [start, stop].
+    """Return the first and the last tile that has a pixel center in center + [start, stop].
 
     The image has `size` pixels; the last tile is before the first where there is none. NaN stands
     for the image's edge.
@@ -64,8 +64,8 @@ def find_box(ellipse, extent_x, frame, box):
 def row_span(ellipse, row, frame):
     """Return the first and the last tile of a row of tiles that the ellipse touches.
 
-    Between the row's outermost pixel centres its right edge is farthest out at its tip, or, where
-    the tip is not among them, at the centre nearest to it; the left edge mirrors it.
+    Between the row's outermost pixel centers its right edge is farthest out at its tip, or, where
+    the tip is not among them, at the center nearest to it; the left edge mirrors it.
     """
     a, b, c, extent = ellipse.a, ellipse.b, ellipse.c, ellipse.extent_y
     square = (c * extent) ** 2

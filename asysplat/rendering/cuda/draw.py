@@ -15,7 +15,7 @@ from asysplat.rendering.cuda.rasterize import Saved, rasterize, rasterize_backwa
 from asysplat.rendering.cuda.splat import GRADIENT, SPLAT, TILE, Frame
 from asysplat.rendering.cuda.tiles import Lists, list_tiles
 from asysplat.rendering.formulas import CAMERA_GRADIENT, Inputs, camera_gradients, camera_rows
-from asysplat.rendering.interface import RenderOutputs, Settings, check_pairs
+from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs
 from asysplat.scene import Cameras, Gaussians
 
 INTERPRETED = triton.knobs.runtime.interpret  # on a CPU, in NumPy: for tests
@@ -29,11 +29,11 @@ PROJECT_OPTIONS = {"enable_fp_fusion": False}
 
 
 def draw(
-    gaussians: Gaussians, cameras: Cameras, settings: Settings, masks: Tensor | None = None
+    gaussians: Gaussians, cameras: Cameras, settings: RenderSettings, masks: Tensor | None = None
 ) -> RenderOutputs:
     """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
 
-    What it draws where `masks` is False has no meaning. It uses all of `settings.skips` but rows,
+    What it draws where `masks` is False has no meaning. It uses all of `settings.culling` but rows,
     which its small tiles are not cut into.
 
     Raises:
@@ -49,7 +49,7 @@ def draw(
     poses = (cameras.cam_to_world, cameras.intrinsics)
     size = (cameras.height, cameras.width)
     stats: dict[str, int] = {}
-    masks = masks if settings.skips.masks else None
+    masks = masks if settings.culling.masks else None
     *images, origins = _Draw.apply(settings, size, masks, stats, *fields, *poses)
     return RenderOutputs(*images, stats, origins)
 
@@ -63,9 +63,9 @@ class _Draw(torch.autograd.Function):
         inputs = _inputs(tensors, size, settings)
         with torch.cuda.device_of(inputs.means):
             splats, depths, counters = _project(frame, inputs, settings)
-            lists, boxes = _list_tiles(frame, splats, depths, masks, settings.skips.ellipse)
+            lists, boxes = _list_tiles(frame, splats, depths, masks, settings.culling.ellipse)
             images, saved = _rasterize(frame, lists, settings)
-        _count(stats, lists, saved, counters, boxes, settings.skips.ellipse)
+        _count(stats, lists, saved, counters, boxes, settings.culling.ellipse)
         ctx.save_for_backward(*tensors, *lists, *saved)
         ctx.settings, ctx.size, ctx.frame = settings, size, frame
         ctx.set_materialize_grads(False)
@@ -138,23 +138,25 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
     )
 
 
-def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: Settings) -> Inputs:
+def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Inputs:
     """Lay out the fields of Gaussians, poses and intrinsics for the kernels."""
     *fields, cam_to_world, intrinsics = tensors
     cameras = camera_rows(cam_to_world, intrinsics, size, settings.convention)
     return Inputs(*(t.detach().contiguous().flatten(0, 1) for t in fields), cameras=cameras)
 
 
-def _kinds(settings: Settings) -> dict[str, bool]:
+def _kinds(settings: RenderSettings) -> dict[str, bool]:
     """Say which depth is drawn."""
     depth = settings.depth
     return {"DEPTH": depth not in (None, "median"), "MEDIAN": depth == "median"}
 
 
-def _project(frame: Frame, inputs: Inputs, settings: Settings) -> tuple[Tensor, Tensor, Tensor]:
+def _project(
+    frame: Frame, inputs: Inputs, settings: RenderSettings
+) -> tuple[Tensor, Tensor, Tensor]:
     """Find splats, depths and counters; see `project`."""
     total, blocks = frame.images * frame.num, -(-frame.num // BLOCK)
-    device, skips, convention = inputs.means.device, settings.skips, settings.convention
+    device, culling, convention = inputs.means.device, settings.culling, settings.convention
     splats = torch.empty(total, SPLAT.value, dtype=torch.float32, device=device)
     depths = torch.empty(total, dtype=torch.float32, device=device)
     counters = torch.empty(blocks * frame.images, COUNTERS, dtype=torch.int32, device=device)
@@ -174,9 +176,9 @@ def _project(frame: Frame, inputs: Inputs, settings: Settings) -> tuple[Tensor, 
             near=convention.near,
             compensation_min=convention.compensation_min,
             ANTIALIASED=settings.antialiased,
-            SKIP_OPACITY=skips.opacity,
-            SKIP_FRUSTUM=skips.frustum,
-            OWN_EXTENT=skips.extent,
+            CULL_OPACITY=culling.opacity,
+            CULL_FRUSTUM=culling.frustum,
+            OWN_EXTENT=culling.extent,
             COUNT=frame.sh_count,
             BLOCK=BLOCK,
             **PROJECT_OPTIONS,
@@ -234,7 +236,7 @@ def _list_tiles(
 
 
 def _rasterize(
-    frame: Frame, lists: Lists, settings: Settings
+    frame: Frame, lists: Lists, settings: RenderSettings
 ) -> tuple[tuple[Tensor | None, ...], Saved]:
     """Draw image, alpha, transmittance, depth and its origins; also what backward needs."""
     kinds, convention, splats = _kinds(settings), settings.convention, lists.splats
@@ -263,7 +265,7 @@ def _rasterize(
         transmittance_min=convention.transmittance_min,
         MASKED=lists.wanted is not None,
         **kinds,
-        SKIP_OPAQUE=settings.skips.opaque,
+        CULL_OPAQUE=settings.culling.opaque,
         STEP=FORWARD_STEP,
         **RASTER_OPTIONS,
     )
@@ -293,7 +295,7 @@ def _project_backward(
     inputs: Inputs,
     lists: Lists,
     pair_grads: Tensor,
-    settings: Settings,
+    settings: RenderSettings,
     needs: dict[str, bool],
 ) -> Inputs:
     """Return the gradients of the inputs from those of the pairs; None where not needed."""

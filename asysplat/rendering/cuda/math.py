@@ -92,9 +92,9 @@ def clamp(value, low, high):
 
 @kernel
 def in_camera(camera, mean):
-    """Project means and linearise the projection around them.
+    """Project means and linearize the projection around them.
 
-    Return the offset from the camera's centre, in world axes; x / z, y / z, z, 1 / z in the
+    Return the offset from the camera's center, in world axes; x / z, y / z, z, 1 / z in the
     camera's frame; the tangents that the Jacobian is taken at, and its rows in world axes.
     """
     right, down = load_row3(camera, RIGHT), load_row3(camera, DOWN)

@@ -50,8 +50,8 @@ def project(
     near,
     compensation_min,
     ANTIALIASED: tl.constexpr,
-    SKIP_OPACITY: tl.constexpr,
-    SKIP_FRUSTUM: tl.constexpr,
+    CULL_OPACITY: tl.constexpr,
+    CULL_FRUSTUM: tl.constexpr,
     OWN_EXTENT: tl.constexpr,
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -72,7 +72,7 @@ def project(
     g = image // views * num + n
     opacity = tl.load(opacities + g, mask=n < num, other=0.0).to(tl.float64)
     there = n < num
-    if SKIP_OPACITY:
+    if CULL_OPACITY:
         # Written so that NaN stays, and is culled below.
         there = there & ((opacity >= alpha_min) | (opacity != opacity))
     faint = tl.sum(((n < num) & (there == 0)).to(tl.int32), 0)
@@ -101,7 +101,7 @@ def project(
     inside = (x + extent_x >= edge) & (x - extent_x <= width - edge)
     inside = inside & (y + extent_y >= edge) & (y - extent_y <= height - edge)
     outside = 0
-    if SKIP_FRUSTUM:
+    if CULL_FRUSTUM:
         outside += tl.sum((shown & (inside == 0)).to(tl.int32), 0)
         shown = shown & inside
     d = image * num + n

@@ -267,7 +267,7 @@ def splat_backward(
     g_row_x = plus(plus(scaled(h_x[0], axis0), h_x[1], axis1), h_x[2], axis2)
     g_row_y = plus(plus(scaled(h_y[0], axis0), h_y[1], axis1), h_y[2], axis2)
 
-    # The Jacobian's rows and the centre to the camera and the mean.
+    # The Jacobian's rows and the center to the camera and the mean.
     g_x, g_y = LOG_2 * g_x, LOG_2 * g_y
     g_z -= inverse_z * (dot(row_x, g_row_x) + dot(row_y, g_row_y))
     g_fx = g_x * tangent_x + dot(row_x, g_row_x) / fx
@@ -284,7 +284,7 @@ def splat_backward(
     g_u, g_v = g_tangent_x * inverse_z, g_tangent_y * inverse_z
     g_offset = plus(plus(scaled(g_u, right), g_v, down), g_z, forward)
 
-    # Colour.
+    # Color.
     square, length, dx, dy, dz = direction(offset)
     functions = sh_basis(dx, dy, dz, COUNT)
     g_red = where_lit(sum_sh(sh, g, 0, functions, drawn, COUNT), g_red)
@@ -328,7 +328,7 @@ def splat_backward(
 
 @kernel
 def where_lit(color, grad):
-    """Return the colour's gradient in float32, 0 where the colour is clamped."""
+    """Return the color's gradient in float32, 0 where the color is clamped."""
     return tl.where(color > 0, grad.to(tl.float32), 0.0)
 
 

@@ -68,7 +68,7 @@ def rasterize(
     MASKED: tl.constexpr,
     DEPTH: tl.constexpr,
     MEDIAN: tl.constexpr,
-    SKIP_OPAQUE: tl.constexpr,
+    CULL_OPAQUE: tl.constexpr,
     STEP: tl.constexpr,
 ):
     """Draw a tile: every pixel of it is written.
@@ -140,7 +140,7 @@ def rasterize(
             passed = tl.where(drops, passed, behind)
         position += STEP
         drawing = position < end
-        if SKIP_OPAQUE:
+        if CULL_OPAQUE:
             drawing = drawing & (tl.max(live.to(tl.int32), 0) > 0)
     tl.store(last_entry + tile, tl.minimum(position, end))
     red_pixel, green_pixel, blue_pixel = color_pixels(pixel, image_index, height, width)
@@ -243,7 +243,7 @@ def rasterize_backward(
             e = tl.fma(weight, value, -opacity * inverse * behind)
             e = tl.where(opacity < alpha_max, e, 0.0)
             behind = tl.fma(weight, value, behind)
-            # The exponent is log_opacity - u^2 - v^2, u = a x + b y, v = c y, of minus the centre.
+            # The exponent is log_opacity - u^2 - v^2, u = a x + b y, v = c y, of minus the center.
             eu, ey = e * u, e * dy
             sum_eu = tl.sum(eu, 0)
             tl.store(grad, 2 * a * sum_eu, mask=there)

@@ -7,13 +7,13 @@ import triton.language as tl
 from asysplat.ops.cuda.kernel import kernel
 from asysplat.rendering import formulas
 
-# A splat [16] float32: alpha = 2^(log_opacity - (a dx + b dy)^2 - (c dy)^2), its centre, rounded
+# A splat [16] float32: alpha = 2^(log_opacity - (a dx + b dy)^2 - (c dy)^2), its center, rounded
 # down, in columns 0 and 1 as int32, and what that leaves of it in 2 and 3; a, b, c in 4 to 6, and
 # what float32 leaves of a and b in 7 and 8; log_opacity in 9; its extent along y in 10;
-# colour in 11 to 13; depth in 14, and what float32 leaves of it in 15.
+# color in 11 to 13; depth in 14, and what float32 leaves of it in 15.
 SPLAT = tl.constexpr(16)
 # Its gradient in a tile [10] float32: of x, y, a, b, c, log_opacity (these less a factor ln 2),
-# colour, depth.
+# color, depth.
 GRADIENT = tl.constexpr(10)
 
 TILE = tl.constexpr(8)  # pixels a side
@@ -54,7 +54,7 @@ def whole_pixels(value):
 
 @kernel
 def store_splat(splats, d, ellipse, log_opacity, color, z, there):
-    """Round float64 ellipses, opacities and depths, and float32 colours, to splats d."""
+    """Round float64 ellipses, opacities and depths, and float32 colors, to splats d."""
     x, y, a, b, c, extent_y = ellipse
     red, green, blue = color
     splat = splats + SPLAT * d
@@ -80,7 +80,7 @@ def store_splat(splats, d, ellipse, log_opacity, color, z, there):
 
 @kernel
 def load_ellipse(splats, d, there):
-    """Read centre, a, b, c and extent along y of splats d, in float64; ones where not `there`."""
+    """Read center, a, b, c and extent along y of splats d, in float64; ones where not `there`."""
     splat = splats + SPLAT * d
     whole = splat.to(tl.pointer_type(tl.int32))
     x = tl.load(whole, mask=there, other=0).to(tl.float64)
@@ -125,8 +125,8 @@ def color_pixels(pixel, image, height, width):
 def load_splat(splats, d, left, top, there):
     """Read splat d as it looks from the middle of the tile whose first pixel is (left, top).
 
-    Return x and y from its centre to the middle, whole pixels and the rest of each; u = a x + b y
-    there; a, b, c; log_opacity, so low where not `there` that nothing shows. Far from its centre a
+    Return x and y from its center to the middle, whole pixels and the rest of each; u = a x + b y
+    there; a, b, c; log_opacity, so low where not `there` that nothing shows. Far from its center a
     needle's two terms nearly cancel: products are taken exactly, as a sum of two numbers.
     """
     splat = splats + SPLAT * d

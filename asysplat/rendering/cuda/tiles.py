@@ -100,7 +100,7 @@ def list_tiles(
 
 @kernel
 def tile_range(center, start, stop, size):
-    """Return the first and the last tile that has a pixel centre in center + [start, stop].
+    """Return the first and the last tile that has a pixel center in center + [start, stop].
 
     The image has `size` pixels; the last tile is before the first where there is none. NaN stands
     for the image's edge.
@@ -134,8 +134,8 @@ def row_span(ellipse, row, height, width, EXACT: tl.constexpr):
     """Return the first and the last tile of a row of tiles that the ellipse touches.
 
     If not EXACT, those that its box touches. The ellipse is (a dx + b dy)^2 + (c dy)^2 <=
-    (c extent)^2. Between the row's outermost pixel centres its right edge is farthest out at its
-    tip, or, where the tip is not among them, at the centre nearest to it; the left edge mirrors it.
+    (c extent)^2. Between the row's outermost pixel centers its right edge is farthest out at its
+    tip, or, where the tip is not among them, at the center nearest to it; the left edge mirrors it.
     """
     if not EXACT:
         return box_columns(ellipse, width)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from asysplat.rendering.interface import RenderOutputs, Settings
+from asysplat.rendering.interface import RenderOutputs, RenderSettings
 from asysplat.rendering.reference import rasterize as raster
 from asysplat.rendering.reference.project import Splats, project
 from asysplat.rendering.reference.rasterize import rasterize
@@ -12,11 +12,11 @@ from asysplat.scene import Cameras, Gaussians
 
 
 def draw(
-    gaussians: Gaussians, cameras: Cameras, settings: Settings, masks: Tensor | None = None
+    gaussians: Gaussians, cameras: Cameras, settings: RenderSettings, masks: Tensor | None = None
 ) -> RenderOutputs:
     """Draw Gaussians [B, N] for cameras [B, V]: B V images, all of one float type.
 
-    It uses none of `settings.skips`, and so draws masked pixels too.
+    It uses none of `settings.culling`, and so draws masked pixels too.
     """
     splats = project(gaussians, cameras, settings)
     images = cameras.intrinsics.shape[0] * cameras.num_views
@@ -40,6 +40,6 @@ def draw(
 
 
 def _values(splats: Splats, depth: bool) -> Tensor:
-    """Return [M, 4 or 5]: the colour; 1, which composites to alpha; and the depth."""
+    """Return [M, 4 or 5]: the color; 1, which composites to alpha; and the depth."""
     depths = (splats.depths[:, None],) if depth else ()
     return torch.cat((splats.colors, torch.ones_like(splats.colors[:, :1]), *depths), -1)

@@ -1,4 +1,4 @@
-"""Arithmetic of the reference: rotations, ellipses, and colours from spherical harmonics (SH)."""
+"""Arithmetic of the reference: rotations, ellipses, and colors from spherical harmonics (SH)."""
 
 import math
 
@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.rendering.interface import TINY, Settings
+from asysplat.rendering.interface import TINY, RenderSettings
 
 
-def whiten(row_x: Tensor, row_y: Tensor, settings: Settings) -> tuple[Tensor, Tensor, Tensor]:
-    """Factorise the covariance M M^T + eps I, M = (row_x; row_y).
+def whiten(row_x: Tensor, row_y: Tensor, settings: RenderSettings) -> tuple[Tensor, Tensor, Tensor]:
+    """Factorize the covariance M M^T + eps I, M = (row_x; row_y).
 
     Return the whitening (a, b, c), which is the Cholesky factor of the inverse; the standard
     deviations along x and y; the factor that antialiasing lowers the opacity by. The determinant is
@@ -88,7 +88,7 @@ def sh_colors(
 ) -> Float[Tensor, "*points 3"]:
     """Return max(0, 0.5 + sum_k sh_k Y_k), seen along `offsets`.
 
-    An offset is a mean minus the camera's centre, of any length.
+    An offset is a mean minus the camera's center, of any length.
     """
     length = offsets.square().sum(-1, keepdim=True).clamp_min(TINY).sqrt()
     basis = sh_basis(offsets / length, sh.shape[-2])

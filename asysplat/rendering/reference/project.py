@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.rendering.interface import LARGEST, Settings
+from asysplat.rendering.interface import LARGEST, RenderSettings
 from asysplat.rendering.reference.math import rotations, sh_colors, whiten
 from asysplat.scene import Cameras, Gaussians
 
@@ -20,8 +20,8 @@ class Splats:
 
     Args:
         images: [M] index of the image, batch and views flattened.
-        xy: [M, 2] centre in pixels.
-        whitening: [M, 3] = (a, b, c); a pixel at (dx, dy) from the centre has
+        xy: [M, 2] center in pixels.
+        whitening: [M, 3] = (a, b, c); a pixel at (dx, dy) from the center has
             alpha = opacity * exp(-((a dx + b dy)^2 + (c dy)^2) / 2).
         opacities: [M].
         colors: [M, 3], >= 0.
@@ -42,7 +42,7 @@ class Splats:
 class Footprint(NamedTuple):
     """Where a Gaussian lies in an image, and how large it is."""
 
-    offsets: Tensor  # [..., 3] mean - camera centre, world axes
+    offsets: Tensor  # [..., 3] mean - camera center, world axes
     depths: Tensor  # [...]
     xy: Tensor  # [..., 2]
     whitening: Tensor  # [..., 3]
@@ -50,7 +50,7 @@ class Footprint(NamedTuple):
     compensation: Tensor  # [...] of the opacity, for antialiasing
 
 
-def project(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Splats:
+def project(gaussians: Gaussians, cameras: Cameras, settings: RenderSettings) -> Splats:
     """Find the splats of every view of every scene.
 
     Args:
@@ -58,7 +58,7 @@ def project(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Splat
         cameras: [B, V], zero skew; image b * V + v is view v of scene b.
         settings: convention and antialiasing.
 
-    Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel centre within its
+    Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel center within its
     extent, and whatever does not project to finite numbers (NaN, infinity, a zero quaternion).
     """
     size = (cameras.width, cameras.height)
@@ -91,7 +91,7 @@ def project(gaussians: Gaussians, cameras: Cameras, settings: Settings) -> Splat
 
 @torch.no_grad()
 def find_visible(
-    gaussians: Gaussians, cameras: Cameras, settings: Settings
+    gaussians: Gaussians, cameras: Cameras, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
     """Return image and flat Gaussian index of every visible pair, in the order of `Splats`."""
     size = (cameras.width, cameras.height)
@@ -134,7 +134,7 @@ def find_footprint(
     cam_to_world: Tensor,
     intrinsics: Tensor,
     size: tuple[int, int],
-    settings: Settings,
+    settings: RenderSettings,
 ) -> Footprint:
     """Project Gaussians; all arguments broadcast over their leading dimensions."""
     rotation = cam_to_world[..., :3, :3]
@@ -161,9 +161,9 @@ def find_footprint(
 
 @torch.no_grad()
 def _pixel_range(
-    footprint: Footprint, opacities: Tensor, size: tuple[int, int], settings: Settings
+    footprint: Footprint, opacities: Tensor, size: tuple[int, int], settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return first and last pixel (x, y) whose centre is in the box around alpha >= alpha_min."""
+    """Return first and last pixel (x, y) whose center is in the box around alpha >= alpha_min."""
     distance = (2 * (opacities / settings.convention.alpha_min).log().clamp_min(0)).sqrt()
     extent = footprint.deviations * distance[..., None] + BOUNDS_MARGIN
     size = extent.new_tensor(size)

@@ -96,7 +96,7 @@ def _rows(packed: Tensor, index: Tensor) -> Tensor:
 
 
 def _keep_at_least(values: Tensor, gate: Tensor, limit: float) -> None:
-    """Set values to 0 where gate < limit; one vectorised pass, several times faster than where."""
+    """Set values to 0 where gate < limit; one vectorized pass, several times faster than where."""
     below = torch.nextafter(gate.new_tensor(limit), gate.new_zeros(())).item()
     torch.ops.aten.threshold_backward.grad_input(values, gate, below, grad_input=values)
 

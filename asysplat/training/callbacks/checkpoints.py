@@ -160,7 +160,7 @@ def _begin_at_next_batch(loop: dict[str, Any]) -> None:
     loop["epoch_loop.state_dict"]["_batches_that_stepped"] -= 1  # it adds 1 when it goes on
 
 
-class WholeFiles(TorchCheckpointIO):
+class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes checkpoints that are there whole or not at all.
 
     Raises:

@@ -7,10 +7,10 @@ from typing import Any
 
 import lightning
 
-from asysplat.evaluation.pictures import learning_curve
-from asysplat.files import replaced
+from asysplat.evaluation.figures import learning_curve
+from asysplat.files import atomic_write
 
-COLUMNS = ("psnr", "nearest_view/psnr", "mean_colour/psnr", "ssim", "lpips", "absrel")
+COLUMNS = ("psnr", "nearest_view/psnr", "mean_color/psnr", "ssim", "lpips", "absrel")
 
 
 class Curve(lightning.Callback):
@@ -59,7 +59,7 @@ class Curve(lightning.Callback):
 
 def write_curve(path: Path, rows: list[dict[str, float | int]]) -> None:
     """Write a line for each validation, oldest first; the file is there whole or not at all."""
-    with replaced(path) as partial, partial.open("w", newline="") as file:
+    with atomic_write(path) as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[-1]))
         writer.writeheader()
         writer.writerows(rows)

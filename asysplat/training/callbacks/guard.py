@@ -16,7 +16,7 @@ from asysplat.training.side_by_side import split
 FILES = 3  # of a run: each has the weights of the model
 
 
-class SkipNonFiniteSteps(lightning.Callback):
+class NonFiniteSteps(lightning.Callback):
     """Drops the gradients of a step in which any is NaN or infinite, and what it did to buffers.
 
     Then the step is taken once more, scene by scene, to name the scene and the first tensor that is

@@ -62,7 +62,7 @@ class Metrics(lightning.Callback):
         inputs, targets = batch["inputs"], batch["targets"]
         values = self.measure(outcome.rendering.image, targets)
         values |= self.protocol.depth_metrics(outcome.rendering.depth, targets)
-        for name in ("mean_colour", "nearest_view"):
+        for name in ("mean_color", "nearest_view"):
             found = measure_baseline(getattr(baselines, name)(inputs, targets), targets)
             values.update({f"{name}/{metric}": value for metric, value in found.items()})
         for index, scene in enumerate(batch["scene"]):

@@ -15,7 +15,7 @@ SPEED_SECONDS = 3600  # of training, from which the time left is estimated
 LINE_SECONDS, LINE_SHARE = 60, 0.01  # least time and share of the steps between two lines
 
 
-class Progress(ProgressBar):
+class TrainingProgressBar(ProgressBar):
     """Shows the steps of the whole training with their PSNR; bars for validation and test.
 
     Without a terminal, or when several runs share one, it prints a line after each validation, and

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from asysplat.data.bad_frames import BadFrames
-from asysplat.data.capture import PhotographCapture
+from asysplat.data.bad_images import BadFrames
+from asysplat.data.sequence import FileSequence
 from asysplat.data.check.matches import find_matches
 from asysplat.data.check.report import LIMIT, judge, measure_fit
 from asysplat.data.readers import llff, long_lrm, posed, transforms
@@ -24,9 +24,9 @@ def real(request, shared):
         pytest.skip(f"{folder} is absent")
     scene = LAYOUTS[request.param].read_scene(folder, BadFrames())
     lens = scene.photographs[0].lens
-    capture = PhotographCapture(scene, lens.height, lens.width)
+    sequence = FileSequence(scene, lens.height, lens.width)
     names = [str(photograph.image) for photograph in scene.photographs]
-    return capture.cameras.to(torch.float64), find_matches(capture), names
+    return sequence.cameras.to(torch.float64), find_matches(sequence), names
 
 
 def posed_by(change):

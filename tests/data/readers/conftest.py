@@ -12,9 +12,9 @@ HEIGHT, WIDTH = 24, 32
 
 
 @pytest.fixture(scope="session")
-def centred_views() -> Views:
-    """Twelve views of a room, 24 x 32, as 8-bit images and depths of whole millimetres can hold
-    them; one focal length, and the principal point at the centre."""
+def centerd_views() -> Views:
+    """Twelve views of a room, 24 x 32, as 8-bit images and depths of whole millimeters can hold
+    them; one focal length, and the principal point at the center."""
     scene = ProceduralScene(1, HEIGHT, WIDTH, num_frames=40, places="rooms")
     views = scene.views(range(12))
     return replace(
@@ -25,9 +25,9 @@ def centred_views() -> Views:
 
 
 @pytest.fixture(scope="session")
-def views(centred_views) -> Views:
-    """The same with two focal lengths and the principal point off the centre."""
-    cameras = centred_views.cameras
+def views(centerd_views) -> Views:
+    """The same with two focal lengths and the principal point off the center."""
+    cameras = centerd_views.cameras
     change = torch.tensor([[0.0, 0.0, 1.25], [0.0, 1.5, -2.5], [0.0, 0.0, 0.0]])
     cameras = replace(cameras, intrinsics=cameras.intrinsics + change)
-    return replace(centred_views, cameras=cameras)
+    return replace(centerd_views, cameras=cameras)

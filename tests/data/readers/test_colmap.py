@@ -9,7 +9,7 @@ from layouts import colmap as layout
 from layouts import save_image
 
 from asysplat.data import open_scene
-from asysplat.data.bad_frames import BadFrames
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.images import Lens
 from asysplat.data.readers import colmap
 from asysplat.errors import InputError
@@ -198,8 +198,8 @@ def test_bad_images_are_listed_together_or_skipped(scene):
     assert "3 of 12" in message and "4.png does not exist" in message
     assert "7.png cannot be read" in message and "gone/10.png does not exist" in message
     with pytest.warns(UserWarning, match="left out 3 of 12"):
-        capture = open_scene(scene, HEIGHT, WIDTH, layout="colmap", on_bad_frame="skip")
-    assert capture.num_frames == 9
+        sequence = open_scene(scene, HEIGHT, WIDTH, layout="colmap", on_bad_image="skip")
+    assert sequence.num_frames == 9
 
 
 @pytest.mark.parametrize("binary", [False, True])

@@ -41,28 +41,28 @@ def test_scenes_are_named_by_their_hash(few, scene, tmp_path):
 
 
 def test_the_benchmark_is_read_at_960p(few, tmp_path):
-    capture = opened(write_benchmark(few, tmp_path) / HASH)
-    read = capture.views(range(4))
+    sequence = opened(write_benchmark(few, tmp_path) / HASH)
+    read = sequence.views(range(4))
     torch.testing.assert_close(read.images, few.images, rtol=0, atol=1e-5)
     torch.testing.assert_close(read.cameras.intrinsics, few.cameras.intrinsics, rtol=0, atol=1e-5)
 
 
 def test_smaller_images_are_read_where_there_are_no_others(few, tmp_path):
     write_scene(few, tmp_path / HASH, level=8)
-    capture = opened(tmp_path / HASH)
-    lens = capture.scene.photographs[0].lens
+    sequence = opened(tmp_path / HASH)
+    lens = sequence.scene.photographs[0].lens
     assert (lens.width, lens.height) == (16, 12)
     torch.testing.assert_close(
-        capture.cameras.intrinsics, few.cameras.intrinsics, rtol=0, atol=1e-5
+        sequence.cameras.intrinsics, few.cameras.intrinsics, rtol=0, atol=1e-5
     )
 
 
 def test_distortion_does_not_depend_on_the_images_size(few, tmp_path):
     lens = LENS | {"k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": -0.004}
     write_scene(few, tmp_path / HASH, lens=lens)
-    capture = opened(tmp_path / HASH)
-    assert capture.scene.photographs[0].lens.distortion == (0.1, -0.02, 0.003, -0.004, 0)
-    views = capture.views([0])
+    sequence = opened(tmp_path / HASH)
+    assert sequence.scene.photographs[0].lens.distortion == (0.1, -0.02, 0.003, -0.004, 0)
+    views = sequence.views([0])
     assert views.masks is not None and (views.images - few.images[:1]).abs().max() > 0.01
 
 
@@ -117,7 +117,7 @@ def test_a_bad_frame_is_named_or_left_out(scene, damage, message):
     with pytest.raises(InputError, match=f"1 of 4 frames cannot be used(.|\n)*{message}"):
         opened(scene)
     with pytest.warns(UserWarning, match=f"left out 1 of 4 frames(.|\n)*{message}"):
-        assert opened(scene, on_bad_frame="skip").num_frames == 3
+        assert opened(scene, on_bad_image="skip").num_frames == 3
 
 
 def test_all_bad_frames_are_told_together(scene):
@@ -153,4 +153,4 @@ SCENES = {
 def test_a_broken_scene_is_refused(scene: Path, damage, message):
     damage(scene)
     with pytest.raises(InputError, match=message):
-        opened(scene, on_bad_frame="skip")
+        opened(scene, on_bad_image="skip")

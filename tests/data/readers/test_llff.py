@@ -12,8 +12,8 @@ HEIGHT, WIDTH = 24, 32
 
 
 @pytest.fixture
-def scene(centred_views, tmp_path):
-    return layout.write(centred_views, tmp_path)
+def scene(centerd_views, tmp_path):
+    return layout.write(centerd_views, tmp_path)
 
 
 def open_llff(scene, **options):
@@ -71,7 +71,7 @@ def test_all_bad_frames_are_listed_or_skipped(scene):
     for sentence, part in zip(sentences, expected, strict=True):
         assert part in sentence
     with pytest.warns(UserWarning, match="left out 4 of 12"):
-        assert open_llff(scene, on_bad_frame="skip").num_frames == 8
+        assert open_llff(scene, on_bad_image="skip").num_frames == 8
 
 
 ARRAYS = {
@@ -104,8 +104,8 @@ def test_an_archive_of_arrays_is_refused(scene):
         open_llff(scene)
 
 
-def test_points_of_a_model_beside_are_taken(scene, centred_views, tmp_path):
-    model = colmap_layout.write(centred_views, tmp_path / "model")
+def test_points_of_a_model_beside_are_taken(scene, centerd_views, tmp_path):
+    model = colmap_layout.write(centerd_views, tmp_path / "model")
     for index in range(12):
         (scene / f"images_8/image{index:03d}.png").rename(scene / f"images_8/{index:02d}.png")
     text = model / "sparse/0/images.txt"
@@ -113,5 +113,5 @@ def test_points_of_a_model_beside_are_taken(scene, centred_views, tmp_path):
     assert open_llff(scene).scene.points is None
     shutil.copytree(model / "sparse", scene / "sparse")
     np.testing.assert_allclose(
-        open_llff(scene).scene.points, colmap_layout.points_of(centred_views), atol=1e-9
+        open_llff(scene).scene.points, colmap_layout.points_of(centerd_views), atol=1e-9
     )

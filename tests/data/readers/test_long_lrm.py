@@ -27,8 +27,8 @@ def change(scene, edit):
     return scene
 
 
-def names_of(capture):
-    return [photograph.image.name for photograph in capture.scene.photographs]
+def names_of(sequence):
+    return [photograph.image.name for photograph in sequence.scene.photographs]
 
 
 def test_a_scene_is_found_from_its_list_json_or_folder(listed, scene):
@@ -61,8 +61,8 @@ def test_intrinsics_of_larger_images_are_scaled(scene, views):
             for name in ("fx", "fy", "cx", "cy", "w", "h"):
                 frame[name] *= 4
 
-    capture = open_scene(change(scene, enlarge), HEIGHT, WIDTH)
-    difference = capture.cameras.intrinsics - views.cameras.intrinsics
+    sequence = open_scene(change(scene, enlarge), HEIGHT, WIDTH)
+    difference = sequence.cameras.intrinsics - views.cameras.intrinsics
     assert difference.abs().max() < 1e-5
 
 
@@ -99,8 +99,8 @@ def test_all_bad_frames_are_listed_or_skipped(scene):
     for sentence, part in zip(sentences, expected, strict=True):
         assert part in sentence
     with pytest.warns(UserWarning, match="left out 9 of 12"):
-        capture = open_scene(scene, HEIGHT, WIDTH, on_bad_frame="skip")
-    assert names_of(capture) == ["frame90.png", "frame100.png", "frame110.png"]
+        sequence = open_scene(scene, HEIGHT, WIDTH, on_bad_image="skip")
+    assert names_of(sequence) == ["frame90.png", "frame100.png", "frame110.png"]
 
 
 def test_a_cut_json_is_refused(scene):

@@ -60,7 +60,7 @@ def test_all_bad_frames_are_listed_or_skipped(scene):
     for sentence, part in zip(sentences, expected, strict=True):
         assert part in sentence
     with pytest.warns(UserWarning, match="left out 5 of 12"):
-        assert open_posed(scene, on_bad_frame="skip").num_frames == 7
+        assert open_posed(scene, on_bad_image="skip").num_frames == 7
 
 
 def test_poses_and_images_that_differ_in_number_are_refused(scene):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asysplat.data import open_scene
-from asysplat.data.bad_frames import BadFrames
+from asysplat.data.bad_images import BadFrames
 from asysplat.data.points import depths_of_points
 from asysplat.data.readers import colmap, llff, long_lrm, posed, transforms
 
@@ -49,16 +49,16 @@ def test_both_readers_give_the_same_cameras(scene):
 
 
 def test_it_opens_in_its_own_layout(scene):
-    capture = open_scene(scene, 64, 64)
-    views = capture.views([0, capture.num_frames // 2, capture.num_frames - 1]).validate()
+    sequence = open_scene(scene, 64, 64)
+    views = sequence.views([0, sequence.num_frames // 2, sequence.num_frames - 1]).validate()
     assert views.images.std() > 0.05
     assert (views.depths is not None) == (scene.name == "hololens-000")
 
 
 def test_points_seen_lie_on_the_surfaces(scene):
-    capture = open_scene(scene, 64, 64)
-    views = capture.views(range(0, capture.num_frames, 10))
-    depths = depths_of_points(capture.points, views.cameras)
+    sequence = open_scene(scene, 64, 64)
+    views = sequence.views(range(0, sequence.num_frames, 10))
+    depths = depths_of_points(sequence.points, views.cameras)
     assert (depths > 0).sum((1, 2)).median() > 200
     if views.depths is not None:
         known = (depths > 0) & (views.depths > 0)

@@ -128,7 +128,7 @@ def test_a_bad_frame_is_named_or_left_out(chunk, change, message):
     with pytest.raises(InputError, match=f"1 of 4 frames cannot be used(.|\n)*{message}"):
         opened(address)
     with pytest.warns(UserWarning, match=f"left out 1 of 4 frames(.|\n)*{message}"):
-        assert opened(address, on_bad_frame="skip").num_frames == 3
+        assert opened(address, on_bad_image="skip").num_frames == 3
 
 
 SCENES = {
@@ -147,7 +147,7 @@ SCENES = {
 @pytest.mark.parametrize("change, message", SCENES.values(), ids=SCENES.keys())
 def test_a_broken_scene_is_refused(chunk, change, message):
     with pytest.raises(InputError, match=message):
-        opened(chunk(change) / KEY, on_bad_frame="skip")
+        opened(chunk(change) / KEY, on_bad_image="skip")
 
 
 @pytest.mark.parametrize("left", [0, 10, 5000, -100])

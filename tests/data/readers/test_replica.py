@@ -10,7 +10,7 @@ from layouts.replica import write
 from asysplat.data import open_scene
 from asysplat.errors import InputError
 
-STEPS = 6553.5  # a metre, in the published files
+STEPS = 6553.5  # a meter, in the published files
 
 
 @pytest.fixture
@@ -38,9 +38,9 @@ def change_row(room, index, change):
 def test_depths_have_the_published_steps(views, tmp_path):
     views = views.select(range(2))
     views = replace(views, depths=(views.depths * STEPS).round() / STEPS)
-    capture = opened(write(views, tmp_path, STEPS) / "room0")
-    assert capture.name == "room0"
-    torch.testing.assert_close(capture.views([0, 1]).depths, views.depths, rtol=0, atol=1e-5)
+    sequence = opened(write(views, tmp_path, STEPS) / "room0")
+    assert sequence.name == "room0"
+    torch.testing.assert_close(sequence.views([0, 1]).depths, views.depths, rtol=0, atol=1e-5)
 
 
 def test_the_principal_point_counts_from_the_corner(room):
@@ -110,7 +110,7 @@ def test_a_bad_frame_is_named_or_left_out(room, damage, message):
     with pytest.raises(InputError, match=f"1 of 4 frames cannot be used(.|\n)*{message}"):
         opened(room)
     with pytest.warns(UserWarning, match=f"left out 1 of 4 frames(.|\n)*{message}"):
-        assert opened(room, on_bad_frame="skip").num_frames == 3
+        assert opened(room, on_bad_image="skip").num_frames == 3
 
 
 def test_all_bad_frames_are_told_together(room):
@@ -145,4 +145,4 @@ SCENES = {
 def test_a_broken_scene_is_refused(room, damage, message):
     damage(room)
     with pytest.raises(InputError, match=message):
-        opened(room, on_bad_frame="skip")
+        opened(room, on_bad_image="skip")

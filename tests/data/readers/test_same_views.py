@@ -13,16 +13,16 @@ NAMES = [module.name for module in iter_modules(layouts.__path__)]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_layout_gives_the_same_views(name, views, centred_views, tmp_path):
+def test_every_layout_gives_the_same_views(name, views, centerd_views, tmp_path):
     layout = import_module(f"layouts.{name}")
-    expected = views if getattr(layout, "FREE_INTRINSICS", True) else centred_views
+    expected = views if getattr(layout, "FREE_INTRINSICS", True) else centerd_views
     root = layout.write(expected, tmp_path / "scène 1")
     found, scenes = find_scenes(root)
     assert found == name and len(scenes) == 1
     height, width = expected.images.shape[-2:]
-    capture = open_scene(scenes[0], height, width, layout=name)
-    assert capture.num_frames == expected.num_views
-    read = capture.views(range(capture.num_frames)).validate()
+    sequence = open_scene(scenes[0], height, width, layout=name)
+    assert sequence.num_frames == expected.num_views
+    read = sequence.views(range(sequence.num_frames)).validate()
 
     def same(found, wanted):
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)

@@ -108,10 +108,10 @@ def test_the_iphone_s_colmap_comes_before_arkit(few, iphone):
 
 def test_fisheye_is_undistorted(few, dslr):
     write_dslr(few, dslr, lens=FISHEYE)
-    capture = opened(dslr / "nerfstudio/transforms.json")
-    lens = capture.scene.photographs[0].lens
+    sequence = opened(dslr / "nerfstudio/transforms.json")
+    lens = sequence.scene.photographs[0].lens
     assert lens.fisheye and lens.distortion == tuple(FISHEYE.values())
-    assert capture.views([0]).masks is not None
+    assert sequence.views([0]).masks is not None
 
 
 def test_rendered_depths_belong_to_the_fisheye(few, dslr):
@@ -141,8 +141,8 @@ def test_masks_are_read(few, dslr, iphone):
 
 def test_published_test_frames_are_among_the_photographs(few, dslr):
     write_dslr(few, dslr, test=[1, 3])
-    capture = opened(dslr)
-    same(capture.cameras.cam_to_world, few.cameras.cam_to_world)
+    sequence = opened(dslr)
+    same(sequence.cameras.cam_to_world, few.cameras.cam_to_world)
     for name in ("DSC00002.JPG", "DSC00004.JPG"):
         (dslr / "resized_undistorted_images" / name).unlink()
     hidden = opened(dslr)
@@ -224,7 +224,7 @@ def test_a_bad_frame_is_named_or_left_out(iphone, damage, message):
     with pytest.raises(InputError, match=f"1 of 4 frames cannot be used(.|\n)*{message}"):
         opened(iphone)
     with pytest.warns(UserWarning, match=f"left out 1 of 4 frames(.|\n)*{message}"):
-        assert opened(iphone, on_bad_frame="skip").num_frames == 3
+        assert opened(iphone, on_bad_image="skip").num_frames == 3
 
 
 def test_a_frame_without_numbers_is_a_bad_frame(iphone):

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from asysplat.data import open_scene as open_at
-from asysplat.data.capture import Capture
+from asysplat.data.sequence import ImageSequence
 from asysplat.errors import InputError
 
 WIDTH, HEIGHT = 24, 16
@@ -52,14 +52,14 @@ def scene(tmp_path):
 
 def test_cameras_and_images_are_the_file_s(scene):
     folder = scene()
-    capture = open_scene(folder)
-    assert isinstance(capture, Capture)
-    assert capture.name == folder.name and capture.num_frames == 4
-    cameras = capture.cameras.validate()
+    sequence = open_scene(folder)
+    assert isinstance(sequence, ImageSequence)
+    assert sequence.name == folder.name and sequence.num_frames == 4
+    cameras = sequence.cameras.validate()
     expected = np.stack([pose(i) @ FLIP for i in range(4)])
     assert np.abs(cameras.cam_to_world.numpy() - expected).max() < 1e-6
     assert cameras.intrinsics[2].tolist() == [[20, 0, 12.5], [0, 21, 7.5], [0, 0, 1]]
-    views = capture.views([2, 0]).validate()
+    views = sequence.views([2, 0]).validate()
     stored = np.asarray(Image.open(folder / "images/2.png"))
     assert np.array_equal((views.images[0] * 255).round().byte().permute(1, 2, 0), stored)
     assert torch.equal(views.cameras.cam_to_world[1], cameras.cam_to_world[0])
@@ -76,8 +76,8 @@ def test_nothing_is_written(scene):
 def test_the_json_file_itself_may_be_named(scene):
     folder = scene()
     (folder / "transforms.json").rename(folder / "transforms_train.json")
-    capture = open_scene(folder / "transforms_train.json")
-    assert capture.num_frames == 4 and capture.name == folder.name
+    sequence = open_scene(folder / "transforms_train.json")
+    assert sequence.num_frames == 4 and sequence.name == folder.name
 
 
 def test_field_of_view_alone_is_enough(scene):
@@ -98,10 +98,10 @@ def test_a_frame_s_own_intrinsics_and_size_win(scene):
 
     folder = scene(change)
     Image.new("RGB", (48, 32), (255, 0, 0)).save(folder / "images/1.png")
-    capture = open_scene(folder)
-    assert capture.cameras.intrinsics[1].tolist() == [[25, 0, 12.5], [0, 26, 7.5], [0, 0, 1]]
-    assert capture.cameras.intrinsics[0, 0, 0] == 20
-    assert capture.views([1]).images[0, :, 8, 8].tolist() == [1, 0, 0]
+    sequence = open_scene(folder)
+    assert sequence.cameras.intrinsics[1].tolist() == [[25, 0, 12.5], [0, 26, 7.5], [0, 0, 1]]
+    assert sequence.cameras.intrinsics[0, 0, 0] == 20
+    assert sequence.views([1]).images[0, :, 8, 8].tolist() == [1, 0, 0]
 
 
 def test_resize_and_crop_reach_the_cameras(scene):
@@ -165,12 +165,12 @@ def test_depth_unit_is_read(scene):
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
 def test_distortion_moves_pixels_and_masks_what_no_lens_saw(scene, model):
-    capture = open_scene(scene(lambda content: content.update(camera_model=model, k1=0.6)))
+    sequence = open_scene(scene(lambda content: content.update(camera_model=model, k1=0.6)))
     plain = open_scene(scene(lambda content: content.update(camera_model="PINHOLE", k1=0.0)))
-    views, straight = capture.views([0]), plain.views([0])
+    views, straight = sequence.views([0]), plain.views([0])
     assert (views.images - straight.images).abs().max() > 0.1
     assert bool(views.masks[0, 8, 12]) and not bool(views.masks.all()) and straight.masks is None
-    assert torch.equal(capture.cameras.intrinsics, plain.cameras.intrinsics)
+    assert torch.equal(sequence.cameras.intrinsics, plain.cameras.intrinsics)
 
 
 def test_rotations_are_made_orthonormal(scene):
@@ -286,7 +286,7 @@ def epipolar_error(views) -> float:
     pairs = cv2.BFMatcher().knnMatch(*descriptors, k=2)
     good = [first for first, second in pairs if first.distance < 0.7 * second.distance]
     assert len(good) > 100
-    # SIFT, as all of OpenCV, puts the first pixel's centre at 0.
+    # SIFT, as all of OpenCV, puts the first pixel's center at 0.
     a = np.array([keys[0][match.queryIdx].pt for match in good]) + 0.5
     b = np.array([keys[1][match.trainIdx].pt for match in good]) + 0.5
     a, b = np.c_[a, np.ones(len(a))], np.c_[b, np.ones(len(b))]
@@ -308,9 +308,9 @@ def test_real_photographs_meet_their_cameras(shared, tmp_path):
     if not folder.is_dir():
         pytest.skip(f"{folder} is absent")
     frames = [0, 6]
-    capture = open_scene(folder, height=720, width=405)
-    assert capture.num_frames == 50
-    assert epipolar_error(capture.views(frames).validate()) < 0.5
+    sequence = open_scene(folder, height=720, width=405)
+    assert sequence.num_frames == 50
+    assert epipolar_error(sequence.views(frames).validate()) < 0.5
     # Smaller, with another shape: intrinsics and pixels must still agree.
     assert epipolar_error(open_scene(folder, 480, 360).views(frames)) < 0.5
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scans import assert_exact, make_arguments
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.medium
 
 # Where a state is the sum of 10,000 tokens and more, each addition is rounded, and a float32 decay
 # next to 1 holds only the first digits of what is lost: no form comes within 2e-6.

@@ -1,6 +1,6 @@
 """The costs: a task takes a vector of planes through a view, two rows at a time.
 
-Of each neighbour it warps one row after the other, where the neighbour may see something, and keeps
+Of each neighbor it warps one row after the other, where the neighbor may see something, and keeps
 as many as two rows of patches have; the sums over patches are taken along columns first, then along
 the row.
 """
@@ -43,7 +43,7 @@ INFINITY = np.float32(np.inf)
 
 def match(
     images: Float[Tensor, "B V H W"],
-    neighbours: Int[Tensor, "B V K"],
+    neighbors: Int[Tensor, "B V K"],
     projections: Float[Tensor, "B V K 3 4"],
     ranges: Float[Tensor, "B V 2"],
     planes: int,
@@ -51,7 +51,7 @@ def match(
 ) -> Float[Tensor, "B V h w D"]:
     """Compute the costs in float32; see `reference.match`."""
     B, V, H, W = images.shape
-    inputs = prepare(images, neighbours, projections, ranges, planes)
+    inputs = prepare(images, neighbors, projections, ranges, planes)
     costs = torch.empty(B * V, H // stride, W // stride, planes)
     run_blocks(
         match_planes,
@@ -73,10 +73,10 @@ def match_planes(start, stop, inputs, stride, costs):
     """
     H, W = inputs.images.shape[1:]
     h, w, planes = costs.shape[1:]
-    K = inputs.neighbours.shape[1]
+    K = inputs.neighbors.shape[1]
     vectors = inputs.inverse.shape[1] // LANES
     share = np.float32(0.5 / (stride * stride))
-    # A place for each of the last rows of each neighbour.
+    # A place for each of the last rows of each neighbor.
     warped = np.empty((K, KEPT, W, LANES), np.float32)
     seen = np.empty((K, KEPT, W), np.uint16)
     spans = np.empty((K, H, 2), np.int64)
@@ -92,21 +92,21 @@ def match_planes(start, stop, inputs, stride, costs):
         image = inputs.images[view]
         number = 0
         for k in range(K):
-            if inputs.neighbours[view, k] >= 0:
+            if inputs.neighbors[view, k] >= 0:
                 number += 1
                 for y in range(H):
                     _find_span(spans[k, y], inputs.projections[view, k], y, depth, H, W)
         for y in range(0, H, 2):
-            # What fewer neighbours than two leave open is unseen.
+            # What fewer neighbors than two leave open is unseen.
             for row in range(2):
                 describe_row(offsets[row], scales[row], image, min(y + row, H - 1), along)
                 for x in range(W):
                     store(first[row], x, zeros() + (UNSEEN if number < 2 else INFINITY))
                     store(second[row], x, zeros() + (UNSEEN if number < 1 else INFINITY))
             for k in range(K):
-                if inputs.neighbours[view, k] < 0:
+                if inputs.neighbors[view, k] < 0:
                     continue
-                other = inputs.padded[inputs.neighbours[view, k]]
+                other = inputs.padded[inputs.neighbors[view, k]]
                 matrix = inputs.projections[view, k]
                 for row in range(0 if y == 0 else y + AROUND, min(y + AROUND + 2, H)):
                     begin, end = W, 0  # of what patches take from this row
@@ -134,7 +134,7 @@ def match_planes(start, stop, inputs, stride, costs):
 
 @inline
 def _find_span(span, matrix, y, depth, H, W):
-    """Write the first column of row y that a neighbour sees at some plane, and one past the last.
+    """Write the first column of row y that a neighbor sees at some plane, and one past the last.
 
     A pixel around its image counts as within, so that rounding leaves none out.
     """
@@ -161,7 +161,7 @@ def _find_span(span, matrix, y, depth, H, W):
 
 @inline
 def _warp_row(warped, seen, other, matrix, y, depth, columns):
-    """Write what a neighbour shows at pixels of a row, [W, LANES] and whether it sees them."""
+    """Write what a neighbor shows at pixels of a row, [W, LANES] and whether it sees them."""
     bottom, right = np.float32(other.shape[0] - 1), np.float32(other.shape[1] - 1)
     row = np.float32(y) + HALF
     x_row = fma(depth, matrix[0, 3], fma(matrix[0, 1], row, matrix[0, 2]))
@@ -184,7 +184,7 @@ def _warp_row(warped, seen, other, matrix, y, depth, columns):
 
 @inline
 def _compare_rows(first, second, patches, y, warped, seen, spans):
-    """Put the costs of a neighbour among the two least of each pixel of the rows y and y + 1.
+    """Put the costs of a neighbor among the two least of each pixel of the rows y and y + 1.
 
     Both rows' patches have four rows in common. Past the last row, y stands in for y + 1.
     """
@@ -199,7 +199,7 @@ def _compare_rows(first, second, patches, y, warped, seen, spans):
         for x in range(end, W):
             _put(first[row], second[row], x, UNSEEN + zeros())
     top, bottom = max(y - AROUND, 0), min(y + AROUND + 1, H - 1)
-    # The sums along the last columns: of the neighbour, its square, its product with the view.
+    # The sums along the last columns: of the neighbor, its square, its product with the view.
     nothing = (zeros(), zeros(), zeros(), zeros())
     a, b, c, d, e, f = nothing, nothing, nothing, nothing, nothing, nothing
     for right in range(begin - AROUND, end + AROUND):
@@ -224,7 +224,7 @@ def _compare_rows(first, second, patches, y, warped, seen, spans):
 
 @inline
 def _add(sums, value, pixel):
-    """Add a neighbour's values to the three sums."""
+    """Add a neighbor's values to the three sums."""
     return sums[0] + value, fma(value, value, sums[1]), fma(value, pixel, sums[2])
 
 

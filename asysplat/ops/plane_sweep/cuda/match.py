@@ -1,6 +1,6 @@
 """The costs: a program takes some columns and planes down a band of a view's rows.
 
-The sums along a patch's last rows stay in registers, of every neighbour.
+The sums along a patch's last rows stay in registers, of every neighbor.
 """
 
 import torch
@@ -24,7 +24,7 @@ TILE, BAND = (8192, 1024) if INTERPRETED else (128, 16)  # columns x planes; row
 
 def match(
     images: Float[Tensor, "B V H W"],
-    neighbours: Int[Tensor, "B V K"],
+    neighbors: Int[Tensor, "B V K"],
     projections: Float[Tensor, "B V K 3 4"],
     ranges: Float[Tensor, "B V 2"],
     planes: int,
@@ -33,7 +33,7 @@ def match(
     """Compute the costs in float32; see `reference.match`."""
     B, V, H, W = images.shape
     h, w = H // stride, W // stride
-    inputs = prepare(images, neighbours, projections, ranges, planes)
+    inputs = prepare(images, neighbors, projections, ranges, planes)
     means = reference.patch_mean(inputs.images)
     variances = (reference.patch_mean(inputs.images**2) - means**2).clamp_min(0)
     costs = images.new_zeros(B * V, h, w, planes)
@@ -51,7 +51,7 @@ def match(
             planes=planes,
             padded_planes=inputs.inverse.shape[1],
             stride=stride,
-            K=neighbours.shape[2],
+            K=neighbors.shape[2],
             COLUMNS=columns,
             PLANES=tile_planes,
             BAND=BAND,
@@ -64,7 +64,7 @@ def match(
 def match_band(
     images,
     padded,
-    neighbours,
+    neighbors,
     projections,
     inverse,
     means,
@@ -83,7 +83,7 @@ def match_band(
     """Add to zeros the costs [n, h, w, D] of COLUMNS x PLANES in BAND rows.
 
     Args:
-        images, padded, neighbours, projections, inverse: see `MatchInputs`.
+        images, padded, neighbors, projections, inverse: see `MatchInputs`.
         means, scales: [n, H, W], of patches, and 1 / their standard deviations.
     """
     view = tl.program_id(2).to(tl.int64)
@@ -93,7 +93,7 @@ def match_band(
     depth = tl.load(inverse + view * padded_planes + plane, mask=plane < planes, other=0.0)[None, :]
     number = 0
     for k in tl.static_range(K):
-        number += (tl.load(neighbours + view * K + k) >= 0).to(tl.int32)
+        number += (tl.load(neighbors + view * K + k) >= 0).to(tl.int32)
     begin = tl.program_id(1) * BAND * stride
     rows = tl.minimum(BAND * stride, height - begin)
     nothing = tl.zeros((COLUMNS, PLANES), tl.float32)
@@ -109,13 +109,13 @@ def match_band(
             middle = tl.minimum(tl.maximum(y, 0), height - 1)
             pixel = (view * height + middle) * width + x
             mean, scale = tl.load(means + pixel)[:, None], tl.load(scales + pixel)[:, None]
-            # What fewer neighbours than two leave open is unseen.
+            # What fewer neighbors than two leave open is unseen.
             first = nothing + tl.where(number < 2, UNSEEN, INFINITY)
             second = nothing + tl.where(number < 1, UNSEEN, INFINITY)
             kept = ()
             for k in tl.static_range(K):
-                neighbour = tl.load(neighbours + view * K + k).to(tl.int64)
-                other = padded + tl.maximum(neighbour, 0) * (height + 1) * (width + 1)
+                neighbor = tl.load(neighbors + view * K + k).to(tl.int64)
+                other = padded + tl.maximum(neighbor, 0) * (height + 1) * (width + 1)
                 matrix = projections + (view * K + k) * 12
                 line = images + (view * height + row) * width
                 a, b, c = add_row(line, other, matrix, x, row, depth, height, width)
@@ -134,7 +134,7 @@ def match_band(
                 both = total_c * SHARE - mean * other_mean
                 variance = tl.maximum(total_b * SHARE - other_mean * other_mean, 0.0) + NOISE
                 cost = tl.where(seen, 1 - both * scale / tl.sqrt(variance), UNSEEN)
-                cost = tl.where(neighbour >= 0, cost, INFINITY)
+                cost = tl.where(neighbor >= 0, cost, INFINITY)
                 second = tl.minimum(second, tl.maximum(first, cost))
                 first = tl.minimum(first, cost)
             sums = kept
@@ -151,7 +151,7 @@ def match_band(
 
 @kernel
 def add_row(line, other, matrix, x, row, depth, height, width):
-    """Return the sums of a neighbour along a patch's row, of its square, its product with `line`.
+    """Return the sums of a neighbor along a patch's row, of its square, its product with `line`.
 
     Beyond the border, its pixels go on.
     """
@@ -179,7 +179,7 @@ def add_row(line, other, matrix, x, row, depth, height, width):
 def factors_at(matrix, y):
     """Return by what x, 1 and the inverse depth are multiplied for the pixels of a row.
 
-    Three numbers for each of a neighbour's homogeneous coordinates.
+    Three numbers for each of a neighbor's homogeneous coordinates.
     """
     y += 0.5
     factors = ()
@@ -192,7 +192,7 @@ def factors_at(matrix, y):
 
 @kernel
 def project(factors, x, depth):
-    """Return where a neighbour has the pixels, [columns, planes], and at which depth."""
+    """Return where a neighbor has the pixels, [columns, planes], and at which depth."""
     x = x[:, None] + 0.5
     u = factors[0] * x + factors[1] + factors[2] * depth
     v = factors[3] * x + factors[4] + factors[5] * depth

@@ -3,7 +3,7 @@
 write(views, folder) -> what a user would give as data.root
 
 A module says what its layout cannot hold: HAS_DEPTHS = False, or FREE_INTRINSICS = False where
-there is one focal length and the principal point is the centre.
+there is one focal length and the principal point is the center.
 """
 
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-MILLIMETRES = 1000  # a scene unit
+MILLIMETERS = 1000  # a scene unit
 
 
 def save_image(path: Path, image: torch.Tensor) -> None:
@@ -22,7 +22,7 @@ def save_image(path: Path, image: torch.Tensor) -> None:
     Image.fromarray(levels.numpy()).save(path, format="png")
 
 
-def save_depth(path: Path, depth: torch.Tensor, steps: float = MILLIMETRES) -> None:
+def save_depth(path: Path, depth: torch.Tensor, steps: float = MILLIMETERS) -> None:
     """[H, W] as 16-bit PNG of `steps` a scene unit."""
     path.parent.mkdir(parents=True, exist_ok=True)
     stored = (depth.double() * steps).round().numpy().astype(np.uint16)

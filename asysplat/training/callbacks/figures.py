@@ -1,0 +1,62 @@
+"""Figures of every validation and of the test: for the logger and as PNG files."""
+
+from pathlib import Path
+from typing import Any
+
+import lightning
+
+from asysplat.evaluation.figures import comparison
+from asysplat.training.loggers import log_figure
+from asysplat.training.outcome import Outcome
+
+
+class Figures(lightning.Callback):
+    """Draws the first scenes of each validation and of the first test set, see `comparison`.
+
+    Args:
+        folder: of the run; pictures go to its sub-folder `pictures`.
+        scenes: how many scenes to draw.
+    """
+
+    def __init__(self, folder: str, scenes: int):
+        self.folder, self.scenes = Path(folder) / "pictures", scenes
+
+    def on_validation_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        module: lightning.LightningModule,
+        outputs: Outcome,
+        batch: Any,
+        index: int,
+        *_: Any,
+    ) -> None:
+        self._draw(trainer, "val", outputs, batch, index)
+
+    def on_test_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        module: lightning.LightningModule,
+        outputs: Outcome,
+        batch: Any,
+        index: int,
+        test_set: int = 0,
+    ) -> None:
+        if test_set == 0:
+            self._draw(trainer, "test", outputs, batch, index)
+
+    def _draw(
+        self, trainer: lightning.Trainer, split: str, outcome: Outcome, batch: Any, index: int
+    ) -> None:
+        if index >= self.scenes or not trainer.is_global_zero:
+            return
+        first = (
+            record.map(lambda tensor: tensor[0].detach())
+            for record in (batch["inputs"], batch["targets"], outcome.rendering)
+        )
+        figure = comparison(*first)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        step = "" if split == "test" else f"-{trainer.global_step:06d}"
+        figure.savefig(self.folder / f"{split}-{index}{step}.png", dpi=100)
+        name = f"{split}/{batch['scene'][0] if split == 'test' else index}"
+        for logger in trainer.loggers:
+            log_figure(logger, name, figure, trainer.global_step)

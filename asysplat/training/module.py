@@ -1,0 +1,207 @@
+"""The LightningModule: it wires a network, the renderer and the losses, and nothing else."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from typing import Any, Literal
+
+import lightning
+import torch
+from torch import Tensor, nn
+from torch.distributed.fsdp import FSDPModule, fully_shard
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from asysplat.evaluation.metrics import psnr
+from asysplat.evaluation.static_cost import blank_views
+from asysplat.models.layers import Layers
+from asysplat.models.network import Network
+from asysplat.rendering import render
+from asysplat.training.losses import SplattingLoss
+from asysplat.training.outcome import Outcome
+from asysplat.training.parts import Parts
+from asysplat.training.side_by_side import SideBySide
+from asysplat.training.step_means import StepMeans
+
+
+class SplattingModule(lightning.LightningModule):
+    """Predict Gaussians from the input views, render the targets, compare.
+
+    Args:
+        net: views -> Gaussians; see `freeze_unused`.
+        loss: of an outcome against its batch.
+        optimizer: parameter groups -> optimizer; weight decay applies to those of `decaying`
+            alone.
+        schedule: optimizer -> its learning rates, one for each step.
+        background: RGB in [0, 1] behind the Gaussians, or "inputs": the mean color of the input
+            views; while it trains black or white, whichever is less like it, so that being
+            transparent never pays.
+        checkpoint_layers: compute each layer again in the backward pass, to save memory.
+        views_at_once: render this many targets of each scene at a time, and again in the backward
+            pass, to save memory; None: all at once. See `render`.
+    """
+
+    def __init__(
+        self,
+        net: Network,
+        loss: SplattingLoss,
+        optimizer: Callable[[list[dict[str, Any]]], Optimizer],
+        schedule: Callable[[Optimizer], LRScheduler],
+        background: Sequence[float] | Literal["inputs"],
+        checkpoint_layers: bool = False,
+        views_at_once: int | None = None,
+    ):
+        super().__init__()
+        freeze_unused(net)
+        net.checkpoint_layers(checkpoint_layers)
+        self.net, self.loss = net, loss
+        self.optimizer, self.schedule = optimizer, schedule
+        self.views_at_once = views_at_once
+        self.parts = Parts()  # of a step, which a callback measures
+        self._side_by_side = SideBySide(net, self._terms, self.parts)
+        self._step_means = StepMeans(net)
+        fixed = None if background == "inputs" else torch.tensor(background)
+        self.register_buffer("background", fixed, persistent=False)
+
+    def configure_model(self) -> None:
+        """Divide the parameters among the processes, layer by layer, if the strategy is FSDP's."""
+        if self.device_mesh is None or isinstance(self.net, FSDPModule):
+            return
+        groups = [module for module in self.net.modules() if isinstance(module, Layers)]
+        for block in (*(layer for layers in groups for layer in layers), self.net):
+            fully_shard(block, mesh=self.device_mesh["data_parallel"])
+
+    def reconstruct(self, batch: dict[str, Any], depth: bool) -> Outcome:
+        """Predict the Gaussians of the inputs and render them at the target cameras.
+
+        Args:
+            batch: `inputs` and `targets`, both Views.
+            depth: whether to render depth too.
+        """
+        return self._reconstruct(self.net, batch, depth)
+
+    def _reconstruct(self, net: nn.Module, batch: dict[str, Any], depth: bool) -> Outcome:
+        with self.parts("network"), self.parts.of("prior", net.prior):
+            gaussians = net(batch["inputs"])
+        targets, background = batch["targets"], self.behind(batch)
+        with self.parts("rendering"):
+            rendering = render(
+                gaussians,
+                targets.cameras,
+                background,
+                depth=depth,
+                masks=targets.masks,
+                views_at_once=self.views_at_once,
+            )
+        return Outcome(gaussians, rendering)
+
+    def behind(self, batch: dict[str, Any]) -> Tensor:
+        """Return the background of the targets: [3], or [B, V, 3] where it follows the inputs."""
+        if self.background is not None:
+            return self.background
+        mean = batch["inputs"].images.mean((1, 3, 4))[:, None]
+        color = (mean < 0.5).to(mean) if self.training else mean
+        return color.expand(-1, batch["targets"].cameras.num_views, -1)
+
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
+        """Compute the loss of a micro-batch; log the means of a step at its last."""
+        accumulated = self.trainer.accumulate_grad_batches
+        if batch_idx % accumulated == 0:
+            self._step_means.start()
+        terms = self.compute_terms(batch)
+        self._step_means.add(terms)
+        if (batch_idx + 1) % accumulated == 0:
+            means = self._step_means.finish(self.trainer.strategy.reduce)
+            self.log("train/psnr", means.pop("psnr"), prog_bar=True)
+            self.log_dict({f"train/{name}": term for name, term in means.items()})
+            self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])
+        return terms["loss"]
+
+    def compute_terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Compute "loss", which has gradients, its terms and "psnr": means over the scenes."""
+        # The copies of a network whose parameters are divided (FSDP) could not gather them.
+        if self.device.type == "cpu" and len(batch["scene"]) > 1 and self.device_mesh is None:
+            return self._side_by_side(batch)
+        return self.terms(batch)
+
+    def terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Do what `compute_terms` does, always in the network itself, whose hooks see it all."""
+        return self._terms(self.net, batch)
+
+    def _terms(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Compute the loss, its terms and the PSNR: means over the scenes of the batch."""
+        outcome = self._reconstruct(net, batch, depth=self.loss.needs_depth)
+        targets = batch["targets"]
+        image = targets.masked(outcome.rendering.image.detach())
+        with self.parts("loss"):
+            return {**self.loss(outcome, batch), "psnr": psnr(image, targets.images).mean()}
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> Outcome:
+        return self.reconstruct(batch, depth=True)
+
+    def test_step(self, batch: dict[str, Any], batch_idx: int, dataloader_idx: int = 0) -> Outcome:
+        return self.reconstruct(batch, depth=True)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        decay = set(decaying(self.net))
+        trained = [p for p in self.parameters() if p.requires_grad]
+        optimizer = self.optimizer(
+            [
+                {"params": [p for p in trained if p in decay]},
+                {"params": [p for p in trained if p not in decay], "weight_decay": 0.0},
+            ]
+        )
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": self.schedule(optimizer), "interval": "step"},
+        }
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip by the norm of all gradients, or by value.
+
+        Lightning's own refuses a fused optimizer under autocast, for the sake of fp16's loss
+        scaling, which bf16 does without.
+        """
+        if not gradient_clip_val:
+            return
+        if gradient_clip_algorithm == "value":
+            torch.nn.utils.clip_grad_value_(self.parameters(), gradient_clip_val)
+        else:
+            torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val)
+
+
+WEIGHTED = (nn.Linear, nn.Conv1d, nn.Conv2d)
+
+
+def decaying(net: nn.Module) -> list[nn.Parameter]:
+    """List the parameters that weight decay applies to: weights of Linear and Conv layers.
+
+    All others have a meaning away from zero: norms, biases, learned tokens, and A, dt and D of the
+    scans, whatever their shape.
+    """
+    return [module.weight for module in net.modules() if isinstance(module, WEIGHTED)]
+
+
+def freeze_unused(net: Network) -> None:
+    """Turn off the gradients of parameters on which no Gaussian depends.
+
+    Processes that train together would wait for those gradients forever. The parameters exist
+    because the paper counts them, as a link into a branch from which nothing is predicted.
+    """
+    with torch.device("meta"):
+        views = blank_views(2, net.size_multiple, net.size_multiple)
+        state = {n: torch.empty(t.shape, dtype=t.dtype) for n, t in net.named_buffers()}
+        leaves = {
+            n: torch.empty(p.shape, dtype=p.dtype, requires_grad=True)
+            for n, p in net.named_parameters()
+        }
+    gaussians = torch.func.functional_call(net, state | leaves, (views,))
+    outputs = [getattr(gaussians, field.name).sum() for field in fields(gaussians)]
+    grads = torch.autograd.grad(sum(outputs), list(leaves.values()), allow_unused=True)
+    for parameter, grad in zip(net.parameters(), grads, strict=True):
+        if grad is None:
+            parameter.requires_grad_(False)

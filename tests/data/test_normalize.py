@@ -1,0 +1,155 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from asysplat import render
+from asysplat.data.normalize import normalize
+from asysplat.scene import Cameras, Views
+
+HEIGHT, WIDTH = 4, 6
+
+
+def random_rotations(count: int) -> torch.Tensor:
+    """Rotations within about 30 degrees of one another."""
+    skew = torch.randn(count, 3, 3) * 0.3
+    base = torch.linalg.matrix_exp(torch.tensor([[0, -1.0, 2], [1, 0, 0.5], [-2, -0.5, 0]]))
+    return torch.linalg.matrix_exp(skew - skew.mT) @ base
+
+
+def make_views(rotations: torch.Tensor, centers: torch.Tensor) -> Views:
+    count = len(rotations)
+    poses = torch.eye(4).repeat(count, 1, 1)
+    poses[:, :3, :3], poses[:, :3, 3] = rotations, centers
+    intrinsics = torch.tensor([[5.0, 0, 3], [0, 6, 2], [0, 0, 1]]).repeat(count, 1, 1)
+    return Views(
+        cameras=Cameras(intrinsics, poses, HEIGHT, WIDTH),
+        images=torch.rand(count, 3, HEIGHT, WIDTH),
+        depths=torch.rand(count, HEIGHT, WIDTH) + 1,
+        point_depths=torch.rand(count, HEIGHT, WIDTH) + 1,
+    )
+
+
+@pytest.fixture
+def pair() -> tuple[Views, Views]:
+    return (
+        make_views(random_rotations(5), torch.randn(5, 3) * 4 + 20),
+        make_views(random_rotations(3), torch.randn(3, 3) * 4 + 20),
+    )
+
+
+def relative(views: Views, to: Views) -> torch.Tensor:
+    return torch.linalg.inv(to.cameras.cam_to_world[:1]) @ views.cameras.cam_to_world
+
+
+def project_depth(source: Views, target: Views) -> torch.Tensor:
+    """Where the first source view's depth pixels land in every target view."""
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    pixels = torch.stack((x, y, torch.ones_like(x)), -1).reshape(-1, 3)
+    camera = pixels @ torch.linalg.inv(source.cameras.intrinsics[0]).T
+    camera = camera * source.depths[0].reshape(-1, 1)
+    pose = source.cameras.cam_to_world[0]
+    world = camera @ pose[:3, :3].T + pose[:3, 3]
+    world_to_cam = torch.linalg.inv(target.cameras.cam_to_world)
+    seen = (
+        torch.einsum("vij,nj->vni", world_to_cam[:, :3, :3], world) + world_to_cam[:, None, :3, 3]
+    )
+    image = torch.einsum("vij,vnj->vni", target.cameras.intrinsics, seen)
+    return image[..., :2] / image[..., 2:]
+
+
+def test_mean_pose_becomes_the_world_and_the_farthest_input_is_at_one(pair):
+    inputs, _, frame = normalize(*pair)
+    centers = inputs.cameras.centers
+    torch.testing.assert_close(centers.mean(0), torch.zeros(3), atol=1e-5, rtol=0)
+    assert centers.norm(dim=-1).max().item() == pytest.approx(1, abs=1e-5)
+    original = pair[0].cameras.centers
+    radius = (original - original.mean(0)).norm(dim=-1).max()
+    assert frame.scale == pytest.approx(1 / radius.item(), rel=1e-5)
+    forward = inputs.cameras.cam_to_world[:, :3, 2].mean(0)
+    torch.testing.assert_close(forward[:2], torch.zeros(2), atol=1e-5, rtol=0)
+    # The mean down axis lies in the plane of y and z, on y's side.
+    down = inputs.cameras.cam_to_world[:, :3, 1].mean(0)
+    assert forward[2] > 0 and down[1] > 0 and abs(down[0].item()) < 1e-5
+
+
+def test_relative_poses_change_in_scale_alone(pair):
+    inputs, targets, frame = normalize(*pair)
+    for before, after in ((pair[0], inputs), (pair[1], targets)):
+        expected = relative(before, pair[0])
+        expected[:, :3, 3] *= frame.scale
+        torch.testing.assert_close(relative(after, inputs), expected, atol=1e-5, rtol=0)
+
+
+def test_depth_reprojection_is_unchanged(pair):
+    inputs, targets, frame = normalize(*pair)
+    torch.testing.assert_close(
+        project_depth(inputs, targets), project_depth(*pair), atol=2e-3, rtol=1e-3
+    )
+    for name in ("depths", "point_depths"):
+        before, after = (getattr(views, name) for views in (pair[1], targets))
+        torch.testing.assert_close(after, before * frame.scale)
+    assert torch.equal(inputs.images, pair[0].images)
+
+
+def test_pure_rotation_keeps_its_scale():
+    views = make_views(random_rotations(4), torch.tensor([7.0, -3, 2]).expand(4, 3))
+    inputs, _, frame = normalize(views, views)
+    assert frame.scale == 1
+    torch.testing.assert_close(inputs.cameras.centers, torch.zeros(4, 3), atol=1e-6, rtol=0)
+
+
+def test_a_full_circle_of_cameras_has_a_frame():
+    angle = torch.arange(4) * torch.pi / 2
+    zero, one = torch.zeros(4), torch.ones(4)
+    forward = torch.stack((angle.sin(), zero, angle.cos()), -1)
+    right = torch.stack((angle.cos(), zero, -angle.sin()), -1)
+    rotations = torch.stack((right, torch.stack((zero, one, zero), -1), forward), -1)
+    ring = make_views(rotations, -3 * forward)
+    inputs, _, frame = normalize(ring, ring)
+    inputs.validate()
+    assert frame.scale == pytest.approx(1 / 3)
+    torch.testing.assert_close(inputs.cameras.cam_to_world[0, :3, :3], torch.eye(3))
+
+
+def test_views_without_depths_stay_without(pair):
+    inputs, targets, _ = normalize(*(replace(views, depths=None) for views in pair))
+    assert inputs.depths is None and targets.depths is None
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_is_undone_looks_the_same_from_the_data_set_s_cameras(make_scene, degree):
+    """The data set's world lies far from the frame of networks, turned and in other units."""
+    gaussians, _ = make_scene(count=40, degree=degree)
+    _, cameras = make_scene(views=3, height=16, width=16)
+    world = make_views(random_rotations(1), torch.randn(1, 3) * 20).cameras.cam_to_world.double()
+    poses = cameras.cam_to_world.clone()
+    poses[:, :3, 3] *= 7
+    given = replace(cameras, cam_to_world=world @ poses)
+    views = Views(given, torch.zeros(3, 3, 16, 16, dtype=torch.float64))
+    inputs, _, frame = normalize(views, views)
+    before = render(gaussians, inputs.cameras, backend="reference", depth=True)
+    after = render(frame.to_world(gaussians), given, backend="reference", depth=True)
+    assert before.alpha.max() > 0.5 and before.image.std() > 0.05
+    torch.testing.assert_close(after.image, before.image, atol=1e-9, rtol=0)
+    torch.testing.assert_close(after.alpha, before.alpha, atol=1e-9, rtol=0)
+    torch.testing.assert_close(after.depth * frame.scale, before.depth, atol=1e-8, rtol=1e-8)
+
+
+def test_what_is_brought_back_is_where_it_was(make_scene, pair):
+    gaussians, _ = make_scene(count=40, dtype=torch.float64)
+    frame = normalize(*pair)[2]
+    back = frame.to_network(frame.to_world(gaussians))
+    assert not torch.allclose(frame.to_world(gaussians).means, gaussians.means, atol=1)
+    for name in ("means", "scales", "sh"):
+        torch.testing.assert_close(getattr(back, name), getattr(gaussians, name))
+    # q and -q are one rotation.
+    turns = [one.quats[:, :, None] * one.quats[:, None] for one in (back, gaussians)]
+    torch.testing.assert_close(*turns)
+
+
+def test_undone_gaussians_keep_their_type(make_scene, pair):
+    gaussians, _ = make_scene(dtype=torch.float32)
+    undone = normalize(*pair)[2].to_world(gaussians).validate()
+    assert undone.means.dtype == undone.sh.dtype == undone.quats.dtype == torch.float32
+    assert torch.equal(undone.opacities, gaussians.opacities)

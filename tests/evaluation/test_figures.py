@@ -1,0 +1,61 @@
+"""Pictures: the columns there are, and what is shown where nothing is known."""
+
+from dataclasses import replace
+
+import torch
+
+from asysplat import Cameras, Views
+from asysplat.evaluation.figures import comparison, disparity, learning_curve
+from asysplat.rendering import Rendering
+
+
+def scene(depths=True):
+    intrinsics = torch.tensor([[20.0, 0, 8.0], [0, 20.0, 8.0], [0, 0, 1]]).repeat(2, 1, 1)
+    cameras = Cameras(intrinsics, torch.eye(4).repeat(2, 1, 1), 16, 16)
+    images = torch.rand(2, 3, 16, 16)
+    views = Views(cameras, images, torch.ones(2, 16, 16) if depths else None)
+    return views, Rendering(images, torch.ones(2, 16, 16), torch.full((2, 16, 16), 2.0), {})
+
+
+def test_no_depth_is_shown_as_far_away():
+    found = disparity(torch.tensor([[0.0, 0.5], [2.0, 4.0]]))
+    torch.testing.assert_close(found, torch.tensor([[0.0, 2.0], [0.5, 0.25]]))
+
+
+def test_a_row_for_each_view_and_true_depth_where_known():
+    for depths, columns in ((True, 6), (False, 5)):
+        views, rendering = scene(depths)
+        axes = comparison(views, views, rendering).axes
+        assert len(axes) == 2 * columns
+        assert axes[2].get_xlabel() == "100.0 dB"
+
+
+def test_masked_pixels_are_blank_and_no_part_of_the_colors_range():
+    views, rendering = scene()
+    masks = torch.ones(2, 16, 16, dtype=torch.bool)
+    masks[:, :, :4] = False
+    depths = torch.where(masks, 2.0, 0.01)  # what is masked would be the brightest by far
+    image = torch.where(masks[:, None], rendering.image, 0)
+    rendering = replace(rendering, image=image, depth=torch.where(masks, 2.0, 0.0))
+    figure = comparison(views, replace(views, depths=depths, masks=masks), rendering)
+    for row in (figure.axes[:6], figure.axes[6:]):
+        assert row[2].get_xlabel() == "100.0 dB"
+        for axis, value in zip(row[3:], (0.0, 0.5, 0.5), strict=True):
+            (picture,) = axis.images
+            shown = picture.get_array()
+            assert shown.mask[:, :4].all() and (shown[:, 4:] == value).all()
+        assert row[4].images[0].get_clim() == row[5].images[0].get_clim() == (0, 0.5)
+
+
+def test_a_view_that_is_masked_as_a_whole_can_be_drawn():
+    views, rendering = scene()
+    views = replace(views, masks=torch.zeros(2, 16, 16, dtype=torch.bool))
+    comparison(views, views, rendering).canvas.draw()
+
+
+def test_curve_shows_every_validation():
+    rows = [
+        {"step": s, "minutes": s / 10, "psnr": 15 + s, "nearest_view/psnr": 16} for s in range(3)
+    ]
+    figure = learning_curve([row | {"mean_color/psnr": 12} for row in rows])
+    assert list(figure.axes[0].lines[0].get_ydata()) == [15, 16, 17]

@@ -1,0 +1,35 @@
+"""What several tests of reconstruction share."""
+
+import pytest
+import torch
+
+from asysplat.data import ProceduralScene
+from asysplat.models.prior import Prior
+from asysplat.refinement import gaussians_of_prior, thinned
+
+
+@pytest.fixture
+def threads():
+    """Sets their number, until the test's end."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def room():
+    """Photographs of a room with their depths: 12 to fit to, and 3 between them."""
+    scene = ProceduralScene(1, 45, 60, 24, places="rooms")
+    return scene.views(range(0, 24, 2)), scene.views(range(3, 24, 8))
+
+
+@pytest.fixture(scope="session")
+def start(room):
+    """Gaussians at the true surfaces, of a pixel in nine."""
+    views = room[0]
+    size = (views.cameras.height // 3, views.cameras.width // 3)
+    length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
+    depths = torch.nn.functional.interpolate(views.depths[None], size)[0]
+    distance = (depths * length)[None]
+    prior = Prior(distance, torch.ones_like(distance), torch.full_like(distance, 0.5))
+    return thinned(gaussians_of_prior(views, prior), views.cameras, 4.0, 10_000)

@@ -1,0 +1,310 @@
+"""Adam over what was seen: torch's for rows that take a step, and nothing for the others."""
+
+import inspect
+
+import pytest
+import torch
+
+from asysplat.errors import InputError
+from asysplat.refinement.adam import VisibleAdam
+
+NUM = 2100  # more than two blocks, and no whole number of vectors
+# Rows of a number, of less than a vector, of a vector and of more.
+SHAPES = {"means": (3,), "quats": (4,), "opacities": (), "sh": (16, 3), "other": (16,)}
+RATES = {"means": 1e-2, "quats": 2e-3, "opacities": 5e-2, "sh": 1e-3, "other": 1e-2}
+DTYPES = [torch.float32, torch.float64]  # of the kernel, and of the reference
+
+
+@pytest.fixture
+def threads():
+    """Sets their number, until the test's end."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def normal(num=NUM, dtype=torch.float32):
+    return {name: torch.randn(num, *shape).to(dtype) for name, shape in SHAPES.items()}
+
+
+def random_gradients(num=NUM, dtype=torch.float32):
+    """Rows from 1e-6 to 1e4."""
+    size = 10 ** torch.linspace(-6, 4, num)
+    return {
+        name: tensor * size.to(dtype).view(-1, *(1,) * (tensor.ndim - 1))
+        for name, tensor in normal(num, dtype).items()
+    }
+
+
+def everything(optimizer):
+    tensors = optimizer.parameters | optimizer.state()
+    return {name: tensor.detach().clone() for name, tensor in tensors.items()}
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    for name, tensor in one.items():
+        assert torch.equal(tensor, other[name]), name
+
+
+def torchs_adam(parameters, rates, **options):
+    """In float64, on copies of the parameters, which it also returns."""
+    copies = {name: t.detach().double().clone().requires_grad_() for name, t in parameters.items()}
+    groups = [{"params": [copies[name]], "lr": rate} for name, rate in rates.items()]
+    return torch.optim.Adam(groups, **{"eps": 1e-15, **options}), copies
+
+
+def torchs_step(adam, copies, gradients, rows=slice(None)):
+    for name, tensor in copies.items():
+        tensor.grad = gradients[name][rows].double()
+    adam.step()
+
+
+def run_steps(optimizer, steps=5, dtype=torch.float32):
+    """Random gradients for random rows."""
+    for _ in range(steps):
+        seen = torch.rand(optimizer.num_rows) < 0.6
+        optimizer.step(random_gradients(optimizer.num_rows, dtype), RATES, seen)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("options", [{}, {"betas": (0.0, 0.5), "eps": 1e-3}], ids=str)
+def test_it_is_adam_where_all_is_seen(dtype, options):
+    ours = VisibleAdam(normal(dtype=dtype), **options)
+    begin = everything(ours)
+    theirs, exact = torchs_adam(ours.parameters, RATES, **options)
+    for _ in range(50):
+        gradients = random_gradients(dtype=dtype)
+        torchs_step(theirs, exact, gradients)
+        ours.step(gradients, RATES, torch.ones(NUM, dtype=torch.bool))
+    for name, tensor in exact.items():
+        assert (tensor - begin[name]).abs().max() > 5 * RATES[name]
+        assert (ours.parameters[name] - tensor).abs().max() <= 1e-6 * tensor.abs().max()
+    assert ours.skipped == 0
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("runs", [False, True])
+def test_rows_that_are_seldom_seen_are_as_with_an_adam_of_their_own(dtype, runs):
+    """Each group of rows has its own times; there may be whole vectors and blocks of a group."""
+    ours = VisibleAdam(normal(dtype=dtype))
+    groups = torch.arange(NUM) * 4 // NUM if runs else torch.randint(4, (NUM,))
+    begin = everything(ours)
+    theirs = {}
+    for group in range(3):  # the last is never seen
+        rows = {name: tensor[groups == group] for name, tensor in ours.parameters.items()}
+        theirs[group] = torchs_adam(rows, RATES)
+    for step in range(30):
+        gradients = random_gradients(dtype=dtype)
+        seen = torch.zeros(NUM, dtype=torch.bool)
+        for group, (adam, copies) in theirs.items():
+            if step % (3 * group + 1) == 0:
+                seen |= groups == group
+                torchs_step(adam, copies, gradients, groups == group)
+        for name, gradient in gradients.items():
+            gradient[~seen] = torch.nan  # is not looked at
+            assert gradient.shape == ours.parameters[name].shape
+        ours.step(gradients, RATES, seen)
+    for name, tensor in ours.parameters.items():
+        for group, (_, copies) in theirs.items():
+            exact = copies[name].detach()
+            assert (tensor[groups == group] - exact).abs().max() <= 1e-6 * exact.abs().max()
+    never = groups == 3
+    for name, tensor in everything(ours).items():
+        assert torch.equal(tensor[never], begin.get(name, torch.zeros_like(tensor))[never]), name
+    assert ours.skipped == 0
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_rows_with_a_gradient_that_is_not_finite_are_left_out_of_all_tensors(dtype):
+    ours, clean = (VisibleAdam(normal(dtype=dtype)) for _ in range(2))
+    for name, tensor in clean.parameters.items():
+        tensor.copy_(ours.parameters[name])
+    gradients, seen = random_gradients(dtype=dtype), torch.rand(NUM) < 0.5
+    seen[[0, 17, 18, NUM - 1]] = True
+    seen[40] = False
+    bad = {name: gradient.clone() for name, gradient in gradients.items()}
+    bad["means"][0, 1] = torch.nan
+    bad["opacities"][17] = torch.inf
+    bad["sh"][17, 2, 1] = torch.nan  # a second time
+    bad["sh"][18, 15, 2] = -torch.inf
+    bad["quats"][NUM - 1, 3] = torch.nan
+    bad["means"][40] = torch.nan  # was not seen
+    ours.step(bad, RATES, seen)
+    seen[[0, 17, 18, NUM - 1]] = False
+    clean.step(gradients, RATES, seen)
+    assert_same(everything(ours), everything(clean))
+    assert (ours.skipped, clean.skipped) == (4, 0)
+    assert type(ours.skipped) is int
+
+
+def test_a_gradient_whose_square_is_infinite_stops_its_number_alone():
+    optimizer = VisibleAdam(normal())
+    every = torch.ones(NUM, dtype=torch.bool)
+    for step in range(3):
+        gradients = random_gradients()
+        gradients["sh"][7, 2, 1] = 1e30 if step == 0 else 1.0
+        optimizer.step(gradients, RATES, every)
+    infinite = {
+        name: tensor.isinf().nonzero().tolist() for name, tensor in everything(optimizer).items()
+    }
+    assert {name: places for name, places in infinite.items() if places} == {
+        "sh.square": [[7, 2, 1]]
+    }
+    assert all(tensor.isfinite().all() for tensor in optimizer.parameters.values())
+    assert optimizer.skipped == 0
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_tensor_without_a_rate_is_left_out_and_may_begin_later(dtype):
+    ours = VisibleAdam(normal(dtype=dtype))
+    begin = everything(ours)
+    every = torch.ones(NUM, dtype=torch.bool)
+    without = {name: RATES[name] for name in ("means", "quats")} | {"opacities": 0.0}
+    for _ in range(3):
+        gradients = random_gradients(dtype=dtype)
+        ours.step({name: gradients[name] for name in ("means", "quats")}, without, every)
+    for name, tensor in everything(ours).items():
+        rests = name.split(".")[0] in ("opacities", "sh", "other")
+        assert torch.equal(tensor, begin[name]) == rests, name
+    gradients = random_gradients(dtype=dtype)
+    ours.step(gradients, RATES, every)
+    # The first step of Adam goes as far as the rate says.
+    moved = ours.parameters["sh"] - begin["sh"]
+    expected = -RATES["sh"] * gradients["sh"].sign()
+    torch.testing.assert_close(moved, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_numbers_of_a_row_may_have_rates_of_their_own(dtype):
+    whole = VisibleAdam(normal(dtype=dtype))
+    parts = {"sh_0": whole.parameters["sh"][:, :1], "sh_rest": whole.parameters["sh"][:, 1:]}
+    parts = VisibleAdam({name: part.clone() for name, part in parts.items()})
+    rates = torch.full((16, 1), 5e-5)
+    rates[0] = 1e-3
+    for _ in range(4):
+        seen, gradients = torch.rand(NUM) < 0.7, random_gradients(dtype=dtype)
+        whole.step(gradients, {"sh": rates}, seen)
+        split = {"sh_0": gradients["sh"][:, :1], "sh_rest": gradients["sh"][:, 1:]}
+        parts.step(split, {"sh_0": rates[0], "sh_rest": 5e-5}, seen)
+    together = torch.cat((parts.parameters["sh_0"], parts.parameters["sh_rest"]), 1)
+    torch.testing.assert_close(whole.parameters["sh"], together, rtol=1e-6, atol=1e-7)
+
+
+def test_any_number_of_threads_gives_the_same_bits(threads):
+    begin = normal(9000)
+    found = []
+    for count in (1, 2, 3):
+        threads(count)
+        optimizer = VisibleAdam({name: tensor.clone() for name, tensor in begin.items()})
+        torch.manual_seed(1)
+        run_steps(optimizer)
+        found.append(everything(optimizer))
+    assert_same(found[1], found[0])
+    assert_same(found[2], found[0])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_rows_are_kept_dropped_and_copied_with_their_state(dtype):
+    optimizer = VisibleAdam(normal(dtype=dtype))
+    optimizer.parameters["means"].requires_grad_()
+    run_steps(optimizer, dtype=dtype)
+    before, index = everything(optimizer), torch.tensor([5, 2, 2, NUM - 1, 0])
+    optimizer.keep(index)
+    assert optimizer.num_rows == 5
+    assert_same(everything(optimizer), {name: tensor[index] for name, tensor in before.items()})
+    for name, tensor in optimizer.parameters.items():
+        assert tensor.is_leaf and tensor.requires_grad == (name == "means")
+    run_steps(optimizer, dtype=dtype)
+    optimizer.keep(torch.zeros(0, dtype=torch.int64))
+    run_steps(optimizer, 1, dtype)
+    assert optimizer.num_rows == 0
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_new_rows_begin_at_the_first_step(dtype):
+    optimizer, more = VisibleAdam(normal(dtype=dtype)), normal(70, dtype)
+    optimizer.parameters["sh"].requires_grad_()
+    run_steps(optimizer, dtype=dtype)
+    before = everything(optimizer)
+    optimizer.append(more)
+    assert optimizer.num_rows == NUM + 70
+    assert optimizer.parameters["sh"].requires_grad
+    expected = {name: tensor.new_zeros(70, *tensor.shape[1:]) for name, tensor in before.items()}
+    expected = {name: torch.cat((before[name], t)) for name, t in (expected | more).items()}
+    assert_same(everything(optimizer), {name: expected[name] for name in before})
+    alone = VisibleAdam(more)
+    gradients = random_gradients(dtype=dtype)
+    for _ in range(2):
+        rows = {name: torch.cat((t, t[:70])) for name, t in gradients.items()}
+        optimizer.step(rows, RATES, torch.ones(NUM + 70, dtype=torch.bool))
+        first = {name: t[:70] for name, t in gradients.items()}
+        alone.step(first, RATES, torch.ones(70, dtype=torch.bool))
+    found = {name: tensor[NUM:] for name, tensor in everything(optimizer).items()}
+    assert_same(found, everything(alone))
+
+
+def test_rows_that_are_reset_have_no_state():
+    optimizer = VisibleAdam(normal())
+    run_steps(optimizer)
+    before, rows = everything(optimizer), torch.tensor([3, 100])
+    optimizer.reset(rows)
+    for name, tensor in optimizer.state().items():
+        before[name][rows] = 0
+        assert tensor.count_nonzero() > 0
+    assert_same(everything(optimizer), before)
+    optimizer.reset(torch.ones(NUM, dtype=torch.bool))
+    assert all((tensor == 0).all() for tensor in optimizer.state().values())
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_training_goes_on_from_a_checkpoint(dtype, tmp_path):
+    optimizer = VisibleAdam(normal(dtype=dtype))
+    run_steps(optimizer, dtype=dtype)
+    torch.save(optimizer.state(), tmp_path / "state.pt")
+    again = VisibleAdam({name: tensor.clone() for name, tensor in optimizer.parameters.items()})
+    again.load(torch.load(tmp_path / "state.pt", weights_only=True))
+    for each in (optimizer, again):
+        torch.manual_seed(2)
+        run_steps(each, dtype=dtype)
+    assert_same(everything(again), everything(optimizer))
+
+
+def test_mistakes_are_named():
+    make = inspect.unwrap(VisibleAdam)
+    for sentence, arguments in {
+        r"betas=\(0.9, 1.0\) and eps=1e-15: give": (normal(4), (0.9, 1.0)),
+        "eps=0.0: give": (normal(4), (0.9, 0.999), 0.0),
+        "no parameters": ({},),
+        r"quats has shape \(5, 4\).*expected 4 contiguous rows": (
+            {"means": torch.rand(4, 3), "quats": torch.rand(5, 4)},
+        ),
+        r"means has .* strides \(1, 4\)": ({"means": torch.rand(3, 4).T},),
+    }.items():
+        with pytest.raises(InputError, match=sentence):
+            make(*arguments)
+    optimizer = VisibleAdam(normal(4))
+    before, seen = everything(optimizer), torch.ones(4, dtype=torch.bool)
+    for sentence, (gradients, rates) in {
+        "rate for 'mean': expected one of means, quats": (normal(4), {"mean": 1e-3}),
+        "rate -0.1 for quats: give numbers >= 0": (normal(4), {"means": 1.0, "quats": -0.1}),
+        "rate nan for quats": (normal(4), {"quats": float("nan")}),
+        r"rate of shape \(3, 1\) for sh: expected \(16, 3\)": (
+            normal(4),
+            {"sh": torch.ones(3, 1)},
+        ),
+        "gradient of sh is missing": ({"means": torch.ones(4, 3)}, {"means": 1.0, "sh": 1.0}),
+        r"gradient of means has shape \(4, 4\): expected \(4, 3\)": (
+            {"means": torch.ones(4, 4)},
+            {"means": 1.0},
+        ),
+    }.items():
+        with pytest.raises(InputError, match=sentence):
+            optimizer.step(gradients, rates, seen)
+    with pytest.raises(InputError, match=r"seen .* \(5,\), type torch.bool: expected \(4,\), bool"):
+        inspect.unwrap(VisibleAdam.step)(optimizer, normal(4), RATES, torch.ones(5) > 0)
+    with pytest.raises(InputError, match="append got tensors"):
+        optimizer.append({"means": torch.ones(2, 3)})
+    with pytest.raises(InputError, match="load got tensors"):
+        optimizer.load(VisibleAdam(normal(5)).state())
+    assert_same(everything(optimizer), before)

@@ -1,0 +1,123 @@
+"""Gaussians whose images are pulled become two."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from asysplat.refinement.clone_split import LARGE, PULLED, SHRUNK, Pulls
+from asysplat.refinement.densify import LEAST_OPACITY
+from asysplat.refinement.fields import Fields
+from asysplat.refinement.start import round_gaussians
+from asysplat.rendering import render
+from asysplat.scene import Cameras
+
+COUNT = 6
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def camera():
+    intrinsics = torch.tensor([[[40.0, 0, 24], [0, 50, 16], [0, 0, 1]]])
+    return Cameras(intrinsics, torch.eye(4)[None], height=32, width=48)
+
+
+def gaussians(size=LARGE / 2, count=COUNT):
+    means = torch.tensor([[0.0, 0.0, 2.0]]) + torch.arange(count)[:, None] * 0.1
+    colors = torch.linspace(0, 1, 3 * count).reshape(count, 3)
+    return round_gaussians(means, torch.full((count,), size), torch.full((count,), 0.5), colors)
+
+
+def fields_of(start):
+    return Fields(start, torch.linspace(0.5, 2, start.num_gaussians))
+
+
+def pulled(fields, *rows):
+    """Return pulls of which those of `rows` are enough, the first the strongest."""
+    pulls = Pulls(fields)
+    # At distance 2 to 2.5 and focal length 40 this is 2.4 or more of half an image.
+    gradients = torch.zeros(len(fields), 3)
+    for rank, row in enumerate(rows):
+        gradients[row, 0] = fields.units[row] * PULLED * (len(rows) - rank)
+    pulls.add(gradients, camera())
+    return pulls
+
+
+def test_a_pull_is_the_gradient_of_the_place_in_the_image():
+    """With one Gaussian, that of the principal point, times half the image's sides."""
+    start = gaussians(size=0.1, count=1)
+    fields, cameras = fields_of(start), camera()
+    intrinsics = cameras.intrinsics.requires_grad_()
+    target = torch.rand(1, 3, 32, 48, generator=generator())
+    leaves = fields.leaves()
+    image = render(fields.gaussians(leaves), cameras, depth=False).image
+    error = (image - target).abs().mean()
+    of_pixels, of_offsets = torch.autograd.grad(error, (intrinsics, leaves["offsets"]))
+    pulls = Pulls(fields)
+    pulls.add(of_offsets, camera())
+    expected = (of_pixels[0, :2, 2] * torch.tensor([24.0, 16.0])).norm()
+    assert expected > 1e-5
+    torch.testing.assert_close(pulls.mean, expected[None], rtol=1e-3, atol=0)
+
+
+def test_the_mean_is_over_the_photographs_that_see_it():
+    fields = fields_of(gaussians())
+    pulls = pulled(fields, 1)
+    once = pulls.mean.clone()
+    pulls.add(torch.zeros(COUNT, 3), camera())
+    torch.testing.assert_close(pulls.mean, once)
+    assert once[1] > PULLED and once.count_nonzero() == 1
+
+
+def test_a_small_one_is_cloned_where_it_is():
+    fields = fields_of(gaussians())
+    before = fields.gaussians()
+    pulled(fields, 3).clone_and_split(100, generator())
+    after = fields.gaussians()
+    assert len(fields) == COUNT + 1
+    for name in ("means", "scales", "opacities", "sh"):
+        torch.testing.assert_close(getattr(after, name)[:COUNT], getattr(before, name))
+        torch.testing.assert_close(getattr(after, name)[COUNT], getattr(before, name)[3])
+
+
+def test_a_large_one_is_split_in_two_smaller_ones_around_it():
+    fields = fields_of(gaussians(size=2 * LARGE, count=200))
+    before = fields.gaussians()
+    pulled(fields, *range(100)).clone_and_split(1000, generator())
+    after = fields.gaussians()
+    assert len(fields) == 300
+    torch.testing.assert_close(after.means[:100], before.means[100:])
+    halves = after.map(lambda field: field[100:])
+    torch.testing.assert_close(halves.scales, torch.full((200, 3), 2 * LARGE / SHRUNK))
+    colors = torch.cdist(halves.sh[:, 0], before.sh[:, 0])
+    away = halves.means - before.means[colors.argmin(1)]  # of the one with the same
+    assert 0.8 < away.std() / (2 * LARGE) < 1.2
+
+
+def test_no_more_than_there_is_room_for_and_the_most_pulled_first():
+    fields = fields_of(gaussians())
+    before = fields.gaussians()
+    pulled(fields, 4, 2, 0).clone_and_split(COUNT + 1, generator())
+    assert len(fields) == COUNT + 1
+    torch.testing.assert_close(fields.gaussians().means[-1], before.means[4])
+
+
+def test_transparent_ones_are_dropped_but_one_is_left():
+    start = gaussians()
+    faint = torch.full((COUNT,), LEAST_OPACITY / 2)
+    some = faint.clone()
+    some[2] = 0.9
+    for opacities, left in ((some, 2), (faint, 0)):
+        fields = fields_of(replace(start, opacities=opacities))
+        Pulls(fields).clone_and_split(100, generator())
+        torch.testing.assert_close(fields.gaussians().means, start.means[left, None])
+
+
+@pytest.mark.parametrize("rows", [(), (1,)])
+def test_pulls_are_forgotten_after_a_round(rows):
+    fields = fields_of(gaussians())
+    pulls = pulled(fields, *rows)
+    pulls.clone_and_split(100, generator())
+    assert pulls.mean.shape == (len(fields),) and not pulls.mean.any()

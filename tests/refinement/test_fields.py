@@ -1,0 +1,153 @@
+"""Gaussians as numbers that move, and back."""
+
+from dataclasses import fields as fields_of
+from dataclasses import replace
+
+import pytest
+import torch
+
+from asysplat.refinement.fields import Fields
+from asysplat.refinement.settings import Rates
+from asysplat.scene import Gaussians
+
+NAMES = [field.name for field in fields_of(Gaussians)]
+
+
+@pytest.fixture
+def gaussians(make_scene):
+    return make_scene(count=12, degree=2, dtype=torch.float32)[0]
+
+
+def units(gaussians):
+    return torch.linspace(0.1, 3, gaussians.num_gaussians)
+
+
+def assert_close(found, expected, error=1e-6):
+    for name in NAMES:
+        one, other = getattr(found, name), getattr(expected, name)
+        torch.testing.assert_close(one, other, rtol=error, atol=error, msg=name)
+
+
+def gradients_of(fields, fill=1.0):
+    return {name: torch.full_like(tensor, fill) for name, tensor in fields.numbers.items()}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gaussians_come_back(gaussians, dtype):
+    gaussians.opacities[:3] = torch.tensor([1.0, 1 - 1e-6, 1e-6])
+    gaussians.scales[3:5] = torch.tensor([1e-30, 1e30])[:, None]
+    fields = Fields(gaussians.to(dtype), units(gaussians).to(dtype))
+    assert_close(fields.gaussians(), gaussians)
+    assert len(fields) == 12 and torch.equal(fields.units, units(gaussians))
+    fields.gaussians().validate()
+
+
+def test_any_layout_and_half_precision_will_do(gaussians):
+    gaussians = replace(gaussians, sh=gaussians.sh.mT.contiguous().mT)
+    assert not gaussians.sh.is_contiguous()
+    assert_close(Fields(gaussians, units(gaussians)).gaussians(), gaussians)
+    half = gaussians.to(torch.bfloat16)
+    half.opacities[0] = 1
+    found = Fields(half, units(gaussians)).gaussians()
+    assert_close(found.validate(), half.to(torch.float32))
+
+
+@pytest.mark.parametrize("degree", [None, 0, 1, 2, 3])
+def test_sh_are_cut_or_filled_with_0(gaussians, degree):
+    found = Fields(gaussians, units(gaussians), degree).gaussians().sh
+    count = 9 if degree is None else (degree + 1) ** 2
+    assert found.shape == (12, count, 3)
+    both = min(count, 9)
+    assert torch.equal(found[:, :both], gaussians.sh[:, :both])
+    assert (found[:, both:] == 0).all()
+
+
+def test_what_one_starts_from_is_not_changed(gaussians):
+    before = gaussians.map(torch.clone)
+    fields = Fields(gaussians, units(gaussians))
+    fields.step(gradients_of(fields), Rates(), 1.0)
+    assert_close(gaussians, before, 0)
+    assert (fields.gaussians().means - before.means).abs().min() > 0
+
+
+def test_the_first_step_is_as_long_as_the_rates(gaussians):
+    """Adam's first step is the rate; a mean moves in its own unit."""
+    rates = Rates(means=0.5, quats=1e-3, scales=1e-2, opacities=0.1, sh=0.02, higher=0.25)
+    fields = Fields(gaussians, units(gaussians))
+    before = {name: tensor.clone() for name, tensor in fields.numbers.items()}
+    assert fields.step(gradients_of(fields), rates, 0.5).all()
+    moved = {name: before[name] - tensor for name, tensor in fields.numbers.items()}
+    for name, rate in {"offsets": 0.5, "quats": 1e-3, "log_scales": 1e-2, "logits": 0.1}.items():
+        expected = torch.full_like(moved[name], rate / 2)
+        torch.testing.assert_close(moved[name], expected, rtol=1e-3, atol=1e-7, msg=name)
+    expected = torch.full_like(moved["sh"], 0.25 * 0.01)
+    expected[:, 0] = 0.01
+    torch.testing.assert_close(moved["sh"], expected, rtol=1e-3, atol=1e-7)
+    means = gaussians.means - 0.25 * units(gaussians)[:, None]
+    torch.testing.assert_close(fields.gaussians().means, means, rtol=1e-4, atol=1e-6)
+
+
+def test_what_was_not_seen_or_has_no_rate_stays(gaussians):
+    fields = Fields(gaussians, units(gaussians))
+    gradients = gradients_of(fields)
+    for gradient in gradients.values():
+        gradient[::3] = 0
+    gradients["sh"][1] = torch.nan
+    rates = Rates(quats=0.0, opacities=0.0)
+    seen = fields.step(gradients, rates, 1.0)
+    assert torch.equal(seen, torch.arange(12) % 3 > 0)
+    assert fields.skipped == 1
+    found = fields.gaussians()
+    for name in NAMES:
+        same = (getattr(found, name) == getattr(gaussians, name)).flatten(1 - (name == "opacities"))
+        stays = same.view(12, -1).all(-1)
+        if name in ("quats", "opacities"):
+            torch.testing.assert_close(getattr(found, name), getattr(gaussians, name))
+        elif name == "means":
+            assert torch.equal(~stays, seen & (torch.arange(12) != 1))
+
+
+def test_leaves_have_a_gradient_and_the_numbers_none(gaussians):
+    fields = Fields(gaussians, units(gaussians))
+    leaves = fields.leaves()
+    found = fields.gaussians(leaves)
+    torch.stack([getattr(found, name).sum() for name in NAMES]).sum().backward()
+    assert all((leaf.grad != 0).any() for leaf in leaves.values())
+    torch.testing.assert_close(leaves["offsets"].grad, units(gaussians)[:, None].repeat(1, 3))
+    assert not any(tensor.requires_grad for tensor in fields.numbers.values())
+
+
+def test_rows_are_kept_dropped_and_copied(gaussians):
+    fields = Fields(gaussians, units(gaussians))
+    fields.step(gradients_of(fields), Rates(), 1.0)
+    before, index = fields.gaussians(), torch.tensor([7, 0, 7])
+    fields.keep(index)
+    assert len(fields) == 3
+    assert_close(fields.gaussians(), before.map(lambda tensor: tensor[index]), 0)
+    assert torch.equal(fields.units, units(gaussians)[index])
+    fields.keep(torch.tensor([1]))
+    assert fields.gaussians().num_gaussians == len(fields) == 1
+
+
+def test_rows_are_added_with_a_unit_of_their_own(gaussians):
+    fields = Fields(gaussians, units(gaussians))
+    fields.step(gradients_of(fields), Rates(), 1.0)
+    before = fields.gaussians()
+    more = gaussians.keep(torch.arange(12) < 4)
+    more = replace(more, sh=more.sh[:, :1])  # of fewer coefficients
+    fields.append(more, torch.full((4,), 7.0))
+    found, old = fields.gaussians(), torch.arange(16) < 12
+    assert_close(found.keep(old), before, 0)
+    assert torch.equal(fields.units, torch.cat((units(gaussians), torch.full((4,), 7.0))))
+    added = found.keep(~old)
+    assert (added.sh[:, 1:] == 0).all()
+    assert_close(replace(added, sh=added.sh[:, :1]), more)
+    fields.step(gradients_of(fields), Rates(means=1.0), 1.0)
+    moved = added.means - fields.gaussians().means[12:]
+    torch.testing.assert_close(moved, torch.full_like(moved, 7.0), rtol=1e-3, atol=0)
+
+
+def test_no_rows_may_be_added(gaussians):
+    fields = Fields(gaussians, units(gaussians))
+    fields.append(gaussians.keep(torch.zeros(12, dtype=torch.bool)), torch.zeros(0))
+    assert_close(fields.gaussians(), gaussians)

@@ -1,0 +1,477 @@
+"""Refinement: photographs and those held out become better; nothing that is given breaks it."""
+
+import inspect
+import math
+from dataclasses import fields as fields_of
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+
+from asysplat.errors import InputError
+from asysplat.evaluation.metrics import psnr
+from asysplat.refinement import PAPER, Rates, Refinement, RefinementSettings, mean_color, refine
+from asysplat.refinement.densify import LEAST_OPACITY
+from asysplat.refinement.refine import half_size
+from asysplat.refinement.start import footprints, round_gaussians
+from asysplat.rendering import render
+from asysplat.scene import Cameras, Gaussians, Views
+
+NAMES = [field.name for field in fields_of(Gaussians)]
+KINDS = ["error", "mcmc", "gradient", "none"]
+
+
+def quality(gaussians, views):
+    with torch.no_grad():
+        image = render(gaussians, views.cameras, mean_color(views), depth=False).image
+    return psnr(views.masked(image.clamp(0, 1)), views.images).mean().item()
+
+
+def same_bits(one, other):
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in NAMES)
+
+
+def small_views(count=2, height=12, width=15):
+    """Photographs of noise, from cameras that look along z."""
+    poses = torch.eye(4).repeat(count, 1, 1)
+    poses[:, 0, 3] = torch.linspace(-1, 1, count) if count > 1 else 0
+    matrix = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+    cameras = Cameras(matrix.repeat(count, 1, 1), poses, height, width)
+    return Views(cameras, torch.rand(count, 3, height, width))
+
+
+def small_scene(count=20):
+    means = torch.rand(count, 3) * torch.tensor([2.0, 2, 1]) + torch.tensor([-1.0, -1, 2])
+    sizes = torch.full((count,), 0.2)
+    return round_gaussians(means, sizes, torch.full((count,), 0.5), torch.rand(count, 3))
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("kind", KINDS)
+def test_photographs_and_those_held_out_become_better(room, start, kind):
+    views, held = room
+    settings = RefinementSettings(densify=kind, most=start.num_gaussians + 1500)
+    found = refine(start, views, settings, steps=80).validate()
+    assert quality(found, views) >= quality(start, views) + 4
+    assert quality(found, held) >= quality(start, held) + 4
+    more = found.num_gaussians - start.num_gaussians
+    added = {"error": (1000, 1500), "mcmc": (1, 1500), "gradient": (1, 1500), "none": (0, 0)}
+    assert added[kind][0] <= more <= added[kind][1]
+    assert found.sh.shape[1] == 4
+
+
+@pytest.mark.medium
+def test_new_gaussians_where_pixels_are_wrong_are_worth_it(room, start):
+    views, held = room
+    with_more, without = (
+        refine(start, views, RefinementSettings(densify=kind), steps=80)
+        for kind in ("error", "none")
+    )
+    assert quality(with_more, held) >= quality(without, held) + 0.5
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(room, start, kind, threads):
+    found = []
+    for count, seed in ((1, 0), (2, 0), (2, 0), (1, 1)):
+        threads(count)
+        settings = RefinementSettings(densify=kind, rounds=3)
+        found.append(refine(start, room[0], settings, steps=12, seed=seed))
+    assert same_bits(found[1], found[0]) and same_bits(found[2], found[0])
+    assert not torch.equal(found[3].sh, found[0].sh)
+
+
+@pytest.mark.medium
+def test_the_papers_post_optimization_changes_means_and_colors_and_only_improves(room, start):
+    views = room[0].select([0, 3, 6, 9])
+    shown, moved = [], []
+
+    def watch(progress, refinement):
+        shown.append(progress.psnr)
+        moved.append((refinement.gaussians.means - start.means).abs().max().item())
+        return False
+
+    found = refine(start, views, PAPER, steps=28, watch=watch)
+    for name in NAMES:
+        one, other = getattr(found, name), getattr(start, name)
+        if name in ("means", "sh"):
+            assert not torch.equal(one, other)
+        else:
+            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
+    assert moved[0] == pytest.approx(5e-4, rel=1e-3)  # of the scene's unit, as Adam's first step
+    # `psnr` is that of the last steps, as many as there are views.
+    assert len(shown) == 28
+    assert all(later > earlier for earlier, later in pairwise(shown))
+    assert quality(found, views) > quality(start, views) + 0.3
+
+
+def test_a_refinement_starts_from_copies():
+    views, before = small_views(), small_scene()
+    start = before.map(torch.clone)
+    refine(start, views, steps=3)
+    assert same_bits(start, before)
+
+
+def test_masked_pixels_have_no_say():
+    views, masks = small_views(), torch.ones(2, 12, 15, dtype=torch.bool)
+    masks[0, :7] = False
+    masks[1, :, 3:6] = False
+    noise = torch.where(masks[:, None], views.images, torch.rand_like(views.images))
+    found = []
+    for images in (views.images, noise):
+        settings = RefinementSettings(ssim=0.0, half_size=0.5, rounds=2)
+        found.append(
+            refine(small_start(), Views(views.cameras, images, masks=masks), settings, steps=10)
+        )
+    assert found[0].num_gaussians > 20
+    assert same_bits(*found)
+
+
+def small_start():
+    torch.manual_seed(7)
+    return small_scene()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_views_that_are_masked_wholly_harm_nothing(kind):
+    views = replace(small_views(), masks=torch.zeros(2, 12, 15, dtype=torch.bool))
+    found = refine(small_scene(), views, RefinementSettings(densify=kind), steps=6).validate()
+    assert found.num_gaussians >= 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (5, 7), (10, 40), (11, 11), (23, 31)], ids=str)
+def test_pictures_of_any_size_will_do(size, kind):
+    """Also of less than the 11 pixels of an SSIM window, and of an odd number of them."""
+    views = small_views(2, *size)
+    found = refine(
+        small_scene(), views, RefinementSettings(densify=kind, rounds=4), steps=8
+    ).validate()
+    assert not torch.equal(found.sh[:20, 0], small_start().sh[:, 0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_view_and_one_gaussian_are_enough(kind, count):
+    views = small_views(1)
+    start = round_gaussians(
+        torch.tensor([[0.0, 0, 3]]).repeat(count, 1),
+        *torch.full((2, count), 0.5),
+        torch.rand(count, 3),
+    )
+    settings = RefinementSettings(densify=kind, rounds=3, growth=1.0)
+    found = refine(start, views, settings, steps=10).validate()
+    assert quality(found, views) > quality(start, views)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cameras_may_all_be_in_one_place(kind):
+    views = small_views(3)
+    views.cameras.cam_to_world[:, :3, 3] = 0
+    refine(small_scene(), views, RefinementSettings(densify=kind), steps=6).validate()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_worlds_of_any_unit_harm_nothing(kind, scale):
+    """In the smallest all is nearer than the renderer draws."""
+    views = small_views()
+    views.cameras.cam_to_world[:, :3, 3] *= scale
+    found = refine(small_scene().scale_by(scale), views, RefinementSettings(densify=kind), steps=12)
+    assert found.validate().num_gaussians >= 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_is_left_where_none_is_of_use(kind):
+    """Behind all cameras, and too faint."""
+    hidden, faint = small_scene(), small_scene()
+    hidden.means[:, 2] *= -1
+    faint.opacities[:] = torch.linspace(1e-5, LEAST_OPACITY / 2, 20)
+    for start in (hidden, faint):
+        settings = RefinementSettings(
+            densify=kind, rounds=30, until=1.0, rates=Rates(opacities=0.0)
+        )
+        found = refine(start, small_views(), settings, steps=20).validate()
+        assert found.num_gaussians >= 1
+
+
+def test_what_is_faint_or_lost_is_dropped():
+    start = small_scene()
+    start.opacities[2] = LEAST_OPACITY / 2
+    start.means[5, 2] = -3  # behind both cameras
+    refinement = Refinement(start, small_views(), settings=RefinementSettings(most=1))
+    refinement.densify(0.0)
+    kept = torch.arange(20) != 2
+    assert same_bits(refinement.gaussians.keep(torch.ones(19) > 0), padded(start.keep(kept)))
+    for _ in range(5):  # each view twice, and one
+        refinement.step(0.5)
+    refinement.densify(0.5)
+    assert len(refinement.fields) == 18
+    assert (refinement.gaussians.means[:, 2] > 0).all()
+
+
+def padded(gaussians):
+    """Gaussians as `Fields` gives them back, with SH of degree 1."""
+    sh = torch.cat((gaussians.sh, torch.zeros(gaussians.num_gaussians, 3, 3)), 1)
+    opacities = gaussians.opacities.logit().sigmoid()
+    return replace(gaussians, sh=sh, opacities=opacities, scales=gaussians.scales.log().exp())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_most_below_the_number_at_the_start_adds_none(kind):
+    settings = RefinementSettings(densify=kind, most=5, rounds=3)
+    assert refine(small_scene(), small_views(), settings, steps=8).num_gaussians == 20
+
+
+@pytest.mark.parametrize("kind", ["error", "mcmc"])
+def test_no_more_than_most_and_growth(kind):
+    counts = []
+
+    def watch(progress, _):
+        counts.append(progress.gaussians)
+        return False
+
+    settings = RefinementSettings(densify=kind, most=40, rounds=9, growth=0.25, until=1.0)
+    refine(small_scene(), small_views(), settings, steps=20, watch=watch)
+    assert counts[0] == 20 and max(counts) == 40
+    assert all(b <= 1.25 * a for a, b in pairwise(counts))
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.25])
+def test_what_is_dropped_is_replaced(growth):
+    """In a long refinement more would be lost between two rounds than one adds."""
+    start = small_scene()
+    start.opacities[:] = torch.where(torch.arange(20) < 10, LEAST_OPACITY / 2, 0.95)
+    refinement = Refinement(
+        start, small_views(), settings=RefinementSettings(growth=growth, most=40)
+    )
+    refinement.densify(0.0)
+    assert len(refinement.fields) == 20 * (1 + growth)
+    assert (refinement.gaussians.opacities > LEAST_OPACITY).all()
+
+
+@pytest.mark.parametrize("kind", ["error", "mcmc"])
+def test_small_photographs_have_room_for_few(kind):
+    """Two of 12 x 15 pixels: one Gaussian for 8 of them."""
+    settings = RefinementSettings(densify=kind, most=10**6, rounds=9, growth=0.25, until=1.0)
+    refined = refine(small_scene(), small_views(), settings, steps=20)
+    assert refined.num_gaussians == 2 * 12 * 15 // 8
+
+
+def test_rounds_and_their_time():
+    """Of 3 rounds in the first half of 16 steps, the steps before which Gaussians are added."""
+    found = []
+    for settings in (
+        RefinementSettings(rounds=3, until=0.5, most=10**6),
+        RefinementSettings(rounds=0),
+        RefinementSettings(until=0.0),
+        RefinementSettings(densify="none"),
+    ):
+        counts = [20]
+
+        def watch(progress, _, counts=counts):
+            counts.append(progress.gaussians)
+            return False
+
+        refine(small_scene(), small_views(), settings, steps=16, watch=watch)
+        found.append([step for step in range(16) if counts[step + 1] > counts[step]])
+    assert found == [[2, 4, 6], [], [], []]
+
+
+def test_rates_cool_down_at_the_end():
+    """With a constant gradient, a step of Adam is as long as its rate."""
+    views, steps, before = small_views(1), [], [None]
+
+    def watch(_, refinement):
+        sh = refinement.gaussians.sh[0, 0]
+        if before[0] is not None:
+            steps.append((sh - before[0]).abs().max().item())
+        before[0] = sh
+        return False
+
+    views.images[:] = 1
+    one = round_gaussians(torch.tensor([[0.0, 0, 3]]), *torch.full((2, 1), 0.5), torch.zeros(1, 3))
+    rates = Rates(means=0.0, quats=0.0, scales=0.0, opacities=0.0, sh=1e-4)
+    settings = RefinementSettings(
+        rates, densify="none", cool_down=0.5, decay=0.1, ssim=0.0, half_size=0.0
+    )
+    refine(one, views, settings, steps=40, watch=watch)
+    expected = [1e-4 * 0.1 ** max(0, (step / 40 - 0.5) / 0.5) for step in range(1, 40)]
+    assert steps == pytest.approx(expected, rel=0.02)
+
+
+def test_a_watch_sees_each_step_and_may_end_all():
+    views, seen = small_views(), []
+
+    def watch(progress, refinement):
+        assert progress.gaussians == len(refinement.fields)
+        seen.append(progress)
+        return progress.step == 3
+
+    refine(small_scene(), views, RefinementSettings(densify="none"), steps=10, watch=watch)
+    assert [progress.step for progress in seen] == [1, 2, 3]
+    assert [progress.share for progress in seen] == [0.1, 0.2, 0.3]
+    assert all(b.seconds >= a.seconds >= 0 for a, b in pairwise(seen))
+
+
+def test_the_psnr_is_that_of_the_last_photographs():
+    views = small_views(1)
+    small, shown = small_scene(), []
+
+    def watch(progress, refinement):
+        shown.append((progress.psnr, quality(refinement.gaussians, views)))
+        return False
+
+    before = quality(small, views)
+    settings = RefinementSettings(densify="none", half_size=0.0)
+    refine(small, views, settings, steps=4, watch=watch)
+    found, after = zip(*shown, strict=True)
+    assert found == pytest.approx([before, *after[:-1]], abs=0.05)  # without a clamp of the image
+
+
+def test_seconds_end_a_refinement():
+    start, steps = small_scene(), []
+
+    def watch(progress, _):
+        steps.append(progress)
+        return False
+
+    found = refine(start, small_views(), seconds=0.3, watch=watch)
+    assert steps and not same_bits(found, start)
+    assert all(progress.share < 1 for progress in steps[:-1]) and steps[-1].share == 1
+    assert steps[-1].seconds >= 0.3
+
+
+def test_half_of_a_picture_has_its_means_and_its_field_of_view():
+    views = small_views(2, 9, 14)
+    masks = torch.ones(2, 9, 14, dtype=torch.bool)
+    masks[1, 3, 5] = False
+    half = half_size(replace(views, masks=masks))
+    assert (half.cameras.height, half.cameras.width) == (4, 7)
+    expected = views.cameras.resized(4, 7)
+    assert torch.equal(half.cameras.intrinsics, expected.intrinsics)
+    even = half_size(small_views(2, 8, 14))
+    assert even.masks is None
+    assert half.masks.sum() == 2 * 4 * 7 - 1 and not half.masks[1, 1, 2]
+    whole = small_views(1, 8, 8)
+    blocks = whole.images.unflatten(2, (4, 2)).unflatten(4, (4, 2)).mean((3, 5))
+    torch.testing.assert_close(half_size(whole).images, blocks)
+
+
+def test_the_background_is_the_mean_color_of_what_counts(threads):
+    views = small_views(4, 150, 100)
+    mean = mean_color(views)
+    torch.testing.assert_close(mean, views.images.mean((0, 2, 3)))
+    found = []
+    for count in (1, 2):
+        threads(count)
+        found.append(mean_color(views))
+    assert torch.equal(*found)
+    masks = torch.zeros(4, 150, 100, dtype=torch.bool)
+    assert mean_color(replace(views, masks=masks)).tolist() == [0.5] * 3
+    masks[2, 7, 9] = masks[0, 1, 1] = True
+    expected = (views.images[2, :, 7, 9] + views.images[0, :, 1, 1]) / 2
+    torch.testing.assert_close(mean_color(replace(views, masks=masks)), expected)
+    assert torch.equal(Refinement(small_scene(), views).background, mean)
+    given = torch.tensor([1.0, 0, 0])
+    assert torch.equal(Refinement(small_scene(), views, given).background, given)
+
+
+@pytest.mark.parametrize("unit", ["pixel", "scene"])
+def test_means_move_in_the_unit_that_is_asked_for(unit):
+    start = small_scene()
+    start.means[:10, 2] *= 4
+    rates = Rates(means=0.01, unit=unit)
+    views = small_views(1)
+    refinement = Refinement(start, views, settings=RefinementSettings(rates, half_size=0.0))
+    refinement.step(0.0)
+    moved = (refinement.gaussians.means - start.means).abs().amax(-1)
+    seen = moved > 0
+    assert seen[:10].any() and seen[10:].any()
+    units = footprints(start.means, views.cameras) if unit == "pixel" else torch.ones(20)
+    torch.testing.assert_close(moved[seen], 0.01 * units[seen], rtol=1e-3, atol=0)
+    refinement.densify(0.9)
+    units = refinement.fields.units[20:]
+    assert len(units) > 0 and (units == 1).all() == (unit == "scene")
+
+
+def test_a_mistake_is_named():
+    views, small = small_views(), small_scene()
+    bad = small.map(torch.clone)
+    bad.means[3, 0] = torch.nan
+    white = replace(views, images=views.images + 0.5)
+    for sentence, arguments in {
+        "seconds=None and steps=None: give one": {},
+        "seconds=1.0 and steps=1: give one": {"seconds": 1.0, "steps": 1},
+        "steps=0: give one, above 0": {"steps": 0},
+        "seconds=0.0 and .*above 0": {"seconds": 0.0},
+        "seconds=nan": {"seconds": math.nan},
+    }.items():
+        with pytest.raises(InputError, match=sentence):
+            refine(small, views, **arguments)
+    for sentence, arguments in {
+        "no Gaussians": (small.keep(torch.zeros(20) > 0), views),
+        r"gaussians.means\[3\] holds NaN": (bad, views),
+        "outside \\[0, 1\\]: divide": (small, white),
+    }.items():
+        with pytest.raises(InputError, match=sentence):
+            refine(*arguments, steps=1)
+
+
+def unchecked(kind, **options):
+    """Make a dataclass without the checks of types that tests have."""
+    made = object.__new__(kind)
+    inspect.unwrap(kind.__init__)(made, **options)
+    return made
+
+
+@pytest.mark.parametrize(
+    "sentence, options",
+    {
+        "half_size=1.5: give 0 to 1": {"half_size": 1.5},
+        "growth=-0.1": {"growth": -0.1},
+        "densify=adc: choose error, mcmc, gradient, none": {"densify": "adc"},
+        "sh_degree=4: choose": {"sh_degree": 4},
+        "unit=meter: choose pixel or scene": {"rates": unchecked(Rates, unit="meter")},
+        "most=0, .*at least 1 Gaussian": {"most": 0},
+        "rounds=-1": {"rounds": -1},
+        "views_a_step=0": {"views_a_step": 0},
+        "looks=0: give at least 1, or null": {"looks": 0},
+    }.items(),
+)
+def test_settings_that_cannot_be_are_named(sentence, options):
+    with pytest.raises(InputError, match=f"refinement.*{sentence}"):
+        unchecked(RefinementSettings, **options)
+
+
+def test_it_ends_when_the_photographs_were_looked_at_often_enough():
+    """Many steps end early, with the bits of as many as are worth it."""
+    scene, views = small_scene(), small_views(count=2)
+    found, taken = {}, {}
+    for looks, asked in ((None, 6), (3, 200), (3, 4)):
+        shares = []
+        found[asked] = refine(
+            scene,
+            views,
+            RefinementSettings(looks=looks),
+            steps=asked,
+            watch=lambda progress, _, shares=shares: shares.append(progress.share) and False,
+        )
+        taken[asked] = len(shares)
+        assert shares == pytest.approx([(n + 1) / len(shares) for n in range(len(shares))])
+    assert taken == {6: 6, 200: 6, 4: 4}
+    assert same_bits(found[6], found[200]) and not same_bits(found[6], found[4])
+
+
+def test_all_views_a_step_are_a_look_at_each():
+    taken = []
+    refine(
+        small_scene(),
+        small_views(),
+        RefinementSettings(looks=5, views_a_step=None, densify="none"),
+        seconds=1000,
+        watch=lambda progress, _: taken.append(progress.step) and False,
+    )
+    assert taken[-1] == 5

@@ -1,0 +1,231 @@
+"""Dead Gaussians move to live ones, which look as before; faint ones are shaken."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from asysplat.refinement.densify import LEAST_OPACITY
+from asysplat.refinement.fields import Fields
+from asysplat.refinement.relocate import (
+    MOST_AT_ONE,
+    NOISE,
+    REGULARIZER,
+    regularizer,
+    relocate,
+    shake,
+    shared,
+)
+from asysplat.refinement.settings import Rates
+from asysplat.refinement.start import round_gaussians
+from asysplat.rendering import render
+from asysplat.rendering.reference.math import rotations
+
+
+@pytest.fixture
+def scene(make_scene):
+    return make_scene(count=80, height=40, width=52, dtype=torch.float32)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def fields_of(gaussians):
+    return Fields(gaussians, torch.linspace(0.5, 2, gaussians.num_gaussians))
+
+
+def picture(gaussians, cameras):
+    return render(gaussians, cameras, torch.full((3,), 0.5), depth=False).image
+
+
+def double_sum(opacity, count):
+    """Eq. 9 as it is printed: the factor of the scales."""
+    each = 1 - (1 - opacity) ** (1 / count)
+    total = sum(
+        math.comb(i - 1, k) * (-1) ** k * each ** (k + 1) / math.sqrt(k + 1)
+        for i in range(1, count + 1)
+        for k in range(i)
+    )
+    return opacity / total
+
+
+def test_two_in_the_place_of_one_are_as_in_equation_9():
+    opacities = torch.tensor([0.05, 0.3, 0.75, 0.99])
+    scales = torch.rand(4, 3)
+    found, sizes = shared(opacities, scales, torch.full((4,), 2))
+    half = 1 - (1 - opacities).sqrt()
+    torch.testing.assert_close(found, half)
+    factor = opacities / (2 * half - half**2 / math.sqrt(2))
+    torch.testing.assert_close(sizes, scales * factor[:, None])
+    assert (factor < 1).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, MOST_AT_ONE])
+def test_any_number_are_as_in_equation_9(count):
+    opacities, scales = torch.linspace(0.3, 0.99, 7), torch.rand(7, 3)
+    found, sizes = shared(opacities, scales, torch.full((7,), count))
+    exact = (1 - (1 - opacities.double()) ** (1 / count)).float().clamp_min(LEAST_OPACITY)
+    torch.testing.assert_close(found, exact)
+    factors = torch.tensor([double_sum(opacity, count) for opacity in opacities.tolist()])
+    torch.testing.assert_close(sizes, scales * factors[:, None], rtol=1e-4, atol=0)
+    if count == 1:
+        torch.testing.assert_close((found, sizes), (opacities, scales))
+
+
+def test_more_than_the_most_count_as_that_many():
+    one = torch.tensor([0.9, 1.0]), torch.ones(2, 3)
+    most, more = (shared(*one, torch.full((2,), count)) for count in (MOST_AT_ONE, 1000))
+    assert torch.equal(more[0], most[0]) and torch.equal(more[1], most[1])
+    assert more[0].isfinite().all() and (more[1] > 0).all() and more[1].isfinite().all()
+
+
+@pytest.mark.parametrize("dead", [1, 40])
+def test_the_picture_stays_when_dead_ones_move(scene, dead):
+    gaussians, cameras = scene
+    gaussians.opacities[:dead] = LEAST_OPACITY / 2
+    fields = fields_of(gaussians)
+    before = picture(gaussians, cameras)
+    relocate(fields, 80, 0.0, generator())
+    found = fields.gaussians().validate()
+    assert found.num_gaussians == 80
+    assert (found.opacities > LEAST_OPACITY).all()
+    assert not torch.equal(found.opacities, gaussians.opacities)
+    assert (picture(found, cameras) - before).abs().mean() <= 1e-2
+    uncorrected = gaussians.map(lambda field: torch.cat((field[40:], field[40:])))
+    assert dead < 40 or (picture(uncorrected, cameras) - before).abs().mean() > 2e-2
+
+
+def test_the_picture_stays_when_copies_are_added(scene):
+    gaussians, cameras = scene
+    fields = fields_of(gaussians)
+    relocate(fields, 1000, 0.5, generator())
+    assert len(fields) == 120
+    difference = picture(fields.gaussians(), cameras) - picture(gaussians, cameras)
+    assert difference.abs().mean() <= 1e-2
+
+
+def test_no_more_than_most_and_none_is_lost(scene):
+    for most, growth, expected in ((100, 0.5, 100), (80, 1.0, 80), (20, 1.0, 80), (200, 0.05, 84)):
+        fields = fields_of(scene[0])
+        relocate(fields, most, growth, generator())
+        assert len(fields) == expected
+
+
+def test_those_that_are_alone_stay_and_copies_begin_anew(scene):
+    gaussians = scene[0]
+    gaussians.opacities[:30] = LEAST_OPACITY / 2
+    fields = fields_of(gaussians)
+    old_units = fields.units
+    relocate(fields, 80, 0.0, generator())
+    found = fields.gaussians()
+    # Each is at the place of a live one, with its turn, color and unit.
+    same = (found.means[:, None] == gaussians.means[None, 30:]).all(-1)
+    assert (same.sum(1) == 1).all() and (same.sum(0) >= 1).all()
+    source = 30 + same.int().argmax(1)
+    for name in ("quats", "sh"):
+        assert torch.equal(getattr(found, name), getattr(gaussians, name)[source])
+    assert torch.equal(fields.units, old_units[source])
+    counts = same.sum(0)[source - 30]
+    expected = shared(gaussians.opacities[source], gaussians.scales[source], counts)
+    torch.testing.assert_close((found.opacities, found.scales), expected)
+    assert counts.max() > 2 and counts.min() == 1
+
+
+def test_what_was_copied_takes_its_first_step_again(scene):
+    fields = fields_of(scene[0])
+    up = {name: torch.ones_like(tensor) for name, tensor in fields.numbers.items()}
+    for _ in range(5):
+        fields.step(up, Rates(), 1.0)
+    relocate(fields, 100, 0.25, generator())
+    before = fields.numbers["logits"].clone()
+    down = {name: -torch.ones_like(tensor) for name, tensor in fields.numbers.items()}
+    fields.step(down, Rates(opacities=0.1), 1.0)
+    moved = fields.numbers["logits"] - before
+    means = fields.gaussians().means
+    several = (means[:, None] == means[None]).all(-1).sum(1) > 1
+    torch.testing.assert_close(moved[several], torch.full_like(moved[several], 0.1))
+    assert (moved[~several] < 0).all() and several.any() and (~several).any()
+
+
+def test_live_ones_are_drawn_by_opacity():
+    opacities = torch.cat(
+        (torch.full((2000,), 1e-3), torch.full((50,), 0.2), torch.full((50,), 0.6))
+    )
+    means = torch.arange(2100.0)[:, None].repeat(1, 3)
+    start = round_gaussians(means, torch.ones(2100), opacities, torch.rand(2100, 3))
+    fields = fields_of(start)
+    relocate(fields, 2100, 0.0, generator())
+    place = fields.gaussians().means[:, 0]
+    assert place.min() >= 2000
+    share = (place >= 2050).float().mean().item()
+    assert abs(share - (0.75 * 2000 + 50) / 2100) <= 0.03
+
+
+def test_where_none_is_alive_they_stay():
+    start = round_gaussians(
+        torch.rand(6, 3), torch.ones(6), torch.full((6,), 1e-6), torch.rand(6, 3)
+    )
+    fields = fields_of(start)
+    relocate(fields, 6, 0.0, generator())
+    assert torch.equal(fields.gaussians().means, start.means)
+    relocate(fields, 9, 0.5, generator())
+    assert fields.gaussians().validate().num_gaussians == 9
+
+
+def test_the_same_generator_relocates_the_same(scene):
+    found = []
+    for seed in (0, 0, 1):
+        fields = fields_of(scene[0])
+        relocate(fields, 100, 0.25, generator(seed))
+        shake(fields, 1.0, generator(seed))
+        found.append(fields.gaussians())
+    assert torch.equal(found[0].means, found[1].means)
+    assert torch.equal(found[0].scales, found[1].scales)
+    assert not torch.equal(found[0].scales, found[2].scales)
+
+
+def test_faint_ones_are_shaken_along_their_covariance():
+    """Noise of the deviation NOISE * sigmoid(100 (0.005 - o)) * factor, times the covariance."""
+    count = 4000
+    quats, scales = torch.tensor([[0.8, 0.1, -0.5, 0.3]]), torch.tensor([[0.1, 0.02, 0.3]])
+    start = round_gaussians(
+        torch.zeros(count, 3), torch.ones(count), torch.full((count,), 0.01), torch.rand(count, 3)
+    )
+    start = replace(start, quats=quats.repeat(count, 1), scales=scales.repeat(count, 1))
+    fields = fields_of(start)
+    shake(fields, 0.5, generator())
+    moved = fields.gaussians().means.double()
+    gate = 1 / (1 + math.exp(-100 * (LEAST_OPACITY - 0.01)))
+    along = moved @ rotations(quats)[0].double()
+    expected = 0.5 * NOISE * gate * scales[0].double() ** 2
+    torch.testing.assert_close(along.std(0), expected, rtol=0.05, atol=0)
+    correlation = torch.corrcoef(along.mT) - torch.eye(3)
+    assert correlation.abs().max() <= 0.06
+    assert (along.mean(0).abs() <= 4 * expected / count**0.5).all()
+
+
+def test_opaque_ones_keep_still_and_nothing_else_moves(scene):
+    gaussians = scene[0]
+    gaussians.opacities[:10] = 0.006
+    fields = fields_of(gaussians)
+    before = fields.gaussians()
+    shake(fields, 1.0, generator())
+    after = fields.gaussians()
+    moved = (after.means != before.means).any(-1)
+    assert torch.equal(moved, torch.arange(80) < 10)
+    for name in ("quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(after, name), getattr(before, name))
+    shake(fields, 0.0, generator())
+    assert torch.equal(fields.gaussians().means, after.means)
+
+
+def test_the_regularizer_is_of_the_mean_opacity_and_scale(scene):
+    gaussians = scene[0].map(lambda field: field.requires_grad_())
+    value = regularizer(gaussians)
+    value.backward()
+    expected = REGULARIZER * (gaussians.opacities.mean() + gaussians.scales.mean())
+    torch.testing.assert_close(value, expected)
+    torch.testing.assert_close(gaussians.opacities.grad, torch.full((80,), REGULARIZER / 80))
+    torch.testing.assert_close(gaussians.scales.grad, torch.full((80, 3), REGULARIZER / 240))

@@ -1,0 +1,66 @@
+"""Work that is skipped is not missed: without each skip the same bits, and a gain to show."""
+
+from dataclasses import fields
+
+import pytest
+import torch
+from backends import assert_same_bits, both_ways
+
+from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
+from asysplat.rendering import Culling
+
+
+def needles():
+    """Faint, opaque and long: something for every skip to do."""
+    gaussians, cameras = random_scene(1500, 96, 128)
+    gaussians.scales[:, 0] *= 6
+    gaussians.opacities[::5] = 1e-3
+    gaussians.opacities[1::5] = 0.02
+    gaussians.opacities[2::5] = 1.0
+    return gaussians, cameras
+
+
+SCENES = {"needles": needles, "pixel-aligned": lambda: pixel_aligned_scene(40, 96, 128)}
+NAMES = [field.name for field in fields(Culling)]
+MASKS = torch.ones(1, 96, 128, dtype=torch.bool)
+MASKS[:, :40, 20:100] = False
+# What each skip saves, from the statistics with it and without it.
+GAINS = {
+    "opacity": lambda with_it, _: with_it["culled_by_opacity"],
+    "frustum": lambda with_it, _: with_it["culled_by_frustum"],
+    "extent": lambda with_it, without: without["pairs"] - with_it["pairs"],
+    "ellipse": lambda with_it, _: with_it["pairs_off_ellipse"],
+    "masks": lambda with_it, _: with_it["pairs_masked"],
+    "rows": lambda with_it, _: with_it["rows_out_of_reach"],
+    "opaque": lambda with_it, _: with_it["rows_opaque"] + with_it["pairs_behind_opaque"],
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"depth": "median", "antialiased": True}], ids=str)
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("name", NAMES)
+def test_without_a_skip_all_bits_are_the_same(fast_backend, name, scene, options):
+    gaussians, cameras = SCENES[scene]()
+    options = {"masks": MASKS, **options}
+    plain = both_ways(fast_backend, gaussians, cameras, **options)
+    assert (plain.alpha > 0.999).any() and (plain.alpha[~MASKS] == 0).all()
+    culling = Culling().without(name)
+    assert_same_bits(both_ways(fast_backend, gaussians, cameras, culling=culling, **options), plain)
+
+
+def test_without_all_skips_all_bits_are_the_same(fast_backend):
+    gaussians, cameras = needles()
+    none = Culling(**dict.fromkeys(NAMES, False))
+    result = both_ways(fast_backend, gaussians, cameras, masks=MASKS, culling=none)
+    assert_same_bits(result, both_ways(fast_backend, gaussians, cameras, masks=MASKS))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_skip_has_a_gain_and_it_is_counted(fast_backend, name):
+    gaussians, cameras = needles()
+    culling = Culling().without(name)
+    with_it = both_ways(fast_backend, gaussians, cameras, masks=MASKS).stats
+    without = both_ways(fast_backend, gaussians, cameras, masks=MASKS, culling=culling).stats
+    assert with_it != without
+    assert GAINS[name](with_it, without) > 0
+    assert GAINS[name](without, without) == 0

@@ -1,0 +1,57 @@
+"""Scenes that cannot be read are named once, counted, and too many end the run."""
+
+import lightning
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from asysplat.errors import InputError
+from asysplat.training.callbacks import BadScenes
+
+
+class Module(lightning.LightningModule):
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(1, 1)
+
+    def training_step(self, batch, index):
+        return self.layer(torch.ones(1)).sum()
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def fit(skipped, folder, **options):
+    counter = BadScenes(**options)
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        max_epochs=1,
+        callbacks=[counter],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=folder,
+    )
+    batches = [{"skipped": sentences} for sentences in skipped]
+    trainer.fit(Module(), DataLoader(batches, batch_size=None))
+    return trainer.callback_metrics, counter
+
+
+def test_each_trouble_is_told_once_and_all_are_counted(tmp_path, capsys):
+    logged, counter = fit([["a is cut short"], [], ["b", "a is cut short"]], tmp_path)
+    assert logged["train/skipped_scenes"] == 3
+    said = capsys.readouterr().out
+    assert said == (
+        "step 1: another scene in place of one: a is cut short\n"
+        "step 3: another scene in place of one: b\n"
+    )
+    again = BadScenes()
+    again.load_state_dict(counter.state_dict())
+    assert (again.skipped, again.troubles) == (3, ["a is cut short", "b"])
+
+
+def test_the_budget(tmp_path):
+    fit([["a", "b"], ["b"]], tmp_path, budget=2)
+    with pytest.raises(InputError, match=r"^more than 2 training scenes .*:\n  a\n  b\n  c$"):
+        fit([["a", "b"], ["b", "c"]], tmp_path, budget=2)

@@ -1,0 +1,98 @@
+"""What the optimizer is given: which parameters decay, and which are not trained at all."""
+
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from asysplat.scene import Cameras, Views
+from asysplat.training import SplattingLoss, SplattingModule
+from asysplat.training.schedule import cosine
+
+PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
+FOLDER = Path(__file__).parents[2] / "conf" / "model"
+MODELS = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem not in PARTS)
+
+
+def make_module(net, background=(0.5, 0.5, 0.5)):
+    return SplattingModule(
+        net=net,
+        loss=SplattingLoss(mse=1.0, perceptual=0.0, depth=0.0),
+        optimizer=partial(torch.optim.AdamW, lr=1e-3, weight_decay=0.05, fused=True),
+        schedule=partial(cosine, warmup_steps=1, total_steps=2),
+        background=background,
+    )
+
+
+UNREAD = {
+    "asysplat_pred_coarse": "appearance.links.2.",
+    "asysplat_pred_fine": "geometry.links.2.",
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_which_parameters_are_trained_and_which_decay(build, model):
+    module = make_module(build("width=0.125", "state_size=8", f"model={model}", device="meta"))
+    named = dict(module.net.named_parameters())
+    unread = {name for name in named if name.startswith(UNREAD.get(model, "none"))}
+    assert {name for name, p in named.items() if not p.requires_grad} == unread
+    assert bool(unread) == (model in UNREAD)
+
+    names = {parameter: name for name, parameter in named.items()}
+    groups = module.configure_optimizers()["optimizer"].param_groups
+    assert [group["weight_decay"] for group in groups] == [0.05, 0.0]
+    decaying, steady = ([names[p] for p in group["params"]] for group in groups)
+    assert set(decaying) | set(steady) == set(named) - unread and decaying and steady
+    # By name, which the code does not look at.
+    for name in decaying:
+        assert name.endswith(".weight") and "norm" not in name, name
+    modules = dict(module.net.named_modules())
+    for name in steady:
+        kind = type(modules[name.rpartition(".")[0]]).__name__
+        assert not name.endswith(".weight") or "Norm" in kind, name
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "measure"), [("norm", torch.linalg.vector_norm), ("value", torch.amax)]
+)
+def test_gradients_are_clipped(build, algorithm, measure):
+    module = make_module(build("width=0.125", "state_size=8"))
+    optimizer = module.configure_optimizers()["optimizer"]
+    for parameter in module.parameters():
+        parameter.grad = torch.full_like(parameter, 3.0)
+    module.configure_gradient_clipping(optimizer, 0.5, algorithm)
+    grads = torch.cat([p.grad.flatten().double() for p in module.parameters()])
+    torch.testing.assert_close(measure(grads), torch.tensor(0.5).double(), rtol=1e-5, atol=0)
+
+
+def test_the_matrix_a_of_mamba_vision_does_not_decay(build):
+    module = make_module(build("width=0.125", "state_size=8", device="meta"))
+    matrix = module.net.appearance["stages"][0][0].mixer.A_log
+    steady = module.configure_optimizers()["optimizer"].param_groups[1]["params"]
+    assert matrix.ndim == 2 and any(p is matrix for p in steady)
+
+
+def test_a_branch_that_nothing_reads_is_not_trained(build):
+    overrides = ("model/source=fine", "model/links=only_fine_to_coarse", "width=0.125")
+    net = make_module(build(*overrides, "state_size=8")).net
+    assert not any(p.requires_grad for p in net.geometry.parameters())
+    assert all(p.requires_grad for p in net.appearance.parameters())
+    assert all(isinstance(p, torch.nn.Parameter) and not p.is_meta for p in net.parameters())
+
+
+def test_the_background_follows_the_inputs(build):
+    """What no Gaussian covers has the mean color of each scene's inputs."""
+    module = make_module(build("width=0.125", "state_size=8"), "inputs")
+    poses = torch.eye(4).repeat(2, 2, 1, 1)
+    intrinsics = torch.tensor([[32.0, 0, 16], [0, 32, 16], [0, 0, 1]]).repeat(2, 2, 1, 1)
+    inputs = Views(Cameras(intrinsics, poses, 32, 32), torch.rand(2, 2, 3, 32, 32))
+    away = poses[:, :1] * torch.tensor([-1.0, 1, -1, 1])  # turned round
+    targets = Views(Cameras(intrinsics[:, :1], away, 32, 32), torch.rand(2, 1, 3, 32, 32))
+    batch = {"inputs": inputs, "targets": targets}
+    inputs.images[1] = 0.4 * inputs.images[1]
+    trained = module.train().reconstruct(batch, depth=False).rendering.image
+    assert set(trained[0].unique().tolist()) <= {0, 1} and (trained[1] == 1).all()
+    outcome = module.eval().reconstruct(batch, depth=False)
+    expected = inputs.images.mean((1, 3, 4))[:, None, :, None, None].expand(2, 1, 3, 32, 32)
+    torch.testing.assert_close(outcome.rendering.image, expected)

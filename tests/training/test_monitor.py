@@ -1,0 +1,150 @@
+"""What TrainingMonitor makes of a step: shares, speed, norms; and of Gaussians: histograms."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import nn
+
+from asysplat.errors import InputError
+from asysplat.evaluation import peak
+from asysplat.evaluation.peak import peak_flops
+from asysplat.training import loggers, parts
+from asysplat.training.callbacks import TrainingMonitor, monitor
+from asysplat.training.callbacks.monitor import gradient_norms, sentence
+from asysplat.training.histogram import Histogram
+from asysplat.training.loggers import make_wandb_logger
+from asysplat.training.parts import Parts
+
+CPU = torch.device("cpu")
+
+
+class Clock:
+    seconds = 0.0
+
+    def perf_counter(self):
+        return self.seconds
+
+    def wait(self, seconds):
+        self.seconds += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    made = Clock()
+    for module in (monitor, parts):
+        monkeypatch.setattr(module, "time", made)
+    return made
+
+
+class Run:
+    """The hooks of a training, with what is logged."""
+
+    def __init__(self, clock, every, accumulate=1):
+        self.clock, self.accumulate, self.logged = clock, accumulate, {}
+        self.watch = TrainingMonitor(every)
+        self.watch.flops, self.watch.peak = 6e9, None
+        self.watch.first_step, self.watch.begun_at = 0, None
+        logger = SimpleNamespace(log_metrics=self.log)
+        self.trainer = SimpleNamespace(global_step=0, world_size=2, loggers=[logger])
+        self.module = SimpleNamespace(parts=Parts(), device=CPU, net=nn.ModuleDict())
+        views = [SimpleNamespace(num_views=count) for count in (3, 2)]
+        self.batch = {"scene": ["a", "b"], "inputs": views[0], "targets": views[1]}
+        self.watch.on_train_epoch_start()
+
+    def log(self, numbers, step):
+        self.logged.setdefault(step, {}).update(numbers)
+
+    def step(self, data=1.0, network=4.0, backward=3.0, optimizer=0.5, rest=1.5):
+        hooks = (self.trainer, self.module)
+        for batch in range(self.accumulate):
+            self.clock.wait(data)
+            self.watch.on_train_batch_start(*hooks, self.batch, batch)
+            self.clock.wait(rest)
+            with self.module.parts("network"):
+                self.clock.wait(network)
+            self.watch.on_before_backward(*hooks, None)
+            self.clock.wait(backward)
+            self.watch.on_after_backward(*hooks)
+            if batch == self.accumulate - 1:
+                self.watch.on_before_optimizer_step(*hooks, None)
+                self.clock.wait(optimizer)
+                self.trainer.global_step += 1
+            self.watch.on_train_batch_end(*hooks, None, self.batch, batch)
+
+
+def test_shares_and_speed_of_every_so_many_steps(clock):
+    run = Run(clock, every=3)
+    run.step(network=100)  # the first, which compiles, counts nowhere
+    run.step()
+    run.step(network=14)
+    clock.wait(1000)  # a validation
+    run.watch.on_train_epoch_start()
+    for _ in range(3):
+        run.step()
+    assert run.logged.keys() == {2, 5}
+    first, second = run.logged.values()
+    # Ten seconds in the second step and twenty in the third, two scenes of five views each.
+    assert first["time/seconds_per_step"] == 15 and second["time/seconds_per_step"] == 10
+    assert first["time/views_per_second"] == pytest.approx(2 * 2 * 2 * 5 / 30)
+    assert first["time/gflops_per_second"] == pytest.approx(2 * 2 * 6 / 30)
+    expected = {"data": 1, "network": 14, "backward": 3, "optimizer": 0.5, "other": 1.5}
+    for part in (*parts.PARTS, "other"):
+        assert first[f"time/share_{part}"] == pytest.approx(expected.get(part, 0) / 20)
+    assert "time/mfu" not in first and first["memory/peak_gb"] > 0
+    said = sentence(second)
+    assert "took 10 s, 2 views/s: data 10%, prior 0%, network 40%" in said
+    assert "MFU not measured" in said
+
+
+def test_a_step_of_several_batches(clock):
+    run = Run(clock, every=2, accumulate=2)
+    run.watch.peak = 12e9
+    for _ in range(4):
+        run.step()
+    found = run.logged[3]
+    assert found["time/seconds_per_step"] == 2 * 9.5 + 0.5
+    assert found["time/share_network"] == pytest.approx(8 / 19.5)
+    assert found["time/share_data"] == pytest.approx(2 / 19.5)
+    assert found["time/mfu"] == pytest.approx(4 * 6 / 19.5 / 12)
+    assert "MFU 10.3%" in sentence(found)
+
+
+def test_gradient_norms_by_part():
+    net = nn.ModuleDict({name: nn.Linear(2, 1) for name in ("geometry", "head", "unused")})
+    net["geometry"].weight.grad = torch.tensor([[3.0, 0.0]])
+    net["geometry"].bias.grad = torch.tensor([4.0])
+    net["head"].bias.grad = torch.tensor([-2.0])
+    assert gradient_norms(net) == {"gradient/geometry": 5, "gradient/head": 2}
+
+
+def test_histograms_count_scene_by_scene():
+    histogram = Histogram.empty(0.0, 6.0, CPU)  # sixty bins of a tenth
+    assert histogram.median() != histogram.median()  # NaN
+    histogram.add(torch.tensor([[0.05, 0.15], [float("nan"), -1.0]]))
+    histogram.add(torch.tensor([2.55, 7.0]))
+    assert histogram.counts[[0, 1, 25, 59]].tolist() == [2, 1, 1, 1]
+    assert histogram.counts.sum() == 5 and histogram.edges[25] == pytest.approx(2.5)
+    assert histogram.median() == pytest.approx(0.15)  # half of the second bin
+    numbers = torch.rand(100_000) * 5
+    spread = Histogram.empty(-1.0, 6.0, CPU)
+    spread.add(numbers)
+    assert spread.median() == pytest.approx(numbers.median().item(), abs=0.01)
+
+
+def test_the_peak_of_known_gpus_alone(monkeypatch):
+    gpu = torch.device("cuda")
+    assert peak_flops(CPU, "32-true") is None
+    monkeypatch.setattr(peak.torch.cuda, "get_device_name", lambda _: "NVIDIA H200")
+    assert peak_flops(gpu, "bf16-mixed") == pytest.approx(989.4e12)
+    assert peak_flops(gpu, "32-true") == pytest.approx(66.9e12)
+    monkeypatch.setattr(peak.torch, "get_float32_matmul_precision", lambda: "high")
+    assert peak_flops(gpu, "32-true") == pytest.approx(494.7e12)
+    monkeypatch.setattr(peak.torch.cuda, "get_device_name", lambda _: "another")
+    assert peak_flops(gpu, "bf16-mixed") is None
+
+
+def test_without_wandb_it_says_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setattr(loggers, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'asysplat\[wandb\]', or take logger="):
+        make_wandb_logger(tmp_path, "asysplat", "run", offline=True)
