@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.products import ROWS, add_product, add_triangle, transpose
-from asysplat.ops.cpu.vectors import LANES
+from asysplat.ops.simd.kernel import kernel
+from asysplat.ops.simd.products import ROWS, add_product, add_triangle, transpose
+from asysplat.ops.simd.vectors import LANES
 
 SIDE = 4 * ROWS
 

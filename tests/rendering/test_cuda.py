@@ -228,7 +228,7 @@ def test_tile_lists_hold_what_tiles_show_and_little_more(make_scene, monkeypatch
 @kernel
 def test_too_many_pairs_are_an_error(make_scene, monkeypatch):
     scene = make_batch(make_scene, device=DEVICE)
-    monkeypatch.setattr("asysplat.rendering.interface.MOST_PAIRS", 3)
+    monkeypatch.setattr("asysplat.rendering.interface.MAX_PAIRS", 3)
     with pytest.raises(InputError, match=r"\d+ pairs.* 3: set views_at_once"):
         draw_by_cuda(*scene, RenderSettings())
 
@@ -241,7 +241,7 @@ def test_tensors_on_a_cpu_are_an_error(make_scene):
 
 
 def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
-    names = ("asysplat.rendering.cuda.", "asysplat.ops.cuda.")
+    names = ("asysplat.rendering.cuda.", "asysplat.ops.triton_utils")
     for name in [name for name in sys.modules if name.startswith(names)]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "triton", None)

@@ -15,9 +15,9 @@ from tangents import tangent_scene
 from torch import Tensor
 
 from asysplat.ops import image_loss, plane_sweep, selective_scan, ssd
-from asysplat.ops.cpu.gathers import gather_pairs, gather_squares
-from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.vectors import load, load_some, store, zeros
+from asysplat.ops.simd.gathers import gather_pairs, gather_squares
+from asysplat.ops.simd.kernel import kernel
+from asysplat.ops.simd.vectors import load, load_some, store, zeros
 from asysplat.refinement.adam import VisibleAdam
 from asysplat.rendering import Culling
 from asysplat.rendering.cpu.math import take_sum

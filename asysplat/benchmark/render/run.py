@@ -11,7 +11,7 @@ from torch import Tensor
 
 from asysplat.benchmark.scenes import Scene
 from asysplat.benchmark.timing import now, relative_l2
-from asysplat.ops.cpu.threads import time_kernels
+from asysplat.ops.simd.threads import time_kernels
 from asysplat.rendering import GSPLAT_1_5, INRIA, Convention, Culling, render
 from asysplat.scene import Cameras, Gaussians
 

@@ -14,10 +14,10 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from asysplat.ops.adam.reference import AdamSettings, Rows
-from asysplat.ops.cpu.gathers import gather_pairs
-from asysplat.ops.cpu.kernel import inline, kernel
-from asysplat.ops.cpu.threads import even_bounds, run_blocks
-from asysplat.ops.cpu.vectors import (
+from asysplat.ops.simd.gathers import gather_pairs
+from asysplat.ops.simd.kernel import inline, kernel
+from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.vectors import (
     LANES,
     ZERO,
     fma,

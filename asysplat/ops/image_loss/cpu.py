@@ -19,9 +19,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from asysplat.ops.cpu.kernel import inline, kernel
-from asysplat.ops.cpu.threads import even_bounds, run_blocks
-from asysplat.ops.cpu.vectors import (
+from asysplat.ops.image_loss import reference
+from asysplat.ops.image_loss.reference import SIZE, window_weights
+from asysplat.ops.simd.kernel import inline, kernel
+from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.vectors import (
     LANES,
     ONE,
     ZERO,
@@ -33,8 +35,6 @@ from asysplat.ops.cpu.vectors import (
     where,
     zeros,
 )
-from asysplat.ops.image_loss import reference
-from asysplat.ops.image_loss.reference import SIZE, window_weights
 
 BAND = 64  # rows of a task; for their gradients it also takes the windows that begin above
 REACH = SIZE - 1

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
-from asysplat.ops.cpu.threads import even_bounds, run_blocks, weighted_bounds
+from asysplat.ops.simd.threads import even_bounds, run_blocks, weighted_bounds
 from asysplat.rendering.cpu import project as projection
 from asysplat.rendering.cpu import rasterize as raster
 from asysplat.rendering.cpu.project import Projected, project
@@ -37,9 +37,9 @@ from asysplat.rendering.formulas import CAMERA_GRADIENT, Inputs, camera_gradient
 from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs
 from asysplat.scene import Cameras, Gaussians
 
-MOST_SPLATS = 2**25  # in memory at a time: 2 GiB
-BLOCK = 2048  # Gaussians of a piece of work; more, where an image would have over MOST_BLOCKS
-MOST_BLOCKS = 64
+MAX_SPLATS = 2**25  # in memory at a time: 2 GiB
+BLOCK = 2048  # Gaussians of a piece of work; more, where an image would have over MAX_BLOCKS
+MAX_BLOCKS = 64
 
 
 def draw(
@@ -63,7 +63,7 @@ def draw(
             "'auto', or move them with .to('cpu')."
         )
     images = cameras.intrinsics.shape[:2].numel()
-    if images * gaussians.num_gaussians > MOST_SPLATS and cameras.num_views > 1:
+    if images * gaussians.num_gaussians > MAX_SPLATS and cameras.num_views > 1:
         raise MemoryError(f"{images} images of {gaussians.num_gaussians} Gaussians")
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     poses = (cameras.cam_to_world, cameras.intrinsics)
@@ -123,7 +123,7 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSet
     means, intrinsics = tensors[0], tensors[-1]
     (scenes, num), views = means.shape[:2], intrinsics.shape[1]
     height, width = size
-    blocks = max(1, min(-(-num // BLOCK), MOST_BLOCKS))
+    blocks = max(1, min(-(-num // BLOCK), MAX_BLOCKS))
     columns = -(-width // TILE)
     convention, culling = settings.convention, settings.culling
     return Frame(

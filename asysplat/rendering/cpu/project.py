@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asysplat.ops.cpu.kernel import inline, kernel
+from asysplat.ops.simd.kernel import inline, kernel
 from asysplat.rendering.cpu.math import (
     compensation,
     covariance,
@@ -20,14 +20,14 @@ from asysplat.rendering.cpu.math import (
     log2,
     plus,
     row3,
-    sh_basis,
     triple,
     whitening,
+    write_sh_basis,
 )
 from asysplat.rendering.cpu.splat import RED, Ellipse, load_ellipse, store_ellipse
 from asysplat.rendering.cpu.tiles import find_box, list_tiles
 from asysplat.rendering.formulas import CENTER, EXPONENT_MARGIN, PIXEL_MARGIN, WHITEN_TO_LOG2
-from asysplat.rendering.interface import LARGEST, TINY
+from asysplat.rendering.interface import MAX_MAGNITUDE, MIN_SQUARED_DISTANCE
 
 # Counters of a block: tiles that boxes would touch in the place of ellipses; Gaussians that were
 # culled by their opacity; those that were culled outside the image.
@@ -188,7 +188,7 @@ def _find_ellipses(count, batch, camera, frame, found):
         # Every comparison with NaN is false. Without a short cut: `and` would be a branch.
         seen = (
             (mean.z > settings.near)
-            & (mean.z < LARGEST)
+            & (mean.z < MAX_MAGNITUDE)
             & (opacity >= alpha_min)
             & (float(opacities[i]) <= 1)
             & (a > 0)
@@ -232,15 +232,15 @@ def _store_color(inputs, g, image, functions, splats, d):
     x = y = z = 0.0
     if count > 1:
         offset = plus(row3(inputs.means, g), -1.0, row3(inputs.cameras, image, CENTER))
-        length = math.sqrt(max(dot(offset, offset), TINY))
+        length = math.sqrt(max(dot(offset, offset), MIN_SQUARED_DISTANCE))
         x, y, z = offset[0] / length, offset[1] / length, offset[2] / length
-    sh_basis(x, y, z, count, functions)
+    write_sh_basis(x, y, z, count, functions)
     usable = True
     for channel in range(3):
         color = 0.5
         for k in range(count):
             coefficient = float(sh[g, k, channel])
-            usable &= abs(coefficient) < LARGEST
+            usable &= abs(coefficient) < MAX_MAGNITUDE
             color += functions[k] * coefficient
         splats[d, RED + channel] = max(color, 0.0)
     return usable

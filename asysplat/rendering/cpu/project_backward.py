@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asysplat.ops.cpu.kernel import inline, kernel
+from asysplat.ops.simd.kernel import inline, kernel
 from asysplat.rendering.cpu.math import (
     covariance,
     cross,
@@ -18,11 +18,11 @@ from asysplat.rendering.cpu.math import (
     rotation_gradient,
     row3,
     scaled,
-    sh_basis,
     sh_basis_gradient,
     times,
     unit_quaternion,
     whitening,
+    write_sh_basis,
 )
 from asysplat.rendering.cpu.splat import (
     G_A,
@@ -36,7 +36,7 @@ from asysplat.rendering.cpu.splat import (
     GRADIENT,
 )
 from asysplat.rendering.formulas import CENTER, CX, CY, DOWN, FORWARD, FX, FY, RIGHT, WHITEN_TO_LOG2
-from asysplat.rendering.interface import TINY
+from asysplat.rendering.interface import MIN_SQUARED_DISTANCE
 
 LOG_2 = math.log(2)
 # Where the gradients of a Gaussian's mean, quaternion, scale and SH begin among its sums.
@@ -231,11 +231,11 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
 
     # Color.
     square = dot(offset, offset)
-    length = math.sqrt(max(square, TINY))
+    length = math.sqrt(max(square, MIN_SQUARED_DISTANCE))
     direction = scaled(1 / length, offset)
     sh = inputs.sh
     count = sh.shape[1]
-    sh_basis(direction[0], direction[1], direction[2], count, functions)
+    write_sh_basis(direction[0], direction[1], direction[2], count, functions)
     _clear(g_functions)
     for channel in range(3):
         color = 0.5
@@ -249,7 +249,7 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
                 g_functions[k] += float(sh[g, k, channel]) * g_color
     g_direction = sh_basis_gradient(direction[0], direction[1], direction[2], count, g_functions)
     g_offset = plus(g_offset, 1 / length, g_direction)
-    if square > TINY:
+    if square > MIN_SQUARED_DISTANCE:
         g_offset = plus(g_offset, -dot(direction, g_direction) / length, direction)
 
     _add3(sums, MEAN, 1.0, g_offset)

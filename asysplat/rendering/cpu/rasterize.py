@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asysplat.ops.cpu.kernel import inline, kernel
-from asysplat.ops.cpu.vectors import LANES, ONE, ZERO, exp2, fma
+from asysplat.ops.simd.kernel import inline, kernel
+from asysplat.ops.simd.vectors import LANES, ONE, ZERO, exp2, fma
 from asysplat.rendering.cpu import splat as col
 from asysplat.rendering.cpu.math import take_sum, to_bits
 from asysplat.rendering.cpu.splat import (

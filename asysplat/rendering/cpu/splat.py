@@ -9,9 +9,9 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from asysplat.ops.cpu.kernel import inline
-from asysplat.ops.cpu.vectors import LANES, fma
-from asysplat.rendering.formulas import FARTHEST, PIXEL_MARGIN
+from asysplat.ops.simd.kernel import inline
+from asysplat.ops.simd.vectors import LANES, fma
+from asysplat.rendering.formulas import MAX_CENTER_OFFSET, PIXEL_MARGIN
 
 # A splat [16] float32, one cache line; BASE_* hold int32, *_REST the rounding error of the float32.
 # alpha = 2^(LOG_OPACITY - (A dx + B dy)^2 - (C dy)^2), the center at (BASE_X + X, BASE_Y + Y);
@@ -125,8 +125,8 @@ class Row(NamedTuple):
 def store_ellipse(splats, bases, d, ellipse, log_opacity, z):
     """Round a splat's ellipse, opacity and depth to float32; all but the color."""
     x, y, a, b, c, extent_y = ellipse
-    base_x = min(max(np.floor(x), -FARTHEST), FARTHEST)
-    base_y = min(max(np.floor(y), -FARTHEST), FARTHEST)
+    base_x = min(max(np.floor(x), -MAX_CENTER_OFFSET), MAX_CENTER_OFFSET)
+    base_y = min(max(np.floor(y), -MAX_CENTER_OFFSET), MAX_CENTER_OFFSET)
     bases[d, BASE_X], bases[d, BASE_Y] = np.int32(base_x), np.int32(base_y)
     splats[d, X], splats[d, Y] = x - base_x, y - base_y
     splats[d, A], splats[d, B] = a, b
@@ -136,7 +136,7 @@ def store_ellipse(splats, bases, d, ellipse, log_opacity, z):
     splats[d, LOG_OPACITY] = log_opacity
     splats[d, DEPTH] = z
     splats[d, DEPTH_REST] = z - float(np.float32(z))
-    splats[d, EXTENT_Y] = min(extent_y * (1 + 1e-6), FARTHEST)
+    splats[d, EXTENT_Y] = min(extent_y * (1 + 1e-6), MAX_CENTER_OFFSET)
 
 
 @inline

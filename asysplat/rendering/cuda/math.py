@@ -9,8 +9,8 @@ from types import FunctionType
 
 import triton.language as tl
 
-from asysplat.ops.cuda.kernel import kernel
-from asysplat.rendering import formulas, interface
+from asysplat.ops.triton_utils import kernel
+from asysplat.rendering import formulas, interface, sh
 
 RIGHT, DOWN = tl.constexpr(formulas.RIGHT), tl.constexpr(formulas.DOWN)
 FORWARD, CENTER = tl.constexpr(formulas.FORWARD), tl.constexpr(formulas.CENTER)
@@ -20,12 +20,12 @@ LOW_X, HIGH_X = tl.constexpr(formulas.LOW_X), tl.constexpr(formulas.HIGH_X)
 LOW_Y, HIGH_Y = tl.constexpr(formulas.LOW_Y), tl.constexpr(formulas.HIGH_Y)
 CAMERA = tl.constexpr(formulas.CAMERA)
 CAMERA_GRADIENT = tl.constexpr(formulas.CAMERA_GRADIENT)
-TINY = tl.constexpr(interface.TINY)
+MIN_SQUARED_DISTANCE = tl.constexpr(interface.MIN_SQUARED_DISTANCE)
 
-Y0, Y1 = tl.constexpr(formulas.Y0), tl.constexpr(formulas.Y1)
-Y2, Y2_0 = tl.constexpr(formulas.Y2), tl.constexpr(formulas.Y2_0)
-Y3_0, Y3_1 = tl.constexpr(formulas.Y3_0), tl.constexpr(formulas.Y3_1)
-Y3_2, Y3_3 = tl.constexpr(formulas.Y3_2), tl.constexpr(formulas.Y3_3)
+SH_C0, Y1 = tl.constexpr(sh.SH_C0), tl.constexpr(sh.Y1)
+Y2, Y2_0 = tl.constexpr(sh.Y2), tl.constexpr(sh.Y2_0)
+Y3_0, Y3_1 = tl.constexpr(sh.Y3_0), tl.constexpr(sh.Y3_1)
+Y3_2, Y3_3 = tl.constexpr(sh.Y3_2), tl.constexpr(sh.Y3_3)
 
 
 def shared(formula: Callable) -> Callable:
@@ -143,7 +143,7 @@ def whitening(xy, var_y, det):
 def direction(offset):
     """Return the square of an offset, its length, and its direction, in float32."""
     square = dot(offset, offset)
-    length = tl.sqrt(tl.maximum(square, TINY))
+    length = tl.sqrt(tl.maximum(square, MIN_SQUARED_DISTANCE))
     x, y, z = offset[0] / length, offset[1] / length, offset[2] / length
     return square, length, x.to(tl.float32), y.to(tl.float32), z.to(tl.float32)
 
@@ -154,7 +154,7 @@ def sh_basis(x, y, z, COUNT: tl.constexpr):
 
     Signs are those of INRIA's code.
     """
-    out = (tl.full(x.shape, Y0, tl.float32),)
+    out = (tl.full(x.shape, SH_C0, tl.float32),)
     if COUNT > 1:
         out = out + (y * -Y1, z * Y1, x * -Y1)
     if COUNT > 4:

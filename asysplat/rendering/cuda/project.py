@@ -2,7 +2,7 @@
 
 import triton.language as tl
 
-from asysplat.ops.cuda.kernel import kernel
+from asysplat.ops.triton_utils import kernel
 from asysplat.rendering import formulas, interface
 from asysplat.rendering.cuda.math import (
     CAMERA,
@@ -22,7 +22,7 @@ from asysplat.rendering.cuda.math import (
 )
 from asysplat.rendering.cuda.splat import store_splat
 
-LARGEST = tl.constexpr(interface.LARGEST)
+MAX_MAGNITUDE = tl.constexpr(interface.MAX_MAGNITUDE)
 WHITEN_TO_LOG2 = tl.constexpr(formulas.WHITEN_TO_LOG2)
 EXPONENT_MARGIN = tl.constexpr(formulas.EXPONENT_MARGIN)
 PIXEL_MARGIN = tl.constexpr(formulas.PIXEL_MARGIN)
@@ -95,7 +95,7 @@ def project(
     deviations = tl.sqrt(tl.maximum(room, 0.0)) / WHITEN_TO_LOG2
     extent_x, extent_y = deviations * tl.sqrt(xx + eps2d), deviations * tl.sqrt(yy + eps2d)
     # Every comparison with NaN is false.
-    shown = shown & (z > near) & (z < LARGEST) & (opacity >= alpha_min) & (a > 0)
+    shown = shown & (z > near) & (z < MAX_MAGNITUDE) & (opacity >= alpha_min) & (a > 0)
     shown = shown & (tl.abs(x + y + b + c) < float("inf"))
     edge = 0.5 - PIXEL_MARGIN
     inside = (x + extent_x >= edge) & (x - extent_x <= width - edge)
@@ -126,5 +126,5 @@ def colors(sh, g, offset, shown, COUNT: tl.constexpr):
     blue = tl.maximum(sum_sh(sh, g, 2, functions, shown, COUNT), 0.0)
     for k in tl.static_range(3 * COUNT):
         coefficient = tl.load(sh + 3 * COUNT * g + k, mask=shown, other=0.0)
-        shown = shown & (tl.abs(coefficient) < LARGEST)
+        shown = shown & (tl.abs(coefficient) < MAX_MAGNITUDE)
     return (red, green, blue), shown

@@ -4,7 +4,7 @@ import math
 
 import triton.language as tl
 
-from asysplat.ops.cuda.kernel import kernel
+from asysplat.ops.triton_utils import kernel
 from asysplat.rendering import formulas
 from asysplat.rendering.cuda.math import (
     CAMERA,
@@ -16,8 +16,8 @@ from asysplat.rendering.cuda.math import (
     FORWARD,
     FX,
     FY,
+    MIN_SQUARED_DISTANCE,
     RIGHT,
-    TINY,
     covariance,
     cross,
     direction,
@@ -308,7 +308,7 @@ def splat_backward(
         g_direction = (g_dx.to(tl.float64), g_dy.to(tl.float64), g_dz.to(tl.float64))
         g_offset = plus(g_offset, 1 / length, g_direction)
         radial = dot(offset, g_direction) / (length * length * length)
-        g_offset = plus(g_offset, tl.where(square > TINY, -radial, 0.0), offset)
+        g_offset = plus(g_offset, tl.where(square > MIN_SQUARED_DISTANCE, -radial, 0.0), offset)
 
     if CAMERAS_NEEDED:
         right_part = plus(scaled(g_u, offset), fx * inverse_z, g_row_x)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import triton.language as tl
 
-from asysplat.ops.cuda.kernel import kernel
+from asysplat.ops.triton_utils import kernel
 from asysplat.rendering import formulas
 
 # A splat [16] float32: alpha = 2^(log_opacity - (a dx + b dy)^2 - (c dy)^2), its center, rounded
@@ -18,7 +18,7 @@ GRADIENT = tl.constexpr(10)
 
 TILE = tl.constexpr(8)  # pixels a side
 HALF_TILE = tl.constexpr(4)
-FARTHEST = tl.constexpr(formulas.FARTHEST)
+MAX_CENTER_OFFSET = tl.constexpr(formulas.MAX_CENTER_OFFSET)
 
 
 class Frame(NamedTuple):
@@ -49,7 +49,7 @@ def rounded(value):
 @kernel
 def whole_pixels(value):
     """Round down, as float64."""
-    return tl.minimum(tl.maximum(tl.floor(value), -FARTHEST), FARTHEST)
+    return tl.minimum(tl.maximum(tl.floor(value), -MAX_CENTER_OFFSET), MAX_CENTER_OFFSET)
 
 
 @kernel
@@ -70,7 +70,7 @@ def store_splat(splats, d, ellipse, log_opacity, color, z, there):
     tl.store(splat + 7, (a - rounded(a)).to(tl.float32), mask=there)
     tl.store(splat + 8, (b - rounded(b)).to(tl.float32), mask=there)
     tl.store(splat + 9, log_opacity.to(tl.float32), mask=there)
-    tl.store(splat + 10, tl.minimum(extent_y, FARTHEST).to(tl.float32), mask=there)
+    tl.store(splat + 10, tl.minimum(extent_y, MAX_CENTER_OFFSET).to(tl.float32), mask=there)
     tl.store(splat + 11, red, mask=there)
     tl.store(splat + 12, green, mask=there)
     tl.store(splat + 13, blue, mask=there)

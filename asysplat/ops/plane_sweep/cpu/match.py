@@ -10,10 +10,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.ops.cpu.gathers import gather_squares
-from asysplat.ops.cpu.kernel import inline, kernel
-from asysplat.ops.cpu.threads import even_bounds, run_blocks
-from asysplat.ops.cpu.vectors import (
+from asysplat.ops.plane_sweep import reference
+from asysplat.ops.plane_sweep.cameras import FRONT as LEAST_FRONT
+from asysplat.ops.plane_sweep.cpu.patches import AROUND, describe_row, variance
+from asysplat.ops.plane_sweep.inputs import MatchInputs, prepare
+from asysplat.ops.plane_sweep.reference import BEST, WINDOW
+from asysplat.ops.simd.gathers import gather_squares
+from asysplat.ops.simd.kernel import inline, kernel
+from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.vectors import (
     LANES,
     ONE,
     ZERO,
@@ -27,11 +32,6 @@ from asysplat.ops.cpu.vectors import (
     where,
     zeros,
 )
-from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.cameras import FRONT as LEAST_FRONT
-from asysplat.ops.plane_sweep.cpu.patches import AROUND, describe_row, variance
-from asysplat.ops.plane_sweep.inputs import MatchInputs, prepare
-from asysplat.ops.plane_sweep.reference import BEST, WINDOW
 
 assert BEST == 2 and WINDOW == 5  # the least cost and the one after; sums of five columns
 KEPT = WINDOW + 1  # rows that two rows of patches take

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from asysplat.ops.cpu.kernel import inline
-from asysplat.ops.cpu.vectors import LANES, ZERO, fma, load_some, rsqrt, store_some, zeros
 from asysplat.ops.plane_sweep import reference
 from asysplat.ops.plane_sweep.reference import WINDOW
+from asysplat.ops.simd.kernel import inline
+from asysplat.ops.simd.vectors import LANES, ZERO, fma, load_some, rsqrt, store_some, zeros
 
 AROUND = WINDOW // 2
 COUNT = np.float32(WINDOW**2)  # pixels of a patch

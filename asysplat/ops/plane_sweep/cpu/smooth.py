@@ -5,9 +5,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.cpu.kernel import inline, kernel
-from asysplat.ops.cpu.threads import even_bounds, run_blocks
-from asysplat.ops.cpu.vectors import (
+from asysplat.ops.plane_sweep import reference
+from asysplat.ops.simd.kernel import inline, kernel
+from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.vectors import (
     LANES,
     ZERO,
     least,
@@ -18,7 +19,6 @@ from asysplat.ops.cpu.vectors import (
     where,
     zeros,
 )
-from asysplat.ops.plane_sweep import reference
 
 SMALL_STEP = np.float32(reference.SMALL_STEP)
 FLATTEST = np.float32(reference.FLATTEST)

@@ -7,10 +7,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.ops.cpu.gathers import gather_pairs
-from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.threads import even_bounds, run_blocks
-from asysplat.ops.cpu.vectors import (
+from asysplat.ops.plane_sweep import reference
+from asysplat.ops.plane_sweep.cameras import FRONT as LEAST_FRONT
+from asysplat.ops.simd.gathers import gather_pairs
+from asysplat.ops.simd.kernel import kernel
+from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.vectors import (
     LANES,
     ONE,
     ZERO,
@@ -21,8 +23,6 @@ from asysplat.ops.cpu.vectors import (
     where,
     zeros,
 )
-from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.cameras import FRONT as LEAST_FRONT
 
 HALF, FRONT = np.float32(0.5), np.float32(LEAST_FRONT)
 TOLERANCE = np.float32(reference.TOLERANCE)

@@ -9,10 +9,9 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.ops.cuda.kernel import kernel
-from asysplat.ops.cuda.scans import FUSED, INTERPRETED
 from asysplat.ops.plane_sweep import cameras, reference
 from asysplat.ops.plane_sweep.inputs import prepare
+from asysplat.ops.triton_utils import FUSED, INTERPRETED, kernel
 
 AROUND = tl.constexpr(reference.WINDOW // 2)
 KEPT = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch

@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
-from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.vectors import (
+from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
+from asysplat.ops.simd.kernel import kernel
+from asysplat.ops.simd.vectors import (
     LANES,
     ZERO,
     decay2,
@@ -17,7 +18,6 @@ from asysplat.ops.cpu.vectors import (
     total,
     zeros,
 )
-from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
 
 LN_2 = np.float32(math.log(2))
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch.nn.functional as F
 from torch import Tensor
 
-from asysplat.ops.cpu.vectors import LANES
+from asysplat.ops.simd.vectors import LANES
 
 CACHE_CHUNK = 32  # tokens: what is kept of each, CACHE_CHUNK x LANES, fits a core's nearest cache
 ROWS = (CACHE_CHUNK, LANES)

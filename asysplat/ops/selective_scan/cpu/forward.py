@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.vectors import LANES, ZERO, decay2, fma, load, load_some, store, store_some
 from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
+from asysplat.ops.simd.kernel import kernel
+from asysplat.ops.simd.vectors import LANES, ZERO, decay2, fma, load, load_some, store, store_some
 
 
 @kernel

@@ -6,8 +6,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.cpu.threads import even_bounds, run_blocks
-from asysplat.ops.cpu.vectors import LANES
 from asysplat.ops.scan import ScanInputs
 from asysplat.ops.selective_scan.cpu.backward import backward_blocks
 from asysplat.ops.selective_scan.cpu.chunk import (
@@ -18,6 +16,8 @@ from asysplat.ops.selective_scan.cpu.chunk import (
     by_channel,
 )
 from asysplat.ops.selective_scan.cpu.forward import forward_blocks
+from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.vectors import LANES
 
 LOG2_E = 1 / math.log(2)
 

@@ -2,8 +2,7 @@
 
 import triton.language as tl
 
-from asysplat.ops.cuda.kernel import kernel
-from asysplat.ops.cuda.scans import tokens_at
+from asysplat.ops.triton_utils import kernel, tokens_at
 
 
 @kernel

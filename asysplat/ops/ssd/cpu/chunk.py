@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.cpu.kernel import inline
-from asysplat.ops.cpu.vectors import LANES, ONE, ZERO, decay2, fma, load, total, zeros
+from asysplat.ops.simd.kernel import inline
+from asysplat.ops.simd.vectors import LANES, ONE, ZERO, decay2, fma, load, total, zeros
 
 
 class Decays(NamedTuple):

@@ -6,9 +6,9 @@ that has a row for each token. The columns beyond the head_dim stay 0.
 
 import numpy as np
 
-from asysplat.ops.cpu.kernel import kernel
-from asysplat.ops.cpu.products import add_product, add_triangle
-from asysplat.ops.cpu.vectors import ZERO, fma
+from asysplat.ops.simd.kernel import kernel
+from asysplat.ops.simd.products import add_product, add_triangle
+from asysplat.ops.simd.vectors import ZERO, fma
 from asysplat.ops.ssd.cpu.chunk import scale_rows, take_rows, weigh_scores
 
 

@@ -2,8 +2,7 @@
 
 import triton.language as tl
 
-from asysplat.ops.cuda.kernel import kernel
-from asysplat.ops.cuda.scans import INTERPRETED, tokens_at
+from asysplat.ops.triton_utils import INTERPRETED, kernel, tokens_at
 
 IN_INTERPRETER = tl.constexpr(INTERPRETED)
 # What a token needs, rows of [B, H, ROWS, positions], fp32: log decay since the chunk's start,

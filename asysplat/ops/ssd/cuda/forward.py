@@ -2,7 +2,6 @@
 
 import triton.language as tl
 
-from asysplat.ops.cuda.kernel import kernel
 from asysplat.ops.ssd.cuda.chunk import (
     SINCE,
     STEP,
@@ -15,6 +14,7 @@ from asysplat.ops.ssd.cuda.chunk import (
     square_at,
     state_at,
 )
+from asysplat.ops.triton_utils import kernel
 
 
 @kernel

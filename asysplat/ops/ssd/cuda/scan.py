@@ -7,12 +7,12 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.cuda.scans import FUSED, INTERPRETED, check_size
 from asysplat.ops.scan import ScanInputs
 from asysplat.ops.ssd.chunked import CHUNK
 from asysplat.ops.ssd.cuda.backward import head_gradients, projection_gradients, score_gradients
 from asysplat.ops.ssd.cuda.chunk import ROWS, sum_decays
 from asysplat.ops.ssd.cuda.forward import forward_chunk, pass_states, score_chunk
+from asysplat.ops.triton_utils import FUSED, INTERPRETED, check_size
 
 INTERPRETED_CHUNK = 16  # tokens: tests see several chunks, although the interpreter is slow
 TOKENS = INTERPRETED_CHUNK if INTERPRETED else CHUNK  # of a chunk
@@ -51,7 +51,7 @@ def forward(
         scores = _scores(sizes, B, C)
         states = _states(sizes, x, B, decays, gradient=False)
         forward_chunk[(sizes.chunks * sizes.heads, sizes.batch)](
-            x, C, D, decays, scores, states, y, **sizes.told(forward_chunk)
+            x, C, D, decays, scores, states, y, **sizes.launch_kwargs(forward_chunk)
         )
     return y, dt.new_empty(saved_state_shape(x, B))
 
@@ -89,21 +89,23 @@ def backward(
             grad_dt=grads.dt,
             grad_A=grads.A,
             grad_D=grads.D,
-            **sizes.told(head_gradients),
+            **sizes.launch_kwargs(head_gradients),
         )
         grad_scores = dt.new_empty(sizes.squares)
         score_gradients[(sizes.chunks, sizes.batch)](
-            grad_output, x, decays, grad_scores, **sizes.told(score_gradients)
+            grad_output, x, decays, grad_scores, **sizes.launch_kwargs(score_gradients)
         )
         gradients_of = projection_gradients[(sizes.blocks, sizes.chunks, sizes.batch)]
-        told = sizes.told(projection_gradients)
-        gradients_of(x, C, decays, grad_scores, grad_states, grads.B, OF_B=True, **told)
-        gradients_of(grad_output, B, decays, grad_scores, states, grads.C, OF_B=False, **told)
+        launch_kwargs = sizes.launch_kwargs(projection_gradients)
+        gradients_of(x, C, decays, grad_scores, grad_states, grads.B, OF_B=True, **launch_kwargs)
+        gradients_of(
+            grad_output, B, decays, grad_scores, states, grads.C, OF_B=False, **launch_kwargs
+        )
     return grads._replace(A=grads.A.sum((0, 1)), D=grads.D.sum((0, 1)))
 
 
 class _Sizes(NamedTuple):
-    """The sizes of a scan, as its kernels are told them."""
+    """The sizes of a scan, as its kernels are launch_kwargs them."""
 
     batch: int
     length: int
@@ -133,7 +135,7 @@ class _Sizes(NamedTuple):
     def blocks(self) -> int:
         return self.state // self.block
 
-    def told(self, kernel: Any) -> dict[str, Any]:
+    def launch_kwargs(self, kernel: Any) -> dict[str, Any]:
         """Return what a launch tells a kernel besides its arrays: the sizes it has names for."""
         sizes = {
             "length": self.length,
@@ -169,7 +171,7 @@ def _states(
     shape = (sizes.batch, sizes.chunks, sizes.heads, sizes.head_dim, sizes.state)
     states = decays.new_empty(shape)
     pass_states[(sizes.blocks, sizes.heads, sizes.batch)](
-        values, projections, decays, states, GRADIENT=gradient, **sizes.told(pass_states)
+        values, projections, decays, states, GRADIENT=gradient, **sizes.launch_kwargs(pass_states)
     )
     return states
 
@@ -177,5 +179,5 @@ def _states(
 def _scores(sizes: _Sizes, B: Tensor, C: Tensor) -> Float[Tensor, "B chunks t s"]:
     """Return what `score_chunk` writes."""
     scores = torch.empty(sizes.squares, dtype=torch.float32, device=B.device)
-    score_chunk[(sizes.chunks, sizes.batch)](B, C, scores, **sizes.told(score_chunk))
+    score_chunk[(sizes.chunks, sizes.batch)](B, C, scores, **sizes.launch_kwargs(score_chunk))
     return scores

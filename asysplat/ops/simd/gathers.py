@@ -6,7 +6,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from asysplat.ops.cpu.vectors import FLOATS, INTEGERS, LANES, VECTOR, check_range, lanes, splat
+from asysplat.ops.simd.vectors import FLOATS, INTEGERS, LANES, VECTOR, check_range, lanes, splat
 
 HALF = LANES // 2
 PAIR = ir.IntType(64)
