@@ -1,24 +1,24 @@
 .PHONY: demo quick test bench slow style format
 PYTHON ?= python3
 ENV := .venv/.ready
-# Two tests at a time, a thread each; who is done takes tests of the other.
+# Two worker processes of one thread each; an idle one takes tests from the other.
 PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist worksteal
 
-demo: $(ENV) ## train a small model on synthetic scenes, measure it, draw what it sees
+demo: $(ENV) ## train a small model on synthetic scenes, test it and draw its renderings
 	.venv/bin/python train.py name=demo
-	@echo "to go on with commands of your own: source .venv/bin/activate"
+	@echo "to run commands of your own: source .venv/bin/activate"
 
-quick: style ## style, and the tests that take seconds
+quick: style ## style, and the fast tests
 	$(PYTEST) -m "not medium and not slow"
 
-test: style ## style, and all tests but those of hours
+test: style ## style, and all tests except the slow ones
 	$(PYTEST)
 
-bench: $(ENV) ## did a change make anything slower: ratios within one process, against docs/results/bench.json
+bench: $(ENV) ## check for slowdowns: ratios within one process, against docs/results/bench.json
 	OMP_NUM_THREADS=1 .venv/bin/python benchmark.py suite=bench repeats=11 \
 		output=logs/bench compare=docs/results/bench.json
 
-slow: $(ENV) ## what takes an hour or two: long runs on real scenes, two processes for every model
+slow: $(ENV) ## tests of an hour or two: long runs on real scenes, two processes for every model
 	$(PYTEST) -m slow
 
 style: $(ENV)
