@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from asysplat.rendering.reference.math import sh_basis
+from asysplat.rendering.sh import sh_rotation
 from asysplat.scene import Gaussians
 
 
@@ -31,27 +31,6 @@ def transform(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
         quats=quats.to(gaussians.quats),
         sh=(matrix @ gaussians.sh.double()).to(gaussians.sh),
     )
-
-
-def sh_rotation(rotation: Float[Tensor, "3 3"], count: int) -> Float[Tensor, "{count} {count}"]:
-    """Return the matrix that rotates SH coefficients.
-
-    The color that `count` (1, 4, 9 or 16) coefficients give along d is the one that the rotated
-    coefficients give along R d. A rotated SH function is a sum of SH functions of its degree, so
-    its values in enough directions determine the matrix exactly.
-    """
-    directions = _around_the_sphere(2 * count).to(rotation)
-    before = sh_basis(directions @ rotation, count)  # along R^-1 d
-    return torch.linalg.pinv(sh_basis(directions, count)) @ before
-
-
-def _around_the_sphere(count: int) -> Float[Tensor, "{count} 3"]:
-    """Spread directions nearly evenly, on a Fibonacci spiral."""
-    index = torch.arange(count, dtype=torch.float64) + 0.5
-    z = 1 - 2 * index / count
-    angle = index * torch.pi * (1 + 5**0.5)
-    radius = (1 - z * z).sqrt()
-    return torch.stack((radius * angle.cos(), radius * angle.sin(), z), -1)
 
 
 def _quaternion_product(

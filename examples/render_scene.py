@@ -10,9 +10,8 @@ import torch
 
 from asysplat import Gaussians, Views, render
 from asysplat.data import ProceduralScene
-from asysplat.evaluation.figures import comparison
-
-SH_0 = 0.28209479177387814  # the constant SH basis function: color = 0.5 + SH_0 sh[0]
+from asysplat.evaluation.figures import comparison_figure
+from asysplat.rendering.sh import SH_C0
 
 
 def gaussians_of(views: Views) -> Gaussians:
@@ -29,7 +28,7 @@ def gaussians_of(views: Views) -> Gaussians:
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num, 1),
         scales=0.6 * pixel.reshape(num, 1).repeat(1, 3),
         opacities=torch.full((num,), 0.95),
-        sh=((colors - 0.5) / SH_0).reshape(num, 1, 3),
+        sh=((colors - 0.5) / SH_C0).reshape(num, 1, 3),
     )
 
 
@@ -37,7 +36,7 @@ def main(picture: Path) -> None:
     scene = ProceduralScene(seed=5, height=128, width=128)
     inputs, targets = scene.views([0, 12, 24]), scene.views([6, 18])
     rendering = render(gaussians_of(inputs), targets.cameras)
-    comparison(inputs, targets, rendering).savefig(picture, dpi=120)
+    comparison_figure(inputs, targets, rendering).savefig(picture, dpi=120)
     print(f"{rendering.stats['visible']:,} Gaussians seen; picture: {picture}")
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from asysplat.motion import sh_rotation, transform
-from asysplat.rendering.reference.math import sh_basis
+from asysplat.rendering.sh import sh_basis
 
 
 def motion(seed: int) -> torch.Tensor:

@@ -7,7 +7,7 @@ import torch
 
 from asysplat.errors import InputError
 from asysplat.export.checks import TINY, as_read, existing
-from asysplat.rendering.formulas import Y0
+from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Gaussians
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -37,6 +37,6 @@ def read_splat(path: str | Path) -> Gaussians:
         quats=(torch.tensor(rows["quat"], dtype=torch.float32) - 128) / 128,
         scales=torch.tensor(rows["scale"]).clamp_min(TINY),
         opacities=rgba[:, 3].clamp_min(TINY),
-        sh=(rgba[:, None, :3] - 0.5) / Y0,
+        sh=(rgba[:, None, :3] - 0.5) / SH_C0,
     )
     return as_read(path, gaussians)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from asysplat.models.prior import Prior
 from asysplat.ops.precision import without_autocast
+from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Cameras, Gaussians, Views
 
 # With a prior, corrections are bounded: on scenes unlike those of its training a network is wrong
@@ -23,7 +24,6 @@ SURE = 0.3  # times that where it is
 UNBOUNDED = 10.0  # in scenes of which it knows nothing
 MOST_OPACITY = 0.5
 MOST_SIZE = 1.0
-SH_C0 = 0.28209479177387814  # Y_0, so that color = 0.5 + SH_C0 * sh_0
 
 
 class GaussianHead(nn.Module, ABC):

@@ -24,17 +24,9 @@ WHITEN_TO_LOG2 = math.sqrt(0.5 / math.log(2))  # exp(-x^2 / 2) = 2^-(WHITEN_TO_L
 EXPONENT_MARGIN = 1e-3  # of log2 alpha
 PIXEL_MARGIN = 1e-3
 
-FARTHEST = 2.0**30  # pixels; a center farther outside the image is kept as an offset from here
-
-# Factors of the spherical harmonics (SH), by degree and order.
-Y0 = 0.5 / math.sqrt(math.pi)
-Y1 = math.sqrt(3 / (4 * math.pi))
-Y2 = 0.5 * math.sqrt(15 / math.pi)
-Y2_0 = 0.25 * math.sqrt(5 / math.pi)
-Y3_3 = 0.25 * math.sqrt(35 / (2 * math.pi))
-Y3_2 = 0.5 * math.sqrt(105 / math.pi)
-Y3_1 = 0.25 * math.sqrt(21 / (2 * math.pi))
-Y3_0 = 0.25 * math.sqrt(7 / math.pi)
+MAX_CENTER_OFFSET = (
+    2.0**30
+)  # pixels; a center farther outside the image is kept as an offset from here
 
 
 class Inputs(NamedTuple):

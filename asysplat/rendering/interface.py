@@ -9,10 +9,12 @@ from torch import Tensor
 from asysplat.errors import InputError
 
 DEPTHS = ("accumulated", "expected", "median")
-LARGEST = 1e18  # depths and SH coefficients beyond it are culled: their squares overflow float32
-TINY = 1e-20  # below the square of any distance that matters, and normal in float32
-MOST_PAIRS = 2**31 - 1  # of splat and tile: what int32 can number
-MOST_IN_TILE = 2**24  # what float32 can count
+MAX_MAGNITUDE = (
+    1e18  # depths and SH coefficients beyond it are culled: their squares overflow float32
+)
+MIN_SQUARED_DISTANCE = 1e-20  # below the square of any distance that matters, and normal in float32
+MAX_PAIRS = 2**31 - 1  # of splat and tile: what int32 can number
+MAX_SPLATS_PER_TILE = 2**24  # what float32 can count
 
 
 def single(value: float) -> float:
@@ -144,16 +146,16 @@ def check_pairs(pairs: int, longest: int = 0) -> None:
     """Raise InputError if a backend's lists cannot hold what they would have to.
 
     Args:
-        pairs: pairs of Gaussian and tile, of which a list can number MOST_PAIRS.
-        longest: Gaussians in the tile that has most, of which it can count MOST_IN_TILE.
+        pairs: pairs of Gaussian and tile, of which a list can number MAX_PAIRS.
+        longest: Gaussians in the tile that has most, of which it can count MAX_SPLATS_PER_TILE.
     """
-    if longest > MOST_IN_TILE:
+    if longest > MAX_SPLATS_PER_TILE:
         raise InputError(
-            f"render finds {longest} Gaussians in one tile and counts to {MOST_IN_TILE}: render "
-            "smaller Gaussians, or only those that are seen."
+            f"render finds {longest} Gaussians in one tile, and the limit is "
+            f"{MAX_SPLATS_PER_TILE}: render smaller Gaussians, or only the visible ones."
         )
-    if pairs > MOST_PAIRS:
+    if pairs > MAX_PAIRS:
         raise InputError(
-            f"render needs {pairs} pairs of Gaussian and tile, and its lists hold {MOST_PAIRS}: "
+            f"render needs {pairs} pairs of Gaussian and tile, and the limit is {MAX_PAIRS}: "
             "set views_at_once, or render smaller Gaussians."
         )

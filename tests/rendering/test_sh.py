@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from asysplat.rendering.reference.math import sh_basis, sh_colors
+from asysplat.rendering.sh import sh_basis, sh_colors
 
 
 def test_basis_is_orthonormal_on_the_sphere():

@@ -33,8 +33,8 @@ def photographs(scene: Path) -> Views:
     if scene.suffix == ".splat":
         return circle_around(read_splat(scene))
     sequence = open_scene(scene, SIDE, SIDE)
-    count = min(MOST_VIEWS, sequence.num_frames)
-    views = sequence.views(np.linspace(0, sequence.num_frames - 1, count).astype(int).tolist())
+    count = min(MOST_VIEWS, sequence.num_images)
+    views = sequence.views(np.linspace(0, sequence.num_images - 1, count).astype(int).tolist())
     return normalize(views, views)[0]
 
 

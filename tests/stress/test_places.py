@@ -7,7 +7,7 @@ import torch
 from backends import EXACT, assert_close, both_ways, facing, relative_error
 
 from asysplat.rendering import INRIA
-from asysplat.rendering.reference.math import sh_basis
+from asysplat.rendering.sh import sh_basis
 
 
 def test_case_10_no_direction_shows_the_dc_color(backend, make_scene):

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.rendering.interface import LARGEST, RenderSettings
-from asysplat.rendering.reference.math import rotations, sh_colors, whiten
+from asysplat.rendering.interface import MAX_MAGNITUDE, RenderSettings
+from asysplat.rendering.reference.math import rotations, whiten
+from asysplat.rendering.sh import sh_colors
 from asysplat.scene import Cameras, Gaussians
 
 BOUNDS_MARGIN = 1e-3  # pixels; more than the rounding of an extent
@@ -109,13 +110,13 @@ def find_visible(
     # Written so that NaN compares false.
     visible = (
         (footprint.depths > settings.convention.near)
-        & (footprint.depths < LARGEST)
+        & (footprint.depths < MAX_MAGNITUDE)
         & (opacities >= settings.convention.alpha_min)
         & (gaussians.opacities[:, None] <= 1)
         & (first <= last).all(-1)
         & footprint.whitening.isfinite().all(-1)
         & (footprint.whitening[..., 0] > 0)
-        & (gaussians.sh.abs() < LARGEST).flatten(2).all(-1)[:, None]
+        & (gaussians.sh.abs() < MAX_MAGNITUDE).flatten(2).all(-1)[:, None]
     ).flatten(0, 1)
     depths = footprint.depths.flatten(0, 1).where(visible, torch.inf)
     order = torch.argsort(depths, dim=-1, stable=True)
