@@ -176,7 +176,7 @@ def train_stage(
     results = {}
     if "costs" in callbacks:
         results |= callbacks["costs"].values
-    for name in ("metrics", "skipped"):
+    for name in ("metrics", "early_exit"):
         if name in callbacks:
             results |= callbacks[name].results
     if trainer.is_global_zero and logger is not None:

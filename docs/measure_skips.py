@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from asysplat.data.datamodule import collate, load
 from asysplat.data.sources import FilesSource
-from asysplat.evaluation.baselines import mean_color
+from asysplat.evaluation.baselines import mean_color_images
 from asysplat.evaluation.metrics import psnr
 from asysplat.files import atomic_write
 from asysplat.models.early_exit import EXACT, EarlyExit
@@ -91,7 +91,7 @@ def measure(net: Network, batches: list[Batch]) -> dict[str, Row]:
             clock, qualities, skipped = 0.0, [], []
             for batch in batches:
                 inputs, targets = batch["inputs"], batch["targets"]
-                background = mean_color(inputs, targets)[..., 0, 0]
+                background = mean_color_images(inputs, targets)[..., 0, 0]
                 clock -= time.process_time()
                 image = render(net(inputs), targets.cameras, background, depth=False).image
                 clock += time.process_time()

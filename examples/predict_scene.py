@@ -12,7 +12,7 @@ from hydra.utils import instantiate
 
 from asysplat import render
 from asysplat.data import ProceduralScene
-from asysplat.evaluation.figures import comparison
+from asysplat.evaluation.figures import comparison_figure
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 
@@ -33,7 +33,7 @@ def main(checkpoint: Path | None, picture: Path) -> None:
     inputs, targets = scene.views(range(0, 48, 6)), scene.views([9, 21, 33])
     gaussians = net(inputs)
     rendering = render(gaussians, targets.cameras, background=torch.full((3,), 0.5))
-    comparison(inputs, targets, rendering).savefig(picture, dpi=120)
+    comparison_figure(inputs, targets, rendering).savefig(picture, dpi=120)
     print(f"{gaussians.num_gaussians:,} Gaussians; picture: {picture}")
 
 

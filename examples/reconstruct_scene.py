@@ -12,7 +12,7 @@ import torch
 from asysplat import load, mean_color, open_photographs, refine, render, write_gaussians
 from asysplat.data import ProceduralScene
 from asysplat.data.write import write_transforms
-from asysplat.evaluation.figures import comparison
+from asysplat.evaluation.figures import comparison_figure
 
 
 def reconstruct(folder: Path, scene: Path, picture: Path) -> None:
@@ -24,7 +24,7 @@ def reconstruct(folder: Path, scene: Path, picture: Path) -> None:
 
     background = mean_color(photographs.inputs)
     rendering = render(gaussians, photographs.measured.cameras, background)
-    comparison(photographs.inputs, photographs.measured, rendering).savefig(picture, dpi=110)
+    comparison_figure(photographs.inputs, photographs.measured, rendering).savefig(picture, dpi=110)
     print(f"{gaussians.num_gaussians:,} Gaussians; scene: {scene}; picture: {picture}")
 
 

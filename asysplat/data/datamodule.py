@@ -200,7 +200,7 @@ class TrainingTasks(Dataset):
             # (seed, index, 0) gives what (seed, index) gives.
             rng = np.random.default_rng((self.seed, index, len(skipped)))
             try:
-                return self._sample(rng) | {"skipped": skipped}
+                return self._sample(rng) | {"bad_scenes": skipped}
             except (InputError, OSError) as error:
                 skipped.append(str(error).partition("\n")[0])
                 if len(skipped) == self.draws:
@@ -285,5 +285,5 @@ def collate(samples: list[Sample]) -> Sample:
         "scene": [sample["scene"] for sample in samples],
         "inputs": Views.stack([sample["inputs"] for sample in samples]),
         "targets": Views.stack([sample["targets"] for sample in samples]),
-        "skipped": [sentence for sample in samples for sentence in sample.get("skipped", ())],
+        "bad_scenes": [sentence for sample in samples for sentence in sample.get("bad_scenes", ())],
     }

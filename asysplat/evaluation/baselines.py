@@ -1,4 +1,4 @@
-"""Baselines without any training: read every PSNR beside theirs."""
+"""Baselines without any training, to compare every PSNR with."""
 
 import torch
 from jaxtyping import Float
@@ -7,22 +7,24 @@ from torch import Tensor
 from asysplat.scene import Cameras, Views
 
 
-def mean_color(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
+def mean_color_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
     """Fill every target with one color: the mean of all input pixels of its scene."""
     color = inputs.images.mean((-4, -2, -1))
     return color[..., None, :, None, None].expand_as(targets.images)
 
 
-def nearest_view(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
-    """Copy for every target the input view nearest to it; all images have one size.
+def nearest_view_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
+    """Copy the nearest input view for every target; all images have one size.
 
-    The nearest has the smallest distance / spread + angle / pi: the distance between the camera
+    The nearest view minimizes distance / spread + angle / pi: the distance between the camera
     centers, the spread (the largest distance between two input centers), and the angle between the
-    viewing directions.
-    Where all inputs share one center, the angle alone decides.
+    viewing directions. If all inputs share one center, the angle alone decides.
     """
     nearest = _dissimilarity(targets.cameras, inputs.cameras).argmin(-1)
     return inputs.images.take_along_dim(nearest[..., None, None, None], dim=-4)
+
+
+BASELINES = {"mean_color": mean_color_images, "nearest_view": nearest_view_images}
 
 
 def _dissimilarity(targets: Cameras, inputs: Cameras) -> Float[Tensor, "*batch Vt Vi"]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from asysplat.evaluation.baselines import nearest_view
+from asysplat.evaluation.baselines import nearest_view_images
 from asysplat.evaluation.metrics import psnr
 from asysplat.rendering import Rendering
 from asysplat.scene import Views
@@ -15,14 +15,14 @@ from asysplat.scene import Views
 ERROR_RANGE = 0.5  # the error that is shown brightest
 
 
-def comparison(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
+def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
     """Draw a row of images for each target view of one scene; no field has a batch dimension.
 
     Columns: the nearest input, the target, the rendering with its PSNR, the absolute error, the
     rendered inverse depth and, if the data has depths, the true one on the same scale. Pixels that
     a mask excludes are blank in the last three.
     """
-    nearest = nearest_view(inputs, targets)
+    nearest = nearest_view_images(inputs, targets)
     quality = psnr(targets.masked(rendering.image), targets.images)
     everywhere = torch.ones_like(targets.images[:, 0], dtype=torch.bool)
     counts = everywhere if targets.masks is None else targets.masks

@@ -1,4 +1,4 @@
-"""A scene before and after steps of the paper's post-optimization: its images and its costs."""
+"""Measure a scene before and after steps of the paper's post-optimization: images and costs."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from lpips import LPIPS
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.evaluation.baselines import mean_color, nearest_view
+from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.rows import ImageRow
@@ -29,23 +29,23 @@ Watch = Callable[[int, Rendering | None], None]
 
 @dataclass
 class SceneResult:
-    """What was measured of one scene.
+    """The measurements of one scene.
 
     Args:
         scene: its name.
-        gaussians: how many there are.
-        costs: "post<steps>" -> the seconds of the prediction and so many steps together and, where
-            it can be measured, their peak memory, gb.
-        rows: one for each image, with `images` (targets or inputs), `view`, `source` (what drew it:
-            post<steps>, nearest_view or mean_color) and its metrics.
-        skipped: the shares that its prediction left out, see `Network`.
+        gaussians: their number.
+        costs: "post<steps>" -> the seconds of the prediction and that many steps together and,
+            where it can be measured, their peak memory, gb.
+        rows: one for each image, with `images` (targets or inputs), `view`, `source` (post<steps>
+            or a baseline) and its metrics.
+        early_exit: the shares that the network's early exit left out, see `Network`.
     """
 
     scene: str
     gaussians: int = 0
     costs: dict[str, dict[str, float]] = field(default_factory=dict)
     rows: list[ImageRow] = field(default_factory=list)
-    skipped: dict[str, float] = field(default_factory=dict)
+    early_exit: dict[str, float] = field(default_factory=dict)
 
     def add(self, images: str, source: str, values: dict[str, Float[Tensor, "V"]]) -> None:
         """Add a row for each view; `values` has one or more metrics."""
@@ -56,19 +56,19 @@ class SceneResult:
 
 @dataclass(frozen=True)
 class PostOptimization:
-    """Post-optimizes scenes as the paper does (Suppl. A) and measures them on the way.
+    """Runs the paper's post-optimization (Suppl. A) on scenes and measures them at given steps.
 
-    The input views are rendered from the predicted Gaussians; their mean squared error moves means
-    and SH, all views in each step.
+    The input views are rendered from the predicted Gaussians; their mean squared error optimizes
+    means and SH, all views in each step.
 
     Args:
         steps: after which to measure, increasing; 0: as predicted.
-        protocol: how images are measured.
+        protocol: of the metrics.
         lpips: as for `Protocol.image_metrics`.
         background: RGB in [0, 1] behind the Gaussians; None: the mean color of the inputs.
 
     Raises:
-        InputError: steps that are not whole numbers from 0 on, each above the one before.
+        InputError: `steps` are not increasing whole numbers from 0 on.
     """
 
     steps: Sequence[int]
@@ -77,8 +77,8 @@ class PostOptimization:
     background: Float[Tensor, "3"] | None = None
 
     def __post_init__(self):
-        whole = all(type(step) is int and step >= 0 for step in self.steps)
-        if not self.steps or not whole or list(self.steps) != sorted(set(self.steps)):
+        valid = all(type(step) is int and step >= 0 for step in self.steps)
+        if not self.steps or not valid or list(self.steps) != sorted(set(self.steps)):
             raise InputError(
                 f"steps={self.steps}: give whole numbers from 0 on, each above the one before, "
                 "such as [0,3,10]."
@@ -92,22 +92,22 @@ class PostOptimization:
         targets: Views,
         watch: Watch = lambda step, rendering: None,
     ) -> SceneResult:
-        """Measure one scene; its costs leave out what measuring takes.
+        """Measure one scene; the costs do not include the metrics.
 
         Args:
             scene: its name.
             predict: the input views -> [N] Gaussians in their frame.
             inputs, targets: the scene's views, without a batch dimension.
-            watch: called after each step, and where the scene is measured: with the number of
-                steps, and there with the rendering of the targets.
+            watch: called after each step with the number of steps and, at the steps to measure, the
+                rendering of the targets.
         """
         background = self.background
         if background is None:
             background = inputs.images.mean((0, 2, 3))
         result = SceneResult(scene)
-        for source in (nearest_view, mean_color):
-            metrics = self.protocol.image_metrics(source(inputs, targets), targets, self.lpips)
-            result.add("targets", source.__name__, metrics)
+        for source, baseline in BASELINES.items():
+            metrics = self.protocol.image_metrics(baseline(inputs, targets), targets, self.lpips)
+            result.add("targets", source, metrics)
         meter = CostMeter(inputs.images.device)
 
         def measure(step: int, gaussians: Gaussians) -> None:
@@ -116,17 +116,17 @@ class PostOptimization:
             result.costs[source] = {"seconds": sum(meter.seconds)}
             if meter.gb:
                 result.costs[source]["gb"] = max(meter.gb)
-            rendering = _draw(gaussians, targets, background)
+            rendering = _render(gaussians, targets, background)
             metrics = self.protocol.image_metrics(rendering.image, targets, self.lpips)
             metrics |= self.protocol.depth_metrics(rendering.depth, targets)
             result.add("targets", source, metrics)
-            shown = _draw(gaussians, inputs, background).image
-            result.add("inputs", source, {"psnr": self.protocol.psnr(shown, inputs)})
+            images = _render(gaussians, inputs, background).image
+            result.add("inputs", source, {"psnr": self.protocol.psnr(images, inputs)})
             result.gaussians = gaussians.num_gaussians
             watch(step, rendering)
             meter.start()
 
-        def look(progress: RefinementProgress, refinement: Refinement) -> bool:
+        def after_step(progress: RefinementProgress, refinement: Refinement) -> bool:
             if progress.step in self.steps:
                 measure(progress.step, refinement.gaussians)
             else:
@@ -137,18 +137,12 @@ class PostOptimization:
         gaussians = predict(inputs)
         if 0 in self.steps:
             measure(0, gaussians)
-        if self.steps[-1] > 0:
-            refine(
-                gaussians,
-                inputs,
-                PAPER,
-                steps=self.steps[-1],
-                background=background,
-                watch=look,
-            )
+        steps = self.steps[-1]
+        if steps > 0:
+            refine(gaussians, inputs, PAPER, steps=steps, background=background, watch=after_step)
         return result
 
 
 @torch.no_grad()
-def _draw(gaussians: Gaussians, views: Views, background: Float[Tensor, "3"]) -> Rendering:
+def _render(gaussians: Gaussians, views: Views, background: Float[Tensor, "3"]) -> Rendering:
     return render(gaussians, views.cameras, background, masks=views.masks)

@@ -69,7 +69,7 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
         rows = image_rows({test_set: results})
         costs = "cost" if test_set == main else f"cost/{test_set}"
         found[f"{costs}/gaussians"] = sum(r.gaussians for r in results) / len(results)
-        for name, share in average([dict(r.skipped) for r in results], "images").items():
+        for name, share in average([dict(r.early_exit) for r in results], "images").items():
             found[f"skip/{test_set}/{name}"] = share
         for source in dict.fromkeys(row["source"] for row in rows):
             kind = "test" if source in results[0].costs else "baseline"

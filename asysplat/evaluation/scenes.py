@@ -7,7 +7,7 @@ import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from torch.utils.data import Dataset
 
-from asysplat.evaluation.figures import comparison
+from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.post_optimization import PostOptimization, Predict, SceneResult
 from asysplat.evaluation.scene_results import load_result, save_result, scene_rows
 from asysplat.files import atomic_write
@@ -30,14 +30,14 @@ def measure_scenes(
             `inputs` and `targets`.
         predict, measure: see `PostOptimization`.
         device: where to work.
-        folder: for pictures/evaluation-post<steps>.png: the first scene at the first and the last
+        folder: for figures/evaluation-post<steps>.png: the first scene at the first and the last
             of the steps.
         kept: the folder that has the results of scenes, and to which more are added.
         skipped: the shares that the last prediction left out, see `Network`.
     """
     kept.mkdir(parents=True, exist_ok=True)
-    (folder / "pictures").mkdir(exist_ok=True)
-    drawn = {step: folder / "pictures" / f"evaluation-post{step}.png" for step in measure.steps}
+    (folder / "figures").mkdir(exist_ok=True)
+    drawn = {step: folder / "figures" / f"evaluation-post{step}.png" for step in measure.steps}
     main, last = next(iter(tests)), measure.steps[-1]
     columns = (TextColumn("{task.description:8}"), BarColumn(bar_width=20), MofNCompleteColumn())
     with Progress(*columns, TimeElapsedColumn()) as bars:
@@ -52,10 +52,10 @@ def measure_scenes(
                 bars.update(steps, completed=step)
                 if (name, index) == (main, 0) and step in (measure.steps[0], last):
                     with atomic_write(drawn[step]) as partial:
-                        comparison(inputs, targets, rendering).savefig(partial, dpi=100)
+                        comparison_figure(inputs, targets, rendering).savefig(partial, dpi=100)
 
             result = measure(sample["scene"], predict, inputs, targets, watch)
-            result.skipped.update(skipped)
+            result.early_exit.update(skipped)
             bars.console.print(_told(name, result), soft_wrap=True, highlight=False)
             return result
 

@@ -15,9 +15,9 @@ from rich.table import Table
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.evaluation.baselines import mean_color as mean_color_images
-from asysplat.evaluation.baselines import nearest_view
-from asysplat.evaluation.figures import comparison
+from asysplat.evaluation.baselines import mean_color_images
+from asysplat.evaluation.baselines import nearest_view_images
+from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.scene import measure_scene
 from asysplat.export.orbit import orbit
@@ -133,7 +133,7 @@ class Results:
     def _baselines(self, inputs: Views, measured: Views) -> dict[str, float]:
         """Measure what one gets without a reconstruction."""
         drawn = {
-            "nearest_view": nearest_view(inputs, measured),
+            "nearest_view": nearest_view_images(inputs, measured),
             "mean_color": mean_color_images(inputs, measured),
         }
         found: dict[str, list[float]] = {}
@@ -178,7 +178,7 @@ def contact_sheet(
         depth=torch.cat([out.depth for out in outs]),
         stats={},
     )
-    return comparison(photographs.inputs, views, rendering)
+    return comparison_figure(photographs.inputs, views, rendering)
 
 
 def _mean(values: list[float]) -> float:

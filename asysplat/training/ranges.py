@@ -31,7 +31,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
             *("steps", "validate_every", "state_size"),
             *("data.inputs", "data.targets", "data.height", "data.width", "data.batch_size"),
             *("data.val_scenes", "data.test_scenes", "data.micro_batch", "trainer.num_nodes"),
-            *("callbacks.guard.budget", "callbacks.monitor.every"),
+            *("callbacks.non_finite_steps.budget", "callbacks.monitor.every"),
         ),
     ),
     (

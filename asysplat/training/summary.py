@@ -129,7 +129,7 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
         console.print(psnr_table(results, others))
     if costs := cost_sentence(results):
         console.print(costs, soft_wrap=True)
-    for picture in sorted((folder / "pictures").glob("test-*.png")):
+    for picture in sorted((folder / "figures").glob("test-*.png")):
         console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"run: {folder}", soft_wrap=True)
 
@@ -146,6 +146,6 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
     for name in sets:
         costs = "cost" if name == sets[0] else f"cost/{name}"
         console.print(post_optimization_table(results, name, costs))
-    for picture in sorted((folder / "pictures").glob("evaluation-*.png")):
+    for picture in sorted((folder / "figures").glob("evaluation-*.png")):
         console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"evaluation: {folder}", soft_wrap=True)

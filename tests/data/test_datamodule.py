@@ -365,12 +365,12 @@ def test_another_scene_is_drawn_in_place_of_one_that_cannot_be_read(folders):
 
     tasks = TrainingTasks(files_data(**options, on_bad_scene="skip"))
     samples = [tasks[index] for index in range(20)]
-    skipped = [len(sample["skipped"]) for sample in samples]
+    skipped = [len(sample["bad_scenes"]) for sample in samples]
     assert {"4"}.isdisjoint(sample["scene"] for sample in samples)
     assert 0 in skipped and sum(skipped) >= 5
-    assert all("train/4: 24 of 24" in each for sample in samples for each in sample["skipped"])
+    assert all("train/4: 24 of 24" in each for sample in samples for each in sample["bad_scenes"])
     batch = collate(samples)
-    assert len(batch["skipped"]) == sum(skipped)
+    assert len(batch["bad_scenes"]) == sum(skipped)
     again = files_data(**options, on_bad_scene="skip")
     for index, sample in enumerate(samples):
         assert torch.equal(TrainingTasks(again)[index]["inputs"].images, sample["inputs"].images)

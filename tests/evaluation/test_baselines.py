@@ -2,7 +2,7 @@ import math
 
 import torch
 
-from asysplat.evaluation.baselines import mean_color, nearest_view
+from asysplat.evaluation.baselines import mean_color_images, nearest_view_images
 from asysplat.scene import Cameras, Views
 
 
@@ -23,7 +23,7 @@ def make_views(positions, yaws_in_degrees, images=None):
 
 
 def chosen(inputs, targets):
-    return (nearest_view(inputs, targets)[..., 0, 0, 0] * 10).round().int().tolist()
+    return (nearest_view_images(inputs, targets)[..., 0, 0, 0] * 10).round().int().tolist()
 
 
 def test_mean_color_is_of_all_inputs_of_the_scene():
@@ -33,7 +33,7 @@ def test_mean_color_is_of_all_inputs_of_the_scene():
     b = make_views([[0, 0, 0], [1, 0, 0]], [0, 0])
     inputs = Views.stack([a, b])
     targets = Views.stack([make_views([[0, 0, 0]] * 3, [0] * 3)] * 2)
-    found = mean_color(inputs, targets)
+    found = mean_color_images(inputs, targets)
     assert found.shape == (2, 3, 3, 2, 3)
     expected = torch.tensor([[0.5, 0.25, 0.0], [0.05, 0.05, 0.05]])
     torch.testing.assert_close(found, expected[:, None, :, None, None].expand_as(found))
@@ -68,6 +68,6 @@ def test_batched_choice_equals_scene_by_scene():
         return views, Views.stack(views)
 
     (inputs, stacked_inputs), (targets, stacked_targets) = scenes(5), scenes(3)
-    together = nearest_view(stacked_inputs, stacked_targets)
+    together = nearest_view_images(stacked_inputs, stacked_targets)
     for scene in range(4):
-        assert torch.equal(together[scene], nearest_view(inputs[scene], targets[scene]))
+        assert torch.equal(together[scene], nearest_view_images(inputs[scene], targets[scene]))

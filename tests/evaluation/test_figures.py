@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from asysplat import Cameras, Views
-from asysplat.evaluation.figures import comparison, disparity, learning_curve
+from asysplat.evaluation.figures import comparison_figure, disparity, learning_curve
 from asysplat.rendering import Rendering
 
 
@@ -25,7 +25,7 @@ def test_no_depth_is_shown_as_far_away():
 def test_a_row_for_each_view_and_true_depth_where_known():
     for depths, columns in ((True, 6), (False, 5)):
         views, rendering = scene(depths)
-        axes = comparison(views, views, rendering).axes
+        axes = comparison_figure(views, views, rendering).axes
         assert len(axes) == 2 * columns
         assert axes[2].get_xlabel() == "100.0 dB"
 
@@ -37,7 +37,7 @@ def test_masked_pixels_are_blank_and_no_part_of_the_colors_range():
     depths = torch.where(masks, 2.0, 0.01)  # what is masked would be the brightest by far
     image = torch.where(masks[:, None], rendering.image, 0)
     rendering = replace(rendering, image=image, depth=torch.where(masks, 2.0, 0.0))
-    figure = comparison(views, replace(views, depths=depths, masks=masks), rendering)
+    figure = comparison_figure(views, replace(views, depths=depths, masks=masks), rendering)
     for row in (figure.axes[:6], figure.axes[6:]):
         assert row[2].get_xlabel() == "100.0 dB"
         for axis, value in zip(row[3:], (0.0, 0.5, 0.5), strict=True):
@@ -50,7 +50,7 @@ def test_masked_pixels_are_blank_and_no_part_of_the_colors_range():
 def test_a_view_that_is_masked_as_a_whole_can_be_drawn():
     views, rendering = scene()
     views = replace(views, masks=torch.zeros(2, 16, 16, dtype=torch.bool))
-    comparison(views, views, rendering).canvas.draw()
+    comparison_figure(views, views, rendering).canvas.draw()
 
 
 def test_curve_shows_every_validation():

@@ -1,4 +1,4 @@
-"""Scenes that cannot be read are named once, counted, and too many end the run."""
+"""Errors of bad scenes are printed once and counted; too many end the run."""
 
 import lightning
 import pytest
@@ -21,7 +21,7 @@ class Module(lightning.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def fit(skipped, folder, **options):
+def fit(bad_scenes, folder, **options):
     counter = BadScenes(**options)
     trainer = lightning.Trainer(
         accelerator="cpu",
@@ -33,25 +33,25 @@ def fit(skipped, folder, **options):
         enable_model_summary=False,
         default_root_dir=folder,
     )
-    batches = [{"skipped": sentences} for sentences in skipped]
+    batches = [{"bad_scenes": errors} for errors in bad_scenes]
     trainer.fit(Module(), DataLoader(batches, batch_size=None))
     return trainer.callback_metrics, counter
 
 
-def test_each_trouble_is_told_once_and_all_are_counted(tmp_path, capsys):
+def test_each_error_is_printed_once_and_all_scenes_are_counted(tmp_path, capsys):
     logged, counter = fit([["a is cut short"], [], ["b", "a is cut short"]], tmp_path)
-    assert logged["train/skipped_scenes"] == 3
-    said = capsys.readouterr().out
-    assert said == (
-        "step 1: another scene in place of one: a is cut short\n"
-        "step 3: another scene in place of one: b\n"
+    assert logged["train/bad_scenes"] == 3
+    output = capsys.readouterr().out
+    assert output == (
+        "step 1: a bad scene is replaced by another: a is cut short\n"
+        "step 3: a bad scene is replaced by another: b\n"
     )
     again = BadScenes()
     again.load_state_dict(counter.state_dict())
-    assert (again.skipped, again.troubles) == (3, ["a is cut short", "b"])
+    assert (again.count, again.errors) == (3, ["a is cut short", "b"])
 
 
-def test_the_budget(tmp_path):
+def test_budget(tmp_path):
     fit([["a", "b"], ["b"]], tmp_path, budget=2)
     with pytest.raises(InputError, match=r"^more than 2 training scenes .*:\n  a\n  b\n  c$"):
         fit([["a", "b"], ["b", "c"]], tmp_path, budget=2)

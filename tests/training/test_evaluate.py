@@ -81,7 +81,7 @@ def test_a_run_has_its_evaluation_beside_its_results(whole, evaluated):
         )
     assert evaluated["cost/post0/seconds"] < evaluated["cost/post10/seconds"]
     assert {"post0", "post10"} == {
-        path.stem.partition("-")[2] for path in (whole / "pictures").glob("evaluation-*.png")
+        path.stem.partition("-")[2] for path in (whole / "figures").glob("evaluation-*.png")
     }
 
 

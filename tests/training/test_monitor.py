@@ -42,15 +42,15 @@ class Run:
 
     def __init__(self, clock, every, accumulate=1):
         self.clock, self.accumulate, self.logged = clock, accumulate, {}
-        self.watch = TrainingMonitor(every)
-        self.watch.flops, self.watch.peak = 6e9, None
-        self.watch.first_step, self.watch.begun_at = 0, None
+        self.monitor = TrainingMonitor(every)
+        self.monitor.flops, self.monitor.peak = 6e9, None
+        self.monitor.first_step, self.monitor.begin_step = 0, None
         logger = SimpleNamespace(log_metrics=self.log)
         self.trainer = SimpleNamespace(global_step=0, world_size=2, loggers=[logger])
         self.module = SimpleNamespace(parts=Parts(), device=CPU, net=nn.ModuleDict())
         views = [SimpleNamespace(num_views=count) for count in (3, 2)]
         self.batch = {"scene": ["a", "b"], "inputs": views[0], "targets": views[1]}
-        self.watch.on_train_epoch_start()
+        self.monitor.on_train_epoch_start()
 
     def log(self, numbers, step):
         self.logged.setdefault(step, {}).update(numbers)
@@ -59,18 +59,18 @@ class Run:
         hooks = (self.trainer, self.module)
         for batch in range(self.accumulate):
             self.clock.wait(data)
-            self.watch.on_train_batch_start(*hooks, self.batch, batch)
+            self.monitor.on_train_batch_start(*hooks, self.batch, batch)
             self.clock.wait(rest)
             with self.module.parts("network"):
                 self.clock.wait(network)
-            self.watch.on_before_backward(*hooks, None)
+            self.monitor.on_before_backward(*hooks, None)
             self.clock.wait(backward)
-            self.watch.on_after_backward(*hooks)
+            self.monitor.on_after_backward(*hooks)
             if batch == self.accumulate - 1:
-                self.watch.on_before_optimizer_step(*hooks, None)
+                self.monitor.on_before_optimizer_step(*hooks, None)
                 self.clock.wait(optimizer)
                 self.trainer.global_step += 1
-            self.watch.on_train_batch_end(*hooks, None, self.batch, batch)
+            self.monitor.on_train_batch_end(*hooks, None, self.batch, batch)
 
 
 def test_shares_and_speed_of_every_so_many_steps(clock):
@@ -79,7 +79,7 @@ def test_shares_and_speed_of_every_so_many_steps(clock):
     run.step()
     run.step(network=14)
     clock.wait(1000)  # a validation
-    run.watch.on_train_epoch_start()
+    run.monitor.on_train_epoch_start()
     for _ in range(3):
         run.step()
     assert run.logged.keys() == {2, 5}
@@ -92,14 +92,14 @@ def test_shares_and_speed_of_every_so_many_steps(clock):
     for part in (*parts.PARTS, "other"):
         assert first[f"time/share_{part}"] == pytest.approx(expected.get(part, 0) / 20)
     assert "time/mfu" not in first and first["memory/peak_gb"] > 0
-    said = sentence(second)
-    assert "took 10 s, 2 views/s: data 10%, prior 0%, network 40%" in said
-    assert "MFU not measured" in said
+    text = sentence(second)
+    assert "took 10 s, 2 views/s: data 10%, prior 0%, network 40%" in text
+    assert "MFU not measured" in text
 
 
 def test_a_step_of_several_batches(clock):
     run = Run(clock, every=2, accumulate=2)
-    run.watch.peak = 12e9
+    run.monitor.peak = 12e9
     for _ in range(4):
         run.step()
     found = run.logged[3]

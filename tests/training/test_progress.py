@@ -60,21 +60,21 @@ def lines(text):
 
 def test_without_a_terminal_a_line_after_each_validation(tmp_path, capsys):
     fit(tmp_path, 6)
-    said = lines(capsys.readouterr().out)
-    assert [line.partition(" left")[0].rpartition(",")[0] for line in said] == [
+    output = lines(capsys.readouterr().out)
+    assert [line.partition(" left")[0].rpartition(",")[0] for line in output] == [
         "step 2 of 6",
         "step 4 of 6",
         "step 6 of 6",
     ]
-    assert all(line.endswith("left: PSNR 20.0, validation 18.5") for line in said)
+    assert all(line.endswith("left: PSNR 20.0, validation 18.5") for line in output)
 
 
 def test_in_between_a_line_when_a_minute_and_a_share_have_passed(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(progress, "LINE_SECONDS", 0)
     monkeypatch.setattr(progress, "LINE_SHARE", 0.5)
     fit(tmp_path, 2)
-    said = lines(capsys.readouterr().out)
-    steps = [line.split(",")[0].split(":")[0] for line in said]
+    output = lines(capsys.readouterr().out)
+    steps = [line.split(",")[0].split(":")[0] for line in output]
     assert steps == ["step 1 of 2", "step 2 of 2", "step 2 of 2"]  # the last after the validation
 
 
@@ -82,8 +82,8 @@ def test_a_resumed_run_starts_at_its_step(tmp_path, capsys):
     fit(tmp_path, 4)
     capsys.readouterr()
     fit(tmp_path, 8, checkpoint=tmp_path / "last.ckpt")
-    said = lines(capsys.readouterr().out)
-    assert [line.split(",")[0] for line in said] == ["step 6 of 8", "step 8 of 8"]
+    output = lines(capsys.readouterr().out)
+    assert [line.split(",")[0] for line in output] == ["step 6 of 8", "step 8 of 8"]
 
 
 @pytest.fixture

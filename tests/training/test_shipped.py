@@ -12,7 +12,7 @@ from hydra.utils import instantiate
 
 from asysplat.data.datamodule import collate, load
 from asysplat.data.sources import FilesSource
-from asysplat.evaluation.baselines import mean_color, nearest_view
+from asysplat.evaluation.baselines import mean_color_images, nearest_view_images
 from asysplat.evaluation.lpips import load_lpips, lpips_distance
 from asysplat.evaluation.metrics import psnr
 from asysplat.training.checkpoints import SHIPPED, load_weights
@@ -42,7 +42,7 @@ def measure(module, lpips, batch):
     inputs, targets = batch["inputs"], batch["targets"]
     with torch.no_grad():
         image = module.reconstruct(batch, depth=False).rendering.image.clamp(0, 1)
-    drawn = (image, nearest_view(inputs, targets), mean_color(inputs, targets))
+    drawn = (image, nearest_view_images(inputs, targets), mean_color_images(inputs, targets))
     return [
         (
             psnr(each, targets.images).mean().item(),

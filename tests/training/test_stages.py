@@ -118,7 +118,7 @@ TINY += [*SCENES, "data.targets=2", "data.num_workers=0", "data.test_sets=null"]
 TINY += [f"stages.{name}.height=32" for name in NAMES]
 TINY += [f"stages.{name}.width={width}" for name, width in zip(NAMES, (32, 48, 64), strict=True)]
 TINY += ["stages.stage3.learning_rate=1e-12"]
-TINY += [f"callbacks.{name}=null" for name in ("costs", "pictures", "curve")]
+TINY += [f"callbacks.{name}=null" for name in ("costs", "figures", "curve")]
 PREFIXES = ("stage1/", "stage2/", "")  # of folders and results
 
 

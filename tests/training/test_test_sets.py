@@ -105,7 +105,7 @@ def test_a_set_has_costs_of_its_own(together):
 
 def test_only_the_main_set_is_drawn(measure, together):
     _, alone = measure("data.test_sets=null")
-    (drawn,), (expected,) = ((at / "pictures").iterdir() for at in (together[1], alone))
+    (drawn,), (expected,) = ((at / "figures").iterdir() for at in (together[1], alone))
     assert drawn.name == "test-0.png" and drawn.read_bytes() == expected.read_bytes()
 
 

@@ -63,10 +63,10 @@ def test_a_run_leaves_what_is_promised(whole):
 
     assert yaml.safe_load((folder / "config.yaml").read_text())["steps"] == 6
     assert {"best.ckpt", "last.ckpt"} <= {p.name for p in (folder / "checkpoints").iterdir()}
-    assert (folder / "pictures" / "test-0.png").stat().st_size > 10_000
+    assert (folder / "figures" / "test-0.png").stat().st_size > 10_000
     with (folder / "curve.csv").open() as file:
         assert [row["step"] for row in csv.DictReader(file)] == ["2", "4", "6"]
-    assert (folder / "pictures" / "curve.png").stat().st_size > 5_000
+    assert (folder / "figures" / "curve.png").stat().st_size > 5_000
     check_tensorboard(folder / "tensorboard", numbers)
 
 
@@ -119,7 +119,7 @@ def test_a_protocol_by_name(train, shared):
 
 
 LEFT_OUT = [
-    ["~callbacks.metrics", "~callbacks.guard", "callbacks.figures=null"],
+    ["~callbacks.metrics", "~callbacks.non_finite_steps", "callbacks.figures=null"],
     [
         *("~callbacks.costs", "~callbacks.curve", "~callbacks.checkpoints"),
         *("~callbacks.progress", "~callbacks.monitor"),
@@ -142,7 +142,7 @@ def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, mo
     left = {
         "metrics": ("test/procedural/psnr" in numbers, (folder / "metrics.csv").exists()),
         "costs": ("cost/parameters" in numbers, "Gaussians a scene" in result.stdout),
-        "pictures": ((folder / "pictures" / "test-0.png").exists(),),
+        "figures": ((folder / "figures" / "test-0.png").exists(),),
         # The curve is drawn from what metrics measure.
         "curve": ((folder / "curve.csv").exists() or "metrics" in names,),
         "checkpoints": (

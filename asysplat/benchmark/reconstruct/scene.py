@@ -8,8 +8,8 @@ from lpips import LPIPS
 
 from asysplat.benchmark.render.run import Backend, prepare, run
 from asysplat.benchmark.timing import Measurement, Result, seconds_of, time_in_rounds
-from asysplat.evaluation.baselines import mean_color as mean_color_images
-from asysplat.evaluation.baselines import nearest_view
+from asysplat.evaluation.baselines import mean_color_images
+from asysplat.evaluation.baselines import nearest_view_images
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.scene import measure_scene
 from asysplat.models.network import Network
@@ -26,7 +26,7 @@ from asysplat.rendering import Culling
 from asysplat.scene import Gaussians, Views
 
 NEAREST = "nearest view"
-FOR_NOTHING = {NEAREST: nearest_view, "mean color": mean_color_images}
+FOR_NOTHING = {NEAREST: nearest_view_images, "mean color": mean_color_images}
 SEED = 0
 FIRST_LOOK, LATER = (
     1.0,

@@ -1,4 +1,4 @@
-"""Callbacks: what is measured and drawn, what may go wrong, checkpoints, progress."""
+"""Callbacks: metrics, costs, figures, bad scenes, non-finite steps, checkpoints, progress."""
 
 from asysplat.training.callbacks.bad_scenes import BadScenes
 from asysplat.training.callbacks.checkpoints import Checkpoints
@@ -6,9 +6,9 @@ from asysplat.training.callbacks.costs import Costs
 from asysplat.training.callbacks.curve import Curve
 from asysplat.training.callbacks.early_exit import EarlyExitShares
 from asysplat.training.callbacks.figures import Figures
-from asysplat.training.callbacks.guard import NonFiniteSteps
 from asysplat.training.callbacks.metrics import Metrics
 from asysplat.training.callbacks.monitor import TrainingMonitor
+from asysplat.training.callbacks.non_finite_steps import NonFiniteSteps
 from asysplat.training.callbacks.progress import TrainingProgressBar
 
 __all__ = [

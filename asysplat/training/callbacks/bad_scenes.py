@@ -1,4 +1,4 @@
-"""Name and count the scenes that cannot be read, where others are drawn in their place."""
+"""Report and count training scenes that cannot be read and were replaced by others."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from asysplat.errors import InputError
 
 
 class BadScenes(lightning.Callback):
-    """Prints each trouble with a training scene once; logs how many tasks were drawn anew.
+    """Prints each error of a training scene once; logs how many scenes were replaced.
 
-    It is for data.on_bad_scene=skip.
+    Used with data.on_bad_scene=skip.
 
     Args:
-        budget: how many different troubles a process puts up with.
+        budget: how many different errors a process accepts.
 
     Raises:
         InputError: there are more.
@@ -21,37 +21,29 @@ class BadScenes(lightning.Callback):
 
     def __init__(self, budget: int = 10):
         self.budget = budget
-        self.skipped = 0
-        self.troubles: list[str] = []
+        self.count = 0
+        self.errors: list[str] = []
 
     def state_dict(self) -> dict[str, Any]:
-        return {"skipped": self.skipped, "troubles": self.troubles}
+        return {"count": self.count, "errors": self.errors}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.skipped, self.troubles = state_dict["skipped"], list(state_dict["troubles"])
+        self.count, self.errors = state_dict["count"], list(state_dict["errors"])
 
     def on_train_batch_end(
-        self,
-        trainer: lightning.Trainer,
-        module: lightning.LightningModule,
-        outputs: Any,
-        batch: Any,
-        index: int,
+        self, trainer: Any, module: Any, outputs: Any, batch: Any, index: int
     ) -> None:
-        self.skipped += len(batch["skipped"])
-        for trouble in dict.fromkeys(batch["skipped"]):
-            if trouble not in self.troubles:
-                self.troubles.append(trouble)
-                print(f"step {trainer.global_step}: another scene in place of one: {trouble}")
-        if len(self.troubles) > self.budget:
-            listed = "".join(f"\n  {trouble}" for trouble in self.troubles)
+        self.count += len(batch["bad_scenes"])
+        for error in dict.fromkeys(batch["bad_scenes"]):
+            if error not in self.errors:
+                self.errors.append(error)
+                print(f"step {trainer.global_step}: a bad scene is replaced by another: {error}")
+        if len(self.errors) > self.budget:
+            listed = "".join(f"\n  {error}" for error in self.errors)
             raise InputError(
                 f"more than {self.budget} training scenes cannot be used: fix them or take them "
                 f"out of data.root, or raise callbacks.bad_scenes.budget:{listed}"
             )
 
-    def on_train_epoch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> None:
-        skipped = float(self.skipped)
-        module.log("train/skipped_scenes", skipped, sync_dist=True, reduce_fx="sum")
+    def on_train_epoch_end(self, trainer: Any, module: Any) -> None:
+        module.log("train/bad_scenes", float(self.count), sync_dist=True, reduce_fx="sum")

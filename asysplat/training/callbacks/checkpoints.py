@@ -1,4 +1,4 @@
-"""A run's checkpoints: the last two, to resume from, and the best."""
+"""Write a run's checkpoints: the last two, to resume from, and the best."""
 
 import os
 import signal
@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
@@ -16,21 +15,21 @@ from asysplat.training.random_states import RandomStates, random_states, set_ran
 from asysplat.training.revision import revision
 from asysplat.training.tensorboard import event_files
 
-# What a scheduler sends before it kills: SLURM SIGTERM, submitit SIGUSR2, others SIGUSR1.
+# A scheduler sends one before it kills: SLURM SIGTERM, submitit SIGUSR2, others SIGUSR1.
 NOTICES = (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
 class Checkpoints(ModelCheckpoint):
-    """Writes the best checkpoint, last.ckpt, and keeps the one before it as previous.ckpt.
+    """Writes the best checkpoint and last.ckpt; renames the previous last.ckpt to previous.ckpt.
 
-    The best is named and chosen by `filename` and `monitor` in conf/callbacks/default.yaml; without
-    a callback that logs what is monitored, it is not written. last.ckpt is written after every
-    validation, between them every so many minutes, and when a scheduler gives notice. The run then
-    does what it would have done at once: what submitit does, or end with the status 128 + the
-    signal's number.
+    `filename` and `monitor` in conf/callbacks/default.yaml name and select the best; it is not
+    written if no callback logs `monitor`. last.ckpt is written after every validation, every
+    `minutes` between validations, and when a scheduler sends one of NOTICES. After the notice's
+    checkpoint the signal's earlier handler runs (submitit's, for example), or the run ends with
+    status 128 + the signal's number.
 
-    A checkpoint has, beside what Lightning puts there, `revision`, `random_states` (a list, of each
-    process) and `event_files`, see `asysplat.training.tensorboard`.
+    A checkpoint holds, in addition to Lightning's entries, `revision`, `random_states` (a list, one
+    of each process) and `event_files`, see `asysplat.training.tensorboard`.
 
     Args:
         dirpath: the folder.
@@ -43,16 +42,14 @@ class Checkpoints(ModelCheckpoint):
         super().__init__(dirpath=dirpath, **options)
         self.minutes = minutes
         self.notice: int | None = None  # the signal's number
-        self.resumed: list[RandomStates] = []
-        self.saved_step, self.due = 0, False
+        self.loaded_states: list[RandomStates] = []
+        self.saved_step, self.save_due = 0, False
 
     @property
     def last(self) -> Path:
         return Path(self.dirpath) / LAST
 
-    def on_save_checkpoint(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, checkpoint: dict
-    ) -> None:
+    def on_save_checkpoint(self, trainer: Any, module: Any, checkpoint: dict) -> None:
         _begin_at_next_batch(checkpoint["loops"]["fit_loop"])
         states = [random_states()]
         if trainer.world_size > 1:
@@ -62,55 +59,49 @@ class Checkpoints(ModelCheckpoint):
         checkpoint["revision"] = revision()
         checkpoint["event_files"] = event_files(trainer.loggers)
 
-    def on_load_checkpoint(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, checkpoint: dict
-    ) -> None:
-        self.resumed = checkpoint.get("random_states", [])
+    def on_load_checkpoint(self, trainer: Any, module: Any, checkpoint: dict) -> None:
+        self.loaded_states = checkpoint.get("random_states", [])
 
     def on_fit_start(self, *_: Any) -> None:
-        # Before Lightning puts its own in their place, which stop in the middle of a validation.
+        # Before Lightning sets its own handlers, which stop in the middle of a validation.
         self.handlers = {number: signal.getsignal(number) for number in NOTICES}
 
-    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_train_start(self, trainer: Any, module: Any) -> None:
         for number, handler in self.handlers.items():
             if handler not in (signal.SIG_IGN, None):
                 signal.signal(number, self._take_notice)
         self.saved_step, self.saved_at = trainer.global_step, time.monotonic()
-        if len(self.resumed) == trainer.world_size:
-            set_random_states(self.resumed[trainer.global_rank])
+        if len(self.loaded_states) == trainer.world_size:
+            set_random_states(self.loaded_states[trainer.global_rank])
 
     def _take_notice(self, number: int, _: Any) -> None:
         self.notice = number
 
-    def on_train_batch_start(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, _: Any, index: int
-    ) -> None:
-        """Save here, where the step before is complete, its validation and its log too."""
+    def on_train_batch_start(self, trainer: Any, module: Any, _: Any, index: int) -> None:
+        """Save here, where the previous step, its validation and its log are complete."""
         if index % trainer.accumulate_grad_batches:
             return
         waited = time.monotonic() - self.saved_at
         if (self.minutes is not None and waited >= 60 * self.minutes) or self.notice is not None:
-            self.due = True
-        if trainer.strategy.reduce_boolean_decision(self.due, all=False):
+            self.save_due = True
+        if trainer.strategy.reduce_boolean_decision(self.save_due, all=False):
             self._save_last(trainer)
-        self._heed(trainer)
+        self._follow_notice(trainer)
 
-    def on_train_epoch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> None:
+    def on_train_epoch_end(self, trainer: Any, module: Any) -> None:
         if self.monitor in trainer.callback_metrics:
             super().on_train_epoch_end(trainer, module)
-        self.due = True
+        self.save_due = True
 
-    def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_train_end(self, trainer: Any, module: Any) -> None:
         self._save_last(trainer)
 
-    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        # What follows is logged at this step, which Lightning has one lower where it went on from
-        # the end of a training: see `_begin_at_next_batch`.
+    def on_fit_end(self, trainer: Any, module: Any) -> None:
+        # The test is logged at this step. Lightning's count is one lower if it resumed from the end
+        # of a training: see `_begin_at_next_batch`.
         trainer.fit_loop.epoch_loop._batches_that_stepped = trainer.global_step
 
-    def _save_last(self, trainer: lightning.Trainer) -> None:
+    def _save_last(self, trainer: Any) -> None:
         if trainer.global_step == self.saved_step:
             return
         fresh = self.last.with_name("next.ckpt")
@@ -119,10 +110,10 @@ class Checkpoints(ModelCheckpoint):
             if self.last.exists():
                 os.replace(self.last, self.last.with_name(PREVIOUS))
             os.replace(fresh, self.last)
-        self.saved_step, self.saved_at, self.due = trainer.global_step, time.monotonic(), False
+        self.saved_step, self.saved_at, self.save_due = trainer.global_step, time.monotonic(), False
 
-    def _heed(self, trainer: lightning.Trainer) -> None:
-        """Do what the scheduler's notice would have done, now that there is a checkpoint."""
+    def _follow_notice(self, trainer: Any) -> None:
+        """Run the handler of the scheduler's notice, now that there is a checkpoint."""
         if not trainer.strategy.reduce_boolean_decision(self.notice is not None, all=False):
             return
         number, self.notice = self.notice or signal.SIGTERM, None
@@ -135,16 +126,16 @@ class Checkpoints(ModelCheckpoint):
         else:
             raise SystemExit(128 + number)
 
-    def on_exception(self, trainer: lightning.Trainer, module: Any, error: BaseException) -> None:
+    def on_exception(self, trainer: Any, module: Any, error: BaseException) -> None:
         if trainer.is_global_zero:
-            said = f"to go on, add ckpt_path={self.last} to the same command"
-            print(f"stopped; {said if self.last.exists() else 'there is no checkpoint yet'}.")
+            resume = f"to go on, add ckpt_path={self.last} to the same command"
+            print(f"stopped; {resume if self.last.exists() else 'there is no checkpoint yet'}.")
 
 
 def _begin_at_next_batch(loop: dict[str, Any]) -> None:
-    """Let a saved training loop go on with the batch after the last that was trained on.
+    """Change the state of a training loop so that it resumes with the next untrained batch.
 
-    Lightning would end an epoch once more that had ended, or count a batch that was only fetched.
+    Lightning would end a completed epoch again, or count a batch that was only fetched.
 
     Args:
         loop: the state of the loop of epochs, changed in place.
@@ -161,10 +152,10 @@ def _begin_at_next_batch(loop: dict[str, Any]) -> None:
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints that are there whole or not at all.
+    """Writes checkpoints atomically.
 
     Raises:
-        InputError: there is no room, or one may not write there.
+        InputError: the disk is full or the folder is not writable.
     """
 
     def save_checkpoint(

@@ -1,4 +1,4 @@
-"""Costs of a run: parameters, FLOPs, Gaussians, seconds, memory."""
+"""Measure the costs of a run: parameters, FLOPs, Gaussians, seconds, memory."""
 
 from typing import Any
 
@@ -13,16 +13,17 @@ from asysplat.training.plan import make_plan
 
 
 class Costs(lightning.Callback):
-    """Fills `values`, "cost/..." -> number.
+    """Collects the costs of a run in `values`, "cost/..." -> number.
 
-    Before the first step: the `static_costs` of one scene at the run's views and resolution; and it
-    prints the training's plan (`make_plan`), or refuses a training that does not fit. Measured by
-    `CostMeter`, seconds as the mean of all but the longest, memory as the peak:
+    Before the first step, it counts the `static_costs` of one scene at the run's views and
+    resolution, prints the training's plan (`make_plan`) and refuses a training that does not fit.
+    During the run it measures, by `CostMeter`, seconds (mean of all but the longest) and peak
+    memory of:
 
     - a training step: seconds_per_step, peak_gb, and peak_bytes_per_token: the rise of the peak
       over the memory before the first step, for each token of the largest patch in a micro-batch.
-    - the rendering of a step's targets, with its gradients: render_seconds_per_step.
-    - the network's forward pass over the test's scenes: inference_seconds, inference_gb.
+    - rendering a step's targets, with gradients: render_seconds_per_step.
+    - the network's forward pass over the test scenes: inference_seconds, inference_gb.
     - the rest of the test step, which renders the targets with depth: render_seconds, render_gb.
 
     The last two are under cost/<set>/ for further test sets. Place this callback before those that
@@ -32,10 +33,8 @@ class Costs(lightning.Callback):
     def __init__(self):
         self.values: dict[str, float | int] = {}
 
-    def setup(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str
-    ) -> None:
-        """Count and plan, while every process still has all weights."""
+    def setup(self, trainer: Any, module: Any, stage: str) -> None:
+        """Count costs and plan here, where every process still has all weights."""
         if stage != "fit":
             return
         module.to(trainer.strategy.root_device)
@@ -51,11 +50,11 @@ class Costs(lightning.Callback):
             print(plan, flush=True)
         self.values = {f"cost/{name}": value for name, value in costs.items()}
 
-    def on_fit_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_fit_start(self, trainer: Any, module: Any) -> None:
         self.step = CostMeter(module.device)
 
-    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        if trainer.global_step == 0:  # a run that goes on has logged them
+    def on_train_start(self, trainer: Any, module: Any) -> None:
+        if trainer.global_step == 0:  # a resumed run has logged them
             for logger in trainer.loggers:
                 logger.log_metrics(self.values, step=0)
 
@@ -65,7 +64,7 @@ class Costs(lightning.Callback):
     def on_train_batch_end(self, *_: Any) -> None:
         self.step.stop()
 
-    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_fit_end(self, trainer: Any, module: Any) -> None:
         if self.step.seconds:
             micro_batches = self.split.accumulated
             seconds = {
@@ -80,10 +79,8 @@ class Costs(lightning.Callback):
         for logger in trainer.loggers:
             logger.log_metrics(self.values, step=trainer.global_step)
 
-    def _render_seconds(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> float:
-        """Measure rendering a micro-batch, with copies of a validation scene in its place."""
+    def _render_seconds(self, trainer: Any, module: Any) -> float:
+        """Measure the rendering of a micro-batch, made of copies of a validation scene."""
         scene = collate([trainer.datamodule.evaluation["val"][0]] * self.split.micro_batch)
         inputs, targets = scene["inputs"].to(module.device), scene["targets"].to(module.device)
         was_training = module.net.training
@@ -91,10 +88,10 @@ class Costs(lightning.Callback):
         with torch.no_grad():
             gaussians = module.net(inputs)
         module.net.train(was_training)
-        background = module.behind({"inputs": inputs, "targets": targets})
+        background = module.background_for({"inputs": inputs, "targets": targets})
         return render_seconds(gaussians, targets.cameras, background, module.loss.needs_depth)
 
-    def on_test_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_test_start(self, trainer: Any, module: Any) -> None:
         self.tests = [
             {work: CostMeter(module.device) for work in ("inference", "render")}
             for _ in trainer.datamodule.tests
@@ -106,8 +103,8 @@ class Costs(lightning.Callback):
 
     def on_test_batch_start(
         self,
-        trainer: lightning.Trainer,
-        module: lightning.LightningModule,
+        trainer: Any,
+        module: Any,
         batch: Any,
         batch_idx: int,
         dataloader_idx: int = 0,
@@ -124,7 +121,7 @@ class Costs(lightning.Callback):
     def on_test_batch_end(self, *_: Any) -> None:
         self.work["render"].stop()
 
-    def on_test_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_test_end(self, trainer: Any, module: Any) -> None:
         for hook in self.hooks:
             hook.remove()
         for test_set, works in zip(trainer.datamodule.tests, self.tests, strict=True):

@@ -1,6 +1,5 @@
-"""The learning curve of a run, without TensorBoard: curve.csv and pictures/curve.png."""
+"""Write the learning curve of a run, without TensorBoard: curve.csv and figures/curve.png."""
 
-import csv
 import time
 from pathlib import Path
 from typing import Any
@@ -8,13 +7,13 @@ from typing import Any
 import lightning
 
 from asysplat.evaluation.figures import learning_curve
-from asysplat.files import atomic_write
+from asysplat.evaluation.rows import write_csv
 
 COLUMNS = ("psnr", "nearest_view/psnr", "mean_color/psnr", "ssim", "lpips", "absrel")
 
 
 class Curve(lightning.Callback):
-    """Writes a row for each validation that was measured; draws them after training.
+    """Writes a row for each validation; draws them after training.
 
     Args:
         folder: of the run.
@@ -30,36 +29,25 @@ class Curve(lightning.Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.rows = state_dict["rows"]
 
-    def on_fit_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_fit_start(self, trainer: Any, module: Any) -> None:
         minutes = self.rows[-1]["minutes"] if self.rows else 0.0
         self.started = time.monotonic() - 60 * minutes
-        self._write(trainer)  # without what came after the checkpoint of a run that goes on
+        self._write(trainer)  # drops the rows after the checkpoint that a run resumes from
 
-    def on_validation_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> None:
-        found = trainer.callback_metrics
-        if "val/psnr" not in found:  # no callback measures
+    def on_validation_end(self, trainer: Any, module: Any) -> None:
+        values = trainer.callback_metrics
+        if "val/psnr" not in values:  # without the callback Metrics
             return
         row = {"step": trainer.global_step, "minutes": (time.monotonic() - self.started) / 60}
-        row |= {name: found[f"val/{name}"].item() for name in COLUMNS if f"val/{name}" in found}
+        row |= {name: values[f"val/{name}"].item() for name in COLUMNS if f"val/{name}" in values}
         self.rows.append(row)
         self._write(trainer)
 
-    def _write(self, trainer: lightning.Trainer) -> None:
+    def _write(self, trainer: Any) -> None:
         if self.rows and trainer.is_global_zero:
-            write_curve(self.folder / "curve.csv", self.rows)
+            write_csv(self.folder / "curve.csv", self.rows)
 
-    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_fit_end(self, trainer: Any, module: Any) -> None:
         if self.rows and trainer.is_global_zero:
-            (self.folder / "pictures").mkdir(exist_ok=True)
-            picture = self.folder / "pictures" / "curve.png"
-            learning_curve(self.rows).savefig(picture, dpi=100)
-
-
-def write_curve(path: Path, rows: list[dict[str, float | int]]) -> None:
-    """Write a line for each validation, oldest first; the file is there whole or not at all."""
-    with atomic_write(path) as partial, partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[-1]))
-        writer.writeheader()
-        writer.writerows(rows)
+            (self.folder / "figures").mkdir(exist_ok=True)
+            learning_curve(self.rows).savefig(self.folder / "figures" / "curve.png", dpi=100)

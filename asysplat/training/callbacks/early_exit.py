@@ -1,4 +1,4 @@
-"""What the test's predictions left out: see `asysplat.models.early_exit`."""
+"""Log the shares of work that the network's early exit leaves out at test."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ from asysplat.training.callbacks.metrics import gather
 
 
 class EarlyExitShares(lightning.Callback):
-    """Logs skip/<set>/<what>, shares that were left out, as means over the scenes of a test set.
+    """Logs skip/<set>/<what>: shares that were left out, averaged over the scenes of a test set.
 
-    `results` has them too. With speed=exact there are none.
+    `results` has the same numbers; it is empty with speed=exact. See `asysplat.models.early_exit`.
     """
 
     def on_test_epoch_start(self, *_: Any) -> None:
@@ -19,7 +19,7 @@ class EarlyExitShares(lightning.Callback):
 
     def on_test_batch_end(
         self,
-        trainer: lightning.Trainer,
+        trainer: Any,
         module: Any,
         outputs: Any,
         batch: dict[str, Any],
@@ -31,7 +31,7 @@ class EarlyExitShares(lightning.Callback):
             (scene,) = batch["scene"]
             self.rows.append({"set": test_set, "scene": scene, "view": 0, **module.net.skipped})
 
-    def on_test_epoch_end(self, trainer: lightning.Trainer, module: Any) -> None:
+    def on_test_epoch_end(self, trainer: Any, module: Any) -> None:
         rows = gather(trainer, self.rows)
         self.results = {
             f"skip/{test_set}/{name}": share

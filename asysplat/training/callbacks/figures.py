@@ -1,59 +1,45 @@
-"""Figures of every validation and of the test: for the logger and as PNG files."""
+"""Draw figures of every validation and of the test: for the loggers and as PNG files."""
 
 from pathlib import Path
 from typing import Any
 
 import lightning
 
-from asysplat.evaluation.figures import comparison
+from asysplat.evaluation.figures import comparison_figure
 from asysplat.training.loggers import log_figure
 from asysplat.training.outcome import Outcome
 
 
 class Figures(lightning.Callback):
-    """Draws the first scenes of each validation and of the first test set, see `comparison`.
+    """Draws a `comparison_figure` of the first scenes of each validation and first test set.
 
     Args:
-        folder: of the run; pictures go to its sub-folder `pictures`.
+        folder: of the run; the PNG files are written to its sub-folder `figures`.
         scenes: how many scenes to draw.
     """
 
     def __init__(self, folder: str, scenes: int):
-        self.folder, self.scenes = Path(folder) / "pictures", scenes
+        self.folder, self.scenes = Path(folder) / "figures", scenes
 
     def on_validation_batch_end(
-        self,
-        trainer: lightning.Trainer,
-        module: lightning.LightningModule,
-        outputs: Outcome,
-        batch: Any,
-        index: int,
-        *_: Any,
+        self, trainer: Any, module: Any, outputs: Outcome, batch: Any, index: int, *_: Any
     ) -> None:
         self._draw(trainer, "val", outputs, batch, index)
 
     def on_test_batch_end(
-        self,
-        trainer: lightning.Trainer,
-        module: lightning.LightningModule,
-        outputs: Outcome,
-        batch: Any,
-        index: int,
-        test_set: int = 0,
+        self, trainer: Any, module: Any, outputs: Outcome, batch: Any, index: int, test_set: int = 0
     ) -> None:
         if test_set == 0:
             self._draw(trainer, "test", outputs, batch, index)
 
-    def _draw(
-        self, trainer: lightning.Trainer, split: str, outcome: Outcome, batch: Any, index: int
-    ) -> None:
+    def _draw(self, trainer: Any, split: str, outcome: Outcome, batch: Any, index: int) -> None:
         if index >= self.scenes or not trainer.is_global_zero:
             return
         first = (
             record.map(lambda tensor: tensor[0].detach())
             for record in (batch["inputs"], batch["targets"], outcome.rendering)
         )
-        figure = comparison(*first)
+        figure = comparison_figure(*first)
         self.folder.mkdir(parents=True, exist_ok=True)
         step = "" if split == "test" else f"-{trainer.global_step:06d}"
         figure.savefig(self.folder / f"{split}-{index}{step}.png", dpi=100)

@@ -1,4 +1,4 @@
-"""Measure every validation and test image, and the baselines that need no training."""
+"""Compute the metrics of every validation and test image, and of the baselines."""
 
 import warnings
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import lightning
 import torch
 from torch import Tensor
 
-from asysplat.evaluation import baselines
+from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.evaluation.protocol import Protocol
@@ -17,21 +17,21 @@ from asysplat.evaluation.rows import ImageRow, average, write_csv
 from asysplat.scene import Views
 from asysplat.training.outcome import Outcome
 
-IMAGE = ("set", "scene", "view")  # the columns that say which image a row is of
+IMAGE = ("set", "scene", "view")  # the columns that identify a row
 Measure = Callable[[Tensor, Views], dict[str, Tensor]]
 
 
 class Metrics(lightning.Callback):
-    """Measures PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image, for the logger and a CSV.
+    """Computes PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image, for loggers and a CSV.
 
-    `results` holds the means of every test set, the protocol's sentences, and the cost of measuring
-    a test scene and its baselines: cost/metrics_seconds and cost/metrics_gb, see `CostMeter`.
+    `results` holds the means of every test set, the protocol's sentences, and the cost of the
+    metrics of a test scene and its baselines: cost/metrics_seconds and _gb, see `CostMeter`.
 
     Args:
-        protocol: how everything is measured.
+        protocol: of the metrics.
         folder: of the run; metrics.csv is written there after the test.
-        backbone_dir: folder that may hold LPIPS' backbone; without it that column is missing.
-        download: whether to fetch the backbone if it is missing.
+        backbone_dir: folder of LPIPS' backbone; without the backbone there is no LPIPS.
+        download: whether to download a missing backbone.
     """
 
     def __init__(self, protocol: Protocol, folder: str, backbone_dir: str, download: bool = False):
@@ -41,14 +41,11 @@ class Metrics(lightning.Callback):
         sentences = protocol.sentences()
         self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in sentences.items()}
 
-    def setup(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str
-    ) -> None:
+    def setup(self, trainer: Any, module: Any, stage: str) -> None:
         if hasattr(self, "lpips"):
             return
         self.lpips = load_lpips(self.protocol.lpips_net, self.backbone_dir, self.download)
         if self.lpips is None and trainer.is_global_zero:
-            # Lightning calls this, and its own warnings are not shown.
             warnings.warn(self.protocol.without_lpips(), stacklevel=1)
 
     def measure(self, rendered: Tensor, targets: Views) -> dict[str, Tensor]:
@@ -62,9 +59,9 @@ class Metrics(lightning.Callback):
         inputs, targets = batch["inputs"], batch["targets"]
         values = self.measure(outcome.rendering.image, targets)
         values |= self.protocol.depth_metrics(outcome.rendering.depth, targets)
-        for name in ("mean_color", "nearest_view"):
-            found = measure_baseline(getattr(baselines, name)(inputs, targets), targets)
-            values.update({f"{name}/{metric}": value for metric, value in found.items()})
+        for name, baseline in BASELINES.items():
+            metrics = measure_baseline(baseline(inputs, targets), targets)
+            values |= {f"{name}/{metric}": value for metric, value in metrics.items()}
         for index, scene in enumerate(batch["scene"]):
             for view in range(targets.num_views):
                 numbers = {name: value[index, view].item() for name, value in values.items()}
@@ -73,18 +70,15 @@ class Metrics(lightning.Callback):
     def on_validation_epoch_start(self, *_: Any) -> None:
         self.rows = []
 
-    def on_test_epoch_start(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> None:
+    def on_test_epoch_start(self, trainer: Any, module: Any) -> None:
         self.rows = []
         self.work = CostMeter(module.device)
 
     def on_validation_batch_end(
         self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
     ) -> None:
-        def measure_baseline(image: Tensor, to: Views) -> dict[str, Tensor]:
-            """Measure PSNR alone: the learning curve shows no other metric of the baselines."""
-            return {"psnr": self.protocol.psnr(image, to)}
+        def measure_baseline(image: Tensor, targets: Views) -> dict[str, Tensor]:
+            return {"psnr": self.protocol.psnr(image, targets)}  # the learning curve has no other
 
         self._add(trainer.datamodule.name, batch, outputs, measure_baseline)
 
@@ -102,15 +96,11 @@ class Metrics(lightning.Callback):
         self._add(test_set, batch, outputs, self.measure)
         self.work.stop()
 
-    def on_validation_epoch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> None:
+    def on_validation_epoch_end(self, trainer: Any, module: Any) -> None:
         means = average(gather(trainer, self.rows), self.protocol.mean_over)
         module.log_dict({f"val/{name}": value for name, value in means.items()})
 
-    def on_test_epoch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> None:
+    def on_test_epoch_end(self, trainer: Any, module: Any) -> None:
         rows, results = gather(trainer, self.rows), {}
         for test_set in trainer.datamodule.tests:
             of_set = [row for row in rows if row["set"] == test_set]
@@ -123,12 +113,12 @@ class Metrics(lightning.Callback):
             write_csv(self.folder / "metrics.csv", rows)
 
 
-def gather(trainer: lightning.Trainer, rows: list[ImageRow]) -> list[ImageRow]:
-    """Collect the rows of all processes; every process must call this."""
+def gather(trainer: Any, rows: list[ImageRow]) -> list[ImageRow]:
+    """Gather the rows of all processes; every process must call this."""
     if trainer.world_size == 1:
         return rows
     per_process: list[list[ImageRow]] = [[] for _ in range(trainer.world_size)]
     torch.distributed.all_gather_object(per_process, rows)
-    # A scene that a process measured again, so that all take equally many turns, counts once.
+    # A scene that pads the batches of a process to the same number counts once.
     images = {tuple(row[key] for key in IMAGE): row for part in per_process for row in part}
     return list(images.values())

@@ -1,14 +1,14 @@
-"""Where the seconds and the memory of a run go, what its gradients and its Gaussians look like."""
+"""Measure where a training's seconds and memory go, its gradients and its Gaussians."""
 
 import statistics
 import time
 from typing import Any
 
-import lightning
 import torch
+from lightning import Callback
 from torch import nn
 
-from asysplat.evaluation.cost import GB, peak_memory_gb
+from asysplat.evaluation.cost import memory_gb, peak_memory_gb
 from asysplat.evaluation.measured_cost import wait_for
 from asysplat.evaluation.peak import peak_flops
 from asysplat.evaluation.static_cost import forward_flops
@@ -18,46 +18,45 @@ from asysplat.training.outcome import Outcome
 from asysplat.training.parts import PARTS
 
 GIGA = 1e9
-PASSES = 3  # forward, and a backward of about twice its products; computing again does not count
-MIN_ALPHA = 0.5  # below it, too little of a pixel is covered for its depth to count
-# The bounds of what is counted at each validation; of scales and depths the decimal logarithm.
+PASSES = 3  # forward, and a backward of about twice its products; recomputation does not count
+MIN_ALPHA = 0.5  # the depth of a pixel with less coverage is not counted
+# The bounds of the histograms of each validation; of scales and depths the decimal logarithm.
 BOUNDS = {"opacity": (0.0, 1.0), "log10_scale": (-5.0, 1.0), "log10_depth": (-2.0, 2.0)}
 
 
-class TrainingMonitor(lightning.Callback):
-    """Measures every so many steps, and the Gaussians of each validation, for the loggers.
+class TrainingMonitor(Callback):
+    """Logs the costs of one in `every` steps and statistics of each validation's Gaussians.
 
     - time/: views_per_second, seconds_per_step and gflops_per_second of all steps since the last
-      that was measured; mfu, their share of the device's peak, where that is known; and of the
-      measured step share_<part>, of the seconds of its PARTS and of what is left, other.
-    - memory/: peak_gb, see `peak_memory_gb`; on a GPU also its share of what there is.
+      measured one; mfu, their share of the device's peak, where that is known; and of the measured
+      step share_<part>, the share of its seconds of each of PARTS and of the rest, other.
+    - memory/: peak_gb, see `peak_memory_gb`; on a GPU also its share of the GPU's memory.
     - gradient/: the norm of each part of the network, before it is clipped.
     - gaussians/: histograms and medians of opacities, of scales (the geometric mean of a
       Gaussian's three) and of depths as rendered at the targets, in units of the farthest input.
 
-    FLOPs are those of the network's products (`true_flops`): of the forward pass, three times.
+    FLOPs are three times those of the network's products (`true_flops`) in the forward pass.
 
     Args:
-        every: steps between two that are measured.
+        every: steps from one measured step to the next.
     """
 
     def __init__(self, every: int = 50):
         self.every = every
-        self.measured: list[dict[str, float]] = []
+        self.measurements: list[dict[str, float]] = []
 
-    def on_fit_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        self.flops: int | None = None  # of a scene in training, counted when first needed
+    def on_fit_start(self, trainer: Any, module: Any) -> None:
+        self.flops: int | None = None  # of a training scene, counted when first needed
         self.peak = peak_flops(module.device, trainer.precision)
-        # The first step compiles kernels, and counts nowhere.
-        self.first_step, self.begun_at = trainer.global_step, None
+        # The first step compiles kernels and is not counted.
+        self.first_step, self.begin_step = trainer.global_step, None
 
     def on_train_epoch_start(self, *_: Any) -> None:
         self.waiting_since = time.perf_counter()
 
     def on_train_batch_start(self, trainer: Any, module: Any, *_: Any) -> None:
-        due = self.begun_at is not None and (trainer.global_step + 1) % self.every == 0
-        # Of a step of several batches, the first starts it.
-        if due and not module.parts.measuring:
+        due = self.begin_step is not None and (trainer.global_step + 1) % self.every == 0
+        if due and not module.parts.measuring:  # at the first micro-batch of the step
             self.step, self.started = trainer.global_step, self.waiting_since
             module.parts.start(module.device)
         if module.parts.measuring:
@@ -79,7 +78,7 @@ class TrainingMonitor(lightning.Callback):
     def on_train_batch_end(
         self, trainer: Any, module: Any, outputs: Any, batch: Any, _: int
     ) -> None:
-        if self.begun_at is not None:
+        if self.begin_step is not None:
             self._count(trainer, batch)
         elif trainer.global_step > self.first_step:
             self._begin(trainer)
@@ -87,35 +86,33 @@ class TrainingMonitor(lightning.Callback):
             wait_for(module.device)
             now = time.perf_counter()
             module.parts.add("optimizer", now - self.optimizer_since)
-            found = shares(module.parts.stop(), now - self.started)
+            values = shares(module.parts.stop(), now - self.started)
             if self.flops is None:
                 views = batch["inputs"]
                 size = (views.num_views, views.cameras.height, views.cameras.width)
                 self.flops = PASSES * forward_flops(module.net, *size)
-            found |= self._speed(trainer) | memory(module.device)
-            self.measured.append(found)
-            log(trainer, found, self.step)
+            values |= self._rates(trainer) | memory(module.device)
+            self.measurements.append(values)
+            log(trainer, values, self.step)
             self._begin(trainer)
         self.waiting_since = time.perf_counter()
 
-    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        if self.measured and trainer.is_global_zero:
-            names = self.measured[-1]
-            print(sentence({n: statistics.fmean(m[n] for m in self.measured) for n in names}))
+    def on_fit_end(self, trainer: Any, module: Any) -> None:
+        if self.measurements and trainer.is_global_zero:
+            names = self.measurements[-1]
+            print(sentence({n: statistics.fmean(m[n] for m in self.measurements) for n in names}))
 
-    def on_validation_epoch_start(self, trainer: Any, module: lightning.LightningModule) -> None:
+    def on_validation_epoch_start(self, trainer: Any, module: Any) -> None:
         self.histograms = {n: Histogram.empty(*b, module.device) for n, b in BOUNDS.items()}
 
     def on_validation_batch_end(self, trainer: Any, module: Any, outputs: Outcome, *_: Any) -> None:
         gaussians, rendering = outputs.gaussians, outputs.rendering
         self.histograms["opacity"].add(gaussians.opacities)
         self.histograms["log10_scale"].add(gaussians.scales.log10().mean(-1))
-        seen = rendering.depth[rendering.alpha > MIN_ALPHA]
-        self.histograms["log10_depth"].add(seen.log10())
+        depths = rendering.depth[rendering.alpha > MIN_ALPHA]
+        self.histograms["log10_depth"].add(depths.log10())
 
-    def on_validation_epoch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> None:
+    def on_validation_epoch_end(self, trainer: Any, module: Any) -> None:
         for name, histogram in self.histograms.items():
             histogram.counts = trainer.strategy.reduce(histogram.counts, reduce_op="sum")
             log(trainer, {f"gaussians/{name}_median": histogram.median()}, trainer.global_step)
@@ -123,52 +120,49 @@ class TrainingMonitor(lightning.Callback):
                 log_histogram(logger, f"gaussians/{name}", histogram, trainer.global_step)
 
     def _begin(self, trainer: Any) -> None:
-        """Count from now on."""
-        self.begun_at, self.seconds, self.scenes, self.views = trainer.global_step, 0.0, 0, 0
+        self.begin_step, self.seconds, self.scenes, self.views = trainer.global_step, 0.0, 0, 0
 
     def _count(self, trainer: Any, batch: Any) -> None:
-        """Count a batch since `waiting_since`; the views of all processes."""
+        """Count the seconds since `waiting_since`, and the scenes and views of a batch."""
         scenes = len(batch["scene"])
         views = batch["inputs"].num_views + batch["targets"].num_views
         self.seconds += time.perf_counter() - self.waiting_since
         self.scenes += scenes
         self.views += scenes * views * trainer.world_size
 
-    def _speed(self, trainer: Any) -> dict[str, float]:
-        steps = trainer.global_step - self.begun_at
+    def _rates(self, trainer: Any) -> dict[str, float]:
         flops = self.flops * self.scenes / self.seconds
-        found = {
+        rates = {
             "time/views_per_second": self.views / self.seconds,
-            "time/seconds_per_step": self.seconds / steps,
+            "time/seconds_per_step": self.seconds / (trainer.global_step - self.begin_step),
             "time/gflops_per_second": flops / GIGA,
         }
-        return found if self.peak is None else found | {"time/mfu": flops / self.peak}
+        return rates if self.peak is None else rates | {"time/mfu": flops / self.peak}
 
 
 def log(trainer: Any, numbers: dict[str, float], step: int) -> None:
-    """Log numbers at once, whatever `log_every_n_steps` says."""
+    """Log numbers at once, whatever `log_every_n_steps` is."""
     for logger in trainer.loggers:
         logger.log_metrics(numbers, step=step)
 
 
-def shares(seconds: dict[str, float], whole: float) -> dict[str, float]:
-    """Return the share of each part of a step, and of what is none of them, other."""
-    found = {name: seconds.get(name, 0.0) / whole for name in PARTS}
-    found["other"] = max(0.0, 1 - sum(found.values()))
-    return {f"time/share_{name}": share for name, share in found.items()}
+def shares(seconds: dict[str, float], total: float) -> dict[str, float]:
+    """Return the share of each part in a step of `total` seconds, and of the rest, other."""
+    parts = {name: seconds.get(name, 0.0) / total for name in PARTS}
+    parts["other"] = max(0.0, 1 - sum(parts.values()))
+    return {f"time/share_{name}": share for name, share in parts.items()}
 
 
 def memory(device: torch.device) -> dict[str, float]:
-    """Return the peak memory, and on a GPU its share of what the GPU has."""
+    """Return the peak memory, and on a GPU its share of the GPU's memory."""
     peak = peak_memory_gb(device)
     if device.type != "cuda":
         return {"memory/peak_gb": peak}
-    has = torch.cuda.get_device_properties(device).total_memory / GB
-    return {"memory/peak_gb": peak, "memory/peak_share": peak / has}
+    return {"memory/peak_gb": peak, "memory/peak_share": peak / memory_gb(device)}
 
 
 def gradient_norms(net: nn.Module) -> dict[str, float]:
-    """Return the gradient's norm of each part of a network that has one."""
+    """Return the gradient's norm of each part of a network that has a gradient."""
     norms = {}
     for name, part in net.named_children():
         grads = [p.grad for p in part.parameters() if p.grad is not None]
@@ -178,7 +172,7 @@ def gradient_norms(net: nn.Module) -> dict[str, float]:
 
 
 def sentence(means: dict[str, float]) -> str:
-    """Write what was measured as a sentence."""
+    """Write the means of the measurements as a sentence."""
     parts = ", ".join(f"{name} {means[f'time/share_{name}']:.0%}" for name in (*PARTS, "other"))
     mfu = f"{means['time/mfu']:.1%}" if "time/mfu" in means else "not measured"
     return (

@@ -1,90 +1,79 @@
-"""The progress of a run: bars on a terminal, elsewhere a line now and then."""
+"""Show the progress of a run: bars on a terminal, a line now and then elsewhere."""
 
 import time
 from datetime import timedelta
 from multiprocessing import current_process
 from typing import Any
 
-import lightning
 from lightning.pytorch.callbacks import ProgressBar
 from rich import progress
 from rich.console import Console
 
 REFRESH_SECONDS = 0.2
-SPEED_SECONDS = 3600  # of training, from which the time left is estimated
-LINE_SECONDS, LINE_SHARE = 60, 0.01  # least time and share of the steps between two lines
+SPEED_SECONDS = 3600  # of training, from which the remaining time is estimated
+LINE_SECONDS, LINE_SHARE = 60, 0.01  # minimum time and share of the steps between two lines
 
 
 class TrainingProgressBar(ProgressBar):
     """Shows the steps of the whole training with their PSNR; bars for validation and test.
 
     Without a terminal, or when several runs share one, it prints a line after each validation, and
-    between two validations at most one each minute and each hundredth of the training.
+    between two validations at most one line per minute and per hundredth of the training.
     """
 
     def __init__(self):
         super().__init__()
-        self.shown = True
+        self.enabled = True
         self.bars: progress.Progress | None = None
 
     def disable(self) -> None:
-        self.shown = False
+        self.enabled = False
 
     def enable(self) -> None:
-        self.shown = True
+        self.enabled = True
 
-    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_train_start(self, trainer: Any, module: Any) -> None:
         self._open()
         step = trainer.global_step
         self.training = self._add("training", total=trainer.max_steps, completed=step)
-        self._draw(trainer, at_once=True)
-        self.told, self.told_at = step, time.monotonic()
+        self._draw(trainer, now=True)
+        self.printed_step, self.printed_at = step, time.monotonic()
 
-    def on_train_batch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, *_: Any
-    ) -> None:
+    def on_train_batch_end(self, trainer: Any, module: Any, *_: Any) -> None:
         step, total = trainer.global_step, trainer.max_steps
         self.bars.update(self.training, completed=step)
         self._draw(trainer)
-        waited = time.monotonic() - self.told_at
-        if waited > LINE_SECONDS and step - self.told >= LINE_SHARE * total:
-            self._tell(trainer)
+        waited = time.monotonic() - self.printed_at
+        if waited > LINE_SECONDS and step - self.printed_step >= LINE_SHARE * total:
+            self._print_line(trainer)
 
-    def on_validation_start(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> None:
+    def on_validation_start(self, trainer: Any, module: Any) -> None:
         self.validation = self._add("validation", total=sum(trainer.num_val_batches))
 
-    def on_validation_batch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, *_: Any
-    ) -> None:
+    def on_validation_batch_end(self, trainer: Any, module: Any, *_: Any) -> None:
         self.bars.advance(self.validation)
         self._draw(trainer)
 
-    def on_validation_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule
-    ) -> None:
+    def on_validation_end(self, trainer: Any, module: Any) -> None:
         self.bars.remove_task(self.validation)
-        self._tell(trainer)
+        self._print_line(trainer)
 
-    def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_train_end(self, trainer: Any, module: Any) -> None:
         self._close(trainer)
 
-    def on_test_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_test_start(self, trainer: Any, module: Any) -> None:
         self._open()
         self.testing = self._add("test", total=sum(trainer.num_test_batches))
-        self._draw(trainer, at_once=True)
+        self._draw(trainer, now=True)
 
-    def on_test_batch_end(
-        self, trainer: lightning.Trainer, module: lightning.LightningModule, *_: Any
-    ) -> None:
+    def on_test_batch_end(self, trainer: Any, module: Any, *_: Any) -> None:
         self.bars.advance(self.testing)
         self._draw(trainer)
 
-    def on_test_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_test_end(self, trainer: Any, module: Any) -> None:
         self._close(trainer)
 
-    def on_exception(self, trainer: lightning.Trainer, *_: Any) -> None:
+    def on_exception(self, trainer: Any, *_: Any) -> None:
         if self.bars is not None:
             self._close(trainer)
 
@@ -100,22 +89,23 @@ class TrainingProgressBar(ProgressBar):
             progress.TimeRemainingColumn(),
             progress.TextColumn("left  {task.fields[quality]}"),
             console=console,
-            auto_refresh=False,  # a thread that draws would break in the loaders' forks
+            auto_refresh=False,  # a drawing thread would break in the forked data loaders
             speed_estimate_period=SPEED_SECONDS,
-            disable=not (self.shown and self.on_terminal),
+            disable=not (self.enabled and self.on_terminal),
         )
         self.bars.start()
         self.drawn_at = time.monotonic()
 
-    def _close(self, trainer: lightning.Trainer) -> None:
-        self._draw(trainer, at_once=True)
+    def _close(self, trainer: Any) -> None:
+        self._draw(trainer, now=True)
         self.bars.stop()
 
     def _add(self, name: str, **counts: int) -> progress.TaskID:
         return self.bars.add_task(name, quality="", **counts)
 
-    def _draw(self, trainer: lightning.Trainer, at_once: bool = False) -> None:
-        if self.bars.disable or not (at_once or self._due()):
+    def _draw(self, trainer: Any, now: bool = False) -> None:
+        due = now or time.monotonic() - self.drawn_at > REFRESH_SECONDS
+        if self.bars.disable or not due:
             return
         for task in self.bars.tasks:
             if task.description == "training":
@@ -123,21 +113,18 @@ class TrainingProgressBar(ProgressBar):
         self.bars.refresh()
         self.drawn_at = time.monotonic()
 
-    def _due(self) -> bool:
-        return time.monotonic() - self.drawn_at > REFRESH_SECONDS
-
-    def _tell(self, trainer: lightning.Trainer) -> None:
-        if not self.shown or self.on_terminal:
+    def _print_line(self, trainer: Any) -> None:
+        if not self.enabled or self.on_terminal:
             return
-        self.told, self.told_at = trainer.global_step, time.monotonic()
+        self.printed_step, self.printed_at = trainer.global_step, time.monotonic()
         seconds = self.bars.tasks[0].time_remaining
         left = "" if seconds is None else f", {timedelta(seconds=round(seconds))} left"
-        told = f"step {self.told} of {trainer.max_steps}{left}: {quality(trainer)}"
-        print(told.removesuffix(": "), flush=True)
+        line = f"step {self.printed_step} of {trainer.max_steps}{left}: {quality(trainer)}"
+        print(line.removesuffix(": "), flush=True)
 
 
-def quality(trainer: lightning.Trainer) -> str:
-    """Format the PSNR in dB of the last step and of the last validation, as far as measured."""
-    found = trainer.callback_metrics
+def quality(trainer: Any) -> str:
+    """Format the PSNR in dB of the last step and the last validation, where they are measured."""
+    values = trainer.callback_metrics
     names = {"train/psnr": "PSNR {:.1f}", "val/psnr": "validation {:.1f}"}
-    return ", ".join(text.format(found[name]) for name, text in names.items() if name in found)
+    return ", ".join(text.format(values[name]) for name, text in names.items() if name in values)

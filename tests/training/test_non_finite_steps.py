@@ -1,4 +1,4 @@
-"""A non-finite step changes nothing, is named, kept and counted, and too many end the run."""
+"""A non-finite step changes nothing, is reported, saved and counted; too many end the run."""
 
 import re
 import sys
@@ -20,7 +20,7 @@ from asysplat.scene import Cameras, Views
 from asysplat.training.callbacks import NonFiniteSteps
 from asysplat.training.non_finite import first_non_finite, main, replay
 
-KEPT = ("model", "training", "trainer")  # of the configuration, what a step needs
+REPLAYED = ("model", "training", "trainer")  # parts of the configuration that a step needs
 
 
 def noise(views, size=4, scale=1.0, name="kitchen"):
@@ -43,14 +43,16 @@ class Module(lightning.LightningModule):
         self.layer, self.norm = nn.Linear(1, 2, bias=False), nn.BatchNorm1d(2)
         self.history = []
 
-    def terms(self, batch):
-        seen = self.layer(batch["inputs"].images.mean((0, 2, 3, 4))[:, None])
-        size, spread = seen.square().sum().sqrt(), self.norm(seen).square().sum()
+    net = None
+
+    def compute_terms(self, batch, net=None):
+        values = self.layer(batch["inputs"].images.mean((0, 2, 3, 4))[:, None])
+        size, spread = values.square().sum().sqrt(), self.norm(values).square().sum()
         return {"loss": size + spread, "size": size}
 
     def training_step(self, batch, index):
         self.history.append({k: v.clone() for k, v in self.state_dict().items()})
-        return self.terms(batch)["loss"]
+        return self.compute_terms(batch)["loss"]
 
     def configure_optimizers(self):
         return torch.optim.AdamW(self.parameters(), lr=0.1)
@@ -61,11 +63,11 @@ class Module(lightning.LightningModule):
 
 
 def fit(module, folder, loader=None, **options):
-    guard = NonFiniteSteps(folder, **options)
+    callback = NonFiniteSteps(folder, **options)
     trainer = lightning.Trainer(
         accelerator="cpu",
         max_epochs=1,
-        callbacks=[guard],
+        callbacks=[callback],
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -73,31 +75,33 @@ def fit(module, folder, loader=None, **options):
         gradient_clip_val=1.0,
     )
     trainer.fit(module, loader)
-    return guard
+    return callback
 
 
-def test_a_skipped_step_changes_nothing_and_is_named_and_kept(tmp_path, capsys):
+def test_a_non_finite_step_is_dropped_reported_and_saved(tmp_path, capsys):
     module = Module([1.0, float("nan"), 0.5])
-    guard = fit(module, tmp_path)
+    callback = fit(module, tmp_path)
     before, bad, after = module.history
     assert not torch.equal(before["layer.weight"], bad["layer.weight"])
     assert bad.keys() == after.keys() and "norm.running_mean" in bad
     assert all(torch.equal(bad[name], after[name]) for name in bad)
-    assert guard.skipped == 1 and guard.in_a_row == 0
-    said = capsys.readouterr().out
-    kept = tmp_path / "non_finite" / "step-000001-0.pt"
-    assert "step 1: the batch's inputs.images is not finite on scene 1; step skipped" in said
-    assert f"python -m asysplat.training.non_finite {kept}\n" in said
-    step = torch.load(kept, weights_only=True)
+    assert callback.count == 1 and callback.in_a_row == 0
+    output = capsys.readouterr().out
+    saved = tmp_path / "non_finite" / "step-000001-0.pt"
+    assert (
+        "step 1: the batch's inputs.images is not finite on scene 1; the step is dropped" in output
+    )
+    assert f"python -m asysplat.training.non_finite {saved}\n" in output
+    step = torch.load(saved, weights_only=True)
     assert step["scene"] == ["scene 1"] and step["inputs"]["images"].isnan().all()
     assert torch.equal(step["state_dict"]["layer.weight"], bad["layer.weight"])
 
 
-def test_the_budget_and_the_files(tmp_path):
+def test_budget_and_maximum_number_of_files(tmp_path):
     with pytest.raises(InputError, match=r"^5 steps in a row .*\(last: the batch's inputs\.images"):
         fit(Module([1.0] + 9 * [float("inf")]), tmp_path, budget=5)
-    kept = sorted(path.name for path in (tmp_path / "non_finite").iterdir())
-    assert kept == [f"step-{step:06d}-0.pt" for step in (1, 2, 3)]
+    saved = sorted(path.name for path in (tmp_path / "non_finite").iterdir())
+    assert saved == [f"step-{step:06d}-0.pt" for step in (1, 2, 3)]
 
 
 def first(module, scale=1.0):
@@ -108,7 +112,7 @@ def first(module, scale=1.0):
     return found
 
 
-def test_the_first_tensor_is_named_wherever_it_is():
+def test_first_non_finite_tensor():
     assert first(Module()) is None
     assert first(Module(), scale=float("inf")) == "the batch's inputs.images"
     assert first(Module(), scale=0.0) == "the gradient at the output of layer"
@@ -122,22 +126,24 @@ def test_the_first_tensor_is_named_wherever_it_is():
 
 
 @pytest.mark.medium
-def test_a_kept_step_of_the_network_is_taken_again(repository, tmp_path, capsys, monkeypatch):
+def test_replay_of_a_saved_step_of_the_network(repository, tmp_path, capsys, monkeypatch):
     with initialize_config_dir(str(repository / "conf"), version_base=None):
         config = compose("train", [*NETWORK, *STEPS, *VIEWS, "training.loss.depth=0.0"])
     net = instantiate(config.model)
     with torch.no_grad():
         net.head.decode.weight[0, 0] = torch.nan
     module = instantiate(config.training, net=net)
-    parts = {name: OmegaConf.to_container(config[name], resolve=True) for name in KEPT}
+    parts = {name: OmegaConf.to_container(config[name], resolve=True) for name in REPLAYED}
     module.save_hyperparameters(parts, logger=False)
     batch = [noise(4, size=32, name=name) for name in ("kitchen", "hall")]
     fit(module, tmp_path, DataLoader(batch, batch_size=2, collate_fn=collate))
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     pattern = r"step 0: (.*) is not finite on kitchen; .*non_finite (\S+)"
-    named, kept = re.search(pattern, said, re.DOTALL).groups()
-    assert named == "the output of net.head.decode"
-    assert replay(Path(kept)) == named
+    tensor, saved = re.search(pattern, output, re.DOTALL).groups()
+    assert tensor == "the output of net.head.decode"
+    assert replay(Path(saved)) == tensor
     monkeypatch.setattr(sys, "argv", ["non_finite", __file__])
-    with pytest.raises(SystemExit, match=r"error: .*test_guard\.py cannot be read as a step"):
+    with pytest.raises(
+        SystemExit, match=r"error: .*test_non_finite_steps\.py cannot be read as a step"
+    ):
         main()
