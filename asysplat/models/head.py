@@ -1,10 +1,11 @@
 """The linear decoder from tokens to Gaussians (paper, Sec. 3.2, "Merging and Gaussian Prediction").
 
-The paper fixes the 59 numbers of a Gaussian, not what they stand for: here are two readings.
+The paper gives the 59 numbers of a Gaussian, not their meaning; each head has its own.
 """
 
 import math
 from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -17,20 +18,35 @@ from asysplat.ops.precision import without_autocast
 from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Cameras, Gaussians, Views
 
-# With a prior, corrections are bounded: on scenes unlike those of its training a network is wrong
-# more often than the prior. Logits of places in the head's range and of opacity; logarithm of size.
-FARTHEST = 0.01  # where the prior is not sure: more makes surfaces rough,
-SURE = 0.3  # times that where it is
-UNBOUNDED = 10.0  # in scenes of which it knows nothing
-MOST_OPACITY = 0.5
-MOST_SIZE = 1.0
+# With a prior the network's corrections are bounded: on scenes unlike those of its training it is
+# wrong more often than the prior. In logits of the place in the head's range, and of opacity; in
+# logarithms of size.
+MAX_DEPTH_CORRECTION = 0.01  # at confidence 0: more makes surfaces rough,
+CONFIDENT_FACTOR = 0.3  # times that at confidence 1,
+MAX_DEPTH_WITHOUT_PRIOR = 10.0  # and in scenes without any known depth
+MAX_OPACITY_CORRECTION = 0.5
+MAX_SIZE_CORRECTION = 1.0
+
+
+class Decoded(NamedTuple):
+    """What the decoder gives for each Gaussian; quats, scales and sh are any numbers.
+
+    Args:
+        depth_fraction: in [0, 1], place in the head's range of distances.
+        opacities: in [0, 1].
+    """
+
+    depth_fraction: Float[Tensor, "B V h w 1"]
+    quats: Float[Tensor, "B V h w 4"]
+    scales: Float[Tensor, "B V h w 3"]
+    opacities: Float[Tensor, "B V h w"]
+    sh: Float[Tensor, "B V h w K 3"]
 
 
 class GaussianHead(nn.Module, ABC):
     """LayerNorm and Linear: each token gives p_f x p_f Gaussians.
 
-    There is one for each pixel of the image downsampled by p_c / p_f, on the ray through that
-    pixel's center.
+    Each pixel of the image downsampled by p_c / p_f gets one, on the ray through its center.
 
     Args:
         width: d_3.
@@ -64,10 +80,20 @@ class GaussianHead(nn.Module, ABC):
     ) -> Gaussians:
         """Decode Gaussians [B, V h p_f w p_f], row by row of view after view.
 
-        With a prior, distances are corrections of its own, smaller where it is sure, and opacities
-        of its own; without features nothing is corrected.
+        With a prior, the decoder corrects its distances, less at higher confidence, and its
+        opacities. Without features nothing is corrected.
         """
-        raw = self._nothing(views) if features is None else self._decoded(features)
+        if features is None:
+            size = (views.cameras.height // self.stride, views.cameras.width // self.stride)
+            zeros = views.images.new_zeros(())
+            raw = zeros.expand(*views.images.shape[:2], *size, sum(self.splits))
+        else:
+            raw = rearrange(
+                self.decode(self.norm(features)),
+                "b v h w (p q z) -> b v (h p) (w q) z",
+                p=self.patch,
+                q=self.patch,
+            )
         with without_autocast(raw):
             raw = raw.to(views.images.dtype)
             position, quats, scales, opacities, sh = raw.split(self.splits, dim=-1)
@@ -78,59 +104,30 @@ class GaussianHead(nn.Module, ABC):
                 opacities = opacities + self.opacity_bias
             else:
                 expected = self.depth_fraction(prior.distance).clamp(1e-4, 0.99).logit()
-                bound = FARTHEST * (1 - (1 - SURE) * prior.confidence)
-                bound = torch.where(prior.knows_something, bound, UNBOUNDED)
+                bound = MAX_DEPTH_CORRECTION * (1 - (1 - CONFIDENT_FACTOR) * prior.confidence)
+                bound = torch.where(prior.has_depth, bound, MAX_DEPTH_WITHOUT_PRIOR)
                 depth_logit = (expected + bounded(depth_logit[..., 0], bound))[..., None]
-                opacities = prior.opacity.logit() + bounded(opacities, MOST_OPACITY)
-                scales = bounded(scales, MOST_SIZE)
+                opacities = prior.opacity.logit() + bounded(opacities, MAX_OPACITY_CORRECTION)
+                scales = bounded(scales, MAX_SIZE_CORRECTION)
             sh = sh.unflatten(-1, (-1, 3))
-            gaussians = self.activate(
-                depth_logit.sigmoid(), quats, scales, opacities.sigmoid(), sh, views
-            )
-            return gaussians.map(lambda field: field.flatten(1, 3))
-
-    def _decoded(self, features: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h2 w2 z"]:
-        return rearrange(
-            self.decode(self.norm(features)),
-            "b v h w (p q z) -> b v (h p) (w q) z",
-            p=self.patch,
-            q=self.patch,
-        )
-
-    def _nothing(self, views: Views) -> Float[Tensor, "B V h2 w2 z"]:
-        size = (views.cameras.height // self.stride, views.cameras.width // self.stride)
-        return views.images.new_zeros(()).expand(*views.images.shape[:2], *size, sum(self.splits))
+            decoded = Decoded(depth_logit.sigmoid(), quats, scales, opacities.sigmoid(), sh)
+            return self.activate(decoded, views).map(lambda field: field.flatten(1, 3))
 
     @abstractmethod
     def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
-        """Return where a distance is in the head's range, in [0, 1] if it is inside."""
+        """Return the place of a distance in the head's range, in [0, 1] if it is inside."""
 
     @abstractmethod
-    def activate(
-        self,
-        depth_fraction: Float[Tensor, "B V h w 1"],
-        quats: Float[Tensor, "B V h w 4"],
-        scales: Float[Tensor, "B V h w 3"],
-        opacities: Float[Tensor, "B V h w"],
-        sh: Float[Tensor, "B V h w K 3"],
-        views: Views,
-    ) -> Gaussians:
-        """Turn what was decoded into Gaussians [B, V, h, w].
-
-        Args:
-            depth_fraction: in [0, 1], where in the head's range of distances.
-            opacities: in [0, 1].
-            quats, scales, sh: any numbers.
-            views: what the tokens were made of.
-        """
+    def activate(self, raw: Decoded, views: Views) -> Gaussians:
+        """Return Gaussians [B, V, h, w] from decoded numbers and the network's input views."""
 
 
 class PhotographHead(GaussianHead):
-    """Our own head: an untrained model draws its input photographs at a middle distance.
+    """Our own head: an untrained model renders its input images at a middle distance.
 
-    Training therefore starts from pictures. Colors are residuals to the downsampled photograph,
-    sizes are in units of the pixel's footprint, distances logarithmic. The photograph bypasses both
-    branches: what the appearance branch adds is less than with colors of its own.
+    Training therefore starts from images. Colors are residuals to the downsampled image, sizes are
+    in units of the pixel's footprint, distances logarithmic. The image bypasses both branches, so
+    the appearance branch contributes less than in a head without it.
 
     Args:
         width, patch_coarse, patch_fine, sh_degree, opacity_bias: of GaussianHead.
@@ -156,29 +153,23 @@ class PhotographHead(GaussianHead):
     def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
         return (distance / self.near).log() / math.log(self.far / self.near)
 
-    def activate(
-        self,
-        depth_fraction: Float[Tensor, "B V h w 1"],
-        quats: Float[Tensor, "B V h w 4"],
-        scales: Float[Tensor, "B V h w 3"],
-        opacities: Float[Tensor, "B V h w"],
-        sh: Float[Tensor, "B V h w K 3"],
-        views: Views,
-    ) -> Gaussians:
-        cameras = views.cameras.resized(*opacities.shape[2:])
+    def activate(self, raw: Decoded, views: Views) -> Gaussians:
+        cameras = views.cameras.resized(*raw.opacities.shape[2:])
         origins, directions = cameras.rays()
-        distance = self.near * (self.far / self.near) ** depth_fraction
-        identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+        distance = self.near * (self.far / self.near) ** raw.depth_fraction
+        identity = raw.quats.new_tensor([1.0, 0.0, 0.0, 0.0])
         return Gaussians(
             means=origins + distance * directions,
-            quats=quats + identity,
-            scales=(scales + self.scale_bias).clamp(-5, 3).exp() * distance * footprint(cameras),
-            opacities=opacities,
-            sh=torch.cat((sh[..., :1, :] + self._photograph(views), sh[..., 1:, :]), dim=-2),
+            quats=raw.quats + identity,
+            scales=(raw.scales + self.scale_bias).clamp(-5, 3).exp()
+            * distance
+            * footprint(cameras),
+            opacities=raw.opacities,
+            sh=torch.cat((raw.sh[..., :1, :] + self._colors(views), raw.sh[..., 1:, :]), dim=-2),
         )
 
-    def _photograph(self, views: Views) -> Float[Tensor, "B V h w 1 3"]:
-        """Return the downsampled photographs as SH of degree 0."""
+    def _colors(self, views: Views) -> Float[Tensor, "B V h w 1 3"]:
+        """Return the downsampled images as SH of degree 0."""
         small = F.avg_pool2d(views.images.flatten(0, 1), self.stride).unflatten(
             0, views.images.shape[:2]
         )
@@ -190,9 +181,9 @@ class LongLRMHead(GaussianHead):
 
     Colors and sizes are direct, sizes in units of the scene and at most e^largest; the distance
     along the ray is linear from 0 to `farthest`. Lengths are those of the normalized scene, whose
-    input cameras stand within radius 1 (`asysplat.data.normalize`); Long-LRM's stand in the box
-    [-1, 1]^3, so its scenes are up to sqrt(3) times larger. It draws with a near
-    plane at 0.01, as `asysplat.rendering` does, and a far one at 1e6, beyond all that is predicted.
+    input cameras are within radius 1 (`asysplat.data.normalize`); Long-LRM's are in the box
+    [-1, 1]^3, so its scenes are up to sqrt(3) times larger. It renders with a near plane at 0.01,
+    as `asysplat.rendering` does, and a far one at 1e6, beyond every prediction.
 
     Args:
         width, patch_coarse, patch_fine, sh_degree, opacity_bias: of GaussianHead.
@@ -219,29 +210,21 @@ class LongLRMHead(GaussianHead):
     def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
         return distance / self.farthest
 
-    def activate(
-        self,
-        depth_fraction: Float[Tensor, "B V h w 1"],
-        quats: Float[Tensor, "B V h w 4"],
-        scales: Float[Tensor, "B V h w 3"],
-        opacities: Float[Tensor, "B V h w"],
-        sh: Float[Tensor, "B V h w K 3"],
-        views: Views,
-    ) -> Gaussians:
-        origins, directions = views.cameras.resized(*opacities.shape[2:]).rays()
-        sizes = (scales + self.scale_bias).clamp(max=self.largest).exp()
+    def activate(self, raw: Decoded, views: Views) -> Gaussians:
+        origins, directions = views.cameras.resized(*raw.opacities.shape[2:]).rays()
+        sizes = (raw.scales + self.scale_bias).clamp(max=self.largest).exp()
         return Gaussians(
-            means=origins + self.farthest * depth_fraction * directions,
-            quats=quats,
+            means=origins + self.farthest * raw.depth_fraction * directions,
+            quats=raw.quats,
             # Ours: a size stays above 0 where the exponential underflows.
             scales=sizes.clamp_min(torch.finfo(sizes.dtype).tiny),
-            opacities=opacities,
-            sh=sh,
+            opacities=raw.opacities,
+            sh=raw.sh,
         )
 
 
 def bounded(values: Tensor, bound: Tensor | float) -> Tensor:
-    """Return numbers within the bound; those well inside it hardly change."""
+    """Squash numbers into [-bound, bound]; small ones hardly change."""
     return bound * (values / bound).tanh()
 
 

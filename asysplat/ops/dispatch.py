@@ -1,7 +1,9 @@
-"""Which back end of an operator runs: the one that is asked for, or the fast one for a device."""
+"""The choice of an operator's backend, and checks of its inputs."""
 
 from collections.abc import Mapping
+from importlib import import_module
 from importlib.util import find_spec
+from types import ModuleType
 from typing import TypeVar
 
 import torch
@@ -10,14 +12,14 @@ from torch import Tensor
 from asysplat.errors import InputError
 
 Form = TypeVar("Form")
-FAST = ("cpu", "cuda")  # back ends made of kernels
+FAST = ("cpu", "cuda")  # backends made of kernels
 
 
 def pick_backend(operator: str, backends: Mapping[str, Form], backend: str) -> Form:
-    """Return the function or module that `backend` names.
+    """Return the function or module of a backend.
 
     Raises:
-        InputError: an unknown name; the message lists those there are.
+        InputError: an unknown name; the message lists the known ones.
     """
     if backend not in backends:
         raise InputError(f"{operator} backend={backend!r}: expected one of {', '.join(backends)}.")
@@ -25,19 +27,21 @@ def pick_backend(operator: str, backends: Mapping[str, Form], backend: str) -> F
 
 
 def fast_backend(x: Tensor, in_torch: str) -> str:
-    """Return the name of the fastest back end for the device and the type of x.
+    """Return the name of the fastest backend for the device and type of x.
 
     Args:
-        x: what is computed with.
-        in_torch: the name of the one for any device and type.
+        in_torch: the name of the backend for any device and type.
     """
     if x.dtype == torch.float64:
         return in_torch
     if x.device.type in ("cpu", "meta"):
         return "cpu"
-    if x.device.type == "cuda" and find_spec("triton"):
-        return "cuda"
-    return in_torch
+    return "cuda" if x.device.type == "cuda" and find_spec("triton") else in_torch
+
+
+def load_kernels(operator: str, backend: str) -> ModuleType:
+    """Import an operator's kernels when they are first used: Numba and Triton load slowly."""
+    return import_module(f"asysplat.ops.{operator}.{backend}")
 
 
 def check_fast_backend(operator: str, backend: str, x: Tensor) -> None:
@@ -60,8 +64,33 @@ def check_fast_backend(operator: str, backend: str, x: Tensor) -> None:
         raise InputError(f"{operator}'s backend 'cuda' needs triton: pip install triton.")
 
 
+def check_shape(operator: str, name: str, tensor: Tensor, shape: object, reason: str = "") -> None:
+    """Raise InputError unless a tensor has this shape; `reason` follows in the message."""
+    if tuple(tensor.shape) != shape:
+        raise InputError(
+            f"{operator}'s {name} has shape {tuple(tensor.shape)}: expected {shape}{reason}."
+        )
+
+
+def check_device(operator: str, name: str, tensor: Tensor, first: str, like: Tensor) -> None:
+    """Raise InputError unless a tensor is on the device of the argument `first`."""
+    if tensor.device != like.device:
+        raise InputError(
+            f"{operator}'s {name} is on {tensor.device} and {first} on {like.device}: move both "
+            "to one device."
+        )
+
+
+def check_float(operator: str, name: str, tensor: Tensor, advice: str = "") -> None:
+    """Raise InputError unless a tensor has floating-point numbers."""
+    if not tensor.is_floating_point():
+        raise InputError(
+            f"{operator}'s {name} is {tensor.dtype}: give floating-point numbers{advice}."
+        )
+
+
 def _interpreted(backend: str) -> bool:
-    """Return whether Triton interprets its kernels on a CPU, as tests let it."""
+    """Return whether Triton interprets its kernels on a CPU, as in tests."""
     if backend != "cuda" or not find_spec("triton"):
         return False
     import triton

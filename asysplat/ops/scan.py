@@ -1,11 +1,12 @@
-"""What both scans have in common: how one is called, and what torch sees of it.
+"""The frame of both scans: checks, the choice of a backend, and their operators in torch.
 
-A `Scan` checks its inputs and picks a form. "reference" and "chunked" are functions in torch; "cpu"
-and "cuda" are modules of kernels. Torch sees the kernels as one operator, so that autograd,
-torch.compile, autocast, the meta device and the FLOP counter take a scan as a whole.
+"reference" and "chunked" are functions in torch; "cpu" and "cuda" are modules of kernels, which
+torch sees as one operator, so that autograd, torch.compile, autocast, the meta device and the FLOP
+counter take a scan as a whole.
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import torch
@@ -13,8 +14,19 @@ from torch import Tensor
 from torch.utils.flop_counter import register_flop_formula
 
 from asysplat.errors import InputError
-from asysplat.ops.dispatch import FAST, check_fast_backend, fast_backend, pick_backend
+from asysplat.ops.dispatch import (
+    FAST,
+    check_device,
+    check_fast_backend,
+    check_float,
+    check_shape,
+    fast_backend,
+    load_kernels,
+    pick_backend,
+)
 from asysplat.ops.precision import without_autocast
+
+CountFlops = Callable[[tuple[int, ...], tuple[int, ...]], tuple[int, int]]
 
 
 class ScanInputs(NamedTuple):
@@ -29,7 +41,7 @@ class ScanInputs(NamedTuple):
 
 
 class Kernels(Protocol):
-    """The functions of a scan's modules cpu and cuda; x, B and C are of one float type."""
+    """The functions of a scan's modules cpu and cuda; x, B and C have the same float type."""
 
     def saved_state_shape(self, x: Tensor, B: Tensor) -> tuple[int, ...]:
         """Return the shape of what the backward pass needs besides the inputs, in fp32."""
@@ -49,9 +61,7 @@ class Scan:
     Args:
         name: "ssd" or "selective_scan".
         axes: of each input, such as "B L N"; those of x and N give all sizes.
-        forms: the functions in torch, (x, dt, A, B, C, D) -> y, by name.
-        load_kernels: "cpu" or "cuda" -> the module; called when it is first used, as it imports
-            Numba's or Triton's compiler.
+        forms: the functions in torch, by name.
         count_flops: (shape of x, shape of B) -> FLOPs of the forward and of the backward pass.
     """
 
@@ -59,20 +69,19 @@ class Scan:
         self,
         name: str,
         axes: Mapping[str, str],
-        forms: Mapping[str, Callable[..., Tensor]],
-        load_kernels: Callable[[str], Kernels],
-        count_flops: Callable[[tuple[int, ...], tuple[int, ...]], tuple[int, int]],
+        forms: Mapping[str, Callable[[ScanInputs], Tensor]],
+        count_flops: CountFlops,
     ):
         self.name, self.forms = name, forms
         self.axes = {key: value.split() for key, value in axes.items()}
-        self.run_kernels = _register_operator(name, load_kernels, count_flops)
+        self.run_kernels = _register_operator(name, count_flops)
 
     def __call__(self, inputs: ScanInputs, backend: str, reverse: bool) -> Tensor:
         """Return y in the type of x, scanned from the last token to the first if `reverse`.
 
         Raises:
             InputError: an unknown backend, or one that cannot take these tensors; shapes or devices
-                that do not go together; integers; no token.
+                that do not fit together; integers; no token.
         """
         self._check(inputs)
         if backend == "auto":
@@ -83,75 +92,47 @@ class Scan:
                 return self._by_kernels(inputs, backend, reverse)
             backends = {"auto": None, **self.forms, **dict.fromkeys(FAST)}
             form = pick_backend(self.name, backends, backend)
-            return _by_torch(inputs, form, reverse)
+            dtype = torch.promote_types(inputs.x.dtype, torch.float32)
+            arguments = ScanInputs(*(tensor.to(dtype) for tensor in inputs))
+            if not reverse:
+                return form(arguments).to(inputs.x.dtype)
+            x, dt, A, B, C, D = arguments
+            flipped = ScanInputs(x.flip(1), dt.flip(1), A, B.flip(1), C.flip(1), D)
+            return form(flipped).flip(1).to(inputs.x.dtype)
 
     def _by_kernels(self, inputs: ScanInputs, backend: str, reverse: bool) -> Tensor:
         keep = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs)
+        dtypes = (inputs.x.dtype if name in "xBC" else torch.float32 for name in inputs._fields)
+        tensors = (tensor.to(dtype) for tensor, dtype in zip(inputs, dtypes, strict=True))
         y, _ = self.run_kernels(
-            backend,
-            x=inputs.x.contiguous(),
-            dt=inputs.dt.float().contiguous(),
-            A=inputs.A.float().contiguous(),
-            B=inputs.B.to(inputs.x.dtype).contiguous(),
-            C=inputs.C.to(inputs.x.dtype).contiguous(),
-            D=inputs.D.float().contiguous(),
-            reverse=reverse,
-            keep=keep,
+            backend, *(tensor.contiguous() for tensor in tensors), reverse=reverse, keep=keep
         )
         return y
 
     def _check(self, inputs: ScanInputs) -> None:
-        x, B = inputs.x, inputs.B
-        axes = self.axes["x"]
+        x, B, axes = inputs.x, inputs.B, self.axes["x"]
         if x.ndim != len(axes):
-            raise InputError(
-                f"{self.name}'s x has shape {tuple(x.shape)}: expected [{', '.join(axes)}]."
-            )
+            check_shape(self.name, "x", x, f"[{', '.join(axes)}]")
         sizes = dict(zip(axes, x.shape, strict=True)) | {"N": B.shape[-1]}
+        given = f"x has shape {tuple(x.shape)} and B {tuple(B.shape)}"
         for (name, axes), tensor in zip(self.axes.items(), inputs, strict=True):
             shape = tuple(sizes[axis] for axis in axes)
-            if tensor.shape != shape:
-                raise InputError(
-                    f"{self.name}'s {name} has shape {tuple(tensor.shape)}: expected {shape}, as x "
-                    f"has shape {tuple(x.shape)} and B {tuple(B.shape)}."
-                )
-            if tensor.device != x.device:
-                raise InputError(
-                    f"{self.name}'s {name} is on {tensor.device} and x on {x.device}: move both to "
-                    "one device."
-                )
-        for name, tensor in zip(inputs._fields, inputs, strict=True):
-            if not tensor.is_floating_point():
-                raise InputError(
-                    f"{self.name}'s {name} is {tensor.dtype}: give floating-point numbers."
-                )
+            check_shape(self.name, name, tensor, shape, f", as {given}")
+            check_device(self.name, name, tensor, "x", x)
+        for name, tensor in inputs._asdict().items():
+            check_float(self.name, name, tensor)
         if x.numel() == 0 or B.numel() == 0:
-            raise InputError(
-                f"{self.name}'s x has shape {tuple(x.shape)} and B {tuple(B.shape)}: every side "
-                "must be at least 1."
-            )
+            raise InputError(f"{self.name}'s {given}: every side must be at least 1.")
 
 
-def _by_torch(inputs: ScanInputs, form: Callable[..., Tensor], reverse: bool) -> Tensor:
-    dtype = torch.promote_types(inputs.x.dtype, torch.float32)
-    x, dt, A, B, C, D = (tensor.to(dtype) for tensor in inputs)
-    if reverse:
-        x, dt, B, C = (sequence.flip(1) for sequence in (x, dt, B, C))
-    y = form(x, dt, A, B, C, D)
-    return (y.flip(1) if reverse else y).to(inputs.x.dtype)
-
-
-def _register_operator(
-    name: str,
-    load_kernels: Callable[[str], Kernels],
-    count_flops: Callable[[tuple[int, ...], tuple[int, ...]], tuple[int, int]],
-) -> Callable[..., tuple[Tensor, Tensor]]:
-    """Make asysplat::<name> and its backward pass known to torch; see `Scan` for the arguments.
+def _register_operator(name: str, count_flops: CountFlops) -> Callable[..., tuple[Tensor, Tensor]]:
+    """Register asysplat::<name> and its backward pass with torch; see `Scan` for the arguments.
 
     Returns:
         (backend, x, dt, A, B, C, D, reverse, keep) -> (y, saved state).
     """
     tensors = "Tensor x, Tensor dt, Tensor A, Tensor B, Tensor C, Tensor D"
+    kernels = partial(load_kernels, name)  # a module as `Kernels` describes
 
     @torch.library.custom_op(
         f"asysplat::{name}",
@@ -159,7 +140,7 @@ def _register_operator(
         schema=f"(str backend, {tensors}, bool reverse, bool keep) -> (Tensor, Tensor)",
     )
     def forward(backend, x, dt, A, B, C, D, reverse, keep):
-        return load_kernels(backend).forward(ScanInputs(x, dt, A, B, C, D), reverse, keep)
+        return kernels(backend).forward(ScanInputs(x, dt, A, B, C, D), reverse, keep)
 
     @torch.library.custom_op(
         f"asysplat::{name}_backward",
@@ -169,11 +150,11 @@ def _register_operator(
     )
     def backward(backend, grad_output, x, dt, A, B, C, D, saved_state, reverse):
         inputs = ScanInputs(x, dt, A, B, C, D)
-        return tuple(load_kernels(backend).backward(grad_output, inputs, saved_state, reverse))
+        return tuple(kernels(backend).backward(grad_output, inputs, saved_state, reverse))
 
     @forward.register_fake
     def _(backend, x, dt, A, B, C, D, reverse, keep):
-        shape = load_kernels(backend).saved_state_shape(x, B)
+        shape = kernels(backend).saved_state_shape(x, B)
         shape = shape if keep else (0,) * len(shape)
         return torch.empty_like(x), x.new_empty(shape, dtype=torch.float32)
 

@@ -1,14 +1,14 @@
 """Sparse points as a prior, exact at a point and less trusted away from it, and in a sweep."""
 
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 import torch
 
 from asysplat.models import PlaneSweepPrior, PointsPrior
-from asysplat.models import prior as prior_module
-from asysplat.models.prior import UNKNOWN
-from asysplat.ops import plane_sweep
+from asysplat.models.prior.plane_sweep import plane_sweep
+from asysplat.models.prior.prior import UNKNOWN_DISTANCE
 from asysplat.scene import Cameras, Views
 
 SIZE = (16, 16)
@@ -48,7 +48,7 @@ def test_views_without_points_are_unknown():
     none_seen = PointsPrior()(make_views(torch.zeros(1, 2, 32, 32)), SIZE)
     for prior in (unknown, none_seen):
         assert prior.confidence.max() == 0
-        assert (prior.distance == UNKNOWN).all()
+        assert (prior.distance == UNKNOWN_DISTANCE).all()
 
 
 def test_gaussians_start_at_the_points(build):
@@ -67,7 +67,7 @@ def test_a_sweep_looks_where_the_points_are(monkeypatch):
         given.append(ranges)
         return plane_sweep(images, cameras, stride, backend="reference", ranges=ranges, **options)
 
-    monkeypatch.setattr(prior_module, "plane_sweep", spy)
+    monkeypatch.setattr(import_module(PlaneSweepPrior.__module__), "plane_sweep", spy)
     points = torch.zeros(1, 2, 32, 32)
     points[0, 0, :10, :10] = torch.linspace(2, 4, 100).reshape(10, 10)
     points[0, 0, 20, 20] = 0.01  # a stray point

@@ -11,8 +11,8 @@ from test_head import make_views
 
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.models import DepthPrior, LongLRMHead, PhotographHead, PlaneSweepPrior
-from asysplat.models.head import FARTHEST, SURE
-from asysplat.models.prior import COVER, UNKNOWN, Prior
+from asysplat.models.head import CONFIDENT_FACTOR, MAX_DEPTH_CORRECTION
+from asysplat.models.prior.prior import COVER, UNKNOWN_DISTANCE, Prior
 from asysplat.scene import Cameras, Views
 
 MODELS = ["asysplat_4m4s", "longlrm", "single_branch", "asysplat_pred_fine"]
@@ -95,7 +95,7 @@ def test_unknown_is_the_untrained_distance():
     head = PhotographHead(8, 16, 8)
     torch.nn.init.zeros_(head.decode.weight)
     shape = (1, 2, 8, 8)
-    unknown = Prior(torch.full(shape, UNKNOWN), torch.zeros(shape), torch.full(shape, 0.5))
+    unknown = Prior(torch.full(shape, UNKNOWN_DISTANCE), torch.zeros(shape), torch.full(shape, 0.5))
     tokens = torch.zeros(1, 2, 1, 1, 8)
     with_prior, without = head(tokens, views, unknown), head(tokens, views)
     torch.testing.assert_close(with_prior.means, without.means)
@@ -117,12 +117,12 @@ def test_gaussians_start_where_the_prior_says(head):
     torch.testing.assert_close(gaussians.opacities[0], prior.opacity.flatten())
 
 
-@pytest.mark.parametrize("sure", [0.0, 1.0])
-def test_corrections_are_bounded_where_something_is_known(sure):
+@pytest.mark.parametrize("confident", [0.0, 1.0])
+def test_corrections_are_bounded_where_something_is_known(confident):
     views, shape = make_views(), (1, 2, 8, 8)
     head = PhotographHead(8, 16, 8)
     torch.nn.init.normal_(head.decode.weight, std=100.0)
-    confidence = torch.full(shape, sure)
+    confidence = torch.full(shape, confident)
     confidence[0, 0, 0, 0] = 0.5
     prior = Prior(torch.full(shape, 3.0), confidence, torch.full(shape, 0.5))
     tokens = torch.randn(1, 2, 1, 1, 8)
@@ -132,7 +132,7 @@ def test_corrections_are_bounded_where_something_is_known(sure):
     origins = views.cameras.centers[0, :, None].expand(2, 64, 3).reshape(-1, 3)
     ratio = (moved.means[0] - origins).norm(dim=-1) / (before.means[0] - origins).norm(dim=-1)
     # A logit is at most a quarter of the range, which is a factor of 1000.
-    bound = FARTHEST * (SURE if sure else 1) / 4 * math.log(1000)
+    bound = MAX_DEPTH_CORRECTION * (CONFIDENT_FACTOR if confident else 1) / 4 * math.log(1000)
     assert ratio[1:].log().abs().max() <= 1.001 * bound
     assert (moved.opacities.logit() - before.opacities.logit()).abs().max() <= 0.501
     # Sizes are in pixels, so that they follow the distance.

@@ -13,9 +13,13 @@ import pytest
 import torch
 from swept import cameras_at, depth_of_plane, four_cameras, slanted_plane, texture
 
-from asysplat.ops import plane_sweep
+from asysplat.models.prior.plane_sweep import plane_sweep
+from asysplat.models.prior.projections import (
+    Projections,
+    choose_neighbors,
+    inverse_depth_range,
+)
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.cameras import Projections, choose_neighbors, inverse_depth_range
 from asysplat.scene import Cameras
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -36,8 +40,8 @@ if not INTERPRETED:
     SIZES += LARGER
 
 
-def match_arguments(height, width, scenes, views, neighbors, planes, stride):
-    """What `match` is given, in float32: noise that cameras turned a little look at."""
+def cost_arguments(height, width, scenes, views, neighbors, planes, stride):
+    """The inputs of `cost_volume`, in float32: noise seen by slightly rotated cameras."""
     centers = [(0.2 * v, 0.1 * (v % 2), 0.05 * v) for v in range(views)]
     cameras = cameras_at(centers, height=height, width=width, scenes=scenes)
     angles = 0.1 * torch.randn(scenes, views, 3, 3, dtype=torch.float64)
@@ -50,63 +54,63 @@ def match_arguments(height, width, scenes, views, neighbors, planes, stride):
     return images, chosen, between.into(chosen, height, width), ranges, planes, stride
 
 
-def moved(arguments, target):
+def converted(arguments, target):
     return [a.to(target) if torch.is_tensor(a) and a.is_floating_point() else a for a in arguments]
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("backend", FAST)
-def test_costs_are_those_of_the_reference(backend, size):
+def test_cost_volume_equals_the_reference(backend, size):
     form = import_module(f"asysplat.ops.plane_sweep.{backend}")
-    arguments = match_arguments(*size)
-    exact = reference.match(*moved(arguments, torch.float64))
+    arguments = cost_arguments(*size)
+    exact = reference.cost_volume(*converted(arguments, torch.float64))
     device = DEVICE[backend]
-    got = form.match(*(a.to(device) if torch.is_tensor(a) else a for a in arguments))
+    got = form.cost_volume(*(a.to(device) if torch.is_tensor(a) else a for a in arguments))
     assert got.dtype == torch.float32 and got.shape == exact.shape
-    # Seen or not, at the border of an image, may turn on the last bit: of a pixel in a thousand.
+    # Inside the image may depend on the last bit at its border: at one pixel in a thousand.
     error = (got.cpu() - exact).abs()
     assert (error > 2e-5).double().mean() <= 1e-3, error.max()
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("backend", FAST)
-def test_smoothed_planes_are_those_of_the_reference(backend, size):
+def test_sgm_equals_the_reference(backend, size):
     height, width, scenes, views, _, planes, _ = size
     form = import_module(f"asysplat.ops.plane_sweep.{backend}")
     costs = 2 * torch.rand(scenes, views, height, width, planes)
     weights = torch.rand(scenes, views, height, width)
     edges = 0.2 * torch.rand(scenes, views, 2, height, width)
-    exact = reference.smooth(costs.double(), weights.double(), edges.double())
-    got = form.smooth(*(tensor.to(DEVICE[backend]) for tensor in (costs, weights, edges)))
+    exact = reference.sgm(costs.double(), weights.double(), edges.double())
+    got = form.sgm(*(tensor.to(DEVICE[backend]) for tensor in (costs, weights, edges)))
     for there, here in zip(exact, got, strict=True):
         assert here.dtype == torch.float32 and here.shape == there.shape
-        # Two planes may cost the same to the last bit: of a pixel in a hundred.
+        # Two planes may cost the same to the last bit: at one pixel in a hundred.
         assert ((here.cpu() - there).abs() > 1e-3).double().mean() <= 1e-2
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("backend", FAST)
-def test_votes_are_those_of_the_reference(backend, size):
-    """Depths of which some agree, seen by views turned a little."""
+def test_consistency_equals_the_reference(backend, size):
+    """Depths of which some agree, in slightly rotated views."""
     form = import_module(f"asysplat.ops.plane_sweep.{backend}")
-    _, chosen, projections, ranges, _, _ = match_arguments(*size)
+    _, chosen, projections, ranges, _, _ = cost_arguments(*size)
     height, width, scenes, views = size[:4]
     inverse = ranges.mean(-1)[..., None, None] * (1 + torch.rand(scenes, views, height, width)) / 2
     trust = torch.rand(scenes, views, height, width)
     arguments = inverse, inverse.mean((-1, -2)) / 4, trust, chosen, projections
-    exact = reference.count_votes(*moved(arguments, torch.float64))
-    got = form.count_votes(*(tensor.to(DEVICE[backend]) for tensor in arguments))
+    exact = reference.consistency(*converted(arguments, torch.float64))
+    got = form.consistency(*(tensor.to(DEVICE[backend]) for tensor in arguments))
     for name, there, here in zip(exact._fields, exact, got, strict=True):
         assert here.dtype == torch.float32 and here.shape == there.shape
-        # Seen or not, and the same or not, may turn on the last bit: of a pixel in a thousand.
+        # Inside and agreeing may depend on the last bit: at one pixel in a thousand.
         assert ((here.cpu() - there).abs() > 1e-5).double().mean() <= 1e-3, name
     if len(chosen[0]) > 1 and height > 4:
-        assert all(votes.any() for votes in exact)
+        assert all(counts.any() for counts in exact)
 
 
 @pytest.mark.skipif(INTERPRETED, reason="slow")
 @pytest.mark.parametrize("stride", [1, 2])
-def test_the_whole_sweep_is_that_of_the_reference(stride):
+def test_plane_sweep_equals_the_reference(stride):
     cameras = four_cameras()
     images, _ = slanted_plane(cameras)
     exact = plane_sweep(images, cameras, stride, backend="reference")

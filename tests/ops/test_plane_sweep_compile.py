@@ -26,11 +26,11 @@ def test_all_kernels_compile(monkeypatch, architecture):
 
     monkeypatch.setattr(JITFunction, "run", run)
     neighbors = torch.tensor([[[1, -1, -1, -1], [0, -1, -1, -1]]])
-    costs = cuda.match(
+    costs = cuda.cost_volume(
         *(torch.zeros(1, 2, 8, 12), neighbors, torch.zeros(1, 2, 4, 3, 4), torch.zeros(1, 2, 2)),
         planes=48,
         stride=2,
     )
-    cuda.smooth(costs, torch.ones(1, 2, 4, 6), torch.zeros(1, 2, 2, 4, 6))
-    assert {name for name, _ in kernels} == {"match_band", "add_paths"}
+    cuda.sgm(costs, torch.ones(1, 2, 4, 6), torch.zeros(1, 2, 2, 4, 6))
+    assert {name for name, _ in kernels} == {"cost_band", "add_paths"}
     assert all(kernel.asm["cubin"] for kernel in kernels.values())

@@ -5,8 +5,8 @@ import torch
 import torch.nn.functional as F
 from swept import four_cameras, turned
 
-from asysplat.ops.plane_sweep.cameras import Projections
-from asysplat.ops.plane_sweep.images import edges, shrink
+from asysplat.models.prior.plane_sweep import edges, shrink
+from asysplat.models.prior.projections import Projections
 from asysplat.scene import Cameras
 
 

@@ -7,7 +7,7 @@ import torch
 from swept import cameras_at, four_cameras, slanted_plane, turned
 
 from asysplat.errors import InputError
-from asysplat.ops import plane_sweep
+from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.scene import Cameras
 
 BACKENDS = ["reference", "cpu"]

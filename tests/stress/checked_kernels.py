@@ -14,13 +14,14 @@ from poison import FILLS, poisoned
 from tangents import tangent_scene
 from torch import Tensor
 
-from asysplat.ops import image_loss, plane_sweep, selective_scan, ssd
+from asysplat.models.prior.plane_sweep import plane_sweep
+from asysplat.ops import image_loss, selective_scan, ssd
 from asysplat.ops.simd.gathers import gather_pairs, gather_squares
 from asysplat.ops.simd.kernel import kernel
 from asysplat.ops.simd.vectors import load, load_some, store, zeros
 from asysplat.refinement.adam import VisibleAdam
 from asysplat.rendering import Culling
-from asysplat.rendering.cpu.math import take_sum
+from asysplat.rendering.cpu.math import sum_and_clear
 from asysplat.scene import Cameras, Gaussians
 
 CPU = next(backend for backend in FAST if backend.name == "cpu")
@@ -61,7 +62,7 @@ def check_renderer() -> int:
         scene = wild_scene(seed, height, width, degree)
         cases += [(scene, {"antialiased": True}), (scene, {"depth": "median"})]
         for name in ("ellipse", "extent", "frustum", "rows", "opaque"):
-            cases.append((scene, {"culling": culling.without(name)}))
+            cases.append((scene, {"culling": culling.disable(name)}))
         masks = torch.zeros(2, 2, height, width, dtype=torch.bool)
         masks[..., : height // 2] = True
         cases.append((scene, {"masks": masks}))
@@ -155,7 +156,8 @@ def stepped(num: int) -> Result:
         gradients = normal()
         gradients["sh"][::100] = torch.nan
         optimizer.step(gradients, rates, torch.rand(num, generator=generator) < 0.5)
-    return Result(optimizer.parameters | optimizer.state(), {}, {"skipped": optimizer.skipped})
+    state = {f"{n}.{part}": t for n, parts in optimizer._state.items() for part, t in parts.items()}
+    return Result(optimizer.parameters | state, {}, {"non_finite": optimizer.non_finite})
 
 
 def in_all_memories(run) -> None:
@@ -172,7 +174,7 @@ def _step_out(which, numbers, rows):
     if which == 0:
         numbers[len(numbers)] = 1
     elif which == 1:
-        take_sum(numbers, len(numbers) - 15)
+        sum_and_clear(numbers, len(numbers) - 15)
     elif which == 2:
         store(rows, len(rows), load(rows, 0))
     elif which == 3:

@@ -7,7 +7,7 @@ from asysplat.benchmark.stability.judge import Case, Comparison, Function, Tenso
 from asysplat.benchmark.stability.views import Hostile, hostile_views
 from asysplat.benchmark.timing import Result
 from asysplat.models.prior import PlaneSweepPrior
-from asysplat.ops import plane_sweep
+from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.scene import Cameras, Views
 
 NEARLY_0 = 1e-30  # where nothing is found the greatest is 0

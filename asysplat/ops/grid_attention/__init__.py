@@ -1,10 +1,10 @@
-"""Attention over the tokens of all views with one place in a p_g x p_g grid (paper, Sec. 3.3)."""
+"""Attention between tokens of all views at the same place of a p_g x p_g grid (Sec. 3.3)."""
 
 from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.ops.dispatch import pick_backend
+from asysplat.ops.dispatch import check_device, check_float, check_shape, pick_backend
 from asysplat.ops.grid_attention.reference import grid_attention_reference
 from asysplat.ops.grid_attention.sdpa import grid_attention_sdpa
 
@@ -22,14 +22,14 @@ def grid_attention(
     grid: int,
     backend: str = "auto",
 ) -> Float[Tensor, "B V h w H P"]:
-    """Let token (i, j) of every view attend to tokens (i + a p_g, j + b p_g) of all views.
+    """Attend from token (i, j) of every view to tokens (i + a p_g, j + b p_g) of all views.
 
     Args:
         q, k, v: token maps of V views and H heads, P the head_dim.
         grid: p_g; 1 is full attention.
 
     Raises:
-        InputError: shapes, devices or types that do not go together, grid < 1, or an unknown
+        InputError: shapes, devices or types that do not fit together, grid < 1, or an unknown
             backend.
     """
     form = pick_backend("grid_attention", _BACKENDS, backend)
@@ -40,18 +40,9 @@ def grid_attention(
 def _check(q: Tensor, k: Tensor, v: Tensor, grid: int) -> None:
     if grid < 1:
         raise InputError(f"grid_attention got grid={grid}: give 1, full attention, or more.")
+    if q.ndim != 6:
+        check_shape("grid_attention", "q", q, "[B, V, h, w, H, P]")
     for name, tensor in {"q": q, "k": k, "v": v}.items():
-        if tensor.ndim != 6 or tensor.shape != q.shape:
-            expected = "[B, V, h, w, H, P]" if tensor is q else tuple(q.shape)
-            raise InputError(
-                f"grid_attention's {name} has shape {tuple(tensor.shape)}: expected {expected}."
-            )
-        if not tensor.is_floating_point():
-            raise InputError(
-                f"grid_attention's {name} is {tensor.dtype}: give floating-point numbers."
-            )
-        if tensor.device != q.device:
-            raise InputError(
-                f"grid_attention's {name} is on {tensor.device} and q on {q.device}: move both to "
-                "one device."
-            )
+        check_shape("grid_attention", name, tensor, tuple(q.shape))
+        check_float("grid_attention", name, tensor)
+        check_device("grid_attention", name, tensor, "q", q)

@@ -1,11 +1,17 @@
-"""The loss that 3D Gaussians are fitted to photographs with: L1 and SSIM (Kerbl et al. 2023)."""
+"""The photometric loss of 3D Gaussian splatting: L1 and SSIM (Kerbl et al. 2023)."""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.ops.dispatch import check_fast_backend, pick_backend
+from asysplat.ops.dispatch import (
+    check_device,
+    check_fast_backend,
+    check_float,
+    check_shape,
+    pick_backend,
+)
 from asysplat.ops.image_loss.reference import SIZE, image_loss_reference
 from asysplat.ops.precision import without_autocast
 
@@ -27,16 +33,16 @@ def image_loss(
         rendered: RGB; half precision is computed in fp32.
         target: RGB in [0, 1]; a constant, no gradient is computed for it.
         ssim_weight: w in [0, 1]; 0 costs nothing.
-        masks: False where a pixel does not count: it takes the target's values, so that it has no
-            error and no gradient.
-        backend: "cpu", "reference" (torch, any device and float type), or "auto": "cpu" for tensors
-            there, and "reference" for others and for float64.
+        masks: False where a pixel is ignored: it takes the target's values, with no error and no
+            gradient.
+        backend: "cpu", "reference" (torch, any device and float type), or "auto": "cpu" for float32
+            tensors on a CPU, else "reference".
 
     Returns:
         In fp32, or float64 for float64.
 
     Raises:
-        InputError: shapes, types or devices that do not go together, a weight outside [0, 1], an
+        InputError: shapes, types or devices that do not fit together, a weight outside [0, 1], an
             unknown backend or one that cannot take these tensors.
     """
     _check(rendered, target, ssim_weight, masks)
@@ -64,25 +70,14 @@ def _check(rendered: Tensor, target: Tensor, ssim_weight: float, masks: Tensor |
             f"image_loss's rendered has shape {tuple(rendered.shape)}: expected [..., 3, H, W], "
             "every side at least 1."
         )
-    others = {"target": (target, rendered.shape)}
+    reason = f", as rendered has shape {tuple(rendered.shape)}"
+    shapes = {"target": (target, rendered.shape)}
     if masks is not None:
-        others["masks"] = (masks, rendered.shape[:-3] + rendered.shape[-2:])
-    for name, (tensor, shape) in others.items():
-        if tensor.shape != shape:
-            raise InputError(
-                f"image_loss's {name} has shape {tuple(tensor.shape)}: expected {tuple(shape)}, as "
-                f"rendered has shape {tuple(rendered.shape)}."
-            )
-        if tensor.device != rendered.device:
-            raise InputError(
-                f"image_loss's {name} is on {tensor.device} and rendered on {rendered.device}: "
-                "move both to one device."
-            )
+        shapes["masks"] = (masks, rendered.shape[:-3] + rendered.shape[-2:])
+    for name, (tensor, shape) in shapes.items():
+        check_shape("image_loss", name, tensor, tuple(shape), reason)
+        check_device("image_loss", name, tensor, "rendered", rendered)
     for name, tensor in {"rendered": rendered, "target": target}.items():
-        if not tensor.is_floating_point():
-            raise InputError(
-                f"image_loss's {name} is {tensor.dtype}: give floating-point numbers, 8-bit images "
-                "divided by 255."
-            )
+        check_float("image_loss", name, tensor, ", 8-bit images divided by 255")
     if not 0 <= ssim_weight <= 1:
         raise InputError(f"image_loss got ssim_weight={ssim_weight}: give a number from 0 to 1.")

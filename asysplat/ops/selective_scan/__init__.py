@@ -1,7 +1,5 @@
 """Selective scan of Mamba (Gu and Dao 2023, Eq. 2), as MambaVision uses it within a frame."""
 
-from types import ModuleType
-
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,21 +17,10 @@ def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int
     return 4 * states, 10 * states
 
 
-def _load_kernels(backend: str) -> ModuleType:
-    if backend == "cpu":
-        from asysplat.ops.selective_scan import cpu
-
-        return cpu
-    from asysplat.ops.selective_scan import cuda
-
-    return cuda
-
-
 _SCAN = Scan(
     "selective_scan",
     axes={"x": "B L D", "dt": "B L D", "A": "D N", "B": "B L N", "C": "B L N", "D": "D"},
     forms={"chunked": selective_scan_chunked, "reference": selective_scan_reference},
-    load_kernels=_load_kernels,
     count_flops=count_flops,
 )
 

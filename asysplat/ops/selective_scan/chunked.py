@@ -10,19 +10,14 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from asysplat.ops.recurrence import linear_recurrence
+from asysplat.ops.scan import ScanInputs
 
 CHECKPOINT_CHUNK = 256  # tokens whose states are in memory at once
 
 
-def selective_scan_chunked(
-    x: Float[Tensor, "B L D"],
-    dt: Float[Tensor, "B L D"],
-    A: Float[Tensor, "D N"],
-    B: Float[Tensor, "B L N"],
-    C: Float[Tensor, "B L N"],
-    D: Float[Tensor, "D"],
-) -> Float[Tensor, "B L D"]:
+def selective_scan_chunked(inputs: ScanInputs) -> Float[Tensor, "B L D"]:
     """Scan in torch; see `asysplat.ops.selective_scan`."""
+    x, dt, A, B, C, D = inputs
     state = x.new_zeros(x.shape[0], *A.shape)
     outputs = []
     for chunk in zip(

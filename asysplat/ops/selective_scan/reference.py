@@ -4,16 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from asysplat.ops.scan import ScanInputs
 
-def selective_scan_reference(
-    x: Float[Tensor, "B L D"],
-    dt: Float[Tensor, "B L D"],
-    A: Float[Tensor, "D N"],
-    B: Float[Tensor, "B L N"],
-    C: Float[Tensor, "B L N"],
-    D: Float[Tensor, "D"],
-) -> Float[Tensor, "B L D"]:
+
+def selective_scan_reference(inputs: ScanInputs) -> Float[Tensor, "B L D"]:
     """Scan by the formula; see `asysplat.ops.selective_scan`."""
+    x, dt, A, B, C, D = inputs
     state = x.new_zeros(x.shape[0], *A.shape)
     outputs = []
     for t in range(x.shape[1]):

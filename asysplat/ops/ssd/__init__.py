@@ -1,7 +1,5 @@
 """State-space duality of Mamba2 (Dao and Gu 2024, Eq. 1 with scalar A per head)."""
 
-from types import ModuleType
-
 from jaxtyping import Float
 from torch import Tensor
 
@@ -23,21 +21,10 @@ def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int
     return forward, 3 * scores + 2 * within + 3 * states
 
 
-def _load_kernels(backend: str) -> ModuleType:
-    if backend == "cpu":
-        from asysplat.ops.ssd import cpu
-
-        return cpu
-    from asysplat.ops.ssd import cuda
-
-    return cuda
-
-
 _SCAN = Scan(
     "ssd",
     axes={"x": "B L H P", "dt": "B L H", "A": "H", "B": "B L N", "C": "B L N", "D": "H"},
     forms={"chunked": ssd_chunked, "reference": ssd_reference},
-    load_kernels=_load_kernels,
     count_flops=count_flops,
 )
 

@@ -10,33 +10,28 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.ops.recurrence import linear_recurrence
+from asysplat.ops.scan import ScanInputs
 
 CHUNK = 64  # tokens of a chunk on every backend; FLOPs and the benchmark's floors assume it
 
 
-def ssd_chunked(
-    x: Float[Tensor, "B L H P"],
-    dt: Float[Tensor, "B L H"],
-    A: Float[Tensor, "H"],
-    B: Float[Tensor, "B L N"],
-    C: Float[Tensor, "B L N"],
-    D: Float[Tensor, "H"],
-) -> Float[Tensor, "B L H P"]:
+def ssd_chunked(inputs: ScanInputs) -> Float[Tensor, "B L H P"]:
     """Scan in torch; see `asysplat.ops.ssd`."""
+    x, dt, A, B, C, D = inputs
     length = x.shape[1]
     skip = D[:, None] * x
     # Padded tokens have dt = 0: they neither decay the state nor add to it.
     x, dt, B, C = (_into_chunks(tensor) for tensor in (x, dt, B, C))
     exponents = dt * A
     log_decay = torch.cumsum(exponents, dim=2)  # [b c q h], since the chunk's start
-    inputs = x * dt[..., None]
+    scaled = x * dt[..., None]
 
     scores = (C @ B.mT)[..., None] * _decay_between(exponents)  # [b c t s h]
-    y = torch.einsum("bctsh,bcshp->bcthp", scores, inputs)
+    y = torch.einsum("bctsh,bcshp->bcthp", scores, scaled)
 
     if x.shape[1] > 1:
         to_end = torch.exp(F.pad(exponents[:, :, 1:], (0, 0, 0, 1)).flip(2).cumsum(2).flip(2))
-        added = torch.einsum("bcsn,bcsh,bcshp->cbhpn", B, to_end, inputs)
+        added = torch.einsum("bcsn,bcsh,bcshp->cbhpn", B, to_end, scaled)
         decay = rearrange(torch.exp(log_decay[:, :, -1]), "b c h -> c b h 1 1")
         states = linear_recurrence(decay.expand_as(added), added)
         before = F.pad(states[:-1], (0, 0, 0, 0, 0, 0, 0, 0, 1, 0))

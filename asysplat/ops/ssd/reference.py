@@ -4,16 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from asysplat.ops.scan import ScanInputs
 
-def ssd_reference(
-    x: Float[Tensor, "B L H P"],
-    dt: Float[Tensor, "B L H"],
-    A: Float[Tensor, "H"],
-    B: Float[Tensor, "B L N"],
-    C: Float[Tensor, "B L N"],
-    D: Float[Tensor, "H"],
-) -> Float[Tensor, "B L H P"]:
+
+def ssd_reference(inputs: ScanInputs) -> Float[Tensor, "B L H P"]:
     """Scan by the formula; see `asysplat.ops.ssd`."""
+    x, dt, A, B, C, D = inputs
     batch, length, heads, head_dim = x.shape
     state = x.new_zeros(batch, heads, head_dim, B.shape[-1])
     outputs = []

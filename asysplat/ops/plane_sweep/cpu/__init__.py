@@ -1,7 +1,7 @@
 """The plane sweep for CPUs (Numba): sixteen planes of a pixel at a time."""
 
-from asysplat.ops.plane_sweep.cpu.match import match
-from asysplat.ops.plane_sweep.cpu.smooth import smooth
-from asysplat.ops.plane_sweep.cpu.votes import count_votes
+from asysplat.ops.plane_sweep.cpu.consistency import consistency
+from asysplat.ops.plane_sweep.cpu.cost_volume import cost_volume
+from asysplat.ops.plane_sweep.cpu.sgm import sgm
 
-__all__ = ["count_votes", "match", "smooth"]
+__all__ = ["consistency", "cost_volume", "sgm"]

@@ -1,10 +1,10 @@
 """The plane sweep for GPUs (Triton): a program takes some columns and planes of a view.
 
-Votes are counted in torch.
+The consistency check runs in torch.
 """
 
-from asysplat.ops.plane_sweep.cuda.match import match
-from asysplat.ops.plane_sweep.cuda.smooth import smooth
-from asysplat.ops.plane_sweep.reference import count_votes
+from asysplat.ops.plane_sweep.cuda.cost_volume import cost_volume
+from asysplat.ops.plane_sweep.cuda.sgm import sgm
+from asysplat.ops.plane_sweep.reference import consistency
 
-__all__ = ["count_votes", "match", "smooth"]
+__all__ = ["consistency", "cost_volume", "sgm"]

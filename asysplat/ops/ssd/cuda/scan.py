@@ -19,7 +19,7 @@ TOKENS = INTERPRETED_CHUNK if INTERPRETED else CHUNK  # of a chunk
 BLOCK = 64  # columns of a state in a program
 HEADS = 8  # in a program that sums decays
 LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}  # with fewer warps, fp32 products spill
-MOST_HEAD_DIM, MOST_STATE = 128, 256
+MAX_HEAD_DIM, MAX_STATE = 128, 256
 # As what a product's factors are rounded: fp16 has not the range of a state, TF32 has all its bits.
 PRODUCTS = {
     torch.float32: {"DOT": tl.float32, "PRECISION": "ieee"},
@@ -41,8 +41,8 @@ def forward(
     Raises:
         InputError: a head_dim or a state size that is no power of two from 16 to 128 or 256.
     """
-    check_size("ssd", "head_dim", inputs.x.shape[-1], MOST_HEAD_DIM)
-    check_size("ssd", "state size", inputs.B.shape[-1], MOST_STATE)
+    check_size("ssd", "head_dim", inputs.x.shape[-1], MAX_HEAD_DIM)
+    check_size("ssd", "state size", inputs.B.shape[-1], MAX_STATE)
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     y = torch.empty_like(x)
     with torch.cuda.device_of(x):
@@ -105,7 +105,7 @@ def backward(
 
 
 class _Sizes(NamedTuple):
-    """The sizes of a scan, as its kernels are launch_kwargs them."""
+    """The sizes of a scan."""
 
     batch: int
     length: int
@@ -136,7 +136,7 @@ class _Sizes(NamedTuple):
         return self.state // self.block
 
     def launch_kwargs(self, kernel: Any) -> dict[str, Any]:
-        """Return what a launch tells a kernel besides its arrays: the sizes it has names for."""
+        """Return a launch's keyword arguments: the sizes that the kernel takes, and options."""
         sizes = {
             "length": self.length,
             "heads": self.heads,

@@ -1,4 +1,4 @@
-"""The smoothed costs and their least: a task takes a view, down its rows and up again."""
+"""SGM on CPUs: a task takes a view, and its paths one direction after the other."""
 
 import numpy as np
 import torch
@@ -21,31 +21,31 @@ from asysplat.ops.simd.vectors import (
 )
 
 SMALL_STEP = np.float32(reference.SMALL_STEP)
-FLATTEST = np.float32(reference.FLATTEST)
+MIN_BEND = np.float32(reference.MIN_BEND)
 HALF = np.float32(0.5)
 INFINITY = np.float32(np.inf)
 
 
-def smooth(
+def sgm(
     costs: Float[Tensor, "B V h w D"],
     weights: Float[Tensor, "B V h w"],
     edges: Float[Tensor, "B V 2 h w"],
-) -> reference.Lowest:
-    """Find the plane of least smoothed cost; see `reference.smooth`."""
-    found = reference.Lowest(torch.empty(weights.shape), torch.empty(weights.shape))
+) -> reference.BestPlane:
+    """Aggregate the costs in float32; see `reference.sgm`."""
+    best = reference.BestPlane(torch.empty(weights.shape), torch.empty(weights.shape))
     run_blocks(
-        smooth_views,
+        aggregate_views,
         even_bounds(weights.shape[0] * weights.shape[1]),
         costs.flatten(0, 1).contiguous().numpy(),
-        weights.clamp_min(reference.LEAST_WEIGHT).flatten(0, 1).contiguous().numpy(),
+        weights.clamp_min(reference.MIN_WEIGHT).flatten(0, 1).contiguous().numpy(),
         (reference.LARGE_STEP / (1 + edges / reference.EDGE)).flatten(0, 1).contiguous().numpy(),
-        *(each.flatten(0, 1).numpy() for each in found),
+        *(each.flatten(0, 1).numpy() for each in best),
     )
-    return found
+    return best
 
 
 @kernel
-def smooth_views(start, stop, costs, weights, penalties, plane, contrast):
+def aggregate_views(start, stop, costs, weights, penalties, plane, contrast):
     """Write the planes of the views start to stop, and the contrasts.
 
     Args:
@@ -142,6 +142,6 @@ def _find_lowest(costs, numbers, planes):
     if 0 < best < planes - 1:
         before, after = costs[best - 1], costs[best + 1]
         bend = before + after - 2 * costs[best]
-        if bend > FLATTEST:
+        if bend > MIN_BEND:
             shift = min(max((before - after) / (2 * bend), -HALF), HALF)
     return best + shift, total(everything) / planes - low

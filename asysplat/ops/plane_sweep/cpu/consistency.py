@@ -1,4 +1,4 @@
-"""What views say of each other's depths: a task takes a view, sixteen pixels of a row at a time."""
+"""The consistency check on CPUs: a task takes a view, sixteen pixels of a row at a time."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.cameras import FRONT as LEAST_FRONT
 from asysplat.ops.simd.gathers import gather_pairs
 from asysplat.ops.simd.kernel import kernel
 from asysplat.ops.simd.threads import even_bounds, run_blocks
@@ -24,15 +23,15 @@ from asysplat.ops.simd.vectors import (
     zeros,
 )
 
-HALF, FRONT = np.float32(0.5), np.float32(LEAST_FRONT)
+HALF, FRONT = np.float32(0.5), np.float32(reference.FRONT)
 TOLERANCE = np.float32(reference.TOLERANCE)
 
 
-class VoteInputs(NamedTuple):
-    """NumPy's arrays; n counts the views of all scenes.
+class ConsistencyInputs(NamedTuple):
+    """NumPy arrays; n counts the views of all scenes.
 
     Args:
-        maps: [n, h, w, 2], inverse depths and how far they are trusted.
+        maps: [n, h, w, 2], inverse depths and the trust in them.
         steps: [n].
         others: [n, K], counted from a scene's first view; -1 for none.
         projections: [n, K, 3, 4].
@@ -44,35 +43,35 @@ class VoteInputs(NamedTuple):
     projections: np.ndarray
 
 
-def count_votes(
+def consistency(
     inverse: Float[Tensor, "B V h w"],
     steps: Float[Tensor, "B V"],
     trust: Float[Tensor, "B V h w"],
     others: Int[Tensor, "B V K"],
     projections: Float[Tensor, "B V K 3 4"],
-) -> reference.Votes:
-    """Count the votes in float32; see `reference.count_votes`."""
+) -> reference.Consistency:
+    """Count in float32; see `reference.consistency`."""
     B, V, h, w = inverse.shape
-    inputs = VoteInputs(
+    inputs = ConsistencyInputs(
         maps=torch.stack((inverse, trust), dim=-1).flatten(0, 1).numpy(),
         steps=steps.flatten().numpy(),
         others=others.flatten(0, 1).contiguous().numpy(),
         projections=projections.flatten(0, 1).contiguous().numpy(),
     )
-    found = reference.Votes(*(torch.empty(B, V, h, w) for _ in reference.Votes._fields))
-    arrays = reference.Votes(*(votes.flatten(0, 1).numpy() for votes in found))
+    found = reference.Consistency(*(torch.empty(B, V, h, w) for _ in reference.Consistency._fields))
+    arrays = reference.Consistency(*(each.flatten(0, 1).numpy() for each in found))
     run_blocks(count_views, even_bounds(B * V), inputs, V, arrays)
     return found
 
 
 @kernel
-def count_views(start, stop, inputs, views, votes):
-    """Write the votes on the views start to stop.
+def count_views(start, stop, inputs, views, counts):
+    """Write the counts of the views start to stop.
 
     Args:
-        inputs: see `VoteInputs`.
+        inputs: see `ConsistencyInputs`.
         views: of a scene.
-        votes: of `reference.Votes`, each [n, h, w].
+        counts: see `reference.Consistency`, each [n, h, w].
     """
     h, w = inputs.maps.shape[1:3]
     bottom, right = np.float32(h), np.float32(w)
@@ -84,7 +83,7 @@ def count_views(start, stop, inputs, views, votes):
             for x in range(0, w, LANES):
                 count = min(LANES, w - x)
                 column, depth = load_some(columns, x, count), load_some(own, x, count)
-                same, through, within = zeros(), zeros(), zeros()
+                agreeing, contradicting, containing = zeros(), zeros(), zeros()
                 for k in range(inputs.others.shape[1]):
                     if inputs.others[n, k] < 0:
                         continue
@@ -99,14 +98,14 @@ def count_views(start, stop, inputs, views, votes):
                     inside = inside & less(FRONT, z)
                     u = min(max(u, ZERO), right - ONE)
                     v = min(max(v, ZERO), bottom - ONE)
-                    there, trust = gather_pairs(inputs.maps[other], v, u)
-                    nearer = depth * scale - there
-                    tolerance = max(there * TOLERANCE, inputs.steps[other] * HALF)
+                    stored, trust = gather_pairs(inputs.maps[other], v, u)
+                    nearer = depth * scale - stored
+                    tolerance = max(stored * TOLERANCE, inputs.steps[other] * HALF)
                     weight = where(inside, trust, ZERO)
                     apart = max(nearer, ZERO - nearer)
-                    same = same + where(less(tolerance, apart), ZERO, weight)
-                    through = through + where(less(tolerance, nearer), weight, ZERO)
-                    within = within + where(inside, ONE, ZERO)
-                store_some(votes.same[n, y], x, count, same)
-                store_some(votes.through[n, y], x, count, through)
-                store_some(votes.within[n, y], x, count, within)
+                    agreeing = agreeing + where(less(tolerance, apart), ZERO, weight)
+                    contradicting = contradicting + where(less(tolerance, nearer), weight, ZERO)
+                    containing = containing + where(inside, ONE, ZERO)
+                store_some(counts.agreeing[n, y], x, count, agreeing)
+                store_some(counts.contradicting[n, y], x, count, contradicting)
+                store_some(counts.containing[n, y], x, count, containing)

@@ -1,4 +1,4 @@
-"""The smoothed costs: a program takes some rows or columns of a view, from one end to the other."""
+"""SGM on GPUs: a program takes some rows or columns of a view, from one end to the other."""
 
 import torch
 import triton
@@ -13,15 +13,15 @@ SMALL_STEP, INFINITY = tl.constexpr(reference.SMALL_STEP), tl.constexpr(float("i
 TILE = 8192 if INTERPRETED else 256  # lines x planes
 
 
-def smooth(
+def sgm(
     costs: Float[Tensor, "B V h w D"],
     weights: Float[Tensor, "B V h w"],
     edges: Float[Tensor, "B V 2 h w"],
-) -> reference.Lowest:
-    """Find the plane of least smoothed cost; see `reference.smooth`."""
+) -> reference.BestPlane:
+    """Aggregate the costs in float32; see `reference.sgm`."""
     B, V, h, w, planes = costs.shape
     costs = costs.contiguous()
-    weights = weights.clamp_min(reference.LEAST_WEIGHT).contiguous()
+    weights = weights.clamp_min(reference.MIN_WEIGHT).contiguous()
     penalties = reference.LARGE_STEP / (1 + edges / reference.EDGE)
     total = torch.zeros_like(costs)
     tile_planes = triton.next_power_of_2(planes)
@@ -63,7 +63,7 @@ def add_paths(
     LINES: tl.constexpr,
     PLANES: tl.constexpr,
 ):
-    """Add to `total` what the paths along LINES lines cost, in one direction.
+    """Add to `total` the costs of the paths along LINES lines, in one direction.
 
     Args:
         costs, total: [n, h, w, D].

@@ -11,9 +11,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.cameras import FRONT as LEAST_FRONT
 from asysplat.ops.plane_sweep.cpu.patches import AROUND, describe_row, variance
-from asysplat.ops.plane_sweep.inputs import MatchInputs, prepare
+from asysplat.ops.plane_sweep.inputs import CostInputs, prepare
 from asysplat.ops.plane_sweep.reference import BEST, WINDOW
 from asysplat.ops.simd.gathers import gather_squares
 from asysplat.ops.simd.kernel import inline, kernel
@@ -36,12 +35,12 @@ from asysplat.ops.simd.vectors import (
 assert BEST == 2 and WINDOW == 5  # the least cost and the one after; sums of five columns
 KEPT = WINDOW + 1  # rows that two rows of patches take
 HALF = np.float32(0.5)
-FRONT = np.float32(LEAST_FRONT)
+FRONT = np.float32(reference.FRONT)
 UNSEEN = np.float32(reference.UNSEEN)
 INFINITY = np.float32(np.inf)
 
 
-def match(
+def cost_volume(
     images: Float[Tensor, "B V H W"],
     neighbors: Int[Tensor, "B V K"],
     projections: Float[Tensor, "B V K 3 4"],
@@ -49,14 +48,14 @@ def match(
     planes: int,
     stride: int,
 ) -> Float[Tensor, "B V h w D"]:
-    """Compute the costs in float32; see `reference.match`."""
+    """Compute the costs in float32; see `reference.cost_volume`."""
     B, V, H, W = images.shape
     inputs = prepare(images, neighbors, projections, ranges, planes)
     costs = torch.empty(B * V, H // stride, W // stride, planes)
     run_blocks(
-        match_planes,
+        cost_planes,
         even_bounds(B * V * (inputs.inverse.shape[1] // LANES)),
-        MatchInputs(*(tensor.numpy() for tensor in inputs)),
+        CostInputs(*(tensor.numpy() for tensor in inputs)),
         stride,
         costs.numpy(),
     )
@@ -64,11 +63,11 @@ def match(
 
 
 @kernel
-def match_planes(start, stop, inputs, stride, costs):
+def cost_planes(start, stop, inputs, stride, costs):
     """Write the costs of the blocks start to stop, counted over [views, vectors of planes].
 
     Args:
-        inputs: see `MatchInputs`.
+        inputs: see `CostInputs`.
         costs: [n, h, w, D].
     """
     H, W = inputs.images.shape[1:]

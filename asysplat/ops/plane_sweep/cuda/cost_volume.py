@@ -9,19 +9,19 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.ops.plane_sweep import cameras, reference
+from asysplat.ops.plane_sweep import reference
 from asysplat.ops.plane_sweep.inputs import prepare
 from asysplat.ops.triton_utils import FUSED, INTERPRETED, kernel
 
 AROUND = tl.constexpr(reference.WINDOW // 2)
 KEPT = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch
 SHARE = tl.constexpr(1 / reference.WINDOW**2)  # of a pixel in a patch
-FRONT, NOISE = tl.constexpr(cameras.FRONT), tl.constexpr(reference.NOISE)
+FRONT, NOISE = tl.constexpr(reference.FRONT), tl.constexpr(reference.NOISE)
 UNSEEN, INFINITY = tl.constexpr(reference.UNSEEN), tl.constexpr(float("inf"))
 TILE, BAND = (8192, 1024) if INTERPRETED else (128, 16)  # columns x planes; rows of blocks
 
 
-def match(
+def cost_volume(
     images: Float[Tensor, "B V H W"],
     neighbors: Int[Tensor, "B V K"],
     projections: Float[Tensor, "B V K 3 4"],
@@ -29,7 +29,7 @@ def match(
     planes: int,
     stride: int,
 ) -> Float[Tensor, "B V h w D"]:
-    """Compute the costs in float32; see `reference.match`."""
+    """Compute the costs in float32; see `reference.cost_volume`."""
     B, V, H, W = images.shape
     h, w = H // stride, W // stride
     inputs = prepare(images, neighbors, projections, ranges, planes)
@@ -40,7 +40,7 @@ def match(
     columns = min(triton.next_power_of_2(w), TILE // tile_planes)
     tiles = -(-w // columns) * -(-planes // tile_planes)
     with torch.cuda.device_of(images):
-        match_band[(tiles, -(-h // BAND), B * V)](
+        cost_band[(tiles, -(-h // BAND), B * V)](
             *inputs,
             means=means,
             scales=(variances + reference.NOISE).rsqrt(),
@@ -60,7 +60,7 @@ def match(
 
 
 @kernel
-def match_band(
+def cost_band(
     images,
     padded,
     neighbors,
@@ -82,7 +82,7 @@ def match_band(
     """Add to zeros the costs [n, h, w, D] of COLUMNS x PLANES in BAND rows.
 
     Args:
-        images, padded, neighbors, projections, inverse: see `MatchInputs`.
+        images, padded, neighbors, projections, inverse: see `CostInputs`.
         means, scales: [n, H, W], of patches, and 1 / their standard deviations.
     """
     view = tl.program_id(2).to(tl.int64)

@@ -1,4 +1,4 @@
-"""What to sweep: which views see the same as a view, and at which depths. Cameras decide alone."""
+"""Projections between views, and what follows from the cameras alone: neighbors, depth ranges."""
 
 from dataclasses import dataclass
 
@@ -10,21 +10,20 @@ from asysplat.scene import Cameras
 
 SAMPLES = 6  # points along each side of a view that stand for all its pixels
 USEFUL_PARALLAX = 0.1  # in image widths: more adds nothing,
-WIDE_PARALLAX = 0.5  # and from here on two views look too different
-LEAST_SHARE = 0.2  # of a view that a neighbor sees at the nearest plane
-OUTLIERS = 0.02  # share of the depths that are known, at either end, that do not count for a range,
-FEWEST = 16  # how many it takes to tell one
-MARGIN = 1.5  # and how much wider it is: surfaces without texture are not known
-SUBPIXEL = 0.25  # pixels by which matches are off
-FRONT = 1e-6  # least depth in front of a camera, over the depth in the other
+WIDE_PARALLAX = 0.5  # and above this two views look too different
+MIN_SHARE = 0.2  # of a view that a neighbor must see at the nearest plane
+OUTLIERS = 0.02  # share of the known depths at either end that a range ignores
+MIN_POINTS = 16  # known depths that a range needs
+MARGIN = 1.5  # by which a range is wider: surfaces without texture have no known depth
+SUBPIXEL = 0.25  # error of a match, pixels
 
 
 @dataclass(frozen=True)
 class Projections:
-    """Where all views have each other's pixels: from the cameras once, for images of any size.
+    """The projections between all pairs of views, for images of any size.
 
     Args:
-        unit: of images one wide and one high, as `into` describes them.
+        unit: for images of width and height 1; see `into`.
         dtype: of the cameras.
     """
 
@@ -39,17 +38,18 @@ class Projections:
         intrinsics = size[:, None] * cameras.intrinsics.to(torch.float64)
         relative = torch.linalg.inv(poses)[:, None] @ poses[:, :, None]
         rays = relative[..., :3, :3] @ torch.linalg.inv(intrinsics)[:, :, None]
-        moved = torch.cat((rays, relative[..., :3, 3:]), dim=-1)
-        unit = intrinsics[:, None] @ moved
+        to_other = torch.cat((rays, relative[..., :3, 3:]), dim=-1)
+        unit = intrinsics[:, None] @ to_other
         return cls(unit, cameras.intrinsics.dtype)
 
     def into(
         self, others: Int[Tensor, "B V K"], height: int, width: int
     ) -> Float[Tensor, "B V K 3 4"]:
-        """Return M with which (x, y, 1, inverse depth) of a view is another's homogeneous pixel.
+        """Return M such that M (x, y, 1, inverse depth) is the homogeneous pixel in another view.
 
-        Both have `height` x `width` pixels; x and y are counted from the image's corner. The third
-        coordinate is the other's depth over the view's own. A view of -1 stands for the first.
+        Both images have `height` x `width` pixels; x and y count from the image's corner. The third
+        coordinate is the depth in the other view over the depth in this one. The index -1 gives
+        the first view.
         """
         size = self.unit.new_tensor([width, height, 1])
         factors = torch.cat((1 / size, size.new_ones(1))) * size[:, None]
@@ -60,11 +60,11 @@ class Projections:
 def choose_neighbors(
     cameras: Cameras, projections: Projections, count: int
 ) -> Int[Tensor, "B V K"]:
-    """Return the views that see most of what a view sees, from elsewhere; -1 for none.
+    """Return for each view the neighbors with the most overlap and parallax; -1 for none.
 
-    Two views are scored by the share of pixels that both see at inverse depths from 0 to many
-    times the inverse of their distance, where the parallax is useful but not too wide. K is at
-    most `count` and V - 1, at least 1.
+    The score of two views is the share of pixels that both contain, over inverse depths from 0 to
+    many times the inverse of their distance, weighted by how useful the parallax is. K is at most
+    `count` and V - 1, at least 1.
     """
     V = cameras.num_views
     apart = torch.cdist(cameras.centers, cameras.centers)
@@ -72,12 +72,12 @@ def choose_neighbors(
     steps = torch.logspace(-1.5, 1.5, 11, base=10.0).to(apart)
     focal = cameras.intrinsics[..., 0, 0] / cameras.width
     inverse = torch.cat((steps.new_zeros(1), steps)) * 2 / (largest * focal.mean(-1))[:, None]
-    everyone = torch.arange(V, device=apart.device).expand(len(apart), V, V)
-    seen = _sees(projections, everyone, inverse[:, None].expand(-1, V, -1)).mean(-2)
+    every_view = torch.arange(V, device=apart.device).expand(len(apart), V, V)
+    overlap = _inside(projections, every_view, inverse[:, None].expand(-1, V, -1)).mean(-2)
     parallax = focal[:, :, None, None] * apart[..., None] * inverse[:, None, None]
     useful = (parallax / USEFUL_PARALLAX).clamp_max(1) / (1 + (parallax / WIDE_PARALLAX) ** 2)
-    score = (seen * useful).sum(-1)
-    # Nearer than this, two centers differ by rounding.
+    score = (overlap * useful).sum(-1)
+    # Centers closer than this differ by rounding only.
     score = score.masked_fill(apart < 1e-5 * cameras.centers.abs().amax((-1, -2))[:, None, None], 0)
     score.diagonal(dim1=-2, dim2=-1).fill_(0)
     # Stable, so that equal scores give the same views on every machine.
@@ -88,16 +88,16 @@ def choose_neighbors(
 def inverse_depth_range(
     cameras: Cameras, projections: Projections, neighbors: Int[Tensor, "B V K"]
 ) -> Float[Tensor, "B V 2"]:
-    """Return the least and the greatest inverse depth at which neighbors see enough of a view.
+    """Return the least and greatest inverse depth at which a neighbor sees MIN_SHARE of a view.
 
-    Both are 0 for a view without neighbors; the least is 0 where infinity is seen.
+    Both are 0 for a view without neighbors; the least is 0 if the neighbors see points at infinity.
     """
     distance = _farthest(cameras, neighbors)
     steps = torch.logspace(-2, 2, 97, base=10.0).to(distance)
     focal = cameras.intrinsics[..., 0, 0] / cameras.width
     inverse = steps / (distance.clamp_min(1e-12) * focal)[..., None]
-    share = _sees(projections, neighbors, inverse).amax(2).mean(-2)
-    enough = share >= LEAST_SHARE
+    share = _inside(projections, neighbors, inverse).amax(2).mean(-2)
+    enough = share >= MIN_SHARE
     first = enough.int().argmax(-1, keepdim=True)
     last = enough.shape[-1] - 1 - enough.flip(-1).int().argmax(-1, keepdim=True)
     least = inverse.gather(-1, first).masked_fill(first == 0, 0)
@@ -108,7 +108,7 @@ def inverse_depth_range(
     return ranges.masked_fill((distance == 0)[..., None], 0)
 
 
-def least_step(cameras: Cameras, neighbors: Int[Tensor, "B V K"]) -> Float[Tensor, "B V"]:
+def smallest_step(cameras: Cameras, neighbors: Int[Tensor, "B V K"]) -> Float[Tensor, "B V"]:
     """Return the inverse depth that moves a pixel by SUBPIXEL in the farthest neighbor's image."""
     pixels = cameras.intrinsics[..., 0, 0] * _farthest(cameras, neighbors)
     return torch.where(pixels > 0, SUBPIXEL / pixels.clamp_min(1e-30), 0)
@@ -117,13 +117,13 @@ def least_step(cameras: Cameras, neighbors: Int[Tensor, "B V K"]) -> Float[Tenso
 def observed_range(
     inverse: Float[Tensor, "B V n"], known: Bool[Tensor, "B V n"]
 ) -> Float[Tensor, "B V 2"]:
-    """Return the least and greatest inverse depth that those known suggest; 0 and 0 of too few."""
+    """Return the range of the known inverse depths with a margin; 0 and 0 if there are too few."""
     ordered = inverse.masked_fill(~known, torch.inf).sort(dim=-1).values
     count = known.sum(-1, keepdim=True)
     shares = inverse.new_tensor([OUTLIERS, 1 - OUTLIERS])
     index = (shares * (count - 1)).round().long().clamp(0, ordered.shape[-1] - 1)
     ranges = ordered.gather(-1, index) * ordered.new_tensor([1 / MARGIN, MARGIN])
-    return torch.where(count >= FEWEST, ranges, 0)
+    return torch.where(count >= MIN_POINTS, ranges, 0)
 
 
 def _farthest(cameras: Cameras, neighbors: Int[Tensor, "B V K"]) -> Float[Tensor, "B V"]:
@@ -134,12 +134,12 @@ def _farthest(cameras: Cameras, neighbors: Int[Tensor, "B V K"]) -> Float[Tensor
     return distance.masked_fill(neighbors < 0, 0).amax(-1)
 
 
-def _sees(
+def _inside(
     projections: Projections, others: Int[Tensor, "B V K"], inverse: Float[Tensor, "B V n"]
 ) -> Float[Tensor, "B V K p n"]:
-    """Return 1 for p points of a view, each at n inverse depths, that are within another view."""
+    """Return 1 for p points of a view, each at n inverse depths, if another view contains them."""
     u, v, z = projections.into(others, SAMPLES, SAMPLES).to(inverse).unbind(-2)
-    # Within are those for which all of these are positive; their depth is, too.
+    # A point is inside where all of these are positive; then its depth is, too.
     sides = torch.stack((u, SAMPLES * z - u, v, SAMPLES * z - v), dim=-2)
     right, down, corner, away = sides[..., None, None].unbind(-3)
     pixels = torch.arange(SAMPLES, device=inverse.device) + 0.5

@@ -1,0 +1,253 @@
+"""Depth from posed images alone: a plane sweep over each view's neighbors (Collins 1996).
+
+The cameras decide the neighbors and the range of depths (`projections.py`). The kernels of
+`asysplat.ops.plane_sweep` compute the matching costs, aggregate them and check the views' depths
+against each other, which gives the confidence. A first sweep at half the resolution narrows the
+range of the second: surfaces fill a tenth of the range that the cameras allow.
+"""
+
+from dataclasses import dataclass
+from functools import reduce
+from types import ModuleType
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from asysplat.errors import InputError
+from asysplat.models.prior.prior import DepthEstimate, Prior, fill_unknown, other_views
+from asysplat.models.prior.projections import (
+    Projections,
+    choose_neighbors,
+    inverse_depth_range,
+    observed_range,
+    smallest_step,
+)
+from asysplat.ops.plane_sweep import choose_backend, load_backend
+from asysplat.scene import Cameras, Views
+
+PLANES = 48
+NEIGHBORS = 4
+LONGEST_SIDE = 128  # of the swept images, pixels: more than twice the planes
+STRIDE = 2  # swept pixels along a side that share a depth: their mean cost is less noisy
+FULL_CONTRAST = 0.5  # by which the best plane's costs, of four paths, are below the mean
+MIN_AGREEMENT = 0.5  # of a depth that counts for the range of the second sweep
+CONTRADICTION = 2.0  # one contradicting view takes two thirds of the confidence
+LUMA = (0.299, 0.587, 0.114)
+
+
+class PlaneSweepPrior(nn.Module):
+    """Depth from `plane_sweep`, over images shrunk to a size that suits the number of planes.
+
+    The cameras set the range of depths, and in views with enough sparse points the points do.
+
+    Args:
+        planes, neighbors: see `plane_sweep`.
+        longest_side: of the swept images, pixels.
+    """
+
+    def __init__(
+        self, planes: int = PLANES, neighbors: int = NEIGHBORS, longest_side: int = LONGEST_SIDE
+    ):
+        super().__init__()
+        self.planes, self.neighbors, self.longest_side = planes, neighbors, longest_side
+
+    def forward(self, views: Views, size: tuple[int, int]) -> Prior:
+        height, width, factor = views.cameras.height, views.cameras.width, 1
+        while max(height, width) > self.longest_side * factor:
+            factor *= 2
+        multiple = factor * STRIDE
+        small = views.cameras.resized(
+            max(1, height // multiple) * STRIDE, max(1, width // multiple) * STRIDE
+        )
+        images = shrink(views.images, small.height, small.width)
+        ranges = None
+        if views.point_depths is not None:  # of each block of pixels the nearest point counts
+            inverse = (views.point_depths > 0) / views.point_depths.clamp_min(1e-6)
+            inverse = F.max_pool2d(inverse, factor).flatten(2)
+            ranges = observed_range(inverse, inverse > 0)
+        estimate = plane_sweep(
+            images, small, STRIDE, planes=self.planes, neighbors=self.neighbors, ranges=ranges
+        )
+        return Prior.of_estimate(estimate, views, size)
+
+
+def plane_sweep(
+    images: Float[Tensor, "B V 3 H W"],
+    cameras: Cameras,
+    stride: int = 1,
+    planes: int = PLANES,
+    neighbors: int = NEIGHBORS,
+    backend: str = "auto",
+    ranges: Float[Tensor, "B V 2"] | None = None,
+) -> DepthEstimate:
+    """Estimate the depth of every `stride` x `stride` block of pixels: [B, V, H/stride, W/stride].
+
+    The cost volume takes 4 B V h w D bytes for D planes; the first sweep's, a quarter of that, is
+    freed before. In addition "cpu" holds twice the volume of one view for each thread, "cuda" the
+    whole volume once more, and "reference" several times, with some fifty maps [D, H, W] while it
+    compares one view.
+
+    Args:
+        images: RGB in [0, 1].
+        cameras: of the images, [B, V].
+        stride: divides H and W; costs are computed at every pixel and averaged over blocks.
+        planes: number of inverse depths, at least 4.
+        neighbors: most views that each view is compared with.
+        backend: "reference" (torch, any device and float type), "cpu", "cuda", or "auto": the
+            kernels of the device, and "reference" for float64.
+        ranges: least and greatest inverse depth of each view; where both are 0, and in all views
+            if None, they follow from the cameras.
+
+    Raises:
+        InputError: sizes that do not fit together, or an unknown backend.
+    """
+    _check(images, cameras, stride, planes, neighbors)
+    backend = choose_backend(backend, images)
+    images = images if images.dtype == torch.float64 else images.float()
+    poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
+    return DepthEstimate(
+        *_sweep(images, intrinsics, poses, stride, planes, neighbors, backend, ranges)
+    )
+
+
+@torch.library.custom_op("asysplat::plane_sweep", mutates_args=())
+def _sweep(
+    images: Tensor,
+    intrinsics: Tensor,
+    cam_to_world: Tensor,
+    stride: int,
+    planes: int,
+    neighbors: int,
+    backend: str,
+    ranges: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sweep twice; one operator for torch, so that the meta device gets shapes without content."""
+    cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
+    projections = Projections.between(cameras)
+    chosen = choose_neighbors(cameras, projections, neighbors)
+    visible = inverse_depth_range(cameras, projections, chosen)
+    if ranges is None:
+        ranges = visible
+    ranges = torch.where(ranges[..., 1:] > 0, ranges.to(visible), visible)
+    kernels = load_backend(backend, images)
+    sweep = _Sweep(projections, chosen, smallest_step(cameras, chosen), planes, stride, kernels)
+    half = (max(1, side // (2 * stride)) * stride for side in images.shape[-2:])
+    inverse, steps, agreement = sweep.depths(shrink(images, *half), ranges, aggregations=1)
+    ranges = _narrowed(ranges, inverse, steps, agreement, planes * sweep.smallest_step)
+    inverse, steps, agreement = sweep.depths(images, ranges, aggregations=2)
+    others = other_views(images.shape[1], images.shape[0], images.device)
+    small = projections.into(others, *inverse.shape[-2:])
+    found = kernels.consistency(inverse, steps, agreement, others, small)
+    agreement = agreement / (1 + CONTRADICTION * found.contradicting)
+    squared = inverse**2  # how well a depth differs from the next plane's; 0 at infinity
+    precision = squared / (squared + steps[..., None, None] ** 2).clamp_min(1e-30)
+    inverse = fill_unknown(inverse, agreement * precision)
+    return inverse, agreement * (1 + precision) / 2, found.agreeing, found.containing
+
+
+@_sweep.register_fake
+def _(images, intrinsics, cam_to_world, stride, planes, neighbors, backend, ranges):
+    shape = (*images.shape[:2], images.shape[-2] // stride, images.shape[-1] // stride)
+    return tuple(images.new_empty(shape) for _ in range(4))
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """What both sweeps share."""
+
+    projections: Projections
+    chosen: Int[Tensor, "B V K"]
+    smallest_step: Float[Tensor, "B V"]
+    planes: int
+    stride: int
+    kernels: ModuleType
+
+    def depths(
+        self, images: Float[Tensor, "B V 3 H W"], ranges: Float[Tensor, "B V 2"], aggregations: int
+    ) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V"], Float[Tensor, "B V h w"]]:
+        """Return the inverse depths, the steps between planes, and how far neighbors agree.
+
+        From the second aggregation on, a pixel's costs have its agreement as weight.
+        """
+        height, width = images.shape[-2:]
+        h, w = height // self.stride, width // self.stride
+        gray = (images * images.new_tensor(LUMA)[:, None, None]).sum(-3)
+        costs = self.kernels.cost_volume(
+            *(gray, self.chosen, self.projections.into(self.chosen, height, width)),
+            *(ranges, self.planes, self.stride),
+        )
+        borders = edges(shrink(images, h, w))
+        first, last = ranges[..., None, None, :].unbind(-1)
+        spacing = (last - first) / (self.planes - 1)
+        steps = torch.maximum(spacing[..., 0, 0], self.smallest_step)
+        small = self.projections.into(self.chosen, h, w)
+        agreement = images.new_ones(*images.shape[:2], h, w)
+        for _ in range(aggregations):
+            best = self.kernels.sgm(costs, agreement, borders)
+            inverse = first + best.plane * spacing
+            trust = torch.ones_like(inverse)
+            found = self.kernels.consistency(inverse, steps, trust, self.chosen, small)
+            agree, contradict = found.agreeing, found.contradicting
+            agreement = (2 * agree / (agree + contradict + 1)).clamp_max(1)
+        return inverse, steps, agreement * (best.contrast / FULL_CONTRAST).clamp(0, 1)
+
+
+def _narrowed(
+    ranges: Float[Tensor, "B V 2"],
+    inverse: Float[Tensor, "B V h w"],
+    steps: Float[Tensor, "B V"],
+    agreement: Float[Tensor, "B V h w"],
+    shortest: Float[Tensor, "B V"],
+) -> Float[Tensor, "B V 2"]:
+    """Narrow the ranges to the depths that neighbors agree on, unless these are few."""
+    observed = observed_range(inverse.flatten(2), agreement.flatten(2) > MIN_AGREEMENT)
+    least = torch.maximum(ranges[..., 0], observed[..., 0] - steps / 2)
+    greatest = torch.maximum(observed[..., 1] + steps / 2, least + shortest)
+    narrowed = torch.stack((least, torch.minimum(ranges[..., 1], greatest)), dim=-1)
+    return torch.where(observed[..., 1:] > 0, narrowed, ranges)
+
+
+def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbors: int) -> None:
+    expected = (*cameras.intrinsics.shape[:-2], 3, cameras.height, cameras.width)
+    if images.ndim != 5 or tuple(images.shape) != expected:
+        raise InputError(
+            f"plane_sweep's images have shape {tuple(images.shape)}: expected {expected}, the "
+            "cameras' number and size."
+        )
+    if stride < 1 or cameras.height % stride or cameras.width % stride:
+        raise InputError(
+            f"plane_sweep got stride={stride} for images of {cameras.height}x{cameras.width}: give "
+            "a number that divides both."
+        )
+    if planes < 4 or neighbors < 1:
+        raise InputError(
+            f"plane_sweep got planes={planes} and neighbors={neighbors}: give at least 4 planes "
+            "and one neighbor."
+        )
+
+
+def shrink(
+    images: Float[Tensor, "*more H W"], height: int, width: int
+) -> Float[Tensor, "*more h w"]:
+    """Resize images to `height` x `width` pixels by the means over areas.
+
+    Sums of shifted maps where the sizes divide: torch's pooling takes several times as long there.
+    """
+    H, W = images.shape[-2:]
+    if H % height or W % width:
+        smaller = F.interpolate(images.reshape(-1, 1, H, W), (height, width), mode="area")
+        return smaller.reshape(*images.shape[:-2], height, width)
+    down, right = H // height, W // width
+    if down == right == 1:
+        return images
+    rows = reduce(torch.add, (images[..., k::down, :] for k in range(down)))
+    return reduce(torch.add, (rows[..., k::right] for k in range(right))) / (down * right)
+
+
+def edges(images: Float[Tensor, "B V 3 h w"]) -> Float[Tensor, "B V 2 h w"]:
+    """Return the mean absolute color difference to the left pixel, and to the pixel above."""
+    left = F.pad(images.diff(dim=-1).abs().mean(2), (1, 0))
+    above = F.pad(images.diff(dim=-2).abs().mean(2), (0, 0, 1, 0))
+    return torch.stack((left, above), dim=2)

@@ -1,0 +1,135 @@
+"""A prior's maps, made from the depths of all views and from how many views confirm them."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from asysplat.models.prior.projections import Projections
+from asysplat.ops.plane_sweep import Consistency, load_backend
+from asysplat.scene import TensorRecord, Views
+
+PRIOR_CHANNELS = 2
+UNKNOWN_DISTANCE = 10**0.5  # the middle of PhotographHead's range
+COVER = 0.95  # opacity of a surface, over all views that are confident of it,
+UNSURE_COVER = 0.7  # and over all views that contain the point where none is confident
+SURROUNDINGS = 0.05  # weight of a pixel's surroundings against its own depth at full confidence
+
+
+@dataclass(frozen=True)
+class DepthEstimate(TensorRecord):
+    """Depths of all views, and how many other views confirm them.
+
+    Args:
+        inverse_depth: 1 / depth along the camera's z axis, > 0; 0 where no depth is known.
+        confidence: in [0, 1]; 0 where no other view confirms the depth.
+        agreeing, containing: see `Consistency`.
+    """
+
+    inverse_depth: Float[Tensor, "*batch V h w"]
+    confidence: Float[Tensor, "*batch V h w"]
+    agreeing: Float[Tensor, "*batch V h w"]
+    containing: Float[Tensor, "*batch V h w"]
+
+
+@dataclass(frozen=True)
+class Prior(TensorRecord):
+    """Distances and their confidence.
+
+    Args:
+        distance: along the ray of each pixel of the head's grid, > 0, in scene units.
+        confidence: in [0, 1].
+        opacity: to start from, in (0, 1); views that see the same surface share it.
+    """
+
+    distance: Float[Tensor, "B V h w"]
+    confidence: Float[Tensor, "B V h w"]
+    opacity: Float[Tensor, "B V h w"]
+
+    @property
+    def has_depth(self) -> Bool[Tensor, "B 1 1 1"]:
+        """Return which scenes have a known depth anywhere."""
+        return (self.confidence > 0).flatten(1).any(dim=-1)[:, None, None, None]
+
+    @classmethod
+    def of_estimate(cls, depth: DepthEstimate, views: Views, size: tuple[int, int]) -> "Prior":
+        """Return the prior of estimated depths, resized to the grid's size."""
+        alone = (depth.containing == 0).to(depth.confidence)
+        sure = _share(COVER, depth.agreeing).logit()
+        unsure = _share(UNSURE_COVER, depth.containing).logit()
+        opacity = unsure + (sure - unsure) * torch.maximum(depth.confidence, alone)
+        inverse, confidence, opacity = (
+            F.interpolate(each, size, mode="bilinear")
+            for each in (depth.inverse_depth, depth.confidence, opacity)
+        )
+        length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
+        distance = torch.where(inverse > 0, length / inverse.clamp_min(1e-6), UNKNOWN_DISTANCE)
+        return cls(distance, confidence, opacity.sigmoid())
+
+    @classmethod
+    def of_given_depths(
+        cls,
+        inverse: Float[Tensor, "B V h w"],
+        weight: Float[Tensor, "B V h w"],
+        confidence: Float[Tensor, "B V h w"],
+        views: Views,
+    ) -> "Prior":
+        """Return the prior of given inverse depths, filled where their weight is less than 1."""
+        scenes, count, *size = inverse.shape
+        inverse = fill_unknown(inverse, weight)
+        others = other_views(count, scenes, inverse.device)
+        projections = Projections.between(views.cameras).into(others, *size)
+        steps = torch.zeros_like(inverse[..., 0, 0])
+        kernels = load_backend("auto", inverse)
+        found: Consistency = kernels.consistency(inverse, steps, confidence, others, projections)
+        estimate = DepthEstimate(inverse, confidence, found.agreeing, found.containing)
+        return cls.of_estimate(estimate, views, tuple(size))
+
+    def features(self, height: int, width: int) -> Float[Tensor, "B V H W 2"]:
+        """Return the log distance relative to the scene's median, and the confidence.
+
+        Both are in about [-1, 1], independent of the scene's size.
+        """
+        ordered = self.distance.flatten(1).sort(dim=-1).values
+        median = ordered[:, (ordered.shape[1] - 1) // 2, None, None, None]
+        maps = ((self.distance / median).log().clamp(-4, 4) / 2, self.confidence * 2 - 1)
+        return torch.stack(
+            [F.interpolate(each, (height, width), mode="bilinear") for each in maps], dim=-1
+        )
+
+
+def other_views(views: int, scenes: int, device: torch.device) -> Int[Tensor, "B V K"]:
+    """Return for each view the indices of all others; -1 for a single view."""
+    if views == 1:
+        return torch.full((scenes, 1, 1), -1, device=device)
+    following = torch.arange(1, views, device=device) + torch.arange(views, device=device)[:, None]
+    return (following % views).expand(scenes, -1, -1)
+
+
+def fill_unknown(
+    inverse: Float[Tensor, "B V h w"], trust: Float[Tensor, "B V h w"]
+) -> Float[Tensor, "B V h w"]:
+    """Replace uncertain inverse depths by those around them; 0 if none is known.
+
+    A pyramid of weighted means, from the mean of the whole scene down to each pixel.
+
+    Args:
+        trust: in [0, 1]; its square is the pixel's weight.
+    """
+    weights, sums = [trust**2], [trust**2 * inverse]
+    while max(weights[-1].shape[-2:]) > 1:
+        for maps in (weights, sums):
+            maps.append(F.avg_pool2d(maps[-1], 2, ceil_mode=True))
+    scene = sums[-1].sum(1, keepdim=True) / weights[-1].sum(1, keepdim=True).clamp_min(1e-12)
+    filled = scene.expand_as(weights[-1])
+    for weight, total in zip(reversed(weights), reversed(sums), strict=True):
+        around = F.interpolate(filled, weight.shape[-2:], mode="bilinear")
+        filled = (total + SURROUNDINGS * around) / (weight + SURROUNDINGS)
+    return filled
+
+
+def _share(cover: float, others: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
+    """Return the opacity at which a view and `others` more reach the opacity `cover` together."""
+    return 1 - (1 - cover) ** (1 / (1 + others))

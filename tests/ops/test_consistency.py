@@ -1,0 +1,82 @@
+"""The consistency check between views, and the range of known depths."""
+
+import pytest
+import torch
+from swept import cameras_at, depth_of_plane, four_cameras, slanted_plane
+
+from asysplat.models.prior.plane_sweep import plane_sweep
+from asysplat.models.prior.prior import other_views
+from asysplat.models.prior.projections import MARGIN, Projections, observed_range
+from asysplat.ops.plane_sweep import load_backend, reference
+
+CAMERAS = cameras_at([(0.1 * v, 0.05 * (v % 2), 0.0) for v in range(4)])
+INNER = (slice(None), slice(None), slice(4, -4), slice(12, -12))
+
+
+def check_wall(halved=(), trust=None):
+    """Compare the depths of a wall between all views; some views have half the distance."""
+    inverse = 1 / depth_of_plane(CAMERAS, 2.0)[0]
+    for view in halved:
+        inverse[:, view] *= 2
+    others = other_views(4, 1, torch.device("cpu"))
+    projections = Projections.between(CAMERAS).into(others, CAMERAS.height, CAMERAS.width)
+    trust = torch.ones_like(inverse) if trust is None else trust
+    steps = torch.zeros(1, 4, dtype=torch.float64)
+    return load_backend("auto", inverse).consistency(inverse, steps, trust, others, projections)
+
+
+def test_all_views_agree_on_a_wall():
+    found = check_wall()
+    assert (found.agreeing[INNER] == 3).all() and (found.containing[INNER] == 3).all()
+    assert not found.contradicting.any()
+    assert (found.containing[:, 0, :, 0] < 3).all()  # the left border is outside other images
+    assert (found.agreeing == found.containing).all()
+
+
+def test_other_views_contradict_a_depth_that_is_too_near():
+    found = check_wall(halved=[3])
+    assert (found.contradicting[:, 3][:, 4:-4, 12:-12] == 3).all()
+    assert not found.agreeing[:, 3].any()
+    # The near surface of the fourth view occludes the wall: it does not contradict the others.
+    assert (found.agreeing[:, :3][INNER] == 2).all() and not found.contradicting[:, :3].any()
+
+
+def test_views_count_as_much_as_they_are_trusted():
+    trust = torch.ones(1, 4, 24, 32, dtype=torch.float64)
+    trust[:, 0] = 0.25
+    found = check_wall(halved=[3], trust=trust)
+    assert (found.contradicting[:, 3][:, 4:-4, 12:-12] == 2.25).all()
+    assert (found.agreeing[:, 1][:, 4:-4, 12:-12] == 1.25).all()
+
+
+def test_chunks_give_the_same_counts(monkeypatch):
+    expected = check_wall(halved=[1])
+    monkeypatch.setattr(reference, "PIXELS_AT_ONCE", 1)
+    assert all(map(torch.equal, check_wall(halved=[1]), expected))
+
+
+@pytest.mark.parametrize("views", [1, 2, 5])
+def test_other_views_are_all_but_itself(views):
+    others = other_views(views, 2, torch.device("cpu"))
+    assert len(others) == 2
+    for view, found in enumerate(others[1].tolist()):
+        assert sorted(found) == ([v for v in range(views) if v != view] or [-1])
+
+
+def test_a_range_ignores_outliers():
+    inverse = torch.cat((torch.linspace(0.5, 2, 98), torch.tensor([1e-4, 1e4]))).expand(1, 2, 100)
+    known = torch.ones(1, 2, 100, dtype=torch.bool)
+    known[0, 1, 15:] = False  # too few in the second view
+    least, greatest = observed_range(inverse, known)[0, 0].tolist()
+    assert least == pytest.approx(0.5 / MARGIN, rel=0.05)
+    assert greatest == pytest.approx(2 * MARGIN, rel=0.05)
+    assert observed_range(inverse, known)[0, 1].tolist() == [0, 0]
+
+
+def test_the_second_sweep_has_planes_where_surfaces_are():
+    """With few planes over the cameras' whole range the error would be several times as large."""
+    cameras = four_cameras(48, 64)
+    images, depth = slanted_plane(cameras, distance=6.0)
+    found = plane_sweep(images, cameras, planes=16)
+    error = (found.inverse_depth * depth - 1).abs()
+    assert error.median() < 0.02
