@@ -24,12 +24,18 @@ from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 
 from asysplat import read_gaussians, render, write_gaussians
-from asysplat.data import ProceduralScene, open_scene
+from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.write import write_transforms
 
 SIZE = 48
 LAYOUTS = Path(__file__).parent / "data" / "readers"  # writers of them
-TINY = (f"height={SIZE}", "steps=60", "refinement.most=3000", "views=12", "init=plane_sweep")
+TINY = (
+    f"height={SIZE}",
+    "steps=60",
+    "refinement.max_gaussians=3000",
+    "views=12",
+    "init=plane_sweep",
+)
 TINY += ("video.seconds=0.2", "paths.weights=none")
 FILES = {"scene.ply", "scene.safetensors", "path.mp4", "contact.png", "start.png"}
 FILES |= {"metrics.json", "metrics.csv", "config.yaml"}
@@ -37,8 +43,8 @@ FILES |= {"metrics.json", "metrics.csv", "config.yaml"}
 
 @pytest.fixture(scope="session")
 def views():
-    scene = ProceduralScene(seed=7, height=SIZE, width=SIZE, num_frames=16)
-    return scene.views(range(scene.num_frames))
+    scene = ProceduralScene(seed=7, height=SIZE, width=SIZE, num_images=16)
+    return scene.views(range(scene.num_images))
 
 
 @pytest.fixture(scope="session")
@@ -119,7 +125,7 @@ def test_the_scene_stands_in_the_world_of_the_files(command, views, tmp_path, un
         background = torch.tensor([float(x) for x in file.metadata()["background"].split()])
     with (folder / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
-    seen = open_scene(tmp_path / "photographs", SIZE, SIZE)
+    seen = open_scene(tmp_path / "photographs", SceneOptions(SIZE, SIZE))
     seen = seen.views([int(Path(row["file"]).stem) for row in rows])
     images = render(gaussians, seen.cameras, background).image.clamp(0, 1)
     psnr = -10 * (images - seen.images).square().mean((1, 2, 3)).log10()
@@ -131,7 +137,7 @@ def test_the_scene_stands_in_the_world_of_the_files(command, views, tmp_path, un
 @pytest.mark.medium
 def test_the_same_steps_and_seed_give_the_same_bytes(run_script, photographs, tmp_path):
     def scene(name, *overrides):
-        options = [*TINY, "steps=20", "held_out=null", "video.path=none", *overrides]
+        options = [*TINY, "steps=20", "held_out_every=null", "video.path=none", *overrides]
         options = [*dict((option.split("=")[0], option) for option in options).values()]
         folder = tmp_path / name
         finished(run_script("reconstruct.py", photographs, f"paths.run={folder}", *options))
@@ -144,9 +150,15 @@ def test_the_same_steps_and_seed_give_the_same_bytes(run_script, photographs, tm
 
 @pytest.mark.medium
 def test_it_says_why_it_ends_before_the_seconds(command, photographs, tmp_path):
-    overrides = ("views=3", "refinement.looks=2", "seconds=600", "steps=null", "video.path=none")
+    overrides = (
+        "views=3",
+        "refinement.max_steps_per_image=2",
+        "seconds=600",
+        "steps=null",
+        "video.path=none",
+    )
     said = finished(command(photographs, *overrides))
-    assert "ended: each photograph was looked at refinement.looks=2 times" in said
+    assert "ended after refinement.max_steps_per_image=2" in said
     assert numbers_of(tmp_path / "run")["steps"] == 6
 
 
@@ -177,7 +189,7 @@ def test_where_there_is_no_network_it_starts_from_the_sweep(command, photographs
     overrides = ("views=4", "checkpoint=absent.safetensors", "steps=2")
     said = finished(command(photographs, "init=null", *overrides))
     assert "absent.safetensors does not exist" in said and "by init=plane_sweep" in said
-    assert "refinement.looks" not in said
+    assert "refinement.max_steps_per_image" not in said
     asked = command(photographs, "init=network", *overrides)
     assert asked.returncode == 1 and "absent.safetensors does not exist" in asked.stderr
 
@@ -212,9 +224,12 @@ def test_words_of_the_command(repository, monkeypatch, words, expected):
 REFUSED = {
     "no path": ([], "no photographs: python reconstruct.py my_scene"),
     "an unknown option": (["heigth=9"], "heigth is unknown: did you mean height?"),
-    "an unknown init": (["init=swep"], "init=swep: choose network, sweep, points, depth, or a"),
+    "an unknown init": (
+        ["init=swep"],
+        "init=swep: choose network, plane_sweep, points, depth, or a",
+    ),
     "no such file": (["init=absent.ply"], "absent.ply"),
-    "no points": (["init=points"], "has no sparse points; choose sweep"),
+    "no points": (["init=points"], "has no sparse points; choose plane_sweep"),
     "no time": (["steps=null", "seconds=null"], "seconds=None: give a number above 0"),
     "zero seconds": (["steps=null", "seconds=0"], "seconds=0: give a number above 0"),
     "seconds below zero": (["steps=null", "seconds=-3"], "seconds=-3: give a number above 0"),
@@ -244,7 +259,9 @@ def test_mistakes_are_one_sentence(command, photographs, tmp_path, case):
 
 def test_too_few_photographs(command, views, tmp_path):
     write_transforms(views.select([0, 5]), tmp_path / "two")
-    check_refusal(command(tmp_path / "two"), "has 2 photographs, of which held_out=8 leaves 1")
+    check_refusal(
+        command(tmp_path / "two"), "has 2 photographs, of which held_out_every=8 leaves 1"
+    )
 
 
 @pytest.mark.parametrize("case", ["nan", "none"])
@@ -283,7 +300,7 @@ def test_logs_that_cannot_be_written(command, photographs, tmp_path):
 
 @pytest.mark.medium
 def test_a_full_disk_leaves_the_old_scene(command, photographs, tmp_path):
-    overrides = ("views=3", "steps=2", "video.path=none", "refinement.most=6000")
+    overrides = ("views=3", "steps=2", "video.path=none", "refinement.max_gaussians=6000")
     finished(command(photographs, *overrides))
     file = tmp_path / "run" / "scene.ply"
     before = file.read_bytes()
@@ -342,7 +359,7 @@ def test_interrupted_at_any_moment_there_is_a_whole_file_or_none(process, tmp_pa
 @pytest.mark.parametrize("times", [1, 2])
 def test_the_first_interruption_hands_over_and_the_second_stops(process, tmp_path, times, number):
     running = process("seconds=600")
-    while not running.stdout.readline().startswith("picture:"):
+    while not running.stdout.readline().startswith("figure:"):
         assert running.poll() is None, running.stderr.read()
     time.sleep(2)
     running.send_signal(number)

@@ -1,9 +1,9 @@
-"""One scene's Gaussians, fitted to its photographs: where they start, merging, refinement."""
+"""Fit the Gaussians of one scene to its images: initialization, merging, refinement."""
 
-from asysplat.refinement.merge import merged, thinned
-from asysplat.refinement.refine import Refinement, RefinementProgress, mean_color, refine
+from asysplat.refinement.merge import merge_to_limit
+from asysplat.refinement.refine import Refinement, RefinementProgress, refine
 from asysplat.refinement.settings import PAPER, Rates, RefinementSettings
-from asysplat.refinement.start import gaussians_of_points, gaussians_of_prior
+from asysplat.refinement.views import mean_color
 
 __all__ = [
     "PAPER",
@@ -11,10 +11,7 @@ __all__ = [
     "Refinement",
     "RefinementProgress",
     "RefinementSettings",
-    "gaussians_of_points",
-    "gaussians_of_prior",
     "mean_color",
-    "merged",
+    "merge_to_limit",
     "refine",
-    "thinned",
 ]

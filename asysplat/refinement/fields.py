@@ -1,4 +1,4 @@
-"""A scene's Gaussians as unconstrained numbers that an optimizer moves."""
+"""Gaussians as unconstrained parameters of an optimizer."""
 
 from collections.abc import Mapping
 
@@ -10,34 +10,35 @@ from asysplat.refinement.adam import VisibleAdam
 from asysplat.refinement.settings import Rates
 from asysplat.scene import Gaussians
 
-Numbers = dict[str, Tensor]
+Parameters = dict[str, Tensor]
 
 
 class Fields:
-    """Offsets of the means, quaternions, logarithms of scales, logits of opacities and SH.
+    """Offsets of the means, quaternions, log scales, opacity logits and SH, with their optimizer.
 
-    Offsets are in a unit of each Gaussian's own, so that near and far ones move alike.
+    Each Gaussian has its own unit of the offsets, so that one learning rate suits near and far
+    ones.
 
     Args:
-        gaussians: [N], to start from.
+        gaussians: [N], initial values.
         units: length of an offset of 1.
-        sh_degree: of the SH; coefficients that are missing start at 0.
+        sh_degree: missing SH coefficients start at 0; None keeps the degree.
     """
 
     def __init__(
         self, gaussians: Gaussians, units: Float[Tensor, "N"], sh_degree: int | None = None
     ):
         self.count = gaussians.sh.shape[1] if sh_degree is None else (sh_degree + 1) ** 2
-        self._origins, numbers = self._unconstrained(gaussians)
+        self._origins, parameters = self._unconstrained(gaussians)
         self._units = units[:, None].to(self._origins)
-        self._adam = VisibleAdam(numbers)
+        self._adam = VisibleAdam(parameters)
 
     def __len__(self) -> int:
         return len(self._origins)
 
     @property
-    def numbers(self) -> Numbers:
-        """The tensors that the optimizer moves, by name."""
+    def parameters(self) -> Parameters:
+        """The tensors that the optimizer updates, by name."""
         return self._adam.parameters
 
     @property
@@ -46,35 +47,35 @@ class Fields:
         return self._units[:, 0]
 
     @property
-    def skipped(self) -> int:
-        """How many rows were left out, a gradient being NaN or infinite."""
-        return self._adam.skipped
+    def non_finite(self) -> int:
+        """Number of rows that were not updated because of NaN or infinite gradients."""
+        return self._adam.non_finite
 
-    def leaves(self) -> Numbers:
-        """Return the tensors as leaves of a graph."""
-        return {name: tensor.detach().requires_grad_() for name, tensor in self.numbers.items()}
+    def leaves(self) -> Parameters:
+        """Return the parameters as leaves of a graph."""
+        return {name: tensor.detach().requires_grad_() for name, tensor in self.parameters.items()}
 
-    def gaussians(self, numbers: Mapping[str, Tensor] | None = None) -> Gaussians:
-        """Return the Gaussians of `numbers`, or as they are, differentiable in them."""
-        numbers = self.numbers if numbers is None else numbers
+    def gaussians(self, parameters: Mapping[str, Tensor] | None = None) -> Gaussians:
+        """Return the Gaussians of given or current parameters, differentiable in them."""
+        parameters = self.parameters if parameters is None else parameters
         return Gaussians(
-            means=torch.addcmul(self._origins, self._units, numbers["offsets"]),
-            quats=numbers["quats"],
-            scales=numbers["log_scales"].exp(),
-            opacities=numbers["logits"].sigmoid(),
-            sh=numbers["sh"],
+            means=torch.addcmul(self._origins, self._units, parameters["offsets"]),
+            quats=parameters["quats"],
+            scales=parameters["log_scales"].exp(),
+            opacities=parameters["logits"].sigmoid(),
+            sh=parameters["sh"],
         )
 
-    def step(self, gradients: Numbers, rates: Rates, factor: float) -> Bool[Tensor, "N"]:
-        """Move the Gaussians that were seen against their gradients; return which were.
+    def step(self, gradients: Parameters, rates: Rates, factor: float) -> Bool[Tensor, "N"]:
+        """Update the visible Gaussians (with a gradient of the opacity); return their mask.
 
         Args:
-            gradients: of the numbers.
-            rates: see `Rates`.
+            gradients: of the parameters.
+            rates: learning rates.
             factor: of all rates.
         """
-        seen = gradients["logits"] != 0
-        bands = torch.full((self.count, 1), rates.sh * rates.higher)
+        visible = gradients["logits"] != 0
+        bands = torch.full((self.count, 1), rates.sh * rates.sh_rest)
         bands[0] = rates.sh
         self._adam.step(
             gradients,
@@ -85,9 +86,9 @@ class Fields:
                 "logits": rates.opacities * factor,
                 "sh": bands * factor,
             },
-            seen,
+            visible,
         )
-        return seen
+        return visible
 
     def keep(self, index: Int[Tensor, "M"]) -> None:
         """Keep the rows of `index`."""
@@ -95,14 +96,14 @@ class Fields:
         self._origins, self._units = self._origins[index], self._units[index]
 
     def append(self, gaussians: Gaussians, units: Float[Tensor, "M"]) -> None:
-        """Add Gaussians, without steps yet."""
-        origins, numbers = self._unconstrained(gaussians)
-        self._adam.append(numbers)
+        """Add Gaussians, with a new optimizer state."""
+        origins, parameters = self._unconstrained(gaussians)
+        self._adam.append(parameters)
         self._origins = torch.cat((self._origins, origins))
         self._units = torch.cat((self._units, units[:, None].to(self._units)))
 
-    def _unconstrained(self, gaussians: Gaussians) -> tuple[Float[Tensor, "N 3"], Numbers]:
-        """Return where the offsets begin, and the numbers: copies in float32."""
+    def _unconstrained(self, gaussians: Gaussians) -> tuple[Float[Tensor, "N 3"], Parameters]:
+        """Return the origins of the offsets, and the parameters: copies in float32."""
         options = {"dtype": torch.float32, "memory_format": torch.contiguous_format, "copy": True}
         gaussians = gaussians.map(lambda field: field.detach().to(**options))
         sh = gaussians.sh[:, : self.count]

@@ -1,90 +1,158 @@
-"""The Gaussians that a refinement starts from, by name."""
+"""The Gaussians that a refinement starts from."""
+
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
-from torch import nn
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.models.network import Network
-from asysplat.models.prior import DepthPrior, PlaneSweepPrior
-from asysplat.refinement.merge import thinned
+from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
+from asysplat.refinement.isotropic import footprints, isotropic_gaussians, project
+from asysplat.refinement.merge import SPREAD, merge_to_limit
 from asysplat.refinement.photographs import Photographs
-from asysplat.refinement.start import gaussians_of_points, gaussians_of_prior
+from asysplat.refinement.views import resize
 from asysplat.scene import Gaussians, Views
 
-INITS = ("network", "sweep", "points", "depth")
-GRID = 64  # longest side of a prior's grid: what the sweep compares
-LOOKED_AT = 128  # longest side of what a network sees
-FEW = 8  # views up to which the network adds to the sweep (checkpoints/asysplat_plane_sweep.md)
+INITS = ("network", "plane_sweep", "points", "depth")
+PRIOR_MAX_SIDE = 64  # pixels of a prior's depth maps
+NETWORK_MAX_SIDE = 128  # pixels of the network's input images
+NETWORK_MAX_VIEWS = 8  # above it the network adds nothing (checkpoints/asysplat_plane_sweep.md)
+NEIGHBORS = 3  # the size of a point is their mean distance (Kerbl et al. 2023)
+POINT_OPACITY = 0.1
 
 
-def best_init(views: int) -> str:
-    """Return the better start: the network's where views are few, else the sweep's."""
-    return "network" if views <= FEW else "sweep"
+def best_init(num_views: int) -> str:
+    """Return the better initialization: the network for few views, else the plane sweep."""
+    return "network" if num_views <= NETWORK_MAX_VIEWS else "plane_sweep"
 
 
 @torch.no_grad()
 def initial_gaussians(
-    init: str, photographs: Photographs, most: int, network: Network | None = None
+    init: str, photographs: Photographs, max_gaussians: int, network: Network | None = None
 ) -> Gaussians:
-    """Return at most `most` Gaussians to refine, in the network's frame.
+    """Build at most `max_gaussians` Gaussians, in the network's frame.
 
-    Those of several views that say the same are merged: a cell is a pixel of the grid that they
-    were found on.
+    Gaussians of several views on the same surface are merged, in cells of a pixel of the network's
+    input or of the prior's depth map.
 
     Args:
         init: one of INITS.
         photographs: of the scene.
-        most: Gaussians.
-        network: of init=network.
+        max_gaussians: limit, >= 1.
+        network: for init=network.
 
     Raises:
-        InputError: an unknown init, or photographs without what it needs.
+        InputError: an unknown init, or photographs without the points or depths that it needs.
     """
     views = photographs.inputs
     height, width = views.cameras.height, views.cameras.width
     if init == "points":
         if photographs.points is None:
             raise InputError(
-                f"init=points: {photographs.name} has no sparse points; choose sweep, or a layout "
-                "with points (COLMAP)."
+                f"init=points: {photographs.name} has no sparse points; choose plane_sweep, or a "
+                "layout with points (COLMAP)."
             )
-        return thinned(gaussians_of_points(photographs.points, views), views.cameras, 1.0, most)
+        gaussians = gaussians_from_points(photographs.points, views)
+        return merge_to_limit(gaussians, views.cameras, 1.0, max_gaussians)
     if init == "network":
-        seen = _resized(views, LOOKED_AT, network.size_multiple)
-        found = network.eval()(seen)
-        grid = GRID
-    elif init in ("sweep", "depth"):
+        gaussians = network.eval()(_resize(views, NETWORK_MAX_SIDE, network.size_multiple))
+        side = PRIOR_MAX_SIDE
+    elif init in ("plane_sweep", "depth"):
         if init == "depth" and views.depths is None:
             raise InputError(
-                f"init=depth: {photographs.name} has no depth maps; choose sweep or points."
+                f"init=depth: {photographs.name} has no depth maps; choose plane_sweep or points."
             )
-        prior = _prior(PlaneSweepPrior() if init == "sweep" else DepthPrior(), views)
-        found, grid = gaussians_of_prior(views, prior), max(prior.distance.shape[-2:])
+        prior = _run_prior(PlaneSweepPrior() if init == "plane_sweep" else DepthPrior(), views)
+        gaussians, side = gaussians_from_prior(views, prior), max(prior.distance.shape[-2:])
     else:
         raise InputError(f"init={init}: choose {', '.join(INITS)}, or a file of Gaussians.")
-    return thinned(found, views.cameras, max(1.0, max(height, width) / grid), most)
+    return merge_to_limit(
+        gaussians, views.cameras, max(1.0, max(height, width) / side), max_gaussians
+    )
 
 
-def _prior(prior: nn.Module, views: Views):
-    """Ask a prior for a grid of at most GRID pixels, whose sides divide those of the views."""
-    side = max(1, -(-max(views.cameras.height, views.cameras.width) // GRID))
-    views = _resized(views, max(views.cameras.height, views.cameras.width), side)
-    size = views.cameras.height // side, views.cameras.width // side
+def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:
+    """Place an isotropic Gaussian at the surface point of each pixel of a prior's depth maps.
+
+    Pixels that are masked out, wholly or in part, get none, unless all are masked out.
+
+    Args:
+        views: [V].
+        prior: of these views, [1, V, h, w].
+    """
+    size = tuple(prior.distance.shape[-2:])
+    cameras = views.cameras.resized(*size)
+    origins, directions = cameras.rays()
+    distance = prior.distance[0].to(directions)
+    colors = F.interpolate(views.images, size, mode="area").movedim(1, -1)
+    gaussians = isotropic_gaussians(
+        (origins + distance[..., None] * directions).flatten(0, 2),
+        (distance / cameras.intrinsics[:, 0, 0, None, None] * SPREAD).flatten(),
+        prior.opacity[0].to(directions).flatten(),
+        colors.flatten(0, 2),
+    )
+    if views.masks is None:
+        return gaussians
+    valid = F.interpolate(views.masks[:, None].float(), size, mode="area").flatten() == 1
+    return gaussians.keep(valid) if valid.any() else gaussians
+
+
+def gaussians_from_points(points: Float[Tensor, "P 3"], views: Views) -> Gaussians:
+    """Place a faint isotropic Gaussian at each sparse point, as Kerbl et al. (2023).
+
+    Args:
+        points: in the world of the views.
+        views: [V]; a point has the mean color of its pixels.
+
+    Raises:
+        InputError: no points, or NaN or infinite coordinates.
+    """
+    if len(points) == 0 or not points.isfinite().all():
+        raise InputError(
+            f"gaussians_from_points got {len(points)} points with "
+            f"{int((~points.isfinite()).sum())} coordinates that are NaN or infinite: give at "
+            "least one point, and finite numbers."
+        )
+    sizes = footprints(points, views.cameras)  # the minimum: for lone or coincident points
+    if len(points) > 1:
+        ranks = range(2, min(NEIGHBORS + 1, len(points)) + 1)  # the first is the point itself
+        distances = cKDTree(points.numpy()).query(points.numpy(), k=list(ranks))[0]
+        sizes = torch.maximum(sizes, torch.as_tensor(distances.mean(-1)).to(points))
+    opacities = torch.full_like(sizes, POINT_OPACITY)
+    return isotropic_gaussians(points, sizes, opacities, sample_colors(points, views))
+
+
+def sample_colors(points: Float[Tensor, "N 3"], views: Views) -> Float[Tensor, "N 3"]:
+    """Compute the mean color of the pixels that points project to; gray if all are masked out."""
+    total, count = torch.zeros_like(points), torch.zeros_like(points[:, :1])
+    for view in range(views.num_views):
+        pixels, depth = project(points, views.cameras.select([view]))
+        visible = depth[0].nonzero()[:, 0]
+        column, row = pixels[0, visible].long().unbind(-1)
+        if views.masks is not None:
+            valid = views.masks[view, row, column]
+            visible, row, column = visible[valid], row[valid], column[valid]
+        total[visible] += views.images[view, :, row, column].mT
+        count[visible] += 1
+    return torch.where(count > 0, total / count.clamp_min(1), 0.5)
+
+
+def _run_prior(prior: nn.Module, views: Views) -> Prior:
+    """Compute depth maps of PRIOR_MAX_SIDE pixels a side at most, a divisor of the views."""
+    longest = max(views.cameras.height, views.cameras.width)
+    stride = max(1, -(-longest // PRIOR_MAX_SIDE))
+    views = _resize(views, longest, stride)
+    size = views.cameras.height // stride, views.cameras.width // stride
     return prior(views.map(lambda tensor: tensor[None]), size)
 
 
-def _resized(views: Views, longest: int, multiple: int) -> Views:
+def _resize(views: Views, longest: int, multiple: int) -> Views:
     """Return views whose longer side is about `longest` and whose sides are multiples."""
-    cameras = views.cameras
-    scale = min(1.0, longest / max(cameras.height, cameras.width))
-    size = [
-        max(multiple, round(side * scale / multiple) * multiple)
-        for side in (cameras.height, cameras.width)
-    ]
-    depths = views.depths
-    if depths is not None:
-        depths = F.interpolate(depths[:, None], size, mode="nearest")[:, 0]
-    return Views(
-        cameras.resized(*size), F.interpolate(views.images, size, mode="area"), depths=depths
-    )
+    height, width = views.cameras.height, views.cameras.width
+    scale = min(1.0, longest / max(height, width))
+    size = (max(multiple, round(side * scale / multiple) * multiple) for side in (height, width))
+    return resize(replace(views, masks=None), *size)

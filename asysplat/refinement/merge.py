@@ -1,30 +1,31 @@
-"""Merge Gaussians that say the same: many views see one surface."""
+"""Merge Gaussians of several views that lie on the same surface."""
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.refinement.start import SPREAD, footprints
+from asysplat.refinement.isotropic import footprints
 from asysplat.scene import Cameras, Gaussians
 
-LEAST_OPACITY, MOST_OPACITY = 0.05, 0.95  # what is merged keeps a gradient
-COARSER = 2**0.5  # by which cells grow until few enough Gaussians are left
+SPREAD = 0.5  # standard deviation of a Gaussian, in sides of the cell that it covers
+MIN_OPACITY, MAX_OPACITY = 0.05, 0.95  # of merged Gaussians, so that they keep a gradient
+CELL_GROWTH = 2**0.5  # by which cells grow until few enough Gaussians are left
 
 
-def merged(gaussians: Gaussians, cells: Float[Tensor, "N"]) -> Gaussians:
-    """Merge the Gaussians of each cubic cell: their mean, weighted by opacity.
+def merge_cells(gaussians: Gaussians, cells: Float[Tensor, "N"]) -> Gaussians:
+    """Merge the Gaussians of each cubic cell into their mean, weighted by opacity.
 
-    Together they hide what all of them hid, in the range from LEAST_OPACITY to MOST_OPACITY. What
-    is left covers its cell.
+    The merged Gaussian has the opacity of all of them one behind the other, clamped to MIN_OPACITY
+    and MAX_OPACITY, and is at least as large as its cell.
 
     Args:
         gaussians: [N], N >= 1.
-        cells: side of the cell that each is in, > 0, in scene units; rounded to a power of 2, so
-            that cells of one size tile the space, from the least corner of all means.
+        cells: side of each Gaussian's cell, > 0, in scene units; rounded to a power of 2, so that
+            cells of one size tile the space, from the minimum corner of all means.
     """
-    cell, count = _ranks_of_cells(gaussians.means, cells)
-    weights = gaussians.opacities.clamp_min(1e-6)  # what nobody sees has a mean, too
+    cell, count = _cell_ids(gaussians.means, cells)
+    weights = gaussians.opacities.clamp_min(1e-6)  # transparent Gaussians have a mean, too
     total = weights.new_zeros(count).index_add_(0, cell, weights)
 
     def mean(values: Tensor) -> Tensor:
@@ -32,11 +33,11 @@ def merged(gaussians: Gaussians, cells: Float[Tensor, "N"]) -> Gaussians:
         summed = values.new_zeros(count, *values.shape[1:])
         return summed.index_add_(0, cell, values * weights.view(shape)) / total.view(shape)
 
-    hidden = torch.log1p(-gaussians.opacities.clamp(max=0.999))
-    opacities = 1 - weights.new_zeros(count).index_add_(0, cell, hidden).exp()
-    # q and -q are one rotation: all of a cell are turned to the side of its first.
-    every = torch.arange(len(cell))
-    first = every.new_full((count,), len(cell)).scatter_reduce_(0, cell, every, "amin")[cell]
+    log_transmittance = torch.log1p(-gaussians.opacities.clamp(max=0.999))
+    opacities = 1 - weights.new_zeros(count).index_add_(0, cell, log_transmittance).exp()
+    # q and -q are the same rotation: flip all quaternions of a cell to the side of its first.
+    rows = torch.arange(len(cell))
+    first = rows.new_full((count,), len(cell)).scatter_reduce_(0, cell, rows, "amin")[cell]
     quats = F.normalize(gaussians.quats, dim=-1)
     opposite = (quats * quats[first]).sum(-1, keepdim=True) < 0
     scales = mean(gaussians.scales.log()).exp()
@@ -44,47 +45,49 @@ def merged(gaussians: Gaussians, cells: Float[Tensor, "N"]) -> Gaussians:
         means=mean(gaussians.means),
         quats=F.normalize(mean(torch.where(opposite, -quats, quats)), dim=-1),
         scales=torch.maximum(scales, SPREAD * mean(cells.log()).exp()[:, None]),
-        opacities=opacities.clamp(LEAST_OPACITY, MOST_OPACITY),
+        opacities=opacities.clamp(MIN_OPACITY, MAX_OPACITY),
         sh=mean(gaussians.sh),
     )
 
 
-def thinned(gaussians: Gaussians, cameras: Cameras, pixels: float, most: int) -> Gaussians:
-    """Merge Gaussians in cells of `pixels`, and of more until at most `most` are left.
+def merge_to_limit(
+    gaussians: Gaussians, cameras: Cameras, pixels: float, max_gaussians: int
+) -> Gaussians:
+    """Merge Gaussians in cells of `pixels`, then larger ones until few enough are left.
 
     Args:
         gaussians: [N], N >= 1.
-        cameras: that see them.
-        pixels: > 0, side of a cell, in pixels of the camera that sees it closest.
-        most: >= 1.
+        cameras: of the views that show them.
+        pixels: > 0, side of a cell, in pixels of the view where these are smallest.
+        max_gaussians: >= 1.
 
     Raises:
-        InputError: values that cannot be used.
+        InputError: see `Gaussians.validate`.
     """
-    gaussians.validate("thinned's gaussians")
+    gaussians.validate("merge_to_limit's gaussians")
     cells = pixels * footprints(gaussians.means, cameras)
     extent = (gaussians.means.amax(0) - gaussians.means.amin(0)).max()
-    largest = torch.maximum(2 * extent, cells.max())  # it holds all of them
-    while _ranks_of_cells(gaussians.means, cells)[1] > most and cells.min() < largest:
-        cells = torch.minimum(COARSER * cells, largest)
-    return merged(gaussians, cells)
+    largest = torch.maximum(2 * extent, cells.max())  # one cell holds all means
+    while _cell_ids(gaussians.means, cells)[1] > max_gaussians and cells.min() < largest:
+        cells = torch.minimum(CELL_GROWTH * cells, largest)
+    return merge_cells(gaussians, cells)
 
 
-def _ranks_of_cells(
+def _cell_ids(
     means: Float[Tensor, "N 3"], cells: Float[Tensor, "N"]
 ) -> tuple[Int[Tensor, "N"], int]:
-    """Give each mean the rank of its cell, from 0, and tell how many cells there are."""
+    """Return the id of each mean's cell, from 0, and the number of cells."""
     level = cells.double().log2().round()
     offsets = means.double() - means.double().amin(0)
-    place = (offsets / (2**level)[:, None]).floor()
-    ranks, count = _ranks(level)
-    for axis in place.unbind(-1):
-        # Ranks, as places themselves may be too large for an integer that holds all three.
+    position = (offsets / (2**level)[:, None]).floor()
+    ids, count = _ranks(level)
+    for axis in position.unbind(-1):
+        # By ranks, as three positions may not fit into one integer.
         along, length = _ranks(axis)
-        ranks, count = _ranks(ranks * length + along)
-    return ranks, count
+        ids, count = _ranks(ids * length + along)
+    return ids, count
 
 
 def _ranks(values: Tensor) -> tuple[Int[Tensor, "N"], int]:
-    ordered, ranks = values.unique(return_inverse=True)
-    return ranks, len(ordered)
+    unique, ranks = values.unique(return_inverse=True)
+    return ranks, len(unique)

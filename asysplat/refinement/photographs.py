@@ -1,7 +1,7 @@
-"""The photographs of one scene: those that are fitted to, and those held out to measure."""
+"""The photographs of one scene, as input and held-out views."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -11,10 +11,10 @@ from torch import Tensor
 from asysplat.data import open_scene
 from asysplat.data.bad_images import Policy
 from asysplat.data.check.matches import find_matches
-from asysplat.data.check.report import judge
+from asysplat.data.check.report import diagnose_cameras
 from asysplat.data.normalize import Normalization, normalize
-from asysplat.data.selection import spread
-from asysplat.data.sequence import FileSequence
+from asysplat.data.selection.views import spread
+from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
@@ -23,22 +23,22 @@ ANY_SIZE = 8  # pixels a side: to read cameras, before the size is known
 
 @dataclass(frozen=True)
 class Photographs:
-    """Views of one scene in the network's frame, and the way back.
+    """Views of one scene in the network's frame.
 
     Args:
         name: of the scene.
-        inputs: views that are fitted to.
-        measured: views that are held out; None where there are none.
-        input_files, measured_files: the names of their photographs.
-        frame: brings Gaussians back to the world of the files.
+        inputs: input views.
+        held_out: held-out views; None without any.
+        input_files, held_out_files: their file names.
+        frame: the network's frame, in the world of the files.
         points: sparse points in the network's frame; None where the files have none.
     """
 
     name: str
     inputs: Views
-    measured: Views | None
+    held_out: Views | None
     input_files: list[str]
-    measured_files: list[str]
+    held_out_files: list[str]
     frame: Normalization
     points: Float[Tensor, "P 3"] | None
 
@@ -48,81 +48,75 @@ def open_photographs(
     height: int,
     width: int | None = None,
     views: int = 32,
-    held_out: int | None = 8,
+    held_out_every: int | None = 8,
     max_held_out: int = 12,
     layout: str = "auto",
     on_bad_image: Policy = "fail",
     say: Callable[[str], None] = print,
 ) -> Photographs:
-    """Open posed photographs, choose some evenly, and bring them into the network's frame.
+    """Open posed photographs, select some evenly, and bring them into the network's frame.
 
     Args:
         path: a scene, in any layout that `open_scene` reads.
-        height, width: of the views, in pixels; width None: that of the first photograph at this
-            height.
-        views: how many are fitted to, at most.
-        held_out: one frame in so many, from the first on, is measured and not fitted to; None:
-            none is.
-        max_held_out: of these.
+        height, width: of the views, in pixels; width None keeps the first photograph's aspect
+            ratio.
+        views: number of input views, at most.
+        held_out_every: hold out every n-th photograph, from the first on; None: none.
+        max_held_out: number of held-out views, at most.
         layout, on_bad_image: see `open_scene`.
-        say: takes a sentence where there are fewer views than asked for, or where the cameras do
-            not fit the photographs.
+        say: takes warnings: fewer views than asked for, or cameras that do not fit the photographs.
 
     Raises:
-        InputError: fewer than two photographs are left to fit to; see `open_scene`.
+        InputError: fewer than two input views; see `open_scene`.
     """
-    if height < 1 or (width is not None and width < 1) or views < 2 or (held_out or 2) < 2:
+    if height < 1 or (width is not None and width < 1) or views < 2 or (held_out_every or 2) < 2:
         raise InputError(
-            f"height={height}, width={width}, views={views} and held_out={held_out}: give at "
-            "least 1 pixel, 2 views and one frame in 2, or held_out=null."
+            f"height={height}, width={width}, views={views} and held_out_every={held_out_every}: "
+            "give at least 1 pixel, 2 views, and held_out_every of 2 or more, or null."
         )
-    scene = open_scene(path, ANY_SIZE, ANY_SIZE, layout, on_bad_image).scene
-    lens = scene.photographs[0].lens
-    sequence = FileSequence(
-        scene, height, max(1, round(height * lens.width / lens.height)) if width is None else width
-    )
-    frames = range(sequence.num_frames)
-    measured = list(frames[::held_out]) if held_out else []
-    left = sorted(set(frames) - set(measured))
-    if len(left) < 2:
+    scene = open_scene(path, SceneOptions(ANY_SIZE, ANY_SIZE, layout, on_bad_image)).scene
+    if width is None:
+        lens = scene.images[0].lens
+        width = max(1, round(height * lens.width / lens.height))
+    sequence = FileSequence(scene, SceneOptions(height, width))
+    indices = list(range(sequence.num_images))
+    held_out = indices[::held_out_every] if held_out_every else []
+    rest = sorted(set(indices) - set(held_out))
+    if len(rest) < 2:
         raise InputError(
-            f"{path} has {len(frames)} photographs, of which held_out={held_out} leaves "
-            f"{len(left)}: set held_out=null, or give more photographs."
+            f"{path} has {len(indices)} photographs, of which held_out_every={held_out_every} "
+            f"leaves {len(rest)}: set held_out_every=null, or give more photographs."
         )
-    if len(left) < views:
-        say(f"{path} has {len(left)} photographs to fit to, not {views}: all are used.")
-    chosen = spread(left, min(views, len(left)))
-    measured = spread(measured, min(max_held_out, len(measured))) if measured else []
-    fitted = replace(scene, photographs=[scene.photographs[frame] for frame in chosen])
-    _warn_of_cameras(FileSequence(fitted, sequence.cameras.height, sequence.cameras.width), say)
-    inputs = sequence.views(chosen).validate(str(path))
-    targets = sequence.views(measured).validate(str(path)) if measured else inputs
-    inputs, targets, frame = normalize(inputs, targets)
-    return Photographs(
-        name=scene.name,
-        inputs=inputs,
-        measured=targets if measured else None,
-        input_files=[str(scene.photographs[frame].image) for frame in chosen],
-        measured_files=[str(scene.photographs[frame].image) for frame in measured],
-        frame=frame,
-        points=_moved_points(scene.points, frame),
-    )
-
-
-def _moved_points(points: object, frame: Normalization) -> Float[Tensor, "P 3"] | None:
-    if points is None or len(points) == 0:
-        return None
-    pose = frame.world_to_mean
-    moved = torch.as_tensor(points, dtype=torch.float64) @ pose[:3, :3].mT + pose[:3, 3]
-    return (moved * frame.scale).float()
-
-
-def _warn_of_cameras(sequence: FileSequence, say: Callable[[str], None]) -> None:
-    """Say so where points that are found in several photographs do not fit the cameras."""
-    names = [str(photograph.image) for photograph in sequence.scene.photographs]
-    verdict = judge(sequence.cameras, find_matches(sequence), names)
+    if len(rest) < views:
+        say(f"{path} has {len(rest)} photographs to fit to, not {views}: all are used.")
+    inputs = spread(rest, min(views, len(rest)))
+    held_out = spread(held_out, min(max_held_out, len(held_out))) if held_out else []
+    files = [str(image.file) for image in scene.images]
+    input_files = [files[index] for index in inputs]
+    chosen = sequence.with_images([scene.images[index] for index in inputs])
+    verdict = diagnose_cameras(chosen.cameras, find_matches(chosen), input_files)
     if not verdict.fits:
         say(
             f"warning: {verdict.sentence}; python -m asysplat.data.check shows it at full size. "
             "The reconstruction goes on."
         )
+    input_views = sequence.views(inputs).validate(str(path))
+    targets = sequence.views(held_out).validate(str(path)) if held_out else input_views
+    input_views, targets, frame = normalize(input_views, targets)
+    return Photographs(
+        name=scene.name,
+        inputs=input_views,
+        held_out=targets if held_out else None,
+        input_files=input_files,
+        held_out_files=[files[index] for index in held_out],
+        frame=frame,
+        points=_to_frame(scene.points, frame),
+    )
+
+
+def _to_frame(points: object, frame: Normalization) -> Float[Tensor, "P 3"] | None:
+    if points is None or len(points) == 0:
+        return None
+    pose = frame.world_to_mean
+    points = torch.as_tensor(points, dtype=torch.float64) @ pose[:3, :3].mT + pose[:3, 3]
+    return (points * frame.scale).float()

@@ -1,6 +1,6 @@
-"""Fit a scene's Gaussians to its photographs: per-scene optimization from a good start.
+"""Per-scene optimization of Gaussians, from a good initialization.
 
-The paper's post-optimization is one setting of it, `PAPER`.
+The paper's post-optimization is the setting `PAPER`.
 """
 
 import math
@@ -16,31 +16,35 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.ops.image_loss import image_loss
-from asysplat.refinement.clone_split import Pulls
-from asysplat.refinement.corrections import Corrections, exposed, moved_cameras
-from asysplat.refinement.densify import LEAST_OPACITY, gaussians_where_wrong, look
-from asysplat.refinement.fields import Fields, Numbers
-from asysplat.refinement.relocate import regularizer, relocate, shake
+from asysplat.refinement.corrections import Corrections, correct_exposure, correct_poses
+from asysplat.refinement.densification.clone_split import ScreenGradients
+from asysplat.refinement.densification.relocate import (
+    inject_position_noise,
+    mcmc_regularizer,
+    relocate,
+)
+from asysplat.refinement.densification.spawn import MIN_OPACITY, render_views, spawn_at_errors
+from asysplat.refinement.fields import Fields, Parameters
+from asysplat.refinement.isotropic import footprints
 from asysplat.refinement.settings import RefinementSettings
-from asysplat.refinement.start import footprints
+from asysplat.refinement.views import mean_color, resize
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
-PIXELS_EACH = 8  # of the photographs, at least, for each Gaussian: with fewer they learn noise
-VIEWS_A_ROUND = 8  # in which wrong pixels are looked for
+PIXELS_PER_GAUSSIAN = 8  # of the input images, at least: with fewer, Gaussians fit noise
+VIEWS_PER_ROUND = 8  # rendered to find pixels with large errors
 
 
 @dataclass(frozen=True)
 class RefinementProgress:
-    """How far a refinement is.
+    """Progress of a refinement.
 
     Args:
-        step: steps that were taken.
-        share: of the refinement, in [0, 1].
-        seconds: since it began.
-        psnr: of the photographs, each before the step that it was looked at, in dB: mean of the
-            last ones.
-        gaussians: how many there are.
+        step: steps so far.
+        share: of the refinement that is done, in [0, 1].
+        seconds: since its start.
+        psnr: mean over the last steps, one for each input image, in dB; each before its update.
+        gaussians: their number.
     """
 
     step: int
@@ -51,17 +55,17 @@ class RefinementProgress:
 
 
 class Refinement:
-    """Gaussians, the photographs they are fitted to, and a step.
+    """The state of a refinement: Gaussians, input views and the optimizer.
 
     Args:
-        gaussians: [N], to start from.
-        views: the photographs, [V].
-        background: behind all; the mean color of the photographs where it is None.
+        gaussians: [N], initial values.
+        views: the input views, [V].
+        background: RGB; None: the mean color of the views.
         settings: see `RefinementSettings`.
-        seed: of the order of the photographs and of new Gaussians.
+        seed: of the order of the views and of new Gaussians.
 
     Raises:
-        InputError: no Gaussians, or values that cannot be used.
+        InputError: no Gaussians, or invalid values.
     """
 
     def __init__(
@@ -81,120 +85,121 @@ class Refinement:
         self._generator = torch.Generator().manual_seed(seed)
         self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
         self.corrections = Corrections(views.num_views, settings.rates)
-        self._half = half_size(views) if settings.half_size > 0 else views
+        size = (max(1, side // 2) for side in (views.cameras.height, views.cameras.width))
+        self._half_views = resize(views, *size) if settings.half_size > 0 else views
         self._queue: list[int] = []
         self._steps = 0
-        self._last_seen = views.images.new_zeros(len(self.fields), dtype=torch.long)
-        self._pulls = Pulls(self.fields) if settings.densify == "gradient" else None
-        self._room = min(settings.most, views.images[:, 0].numel() // PIXELS_EACH)
+        self._last_visible = torch.zeros(len(self.fields), dtype=torch.long)
+        self._screen_gradients = ScreenGradients(self.fields)
+        pixels = views.images[:, 0].numel()
+        self._max_gaussians = min(settings.max_gaussians, pixels // PIXELS_PER_GAUSSIAN)
 
     @property
     def gaussians(self) -> Gaussians:
-        """The Gaussians as they are now, copied."""
+        """The current Gaussians, copied."""
         return self.fields.gaussians().map(lambda field: field.detach().clone())
 
     def step(self, share: float) -> float:
-        """Take a step; return the mean squared error of the photographs that it looked at.
+        """Take a step; return the mean squared error of its views.
 
         Args:
-            share: of the refinement that has passed, in [0, 1].
+            share: of the refinement that is done, in [0, 1].
         """
-        settings = self.settings
-        views = self._half if share < settings.half_size else self.views
-        chosen = self._next(settings.views_a_step or self.views.num_views)
-        leaves, factor = self.fields.leaves(), self._factor(share)
+        settings, views = self.settings, self._views(share)
+        chosen = self._next_views(settings.views_per_step or self.views.num_views)
+        leaves, factor = self.fields.leaves(), self._rate_factor(share)
         error, gradients = 0.0, {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
         for view in chosen:
-            mse, found = self._gradients(views.select([view]), view, leaves, factor)
-            if self._pulls is not None:
-                self._pulls.add(found[0], views.cameras.select([view]))
-            for name, gradient in zip(leaves, found, strict=True):
+            mse, of_view = self._gradients(views.select([view]), view, leaves, factor)
+            if settings.densify == "gradient":
+                self._screen_gradients.add(of_view[0], views.cameras.select([view]))
+            for name, gradient in zip(leaves, of_view, strict=True):
                 gradients[name] = gradient if len(chosen) == 1 else gradients[name] + gradient
             error += mse / len(chosen)
-        seen = self.fields.step(gradients, settings.rates, factor)
+        visible = self.fields.step(gradients, settings.rates, factor)
         if settings.densify == "mcmc":
-            shake(self.fields, factor, self._generator)
+            inject_position_noise(self.fields, factor, self._generator)
         self._steps += 1
-        self._last_seen[seen] = self._steps
+        self._last_visible[visible] = self._steps
         return error
 
     def densify(self, share: float) -> None:
-        """Drop Gaussians that are of no use, and add some where pixels are wrong.
+        """Prune, add or relocate Gaussians, by the method of the settings.
 
         Args:
-            share: of the refinement that has passed, in [0, 1].
+            share: of the refinement that is done, in [0, 1].
         """
         settings = self.settings
         if settings.densify == "error":
-            self._densify_where_wrong(share)
+            self._prune_and_spawn(share)
             return
         if settings.densify == "mcmc":
-            relocate(self.fields, self._room, settings.growth, self._generator)
-        elif self._pulls is not None:
-            self._pulls.clone_and_split(self._room, self._generator)
-        self._last_seen = self._last_seen.new_full((len(self.fields),), self._steps)
+            relocate(self.fields, self._max_gaussians, settings.growth, self._generator)
+        elif settings.densify == "gradient":
+            self._screen_gradients.clone_and_split(self._max_gaussians, self._generator)
+        self._last_visible = self._last_visible.new_full((len(self.fields),), self._steps)
 
-    def _densify_where_wrong(self, share: float) -> None:
-        settings = self.settings
-        views = self._half if share < settings.half_size else self.views
-        opacities = self.fields.numbers["logits"].detach().sigmoid()
-        # Seen by none of the photographs, all of which have come twice.
-        lost = self._steps - self._last_seen > 2 * views.num_views
-        useful = (opacities > LEAST_OPACITY) & ~lost
-        useful[opacities.argmax()] = True  # one is left
-        most = min(self._room, int((1 + settings.growth) * len(self.fields)))
-        kept = torch.nonzero(useful)[:, 0]
-        self.fields.keep(kept)
-        self._last_seen = self._last_seen[kept]
-        count = most - len(self.fields)
+    def _prune_and_spawn(self, share: float) -> None:
+        views = self._views(share)
+        opacities = self.fields.parameters["logits"].detach().sigmoid()
+        # Every view has been used twice since.
+        unseen = self._steps - self._last_visible > 2 * views.num_views
+        useful = (opacities > MIN_OPACITY) & ~unseen
+        useful[opacities.argmax()] = True  # never prune all
+        limit = min(self._max_gaussians, int((1 + self.settings.growth) * len(self.fields)))
+        rows = torch.nonzero(useful)[:, 0]
+        self.fields.keep(rows)
+        self._last_visible = self._last_visible[rows]
+        count = limit - len(self.fields)
         if count > 0:
             order = torch.randperm(views.num_views, generator=self._generator)
-            some = views.select(order[:VIEWS_A_ROUND])
-            seen = look(self.gaussians, some, self.background)
-            new = gaussians_where_wrong(some, *seen, count, self._generator)
+            views = views.select(order[:VIEWS_PER_ROUND])
+            rendered = render_views(self.gaussians, views, self.background)
+            new = spawn_at_errors(views, *rendered, count, self._generator)
             self.fields.append(new, self._units(new.means))
-            now = self._last_seen.new_full((new.num_gaussians,), self._steps)
-            self._last_seen = torch.cat((self._last_seen, now))
+            now = self._last_visible.new_full((new.num_gaussians,), self._steps)
+            self._last_visible = torch.cat((self._last_visible, now))
 
     def _gradients(
-        self, target: Views, view: int, leaves: Numbers, factor: float
+        self, target: Views, view: int, leaves: Parameters, factor: float
     ) -> tuple[float, Sequence[Tensor]]:
-        """Render a photograph; return its squared error and the gradients of the leaves.
+        """Render a view; return its squared error and the gradients of the leaves.
 
-        What the photograph itself is forgiven is corrected at once.
+        The view's exposure and pose corrections are updated at once.
         """
-        cameras, forgiven = target.cameras, {}
-        if self.corrections.wanted:
-            forgiven = self.corrections.leaves(view)
-            cameras = moved_cameras(cameras, forgiven["poses"])
+        cameras, correction = target.cameras, {}
+        if self.corrections.enabled:
+            correction = self.corrections.leaves(view)
+            cameras = correct_poses(cameras, correction["poses"])
         gaussians = self.fields.gaussians(leaves)
         image = render(gaussians, cameras, self.background, depth=False, masks=target.masks).image
-        if forgiven:
-            image = exposed(image, forgiven["exposure"])
-        loss = self._loss(image, target)
+        if correction:
+            image = correct_exposure(image, correction["exposure"])
+        if self.settings.ssim is None:
+            loss = F.mse_loss(target.masked(image), target.images)
+        else:
+            loss = image_loss(image, target.images, self.settings.ssim, target.masks).sum()
         if self.settings.densify == "mcmc":
-            loss = loss + regularizer(gaussians)
-        found = torch.autograd.grad(loss, [*leaves.values(), *forgiven.values()])
-        if forgiven:
-            own = dict(zip(forgiven, found[len(leaves) :], strict=True))
+            loss = loss + mcmc_regularizer(gaussians)
+        gradients = torch.autograd.grad(loss, [*leaves.values(), *correction.values()])
+        if correction:
+            own = dict(zip(correction, gradients[len(leaves) :], strict=True))
             self.corrections.step(view, own, factor)
         mse = F.mse_loss(target.masked(image.detach()), target.images).item()
-        return mse, found[: len(leaves)]
+        return mse, gradients[: len(leaves)]
 
-    def _loss(self, image: Float[Tensor, "1 3 H W"], target: Views) -> Tensor:
-        if self.settings.ssim is None:
-            return F.mse_loss(target.masked(image), target.images)
-        return image_loss(image, target.images, self.settings.ssim, target.masks).sum()
+    def _views(self, share: float) -> Views:
+        return self._half_views if share < self.settings.half_size else self.views
 
-    def _factor(self, share: float) -> float:
+    def _rate_factor(self, share: float) -> float:
         """Return the factor of all rates: 1, then down to `decay` over the cool-down."""
         cool_down = self.settings.cool_down
         if cool_down == 0:
             return 1.0
         return self.settings.decay ** max(0.0, (share - 1 + cool_down) / cool_down)
 
-    def _next(self, count: int) -> list[int]:
-        """Return the next photographs: all of them come before one comes again."""
+    def _next_views(self, count: int) -> list[int]:
+        """Return the next views of a random order; all are used before one is used again."""
         while len(self._queue) < count:
             self._queue += torch.randperm(self.views.num_views, generator=self._generator).tolist()
         chosen, self._queue = self._queue[:count], self._queue[count:]
@@ -217,14 +222,14 @@ def refine(
     seed: int = 0,
     watch: Callable[[RefinementProgress, Refinement], bool] | None = None,
 ) -> Gaussians:
-    """Refine Gaussians until the seconds or the steps are used, or more would fit noise.
+    """Refine Gaussians for some seconds or steps, at most for the settings' `max_steps`.
 
     With `steps`, the same inputs and seed give the same bits.
 
     Args:
         gaussians, views, background, settings, seed: see `Refinement`.
         seconds, steps: give one of them.
-        watch: called after each step; True ends the refinement.
+        watch: called after each step; ends the refinement if it returns True.
 
     Raises:
         InputError: neither seconds nor steps, or both; see `Refinement`.
@@ -234,8 +239,8 @@ def refine(
     refinement = Refinement(gaussians, views, background, settings, seed)
     if seconds is not None:
         _compile_kernels(gaussians, views, settings)
-    most = settings.most_steps(views.num_views)
-    errors: deque[float] = deque(maxlen=views.num_views)  # the last at each photograph
+    max_steps = settings.max_steps(views.num_views)
+    errors: deque[float] = deque(maxlen=views.num_views)
     step, rounds, share = 0, 0, 0.0
     clock = time.perf_counter()
     while share < 1:
@@ -248,7 +253,7 @@ def refine(
         step += 1
         passed = time.perf_counter() - clock
         used = step / steps if seconds is None else passed / seconds
-        share = min(1.0, max(used, step / most))
+        share = min(1.0, max(used, step / max_steps))
         psnr = -10 * math.log10(max(sum(errors) / len(errors), 1e-10))
         progress = RefinementProgress(step, share, passed, psnr, len(refinement.fields))
         if watch is not None and watch(progress, refinement):
@@ -257,30 +262,8 @@ def refine(
 
 
 def _compile_kernels(gaussians: Gaussians, views: Views, settings: RefinementSettings) -> None:
-    """Take steps with few Gaussians, so that compiling kernels, once, takes none of the time."""
+    """Take a step with few Gaussians, so that compiling kernels takes none of the time."""
     few = gaussians.map(lambda field: field[:10])
-    small = Refinement(few, views.select([0]), settings=replace(settings, views_a_step=1))
+    small = Refinement(few, views.select([0]), settings=replace(settings, views_per_step=1))
     small.step(0.0)
     small.densify(0.0)
-
-
-def mean_color(views: Views) -> Float[Tensor, "3"]:
-    """Return the mean color of the pixels of photographs that count; gray where none does."""
-    colors = views.images.movedim(-3, -1)
-    if views.masks is not None:
-        colors = colors[views.masks]
-    return colors.flatten(0, -2).mean(0).nan_to_num(0.5)
-
-
-def half_size(views: Views) -> Views:
-    """Return the views with half as many pixels along each side."""
-    height, width = max(1, views.cameras.height // 2), max(1, views.cameras.width // 2)
-    masks = views.masks
-    if masks is not None:
-        kept = F.interpolate(masks[:, None].float(), (height, width), mode="area")
-        masks = kept[:, 0] == 1
-    return Views(
-        views.cameras.resized(height, width),
-        F.interpolate(views.images, (height, width), mode="area"),
-        masks=masks,
-    )

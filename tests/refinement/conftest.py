@@ -5,7 +5,8 @@ import torch
 
 from asysplat.data import ProceduralScene
 from asysplat.models.prior import Prior
-from asysplat.refinement import gaussians_of_prior, thinned
+from asysplat.refinement.init import gaussians_from_prior
+from asysplat.refinement.merge import merge_to_limit
 
 
 @pytest.fixture
@@ -32,4 +33,4 @@ def start(room):
     depths = torch.nn.functional.interpolate(views.depths[None], size)[0]
     distance = (depths * length)[None]
     prior = Prior(distance, torch.ones_like(distance), torch.full_like(distance, 0.5))
-    return thinned(gaussians_of_prior(views, prior), views.cameras, 4.0, 10_000)
+    return merge_to_limit(gaussians_from_prior(views, prior), views.cameras, 4.0, 10_000)

@@ -5,10 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from asysplat.refinement.clone_split import LARGE, PULLED, SHRUNK, Pulls
-from asysplat.refinement.densify import LEAST_OPACITY
+from asysplat.refinement.densification.clone_split import (
+    DENSIFY_GRAD_THRESHOLD,
+    SPLIT_FACTOR,
+    SPLIT_SCALE,
+    ScreenGradients,
+)
+from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.refinement.start import round_gaussians
+from asysplat.refinement.isotropic import isotropic_gaussians
 from asysplat.rendering import render
 from asysplat.scene import Cameras
 
@@ -24,10 +29,10 @@ def camera():
     return Cameras(intrinsics, torch.eye(4)[None], height=32, width=48)
 
 
-def gaussians(size=LARGE / 2, count=COUNT):
+def gaussians(size=SPLIT_SCALE / 2, count=COUNT):
     means = torch.tensor([[0.0, 0.0, 2.0]]) + torch.arange(count)[:, None] * 0.1
     colors = torch.linspace(0, 1, 3 * count).reshape(count, 3)
-    return round_gaussians(means, torch.full((count,), size), torch.full((count,), 0.5), colors)
+    return isotropic_gaussians(means, torch.full((count,), size), torch.full((count,), 0.5), colors)
 
 
 def fields_of(start):
@@ -36,11 +41,11 @@ def fields_of(start):
 
 def pulled(fields, *rows):
     """Return pulls of which those of `rows` are enough, the first the strongest."""
-    pulls = Pulls(fields)
+    pulls = ScreenGradients(fields)
     # At distance 2 to 2.5 and focal length 40 this is 2.4 or more of half an image.
     gradients = torch.zeros(len(fields), 3)
     for rank, row in enumerate(rows):
-        gradients[row, 0] = fields.units[row] * PULLED * (len(rows) - rank)
+        gradients[row, 0] = fields.units[row] * DENSIFY_GRAD_THRESHOLD * (len(rows) - rank)
     pulls.add(gradients, camera())
     return pulls
 
@@ -55,7 +60,7 @@ def test_a_pull_is_the_gradient_of_the_place_in_the_image():
     image = render(fields.gaussians(leaves), cameras, depth=False).image
     error = (image - target).abs().mean()
     of_pixels, of_offsets = torch.autograd.grad(error, (intrinsics, leaves["offsets"]))
-    pulls = Pulls(fields)
+    pulls = ScreenGradients(fields)
     pulls.add(of_offsets, camera())
     expected = (of_pixels[0, :2, 2] * torch.tensor([24.0, 16.0])).norm()
     assert expected > 1e-5
@@ -68,7 +73,7 @@ def test_the_mean_is_over_the_photographs_that_see_it():
     once = pulls.mean.clone()
     pulls.add(torch.zeros(COUNT, 3), camera())
     torch.testing.assert_close(pulls.mean, once)
-    assert once[1] > PULLED and once.count_nonzero() == 1
+    assert once[1] > DENSIFY_GRAD_THRESHOLD and once.count_nonzero() == 1
 
 
 def test_a_small_one_is_cloned_where_it_is():
@@ -83,17 +88,17 @@ def test_a_small_one_is_cloned_where_it_is():
 
 
 def test_a_large_one_is_split_in_two_smaller_ones_around_it():
-    fields = fields_of(gaussians(size=2 * LARGE, count=200))
+    fields = fields_of(gaussians(size=2 * SPLIT_SCALE, count=200))
     before = fields.gaussians()
     pulled(fields, *range(100)).clone_and_split(1000, generator())
     after = fields.gaussians()
     assert len(fields) == 300
     torch.testing.assert_close(after.means[:100], before.means[100:])
     halves = after.map(lambda field: field[100:])
-    torch.testing.assert_close(halves.scales, torch.full((200, 3), 2 * LARGE / SHRUNK))
+    torch.testing.assert_close(halves.scales, torch.full((200, 3), 2 * SPLIT_SCALE / SPLIT_FACTOR))
     colors = torch.cdist(halves.sh[:, 0], before.sh[:, 0])
     away = halves.means - before.means[colors.argmin(1)]  # of the one with the same
-    assert 0.8 < away.std() / (2 * LARGE) < 1.2
+    assert 0.8 < away.std() / (2 * SPLIT_SCALE) < 1.2
 
 
 def test_no_more_than_there_is_room_for_and_the_most_pulled_first():
@@ -106,12 +111,12 @@ def test_no_more_than_there_is_room_for_and_the_most_pulled_first():
 
 def test_transparent_ones_are_dropped_but_one_is_left():
     start = gaussians()
-    faint = torch.full((COUNT,), LEAST_OPACITY / 2)
+    faint = torch.full((COUNT,), MIN_OPACITY / 2)
     some = faint.clone()
     some[2] = 0.9
     for opacities, left in ((some, 2), (faint, 0)):
         fields = fields_of(replace(start, opacities=opacities))
-        Pulls(fields).clone_and_split(100, generator())
+        ScreenGradients(fields).clone_and_split(100, generator())
         torch.testing.assert_close(fields.gaussians().means, start.means[left, None])
 
 

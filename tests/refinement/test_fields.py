@@ -29,7 +29,7 @@ def assert_close(found, expected, error=1e-6):
 
 
 def gradients_of(fields, fill=1.0):
-    return {name: torch.full_like(tensor, fill) for name, tensor in fields.numbers.items()}
+    return {name: torch.full_like(tensor, fill) for name, tensor in fields.parameters.items()}
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -72,11 +72,11 @@ def test_what_one_starts_from_is_not_changed(gaussians):
 
 def test_the_first_step_is_as_long_as_the_rates(gaussians):
     """Adam's first step is the rate; a mean moves in its own unit."""
-    rates = Rates(means=0.5, quats=1e-3, scales=1e-2, opacities=0.1, sh=0.02, higher=0.25)
+    rates = Rates(means=0.5, quats=1e-3, scales=1e-2, opacities=0.1, sh=0.02, sh_rest=0.25)
     fields = Fields(gaussians, units(gaussians))
-    before = {name: tensor.clone() for name, tensor in fields.numbers.items()}
+    before = {name: tensor.clone() for name, tensor in fields.parameters.items()}
     assert fields.step(gradients_of(fields), rates, 0.5).all()
-    moved = {name: before[name] - tensor for name, tensor in fields.numbers.items()}
+    moved = {name: before[name] - tensor for name, tensor in fields.parameters.items()}
     for name, rate in {"offsets": 0.5, "quats": 1e-3, "log_scales": 1e-2, "logits": 0.1}.items():
         expected = torch.full_like(moved[name], rate / 2)
         torch.testing.assert_close(moved[name], expected, rtol=1e-3, atol=1e-7, msg=name)
@@ -96,7 +96,7 @@ def test_what_was_not_seen_or_has_no_rate_stays(gaussians):
     rates = Rates(quats=0.0, opacities=0.0)
     seen = fields.step(gradients, rates, 1.0)
     assert torch.equal(seen, torch.arange(12) % 3 > 0)
-    assert fields.skipped == 1
+    assert fields.non_finite == 1
     found = fields.gaussians()
     for name in NAMES:
         same = (getattr(found, name) == getattr(gaussians, name)).flatten(1 - (name == "opacities"))
@@ -114,7 +114,7 @@ def test_leaves_have_a_gradient_and_the_numbers_none(gaussians):
     torch.stack([getattr(found, name).sum() for name in NAMES]).sum().backward()
     assert all((leaf.grad != 0).any() for leaf in leaves.values())
     torch.testing.assert_close(leaves["offsets"].grad, units(gaussians)[:, None].repeat(1, 3))
-    assert not any(tensor.requires_grad for tensor in fields.numbers.values())
+    assert not any(tensor.requires_grad for tensor in fields.parameters.values())
 
 
 def test_rows_are_kept_dropped_and_copied(gaussians):

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from asysplat.errors import InputError
-from asysplat.refinement.merge import LEAST_OPACITY, MOST_OPACITY, merged, thinned
-from asysplat.refinement.start import SPREAD, footprints, round_gaussians
+from asysplat.refinement.isotropic import footprints, isotropic_gaussians
+from asysplat.refinement.merge import MAX_OPACITY, MIN_OPACITY, SPREAD, merge_cells, merge_to_limit
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians
 
@@ -16,7 +16,7 @@ def some(count, scale=1.0):
     """Round Gaussians in a box before the camera below."""
     means = scale * (torch.rand(count, 3) * 4 + torch.tensor([-2.0, -2, 2]))
     sizes = torch.full((count,), 0.1 * scale)
-    return round_gaussians(means, sizes, 0.2 + 0.5 * torch.rand(count), torch.rand(count, 3))
+    return isotropic_gaussians(means, sizes, 0.2 + 0.5 * torch.rand(count), torch.rand(count, 3))
 
 
 def camera(size=32):
@@ -42,7 +42,7 @@ def everything(gaussians):
 
 def test_two_alike_become_one_that_hides_what_both_did():
     one = some(1)
-    two = merged(repeated(one, 2), torch.full((2,), 0.01))
+    two = merge_cells(repeated(one, 2), torch.full((2,), 0.01))
     assert two.num_gaussians == 1
     for name in ("means", "quats", "scales", "sh"):
         torch.testing.assert_close(getattr(two, name), getattr(one, name))
@@ -53,7 +53,7 @@ def test_the_picture_of_twice_the_same_stays():
     gaussians = some(60)
     gaussians.opacities.mul_(0.3)
     twice, cells = repeated(gaussians, 2), torch.full((120,), 1e-4)
-    once = merged(twice, cells)
+    once = merge_cells(twice, cells)
     assert once.num_gaussians == 60
     twice, once, half = (render(each, camera()).image for each in (twice, once, gaussians))
     # Where two lie over one another, alpha is not quite that of one with both opacities.
@@ -62,10 +62,10 @@ def test_the_picture_of_twice_the_same_stays():
 
 def test_a_cell_has_the_means_weighted_by_opacity():
     means = torch.tensor([[0.0, 0, 0], [0.1, 0.2, 0.3]])
-    both = round_gaussians(
+    both = isotropic_gaussians(
         means, torch.tensor([2.0, 8.0]), torch.tensor([0.6, 0.2]), torch.eye(3)[:2]
     )
-    one = merged(both, torch.ones(2))
+    one = merge_cells(both, torch.ones(2))
     torch.testing.assert_close(one.means, means[1:] / 4)
     torch.testing.assert_close(one.sh[0], 0.75 * both.sh[0] + 0.25 * both.sh[1])
     torch.testing.assert_close(one.scales, torch.full((1, 3), 2**1.5))  # of their logarithms
@@ -73,10 +73,10 @@ def test_a_cell_has_the_means_weighted_by_opacity():
 
 
 def test_what_is_left_covers_its_cell():
-    both = round_gaussians(
+    both = isotropic_gaussians(
         torch.zeros(2, 3), torch.full((2,), 1e-3), torch.full((2,), 0.5), torch.zeros(2, 3)
     )
-    one = merged(both, torch.tensor([1.0, 1.21]))
+    one = merge_cells(both, torch.tensor([1.0, 1.21]))
     torch.testing.assert_close(one.scales, torch.full((1, 3), SPREAD * 1.1))
 
 
@@ -84,9 +84,9 @@ def test_what_is_left_covers_its_cell():
 def test_opacities_keep_a_gradient(opacity):
     few = repeated(some(1), 3)
     few.opacities[:] = opacity
-    one = merged(few, torch.ones(3)).validate()
+    one = merge_cells(few, torch.ones(3)).validate()
     exact = 1 - (1 - opacity) ** 3
-    expected = min(max(exact, LEAST_OPACITY), MOST_OPACITY)
+    expected = min(max(exact, MIN_OPACITY), MAX_OPACITY)
     torch.testing.assert_close(one.opacities, torch.tensor([expected]))
     torch.testing.assert_close(one.means, few.means[:1])
 
@@ -95,7 +95,9 @@ def test_one_that_is_hardly_there_changes_nothing():
     both = some(2)
     both.means[:] = 0
     both.opacities[1] = 1e-7
-    torch.testing.assert_close(merged(both, torch.ones(2)).sh[0], both.sh[0], rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        merge_cells(both, torch.ones(2)).sh[0], both.sh[0], rtol=0, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("angle", [0.0, 3.1415, 3.1416, 3.2, 6.28], ids=str)
@@ -105,7 +107,7 @@ def test_turns_that_differ_little_have_a_mean(angle):
     both = repeated(some(1), 3)
     both.quats[:] = torch.stack((angles.div(2).cos(), *2 * [0 * angles], angles.div(2).sin()), -1)
     both.quats[1] *= -3
-    found = merged(both, torch.ones(3)).quats[0]
+    found = merge_cells(both, torch.ones(3)).quats[0]
     torch.testing.assert_close(found.norm(), torch.tensor(1.0))
     expected = torch.tensor([angle / 2]).cos(), torch.tensor([angle / 2]).sin()
     assert (found[0] * expected[0] + found[3] * expected[1]).abs() >= 1 - 1e-5
@@ -115,10 +117,10 @@ def test_cells_are_powers_of_2_and_tile_the_space():
     """Along x, from the least: sides of 0.8 and 1.4 are of 1, those of 1.5 and 2.8 of 2."""
     x = torch.arange(8) + 0.5
     means = torch.stack((x, 0 * x, 0 * x), -1)
-    line = round_gaussians(means, 0.1 * torch.ones(8), 0.5 * torch.ones(8), torch.zeros(8, 3))
+    line = isotropic_gaussians(means, 0.1 * torch.ones(8), 0.5 * torch.ones(8), torch.zeros(8, 3))
     for side, count in ((0.4, 8), (0.8, 8), (1.4, 8), (1.5, 4), (2.8, 4), (3.0, 2), (6.0, 1)):
-        assert merged(line, torch.full((8,), side)).num_gaussians == count, side
-    mixed = merged(line, torch.tensor([2.0, 2, 1, 1, 2, 2, 1, 2]))
+        assert merge_cells(line, torch.full((8,), side)).num_gaussians == count, side
+    mixed = merge_cells(line, torch.tensor([2.0, 2, 1, 1, 2, 2, 1, 2]))
     assert sorted(mixed.means[:, 0].tolist()) == [1, 2.5, 3.5, 5, 6.5, 7.5]
 
 
@@ -127,9 +129,9 @@ def test_where_the_world_begins_changes_nothing():
     shift = torch.tensor([1024.0, -512, 64])
     moved = gaussians.map(lambda tensor: tensor)
     moved.means[:] = (moved.means * 1024).round() / 1024  # so that the sum is exact
-    expected = merged(moved, cells)
+    expected = merge_cells(moved, cells)
     moved.means.add_(shift)
-    found = merged(moved, cells)
+    found = merge_cells(moved, cells)
     assert 50 < found.num_gaussians == expected.num_gaussians < 290
     torch.testing.assert_close(found.means - shift, expected.means, rtol=0, atol=1e-3)
 
@@ -137,23 +139,23 @@ def test_where_the_world_begins_changes_nothing():
 def test_the_order_changes_nothing_but_the_bits():
     gaussians, cells = some(200), torch.rand(200) + 0.1
     order = torch.randperm(200)
-    found = merged(gaussians.map(lambda tensor: tensor[order]), cells[order])
-    torch.testing.assert_close(found.means, merged(gaussians, cells).means)
+    found = merge_cells(gaussians.map(lambda tensor: tensor[order]), cells[order])
+    torch.testing.assert_close(found.means, merge_cells(gaussians, cells).means)
 
 
 def test_ranks_do_not_collide_where_places_do_not_fit_an_integer():
     """A point at a camera has a cell of next to nothing, and its place a number beyond 2^63."""
     means = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1, 0], [1.0, 1, 1e-30]])
-    few = round_gaussians(means, torch.ones(4), torch.full((4,), 0.5), torch.zeros(4, 3))
-    assert merged(few, torch.full((4,), 1e-37)).num_gaussians == 4
-    assert merged(few, torch.tensor([1e-37, 1e-37, 1.0, 1.0])).num_gaussians == 3
+    few = isotropic_gaussians(means, torch.ones(4), torch.full((4,), 0.5), torch.zeros(4, 3))
+    assert merge_cells(few, torch.full((4,), 1e-37)).num_gaussians == 4
+    assert merge_cells(few, torch.tensor([1e-37, 1e-37, 1.0, 1.0])).num_gaussians == 3
 
 
 @pytest.mark.parametrize("most", [1, 2, 7, 50, 199, 200, 1000])
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_there_are_never_more_than_most(most, scale):
     gaussians = some(200, scale)
-    few = thinned(gaussians, camera(), 1e-3, most).validate()
+    few = merge_to_limit(gaussians, camera(), 1e-3, most).validate()
     assert few.num_gaussians <= most
     assert few.num_gaussians >= min(most, 200) // 5
     assert few.num_gaussians == 200 or most < 200
@@ -164,20 +166,23 @@ def test_there_are_never_more_than_most(most, scale):
 def test_pixels_decide_where_there_is_room():
     gaussians = some(400)
     counts = [
-        thinned(gaussians, camera(), pixels, 400).num_gaussians for pixels in (0.1, 2.0, 8.0, 64.0)
+        merge_to_limit(gaussians, camera(), pixels, 400).num_gaussians
+        for pixels in (0.1, 2.0, 8.0, 64.0)
     ]
     assert counts == sorted(counts, reverse=True) and counts[0] > 390 and counts[-1] <= 8
     cells = 8 * footprints(gaussians.means, camera())
-    expected = merged(gaussians, cells)
-    assert torch.equal(everything(thinned(gaussians, camera(), 8.0, 400)), everything(expected))
+    expected = merge_cells(gaussians, cells)
+    assert torch.equal(
+        everything(merge_to_limit(gaussians, camera(), 8.0, 400)), everything(expected)
+    )
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_few_and_those_at_one_place_become_one(count):
     alike = repeated(some(1), count)
-    assert thinned(alike, camera(), 1.0, 1).validate().num_gaussians == 1
+    assert merge_to_limit(alike, camera(), 1.0, 1).validate().num_gaussians == 1
     alike.means[:] = 0  # at the camera
-    assert thinned(alike, camera(), 1.0, 1).validate().num_gaussians == 1
+    assert merge_to_limit(alike, camera(), 1.0, 1).validate().num_gaussians == 1
 
 
 def test_the_same_bits_again(threads):
@@ -185,13 +190,13 @@ def test_the_same_bits_again(threads):
     found = []
     for count in (1, 2, 2):
         threads(count)
-        found.append(everything(thinned(gaussians, camera(), 1.0, 5000)))
+        found.append(everything(merge_to_limit(gaussians, camera(), 1.0, 5000)))
     assert torch.equal(found[0], found[1]) and torch.equal(found[1], found[2])
 
 
 def test_nan_is_named():
     gaussians = some(5)
     gaussians.means[3, 1] = torch.nan
-    with pytest.raises(InputError, match=r"thinned's gaussians.means\[3\] holds NaN"):
-        thinned(gaussians, camera(), 1.0, 5)
+    with pytest.raises(InputError, match=r"merge_to_limit's gaussians.means\[3\] holds NaN"):
+        merge_to_limit(gaussians, camera(), 1.0, 5)
     assert isinstance(gaussians, Gaussians)

@@ -12,9 +12,9 @@ import torch
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
 from asysplat.refinement import PAPER, Rates, Refinement, RefinementSettings, mean_color, refine
-from asysplat.refinement.densify import LEAST_OPACITY
-from asysplat.refinement.refine import half_size
-from asysplat.refinement.start import footprints, round_gaussians
+from asysplat.refinement.densification.spawn import MIN_OPACITY
+from asysplat.refinement.isotropic import footprints, isotropic_gaussians
+from asysplat.refinement.views import resize
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 
@@ -44,14 +44,14 @@ def small_views(count=2, height=12, width=15):
 def small_scene(count=20):
     means = torch.rand(count, 3) * torch.tensor([2.0, 2, 1]) + torch.tensor([-1.0, -1, 2])
     sizes = torch.full((count,), 0.2)
-    return round_gaussians(means, sizes, torch.full((count,), 0.5), torch.rand(count, 3))
+    return isotropic_gaussians(means, sizes, torch.full((count,), 0.5), torch.rand(count, 3))
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize("kind", KINDS)
 def test_photographs_and_those_held_out_become_better(room, start, kind):
     views, held = room
-    settings = RefinementSettings(densify=kind, most=start.num_gaussians + 1500)
+    settings = RefinementSettings(densify=kind, max_gaussians=start.num_gaussians + 1500)
     found = refine(start, views, settings, steps=80).validate()
     assert quality(found, views) >= quality(start, views) + 4
     assert quality(found, held) >= quality(start, held) + 4
@@ -156,7 +156,7 @@ def test_pictures_of_any_size_will_do(size, kind):
 @pytest.mark.parametrize("count", [1, 2])
 def test_one_view_and_one_gaussian_are_enough(kind, count):
     views = small_views(1)
-    start = round_gaussians(
+    start = isotropic_gaussians(
         torch.tensor([[0.0, 0, 3]]).repeat(count, 1),
         *torch.full((2, count), 0.5),
         torch.rand(count, 3),
@@ -188,7 +188,7 @@ def test_one_is_left_where_none_is_of_use(kind):
     """Behind all cameras, and too faint."""
     hidden, faint = small_scene(), small_scene()
     hidden.means[:, 2] *= -1
-    faint.opacities[:] = torch.linspace(1e-5, LEAST_OPACITY / 2, 20)
+    faint.opacities[:] = torch.linspace(1e-5, MIN_OPACITY / 2, 20)
     for start in (hidden, faint):
         settings = RefinementSettings(
             densify=kind, rounds=30, until=1.0, rates=Rates(opacities=0.0)
@@ -199,9 +199,9 @@ def test_one_is_left_where_none_is_of_use(kind):
 
 def test_what_is_faint_or_lost_is_dropped():
     start = small_scene()
-    start.opacities[2] = LEAST_OPACITY / 2
+    start.opacities[2] = MIN_OPACITY / 2
     start.means[5, 2] = -3  # behind both cameras
-    refinement = Refinement(start, small_views(), settings=RefinementSettings(most=1))
+    refinement = Refinement(start, small_views(), settings=RefinementSettings(max_gaussians=1))
     refinement.densify(0.0)
     kept = torch.arange(20) != 2
     assert same_bits(refinement.gaussians.keep(torch.ones(19) > 0), padded(start.keep(kept)))
@@ -221,7 +221,7 @@ def padded(gaussians):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_most_below_the_number_at_the_start_adds_none(kind):
-    settings = RefinementSettings(densify=kind, most=5, rounds=3)
+    settings = RefinementSettings(densify=kind, max_gaussians=5, rounds=3)
     assert refine(small_scene(), small_views(), settings, steps=8).num_gaussians == 20
 
 
@@ -233,7 +233,7 @@ def test_no_more_than_most_and_growth(kind):
         counts.append(progress.gaussians)
         return False
 
-    settings = RefinementSettings(densify=kind, most=40, rounds=9, growth=0.25, until=1.0)
+    settings = RefinementSettings(densify=kind, max_gaussians=40, rounds=9, growth=0.25, until=1.0)
     refine(small_scene(), small_views(), settings, steps=20, watch=watch)
     assert counts[0] == 20 and max(counts) == 40
     assert all(b <= 1.25 * a for a, b in pairwise(counts))
@@ -243,19 +243,21 @@ def test_no_more_than_most_and_growth(kind):
 def test_what_is_dropped_is_replaced(growth):
     """In a long refinement more would be lost between two rounds than one adds."""
     start = small_scene()
-    start.opacities[:] = torch.where(torch.arange(20) < 10, LEAST_OPACITY / 2, 0.95)
+    start.opacities[:] = torch.where(torch.arange(20) < 10, MIN_OPACITY / 2, 0.95)
     refinement = Refinement(
-        start, small_views(), settings=RefinementSettings(growth=growth, most=40)
+        start, small_views(), settings=RefinementSettings(growth=growth, max_gaussians=40)
     )
     refinement.densify(0.0)
     assert len(refinement.fields) == 20 * (1 + growth)
-    assert (refinement.gaussians.opacities > LEAST_OPACITY).all()
+    assert (refinement.gaussians.opacities > MIN_OPACITY).all()
 
 
 @pytest.mark.parametrize("kind", ["error", "mcmc"])
 def test_small_photographs_have_room_for_few(kind):
     """Two of 12 x 15 pixels: one Gaussian for 8 of them."""
-    settings = RefinementSettings(densify=kind, most=10**6, rounds=9, growth=0.25, until=1.0)
+    settings = RefinementSettings(
+        densify=kind, max_gaussians=10**6, rounds=9, growth=0.25, until=1.0
+    )
     refined = refine(small_scene(), small_views(), settings, steps=20)
     assert refined.num_gaussians == 2 * 12 * 15 // 8
 
@@ -264,7 +266,7 @@ def test_rounds_and_their_time():
     """Of 3 rounds in the first half of 16 steps, the steps before which Gaussians are added."""
     found = []
     for settings in (
-        RefinementSettings(rounds=3, until=0.5, most=10**6),
+        RefinementSettings(rounds=3, until=0.5, max_gaussians=10**6),
         RefinementSettings(rounds=0),
         RefinementSettings(until=0.0),
         RefinementSettings(densify="none"),
@@ -292,7 +294,9 @@ def test_rates_cool_down_at_the_end():
         return False
 
     views.images[:] = 1
-    one = round_gaussians(torch.tensor([[0.0, 0, 3]]), *torch.full((2, 1), 0.5), torch.zeros(1, 3))
+    one = isotropic_gaussians(
+        torch.tensor([[0.0, 0, 3]]), *torch.full((2, 1), 0.5), torch.zeros(1, 3)
+    )
     rates = Rates(means=0.0, quats=0.0, scales=0.0, opacities=0.0, sh=1e-4)
     settings = RefinementSettings(
         rates, densify="none", cool_down=0.5, decay=0.1, ssim=0.0, half_size=0.0
@@ -344,20 +348,18 @@ def test_seconds_end_a_refinement():
     assert steps[-1].seconds >= 0.3
 
 
-def test_half_of_a_picture_has_its_means_and_its_field_of_view():
+def test_resized_images_have_the_same_means_and_field_of_view():
     views = small_views(2, 9, 14)
     masks = torch.ones(2, 9, 14, dtype=torch.bool)
     masks[1, 3, 5] = False
-    half = half_size(replace(views, masks=masks))
-    assert (half.cameras.height, half.cameras.width) == (4, 7)
-    expected = views.cameras.resized(4, 7)
-    assert torch.equal(half.cameras.intrinsics, expected.intrinsics)
-    even = half_size(small_views(2, 8, 14))
-    assert even.masks is None
+    half = resize(replace(views, masks=masks), 4, 7)
+    assert torch.equal(half.cameras.intrinsics, views.cameras.resized(4, 7).intrinsics)
     assert half.masks.sum() == 2 * 4 * 7 - 1 and not half.masks[1, 1, 2]
     whole = small_views(1, 8, 8)
     blocks = whole.images.unflatten(2, (4, 2)).unflatten(4, (4, 2)).mean((3, 5))
-    torch.testing.assert_close(half_size(whole).images, blocks)
+    half = resize(whole, 4, 4)
+    torch.testing.assert_close(half.images, blocks)
+    assert half.masks is None
 
 
 def test_the_background_is_the_mean_color_of_what_counts(threads):
@@ -434,28 +436,40 @@ def unchecked(kind, **options):
         "growth=-0.1": {"growth": -0.1},
         "densify=adc: choose error, mcmc, gradient, none": {"densify": "adc"},
         "sh_degree=4: choose": {"sh_degree": 4},
-        "unit=meter: choose pixel or scene": {"rates": unchecked(Rates, unit="meter")},
-        "most=0, .*at least 1 Gaussian": {"most": 0},
+        "max_gaussians=0: give at least 1": {"max_gaussians": 0},
         "rounds=-1": {"rounds": -1},
-        "views_a_step=0": {"views_a_step": 0},
-        "looks=0: give at least 1, or null": {"looks": 0},
+        "views_per_step=0: give at least 1, or null": {"views_per_step": 0},
+        "max_steps_per_image=0: give at least 1, or null": {"max_steps_per_image": 0},
     }.items(),
 )
-def test_settings_that_cannot_be_are_named(sentence, options):
+def test_settings_out_of_range_are_named(sentence, options):
     with pytest.raises(InputError, match=f"refinement.*{sentence}"):
         unchecked(RefinementSettings, **options)
+
+
+@pytest.mark.parametrize(
+    "sentence, options",
+    {
+        "unit=meter: choose pixel or scene": {"unit": "meter"},
+        "means=-0.1: give a number >= 0": {"means": -0.1},
+        "sh=nan": {"sh": math.nan},
+    }.items(),
+)
+def test_rates_out_of_range_are_named(sentence, options):
+    with pytest.raises(InputError, match=f"refinement.rates.{sentence}"):
+        unchecked(Rates, **options)
 
 
 def test_it_ends_when_the_photographs_were_looked_at_often_enough():
     """Many steps end early, with the bits of as many as are worth it."""
     scene, views = small_scene(), small_views(count=2)
     found, taken = {}, {}
-    for looks, asked in ((None, 6), (3, 200), (3, 4)):
+    for limit, asked in ((None, 6), (3, 200), (3, 4)):
         shares = []
         found[asked] = refine(
             scene,
             views,
-            RefinementSettings(looks=looks),
+            RefinementSettings(max_steps_per_image=limit),
             steps=asked,
             watch=lambda progress, _, shares=shares: shares.append(progress.share) and False,
         )
@@ -470,7 +484,7 @@ def test_all_views_a_step_are_a_look_at_each():
     refine(
         small_scene(),
         small_views(),
-        RefinementSettings(looks=5, views_a_step=None, densify="none"),
+        RefinementSettings(max_steps_per_image=5, views_per_step=None, densify="none"),
         seconds=1000,
         watch=lambda progress, _: taken.append(progress.step) and False,
     )

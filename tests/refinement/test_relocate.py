@@ -6,19 +6,19 @@ from dataclasses import replace
 import pytest
 import torch
 
-from asysplat.refinement.densify import LEAST_OPACITY
-from asysplat.refinement.fields import Fields
-from asysplat.refinement.relocate import (
-    MOST_AT_ONE,
+from asysplat.refinement.densification.relocate import (
+    MAX_COPIES,
     NOISE,
     REGULARIZER,
-    regularizer,
+    inject_position_noise,
+    mcmc_regularizer,
     relocate,
-    shake,
-    shared,
+    split_opacity_and_scale,
 )
+from asysplat.refinement.densification.spawn import MIN_OPACITY
+from asysplat.refinement.fields import Fields
+from asysplat.refinement.isotropic import isotropic_gaussians
 from asysplat.refinement.settings import Rates
-from asysplat.refinement.start import round_gaussians
 from asysplat.rendering import render
 from asysplat.rendering.reference.math import rotations
 
@@ -54,7 +54,7 @@ def double_sum(opacity, count):
 def test_two_in_the_place_of_one_are_as_in_equation_9():
     opacities = torch.tensor([0.05, 0.3, 0.75, 0.99])
     scales = torch.rand(4, 3)
-    found, sizes = shared(opacities, scales, torch.full((4,), 2))
+    found, sizes = split_opacity_and_scale(opacities, scales, torch.full((4,), 2))
     half = 1 - (1 - opacities).sqrt()
     torch.testing.assert_close(found, half)
     factor = opacities / (2 * half - half**2 / math.sqrt(2))
@@ -62,11 +62,11 @@ def test_two_in_the_place_of_one_are_as_in_equation_9():
     assert (factor < 1).all()
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 10, MOST_AT_ONE])
+@pytest.mark.parametrize("count", [1, 2, 3, 10, MAX_COPIES])
 def test_any_number_are_as_in_equation_9(count):
     opacities, scales = torch.linspace(0.3, 0.99, 7), torch.rand(7, 3)
-    found, sizes = shared(opacities, scales, torch.full((7,), count))
-    exact = (1 - (1 - opacities.double()) ** (1 / count)).float().clamp_min(LEAST_OPACITY)
+    found, sizes = split_opacity_and_scale(opacities, scales, torch.full((7,), count))
+    exact = (1 - (1 - opacities.double()) ** (1 / count)).float().clamp_min(MIN_OPACITY)
     torch.testing.assert_close(found, exact)
     factors = torch.tensor([double_sum(opacity, count) for opacity in opacities.tolist()])
     torch.testing.assert_close(sizes, scales * factors[:, None], rtol=1e-4, atol=0)
@@ -76,7 +76,9 @@ def test_any_number_are_as_in_equation_9(count):
 
 def test_more_than_the_most_count_as_that_many():
     one = torch.tensor([0.9, 1.0]), torch.ones(2, 3)
-    most, more = (shared(*one, torch.full((2,), count)) for count in (MOST_AT_ONE, 1000))
+    most, more = (
+        split_opacity_and_scale(*one, torch.full((2,), count)) for count in (MAX_COPIES, 1000)
+    )
     assert torch.equal(more[0], most[0]) and torch.equal(more[1], most[1])
     assert more[0].isfinite().all() and (more[1] > 0).all() and more[1].isfinite().all()
 
@@ -84,13 +86,13 @@ def test_more_than_the_most_count_as_that_many():
 @pytest.mark.parametrize("dead", [1, 40])
 def test_the_picture_stays_when_dead_ones_move(scene, dead):
     gaussians, cameras = scene
-    gaussians.opacities[:dead] = LEAST_OPACITY / 2
+    gaussians.opacities[:dead] = MIN_OPACITY / 2
     fields = fields_of(gaussians)
     before = picture(gaussians, cameras)
     relocate(fields, 80, 0.0, generator())
     found = fields.gaussians().validate()
     assert found.num_gaussians == 80
-    assert (found.opacities > LEAST_OPACITY).all()
+    assert (found.opacities > MIN_OPACITY).all()
     assert not torch.equal(found.opacities, gaussians.opacities)
     assert (picture(found, cameras) - before).abs().mean() <= 1e-2
     uncorrected = gaussians.map(lambda field: torch.cat((field[40:], field[40:])))
@@ -115,7 +117,7 @@ def test_no_more_than_most_and_none_is_lost(scene):
 
 def test_those_that_are_alone_stay_and_copies_begin_anew(scene):
     gaussians = scene[0]
-    gaussians.opacities[:30] = LEAST_OPACITY / 2
+    gaussians.opacities[:30] = MIN_OPACITY / 2
     fields = fields_of(gaussians)
     old_units = fields.units
     relocate(fields, 80, 0.0, generator())
@@ -128,21 +130,23 @@ def test_those_that_are_alone_stay_and_copies_begin_anew(scene):
         assert torch.equal(getattr(found, name), getattr(gaussians, name)[source])
     assert torch.equal(fields.units, old_units[source])
     counts = same.sum(0)[source - 30]
-    expected = shared(gaussians.opacities[source], gaussians.scales[source], counts)
+    expected = split_opacity_and_scale(
+        gaussians.opacities[source], gaussians.scales[source], counts
+    )
     torch.testing.assert_close((found.opacities, found.scales), expected)
     assert counts.max() > 2 and counts.min() == 1
 
 
 def test_what_was_copied_takes_its_first_step_again(scene):
     fields = fields_of(scene[0])
-    up = {name: torch.ones_like(tensor) for name, tensor in fields.numbers.items()}
+    up = {name: torch.ones_like(tensor) for name, tensor in fields.parameters.items()}
     for _ in range(5):
         fields.step(up, Rates(), 1.0)
     relocate(fields, 100, 0.25, generator())
-    before = fields.numbers["logits"].clone()
-    down = {name: -torch.ones_like(tensor) for name, tensor in fields.numbers.items()}
+    before = fields.parameters["logits"].clone()
+    down = {name: -torch.ones_like(tensor) for name, tensor in fields.parameters.items()}
     fields.step(down, Rates(opacities=0.1), 1.0)
-    moved = fields.numbers["logits"] - before
+    moved = fields.parameters["logits"] - before
     means = fields.gaussians().means
     several = (means[:, None] == means[None]).all(-1).sum(1) > 1
     torch.testing.assert_close(moved[several], torch.full_like(moved[several], 0.1))
@@ -154,7 +158,7 @@ def test_live_ones_are_drawn_by_opacity():
         (torch.full((2000,), 1e-3), torch.full((50,), 0.2), torch.full((50,), 0.6))
     )
     means = torch.arange(2100.0)[:, None].repeat(1, 3)
-    start = round_gaussians(means, torch.ones(2100), opacities, torch.rand(2100, 3))
+    start = isotropic_gaussians(means, torch.ones(2100), opacities, torch.rand(2100, 3))
     fields = fields_of(start)
     relocate(fields, 2100, 0.0, generator())
     place = fields.gaussians().means[:, 0]
@@ -164,7 +168,7 @@ def test_live_ones_are_drawn_by_opacity():
 
 
 def test_where_none_is_alive_they_stay():
-    start = round_gaussians(
+    start = isotropic_gaussians(
         torch.rand(6, 3), torch.ones(6), torch.full((6,), 1e-6), torch.rand(6, 3)
     )
     fields = fields_of(start)
@@ -179,7 +183,7 @@ def test_the_same_generator_relocates_the_same(scene):
     for seed in (0, 0, 1):
         fields = fields_of(scene[0])
         relocate(fields, 100, 0.25, generator(seed))
-        shake(fields, 1.0, generator(seed))
+        inject_position_noise(fields, 1.0, generator(seed))
         found.append(fields.gaussians())
     assert torch.equal(found[0].means, found[1].means)
     assert torch.equal(found[0].scales, found[1].scales)
@@ -190,14 +194,14 @@ def test_faint_ones_are_shaken_along_their_covariance():
     """Noise of the deviation NOISE * sigmoid(100 (0.005 - o)) * factor, times the covariance."""
     count = 4000
     quats, scales = torch.tensor([[0.8, 0.1, -0.5, 0.3]]), torch.tensor([[0.1, 0.02, 0.3]])
-    start = round_gaussians(
+    start = isotropic_gaussians(
         torch.zeros(count, 3), torch.ones(count), torch.full((count,), 0.01), torch.rand(count, 3)
     )
     start = replace(start, quats=quats.repeat(count, 1), scales=scales.repeat(count, 1))
     fields = fields_of(start)
-    shake(fields, 0.5, generator())
+    inject_position_noise(fields, 0.5, generator())
     moved = fields.gaussians().means.double()
-    gate = 1 / (1 + math.exp(-100 * (LEAST_OPACITY - 0.01)))
+    gate = 1 / (1 + math.exp(-100 * (MIN_OPACITY - 0.01)))
     along = moved @ rotations(quats)[0].double()
     expected = 0.5 * NOISE * gate * scales[0].double() ** 2
     torch.testing.assert_close(along.std(0), expected, rtol=0.05, atol=0)
@@ -211,19 +215,19 @@ def test_opaque_ones_keep_still_and_nothing_else_moves(scene):
     gaussians.opacities[:10] = 0.006
     fields = fields_of(gaussians)
     before = fields.gaussians()
-    shake(fields, 1.0, generator())
+    inject_position_noise(fields, 1.0, generator())
     after = fields.gaussians()
     moved = (after.means != before.means).any(-1)
     assert torch.equal(moved, torch.arange(80) < 10)
     for name in ("quats", "scales", "opacities", "sh"):
         assert torch.equal(getattr(after, name), getattr(before, name))
-    shake(fields, 0.0, generator())
+    inject_position_noise(fields, 0.0, generator())
     assert torch.equal(fields.gaussians().means, after.means)
 
 
 def test_the_regularizer_is_of_the_mean_opacity_and_scale(scene):
     gaussians = scene[0].map(lambda field: field.requires_grad_())
-    value = regularizer(gaussians)
+    value = mcmc_regularizer(gaussians)
     value.backward()
     expected = REGULARIZER * (gaussians.opacities.mean() + gaussians.scales.mean())
     torch.testing.assert_close(value, expected)

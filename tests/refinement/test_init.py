@@ -7,17 +7,16 @@ import torch
 
 from asysplat.data import ProceduralScene
 from asysplat.errors import InputError
-from asysplat.models.head import SH_C0
 from asysplat.models.prior import Prior
-from asysplat.refinement.start import (
-    FAINT,
-    SPREAD,
-    colors_at,
-    footprints,
-    gaussians_of_points,
-    gaussians_of_prior,
-    seen_at,
+from asysplat.refinement.init import (
+    POINT_OPACITY,
+    gaussians_from_points,
+    gaussians_from_prior,
+    sample_colors,
 )
+from asysplat.refinement.isotropic import footprints, project
+from asysplat.refinement.merge import SPREAD
+from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Cameras, Views
 
 
@@ -46,11 +45,11 @@ def true_prior(views, opacity=0.5):
 
 
 def test_a_prior_puts_a_gaussian_where_each_pixel_sees_its_surface(room):
-    gaussians = gaussians_of_prior(room, true_prior(room)).validate()
+    gaussians = gaussians_from_prior(room, true_prior(room)).validate()
     assert gaussians.num_gaussians == room.depths.numel()
     for view in range(room.num_views):
         part = slice(view * 24 * 32, (view + 1) * 24 * 32)
-        pixels, depth = seen_at(gaussians.means[part], room.cameras.select([view]))
+        pixels, depth = project(gaussians.means[part], room.cameras.select([view]))
         torch.testing.assert_close(depth[0], room.depths[view].flatten(), rtol=1e-4, atol=0)
         y, x = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(32) + 0.5, indexing="ij")
         at = torch.stack((x, y), -1).flatten(0, 1)
@@ -65,7 +64,7 @@ def test_a_gaussian_of_a_prior_covers_its_pixel():
     """8 x 10 pixels with a focal length of 5: at a distance of 2, one is 2 / 5 wide."""
     views = front_views()
     distance = torch.full((1, 1, 8, 10), 2.0)
-    gaussians = gaussians_of_prior(views, Prior(distance, distance, distance / 4))
+    gaussians = gaussians_from_prior(views, Prior(distance, distance, distance / 4))
     torch.testing.assert_close(gaussians.scales, torch.full((80, 3), SPREAD * 2 / 5))
     torch.testing.assert_close(gaussians.means.norm(dim=-1), torch.full((80,), 2.0))
 
@@ -75,7 +74,7 @@ def test_a_prior_has_a_grid_of_its_own(size):
     """Of fewer pixels than the photographs, of more, and of such as do not divide them."""
     views = front_views(height=8, width=10)
     distance = torch.full((1, 1, *size), 2.0)
-    gaussians = gaussians_of_prior(views, Prior(distance, distance, distance / 4)).validate()
+    gaussians = gaussians_from_prior(views, Prior(distance, distance, distance / 4)).validate()
     assert gaussians.num_gaussians == size[0] * size[1]
     if size == (4, 5):
         blocks = views.images[0].unflatten(1, (4, 2)).unflatten(3, (5, 2)).mean((2, 4))
@@ -92,20 +91,20 @@ def test_masked_pixels_get_no_gaussian():
     masks[0, 4:, 2:] = False  # eight blocks, wholly
     distance = torch.full((1, 1, 4, 5), 2.0)
     prior = Prior(distance, distance, distance / 4)
-    every = gaussians_of_prior(views, prior)
-    some = gaussians_of_prior(replace(views, masks=masks), prior)
+    every = gaussians_from_prior(views, prior)
+    some = gaussians_from_prior(replace(views, masks=masks), prior)
     expected = every.keep(
         torch.tensor([i not in (0, 11, 12, 13, 14, 16, 17, 18, 19) for i in range(20)])
     )
     assert torch.equal(some.means, expected.means) and torch.equal(some.sh, expected.sh)
-    none = gaussians_of_prior(replace(views, masks=torch.zeros_like(masks)), prior)
+    none = gaussians_from_prior(replace(views, masks=torch.zeros_like(masks)), prior)
     assert torch.equal(none.means, every.means)
 
 
 def test_points_fall_where_the_renderer_draws_them():
     views = front_views(places=[(0.0, 0, 0), (1.0, 0, 0)])
     points = torch.tensor([[0.0, 0, 2], [1.0, -1, 4], [0.0, 0, -2], [-3.0, 0, 2], [0.0, 0, 0]])
-    pixels, depth = seen_at(points, views.cameras)
+    pixels, depth = project(points, views.cameras)
     # x = 5 X / Z + 5, y = 5 Y / Z + 4
     torch.testing.assert_close(pixels[0, :2], torch.tensor([[5.0, 4], [6.25, 2.75]]))
     torch.testing.assert_close(pixels[1, :2], torch.tensor([[2.5, 4], [5.0, 2.75]]))
@@ -140,8 +139,8 @@ def test_the_unit_of_the_world_changes_nothing_else(scale):
     torch.manual_seed(3)
     views, plain = front_views(places, scale=scale), front_views(places)
     points = torch.rand(50, 3) * torch.tensor([2.0, 2, 3]) + torch.tensor([-1.0, -1, 1])
-    expected = gaussians_of_points(points, plain)
-    found = gaussians_of_points(points * scale, replace(views, images=plain.images))
+    expected = gaussians_from_points(points, plain)
+    found = gaussians_from_points(points * scale, replace(views, images=plain.images))
     torch.testing.assert_close(found.means / scale, expected.means)
     torch.testing.assert_close(found.scales / scale, expected.scales)
     torch.testing.assert_close(found.sh, expected.sh)
@@ -151,15 +150,15 @@ def test_the_unit_of_the_world_changes_nothing_else(scale):
 
 def test_points_are_as_large_as_their_neighbors_are_far():
     points = torch.tensor([[0.0, 0, 5], [3.0, 0, 5], [0.0, 4, 5], [0.0, 0, 6], [100.0, 0, 5]])
-    gaussians = gaussians_of_points(points, front_views(focal=50.0)).validate()
+    gaussians = gaussians_from_points(points, front_views(focal=50.0)).validate()
     torch.testing.assert_close(gaussians.scales[0], torch.full((3,), (3 + 4 + 1) / 3))
-    assert (gaussians.opacities == FAINT).all()
+    assert (gaussians.opacities == POINT_OPACITY).all()
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_few_points_are_enough(count):
     points = torch.tensor([[0.0, 0, 2], [0.0, 0, 2.5], [0.5, 0, 2]])[:count]
-    gaussians = gaussians_of_points(points, front_views()).validate()
+    gaussians = gaussians_from_points(points, front_views()).validate()
     size = {1: 2 / 5, 2: 0.5, 3: 0.5}[count]  # a pixel, and the mean distance of the others
     torch.testing.assert_close(gaussians.scales[0], torch.full((3,), size))
 
@@ -167,7 +166,7 @@ def test_few_points_are_enough(count):
 def test_points_at_one_place_are_as_large_as_a_pixel():
     for place in ([0.0, 0.0, 2.0], [0.0, 0.0, 0.0]):  # before a camera, and at it
         points = torch.tensor(place).repeat(6, 1)
-        gaussians = gaussians_of_points(points, front_views()).validate()
+        gaussians = gaussians_from_points(points, front_views()).validate()
         expected = footprints(points, front_views().cameras)
         assert torch.equal(gaussians.scales, expected[:, None].repeat(1, 3))
 
@@ -178,7 +177,7 @@ def test_what_cannot_be_a_point_is_named():
         (torch.tensor([[0.0, 0, 1], [torch.nan, torch.inf, 1]]), "2 points with 2 coordinates"),
     ):
         with pytest.raises(InputError, match=f"{found}.*give at least one point, and finite"):
-            gaussians_of_points(points, front_views())
+            gaussians_from_points(points, front_views())
 
 
 def test_colors_are_the_mean_of_the_pixels_that_count():
@@ -188,10 +187,10 @@ def test_colors_are_the_mean_of_the_pixels_that_count():
     one, two = views.images[0, :, 4, 6], views.images[1, :, 4, 3]
     corner, gray = views.images[0, :, 0, 0], torch.full((3,), 0.5)
     expected = torch.stack(((one + two) / 2, corner, gray))
-    torch.testing.assert_close(colors_at(points, views), expected)
+    torch.testing.assert_close(sample_colors(points, views), expected)
     masks = torch.ones(2, 8, 10, dtype=torch.bool)
     masks[1, 4, 3] = masks[0, 0, 0] = False
-    found = colors_at(points, replace(views, masks=masks))
+    found = sample_colors(points, replace(views, masks=masks))
     torch.testing.assert_close(found, torch.stack((one, gray, gray)))
 
 
@@ -199,6 +198,6 @@ def test_cameras_all_in_one_place_are_cameras(room):
     poses = room.cameras.cam_to_world.clone()
     poses[:, :3, 3] = poses[0, :3, 3]
     views = replace(room, cameras=replace(room.cameras, cam_to_world=poses))
-    gaussians = gaussians_of_prior(views, true_prior(views)).validate()
+    gaussians = gaussians_from_prior(views, true_prior(views)).validate()
     assert footprints(gaussians.means, views.cameras).isfinite().all()
-    gaussians_of_points(gaussians.means[::50], views).validate()
+    gaussians_from_points(gaussians.means[::50], views).validate()

@@ -1,9 +1,9 @@
-"""What a person sees of a refinement, and how it is stopped."""
+"""Progress of a refinement in the terminal and the browser, and how it is stopped."""
 
 import os
 import signal
 import time
-from types import FrameType, TracebackType
+from types import FrameType
 
 from rich import progress
 from rich.console import Console
@@ -12,35 +12,34 @@ from asysplat.export.viewer import Viewer
 from asysplat.refinement.refine import Refinement, RefinementProgress
 from asysplat.scene import Gaussians, Views
 
-SHOWN_EVERY = 1.0  # seconds between two states that the viewer is given
-TOLD_EVERY = 10.0  # seconds between two lines where there is no terminal
+VIEWER_SECONDS = 1.0  # between two updates of the viewer
+PRINT_SECONDS = 10.0  # between two lines where there is no terminal
 STDERR = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class RefinementDisplay:
-    """A progress bar, and a viewer if wanted; Ctrl-C ends the refinement after its step.
+    """A progress bar and, if asked for, a viewer; Ctrl-C ends the refinement after its step.
 
-    Use it as a context: the signals are its own until its end, and from the first one on those of
-    before.
+    Use it as a context manager: it handles SIGINT and SIGTERM, and restores the previous handlers
+    at its end or with the first signal.
 
     Args:
-        views: the photographs.
-        view: whether to open a viewer in the browser.
+        views: the input views.
+        view: whether to open a viewer for the browser.
     """
 
     def __init__(self, views: Views, view: bool):
         self.last: RefinementProgress | None = None
         self.stopped = False
         self._console = Console()
-        self._told = self._shown = time.monotonic()
-        self._viewer = None
-        if view:
-            self._viewer = Viewer(views)
+        self._printed = self._shown = time.monotonic()
+        self._viewer = Viewer(views) if view else None
+        if self._viewer is not None:
             print(f"viewer: {self._viewer.url}")
 
     def __enter__(self) -> "RefinementDisplay":
-        self._before = {number: signal.signal(number, self._stop) for number in SIGNALS}
+        self._handlers = {number: signal.signal(number, self._stop) for number in SIGNALS}
         self._bar = progress.Progress(
             progress.TextColumn("refining"),
             progress.BarColumn(),
@@ -53,35 +52,30 @@ class RefinementDisplay:
         self._bar.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
-        self._restore()
+        self._restore_handlers()
         if self._viewer is not None:
             self._viewer.close()
 
     def __call__(self, now: RefinementProgress, refinement: Refinement) -> bool:
-        """Show how far it is; return whether to stop."""
+        """Show the progress; return whether to stop."""
         self.last = now
         text = f"step {now.step}, PSNR {now.psnr:.2f} dB, {now.gaussians:,} Gaussians"
         self._bar.update(self._task, completed=now.share, text=text)
         clock = time.monotonic()
-        if not self._console.is_terminal and clock - self._told > TOLD_EVERY:
-            self._told = clock
+        if not self._console.is_terminal and clock - self._printed > PRINT_SECONDS:
+            self._printed = clock
             print(f"{now.seconds:.0f} s: {text}", flush=True)
-        if self._viewer is not None and clock - self._shown > SHOWN_EVERY:
+        if self._viewer is not None and clock - self._shown > VIEWER_SECONDS:
             self._shown = clock
             self._viewer.show(refinement.gaussians, text)
         return self.stopped
 
     def show(self, gaussians: Gaussians) -> None:
-        """Show what came out in the viewer, if there is one, until Ctrl-C."""
+        """Show the result in the viewer, if there is one, until Ctrl-C."""
         self._bar.stop()
-        self._restore()
+        self._restore_handlers()
         if self._viewer is not None:
             self._viewer.show(gaussians, "done")
             print(f"viewer: {self._viewer.url}, until Ctrl-C")
@@ -89,10 +83,10 @@ class RefinementDisplay:
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self.stopped = True
-        self._restore()  # before it is said: the next one may follow at once
-        # print may be under way, and cannot be entered twice.
-        os.write(STDERR, b"stopping after this step; once more, and nothing is kept\n")
+        self._restore_handlers()  # first: the next signal may follow the message at once
+        # print is not reentrant, and may be running.
+        os.write(STDERR, b"stopping after this step; repeat to stop at once and save nothing\n")
 
-    def _restore(self) -> None:
-        for number, handler in self._before.items():
+    def _restore_handlers(self) -> None:
+        for number, handler in self._handlers.items():
             signal.signal(number, handler)

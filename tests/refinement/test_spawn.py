@@ -6,10 +6,15 @@ import pytest
 import torch
 
 from asysplat.data import ProceduralScene
-from asysplat.models.head import SH_C0
-from asysplat.refinement.densify import OPACITY, SIZE, gaussians_where_wrong, look
-from asysplat.refinement.start import round_gaussians, seen_at
+from asysplat.refinement.densification.spawn import (
+    SPAWN_OPACITY,
+    SPAWN_SIZE,
+    render_views,
+    spawn_at_errors,
+)
+from asysplat.refinement.isotropic import isotropic_gaussians, project
 from asysplat.rendering import render
+from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Views
 
 
@@ -32,10 +37,10 @@ def wrong_in(views, view, rows, columns):
 def test_they_are_at_wrong_pixels_on_the_surface_in_its_color(room):
     rows, columns = slice(10, 14), slice(20, 28)
     rendered = wrong_in(room, 2, rows, columns)
-    found = gaussians_where_wrong(room, rendered, room.depths, 40, generator()).validate()
+    found = spawn_at_errors(room, rendered, room.depths, 40, generator()).validate()
     assert found.num_gaussians == 40
     camera = room.cameras.select([2])
-    pixels, depth = (each[0] for each in seen_at(found.means, camera))
+    pixels, depth = (each[0] for each in project(found.means, camera))
     column, row = pixels.long().unbind(-1)
     assert (pixels - pixels.floor() - 0.5).abs().max() <= 1e-3  # at their centers
     # An error is averaged over 3 x 3 pixels.
@@ -45,9 +50,9 @@ def test_they_are_at_wrong_pixels_on_the_surface_in_its_color(room):
     torch.testing.assert_close(
         found.sh[:, 0] * SH_C0 + 0.5, room.images[2, :, row, column].mT, rtol=0, atol=1e-6
     )
-    sizes = SIZE * depth / camera.intrinsics[0, 0, 0]
+    sizes = SPAWN_SIZE * depth / camera.intrinsics[0, 0, 0]
     torch.testing.assert_close(found.scales, sizes[:, None].repeat(1, 3))
-    assert (found.opacities == OPACITY).all()
+    assert (found.opacities == SPAWN_OPACITY).all()
     assert len(torch.unique(row * 32 + column)) == 40  # each pixel once
 
 
@@ -57,7 +62,7 @@ def test_they_are_drawn_as_often_as_pixels_are_wrong(room):
     rendered[0, :, :, 16:] += 0.1
     rendered[1:, :, :, 16:] += 0.1
     chosen = [
-        gaussians_where_wrong(room, rendered, torch.ones_like(room.depths), 20, generator(seed))
+        spawn_at_errors(room, rendered, torch.ones_like(room.depths), 20, generator(seed))
         for seed in range(40)
     ]
     every = torch.cat([each.means for each in chosen])
@@ -70,12 +75,12 @@ def test_they_are_drawn_as_often_as_pixels_are_wrong(room):
 
 def test_no_more_than_wrong_pixels_and_none_where_nothing_is_seen(room):
     rendered = wrong_in(room, 1, slice(4, 6), slice(4, 6))
-    assert gaussians_where_wrong(room, rendered, room.depths, 500, generator()).num_gaussians == 16
+    assert spawn_at_errors(room, rendered, room.depths, 500, generator()).num_gaussians == 16
     depth = room.depths.clone()
     depth[1, :5] = 0
-    assert gaussians_where_wrong(room, rendered, depth, 500, generator()).num_gaussians == 8
+    assert spawn_at_errors(room, rendered, depth, 500, generator()).num_gaussians == 8
     for right, none in ((room.images, room.depths), (rendered, torch.zeros_like(depth))):
-        found = gaussians_where_wrong(room, right, none, 500, generator())
+        found = spawn_at_errors(room, right, none, 500, generator())
         assert found.num_gaussians == 0 and found.sh.shape == (0, 1, 3)
 
 
@@ -84,10 +89,10 @@ def test_masked_pixels_get_none(room):
     masks[:, :, 8:] = False
     views = replace(room, masks=masks)
     rendered = torch.zeros_like(room.images)
-    found = gaussians_where_wrong(views, rendered, room.depths, 10_000, generator())
+    found = spawn_at_errors(views, rendered, room.depths, 10_000, generator())
     assert found.num_gaussians == 4 * 24 * 8
     nothing = replace(room, masks=torch.zeros_like(masks))
-    assert not gaussians_where_wrong(nothing, rendered, room.depths, 9, generator()).num_gaussians
+    assert not spawn_at_errors(nothing, rendered, room.depths, 9, generator()).num_gaussians
 
 
 def test_the_same_generator_draws_the_same(room, threads):
@@ -96,7 +101,7 @@ def test_the_same_generator_draws_the_same(room, threads):
     for count, seed in ((1, 0), (2, 0), (1, 1)):
         threads(count)
         black, depth = torch.zeros_like(views.images), torch.ones(4, 150, 200)
-        found.append(gaussians_where_wrong(views, black, depth, 50, generator(seed)).means)
+        found.append(spawn_at_errors(views, black, depth, 50, generator(seed)).means)
     assert torch.equal(found[0], found[1])
     assert not torch.equal(found[0], found[2])
 
@@ -105,9 +110,7 @@ def test_the_same_generator_draws_the_same(room, threads):
 def test_tiny_pictures_will_do(room, size):
     cameras = room.cameras.resized(*size)
     views = Views(cameras, torch.rand(4, 3, *size))
-    found = gaussians_where_wrong(
-        views, torch.zeros(4, 3, *size), torch.ones(4, *size), 3, generator()
-    )
+    found = spawn_at_errors(views, torch.zeros(4, 3, *size), torch.ones(4, *size), 3, generator())
     assert found.validate().num_gaussians == 3
 
 
@@ -118,9 +121,9 @@ def test_one_looks_at_each_view_and_where_half_of_a_ray_is_hidden(room):
     pose = room.cameras.cam_to_world[1]
     means = plane.flatten(0, 1) @ pose[:3, :3].mT + pose[:3, 3]
     many = torch.ones(441)
-    wall = round_gaussians(means, 0.1 * many, 0.9 * many, torch.rand(441, 3))
+    wall = isotropic_gaussians(means, 0.1 * many, 0.9 * many, torch.rand(441, 3))
     background = torch.tensor([0.2, 0.4, 0.6])
-    images, depths = look(wall, room, background)
+    images, depths = render_views(wall, room, background)
     assert images.shape == room.images.shape and depths.shape == room.depths.shape
     assert not images.requires_grad
     for view in range(4):

@@ -1,0 +1,1 @@
+"""Reconstruction of a scene from photographs: its progress and its result folder."""

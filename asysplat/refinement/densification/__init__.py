@@ -1,0 +1,1 @@
+"""Where a refinement adds, moves and removes Gaussians."""

@@ -1,0 +1,93 @@
+"""Densification of 3DGS: clone and split Gaussians with large screen-space gradients.
+
+"3D Gaussian Splatting for Real-Time Radiance Field Rendering", Kerbl et al. 2023, Sec. 5.2, with
+the constants of its code. Left out: the opacity reset every 3,000 steps, as few refinements take
+that many.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.refinement.densification.spawn import MIN_OPACITY
+from asysplat.refinement.fields import Fields
+from asysplat.rendering.reference.math import rotations
+from asysplat.scene import Cameras
+
+DENSIFY_GRAD_THRESHOLD = 2e-4  # mean screen-space gradient, in half images
+SPLIT_SCALE = 0.011  # scale above which a Gaussian is split: 1 % of the scene extent of 1.1
+SPLIT_FACTOR = 1.6  # by which the two halves are smaller
+
+
+class ScreenGradients:
+    """Mean norms of the screen-space gradients of Gaussians, over the views that show them.
+
+    Args:
+        fields: of the Gaussians.
+    """
+
+    def __init__(self, fields: Fields):
+        self.fields = fields
+        self._reset()
+
+    def _reset(self) -> None:
+        self._sums = torch.zeros(len(self.fields))
+        self._counts = torch.zeros(len(self.fields))
+
+    @property
+    def mean(self) -> Float[Tensor, "N"]:
+        """Mean gradient norm of a center's image position, in an image with sides [-1, 1]."""
+        return self._sums / self._counts.clamp_min(1)
+
+    @torch.no_grad()
+    def add(self, gradients: Float[Tensor, "N 3"], cameras: Cameras) -> None:
+        """Accumulate the gradients of the offsets from one view.
+
+        Only the projection of the center is considered, not the change of the splat's shape.
+
+        Args:
+            gradients: 0 where a Gaussian is not visible.
+            cameras: of the view, [1].
+        """
+        visible = gradients.any(dim=1)
+        pose, intrinsics = cameras.cam_to_world[0], cameras.intrinsics[0]
+        means = self.fields.gaussians().means[visible]
+        across = (gradients[visible] / self.fields.units[visible, None]) @ pose[:3, :2]
+        depth = (means - pose[:3, 3]) @ pose[:3, 2]
+        half = gradients.new_tensor([cameras.width / 2, cameras.height / 2])
+        screen = across * depth[:, None] / intrinsics.diagonal()[:2] * half
+        self._sums[visible] += screen.norm(dim=1)
+        self._counts[visible] += 1
+
+    @torch.no_grad()
+    def clone_and_split(self, max_gaussians: int, generator: torch.Generator) -> None:
+        """Clone small and split large Gaussians with large gradients; prune transparent ones.
+
+        A clone has the position of its original. Afterwards the gradients are reset.
+
+        Args:
+            max_gaussians: limit up to which some are added, largest gradients first.
+            generator: of random numbers.
+        """
+        fields, gaussians = self.fields, self.fields.gaussians()
+        opaque = gaussians.opacities > MIN_OPACITY
+        opaque[gaussians.opacities.argmax()] = True  # never prune all
+        gradients = torch.where(opaque, self.mean, 0)
+        room = max(0, max_gaussians - int(opaque.sum()))
+        largest = gradients.topk(min(room, len(gradients))).indices
+        selected = torch.zeros_like(opaque)
+        selected[largest] = gradients[largest] > DENSIFY_GRAD_THRESHOLD
+        large = gaussians.scales.amax(1) > SPLIT_SCALE
+        cloned, split = (torch.nonzero(selected & rows)[:, 0] for rows in (~large, large))
+        twice = split.repeat(2)
+        halves = gaussians.map(lambda field: field[twice])
+        noise = halves.scales * torch.randn(len(twice), 3, generator=generator)
+        shift = (rotations(halves.quats) @ noise[..., None])[..., 0]
+        halves = replace(halves, means=halves.means + shift, scales=halves.scales / SPLIT_FACTOR)
+        units = fields.units
+        fields.keep(torch.nonzero(opaque & ~(selected & large))[:, 0])
+        fields.append(gaussians.map(lambda field: field[cloned]), units[cloned])
+        fields.append(halves, units[twice])
+        self._reset()

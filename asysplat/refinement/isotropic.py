@@ -1,0 +1,57 @@
+"""Isotropic Gaussians of a given size and color, and the footprint of a pixel at a point."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.rendering.sh import SH_C0
+from asysplat.scene import Cameras, Gaussians
+
+
+def isotropic_gaussians(
+    means: Float[Tensor, "N 3"],
+    scales: Float[Tensor, "N"],
+    opacities: Float[Tensor, "N"],
+    colors: Float[Tensor, "N 3"],
+) -> Gaussians:
+    """Build Gaussians with one scale for all axes and SH of degree 0."""
+    quats = torch.zeros(len(means), 4).to(means)
+    quats[:, 0] = 1
+    return Gaussians(
+        means=means,
+        quats=quats,
+        scales=scales[:, None].repeat(1, 3),
+        opacities=opacities,
+        sh=((colors - 0.5) / SH_C0)[:, None],
+    )
+
+
+def project(
+    points: Float[Tensor, "N 3"], cameras: Cameras
+) -> tuple[Float[Tensor, "V N 2"], Float[Tensor, "V N"]]:
+    """Project points into each image: positions in pixels and depths, 0 outside the image."""
+    rotation = cameras.cam_to_world[:, :3, :3]
+    local = (points - cameras.centers[:, None]) @ rotation
+    depth = local[..., 2]
+    pixels = (local @ cameras.intrinsics.mT)[..., :2] / depth.clamp_min(1e-12)[..., None]
+    size = pixels.new_tensor([cameras.width, cameras.height])
+    inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
+    return pixels, depth.where(inside, 0)
+
+
+def footprints(points: Float[Tensor, "N 3"], cameras: Cameras) -> Float[Tensor, "N"]:
+    """Compute the size of a pixel at each point: the smallest over the views that show the point.
+
+    For a point outside all views, the smallest as if every camera were turned to it.
+    """
+    focal = cameras.intrinsics[:, 0, 0]
+    visible = torch.full_like(points[:, 0], torch.inf)
+    outside = visible.clone()
+    for view in range(cameras.num_views):
+        camera = cameras.select([view])
+        _, depth = project(points, camera)
+        size = depth[0] / focal[view]
+        visible = torch.minimum(visible, size.where(depth[0] > 0, torch.inf))
+        outside = torch.minimum(outside, (points - camera.centers).norm(dim=-1) / focal[view])
+    sizes = torch.where(visible.isfinite(), visible, outside)
+    return sizes.clamp_min(torch.finfo(points.dtype).tiny)
