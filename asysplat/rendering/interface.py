@@ -85,7 +85,7 @@ class Culling:
     rows: bool = True
     opaque: bool = True
 
-    def without(self, name: str) -> "Culling":
+    def disable(self, name: str) -> "Culling":
         """Return these skips with `name` switched off."""
         return Culling(**{f.name: getattr(self, f.name) and f.name != name for f in fields(self)})
 

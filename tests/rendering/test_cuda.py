@@ -104,9 +104,9 @@ GAINS = {
     "opacity": "culled_by_opacity",
     "frustum": "culled_by_frustum",
     "extent": "pairs",
-    "ellipse": "pairs_off_ellipse",
-    "masks": "pairs_masked",
-    "opaque": "pairs_behind_opaque",
+    "ellipse": "pairs_culled_by_ellipse",
+    "masks": "pairs_culled_by_masks",
+    "opaque": "pairs_culled_by_opaque",
 }
 
 
@@ -123,7 +123,7 @@ def test_skips_leave_the_bits(make_scene):
     masks[..., :9, :9] = False
     images, grads, stats = run(draw_by_cuda, gaussians, cameras, RenderSettings(), masks)
     for name, gain in GAINS.items():
-        settings = RenderSettings(culling=Culling().without(name))
+        settings = RenderSettings(culling=Culling().disable(name))
         other = run(draw_by_cuda, gaussians, cameras, settings, masks)
         assert all(map(torch.equal, [*images, *grads], [*other[0], *other[1]])), name
         assert other[2][gain] != stats[gain], name

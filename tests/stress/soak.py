@@ -16,8 +16,8 @@ from rich.progress import track
 from torch import Tensor
 
 from asysplat import Cameras, Gaussians, Views, render
+from asysplat.data import SceneOptions, open_scene
 from asysplat.data.normalize import normalize
-from asysplat.data.readers import open_scene
 from asysplat.evaluation.metrics import psnr
 from asysplat.export import read_splat
 
@@ -32,7 +32,7 @@ def photographs(scene: Path) -> Views:
     """Views of a scene in the frame of networks; of a .splat file, renderings on a circle."""
     if scene.suffix == ".splat":
         return circle_around(read_splat(scene))
-    sequence = open_scene(scene, SIDE, SIDE)
+    sequence = open_scene(scene, SceneOptions(SIDE, SIDE))
     count = min(MOST_VIEWS, sequence.num_images)
     views = sequence.views(np.linspace(0, sequence.num_images - 1, count).astype(int).tolist())
     return normalize(views, views)[0]

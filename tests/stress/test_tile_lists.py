@@ -11,7 +11,7 @@ from tangents import tangent_scene
 from asysplat.rendering import Culling, render
 from asysplat.rendering.cpu import splat as col
 from asysplat.rendering.cpu.splat import TILE, Frame, ProjectSettings, load_ellipse
-from asysplat.rendering.cpu.tiles import find_box, list_tiles, place
+from asysplat.rendering.cpu.tiles import compute_box, list_tiles, scatter_pairs
 from asysplat.rendering.formulas import PIXEL_MARGIN
 from asysplat.scene import Cameras
 
@@ -153,13 +153,13 @@ def test_a_splat_whose_rows_end_past_its_box():
     splats[0, [col.A, col.B, col.C]] = 0.29677019, -0.024766434, 0.29569972
     splats[0, [col.A_REST, col.B_REST]] = 1.3566894e-08, -4.2892007e-10
     splats[0, [col.LOG_OPACITY, col.EXTENT_Y]] = -0.61427963, 9.1877527
-    any_settings = dict.fromkeys(ProjectSettings._fields, 0.0) | {"exact": True}
+    any_settings = dict.fromkeys(ProjectSettings._fields, 0.0) | {"cull_ellipse": True}
     sizes = dict.fromkeys(Frame._fields, 1) | {"height": 256, "width": 256, "columns": 16}
     frame = Frame(**sizes | {"project": ProjectSettings(**any_settings)})
     ellipse, box = load_ellipse(splats, bases, 0), np.zeros(4, np.int32)
     extent_x = Ellipses(splats).extent_x[0]
     for nudge in (-2e-6, -1e-6, -1e-7, 0, 1e-7, 1e-6, 2e-6):
-        room = find_box(ellipse, extent_x * (1 + nudge), frame, box)
+        room = compute_box(ellipse, extent_x * (1 + nudge), frame, box)
         histogram, tiles = np.zeros(256, np.int32), np.full(room, -1, np.int32)
         count = list_tiles(ellipse, box, frame, histogram, tiles, 0)
         assert sorted(set(tiles[:count]) - {35}) == [33, 34, 50]
@@ -167,6 +167,6 @@ def test_a_splat_whose_rows_end_past_its_box():
         assert (np.flatnonzero(histogram) == np.sort(tiles[:count])).all()
         starts = (np.cumsum(histogram) - histogram).astype(np.int64).reshape(1, 1, -1)
         entries = np.full((count, 2), -1, np.int32)
-        place(0, 1, tiles[:count], np.array([0, count]), starts, frame, entries)
+        scatter_pairs(0, 1, tiles[:count], np.array([0, count]), starts, frame, entries)
         assert (entries[:, 0] == 0).all()
         assert (np.sort(entries[:, 1]) == np.arange(count)).all()

@@ -1,8 +1,8 @@
-"""The renderer for CPUs: Numba kernels, compiled when first used and kept on disk.
+"""Render on a CPU with Numba kernels, compiled at the first use and cached on disk.
 
-A Gaussian is projected in float64 and rounded to a splat once; tiles of 16 x 16 pixels are drawn by
-float32 vectors, a row at a time. Gradients are summed in a fixed order: the same bits on any number
-of threads.
+Gaussians are projected in float64 and rounded to splats once; float32 vectors draw tiles of 16 x 16
+pixels, a row at a time. Gradients are summed in a fixed order: any number of threads gives the same
+bits.
 """
 
 from asysplat.rendering.cpu.draw import draw

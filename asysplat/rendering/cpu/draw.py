@@ -1,4 +1,4 @@
-"""The CPU renderer, one pass after the other, as one operation to torch."""
+"""Run the passes of the CPU renderer as one operation of torch."""
 
 import math
 from collections.abc import Sequence
@@ -32,13 +32,21 @@ from asysplat.rendering.cpu.splat import (
     ProjectSettings,
     RasterSettings,
 )
-from asysplat.rendering.cpu.tiles import Lists, place, start_positions
-from asysplat.rendering.formulas import CAMERA_GRADIENT, Inputs, camera_gradients, camera_rows
+from asysplat.rendering.cpu.tiles import Lists, scatter_pairs, start_positions
+from asysplat.rendering.formulas import (
+    CAMERA_GRADIENT,
+    Inputs,
+    active_tiles,
+    apply_passes,
+    camera_gradients,
+    camera_rows,
+    image_gradients,
+)
 from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs
 from asysplat.scene import Cameras, Gaussians
 
 MAX_SPLATS = 2**25  # in memory at a time: 2 GiB
-BLOCK = 2048  # Gaussians of a piece of work; more, where an image would have over MAX_BLOCKS
+BLOCK = 2048  # Gaussians of a task; more if an image would have over MAX_BLOCKS
 MAX_BLOCKS = 64
 
 
@@ -50,11 +58,11 @@ def draw(
 ) -> RenderOutputs:
     """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
 
-    What it draws where `masks` is False has no meaning.
+    The values of pixels where `masks` is False are arbitrary.
 
     Raises:
         MemoryError: too many splats at once.
-        InputError: tensors elsewhere than on a CPU; more pairs of splat and tile than a list can
+        InputError: tensors that are not on a CPU; more pairs of splat and tile than a list can
             number.
     """
     if gaussians.means.device.type != "cpu":
@@ -65,28 +73,22 @@ def draw(
     images = cameras.intrinsics.shape[:2].numel()
     if images * gaussians.num_gaussians > MAX_SPLATS and cameras.num_views > 1:
         raise MemoryError(f"{images} images of {gaussians.num_gaussians} Gaussians")
-    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    poses = (cameras.cam_to_world, cameras.intrinsics)
-    size = (cameras.height, cameras.width)
-    stats: dict[str, int] = {}
-    masks = masks if settings.culling.masks else None
-    *images, origins = _Draw.apply(settings, size, masks, stats, *fields, *poses)
-    return RenderOutputs(*images, stats, origins)
+    return apply_passes(_Passes, gaussians, cameras, settings, masks)
 
 
-class _Draw(torch.autograd.Function):
-    """The passes, forward and backward; `stats` is filled on the way."""
+class _Passes(torch.autograd.Function):
+    """The forward and backward passes; the forward pass fills `stats`."""
 
     @staticmethod
     def forward(ctx, settings, size, masks, stats, *tensors):
         frame = _frame(tensors, size, settings)
         inputs = _inputs(tensors, size, settings)
         lists = _list_tiles(frame, *_project(frame, inputs), masks, stats)
-        images, saved, beside_depth = _rasterize(frame, lists, settings.depth, stats)
+        images, saved, auxiliary = _rasterize(frame, lists, settings.depth, stats)
         _, _, transmittance, _, origins = images
         ctx.save_for_backward(*tensors, transmittance)  # an output must be saved here
         ctx.settings, ctx.size, ctx.frame, ctx.lists = settings, size, frame, lists
-        ctx.saved, ctx.beside_depth = saved._replace(transmittance=None), beside_depth
+        ctx.saved, ctx.auxiliary = saved._replace(transmittance=None), auxiliary
         ctx.set_materialize_grads(False)
         if origins is not None:
             ctx.mark_non_differentiable(origins)
@@ -97,19 +99,16 @@ class _Draw(torch.autograd.Function):
     def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth, _):
         *tensors, transmittance = ctx.saved_tensors
         frame, lists = ctx.frame, ctx.lists
-        if grad_image is None:
-            grad_image = torch.zeros(frame.images, 3, frame.height, frame.width)
-        if grad_transmittance is None:
-            grad_transmittance = torch.zeros_like(transmittance)
-        if grad_alpha is not None:
-            grad_transmittance = grad_transmittance - grad_alpha
+        grad_image, grad_transmittance = image_gradients(
+            grad_image, grad_alpha, grad_transmittance, transmittance
+        )
         grads = Gradients(
-            image=grad_image.contiguous().numpy(),
-            transmittance=grad_transmittance.contiguous().numpy(),
+            image=grad_image.numpy(),
+            transmittance=grad_transmittance.numpy(),
             pairs=np.empty((len(lists.entries), GRADIENT), np.float32),
         )
         saved = ctx.saved._replace(transmittance=transmittance.numpy())
-        depths = _depths(ctx.settings.depth, grad_depth, ctx.beside_depth)
+        depths = _depths(ctx.settings.depth, grad_depth, ctx.auxiliary)
         tiles = weighted_bounds(lists.first_entry)
         run_blocks(rasterize_backward, tiles, lists, frame, saved, grads, *depths)
         inputs = _inputs(tensors, ctx.size, ctx.settings)
@@ -119,7 +118,7 @@ class _Draw(torch.autograd.Function):
 
 
 def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Frame:
-    """Gather what the kernels are told."""
+    """Collect sizes and settings for the kernels."""
     means, intrinsics = tensors[0], tensors[-1]
     (scenes, num), views = means.shape[:2], intrinsics.shape[1]
     height, width = size
@@ -145,8 +144,8 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSet
             antialiased=settings.antialiased,
             cull_opacity=culling.opacity,
             cull_frustum=culling.frustum,
-            own_extent=culling.extent,
-            exact=culling.ellipse,
+            cull_extent=culling.extent,
+            cull_ellipse=culling.ellipse,
         ),
         raster=RasterSettings(
             alpha_min=np.float32(convention.alpha_min),
@@ -159,14 +158,14 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSet
 
 
 def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Inputs:
-    """Turn the fields of Gaussians, poses and intrinsics into arrays."""
+    """Convert the fields of Gaussians, poses and intrinsics to arrays."""
     *fields, cam_to_world, intrinsics = tensors
     cameras = camera_rows(cam_to_world, intrinsics, size, settings.convention)
     return Inputs(*(_array(field) for field in fields), cameras=cameras.numpy())
 
 
 def _project(frame: Frame, inputs: Inputs) -> tuple[Projected, list[np.ndarray]]:
-    """Find the splats, and the tile of each of their pairs, in pieces."""
+    """Compute the splats and, in parts, the tile of each pair."""
     projected = Projected(
         splats=np.empty((frame.images * frame.num, SPLAT), np.float32),
         counts=np.empty(frame.images * frame.num, np.int32),
@@ -190,66 +189,69 @@ def _list_tiles(
     lengths = np.diff(first_entry)
     pairs = int(first_entry[-1])
     check_pairs(pairs, int(lengths.max()))
+    active = np.ones(len(lengths), np.bool_)
+    if masks is not None:
+        active = active_tiles(masks, TILE).numpy()
     lists = Lists(
         splats=projected.splats,
         first_pair=_starts(projected.counts),
         first_entry=first_entry,
         entries=np.empty((pairs, 2), np.int32),
-        wanted=_wanted_tiles(frame, masks),
+        active=active,
     )
-    boxes, faint, outside = projected.counters.sum((0, 1)).tolist()
+    box_tiles, by_opacity, by_frustum = projected.counters.sum((0, 1)).tolist()
     stats["visible"] = int(np.count_nonzero(projected.counts))
-    stats["culled_by_opacity"], stats["culled_by_frustum"] = faint, outside
+    stats["culled_by_opacity"], stats["culled_by_frustum"] = by_opacity, by_frustum
     stats["pairs"] = pairs
-    stats["pairs_off_ellipse"] = boxes - pairs if frame.project.exact else 0
-    stats["pairs_masked"] = int(lengths[~lists.wanted].sum())
+    stats["pairs_culled_by_ellipse"] = box_tiles - pairs if frame.project.cull_ellipse else 0
+    stats["pairs_culled_by_masks"] = int(lengths[~lists.active].sum())
     stats["tile_size"] = TILE
     positions = np.empty(histograms.shape, np.int64)
     run_blocks(start_positions, even_bounds(frame.images), histograms, first_entry, positions)
     blocks = even_bounds(frame.images * frame.blocks)
     tile_of = np.concatenate(tiles)
-    run_blocks(place, blocks, tile_of, lists.first_pair, positions, frame, lists.entries)
+    run_blocks(scatter_pairs, blocks, tile_of, lists.first_pair, positions, frame, lists.entries)
     return lists
 
 
 def _rasterize(
     frame: Frame, lists: Lists, depth: str | None, stats: dict[str, int]
 ) -> tuple[tuple[Tensor | None, ...], Saved, np.ndarray | None]:
-    """Draw image, alpha, transmittance, depth and its origins; also what backward needs.
+    """Draw image, alpha, transmittance, depth and its origins.
 
-    That is `Saved`, and what stands beside the depth, see `_depths`.
+    Also return `Saved` and the other array of the depth, see `_depths`, for the backward pass.
     """
     image = torch.empty(frame.images, 3, frame.height, frame.width)
     alpha = torch.empty(frame.images, frame.height, frame.width)
     transmittance = torch.empty_like(alpha)
     drawn_depth = torch.empty_like(alpha) if depth else None
     origins = torch.empty_like(alpha) if depth not in (None, "median") else None
-    beside_depth = None if origins is None else origins.numpy()
+    auxiliary = None if origins is None else origins.numpy()
     if depth == "median":
-        beside_depth = np.empty(alpha.shape, np.float32)
+        auxiliary = np.empty(alpha.shape, np.float32)
     saved = Saved(
         transmittance=transmittance.numpy(),
-        stops=np.empty(alpha.shape, np.float32),
+        stop_ranks=np.empty(alpha.shape, np.float32),
         last_entry=np.empty(frame.images * frame.tiles, np.int64),
         counters=np.empty((frame.images * frame.tiles, raster.COUNTERS), np.int64),
     )
     images = Images(image.numpy(), alpha.numpy())
-    depths = _depths(depth, drawn_depth, beside_depth)
+    depths = _depths(depth, drawn_depth, auxiliary)
     tiles = weighted_bounds(lists.first_entry)
     run_blocks(rasterize, tiles, lists, frame, images, saved, *depths)
     rows, in_extent = saved.counters.sum(0).tolist()
     drawn = int((saved.last_entry - lists.first_entry[:-1]).sum())
-    stats["pairs_behind_opaque"] = stats["pairs"] - stats["pairs_masked"] - drawn
+    stats["pairs_culled_by_opaque"] = stats["pairs"] - stats["pairs_culled_by_masks"] - drawn
     stats["rows"] = rows
-    stats["rows_out_of_reach"] = drawn * TILE - in_extent
-    stats["rows_opaque"] = in_extent - rows
-    return (image, alpha, transmittance, drawn_depth, origins), saved, beside_depth
+    stats["rows_culled_by_extent"] = drawn * TILE - in_extent
+    stats["rows_culled_by_opaque"] = in_extent - rows
+    return (image, alpha, transmittance, drawn_depth, origins), saved, auxiliary
 
 
 def _project_backward(
     frame: Frame, inputs: Inputs, needs: Needs, pairs: Pairs, tensors: Sequence[Tensor]
 ) -> tuple[Tensor | None, ...]:
-    """Return the gradients of `tensors`: the fields of Gaussians, poses and intrinsics."""
+    """Compute the gradients of `tensors`: the fields of Gaussians, poses and intrinsics."""
     *fields, cam_to_world, intrinsics = tensors
     field_grads = [_empty_like(field) for field in fields[:4]]
     field_grads.append(_empty_like(fields[4] if needs.sh else fields[4][:0]))
@@ -267,41 +269,33 @@ def _project_backward(
     return (*field_grads, *poses)
 
 
-def _wanted_tiles(frame: Frame, masks: Tensor | None) -> np.ndarray:
-    """Say for each of [images * tiles] whether any pixel of it counts."""
-    if masks is None:
-        return np.ones(frame.images * frame.tiles, np.bool_)
-    counts = masks.flatten(0, 1).to(torch.float32)
-    return torch.nn.functional.max_pool2d(counts, TILE, ceil_mode=True).flatten().numpy() > 0
-
-
 def _depths(
-    kind: str | None, depth: Tensor | None, beside: np.ndarray | None
+    kind: str | None, depth: Tensor | None, auxiliary: np.ndarray | None
 ) -> tuple[BlendedDepth | None, MedianDepth | None]:
-    """Return a depth, or its gradient, as the kind that was asked for, and None as the other.
+    """Wrap a depth, or its gradient, as the requested kind; the other kind is None.
 
-    Beside it stand the origins of a blended depth, or the ranks of a median one.
+    `auxiliary` holds the origins of a blended depth, or the ranks of a median depth.
     """
     if depth is None:
         return None, None
     array = depth.contiguous().numpy()
     if kind == "median":
-        return None, MedianDepth(array, beside)
-    return BlendedDepth(array, beside), None
+        return None, MedianDepth(array, auxiliary)
+    return BlendedDepth(array, auxiliary), None
 
 
 def _empty_like(tensor: Tensor) -> Tensor:
-    """Allocate by NumPy, whose first touch of large arrays is several times faster than torch's."""
+    """Allocate with NumPy, which is several times faster than torch for large arrays."""
     return torch.from_numpy(np.empty_like(tensor.detach().numpy(), order="C"))
 
 
 def _starts(counts: np.ndarray) -> np.ndarray:
-    """Return [0, c_0, c_0 + c_1, ...]."""
+    """Compute [0, c_0, c_0 + c_1, ...]."""
     starts = np.zeros(len(counts) + 1, np.int64)
     np.cumsum(counts, out=starts[1:])
     return starts
 
 
 def _array(tensor: Tensor) -> np.ndarray:
-    """Turn [B, N, ...] into an array [B * N, ...], without a copy where memory allows it."""
+    """Convert [B, N, ...] to an array [B * N, ...], without a copy if the memory layout allows."""
     return tensor.detach().contiguous().flatten(0, 1).numpy()

@@ -1,4 +1,4 @@
-"""Gradients of the Gaussians and the cameras from those of their splats, in float64."""
+"""Compute gradients of Gaussians and cameras from those of their splats, in float64."""
 
 import math
 from typing import NamedTuple
@@ -8,18 +8,17 @@ import numpy as np
 from asysplat.ops.simd.kernel import inline, kernel
 from asysplat.rendering.cpu.math import (
     covariance,
-    cross,
+    covariance_gradient,
     dot,
     ellipse_rows,
-    in_camera,
+    ellipse_rows_gradient,
     load_camera,
     plus,
-    rotation_columns,
-    rotation_gradient,
+    project_mean,
     row3,
     scaled,
     sh_basis_gradient,
-    times,
+    triple,
     unit_quaternion,
     whitening,
     write_sh_basis,
@@ -39,7 +38,7 @@ from asysplat.rendering.formulas import CENTER, CX, CY, DOWN, FORWARD, FX, FY, R
 from asysplat.rendering.interface import MIN_SQUARED_DISTANCE
 
 LOG_2 = math.log(2)
-# Where the gradients of a Gaussian's mean, quaternion, scale and SH begin among its sums.
+# Offsets of the gradients of mean, quaternion, scale and SH in a Gaussian's sums.
 MEAN, QUAT, SCALE, SH = 0, 3, 7, 10
 SUMS = SH + 3 * 16
 
@@ -47,8 +46,8 @@ SUMS = SH + 3 * 16
 class Pairs(NamedTuple):
     """Gradients of all pairs of splat and tile.
 
-    first [images * N + 1] the number of each splat's first pair, and of all pairs; grads [pairs,
-    10], see `splat`.
+    first [images * N + 1] index of each splat's first pair, and the number of pairs; grads
+    [pairs, 10], see `splat`.
     """
 
     first: np.ndarray
@@ -56,22 +55,22 @@ class Pairs(NamedTuple):
 
 
 class Needs(NamedTuple):
-    """Whether the gradients of SH and of the cameras are asked for."""
+    """Whether SH and cameras require gradients."""
 
     sh: bool
     cameras: bool
 
 
 class _Scratch(NamedTuple):
-    """Room for one Gaussian.
+    """Buffers for one Gaussian.
 
-    sums [58] its gradient over all views, see MEAN; functions [16] the SH functions at its
-    direction, and g_functions [16] their gradients.
+    sums [58] its gradient over all views, see MEAN; basis [16] the SH functions in its direction,
+    and g_basis [16] their gradients.
     """
 
     sums: np.ndarray
-    functions: np.ndarray
-    g_functions: np.ndarray
+    basis: np.ndarray
+    g_basis: np.ndarray
 
 
 @kernel
@@ -80,12 +79,12 @@ def project_backward(start, stop, inputs, frame, needs, pairs, grads):
 
     Args:
         start, stop: blocks, numbered scene by scene.
-        inputs: `Inputs`, as for `project`, but with quats and scales flat.
+        inputs: `Inputs`, as for `project`, but with flat quats and scales.
         frame: sizes and settings.
-        needs: what is asked for beside the Gaussians' other fields.
+        needs: which gradients beside those of the Gaussians' other fields are required.
         pairs: gradients of the pairs of splat and tile.
-        grads: `Inputs` to write, float32 or float64: every element of the fields, those of SH if
-            they are needed; of cameras [images, blocks, 16] float64, each block's part.
+        grads: `Inputs` to write, float32 or float64: every element of the fields, SH if required;
+            cameras [images, blocks, 16] float64, the part of each block.
     """
     blocks, num = frame.blocks, frame.num
     count = inputs.sh.shape[1]
@@ -143,32 +142,33 @@ def _add3(out, start, factor, values):
 
 @inline
 def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera):
-    """Add one splat's part to the sums and the camera's gradient; return that of the opacity.
+    """Add a splat's part to the sums and to the camera's gradient; return the opacity's gradient.
 
     Args:
         g: the Gaussian.
-        image: in which it is this splat.
-        inputs: with quats and scales flat.
+        image: the image of the splat.
+        inputs: with flat quats and scales.
         settings: of the projection.
-        needs: what is asked for.
+        needs: which gradients are required.
         splat_grads: [10] of the splat.
-        scratch: room, with the sums to add to.
+        scratch: buffers, with the sums to add to.
         g_camera: [16].
     """
     eps = settings.eps2d
-    sums, functions, g_functions = scratch
+    sums, basis, g_basis = scratch
     camera = load_camera(inputs.cameras, image)
-    right, down, forward, fx, fy = camera.right, camera.down, camera.forward, camera.fx, camera.fy
+    axes = camera.axes
+    right, down, forward = axes
+    fx, fy = camera.focal
 
-    # What `project` computed.
-    mean = in_camera(camera, row3(inputs.means, g))
-    offset, inverse_z, row_x, row_y = mean.offset, mean.inverse_z, mean.row_x, mean.row_y
-    tangent_x, tangent_y = mean.tangent_x, mean.tangent_y
-    inside_x, inside_y = mean.inside_x, mean.inside_y
-    mx, my, turned_x, turned_y, scale = ellipse_rows(inputs.quats, inputs.scales, g, row_x, row_y)
-    _, xy, yy, minors, det0, det = covariance(mx, my, eps)
-    var_y = yy + eps
-    a, b, c = whitening(xy, var_y, det)
+    # Repeat the forward pass.
+    mean = row3(inputs.means, g)
+    offset, _, inverse_z, tangents, clamped, row_x, row_y = project_mean(
+        mean, axes, camera.center, (fx, fy), camera.limits
+    )
+    quat, scale = unit_quaternion(inputs.quats, 4 * g), triple(inputs.scales, 3 * g)
+    mx, my, _, _ = ellipse_rows(quat, scale, row_x, row_y)
+    _, xy, yy, _, det0, det = covariance(mx, my, eps)
 
     # Opacity, and antialiasing.
     opacity = float(inputs.opacities[g])
@@ -178,54 +178,37 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
         half = 0.5 * splat_grads[G_LOG_OPACITY]  # log compensation = (log det0 - log det) / 2
         g_det0, g_det = half / det0, -half / det
 
-    # Whitening to rows of M.
+    # Whitening, covariance, scale and rotation.
     factor = LOG_2 * WHITEN_TO_LOG2
-    g_a, g_b, g_c = factor * splat_grads[G_A], factor * splat_grads[G_B], factor * splat_grads[G_C]
-    g_var_y = (g_a * a - g_b * b - g_c * c) / (2 * var_y)
-    g_xy = -g_b * a / var_y
-    g_det -= (g_a * a + g_b * b) / (2 * det)
-    g_minors = g_det0 + g_det
-    g_xx, g_yy = eps * g_det, g_var_y + eps * g_det
-    g_mx = plus(plus(scaled(2 * g_xx, mx), g_xy, my), 2 * g_minors, cross(my, minors))
-    g_my = plus(plus(scaled(2 * g_yy, my), g_xy, mx), 2 * g_minors, cross(minors, mx))
-
-    # Rows of M to scale, rotation and the Jacobian's rows.
-    _add3(sums, SCALE, 1.0, plus(times(g_mx, turned_x), 1.0, times(g_my, turned_y)))
-    h_x, h_y = times(g_mx, scale), times(g_my, scale)
-    qw, qx, qy, qz, inverse = unit_quaternion(inputs.quats, 4 * g)
-    axis0, axis1, axis2 = rotation_columns(qw, qx, qy, qz)
-    turn = rotation_gradient(
-        qw, qx, qy, qz, inverse,
-        plus(scaled(h_x[0], row_x), h_y[0], row_y),
-        plus(scaled(h_x[1], row_x), h_y[1], row_y),
-        plus(scaled(h_x[2], row_x), h_y[2], row_y),
-    )  # fmt: skip
+    g_abc = (factor * splat_grads[G_A], factor * splat_grads[G_B], factor * splat_grads[G_C])
+    abc = whitening(xy, yy + eps, det)
+    g_mx, g_my = covariance_gradient(g_abc, g_det0, g_det, abc, mx, my, eps)
+    g_scale, g_quat, g_row_x, g_row_y = ellipse_rows_gradient(g_mx, g_my, quat, scale, row_x, row_y)
+    _add3(sums, SCALE, 1.0, g_scale)
     for k in range(4):
-        sums[QUAT + k] += turn[k]
-    g_row_x = plus(plus(scaled(h_x[0], axis0), h_x[1], axis1), h_x[2], axis2)
-    g_row_y = plus(plus(scaled(h_y[0], axis0), h_y[1], axis1), h_y[2], axis2)
+        sums[QUAT + k] += g_quat[k]
 
-    # The Jacobian's rows and the center to the camera and the mean.
+    # The Jacobian's rows and the center.
     g_x, g_y = LOG_2 * splat_grads[G_X], LOG_2 * splat_grads[G_Y]
     g_z = splat_grads[G_DEPTH]
     g_z -= inverse_z * (dot(row_x, g_row_x) + dot(row_y, g_row_y))
-    g_fx = g_x * tangent_x + dot(row_x, g_row_x) / fx
-    g_fy = g_y * tangent_y + dot(row_y, g_row_y) / fy
+    g_fx = g_x * tangents[0] + dot(row_x, g_row_x) / fx
+    g_fy = g_y * tangents[1] + dot(row_y, g_row_y) / fy
     g_cx, g_cy = g_x, g_y
-    g_inside_x = -fx * inverse_z * dot(forward, g_row_x)
-    g_inside_y = -fy * inverse_z * dot(forward, g_row_y)
+    g_clamped_x = -fx * inverse_z * dot(forward, g_row_x)
+    g_clamped_y = -fy * inverse_z * dot(forward, g_row_y)
     g_tangent_x, g_tangent_y = g_x * fx, g_y * fy
-    if inside_x == tangent_x:
-        g_tangent_x += g_inside_x
+    if clamped[0] == tangents[0]:
+        g_tangent_x += g_clamped_x
     else:  # the limit is (constant - cx) / fx
-        g_cx -= g_inside_x / fx
-        g_fx -= g_inside_x * inside_x / fx
-    if inside_y == tangent_y:
-        g_tangent_y += g_inside_y
+        g_cx -= g_clamped_x / fx
+        g_fx -= g_clamped_x * clamped[0] / fx
+    if clamped[1] == tangents[1]:
+        g_tangent_y += g_clamped_y
     else:
-        g_cy -= g_inside_y / fy
-        g_fy -= g_inside_y * inside_y / fy
-    g_z -= inverse_z * (g_tangent_x * tangent_x + g_tangent_y * tangent_y)
+        g_cy -= g_clamped_y / fy
+        g_fy -= g_clamped_y * clamped[1] / fy
+    g_z -= inverse_z * (g_tangent_x * tangents[0] + g_tangent_y * tangents[1])
     g_u, g_v = g_tangent_x * inverse_z, g_tangent_y * inverse_z
     g_offset = plus(plus(scaled(g_u, right), g_v, down), g_z, forward)
 
@@ -235,19 +218,19 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
     direction = scaled(1 / length, offset)
     sh = inputs.sh
     count = sh.shape[1]
-    write_sh_basis(direction[0], direction[1], direction[2], count, functions)
-    _clear(g_functions)
+    write_sh_basis(direction[0], direction[1], direction[2], count, basis)
+    _clear(g_basis)
     for channel in range(3):
         color = 0.5
         for k in range(count):
-            color += functions[k] * float(sh[g, k, channel])
+            color += basis[k] * float(sh[g, k, channel])
         if color > 0:
             g_color = splat_grads[G_RED + channel]
             for k in range(count):
                 if needs.sh:
-                    sums[SH + 3 * k + channel] += functions[k] * g_color
-                g_functions[k] += float(sh[g, k, channel]) * g_color
-    g_direction = sh_basis_gradient(direction[0], direction[1], direction[2], count, g_functions)
+                    sums[SH + 3 * k + channel] += basis[k] * g_color
+                g_basis[k] += float(sh[g, k, channel]) * g_color
+    g_direction = sh_basis_gradient(direction[0], direction[1], direction[2], count, g_basis)
     g_offset = plus(g_offset, 1 / length, g_direction)
     if square > MIN_SQUARED_DISTANCE:
         g_offset = plus(g_offset, -dot(direction, g_direction) / length, direction)
@@ -256,8 +239,8 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
     if needs.cameras:
         _add3(g_camera, RIGHT, 1.0, plus(scaled(g_u, offset), fx * inverse_z, g_row_x))
         _add3(g_camera, DOWN, 1.0, plus(scaled(g_v, offset), fy * inverse_z, g_row_y))
-        through_x = plus(scaled(g_z, offset), -fx * inverse_z * inside_x, g_row_x)
-        _add3(g_camera, FORWARD, 1.0, plus(through_x, -fy * inverse_z * inside_y, g_row_y))
+        through_x = plus(scaled(g_z, offset), -fx * inverse_z * clamped[0], g_row_x)
+        _add3(g_camera, FORWARD, 1.0, plus(through_x, -fy * inverse_z * clamped[1], g_row_y))
         _add3(g_camera, CENTER, -1.0, g_offset)
         g_camera[FX] += g_fx
         g_camera[FY] += g_fy

@@ -1,13 +1,13 @@
-"""Splats to pixels, and their gradients back: a task takes a tile, a vector is a row of it.
+"""Rasterize splats and compute their gradients: a task takes a tile, a vector is a row of it.
 
-The forward pass blends front to back. The backward pass goes back to front: what lies behind a
-splat is summed up on the way, from little to much, so that nothing cancels; the transmittance
-before it is that behind it over 1 - alpha, which keeps its relative precision. Which splats a pixel
-saw is what the forward pass saved: where it stopped. Each pair of splat and tile has a place of its
-own for its gradient: no two threads write to one, and sums have a fixed order.
+The forward pass blends front to back. The backward pass goes back to front: it sums up the light
+from behind a splat, from small terms to large ones, so that nothing cancels. The transmittance in
+front of a splat is the one behind it over 1 - alpha, which keeps its relative precision. The
+forward pass saves where each pixel stopped. Each pair of splat and tile has its own gradient:
+threads never write to the same one, and sums have a fixed order.
 
 Products and sums are fused by name and never by the compiler's choice, so that both passes, which
-share the functions that decide, take identical decisions.
+share the deciding functions, take identical decisions.
 """
 
 from typing import NamedTuple
@@ -17,48 +17,46 @@ import numpy as np
 from asysplat.ops.simd.kernel import inline, kernel
 from asysplat.ops.simd.vectors import LANES, ONE, ZERO, exp2, fma
 from asysplat.rendering.cpu import splat as col
-from asysplat.rendering.cpu.math import take_sum, to_bits
+from asysplat.rendering.cpu.math import sum_and_clear, to_bits
 from asysplat.rendering.cpu.splat import (
     HALF,
     MIDDLE,
     TILE,
-    in_row,
     load_splat,
     prefetch,
-    shown_rows,
+    splat_in_row,
     tile_window,
+    visible_rows,
 )
 from asysplat.rendering.cpu.tiles import DIGITS, RADIX, sort_by_depth
 
 PIXELS = TILE * LANES
-# From one plane of a tile's state to the next: planes 4096 bytes apart would look like one to the
-# processor's store buffer.
+# Distance of two planes of a tile's state; 4096 bytes would alias in the processor's store buffer.
 PLANE = PIXELS + LANES
-AHEAD = 4  # splats that are fetched from memory before they are drawn
-CHECK = 15  # look after every 16 splats whether a row is opaque
-LOWEST = np.float32(-64)  # 2 ** LOWEST is below every threshold and still a normal number
-NEVER = np.float32(2.0**30)  # more than any rank
+PREFETCH_DISTANCE = 4  # splats
+OPAQUE_MASK = 15  # rows are tested for opacity after every 16 splats
+MIN_EXPONENT = np.float32(-64)  # 2 ** -64 is below every threshold and a normal number
+NO_STOP = np.float32(2.0**30)  # more than any rank
 
-# Counters of a tile: rows of splats that were drawn; that were in extent before rows got opaque.
+# Counters of a tile: drawn rows of splats, and those within the extent, opaque rows included.
 ROWS, ROWS_IN_EXTENT = range(2)
 COUNTERS = 2
 
-# Planes of a tile's state in the forward pass: what passes through, at 0; what passed where nothing
-# may any more, and 1 + the rank in the list at which that was; alpha; color; depths, and 1 + the
-# rank of the median's.
-REST, STOP, ALPHA, RED, GREEN, BLUE, DEPTH, ORIGIN, MEDIAN, HALVED = (
+# Planes of a tile's state in the forward pass: the transmittance, at 0; the final transmittance of
+# stopped pixels, and 1 + the rank of the stop; alpha; color; depths, and 1 + the median's rank.
+STOPPED, STOP, ALPHA, RED, GREEN, BLUE, DEPTH, ORIGIN, MEDIAN, MEDIAN_RANK = (
     plane * PLANE for plane in range(1, 11)
 )
 STATE = 11 * PLANE
 
-# Planes in the backward pass: what passes through, at 0; what lies behind, the background included,
-# times its gradient; the rank that the pixel stopped at; the origin of its depth; the rank of its
-# median depth; gradients of the pixel.
-G_BEHIND, G_STOP, G_ORIGIN, G_HALVED, G_RED, G_GREEN, G_BLUE, G_DEPTH, G_MEDIAN = (
+# Planes in the backward pass: the transmittance, at 0; the light from behind, the background
+# included, times its gradient; the stop's rank; the depth's origin; the median's rank; gradients of
+# the pixel.
+G_BEHIND, G_STOP, G_ORIGIN, G_MEDIAN_RANK, G_RED, G_GREEN, G_BLUE, G_DEPTH, G_MEDIAN = (
     plane * PLANE for plane in range(1, 10)
 )
-# Behind them sums over the rows of a splat, for each column: of the exponent's gradient e, e u,
-# e u y, e y, e y^2, e u x, and of the values' gradients.
+# Then sums over the rows of a splat, for each column: of the exponent's gradient e, of e u, e u y,
+# e y, e y^2, e u x, and of the values' gradients.
 SUM_E, SUM_EU, SUM_EUY, SUM_EY, SUM_EYY, SUM_EUX, SUM_RED, SUM_GREEN, SUM_BLUE, SUM_DEPTH = (
     10 * PLANE + k * LANES for k in range(10)
 )
@@ -73,21 +71,21 @@ class Images(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """What `rasterize` leaves for `rasterize_backward`.
+    """What `rasterize` saves for `rasterize_backward`.
 
-    transmittance [images, H, W]; stops [images, H, W] the rank in its list of the splat that a
-    pixel dropped, with all behind it, NEVER where it dropped none; last_entry [tiles] where a
-    tile's list was left, all its pixels being opaque; counters [tiles, COUNTERS].
+    transmittance [images, H, W]; stop_ranks [images, H, W] the rank in the list of the first splat
+    that a pixel dropped, NO_STOP if it dropped none; last_entry [tiles] where the tile's pixels
+    were all opaque and its list was left; counters [tiles, COUNTERS].
     """
 
     transmittance: np.ndarray
-    stops: np.ndarray
+    stop_ranks: np.ndarray
     last_entry: np.ndarray
     counters: np.ndarray
 
 
 class BlendedDepth(NamedTuple):
-    """Depth [images, H, W], or its gradient, and the origins [images, H, W] it is taken from."""
+    """Depth [images, H, W], or its gradient, and the origins [images, H, W] it is relative to."""
 
     depth: np.ndarray
     origins: np.ndarray
@@ -97,11 +95,11 @@ class MedianDepth(NamedTuple):
     """Depth [images, H, W], or its gradient, and the rank of its splat, -1 without one."""
 
     depth: np.ndarray
-    halved: np.ndarray
+    ranks: np.ndarray
 
 
 class Gradients(NamedTuple):
-    """Gradients of the image, of the transmittance, and of the pairs [pairs, 10], see `splat`."""
+    """Gradients of image, transmittance and pairs [pairs, 10], see `splat`."""
 
     image: np.ndarray
     transmittance: np.ndarray
@@ -109,23 +107,23 @@ class Gradients(NamedTuple):
 
 
 @inline
-def aligned(count):
-    """Allocate float32 at a cache line's beginning, so that no vector straddles two."""
+def allocate_aligned(count):
+    """Allocate float32 from the start of a cache line, so that no vector straddles two."""
     memory = np.empty(count + 16, np.float32)
     return memory[((-memory.ctypes.data) & 63) // 4 :]
 
 
 @inline
 def alpha_at(u, row_exponent, settings):
-    """Compute alpha of a pixel, 2^(row_exponent - u^2), 0 below alpha_min."""
-    exponent = max(fma(-u, u, row_exponent), LOWEST)
+    """Compute the alpha of a pixel, 2^(row_exponent - u^2), 0 below alpha_min."""
+    exponent = max(fma(-u, u, row_exponent), MIN_EXPONENT)
     alpha = min(exp2(exponent), settings.alpha_max)
     return alpha if alpha >= settings.alpha_min else ZERO
 
 
 @inline
 def is_opaque(state, base):
-    """Say whether nothing behind can show in the row that begins at `base`."""
+    """Check whether all pixels of the row that begins at `base` are opaque."""
     any_left = np.int32(0)
     for i in range(LANES):
         any_left |= to_bits(state[base + i])
@@ -146,22 +144,24 @@ def draw_row(state, row, rank, splat, settings, blended, median):
         state[base + i] = behind * keep
         stops = (ONE - keep) if before > ZERO else ZERO
         state[STOP + base + i] = fma(stops, rank + ONE, state[STOP + base + i])
-        state[REST + base + i] = fma(stops, before, state[REST + base + i])
+        state[STOPPED + base + i] = fma(stops, before, state[STOPPED + base + i])
         state[ALPHA + base + i] += weight
         state[RED + base + i] = fma(weight, splat.red, state[RED + base + i])
         state[GREEN + base + i] = fma(weight, splat.green, state[GREEN + base + i])
         state[BLUE + base + i] = fma(weight, splat.blue, state[BLUE + base + i])
         if blended is not None:
-            # From the depth of the first that shows: what is blended are small differences.
+            # Relative to the first visible depth: the blended differences are small.
             first = ONE if before == ONE and weight > ZERO else ZERO
             origin = fma(first, splat.z, state[ORIGIN + base + i])
             state[ORIGIN + base + i] = origin
             dz = (splat.z - origin) + splat.z_rest
             state[DEPTH + base + i] = fma(weight, dz, state[DEPTH + base + i])
         if median is not None:
-            halved = ONE if before > HALF and weight > ZERO and behind <= HALF else ZERO
-            state[MEDIAN + base + i] = fma(halved, splat.z, state[MEDIAN + base + i])
-            state[HALVED + base + i] = fma(halved, rank + ONE, state[HALVED + base + i])
+            crosses_half = ONE if before > HALF and weight > ZERO and behind <= HALF else ZERO
+            state[MEDIAN + base + i] = fma(crosses_half, splat.z, state[MEDIAN + base + i])
+            state[MEDIAN_RANK + base + i] = fma(
+                crosses_half, rank + ONE, state[MEDIAN_RANK + base + i]
+            )
 
 
 @kernel
@@ -173,7 +173,7 @@ def rasterize(start, stop, lists, frame, images, saved, blended, median):
         lists: `Lists`, whose entries are sorted by depth in place.
         frame: sizes and settings.
         images, saved: `Images` and `Saved`; every element is written.
-        blended, median: `BlendedDepth` and `MedianDepth` to write; None costs nothing.
+        blended, median: `BlendedDepth` and `MedianDepth` to write, or None.
     """
     settings = frame.raster
     splats, first_entry, entries = lists.splats, lists.first_entry, lists.entries
@@ -184,12 +184,12 @@ def rasterize(start, stop, lists, frame, images, saved, blended, median):
     keys = np.empty((2, longest), np.uint32)
     scratch = np.empty((2, longest, 2), entries.dtype)
     digits = np.empty((DIGITS, RADIX), np.int64)
-    state = aligned(STATE)
+    state = allocate_aligned(STATE)
     for tile in range(start, stop):
         window = tile_window(tile, frame)
         rows = window.rows
         position, end = first_entry[tile], first_entry[tile + 1]
-        if not lists.wanted[tile]:
+        if not lists.active[tile]:
             end = position
         sort_by_depth(lists, position, end, keys, scratch, digits)
         state[:PIXELS] = ONE
@@ -198,22 +198,22 @@ def rasterize(start, stop, lists, frame, images, saved, blended, median):
         in_extent = count = 0
         while position < end and live:
             d = entries[position, 0]
-            prefetch(splats, entries[min(position + AHEAD, end - 1), 0])
-            look = settings.cull_opaque and position & CHECK == CHECK
+            prefetch(splats, entries[min(position + PREFETCH_DISTANCE, end - 1), 0])
+            test_opacity = settings.cull_opaque and position & OPAQUE_MASK == OPAQUE_MASK
             rank = np.float32(position - first_entry[tile])
             position += 1
             splat = load_splat(splats, bases, d, window)
             first, last = 0, rows - 1
             if settings.cull_rows:
-                first, last = shown_rows(splats, d, splat.y, rows)
+                first, last = visible_rows(splats, d, splat.y, rows)
             in_extent += last - first + 1
             for index in range(first, last + 1):
                 if not (live >> index) & 1:
                     continue
                 count += 1
-                row = in_row(splat, index)
+                row = splat_in_row(splat, index)
                 draw_row(state, row, rank, splat, settings, blended, median)
-                if look and is_opaque(state, row.base):
+                if test_opacity and is_opaque(state, row.base):
                     live &= ~(1 << index)
         saved.last_entry[tile] = position
         saved.counters[tile, ROWS_IN_EXTENT] = in_extent
@@ -223,7 +223,7 @@ def rasterize(start, stop, lists, frame, images, saved, blended, median):
             for i in range(window.columns):
                 pixel, y, x = index * LANES + i, top + index, left + i
                 images.alpha[image, y, x] = state[ALPHA + pixel]
-                saved.transmittance[image, y, x] = state[pixel] + state[REST + pixel]
+                saved.transmittance[image, y, x] = state[pixel] + state[STOPPED + pixel]
                 images.image[image, 0, y, x] = state[RED + pixel]
                 images.image[image, 1, y, x] = state[GREEN + pixel]
                 images.image[image, 2, y, x] = state[BLUE + pixel]
@@ -232,24 +232,24 @@ def rasterize(start, stop, lists, frame, images, saved, blended, median):
                     blended.origins[image, y, x] = state[ORIGIN + pixel]
                 if median is not None:
                     median.depth[image, y, x] = state[MEDIAN + pixel]
-                    median.halved[image, y, x] = state[HALVED + pixel] - ONE
+                    median.ranks[image, y, x] = state[MEDIAN_RANK + pixel] - ONE
                 stop_rank = state[STOP + pixel] - ONE
-                saved.stops[image, y, x] = stop_rank if stop_rank >= ZERO else NEVER
+                saved.stop_ranks[image, y, x] = stop_rank if stop_rank >= ZERO else NO_STOP
 
 
 @inline
 def draw_row_backward(state, row, rank, splat, settings, blended, median):
-    """Add a row of a splat to the sums of its gradients; see `draw_row`."""
+    """Add the gradients of a splat in a row to their sums; see `draw_row`."""
     base = row.base
     for i in range(LANES):
         u = fma(splat.a, np.float32(i) - MIDDLE, row.middle)
         opacity = alpha_at(u, row.exponent, settings)
         opacity = opacity if rank < state[G_STOP + base + i] else ZERO
-        passed = ONE - opacity
-        inverse = ONE / passed
+        factor = ONE - opacity
+        inverse = ONE / factor
         after = state[base + i]
         before = after * inverse
-        before = fma(fma(-before, passed, after), inverse, before)  # to the last bit
+        before = fma(fma(-before, factor, after), inverse, before)  # to the last bit
         weight = opacity * before
         state[base + i] = before
         value = splat.red * state[G_RED + base + i]
@@ -260,8 +260,8 @@ def draw_row_backward(state, row, rank, splat, settings, blended, median):
             value = fma(dz, state[G_DEPTH + base + i], value)
         behind = state[G_BEHIND + base + i]
         state[G_BEHIND + base + i] = fma(weight, value, behind)
-        moves = ONE if opacity < settings.alpha_max else ZERO  # a clamped alpha is constant
-        e = moves * fma(weight, value, -opacity * inverse * behind)
+        unclamped = ONE if opacity < settings.alpha_max else ZERO  # a clamped alpha is constant
+        e = unclamped * fma(weight, value, -opacity * inverse * behind)
         eu, ey = e * u, e * row.dy
         state[SUM_E + i] += e
         state[SUM_EU + i] += eu
@@ -274,7 +274,7 @@ def draw_row_backward(state, row, rank, splat, settings, blended, median):
         if blended is not None:
             state[SUM_DEPTH + i] = fma(weight, state[G_DEPTH + base + i], state[SUM_DEPTH + i])
         if median is not None:
-            chosen = rank == state[G_HALVED + base + i]
+            chosen = rank == state[G_MEDIAN_RANK + base + i]
             state[SUM_DEPTH + i] += state[G_MEDIAN + base + i] if chosen else ZERO
 
 
@@ -284,14 +284,14 @@ def rasterize_backward(start, stop, lists, frame, saved, grads, blended, median)
 
     Args:
         start, stop: tiles, numbered image by image.
-        lists, frame, saved: as `rasterize` left them.
-        grads: `Gradients`, of which pairs is written.
-        blended, median: the gradient of the depth, with what `rasterize` wrote beside it, or None.
+        lists, frame, saved: from `rasterize`.
+        grads: `Gradients`; its pairs are written.
+        blended, median: the gradient of the depth, with the other field from `rasterize`, or None.
     """
     settings = frame.raster
     splats, first_entry, entries = lists.splats, lists.first_entry, lists.entries
     bases = splats.view(np.int32)
-    state = aligned(BACKWARD_STATE)
+    state = allocate_aligned(BACKWARD_STATE)
     row_stops = np.empty(TILE, np.float32)
     for tile in range(start, stop):
         window = tile_window(tile, frame)
@@ -305,8 +305,8 @@ def rasterize_backward(start, stop, lists, frame, saved, grads, blended, median)
                 left_over = saved.transmittance[image, y, x]
                 state[pixel] = left_over
                 state[G_BEHIND + pixel] = left_over * grads.transmittance[image, y, x]
-                state[G_STOP + pixel] = saved.stops[image, y, x]
-                row_stops[index] = max(row_stops[index], saved.stops[image, y, x])
+                state[G_STOP + pixel] = saved.stop_ranks[image, y, x]
+                row_stops[index] = max(row_stops[index], saved.stop_ranks[image, y, x])
                 state[G_RED + pixel] = grads.image[image, 0, y, x]
                 state[G_GREEN + pixel] = grads.image[image, 1, y, x]
                 state[G_BLUE + pixel] = grads.image[image, 2, y, x]
@@ -314,39 +314,40 @@ def rasterize_backward(start, stop, lists, frame, saved, grads, blended, median)
                     state[G_DEPTH + pixel] = blended.depth[image, y, x]
                     state[G_ORIGIN + pixel] = blended.origins[image, y, x]
                 if median is not None:
-                    state[G_HALVED + pixel] = median.halved[image, y, x]
+                    state[G_MEDIAN_RANK + pixel] = median.ranks[image, y, x]
                     state[G_MEDIAN + pixel] = median.depth[image, y, x]
         begin = first_entry[tile]
         for position in range(saved.last_entry[tile] - 1, begin - 1, -1):
             d, pair = entries[position, 0], entries[position, 1]
-            prefetch(splats, entries[max(position - AHEAD, begin), 0])
+            prefetch(splats, entries[max(position - PREFETCH_DISTANCE, begin), 0])
             rank = np.float32(position - begin)
             splat = load_splat(splats, bases, d, window)
             first, last = 0, rows - 1
             if settings.cull_rows:
-                first, last = shown_rows(splats, d, splat.y, rows)
+                first, last = visible_rows(splats, d, splat.y, rows)
             for index in range(first, last + 1):
                 if settings.cull_opaque and rank >= row_stops[index]:
                     continue
-                row = in_row(splat, index)
+                row = splat_in_row(splat, index)
                 draw_row_backward(state, row, rank, splat, settings, blended, median)
             for i in range(LANES):
                 state[SUM_EUX + i] = state[SUM_EU + i] * (
                     np.float32(splat.x) + (np.float32(i) - MIDDLE)
                 )
             a, c = splat.a, splat.c
-            eu, ey = take_sum(state, SUM_EU), take_sum(state, SUM_EY)
-            # The exponent is LOG_OPACITY - u^2 - v^2, u = A x + B y, v = C y, of minus the center.
+            eu, ey = sum_and_clear(state, SUM_EU), sum_and_clear(state, SUM_EY)
+            # The exponent is LOG_OPACITY - u^2 - v^2; u = A x + B y, v = C y, x and y of the pixel
+            # relative to the center.
             grad = grads.pairs[pair]
             grad[col.G_X] = 2 * a * eu
             grad[col.G_Y] = np.float32(2 * splat.b) * eu + 2 * c * c * ey
-            grad[col.G_A] = -2 * take_sum(state, SUM_EUX)
-            grad[col.G_B] = -2 * take_sum(state, SUM_EUY)
-            grad[col.G_C] = -2 * c * take_sum(state, SUM_EYY)
-            grad[col.G_LOG_OPACITY] = take_sum(state, SUM_E)
-            grad[col.G_RED] = take_sum(state, SUM_RED)
-            grad[col.G_GREEN] = take_sum(state, SUM_GREEN)
-            grad[col.G_BLUE] = take_sum(state, SUM_BLUE)
-            grad[col.G_DEPTH] = take_sum(state, SUM_DEPTH)
+            grad[col.G_A] = -2 * sum_and_clear(state, SUM_EUX)
+            grad[col.G_B] = -2 * sum_and_clear(state, SUM_EUY)
+            grad[col.G_C] = -2 * c * sum_and_clear(state, SUM_EYY)
+            grad[col.G_LOG_OPACITY] = sum_and_clear(state, SUM_E)
+            grad[col.G_RED] = sum_and_clear(state, SUM_RED)
+            grad[col.G_GREEN] = sum_and_clear(state, SUM_GREEN)
+            grad[col.G_BLUE] = sum_and_clear(state, SUM_BLUE)
+            grad[col.G_DEPTH] = sum_and_clear(state, SUM_DEPTH)
         for position in range(saved.last_entry[tile], first_entry[tile + 1]):
             grads.pairs[entries[position, 1]] = ZERO

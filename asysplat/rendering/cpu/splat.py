@@ -1,4 +1,4 @@
-"""Splats: their columns, the frame they are drawn in, and how one looks from a tile."""
+"""Splats: their columns, the frame they are drawn in, and their position relative to a tile."""
 
 import math
 from typing import NamedTuple
@@ -13,14 +13,14 @@ from asysplat.ops.simd.kernel import inline
 from asysplat.ops.simd.vectors import LANES, fma
 from asysplat.rendering.formulas import MAX_CENTER_OFFSET, PIXEL_MARGIN
 
-# A splat [16] float32, one cache line; BASE_* hold int32, *_REST the rounding error of the float32.
-# alpha = 2^(LOG_OPACITY - (A dx + B dy)^2 - (C dy)^2), the center at (BASE_X + X, BASE_Y + Y);
-# it shows nothing beyond EXTENT_Y above and below its center.
+# A splat is 16 float32, one cache line; BASE_* are int32, *_REST are rounding errors of float32.
+# alpha = 2^(LOG_OPACITY - (A dx + B dy)^2 - (C dy)^2), with its center at (BASE_X + X, BASE_Y + Y).
+# It ends EXTENT_Y above and below its center.
 X, Y, A, B, C, LOG_OPACITY, RED, GREEN, BLUE, DEPTH = range(10)
 BASE_X, BASE_Y, A_REST, B_REST, DEPTH_REST, EXTENT_Y = range(10, 16)
 SPLAT = 16
 
-# Gradients [10] float32 of a splat in one tile; those of A, B, C, LOG_OPACITY less a factor ln 2.
+# Gradients [10] float32 of a splat in one tile; for X to LOG_OPACITY a factor ln 2 is left out.
 G_X, G_Y, G_A, G_B, G_C, G_LOG_OPACITY, G_RED, G_GREEN, G_BLUE, G_DEPTH = range(10)
 GRADIENT = 10
 
@@ -30,7 +30,7 @@ MIDDLE = np.float32((LANES - 1) / 2)
 
 
 class ProjectSettings(NamedTuple):
-    """What the projection is asked for; alpha_min to compensation_min as in `Convention`."""
+    """Settings of the projection; alpha_min to compensation_min as in `Convention`."""
 
     alpha_min: float
     log_alpha_min: float  # to base 2
@@ -40,12 +40,12 @@ class ProjectSettings(NamedTuple):
     antialiased: bool
     cull_opacity: bool
     cull_frustum: bool
-    own_extent: bool
-    exact: bool  # leave out the tiles of a box that the ellipse does not touch
+    cull_extent: bool
+    cull_ellipse: bool
 
 
 class RasterSettings(NamedTuple):
-    """What the rasterization is asked for; the cut-offs as in `Convention`."""
+    """Settings of the rasterization; the cut-offs as in `Convention`."""
 
     alpha_min: np.float32
     alpha_max: np.float32
@@ -55,7 +55,7 @@ class RasterSettings(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Sizes and settings that every kernel reads."""
+    """Sizes and settings for every kernel."""
 
     images: int  # views of all scenes
     views: int  # of a scene
@@ -71,7 +71,7 @@ class Frame(NamedTuple):
 
 
 class Ellipse(NamedTuple):
-    """Where a splat shows, in float64: (a dx + b dy)^2 + (c dy)^2 <= (c extent_y)^2."""
+    """The extent of a splat, in float64: (a dx + b dy)^2 + (c dy)^2 <= (c extent_y)^2."""
 
     x: float
     y: float
@@ -82,7 +82,7 @@ class Ellipse(NamedTuple):
 
 
 class Window(NamedTuple):
-    """The pixels of a tile: its image, its first column and row, how many rows and columns."""
+    """A tile: its image, its first column and row, its numbers of rows and columns."""
 
     image: int
     left: int
@@ -92,10 +92,11 @@ class Window(NamedTuple):
 
 
 class TileSplat(NamedTuple):
-    """A splat as a tile sees it.
+    """A splat relative to a tile.
 
-    x, y lead from its center to the middle of the tile's first row; u is A x + B y there and grows
-    by b a row. These are float64: far from its center a needle's two terms nearly cancel.
+    (x, y) is the middle of the tile's first row, relative to the splat's center; u = A x + B y
+    there grows by b a row. These are float64: far from the center of a needle the two terms nearly
+    cancel.
     """
 
     x: float
@@ -113,17 +114,17 @@ class TileSplat(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A splat in a row of a tile."""
+    """A splat relative to a row of a tile."""
 
     base: int  # where the row begins in a plane of the tile's state
-    dy: np.float32  # how far it is below the splat's center
+    dy: np.float32  # from the splat's center down to the row
     exponent: np.float32  # of 2 in alpha where u is 0
     middle: np.float32  # u in the middle of the row
 
 
 @inline
 def store_ellipse(splats, bases, d, ellipse, log_opacity, z):
-    """Round a splat's ellipse, opacity and depth to float32; all but the color."""
+    """Round a splat's ellipse, opacity and depth to float32."""
     x, y, a, b, c, extent_y = ellipse
     base_x = min(max(np.floor(x), -MAX_CENTER_OFFSET), MAX_CENTER_OFFSET)
     base_y = min(max(np.floor(y), -MAX_CENTER_OFFSET), MAX_CENTER_OFFSET)
@@ -154,7 +155,7 @@ def load_ellipse(splats, bases, d):
 
 @inline
 def tile_window(tile, frame):
-    """Return the pixels of a tile; tiles are numbered image by image, row by row."""
+    """Compute the pixels of a tile; tiles are numbered image by image, row by row."""
     left = tile % frame.tiles % frame.columns * TILE
     top = tile % frame.tiles // frame.columns * TILE
     rows, columns = min(TILE, frame.height - top), min(TILE, frame.width - left)
@@ -163,7 +164,7 @@ def tile_window(tile, frame):
 
 @inline
 def load_splat(splats, bases, d, window):
-    """Read splat d as a tile sees it."""
+    """Read splat d relative to a tile."""
     x = window.left + float(MIDDLE + HALF) - float(bases[d, BASE_X]) - float(splats[d, X])
     y = window.top + float(HALF) - float(bases[d, BASE_Y]) - float(splats[d, Y])
     a = float(splats[d, A]) + float(splats[d, A_REST])
@@ -185,10 +186,10 @@ def load_splat(splats, bases, d, window):
 
 
 @inline
-def shown_rows(splats, d, y, rows):
-    """Return the first and the last of a tile's rows that splat d can show in.
+def visible_rows(splats, d, y, rows):
+    """Compute the first and the last of a tile's rows that splat d can reach.
 
-    y leads from its center to the first row, as in `TileSplat`.
+    y leads from the splat's center to the first row, as in `TileSplat`.
     """
     extent = float(splats[d, EXTENT_Y]) + PIXEL_MARGIN
     first = math.ceil(max(-y - extent, 0.0))
@@ -197,8 +198,8 @@ def shown_rows(splats, d, y, rows):
 
 
 @inline
-def in_row(splat, row):
-    """Return what a splat looks like in a row of the tile."""
+def splat_in_row(splat, row):
+    """Compute a splat relative to a row of the tile."""
     dy = np.float32(splat.y + row)
     v = splat.c * dy
     base = (row & (TILE - 1)) * LANES
@@ -207,7 +208,7 @@ def in_row(splat, row):
 
 @intrinsic
 def prefetch(typing_context, rows, row):
-    """Ask for a row of a 2D array before it is needed."""
+    """Prefetch a row of a 2D array."""
 
     def generate(context, builder, signature, args):
         array_type, row_type = signature.args

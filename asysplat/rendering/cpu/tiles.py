@@ -1,7 +1,7 @@
-"""Which tiles of 16x16 pixels a splat touches, and the list of splats of every tile.
+"""Compute which tiles of 16x16 pixels a splat touches, and the list of splats of every tile.
 
-The tiles of a splat are found once, when it is projected; the lists are built from what was found.
-A list is sorted by depth by the thread that draws its tile.
+The projection computes the tiles of each splat once, and the lists are built from them. The thread
+that draws a tile sorts its list by depth.
 """
 
 import math
@@ -13,7 +13,7 @@ from asysplat.ops.simd.kernel import inline, kernel
 from asysplat.rendering.cpu.splat import DEPTH, DEPTH_REST, TILE
 from asysplat.rendering.formulas import PIXEL_MARGIN
 
-SHORT = 32  # lists up to this are sorted by insertion
+INSERTION_SORT_LENGTH = 32  # lists up to this are sorted by insertion
 RADIX = 256
 DIGITS = 4
 
@@ -21,38 +21,38 @@ DIGITS = 4
 class Lists(NamedTuple):
     """The splats of every tile.
 
-    splats [images * N, 16], see `splat`; first_pair [images * N + 1] the number of each splat's
-    first pair of splat and tile, and of all pairs; first_entry [tiles + 1] where each tile's list
-    begins; entries [pairs, 2] splat and number of each pair, sorted by tile, then by Gaussian,
-    until `rasterize` sorts them by depth; wanted [tiles] whether any pixel of the tile counts.
+    splats [images * N, 16], see `splat`; first_pair [images * N + 1] index of each splat's first
+    pair of splat and tile, and the number of pairs; first_entry [tiles + 1] start of each tile's
+    list; entries [pairs, 2] splat and pair, sorted by tile, then by Gaussian until `rasterize`
+    sorts them by depth; active [tiles] whether any pixel of the tile counts.
     """
 
     splats: np.ndarray
     first_pair: np.ndarray
     first_entry: np.ndarray
     entries: np.ndarray
-    wanted: np.ndarray
+    active: np.ndarray
 
 
 @inline
 def tile_range(center, start, stop, size):
-    """Return the first and the last tile that has a pixel center in center + [start, stop].
+    """Compute the first and the last tile that has a pixel center in center + [start, stop].
 
-    The image has `size` pixels; the last tile is before the first where there is none. NaN stands
-    for the image's edge.
+    The image has `size` pixels; the last tile is before the first if there is none. NaN means the
+    image's edge.
     """
     first, last = center + start - 0.5 - PIXEL_MARGIN, center + stop - 0.5 + PIXEL_MARGIN
-    # Limited as a float: a number beyond int64 has no int.
+    # Clamp the float: a number beyond int64 has no int.
     first = int(np.ceil(min(first, float(size)))) if first > 0 else 0
     last = int(np.floor(max(last, -1.0))) if last < size - 1 else size - 1
     return first // TILE, last // TILE if last >= first else first // TILE - 1
 
 
 @inline
-def find_box(ellipse, extent_x, frame, box):
-    """Set the first and last row, the first and last column of tiles that an ellipse's box touches.
+def compute_box(ellipse, extent_x, frame, box):
+    """Write the first and last row and column of tiles that an ellipse's box touches.
 
-    Return how many tiles these are.
+    Return the number of these tiles.
     """
     x, y, extent_y = ellipse.x, ellipse.y, ellipse.extent_y
     box[0], box[1] = tile_range(y, -extent_y, extent_y, frame.height)
@@ -62,10 +62,10 @@ def find_box(ellipse, extent_x, frame, box):
 
 @inline
 def row_span(ellipse, row, frame):
-    """Return the first and the last tile of a row of tiles that the ellipse touches.
+    """Compute the first and the last tile of a row of tiles that the ellipse touches.
 
-    Between the row's outermost pixel centers its right edge is farthest out at its tip, or, where
-    the tip is not among them, at the center nearest to it; the left edge mirrors it.
+    Between the row's outermost pixel centers, the ellipse's right edge is farthest out at its tip
+    or, if the tip lies outside of them, at the center nearest to it; the left edge mirrors it.
     """
     a, b, c, extent = ellipse.a, ellipse.b, ellipse.c, ellipse.extent_y
     square = (c * extent) ** 2
@@ -83,22 +83,22 @@ def row_span(ellipse, row, frame):
 
 @inline
 def list_tiles(ellipse, box, frame, histogram, tiles, start):
-    """Write the tiles of a splat from tiles[start] on, row by row, and count them in the histogram.
+    """Write the tiles of a splat from tiles[start] on, row by row, and add them to the histogram.
 
     Args:
         ellipse: the splat's.
-        box: see `find_box`.
-        frame: says whether to leave out the tiles of the box that the ellipse does not touch.
+        box: see `compute_box`.
+        frame: sizes and settings.
         histogram: [tiles of an image] to add to.
-        tiles: with room for all of the box.
-        start: where to write.
+        tiles: array with space for all tiles of the box.
+        start: index to write at.
 
     Returns:
-        How many tiles these are.
+        The number of tiles.
     """
     first_row, last_row, left, right = box[0], box[1], box[2], box[3]
-    # A box of one row or one column has no corners to miss.
-    exact = frame.project.exact and right > left and last_row > first_row
+    # The ellipse touches every tile of a box of one row or one column.
+    exact = frame.project.cull_ellipse and right > left and last_row > first_row
     count = 0
     for row in range(first_row, last_row + 1):
         first, last = left, right
@@ -115,9 +115,9 @@ def list_tiles(ellipse, box, frame, histogram, tiles, start):
 
 @kernel
 def start_positions(start, stop, histograms, first_entry, positions):
-    """Turn the counts [images, blocks, tiles] of images start to stop into first positions.
+    """Convert the counts [images, blocks, tiles] of images start to stop to first positions.
 
-    first_entry: [images * tiles] where a tile's list begins.
+    first_entry: [images * tiles] start of each tile's list.
     """
     blocks, tiles = histograms.shape[1:]
     for image in range(start, stop):
@@ -129,14 +129,14 @@ def start_positions(start, stop, histograms, first_entry, positions):
 
 
 @kernel
-def place(start, stop, tiles, first_pair, positions, frame, entries):
+def scatter_pairs(start, stop, tiles, first_pair, positions, frame, entries):
     """Write every pair of splat and tile of blocks start to stop into the lists.
 
     Args:
         start, stop: blocks, numbered image by image.
         tiles: [pairs] the tile of each pair, within its image.
         first_pair: [images * N + 1], see `Lists`.
-        positions: [images, blocks, tiles] where a block's next pair of a tile goes.
+        positions: [images, blocks, tiles] index of a block's next entry of a tile.
         frame: the sizes.
         entries: [pairs, 2], see `Lists`; written.
     """
@@ -154,19 +154,19 @@ def place(start, stop, tiles, first_pair, positions, frame, entries):
 
 @inline
 def sort_by_depth(lists, start, stop, keys, scratch, counts):
-    """Sort entries[start:stop] by depth to all of its digits, then by Gaussian; stable.
+    """Sort entries[start:stop] by the exact depth, then by Gaussian; stable.
 
     Args:
-        lists: with the splats, whose depths are positive, so that their bits order as they do.
+        lists: with the splats; depths are positive, so that their bits sort alike.
         start, stop: the list of one tile.
         keys, scratch: [2, m] and [2, m, 2], m >= stop - start.
         counts: [DIGITS, RADIX].
     """
     entries, splats = lists.entries, lists.splats
     length = stop - start
-    if length > SHORT:
+    if length > INSERTION_SORT_LENGTH:
         _radix_sort(lists, start, length, keys, scratch, counts)
-    # Ties of float32 are short runs, broken by what it left of the depths; short lists are one run.
+    # The rounding errors of the depths break ties of float32, which are short runs.
     for i in range(start + 1, stop):
         d, pair = entries[i, 0], entries[i, 1]
         depth, rest = splats[d, DEPTH], splats[d, DEPTH_REST]
@@ -184,7 +184,7 @@ def sort_by_depth(lists, start, stop, keys, scratch, counts):
 
 @inline
 def _radix_sort(lists, start, length, keys, scratch, counts):
-    """Sort by the 32 bits of float32's depth, 8 at a time."""
+    """Sort by the 32 bits of the float32 depth, 8 at a time."""
     entries, bits = lists.entries, lists.splats.view(np.uint32)
     counts[:] = 0
     for i in range(length):
@@ -193,24 +193,24 @@ def _radix_sort(lists, start, length, keys, scratch, counts):
         scratch[0, i, 0], scratch[0, i, 1] = entries[start + i, 0], entries[start + i, 1]
         for digit in range(DIGITS):
             counts[digit, (key >> np.uint32(8 * digit)) & np.uint32(RADIX - 1)] += 1
-    now = 0
+    source = 0
     for digit in range(DIGITS):
         shift = np.uint32(8 * digit)
-        if counts[digit, (keys[now, 0] >> shift) & np.uint32(RADIX - 1)] == length:
-            continue  # all have the same digit
+        if counts[digit, (keys[source, 0] >> shift) & np.uint32(RADIX - 1)] == length:
+            continue  # all keys have the same digit
         position = 0
         for value in range(RADIX):
             count = counts[digit, value]
             counts[digit, value] = position
             position += count
         for i in range(length):
-            key = keys[now, i]
+            key = keys[source, i]
             value = (key >> shift) & np.uint32(RADIX - 1)
             position = counts[digit, value]
             counts[digit, value] = position + 1
-            keys[1 - now, position] = key
-            scratch[1 - now, position, 0] = scratch[now, i, 0]
-            scratch[1 - now, position, 1] = scratch[now, i, 1]
-        now = 1 - now
+            keys[1 - source, position] = key
+            scratch[1 - source, position, 0] = scratch[source, i, 0]
+            scratch[1 - source, position, 1] = scratch[source, i, 1]
+        source = 1 - source
     for i in range(length):
-        entries[start + i, 0], entries[start + i, 1] = scratch[now, i, 0], scratch[now, i, 1]
+        entries[start + i, 0], entries[start + i, 1] = scratch[source, i, 0], scratch[source, i, 1]

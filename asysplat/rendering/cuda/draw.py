@@ -1,4 +1,4 @@
-"""The GPU renderer, one pass after the other, as one operation to torch."""
+"""Run the passes of the GPU renderer as one operation of torch."""
 
 import math
 from collections.abc import Sequence
@@ -14,16 +14,24 @@ from asysplat.rendering.cuda.project_backward import project_backward, sum_pairs
 from asysplat.rendering.cuda.rasterize import Saved, rasterize, rasterize_backward
 from asysplat.rendering.cuda.splat import GRADIENT, SPLAT, TILE, Frame
 from asysplat.rendering.cuda.tiles import Lists, list_tiles
-from asysplat.rendering.formulas import CAMERA_GRADIENT, Inputs, camera_gradients, camera_rows
+from asysplat.rendering.formulas import (
+    CAMERA_GRADIENT,
+    Inputs,
+    active_tiles,
+    apply_passes,
+    camera_gradients,
+    camera_rows,
+    image_gradients,
+)
 from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs
 from asysplat.scene import Cameras, Gaussians
 
 INTERPRETED = triton.knobs.runtime.interpret  # on a CPU, in NumPy: for tests
 BLOCK = 128  # Gaussians of a program
 BACKWARD_BLOCK = 64
-# Splats of a step. In the interpreter an absent splat takes as long as a present one.
+# Splats of a step. In the interpreter an invalid splat takes as long as a valid one.
 FORWARD_STEP, BACKWARD_STEP = (2, 2) if INTERPRETED else (8, 4)
-# A tile's 64 pixels are two a lane of one warp: no sum leaves it.
+# A tile's 64 pixels are two for each lane of one warp: sums stay within it.
 RASTER_OPTIONS = {"num_warps": 1, "enable_fp_fusion": False}
 PROJECT_OPTIONS = {"enable_fp_fusion": False}
 
@@ -33,11 +41,11 @@ def draw(
 ) -> RenderOutputs:
     """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
 
-    What it draws where `masks` is False has no meaning. It uses all of `settings.culling` but rows,
-    which its small tiles are not cut into.
+    The values of pixels where `masks` is False are arbitrary. Uses all of `settings.culling` but
+    rows.
 
     Raises:
-        InputError: tensors elsewhere than on a GPU, unless Triton interprets its kernels
+        InputError: tensors that are not on a GPU, unless Triton interprets its kernels
             (TRITON_INTERPRET=1); more pairs of splat and tile than a list can number.
     """
     if not (gaussians.means.is_cuda or INTERPRETED):
@@ -45,17 +53,11 @@ def draw(
             f"render's backend is 'cuda' and its Gaussians are on {gaussians.means.device}: choose "
             "'auto', or move them with .to('cuda')."
         )
-    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    poses = (cameras.cam_to_world, cameras.intrinsics)
-    size = (cameras.height, cameras.width)
-    stats: dict[str, int] = {}
-    masks = masks if settings.culling.masks else None
-    *images, origins = _Draw.apply(settings, size, masks, stats, *fields, *poses)
-    return RenderOutputs(*images, stats, origins)
+    return apply_passes(_Passes, gaussians, cameras, settings, masks)
 
 
-class _Draw(torch.autograd.Function):
-    """The passes, forward and backward; `stats` is filled on the way."""
+class _Passes(torch.autograd.Function):
+    """The forward and backward passes; the forward pass fills `stats`."""
 
     @staticmethod
     def forward(ctx, settings, size, masks, stats, *tensors):
@@ -63,9 +65,9 @@ class _Draw(torch.autograd.Function):
         inputs = _inputs(tensors, size, settings)
         with torch.cuda.device_of(inputs.means):
             splats, depths, counters = _project(frame, inputs, settings)
-            lists, boxes = _list_tiles(frame, splats, depths, masks, settings.culling.ellipse)
+            lists, box_tiles = _list_tiles(frame, splats, depths, masks, settings.culling.ellipse)
             images, saved = _rasterize(frame, lists, settings)
-        _count(stats, lists, saved, counters, boxes, settings.culling.ellipse)
+        _count(stats, lists, saved, counters, box_tiles, settings.culling.ellipse)
         ctx.save_for_backward(*tensors, *lists, *saved)
         ctx.settings, ctx.size, ctx.frame = settings, size, frame
         ctx.set_materialize_grads(False)
@@ -79,12 +81,9 @@ class _Draw(torch.autograd.Function):
         tensors, rest = ctx.saved_tensors[:7], ctx.saved_tensors[7:]
         lists, saved = Lists(*rest[: len(Lists._fields)]), Saved(*rest[len(Lists._fields) :])
         frame, settings = ctx.frame, ctx.settings
-        if grad_image is None:
-            grad_image = saved.transmittance.new_zeros(frame.images, 3, frame.height, frame.width)
-        if grad_transmittance is None:
-            grad_transmittance = torch.zeros_like(saved.transmittance)
-        if grad_alpha is not None:
-            grad_transmittance = grad_transmittance - grad_alpha
+        grad_image, grad_transmittance = image_gradients(
+            grad_image, grad_alpha, grad_transmittance, saved.transmittance
+        )
         if grad_depth is None and settings.depth is not None:
             grad_depth = torch.zeros_like(saved.transmittance)
         with torch.cuda.device_of(lists.splats):
@@ -95,8 +94,8 @@ class _Draw(torch.autograd.Function):
                 pairs=lists.pairs,
                 first_entry=lists.first_entry,
                 **saved._asdict(),
-                grad_image=grad_image.contiguous(),
-                grad_transmittance=grad_transmittance.contiguous(),
+                grad_image=grad_image,
+                grad_transmittance=grad_transmittance,
                 grad_depth=None if grad_depth is None else grad_depth.contiguous(),
                 grads=pair_grads,
                 **frame.grid,
@@ -121,7 +120,7 @@ class _Draw(torch.autograd.Function):
 
 
 def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
-    """Gather the sizes."""
+    """Collect the sizes for the kernels."""
     sh, intrinsics = tensors[4], tensors[-1]
     (scenes, num, sh_count), views = sh.shape[:3], intrinsics.shape[1]
     height, width = size
@@ -139,14 +138,14 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
 
 
 def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Inputs:
-    """Lay out the fields of Gaussians, poses and intrinsics for the kernels."""
+    """Arrange the fields of Gaussians, poses and intrinsics for the kernels."""
     *fields, cam_to_world, intrinsics = tensors
     cameras = camera_rows(cam_to_world, intrinsics, size, settings.convention)
     return Inputs(*(t.detach().contiguous().flatten(0, 1) for t in fields), cameras=cameras)
 
 
 def _kinds(settings: RenderSettings) -> dict[str, bool]:
-    """Say which depth is drawn."""
+    """Return the constants of the kernels that select the kind of depth."""
     depth = settings.depth
     return {"DEPTH": depth not in (None, "median"), "MEDIAN": depth == "median"}
 
@@ -154,7 +153,7 @@ def _kinds(settings: RenderSettings) -> dict[str, bool]:
 def _project(
     frame: Frame, inputs: Inputs, settings: RenderSettings
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Find splats, depths and counters; see `project`."""
+    """Compute splats, depths and counters; see `project`."""
     total, blocks = frame.images * frame.num, -(-frame.num // BLOCK)
     device, culling, convention = inputs.means.device, settings.culling, settings.convention
     splats = torch.empty(total, SPLAT.value, dtype=torch.float32, device=device)
@@ -178,7 +177,7 @@ def _project(
             ANTIALIASED=settings.antialiased,
             CULL_OPACITY=culling.opacity,
             CULL_FRUSTUM=culling.frustum,
-            OWN_EXTENT=culling.extent,
+            CULL_EXTENT=culling.extent,
             COUNT=frame.sh_count,
             BLOCK=BLOCK,
             **PROJECT_OPTIONS,
@@ -187,26 +186,32 @@ def _project(
 
 
 def _list_tiles(
-    frame: Frame, splats: Tensor, depths: Tensor, masks: Tensor | None, exact: bool
+    frame: Frame, splats: Tensor, depths: Tensor, masks: Tensor | None, cull_ellipse: bool
 ) -> tuple[Lists, Tensor]:
     """Sort the pairs by tile and depth; also count the tiles that the splats' boxes would touch.
 
-    Depths [images * N] are 0 where there is no splat. `exact` leaves out the tiles of a box that
-    the ellipse does not touch.
+    Depths [images * N] are 0 where there is no splat. With `cull_ellipse`, tiles of a box that the
+    ellipse does not touch are left out.
     """
     tiles, device = frame.images * frame.tiles, splats.device
     visible = torch.nonzero(depths)[:, 0]
-    # By depth across all images: the order of tiles, which comes second, parts these again.
+    # By depth across all images; the sort by tile separates the images.
     order = visible[torch.argsort(depths[visible], stable=True)]
     programs = (-(-len(order) // BLOCK),)
     counts = torch.zeros(len(depths), dtype=torch.int32, device=device)
-    boxes = torch.zeros(programs, dtype=torch.int32, device=device)
+    box_tiles = torch.zeros(programs, dtype=torch.int32, device=device)
     first_pair = torch.empty_like(counts)
     common = {"splats": splats, "order": order, "counts": counts, "num_visible": len(order)}
-    common |= {"num": frame.num, **frame.grid, "EXACT": exact, "BLOCK": BLOCK, **PROJECT_OPTIONS}
+    common |= {
+        "num": frame.num,
+        **frame.grid,
+        "CULL_ELLIPSE": cull_ellipse,
+        "BLOCK": BLOCK,
+        **PROJECT_OPTIONS,
+    }
     if len(order):
         unused = dict.fromkeys(("ends", "tile_of", "owners", "first_pair"))
-        list_tiles[programs](boxes=boxes, **unused, **common, PLACE=False)
+        list_tiles[programs](box_tiles=box_tiles, **unused, **common, WRITE=False)
     ends = counts[order].cumsum(0)
     pairs = int(ends[-1]) if len(order) else 0
     check_pairs(pairs)
@@ -216,13 +221,9 @@ def _list_tiles(
     owners = torch.empty(pairs, dtype=torch.int32, device=device)
     if pairs:
         places = {"ends": ends, "tile_of": tile_of, "owners": owners, "first_pair": first_pair}
-        list_tiles[programs](boxes=None, **places, **common, PLACE=True)
+        list_tiles[programs](box_tiles=None, **places, **common, WRITE=True)
     tile_of, numbers = torch.sort(tile_of, stable=True)
     starts = torch.arange(tiles + 1, dtype=key, device=device)
-    wanted = None
-    if masks is not None:
-        counting = masks.flatten(0, 1).to(torch.float32)
-        wanted = torch.nn.functional.max_pool2d(counting, TILE.value, ceil_mode=True).flatten() > 0
     lists = Lists(
         splats=splats,
         counts=counts,
@@ -230,9 +231,9 @@ def _list_tiles(
         first_entry=torch.searchsorted(tile_of, starts),
         entries=owners[numbers],
         pairs=numbers,
-        wanted=wanted,
+        active=None if masks is None else active_tiles(masks, TILE.value),
     )
-    return lists, boxes.sum()
+    return lists, box_tiles.sum()
 
 
 def _rasterize(
@@ -245,16 +246,16 @@ def _rasterize(
     depth = splats.new_empty(shape) if settings.depth else None
     saved = Saved(
         transmittance=splats.new_empty(shape),
-        stops=splats.new_empty(shape, dtype=torch.int32),
+        stop_ranks=splats.new_empty(shape, dtype=torch.int32),
         last_entry=torch.empty_like(lists.first_entry[:-1]),
         origins=splats.new_empty(shape) if kinds["DEPTH"] else None,
-        halved=splats.new_empty(shape, dtype=torch.int32) if kinds["MEDIAN"] else None,
+        median_ranks=splats.new_empty(shape, dtype=torch.int32) if kinds["MEDIAN"] else None,
     )
     rasterize[(frame.images * frame.tiles,)](
         splats=splats,
         entries=lists.entries,
         first_entry=lists.first_entry,
-        wanted=lists.wanted,
+        active=lists.active,
         image=image,
         alpha=alpha,
         depth=depth,
@@ -263,7 +264,7 @@ def _rasterize(
         alpha_min=convention.alpha_min,
         alpha_max=convention.alpha_max,
         transmittance_min=convention.transmittance_min,
-        MASKED=lists.wanted is not None,
+        MASKED=lists.active is not None,
         **kinds,
         CULL_OPAQUE=settings.culling.opaque,
         STEP=FORWARD_STEP,
@@ -273,20 +274,26 @@ def _rasterize(
 
 
 def _count(
-    stats: dict[str, int], lists: Lists, saved: Saved, counters: Tensor, boxes: Tensor, exact: bool
+    stats: dict[str, int],
+    lists: Lists,
+    saved: Saved,
+    counters: Tensor,
+    box_tiles: Tensor,
+    cull_ellipse: bool,
 ) -> None:
-    """Fill the statistics, waiting for the GPU once."""
+    """Fill the statistics; the program waits for the GPU once."""
     lengths = lists.first_entry.diff()
-    masked = lengths.new_zeros(()) if lists.wanted is None else (lengths * ~lists.wanted).sum()
+    masked = lengths.new_zeros(()) if lists.active is None else (lengths * ~lists.active).sum()
     drawn = (saved.last_entry - lists.first_entry[:-1]).sum()
-    counted = (*counters.sum(0), boxes, masked, drawn, lists.counts.count_nonzero())
-    faint, outside, in_boxes, masked, drawn, stats["visible"] = torch.stack(counted).tolist()
+    counted = (*counters.sum(0), box_tiles, masked, drawn, lists.counts.count_nonzero())
+    by_opacity, by_frustum, box_tiles, masked, drawn, visible = torch.stack(counted).tolist()
     pairs = len(lists.entries)
-    stats["culled_by_opacity"], stats["culled_by_frustum"] = faint, outside
+    stats["visible"] = visible
+    stats["culled_by_opacity"], stats["culled_by_frustum"] = by_opacity, by_frustum
     stats["pairs"] = pairs
-    stats["pairs_off_ellipse"] = in_boxes - pairs if exact else 0
-    stats["pairs_masked"] = masked
-    stats["pairs_behind_opaque"] = pairs - masked - drawn
+    stats["pairs_culled_by_ellipse"] = box_tiles - pairs if cull_ellipse else 0
+    stats["pairs_culled_by_masks"] = masked
+    stats["pairs_culled_by_opaque"] = pairs - masked - drawn
     stats["tile_size"] = TILE.value
 
 
@@ -298,7 +305,7 @@ def _project_backward(
     settings: RenderSettings,
     needs: dict[str, bool],
 ) -> Inputs:
-    """Return the gradients of the inputs from those of the pairs; None where not needed."""
+    """Compute the gradients of the inputs from those of the pairs; None where not required."""
     has_depth = settings.depth is not None
     blocks, device = -(-frame.num // BACKWARD_BLOCK), pair_grads.device
     shape = (frame.images, blocks, CAMERA_GRADIENT)

@@ -1,11 +1,9 @@
 """Arithmetic of the renderer's kernels: cameras, ellipses, spherical harmonics (SH).
 
-All that the two projection passes share is here: SH in float32, the rest in float64.
+Both projection passes share it: SH in float32, the rest in float64.
 """
 
-import inspect
 from collections.abc import Callable
-from types import FunctionType
 
 import triton.language as tl
 
@@ -28,60 +26,10 @@ Y3_0, Y3_1 = tl.constexpr(sh.Y3_0), tl.constexpr(sh.Y3_1)
 Y3_2, Y3_3 = tl.constexpr(sh.Y3_2), tl.constexpr(sh.Y3_3)
 
 
-def shared(formula: Callable) -> Callable:
-    """Compile; Triton wants to see its language among the names that a function knows."""
-    bare = inspect.unwrap(formula)
-    return kernel(FunctionType(bare.__code__, {"__name__": __name__, "tl": tl}))
-
-
-dot = shared(formulas.dot)
-cross = shared(formulas.cross)
-scaled = shared(formulas.scaled)
-plus = shared(formulas.plus)
-times = shared(formulas.times)
-rotation_columns = shared(formulas.rotation_columns)
-rotation_gradient = shared(formulas.rotation_gradient)
-
-
 @kernel
-def load1(array, index, there):
-    """Read float64 from an array, 1 where not `there`."""
-    return tl.load(array + index, mask=there, other=1.0).to(tl.float64)
-
-
-@kernel
-def load3(array, row, there):
-    """Read rows of three."""
-    return (
-        load1(array, 3 * row, there),
-        load1(array, 3 * row + 1, there),
-        load1(array, 3 * row + 2, there),
-    )
-
-
-@kernel
-def load_row3(array, start):
-    """Read three numbers that are the same for all."""
-    return (tl.load(array + start), tl.load(array + start + 1), tl.load(array + start + 2))
-
-
-@kernel
-def store3(array, row, values, there):
-    """Write rows of three."""
-    tl.store(array + 3 * row, values[0], mask=there)
-    tl.store(array + 3 * row + 1, values[1], mask=there)
-    tl.store(array + 3 * row + 2, values[2], mask=there)
-
-
-@kernel
-def unit_quaternion(quats, row, there):
-    """Read quaternions; return the unit quaternions and 1 / their lengths."""
-    w = load1(quats, 4 * row, there)
-    x = load1(quats, 4 * row + 1, there)
-    y = load1(quats, 4 * row + 2, there)
-    z = load1(quats, 4 * row + 3, there)
-    inverse = 1 / tl.sqrt(w * w + x * x + y * y + z * z)
-    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+def sqrt(value):
+    """Compute a square root; the shared formulas call it."""
+    return tl.sqrt(value)
 
 
 @kernel
@@ -90,58 +38,80 @@ def clamp(value, low, high):
     return tl.where(value < low, low, tl.where(value > high, high, value))
 
 
-@kernel
-def in_camera(camera, mean):
-    """Project means and linearize the projection around them.
-
-    Return the offset from the camera's center, in world axes; x / z, y / z, z, 1 / z in the
-    camera's frame; the tangents that the Jacobian is taken at, and its rows in world axes.
-    """
-    right, down = load_row3(camera, RIGHT), load_row3(camera, DOWN)
-    forward, center = load_row3(camera, FORWARD), load_row3(camera, CENTER)
-    # Relative to the camera first: exact for scenes far from the origin.
-    offset = plus(mean, -1.0, center)
-    z = dot(forward, offset)
-    inverse_z = 1 / z
-    tangent_x, tangent_y = dot(right, offset) * inverse_z, dot(down, offset) * inverse_z
-    inside_x = clamp(tangent_x, tl.load(camera + LOW_X), tl.load(camera + HIGH_X))
-    inside_y = clamp(tangent_y, tl.load(camera + LOW_Y), tl.load(camera + HIGH_Y))
-    row_x = scaled(tl.load(camera + FX) * inverse_z, plus(right, -inside_x, forward))
-    row_y = scaled(tl.load(camera + FY) * inverse_z, plus(down, -inside_y, forward))
-    return offset, tangent_x, tangent_y, z, inverse_z, inside_x, inside_y, row_x, row_y
+def compile_formula(formula: Callable) -> Callable:
+    """Compile a shared formula with the functions of this module."""
+    return kernel(formulas.bind(formula, globals()))
 
 
-@kernel
-def ellipse_rows(quat, scale, row_x, row_y):
-    """Return the rows of M in the covariance M M^T, in pixels, after and before they are scaled."""
-    axis0, axis1, axis2 = rotation_columns(quat[0], quat[1], quat[2], quat[3])
-    turned_x = (dot(row_x, axis0), dot(row_x, axis1), dot(row_x, axis2))
-    turned_y = (dot(row_y, axis0), dot(row_y, axis1), dot(row_y, axis2))
-    return times(turned_x, scale), times(turned_y, scale), turned_x, turned_y
+dot = compile_formula(formulas.dot)
+cross = compile_formula(formulas.cross)
+scaled = compile_formula(formulas.scaled)
+plus = compile_formula(formulas.plus)
+times = compile_formula(formulas.times)
+rotation_columns = compile_formula(formulas.rotation_columns)
+rotation_gradient = compile_formula(formulas.rotation_gradient)
+project_mean = compile_formula(formulas.project_mean)
+ellipse_rows = compile_formula(formulas.ellipse_rows)
+ellipse_rows_gradient = compile_formula(formulas.ellipse_rows_gradient)
+covariance = compile_formula(formulas.covariance)
+covariance_gradient = compile_formula(formulas.covariance_gradient)
+whitening = compile_formula(formulas.whitening)
 
 
 @kernel
-def covariance(mx, my, eps):
-    """Return xx, xy, yy of M M^T; M's minors; the determinants of M M^T and of M M^T + eps I.
-
-    The determinant is the sum of the squared minors (Cauchy-Binet): no needle makes it cancel.
-    """
-    xx, xy, yy = dot(mx, mx), dot(mx, my), dot(my, my)
-    minors = cross(mx, my)
-    det0 = dot(minors, minors)
-    return xx, xy, yy, minors, det0, det0 + eps * (xx + yy) + eps * eps
+def load1(array, index, valid):
+    """Read float64 from an array, 1 where not `valid`."""
+    return tl.load(array + index, mask=valid, other=1.0).to(tl.float64)
 
 
 @kernel
-def whitening(xy, var_y, det):
-    """Return a, b, c of the exponent ((a dx + b dy)^2 + (c dy)^2) / 2."""
-    a = tl.sqrt(var_y / det)
-    return a, -a * xy / var_y, 1 / tl.sqrt(var_y)
+def load3(array, row, valid):
+    """Read rows of three."""
+    return (
+        load1(array, 3 * row, valid),
+        load1(array, 3 * row + 1, valid),
+        load1(array, 3 * row + 2, valid),
+    )
+
+
+@kernel
+def load_row3(array, start):
+    """Read three numbers, the same for all lanes."""
+    return (tl.load(array + start), tl.load(array + start + 1), tl.load(array + start + 2))
+
+
+@kernel
+def store3(array, row, values, valid):
+    """Write rows of three."""
+    tl.store(array + 3 * row, values[0], mask=valid)
+    tl.store(array + 3 * row + 1, values[1], mask=valid)
+    tl.store(array + 3 * row + 2, values[2], mask=valid)
+
+
+@kernel
+def unit_quaternion(quats, row, valid):
+    """Read quaternions; return the unit quaternions and 1 / their lengths."""
+    w = load1(quats, 4 * row, valid)
+    x = load1(quats, 4 * row + 1, valid)
+    y = load1(quats, 4 * row + 2, valid)
+    z = load1(quats, 4 * row + 3, valid)
+    inverse = 1 / tl.sqrt(w * w + x * x + y * y + z * z)
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+
+
+@kernel
+def load_camera(camera):
+    """Read axes (right, down, forward), center, focal lengths and limits of the tangents."""
+    axes = (load_row3(camera, RIGHT), load_row3(camera, DOWN), load_row3(camera, FORWARD))
+    focal = (tl.load(camera + FX), tl.load(camera + FY))
+    limits_x = (tl.load(camera + LOW_X), tl.load(camera + HIGH_X))
+    limits_y = (tl.load(camera + LOW_Y), tl.load(camera + HIGH_Y))
+    return axes, load_row3(camera, CENTER), focal, (limits_x, limits_y)
 
 
 @kernel
 def direction(offset):
-    """Return the square of an offset, its length, and its direction, in float32."""
+    """Compute the square of an offset, its length, and its direction in float32."""
     square = dot(offset, offset)
     length = tl.sqrt(tl.maximum(square, MIN_SQUARED_DISTANCE))
     x, y, z = offset[0] / length, offset[1] / length, offset[2] / length
@@ -150,10 +120,7 @@ def direction(offset):
 
 @kernel
 def sh_basis(x, y, z, COUNT: tl.constexpr):
-    """Return the first COUNT (1, 4, 9 or 16) SH functions at unit directions.
-
-    Signs are those of INRIA's code.
-    """
+    """Evaluate the first COUNT (1, 4, 9 or 16) SH functions at unit directions; see `sh`."""
     out = (tl.full(x.shape, SH_C0, tl.float32),)
     if COUNT > 1:
         out = out + (y * -Y1, z * Y1, x * -Y1)
@@ -171,7 +138,7 @@ def sh_basis(x, y, z, COUNT: tl.constexpr):
 
 @kernel
 def sh_basis_gradient(x, y, z, g, COUNT: tl.constexpr):
-    """Return the gradient of x, y, z, as if they were free, from those, g, of `sh_basis`."""
+    """Compute the gradient of x, y and z, as independent variables, from the gradients g."""
     gx, gy, gz = g[3] * -Y1, g[1] * -Y1, g[2] * Y1
     if COUNT > 4:
         gx += (y * g[4] - z * g[7] + x * g[8]) * Y2 - x * g[6] * (2 * Y2_0)
@@ -191,10 +158,10 @@ def sh_basis_gradient(x, y, z, g, COUNT: tl.constexpr):
 
 
 @kernel
-def sum_sh(sh, g, channel: tl.constexpr, functions, there, COUNT: tl.constexpr):
+def sum_sh(sh, g, channel: tl.constexpr, basis, valid, COUNT: tl.constexpr):
     """Compute 0.5 + sum_k sh_k Y_k of one channel of Gaussians g."""
     color = 0.5
     for k in tl.static_range(COUNT):
-        coefficient = tl.load(sh + 3 * (COUNT * g + k) + channel, mask=there, other=0.0)
-        color += functions[k] * coefficient.to(tl.float32)
+        coefficient = tl.load(sh + 3 * (COUNT * g + k) + channel, mask=valid, other=0.0)
+        color += basis[k] * coefficient.to(tl.float32)
     return color

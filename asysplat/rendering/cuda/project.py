@@ -1,4 +1,4 @@
-"""Gaussians to splats, in float64 whatever the inputs: a splat is rounded once, at the end."""
+"""Project Gaussians to splats in float64, whatever the inputs' type; a splat is rounded once."""
 
 import triton.language as tl
 
@@ -8,13 +8,12 @@ from asysplat.rendering.cuda.math import (
     CAMERA,
     CX,
     CY,
-    FX,
-    FY,
     covariance,
     direction,
     ellipse_rows,
-    in_camera,
     load3,
+    load_camera,
+    project_mean,
     sh_basis,
     sum_sh,
     unit_quaternion,
@@ -26,7 +25,9 @@ MAX_MAGNITUDE = tl.constexpr(interface.MAX_MAGNITUDE)
 WHITEN_TO_LOG2 = tl.constexpr(formulas.WHITEN_TO_LOG2)
 EXPONENT_MARGIN = tl.constexpr(formulas.EXPONENT_MARGIN)
 PIXEL_MARGIN = tl.constexpr(formulas.PIXEL_MARGIN)
-COUNTERS = 2  # Gaussians that were culled by their opacity; those that were outside the image
+COUNTERS = (
+    2  # Gaussians that were culled by their opacity; those that were culled_by_frustum the image
+)
 
 
 @kernel
@@ -52,11 +53,11 @@ def project(
     ANTIALIASED: tl.constexpr,
     CULL_OPACITY: tl.constexpr,
     CULL_FRUSTUM: tl.constexpr,
-    OWN_EXTENT: tl.constexpr,
+    CULL_EXTENT: tl.constexpr,
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Find the splats of BLOCK Gaussians in one image.
+    """Compute the splats of BLOCK Gaussians in one image.
 
     Args:
         means, quats, scales, opacities, sh, cameras: see `Inputs`; COUNT coefficients of SH.
@@ -71,60 +72,61 @@ def project(
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     g = image // views * num + n
     opacity = tl.load(opacities + g, mask=n < num, other=0.0).to(tl.float64)
-    there = n < num
+    valid = n < num
     if CULL_OPACITY:
-        # Written so that NaN stays, and is culled below.
-        there = there & ((opacity >= alpha_min) | (opacity != opacity))
-    faint = tl.sum(((n < num) & (there == 0)).to(tl.int32), 0)
-    mean, scale = load3(means, g, there), load3(scales, g, there)
-    qw, qx, qy, qz, _ = unit_quaternion(quats, g, there)
+        # NaN stays and is culled below.
+        valid = valid & ((opacity >= alpha_min) | (opacity != opacity))
+    culled_by_opacity = tl.sum(((n < num) & (valid == 0)).to(tl.int32), 0)
+    mean, scale = load3(means, g, valid), load3(scales, g, valid)
+    quat = unit_quaternion(quats, g, valid)
     camera = cameras + CAMERA * image
-    offset, tangent_x, tangent_y, z, _, _, _, row_x, row_y = in_camera(camera, mean)
-    mx, my, _, _ = ellipse_rows((qw, qx, qy, qz), scale, row_x, row_y)
+    axes, center, focal, limits = load_camera(camera)
+    offset, z, _, tangents, _, row_x, row_y = project_mean(mean, axes, center, focal, limits)
+    mx, my, _, _ = ellipse_rows(quat, scale, row_x, row_y)
     xx, xy, yy, _, det0, det = covariance(mx, my, eps2d)
     a, b, c = whitening(xy, yy + eps2d, det)
-    shown = (opacity <= 1) & there
+    visible = (opacity <= 1) & valid
     if ANTIALIASED:
         opacity *= tl.sqrt(tl.maximum(det0 / det, compensation_min))
-    x = tangent_x * tl.load(camera + FX) + tl.load(camera + CX)
-    y = tangent_y * tl.load(camera + FY) + tl.load(camera + CY)
+    x = tangents[0] * focal[0] + tl.load(camera + CX)
+    y = tangents[1] * focal[1] + tl.load(camera + CY)
     log_opacity = tl.log2(opacity)
     room = EXPONENT_MARGIN - log_alpha_min
-    if OWN_EXTENT:
+    if CULL_EXTENT:
         room += log_opacity
     deviations = tl.sqrt(tl.maximum(room, 0.0)) / WHITEN_TO_LOG2
     extent_x, extent_y = deviations * tl.sqrt(xx + eps2d), deviations * tl.sqrt(yy + eps2d)
-    # Every comparison with NaN is false.
-    shown = shown & (z > near) & (z < MAX_MAGNITUDE) & (opacity >= alpha_min) & (a > 0)
-    shown = shown & (tl.abs(x + y + b + c) < float("inf"))
+    # Comparisons with NaN are false.
+    visible = visible & (z > near) & (z < MAX_MAGNITUDE) & (opacity >= alpha_min) & (a > 0)
+    visible = visible & (tl.abs(x + y + b + c) < float("inf"))
     edge = 0.5 - PIXEL_MARGIN
     inside = (x + extent_x >= edge) & (x - extent_x <= width - edge)
     inside = inside & (y + extent_y >= edge) & (y - extent_y <= height - edge)
-    outside = 0
+    culled_by_frustum = 0
     if CULL_FRUSTUM:
-        outside += tl.sum((shown & (inside == 0)).to(tl.int32), 0)
-        shown = shown & inside
+        culled_by_frustum += tl.sum((visible & (inside == 0)).to(tl.int32), 0)
+        visible = visible & inside
     d = image * num + n
-    if tl.max(shown.to(tl.int32), 0) > 0:
-        color, shown = colors(sh, g, offset, shown, COUNT)
+    if tl.max(visible.to(tl.int32), 0) > 0:
+        color, visible = compute_colors(sh, g, offset, visible, COUNT)
         a, b, c = a * WHITEN_TO_LOG2, b * WHITEN_TO_LOG2, c * WHITEN_TO_LOG2
         ellipse = (x, y, a, b, c, extent_y * (1 + 1e-6))
-        store_splat(splats, d, ellipse, log_opacity, color, z, shown)
-    tl.store(depths + d, tl.where(shown, z, 0.0).to(tl.float32), mask=n < num)
+        store_splat(splats, d, ellipse, log_opacity, color, z, visible)
+    tl.store(depths + d, tl.where(visible, z, 0.0).to(tl.float32), mask=n < num)
     counter = counters + 2 * (image * tl.num_programs(0) + tl.program_id(0))
-    tl.store(counter, faint)
-    tl.store(counter + 1, outside)
+    tl.store(counter, culled_by_opacity)
+    tl.store(counter + 1, culled_by_frustum)
 
 
 @kernel
-def colors(sh, g, offset, shown, COUNT: tl.constexpr):
-    """Return the three channels seen along `offset`, and which of `shown` have a usable SH."""
+def compute_colors(sh, g, offset, visible, COUNT: tl.constexpr):
+    """Compute the colors along `offset`, and which of the `visible` have usable SH."""
     _, _, x, y, z = direction(offset)
-    functions = sh_basis(x, y, z, COUNT)
-    red = tl.maximum(sum_sh(sh, g, 0, functions, shown, COUNT), 0.0)
-    green = tl.maximum(sum_sh(sh, g, 1, functions, shown, COUNT), 0.0)
-    blue = tl.maximum(sum_sh(sh, g, 2, functions, shown, COUNT), 0.0)
+    basis = sh_basis(x, y, z, COUNT)
+    red = tl.maximum(sum_sh(sh, g, 0, basis, visible, COUNT), 0.0)
+    green = tl.maximum(sum_sh(sh, g, 1, basis, visible, COUNT), 0.0)
+    blue = tl.maximum(sum_sh(sh, g, 2, basis, visible, COUNT), 0.0)
     for k in tl.static_range(3 * COUNT):
-        coefficient = tl.load(sh + 3 * COUNT * g + k, mask=shown, other=0.0)
-        shown = shown & (tl.abs(coefficient) < MAX_MAGNITUDE)
-    return (red, green, blue), shown
+        coefficient = tl.load(sh + 3 * COUNT * g + k, mask=visible, other=0.0)
+        visible = visible & (tl.abs(coefficient) < MAX_MAGNITUDE)
+    return (red, green, blue), visible

@@ -1,7 +1,7 @@
-"""Which tiles a splat touches, and the list of splats of every tile.
+"""Compute which tiles a splat touches, and the list of splats of every tile.
 
-One kernel walks through a splat's tiles, as it is stored: once to count them, and once, when there
-is room for all, to write them down.
+One kernel visits the tiles of a stored splat: first to count them, then, with memory allocated for
+all pairs, to write them.
 """
 
 from typing import NamedTuple
@@ -20,10 +20,10 @@ class Lists(NamedTuple):
     """The splats of every tile, by depth; tiles are numbered image by image, row by row.
 
     splats [images * N, 16], see `splat`; counts [images * N] pairs of each splat and a tile;
-    first_pair [images * N] the number of a splat's first pair, where it has any; first_entry
-    [tiles + 1] where each tile's list begins; entries [pairs] the splat of each pair, sorted by
-    tile, then by depth; pairs [pairs] the number of each of these among all pairs; wanted [tiles]
-    whether any pixel of the tile counts, None where all do.
+    first_pair [images * N] index of a splat's first pair, if it has any; first_entry [tiles + 1]
+    start of each tile's list; entries [pairs] the splat of each pair, sorted by tile, then by
+    depth; pairs [pairs] the index of each entry's pair; active [tiles] whether any pixel of the
+    tile counts, None if all do.
     """
 
     splats: Tensor
@@ -32,7 +32,7 @@ class Lists(NamedTuple):
     first_entry: Tensor
     entries: Tensor
     pairs: Tensor
-    wanted: Tensor | None
+    active: Tensor | None
 
 
 @kernel
@@ -40,7 +40,7 @@ def list_tiles(
     splats,
     order,
     counts,
-    boxes,
+    box_tiles,
     ends,
     tile_of,
     owners,
@@ -51,62 +51,62 @@ def list_tiles(
     width,
     columns,
     tiles,
-    PLACE: tl.constexpr,
-    EXACT: tl.constexpr,
+    WRITE: tl.constexpr,
+    CULL_ELLIPSE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Walk through the tiles of BLOCK splats, by depth.
+    """Visit the tiles of BLOCK splats, by depth.
 
     Args:
         splats: [images * N, 16], N is `num`.
         order: [num_visible] the visible splats, by depth.
-        counts: [images * N] tiles of each; written without PLACE, read with it.
-        boxes: [programs] tiles of all their boxes; written without PLACE.
-        ends: [num_visible] the number behind a splat's last pair; this and the rest with PLACE.
-        tile_of, owners: [pairs] tile and splat of each; written.
-        first_pair: [images * N] written for the visible.
+        counts: [images * N] tiles of each splat; written without WRITE, read with it.
+        box_tiles: [programs] tiles of all boxes; written without WRITE.
+        ends: [num_visible] 1 + the index of a splat's last pair; read with WRITE.
+        tile_of, owners: [pairs] tile and splat of each pair; written with WRITE.
+        first_pair: [images * N] written for the visible splats with WRITE.
         columns, tiles: of an image.
     """
     rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    there = rank < num_visible
-    d = tl.load(order + rank, mask=there, other=0)
-    ellipse = load_ellipse(splats, d, there)
+    valid = rank < num_visible
+    d = tl.load(order + rank, mask=valid, other=0)
+    ellipse = load_ellipse(splats, d, valid)
     first_row, last_row = tile_rows(ellipse, height)
-    last_row = tl.where(there, last_row, first_row - 1)
+    last_row = tl.where(valid, last_row, first_row - 1)
     first_tile = d // num * tiles
     count = tl.zeros(rank.shape, tl.int32)
-    if PLACE:
-        first = tl.load(ends + rank, mask=there, other=0)
-        first -= tl.load(counts + d, mask=there, other=0)
-        tl.store(first_pair + d, first.to(tl.int32), mask=there)
+    if WRITE:
+        first = tl.load(ends + rank, mask=valid, other=0)
+        first -= tl.load(counts + d, mask=valid, other=0)
+        tl.store(first_pair + d, first.to(tl.int32), mask=valid)
     for step in range(tl.max(last_row - first_row, 0) + 1):
         row = first_row + step
-        left, right = row_span(ellipse, row, height, width, EXACT)
+        left, right = row_span(ellipse, row, height, width, CULL_ELLIPSE)
         right = tl.where(row <= last_row, right, left - 1)
-        if PLACE:
+        if WRITE:
             for column_step in range(tl.max(right - left, 0) + 1):
                 column = left + column_step
-                here = column <= right
+                in_span = column <= right
                 pair = first + count + column_step
-                tl.store(tile_of + pair, first_tile + row * columns + column, mask=here)
-                tl.store(owners + pair, d.to(tl.int32), mask=here)
+                tl.store(tile_of + pair, first_tile + row * columns + column, mask=in_span)
+                tl.store(owners + pair, d.to(tl.int32), mask=in_span)
         count += right - left + 1
-    if not PLACE:
-        tl.store(counts + d, count, mask=there)
+    if not WRITE:
+        tl.store(counts + d, count, mask=valid)
         left, right = box_columns(ellipse, width)
         box = (last_row - first_row + 1) * (right - left + 1)
-        tl.store(boxes + tl.program_id(0), tl.sum(box, 0))
+        tl.store(box_tiles + tl.program_id(0), tl.sum(box, 0))
 
 
 @kernel
 def tile_range(center, start, stop, size):
-    """Return the first and the last tile that has a pixel center in center + [start, stop].
+    """Compute the first and the last tile that has a pixel center in center + [start, stop].
 
-    The image has `size` pixels; the last tile is before the first where there is none. NaN stands
-    for the image's edge.
+    The image has `size` pixels; the last tile is before the first if there is none. NaN means the
+    image's edge.
     """
     first, last = center + start - 0.5 - PIXEL_MARGIN, center + stop - 0.5 + PIXEL_MARGIN
-    # Limited as a float: a number beyond int32 has no int.
+    # Clamp the float: a number beyond int32 has no int.
     first = tl.where(first > 0, tl.minimum(first, size * 1.0), 0.0)
     last = tl.where(last < size - 1, tl.maximum(last, -1.0), size - 1.0)
     first, last = tl.ceil(first).to(tl.int32), tl.floor(last).to(tl.int32)
@@ -115,14 +115,14 @@ def tile_range(center, start, stop, size):
 
 @kernel
 def tile_rows(ellipse, height):
-    """Return the first and the last row of tiles that the ellipse touches."""
+    """Compute the first and the last row of tiles that the ellipse touches."""
     _, y, _, _, _, extent = ellipse
     return tile_range(y, -extent, extent, height)
 
 
 @kernel
 def box_columns(ellipse, width):
-    """Return the first and the last tile of a row of tiles that the ellipse's box touches."""
+    """Compute the first and the last tile of a row of tiles that the ellipse's box touches."""
     x, _, a, b, c, extent = ellipse
     tilt = b / c
     half_width = c * extent * tl.sqrt(1 + tilt * tilt) / a
@@ -130,14 +130,15 @@ def box_columns(ellipse, width):
 
 
 @kernel
-def row_span(ellipse, row, height, width, EXACT: tl.constexpr):
-    """Return the first and the last tile of a row of tiles that the ellipse touches.
+def row_span(ellipse, row, height, width, CULL_ELLIPSE: tl.constexpr):
+    """Compute the first and the last tile of a row of tiles that the ellipse touches.
 
-    If not EXACT, those that its box touches. The ellipse is (a dx + b dy)^2 + (c dy)^2 <=
-    (c extent)^2. Between the row's outermost pixel centers its right edge is farthest out at its
-    tip, or, where the tip is not among them, at the center nearest to it; the left edge mirrors it.
+    Without CULL_ELLIPSE these are the tiles of its box. The ellipse is (a dx + b dy)^2 + (c dy)^2
+    <= (c extent)^2. Between the row's outermost pixel centers, its right edge is farthest out at
+    its tip or, if the tip lies outside of them, at the center nearest to it; the left edge mirrors
+    it.
     """
-    if not EXACT:
+    if not CULL_ELLIPSE:
         return box_columns(ellipse, width)
     x, y, a, b, c, extent = ellipse
     square = (c * extent) * (c * extent)

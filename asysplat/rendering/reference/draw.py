@@ -25,7 +25,7 @@ def draw(
     values = _values(splats, settings.depth is not None)
     median = settings.depth == "median"
     tiles = rasterize(splats, values, lists, settings.convention, median)
-    out = lists.untile(tiles, *size)
+    out = lists.to_images(tiles, *size)
     return RenderOutputs(
         image=out[:, :3],
         alpha=out[:, 3],

@@ -53,7 +53,9 @@ class _Rasterize(torch.autograd.Function):
         pixels = lists.size**2
         out = packed.new_zeros(len(lists.lengths), packed.shape[1] - 6, pixels)
         for tiles, splats in _groups(lists, len(packed) - 1):
-            block = _Block(_rows(packed, splats), lists.origins(tiles), lists.size, *ctx.options)
+            block = _Block(
+                _gather_rows(packed, splats), lists.origins(tiles), lists.size, *ctx.options
+            )
             out.index_copy_(0, tiles, block.forward())
         return out
 
@@ -64,7 +66,9 @@ class _Rasterize(torch.autograd.Function):
         lists = ctx.lists
         grad = torch.zeros_like(packed)
         for tiles, splats in _groups(lists, len(packed) - 1):
-            block = _Block(_rows(packed, splats), lists.origins(tiles), lists.size, *ctx.options)
+            block = _Block(
+                _gather_rows(packed, splats), lists.origins(tiles), lists.size, *ctx.options
+            )
             rows = block.backward(grad_output.index_select(0, tiles))
             # On a CPU this sums in a fixed order: the same bits every time.
             grad.index_add_(0, splats.flatten(), rows.flatten(0, 1))
@@ -91,11 +95,11 @@ def _groups(lists: Lists, padding: int) -> Iterator[tuple[Tensor, Tensor]]:
         begin += size
 
 
-def _rows(packed: Tensor, index: Tensor) -> Tensor:
+def _gather_rows(packed: Tensor, index: Tensor) -> Tensor:
     return packed.index_select(0, index.flatten()).unflatten(0, index.shape)
 
 
-def _keep_at_least(values: Tensor, gate: Tensor, limit: float) -> None:
+def _zero_below(values: Tensor, gate: Tensor, limit: float) -> None:
     """Set values to 0 where gate < limit; one vectorized pass, several times faster than where."""
     below = torch.nextafter(gate.new_tensor(limit), gate.new_zeros(())).item()
     torch.ops.aten.threshold_backward.grad_input(values, gate, below, grad_input=values)
@@ -121,11 +125,11 @@ class _Block:
         self.v = torch.stack((self.c * self.dy, self.c), -1) @ self.basis[::2]
         exponent = (self.u * self.u).addcmul_(self.v, self.v).mul_(-0.5)
         self.alpha = exponent.exp_().mul_(self.opacity[..., None]).clamp_max_(convention.alpha_max)
-        _keep_at_least(self.alpha, self.alpha, convention.alpha_min)
-        self.passed = 1 - self.alpha
-        self.transmittance = self.passed.cumprod(1)  # behind each splat
+        _zero_below(self.alpha, self.alpha, convention.alpha_min)
+        self.passing = 1 - self.alpha
+        self.transmittance = self.passing.cumprod(1)  # behind each splat
         # It never grows, so dropping below the limit drops everything behind as well.
-        _keep_at_least(self.alpha, self.transmittance, convention.transmittance_min)
+        _zero_below(self.alpha, self.transmittance, convention.transmittance_min)
 
     def weights(self) -> Tensor:
         """Return alpha times the transmittance in front of each splat."""
@@ -133,7 +137,7 @@ class _Block:
         weights[:, 1:] *= self.transmittance[:, :-1]
         return weights
 
-    def halving(self) -> Tensor:
+    def median_weights(self) -> Tensor:
         """Return 1 for the splat that takes the transmittance to half or below, else 0."""
         before = torch.nn.functional.pad(self.transmittance[:, :-1], (0, 0, 1, 0), value=1.0)
         crosses = (before > 0.5) & (self.transmittance <= 0.5) & (self.alpha > 0)
@@ -144,7 +148,7 @@ class _Block:
         if not self.median:
             return self.values.mT @ self.weights()
         blended = self.values[..., :-1].mT @ self.weights()
-        return torch.cat((blended, self.values[..., -1:].mT @ self.halving()), 1)
+        return torch.cat((blended, self.values[..., -1:].mT @ self.median_weights()), 1)
 
     def backward(self, grad_output: Tensor) -> Tensor:
         """Return the gradient of `packed` from that, [t, C, P], of the composited values."""
@@ -152,12 +156,12 @@ class _Block:
         grad_values = weights @ grad_output.mT
         values = self.values
         if self.median:
-            grad_values[..., -1:] = self.halving() @ grad_output[:, -1:].mT
+            grad_values[..., -1:] = self.median_weights() @ grad_output[:, -1:].mT
             values, grad_output = values[..., :-1], grad_output[:, :-1]
         share = weights * (values @ grad_output)  # of each splat in grad_output . output
         behind = share.sum(1, keepdim=True) - share.cumsum(1)
         # alpha dL/dalpha; 0 where alpha is clamped.
-        grad = share.addcmul_(behind, self.alpha / self.passed, value=-1)
+        grad = share.addcmul_(behind, self.alpha / self.passing, value=-1)
         if bool((self.opacity >= self.convention.alpha_max).any()):
             grad.mul_(self.alpha < self.convention.alpha_max)
         u0, a, b = -(self.u.mul_(grad) @ self.basis.T).movedim(-1, 0)

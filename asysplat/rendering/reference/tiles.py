@@ -33,7 +33,7 @@ class Lists:
         column, row = tiles % self.columns, tiles // self.columns % self.rows
         return torch.stack((column, row), -1) * self.size
 
-    def untile(
+    def to_images(
         self, values: Float[Tensor, "T C P"], height: int, width: int
     ) -> Float[Tensor, "images C {height} {width}"]:
         """Arrange the values of all tiles' pixels as images."""
