@@ -23,15 +23,15 @@ def reconstruct(folder: Path, scene: Path, picture: Path) -> None:
     write_gaussians(scene, photographs.frame.to_world(gaussians))  # in the world of the files
 
     background = mean_color(photographs.inputs)
-    rendering = render(gaussians, photographs.measured.cameras, background)
-    comparison_figure(photographs.inputs, photographs.measured, rendering).savefig(picture, dpi=110)
+    rendering = render(gaussians, photographs.held_out.cameras, background)
+    comparison_figure(photographs.inputs, photographs.held_out, rendering).savefig(picture, dpi=110)
     print(f"{gaussians.num_gaussians:,} Gaussians; scene: {scene}; picture: {picture}")
 
 
 def made_up(folder: Path) -> Path:
     """Write a synthetic scene in place of photographs."""
-    scene = ProceduralScene(seed=7, height=128, width=128, num_frames=24)
-    write_transforms(scene.views(range(scene.num_frames)), folder)
+    scene = ProceduralScene(seed=7, height=128, width=128, num_images=24)
+    write_transforms(scene.views(range(scene.num_images)), folder)
     return folder
 
 

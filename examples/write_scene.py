@@ -11,9 +11,9 @@ from asysplat.data.write import write_transforms
 
 
 def main(folder: Path) -> None:
-    scene = ProceduralScene(seed=7, height=256, width=256, num_frames=48)
-    write_transforms(scene.views(range(scene.num_frames)), folder)
-    print(f"{scene.num_frames} photographs, their cameras and depths: {folder}")
+    scene = ProceduralScene(seed=7, height=256, width=256, num_images=48)
+    write_transforms(scene.views(range(scene.num_images)), folder)
+    print(f"{scene.num_images} photographs, their cameras and depths: {folder}")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ def test_a_worker_s_traceback_is_left_out():
     """As torch's loader raises what a worker process raised."""
     told = (
         "Caught InputError in DataLoader worker process 0.\nOriginal Traceback:\n  File x, line 1\n"
-        "asysplat.errors.InputError: a.png is empty (0 bytes): copy it again, or drop its frame."
+        "asysplat.errors.InputError: a.png is empty (0 bytes): copy it again, or leave it out."
     )
     sentence = str(input_error_behind(InputError(told)))
-    assert sentence == "a.png is empty (0 bytes): copy it again, or drop its frame."
+    assert sentence == "a.png is empty (0 bytes): copy it again, or leave it out."

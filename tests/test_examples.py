@@ -14,7 +14,7 @@ from nbclient import NotebookClient
 from tiny import NETWORK, VIEWS
 
 from asysplat import read_gaussians
-from asysplat.data import open_scene
+from asysplat.data import SceneOptions, open_scene
 
 
 @pytest.mark.parametrize("name", ["render_scene", "predict_scene"])
@@ -73,7 +73,7 @@ def test_photographs_are_checked_and_trained_on(repository, tmp_path, monkeypatc
     scene = tmp_path / "my_scene"
     monkeypatch.setattr("sys.argv", ["write_scene", str(scene)])
     runpy.run_path(str(repository / "examples" / "write_scene.py"), run_name="__main__")
-    assert open_scene(scene, 64, 64).num_frames == 48
+    assert open_scene(scene, SceneOptions(64, 64)).num_images == 48
     tiny = [*NETWORK, *VIEWS, "steps=1", "validate_every=1", "data.cache.folder=null"]
     tiny += [f"paths.logs={tmp_path}/logs", "~callbacks.figures"]
     said = subprocess.run(

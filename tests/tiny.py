@@ -5,5 +5,5 @@ NETWORK = [*SIZE, "model.layers=1m1s"]
 VIEWS = [
     *("data.height=32", "data.width=32", "data.inputs=3", "data.targets=2", "data.num_workers=0"),
 ]
-SCENES = ["data.num_frames=24", "data.window=[12,24]", "data.val_scenes=1", "data.test_scenes=1"]
+SCENES = ["data.num_images=24", "data.window=[12,24]", "data.val_scenes=1", "data.test_scenes=1"]
 STEPS = ["steps=4", "validate_every=2", "trainer.log_every_n_steps=1"]

@@ -6,6 +6,7 @@ from asysplat.data.cache import ImageCache
 from asysplat.data.datamodule import SceneDataModule
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.readers import find_scenes, open_scene
+from asysplat.data.sequence import SceneOptions
 from asysplat.data.sources import FilesSource, ProceduralSource
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "ProceduralScene",
     "ProceduralSource",
     "SceneDataModule",
+    "SceneOptions",
     "files_data",
     "find_scenes",
     "open_scene",

@@ -1,21 +1,21 @@
-"""Frames that cannot be used: all are found and reported together, before anything starts."""
+"""Images that cannot be used: all are collected and reported together, before anything starts."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Literal
+from typing import Any, Literal
 
 from asysplat.errors import InputError
 
 Policy = Literal["fail", "skip"]
-FEWEST = 2  # frames of a scene
+MIN_IMAGES = 2  # in a scene
 
 
-class BadFrames:
-    """What is wrong with single frames, collected while a scene is read.
+class BadImages:
+    """Errors of single images, collected while a scene is read.
 
     Args:
-        policy: "fail", or "skip" to go on without the frames that cannot be used.
+        policy: "fail", or "skip" to go on without the images that cannot be used.
 
     Raises:
         InputError: another policy.
@@ -25,39 +25,45 @@ class BadFrames:
         if policy not in ("fail", "skip"):
             raise InputError(f"on_bad_image is {policy!r}: expected fail or skip.")
         self.policy = policy
-        self.sentences: list[str] = []
+        self.errors: list[str] = []
 
     @contextmanager
-    def caught(self) -> Iterator[None]:
-        """Note an InputError that is raised inside, and go on after the block."""
+    def collect(self) -> Iterator[None]:
+        """Collect an InputError that is raised inside, and go on after the block."""
         try:
             yield
         except InputError as error:
-            self.sentences.append(str(error))
+            self.errors.append(str(error))
 
-    def settle(self, scene: str, left: int) -> None:
-        """Report what was noted, after all frames were read.
+    def read_each(self, read: Callable[..., Any], items: Iterable[tuple]) -> list[Any]:
+        """Return `read(*item)` of every item that can be read, and collect the other errors."""
+        results = []
+        for item in items:
+            with self.collect():
+                results.append(read(*item))
+        return results
+
+    def report(self, scene: str, left: int) -> None:
+        """Report the collected errors, after all images of a scene were read.
 
         Args:
             scene: its name, for the message.
-            left: how many of its frames can be used.
+            left: number of its images that can be used.
 
         Raises:
-            InputError: there were bad frames and they are not to be skipped, or too few are left.
+            InputError: there are errors and the policy is "fail", or too few images are left.
         """
-        listed = "".join(f"\n  {sentence}" for sentence in self.sentences)
-        total = left + len(self.sentences)
-        if self.sentences and self.policy == "fail":
+        listed = "".join(f"\n  {error}" for error in self.errors)
+        bad, total = len(self.errors), left + len(self.errors)
+        if bad and self.policy == "fail":
             raise InputError(
-                f"{scene}: {len(self.sentences)} of {total} frames cannot be used; fix them, or "
-                f"leave them out with on_bad_image=skip:{listed}"
+                f"{scene}: {bad} of {total} images cannot be used; fix them, or leave them out "
+                f"with on_bad_image=skip:{listed}"
             )
-        if left < FEWEST:
+        if left < MIN_IMAGES:
             raise InputError(
-                f"{scene} has {left} usable frame(s) of {total}: a scene needs at least {FEWEST}."
-                f"{listed}"
+                f"{scene} has {left} usable image(s) of {total}: a scene needs at least "
+                f"{MIN_IMAGES}.{listed}"
             )
-        if self.sentences:
-            warnings.warn(
-                f"{scene}: left out {len(self.sentences)} of {total} frames:{listed}", stacklevel=2
-            )
+        if bad:
+            warnings.warn(f"{scene}: left out {bad} of {total} images:{listed}", stacklevel=2)

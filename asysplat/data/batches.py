@@ -1,4 +1,4 @@
-"""How the scenes of an optimizer step are divided: among processes, then into micro-batches."""
+"""Division of an optimizer step's scenes: among processes, then into micro-batches."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ class BatchSplit:
     """A global batch of `processes` x `micro_batch` x `accumulated` scenes.
 
     Args:
-        processes: that train together, on all nodes.
+        processes: number of processes that train together, on all nodes.
         micro_batch: scenes that a process holds at a time.
         accumulated: micro-batches whose gradients make an optimizer step.
     """
@@ -20,8 +20,11 @@ class BatchSplit:
     accumulated: int
 
     def __str__(self) -> str:
+        def count(number: int, name: str, plural: str = "s") -> str:
+            return f"{number} {name}{plural if number > 1 else ''}"
+
         total = self.processes * self.micro_batch * self.accumulated
-        factors = f"{_count(self.processes, 'process', 'es')} x {_count(self.micro_batch, 'scene')}"
+        factors = f"{count(self.processes, 'process', 'es')} x {count(self.micro_batch, 'scene')}"
         return f"global batch {total} = {factors} x {self.accumulated} accumulated"
 
 
@@ -32,7 +35,7 @@ def split_batch(batch_size: int, micro_batch: int | None, processes: int) -> Bat
         batch_size: scenes of an optimizer step.
         micro_batch: the most scenes that a process may hold at a time; fewer where these do not
             divide its share; None: all of its share.
-        processes: that train together.
+        processes: number of processes that train together.
 
     Raises:
         InputError: the batch does not divide among the processes.
@@ -42,17 +45,13 @@ def split_batch(batch_size: int, micro_batch: int | None, processes: int) -> Bat
         fewer = largest_divisor(batch_size, processes)
         raise InputError(
             f"data.batch_size={batch_size} scenes do not divide among {processes} processes "
-            f"(trainer.devices x trainer.num_nodes): take {fewer} of them, or set "
+            f"(trainer.devices x trainer.num_nodes): use {fewer} processes, or set "
             f"data.batch_size={processes * (share + 1)}."
         )
-    held = largest_divisor(share, micro_batch or share)
-    return BatchSplit(processes, held, share // held)
+    largest = largest_divisor(share, micro_batch or share)
+    return BatchSplit(processes, largest, share // largest)
 
 
-def _count(number: int, name: str, plural: str = "s") -> str:
-    return f"{number} {name}{plural if number > 1 else ''}"
-
-
-def largest_divisor(number: int, most: int) -> int:
-    """Return the largest divisor of `number` that is not above `most`."""
-    return next(d for d in range(min(number, most), 0, -1) if number % d == 0)
+def largest_divisor(number: int, limit: int) -> int:
+    """Return the largest divisor of `number` up to `limit`."""
+    return next(d for d in range(min(number, limit), 0, -1) if number % d == 0)

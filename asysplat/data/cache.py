@@ -1,7 +1,7 @@
-"""A cache of photographs as they are used, undistorted and resized, in memory and on disk.
+"""A cache of undistorted and resized images, in memory and on disk.
 
-Both are bounded, and what was longest unused is removed first. The folder on disk is never inside a
-data set.
+Both are bounded; the least recently used arrays are removed first. The folder on disk is never
+inside a data set.
 """
 
 import os
@@ -15,17 +15,17 @@ import numpy as np
 from numpy import ndarray
 
 GIGABYTE = 2**30
-KEPT = 0.9  # of the limit, when a full disk cache is cleared
+SHARE_AFTER_CLEARING = 0.9  # of the limit of a full disk cache
 
 
 class ImageCache:
-    """Arrays by key. A key names everything an array was made from, so no entry can be outdated.
+    """Arrays by key. A key covers everything an array is made from, so no entry can be outdated.
 
     Processes may share the folder; each has memory of its own.
 
     Args:
-        folder: on disk, made when first needed; null keeps nothing there.
-        disk_gb, memory_gb: what each may take, in 2^30 bytes.
+        folder: on disk, made at the first write; null writes nothing.
+        disk_gb, memory_gb: limits, in 2^30 bytes.
     """
 
     def __init__(
@@ -35,48 +35,33 @@ class ImageCache:
         self.disk_bytes, self.memory_bytes = disk_gb * GIGABYTE, memory_gb * GIGABYTE
         self._memory: OrderedDict[str, ndarray] = OrderedDict()
         self._in_memory = 0
-        self._on_disk: int | None = None  # bytes when last counted, and what this process has added
+        self._on_disk: int | None = None  # bytes when last counted, plus this process's writes
 
     def get(self, key: str, make: Callable[[], ndarray], to_disk: bool) -> ndarray:
-        """Return the array kept under `key`, else make and keep it; treat it as read-only."""
+        """Return the array under `key`, else make and store it; treat it as read-only."""
         if key in self._memory:
             self._memory.move_to_end(key)
             return self._memory[key]
-        array = self._load(key) if to_disk else None
+        file = self.folder / key[:2] / f"{key}.npy" if to_disk and self.folder else None
+        array = _read(file) if file else None
         if array is None:
             array = make()
-            if to_disk:
-                self._store(key, array)
+            if file:
+                self._store(file, array)
         self._memory[key] = array
         self._in_memory += array.nbytes
         while self._in_memory > self.memory_bytes:
             self._in_memory -= self._memory.popitem(last=False)[1].nbytes
         return array
 
-    def _file(self, key: str) -> Path:
-        return self.folder / key[:2] / f"{key}.npy"
-
-    def _load(self, key: str) -> ndarray | None:
-        if self.folder is None:
-            return None
-        file = self._file(key)
-        try:
-            array = np.load(file, allow_pickle=False)
-            os.utime(file)
-        except (OSError, ValueError, EOFError):  # not there, or not whole
-            return None
-        return array
-
-    def _store(self, key: str, array: ndarray) -> None:
-        if self.folder is None:
-            return
+    def _store(self, file: Path, array: ndarray) -> None:
         if self._on_disk is None:
             self._on_disk = sum(size for _, size, _ in self._files())
         try:
-            self._on_disk += _write(self._file(key), array)
+            self._on_disk += _write(file, array)
         except OSError as error:
             warnings.warn(
-                f"{self.folder} takes no more photographs ({error.strerror}): they are decoded "
+                f"{self.folder} cannot store more images ({error.strerror}): they are decoded "
                 "again when they are needed.",
                 stacklevel=2,
             )
@@ -100,25 +85,32 @@ class ImageCache:
         entries = sorted(self._files())
         self._on_disk = sum(size for _, size, _ in entries)
         for _, size, file in entries:
-            if self._on_disk <= KEPT * self.disk_bytes:
+            if self._on_disk <= SHARE_AFTER_CLEARING * self.disk_bytes:
                 break
             file.unlink(missing_ok=True)
             self._on_disk -= size
 
 
-def _write(file: Path, array: ndarray) -> int:
-    """Write a file aside and put it in place whole: another process may be reading.
+def _read(file: Path) -> ndarray | None:
+    """Read a file and mark it as used; None if it is missing or damaged."""
+    try:
+        array = np.load(file, allow_pickle=False)
+        os.utime(file)
+    except (OSError, ValueError, EOFError):
+        return None
+    return array
 
-    Return its bytes.
-    """
+
+def _write(file: Path, array: ndarray) -> int:
+    """Write a file, atomically since another process may be reading; return its bytes."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, aside = tempfile.mkstemp(dir=file.parent)
+    descriptor, partial = tempfile.mkstemp(dir=file.parent)
     try:
         with os.fdopen(descriptor, "wb") as handle:
             np.save(handle, array)
             size = handle.tell()
-        os.replace(aside, file)
+        os.replace(partial, file)
     except OSError:
-        os.unlink(aside)
+        os.unlink(partial)
         raise
     return size

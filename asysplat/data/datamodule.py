@@ -1,4 +1,4 @@
-"""Batches of reconstruction tasks, the same for the same seed wherever a run is resumed."""
+"""Batches of tasks: the same for the same seed, wherever a run is resumed."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -12,51 +12,51 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset, Subset
 
-from asysplat.data.augment import Augmentation, cropped
+from asysplat.data.augment import Augmentation, center_crop
 from asysplat.data.bad_images import Policy
 from asysplat.data.batches import BatchSplit, split_batch
 from asysplat.data.loader import EpochLoader, batches_done, ignore_first_sigterm
 from asysplat.data.normalize import normalize
 from asysplat.data.points import depths_of_points
-from asysplat.data.selection import Selection, Split
+from asysplat.data.selection.views import Selection, Split
 from asysplat.data.sequence import ImageSequence
 from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
-DRAWS = 10  # of which one must give a task, where bad scenes are skipped
-KEPT_BYTES = 2**30  # of images that one set of fixed tasks keeps loaded
+MAX_DRAWS = 10  # of scenes for one task, with on_bad_scene=skip
+MAX_LOADED_BYTES = 2**30  # of images that a set of fixed tasks keeps in memory
 Sample = dict[str, Any]  # scene: name, inputs: Views, targets: Views; a batch has lists of names
 
 
 class SceneDataModule(lightning.LightningDataModule):
-    """Lightning's data module of reconstruction tasks: random for training, fixed for evaluation.
+    """Lightning's data module of tasks: random for training, fixed for evaluation.
 
-    An epoch is the steps between two validations. Task i of a run is a pure function of the seed
-    and i, and an epoch reads the tasks after those of the epochs before it. Processes that train
-    together take turns at the tasks of each step, and at the scenes of each evaluation: Lightning
-    must add no samplers of its own (use_distributed_sampler=False).
+    An epoch is the steps between two validations. Task i of a run depends only on the seed and i,
+    and an epoch continues where the previous one ended. Processes that train together take turns at
+    the tasks of each step, and at the scenes of each evaluation: Lightning must add no samplers of
+    its own (use_distributed_sampler=False).
 
     Args:
         name: the data set's name in metrics.
         source: where tasks come from.
-        inputs, targets: views given and views to predict, per scene.
-        height, width: size in pixels of every view that `source` gives; test sets may have another.
+        inputs, targets: number of input views and of views to predict, per scene.
+        height, width: size in pixels of every view from `source`; test sets may have another.
         batch_size: scenes of an optimizer step, of all processes together.
         num_workers: number of processes that load ahead; 0 loads in the training process.
         seed: of the training tasks.
         steps_per_epoch: steps between two validations.
-        test_sets: further test sets by name, each a function that makes its tasks; one of the data
-            set's own name takes the place of the source's test.
-        augmentation: how training tasks are varied; None leaves them as they are.
-        points: whether the inputs come with the depths of the scene's sparse points.
-        on_bad_scene: of a training task whose files cannot be used: "fail", or "skip" to draw
-            another in its place. A batch's `skipped` lists what was passed over.
+        test_sets: further test sets by name, each a function that returns its tasks; one with the
+            data set's name replaces the source's test.
+        augmentation: random changes of training tasks; None changes nothing.
+        points: whether the inputs have the depths of the scene's sparse points.
+        on_bad_scene: where the files of a training scene cannot be used: "fail", or "skip" to draw
+            another scene. A batch's `bad_scenes` lists the errors.
         micro_batch: the most scenes that a process holds at a time; None: all of its share.
 
     Raises:
-        InputError: a task that cannot be loaded. `setup` tries one training task, and as many of
-            the fixed ones as are kept in memory.
+        InputError: a task that cannot be loaded. `setup` tries one training task, and all of the
+            fixed ones that are kept in memory.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class SceneDataModule(lightning.LightningDataModule):
         self.tests: dict[str, FixedTasks] = {}  # by test set, this data set first
 
     def setup(self, stage: str | None = None) -> None:
-        """Make the validation and test tasks, and try one training task."""
+        """Load the validation and test tasks, and try one training task."""
         if not self.evaluation:
             samples = {"training": TrainingTasks(self)[0]}
             self.evaluation["val"] = FixedTasks(self._own_tasks("val"), self.points)
@@ -123,12 +123,12 @@ class SceneDataModule(lightning.LightningDataModule):
                 raise InputError(f"{where}: {error}") from error
 
     def split(self, processes: int) -> BatchSplit:
-        """Divide the scenes of an optimizer step among processes; see `split_batch`."""
+        """Divide the scenes of an optimizer step among processes."""
         return split_batch(self.batch_size, self.micro_batch, processes)
 
     @property
     def _process(self) -> tuple[int, int]:
-        """Which process this is, and how many there are."""
+        """The rank of this process, and the number of processes."""
         trainer = self.trainer
         return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
 
@@ -138,11 +138,10 @@ class SceneDataModule(lightning.LightningDataModule):
         return self.tasks(start, per_epoch, done=batches_done(self.trainer))
 
     def tasks(self, start: int, count: int, done: int = 0) -> DataLoader:
-        """Return micro-batches of this process's turns at the tasks `start` to `start + count`.
+        """Return this process's micro-batches of the tasks `start` to `start + count`.
 
-        The first `done` of them are left out.
-
-        The steps are those of one process, whatever the number of processes.
+        Leaves out the first `done` micro-batches. A step has the same tasks for any number of
+        processes.
         """
         rank, processes = self._process
         micro_batch = self.split(processes).micro_batch
@@ -155,26 +154,26 @@ class SceneDataModule(lightning.LightningDataModule):
             num_workers=self.num_workers,
             collate_fn=collate,
             prefetch_factor=4 if self.num_workers else None,
-            # The platform's own way: inside a joblib job the default is joblib's, which cannot
+            # The platform's default: inside a joblib job the default is joblib's, which cannot
             # start these workers.
             multiprocessing_context=get_all_start_methods()[0] if self.num_workers else None,
             worker_init_fn=ignore_first_sigterm,
-            # Of its own: starting it draws from one, and a run that goes on starts it once more.
+            # Starting a loader draws from its generator, and a resumed run starts one more.
             generator=torch.Generator(),
         )
 
     def val_dataloader(self) -> DataLoader:
-        return self._evaluated(self.evaluation["val"])
+        return self._evaluation_loader(self.evaluation["val"])
 
     def test_dataloader(self) -> list[DataLoader]:
-        """Return one loader a test set, in the order of `tests`."""
-        return [self._evaluated(scenes) for scenes in self.tests.values()]
+        """Return one loader per test set, in the order of `tests`."""
+        return [self._evaluation_loader(scenes) for scenes in self.tests.values()]
 
-    def _evaluated(self, scenes: "FixedTasks") -> DataLoader:
-        """Return this process's turns at the scenes, one a batch.
+    def _evaluation_loader(self, scenes: "FixedTasks") -> DataLoader:
+        """Return this process's scenes, one per batch.
 
-        All processes take equally many turns, or they would wait for each other: one with fewer
-        scenes takes its last again.
+        All processes have equally many batches, or they would wait for each other: one with fewer
+        scenes repeats its last.
         """
         rank, processes = self._process
         turns = range(-(-len(scenes) // processes))
@@ -184,27 +183,27 @@ class SceneDataModule(lightning.LightningDataModule):
 
 
 class TrainingTasks(Dataset):
-    """An endless list of training tasks; task i is drawn with a generator of its own.
+    """An endless list of training tasks; task i is drawn with its own generator.
 
-    Where bad scenes are skipped, `skipped` of a sample names them, as sentences.
+    A sample's `bad_scenes` lists the errors of scenes that were drawn before and cannot be used.
     """
 
     def __init__(self, data: SceneDataModule):
         self.source, self.seed, self.augmentation = data.source, data.seed, data.augmentation
         self.inputs, self.targets, self.points = data.inputs, data.targets, data.points
-        self.draws = DRAWS if data.on_bad_scene == "skip" else 1
+        self.draws = MAX_DRAWS if data.on_bad_scene == "skip" else 1
 
     def __getitem__(self, index: int) -> Sample:
-        skipped: list[str] = []
+        errors: list[str] = []
         while True:
             # (seed, index, 0) gives what (seed, index) gives.
-            rng = np.random.default_rng((self.seed, index, len(skipped)))
+            rng = np.random.default_rng((self.seed, index, len(errors)))
             try:
-                return self._sample(rng) | {"bad_scenes": skipped}
+                return self._sample(rng) | {"bad_scenes": errors}
             except (InputError, OSError) as error:
-                skipped.append(str(error).partition("\n")[0])
-                if len(skipped) == self.draws:
-                    row = f"{DRAWS} training scenes in a row cannot be used, the last because "
+                errors.append(str(error).partition("\n")[0])
+                if len(errors) == self.draws:
+                    row = f"{MAX_DRAWS} training scenes in a row cannot be used, the last because "
                     raise InputError(f"{row if self.draws > 1 else ''}{error}") from error
 
     def _sample(self, rng: np.random.Generator) -> Sample:
@@ -218,24 +217,24 @@ class TrainingTasks(Dataset):
 
 
 class FixedTasks(Dataset):
-    """Evaluation tasks; the first of them stay loaded, up to KEPT_BYTES."""
+    """Evaluation tasks; the first ones stay in memory, up to MAX_LOADED_BYTES."""
 
     def __init__(self, tasks: Sequence[Task], points: bool = False):
         self.tasks, self.points = tasks, points
-        self._kept: list[Sample] = []
+        self._loaded: list[Sample] = []
         size = 0
         for task in tasks:
-            self._kept.append(load(task, points=points))
-            size += sum(self._kept[-1][views].images.nbytes for views in ("inputs", "targets"))
-            if size > KEPT_BYTES:
+            self._loaded.append(load(task, points=points))
+            size += sum(self._loaded[-1][views].images.nbytes for views in ("inputs", "targets"))
+            if size > MAX_LOADED_BYTES:
                 break
 
     def __len__(self) -> int:
         return len(self.tasks)
 
     def __getitem__(self, index: int) -> Sample:
-        if index < len(self._kept):
-            return self._kept[index]
+        if index < len(self._loaded):
+            return self._loaded[index]
         return load(self.tasks[index], points=self.points)
 
 
@@ -243,14 +242,14 @@ def load(task: Task, share: float = 1.0, points: bool = False) -> Sample:
     """Read a task's views, validate, crop to `share` of their sides, and normalize them.
 
     With `points`, the inputs have the depths of the sequence's sparse points, if it has any. The
-    sample's `frame` says how it was normalized.
+    sample's `frame` is the Normalization.
     """
     inputs, targets = task.selection.inputs, task.selection.targets
-    # A frame that is both input and target is decoded once.
-    frames = list(dict.fromkeys(inputs + targets))
-    views = cropped(task.sequence.views(frames).validate(task.sequence.name), share)
+    # An image that is both input and target is decoded once.
+    indices = list(dict.fromkeys(inputs + targets))
+    views = center_crop(task.sequence.views(indices).validate(task.sequence.name), share)
     inputs, targets = (
-        views.select([frames.index(frame) for frame in chosen]) for chosen in (inputs, targets)
+        views.select([indices.index(index) for index in chosen]) for chosen in (inputs, targets)
     )
     if points:
         inputs = with_points(inputs, task.sequence)
@@ -267,15 +266,15 @@ def with_points(views: Views, sequence: ImageSequence) -> Views:
 
 
 def _warn_of_no_points(samples: Mapping[str, Sample]) -> None:
-    lacking = [
-        f"{samples[name]['scene']} ({name})"
-        for name in samples
-        if samples[name]["inputs"].point_depths is None
+    missing = [
+        f"{sample['scene']} ({name})"
+        for name, sample in samples.items()
+        if sample["inputs"].point_depths is None
     ]
-    if lacking:
+    if missing:
         warnings.warn(
-            f"data.points=true, but there are no sparse points of {', '.join(lacking)}: a prior "
-            "knows nothing from them. data/README.md says which files have some.",
+            f"data.points=true, but there are no sparse points of {', '.join(missing)}: their "
+            "priors work without points. data/README.md lists the files that hold them.",
             stacklevel=3,
         )
 
@@ -285,5 +284,5 @@ def collate(samples: list[Sample]) -> Sample:
         "scene": [sample["scene"] for sample in samples],
         "inputs": Views.stack([sample["inputs"] for sample in samples]),
         "targets": Views.stack([sample["targets"] for sample in samples]),
-        "bad_scenes": [sentence for sample in samples for sentence in sample.get("bad_scenes", ())],
+        "bad_scenes": [error for sample in samples for error in sample.get("bad_scenes", ())],
     }

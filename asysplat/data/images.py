@@ -1,4 +1,4 @@
-"""Photographs, depth maps and masks from files, without lens distortion and at the asked size.
+"""Read images, depth maps and masks from files, undistort them and resize them.
 
 Pixel positions count from the image's corner: the first pixel's center is at +0.5. Nothing is ever
 written. The exif orientation is not applied, since calibrations are for the pixels as stored.
@@ -21,17 +21,12 @@ from PIL import Image
 from asysplat.errors import InputError
 
 END_MARKERS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
-TAIL_BYTES = 4096  # room for what some cameras append
+TAIL_BYTES = 4096  # some cameras append data after the end marker
 
 
 @dataclass(frozen=True, eq=False)
 class EncodedImage:
-    """An image file's bytes inside another file.
-
-    Args:
-        name: where the bytes are, for error messages.
-        data: what a file of its own would hold.
-    """
+    """The bytes of an image file inside another file; `name` is for error messages."""
 
     name: str
     data: UInt8[ndarray, "bytes"]
@@ -45,13 +40,13 @@ ImageFile = Path | EncodedImage
 
 @dataclass(frozen=True)
 class Lens:
-    """The camera model of one photograph: which direction each pixel shows.
+    """The camera model of one image.
 
     Args:
-        width, height: the photograph's size in pixels.
+        width, height: the image's size in pixels.
         fx, fy, cx, cy: pinhole intrinsics in pixels.
         distortion: OpenCV's k1 k2 p1 p2 k3, or k1 k2 k3 k4 of its fisheye model.
-        fisheye: which of the two models `distortion` belongs to.
+        fisheye: whether `distortion` belongs to the fisheye model.
     """
 
     width: int
@@ -70,21 +65,21 @@ class Lens:
 
 
 def image_size(path: ImageFile) -> tuple[int, int]:
-    """Read (width, height) from the header; a file whose end is missing is decoded as well.
+    """Read (width, height) from the header.
 
     Raises:
         InputError: the file is missing, empty, not an image or cut short.
     """
-    return _read(path, _size_if_whole)
+    return _read(path, _checked_size)
 
 
 def same_proportions(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Tell whether two (width, height) have the same proportions, to a pixel of `one`."""
+    """Check whether two (width, height) have the same proportions, to a pixel of `one`."""
     return abs(one[0] * other[1] / other[0] - one[1]) <= 1
 
 
-def load_photograph(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
-    """Read RGB in 0..255; transparent pixels are laid on white.
+def load_image(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
+    """Read RGB in 0..255, on a white background where the image is transparent.
 
     Raises:
         InputError: the file is damaged, or holds more than 8 bits of gray (a depth map).
@@ -118,11 +113,11 @@ def load_mask(path: ImageFile) -> Bool[ndarray, "h w"]:
 def undistort(
     pixels: Shaped[ndarray, "h w *channels"], lens: Lens, nearest: bool = False
 ) -> Shaped[ndarray, "h w *channels"]:
-    """Resample to what a pinhole camera with the lens's own fx, fy, cx, cy would have taken.
+    """Resample to a pinhole camera with the lens's own fx, fy, cx, cy.
 
-    `pixels` may be smaller or larger than the photograph, as depth maps are, if it shows the same
-    field of view. Beyond the photograph's border the nearest pixel is repeated, or, with `nearest`
-    (for depths and masks, which must not be mixed), the value is 0.
+    `pixels` may have another size than the image, as depth maps do, if the field of view is the
+    same. Beyond the image's border the nearest pixel is repeated, or, with `nearest` (for depths
+    and masks, which must not be mixed), the value is 0.
     """
     if not lens.is_distorted:
         return pixels
@@ -135,34 +130,26 @@ def undistort(
 def resize_and_crop(
     pixels: Shaped[ndarray, "h w *channels"], height: int, width: int, nearest: bool = False
 ) -> Shaped[ndarray, "height width *channels"]:
-    """Crop to the largest centerd part with the asked proportions; resample to `height` x `width`.
+    """Crop to the largest centered part with the given proportions; resize to `height` x `width`.
 
     Antialiased (Lanczos), or the pixel under each new center with `nearest`.
     """
-    _, *box = _centerd_box(pixels.shape[1], pixels.shape[0], height, width)
+    _, *box = _centered_box(pixels.shape[1], pixels.shape[0], height, width)
     method = Image.Resampling.NEAREST if nearest else Image.Resampling.LANCZOS
     return np.asarray(Image.fromarray(pixels).resize((width, height), method, tuple(box)))
 
 
 def resized_intrinsics(lens: Lens, height: int, width: int) -> Float[ndarray, "3 3"]:
-    """Return the pinhole matrix that belongs to the output of `resize_and_crop`."""
-    scale, left, top, _, _ = _centerd_box(lens.width, lens.height, height, width)
-    return np.array(
-        [
-            [lens.fx * scale, 0.0, (lens.cx - left) * scale],
-            [0.0, lens.fy * scale, (lens.cy - top) * scale],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    """Return the pinhole matrix for the output of `resize_and_crop`."""
+    scale, left, top, _, _ = _centered_box(lens.width, lens.height, height, width)
+    cx, cy = (lens.cx - left) * scale, (lens.cy - top) * scale
+    return np.array([[lens.fx * scale, 0.0, cx], [0.0, lens.fy * scale, cy], [0.0, 0.0, 1.0]])
 
 
-def _centerd_box(
+def _centered_box(
     old_width: int, old_height: int, height: int, width: int
 ) -> tuple[float, float, float, float, float]:
-    """Return the scale, and left, top, right, bottom in old pixels.
-
-    Fractions of pixels keep the box exactly centerd.
-    """
+    """Return the scale, and left, top, right, bottom in old pixels, exactly centered."""
     scale = max(width / old_width, height / old_height)
     left = max(0.0, (old_width - width / scale) / 2)
     top = max(0.0, (old_height - height / scale) / 2)
@@ -176,13 +163,8 @@ def _undistortion_maps(
     """Return x and y in the distorted image for each undistorted pixel."""
     scale_x, scale_y = width / lens.width, height / lens.height
     # OpenCV puts the first pixel's center at 0.
-    matrix = np.array(
-        [
-            [lens.fx * scale_x, 0.0, lens.cx * scale_x - 0.5],
-            [0.0, lens.fy * scale_y, lens.cy * scale_y - 0.5],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    cx, cy = lens.cx * scale_x - 0.5, lens.cy * scale_y - 0.5
+    matrix = np.array([[lens.fx * scale_x, 0, cx], [0, lens.fy * scale_y, cy], [0, 0, 1.0]])
     model = cv2.fisheye if lens.fisheye else cv2
     return model.initUndistortRectifyMap(
         matrix, np.array(lens.distortion), np.eye(3), matrix, (width, height), cv2.CV_32FC1
@@ -199,14 +181,14 @@ def _to_rgb(image: Image.Image) -> UInt8[ndarray, "h w 3"]:
 
 
 def content_hash(file: ImageFile) -> str:
-    """Hash the stored bytes; a file is read once, and again only if it changes.
+    """Hash the stored bytes; a file is read again only if it changes.
 
     Raises:
         InputError: the file is missing or empty.
     """
     if isinstance(file, EncodedImage):
         return hashlib.blake2b(file.data.tobytes(), digest_size=16).hexdigest()
-    _check_there(file)
+    _check_exists(file)
     stat = file.stat()
     return _hash_of(file, stat.st_size, stat.st_mtime_ns)
 
@@ -216,16 +198,15 @@ def _hash_of(path: Path, size: int, modified: int) -> str:
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 
-def _size_if_whole(image: Image.Image) -> tuple[int, int]:
+def _checked_size(image: Image.Image) -> tuple[int, int]:
     """Return the size; decode a file without an end marker, which fails if it is cut short."""
     marker = END_MARKERS.get(image.format or "")
     if marker:
         position = image.fp.tell()
-        image.fp.seek(0, 2)
-        image.fp.seek(max(0, image.fp.tell() - TAIL_BYTES))
-        whole = marker in image.fp.read()
+        image.fp.seek(max(0, image.fp.seek(0, 2) - TAIL_BYTES))
+        complete = marker in image.fp.read()
         image.fp.seek(position)
-        if not whole:
+        if not complete:
             image.load()
     return image.size
 
@@ -233,7 +214,7 @@ def _size_if_whole(image: Image.Image) -> tuple[int, int]:
 def _read(file: ImageFile, extract: Callable[[Image.Image], Any]) -> Any:
     """Return `extract` of the opened image; every failure becomes an InputError."""
     if isinstance(file, Path):
-        _check_there(file)
+        _check_exists(file)
     stored = file if isinstance(file, Path) else BytesIO(file.data.tobytes())
     try:
         with Image.open(stored) as image:
@@ -241,12 +222,12 @@ def _read(file: ImageFile, extract: Callable[[Image.Image], Any]) -> Any:
     # Damaged files make Pillow raise anything from OSError to SyntaxError.
     except Exception as error:
         raise InputError(
-            f"{file} cannot be read as an image ({error}): copy it again, or drop its frame."
+            f"{file} cannot be read as an image ({error}): copy it again, or leave it out."
         ) from error
 
 
-def _check_there(path: Path) -> None:
+def _check_exists(path: Path) -> None:
     if not path.is_file():
-        raise InputError(f"{path} does not exist: put the image there, or drop its frame.")
+        raise InputError(f"{path} does not exist: put the image there, or leave it out.")
     if path.stat().st_size == 0:
-        raise InputError(f"{path} is empty (0 bytes): copy it again, or drop its frame.")
+        raise InputError(f"{path} is empty (0 bytes): copy it again, or leave it out.")

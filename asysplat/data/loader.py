@@ -8,7 +8,7 @@ from torch.utils.data import DataLoader
 
 
 class EpochLoader(DataLoader):
-    """A loader whose length counts the batches that were `done` before, as Lightning does."""
+    """A loader whose length includes the batches `done` before the checkpoint, as in Lightning."""
 
     def __init__(self, done: int, *arguments: Any, **options: Any):
         self.done = done
@@ -19,15 +19,15 @@ class EpochLoader(DataLoader):
 
 
 def batches_done(trainer: lightning.Trainer) -> int:
-    """Return how many batches of the epoch at hand came before the checkpoint that goes on."""
+    """Return the number of batches of the current epoch before the checkpoint that is resumed."""
     loop = trainer.fit_loop
     began = loop.epoch_progress.current.ready > loop.epoch_progress.current.processed
     return loop.epoch_loop.batch_progress.current.completed if began else 0
 
 
 def ignore_first_sigterm(_: int) -> None:
-    """Ignore the first SIGTERM: a scheduler sends it to the loaders too, of a run that then saves.
+    """Ignore the first SIGTERM, which a scheduler also sends to the loaders of a run that saves.
 
-    The second ends the process, so that it can be ended.
+    The second one ends the process.
     """
     signal.signal(signal.SIGTERM, lambda *_: signal.signal(signal.SIGTERM, signal.SIG_DFL))

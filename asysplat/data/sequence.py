@@ -1,9 +1,10 @@
-"""Posed photographs of one place: the interface that all of them follow, and those on disk."""
+"""Posed images of one place: the interface that all of them follow, and the images on disk."""
 
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -12,15 +13,15 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from torch import Tensor
 
-from asysplat.data.bad_images import BadFrames
+from asysplat.data.bad_images import BadImages, Policy
 from asysplat.data.cache import ImageCache
 from asysplat.data.images import (
     ImageFile,
     Lens,
     content_hash,
     load_depth,
+    load_image,
     load_mask,
-    load_photograph,
     resize_and_crop,
     resized_intrinsics,
     same_proportions,
@@ -34,10 +35,9 @@ Points = Float[ndarray, "P 3"]
 
 @runtime_checkable
 class ImageSequence(Protocol):
-    """An ordered walk through one static place: cameras at hand, images read when asked for.
+    """Images along a walk through one static place, in the order they were taken.
 
-    File readers and `ProceduralScene` both follow it, so view selection and training need not know
-    where the images come from.
+    The cameras are known from the start; pixels are read when `views` is called.
     """
 
     @property
@@ -46,33 +46,54 @@ class ImageSequence(Protocol):
         ...
 
     @property
-    def num_frames(self) -> int:
-        """The number of frames; they are in the order they were taken."""
+    def num_images(self) -> int:
+        """The number of images."""
         ...
 
     @property
     def cameras(self) -> Cameras:
-        """The cameras of all frames, [num_frames, ...]."""
+        """The cameras of all images, [num_images, ...]."""
         ...
 
-    def views(self, frames: Sequence[int]) -> Views:
-        """Return the named frames in the given order: images in [0, 1], depths where known."""
+    def views(self, indices: Sequence[int]) -> Views:
+        """Return the images at `indices`, in that order: pixels in [0, 1], depths where known."""
         ...
 
 
 @dataclass(frozen=True)
-class Photograph:
-    """One image file, how it was taken, and what lies beside it.
+class SceneOptions:
+    """How scenes on disk are opened.
+
+    Args:
+        height, width: size of every view, in pixels.
+        layout: a name in `readers.LAYOUTS`, or auto.
+        on_bad_image: "fail" raises one error that names every image that cannot be used; "skip"
+            leaves those images out with a warning, and decodes each image once to find them.
+        cache: keeps decoded pixels; None keeps none.
+        disparities: the folder of `python -m asysplat.data.disparity`; None reads none.
+    """
+
+    height: int
+    width: int
+    layout: str = "auto"
+    on_bad_image: Policy = "fail"
+    cache: ImageCache | None = None
+    disparities: Path | str | None = None
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """One image file with its lens, its pose, and the maps that belong to it.
 
     Args:
         cam_to_world: rigid, OpenCV axes.
         depth: one-channel integer image of distances along z, `depth_unit` scene units each.
-        mask: image that is not 0 where the pixel counts.
+        mask: image that is 0 where the pixel must be ignored.
         disparity: one-channel integer image of inverse depths, up to a scale and a shift; 0 where
             unknown.
     """
 
-    image: ImageFile
+    file: ImageFile
     lens: Lens
     cam_to_world: Float[ndarray, "4 4"]
     depth: ImageFile | None = None
@@ -83,125 +104,122 @@ class Photograph:
 
 @dataclass(frozen=True)
 class PosedScene:
-    """What a reader finds in a scene's files.
+    """The content of a scene's files, as a reader returns it.
 
     Args:
         name: unique within the data set.
-        photographs: in the order they were taken.
+        images: in the order they were taken.
         read_points: reads sparse points of the scene's surfaces; None where the files have none.
     """
 
     name: str
-    photographs: list[Photograph]
+    images: list[PosedImage]
     read_points: Callable[[], Points | None] | None = None
 
     @cached_property
     def points(self) -> Points | None:
-        """Sparse points, read when first asked for: they may take longer than all the rest."""
+        """Sparse points, read at the first access: they may take longer than all the rest."""
         return self.read_points() if self.read_points else None
 
 
 class FileSequence:
-    """Photographs in the order they were taken, as a `ImageSequence`.
+    """Images on disk, as an `ImageSequence`.
 
-    Pixels are read when `views` asks for them: undistorted, resized until the shorter side fits,
-    and cropped to the center. If any photograph has a depth map, all views have depths (0 where
-    unknown), and likewise disparities; if any has a mask or a distorting lens, all have masks.
-
-    Args:
-        height, width: the size of every view, in pixels.
-        cache: where decoded pixels are kept.
+    `views` reads pixels, undistorts them, resizes them until the shorter side fits, and crops them
+    to the center. If any image has a depth map, all views have depths (0 where unknown), and
+    likewise disparities; if any has a mask or a distorting lens, all have masks.
     """
 
-    def __init__(self, scene: PosedScene, height: int, width: int, cache: ImageCache | None = None):
-        self.scene, self.name, self._cache = scene, scene.name, cache
-        photographs = scene.photographs
-        shape = (len(photographs), -1, -1)
-        intrinsics = [resized_intrinsics(p.lens, height, width) for p in photographs]
-        poses = [photograph.cam_to_world for photograph in photographs]
+    def __init__(self, scene: PosedScene, options: SceneOptions):
+        self.scene, self.name, self.options = scene, scene.name, options
+        images, (height, width) = scene.images, (options.height, options.width)
+        intrinsics = [resized_intrinsics(image.lens, height, width) for image in images]
+        poses = [image.cam_to_world for image in images]
         self.cameras = Cameras(
-            intrinsics=torch.tensor(np.array(intrinsics), dtype=torch.float32).view(shape[0], 3, 3),
-            cam_to_world=torch.tensor(np.array(poses), dtype=torch.float32).view(shape[0], 4, 4),
-            height=height,
-            width=width,
+            torch.tensor(np.array(intrinsics), dtype=torch.float32).view(len(images), 3, 3),
+            torch.tensor(np.array(poses), dtype=torch.float32).view(len(images), 4, 4),
+            height,
+            width,
         )
-        self._has_depths = any(photograph.depth for photograph in photographs)
-        self._has_disparities = any(photograph.disparity for photograph in photographs)
-        self._has_masks = any(p.mask or p.lens.is_distorted for p in photographs)
+        self._has_depths = any(image.depth for image in images)
+        self._has_disparities = any(image.disparity for image in images)
+        self._has_masks = any(image.mask or image.lens.is_distorted for image in images)
 
     @property
-    def num_frames(self) -> int:
-        return len(self.scene.photographs)
+    def num_images(self) -> int:
+        return len(self.scene.images)
 
     @property
     def points(self) -> Points | None:
-        """Sparse points of the scene's surfaces, read when first asked for; None without any."""
+        """Sparse points of the scene's surfaces; None where the files have none."""
         return self.scene.points
 
-    def views(self, frames: Sequence[int]) -> Views:
-        """Return the named frames, in the given order.
+    def views(self, indices: Sequence[int]) -> Views:
+        """Return the images at `indices`, in that order.
 
         Raises:
             InputError: a file whose pixels are damaged.
         """
-        chosen = [self.scene.photographs[frame] for frame in frames]
+        images = [self.scene.images[index] for index in indices]
 
-        def stacked(there: bool, read: Callable[[Photograph], Tensor]) -> Tensor | None:
-            return torch.stack([read(photograph) for photograph in chosen]) if there else None
+        def stack(available: bool, read: Callable[[PosedImage], Tensor]) -> Tensor | None:
+            return torch.stack([read(image) for image in images]) if available else None
 
         return Views(
-            cameras=self.cameras.select(frames),
-            images=stacked(True, self._image),
-            depths=stacked(self._has_depths, self._depth),
-            masks=stacked(self._has_masks, self._mask),
-            disparities=stacked(self._has_disparities, self._disparity),
+            cameras=self.cameras.select(indices),
+            images=stack(True, self._image),
+            depths=stack(self._has_depths, self._depth),
+            masks=stack(self._has_masks, self._mask),
+            disparities=stack(self._has_disparities, self._disparity),
         )
 
-    def without_damaged(self, bad: BadFrames) -> "FileSequence":
-        """Return the frames whose pixels can be read, and note the others in `bad`."""
-        whole = []
-        for frame, photograph in enumerate(self.scene.photographs):
-            with bad.caught():
-                self.views([frame])
-                whole.append(photograph)
-        scene = replace(self.scene, photographs=whole)
-        return FileSequence(scene, self.cameras.height, self.cameras.width, self._cache)
+    def with_images(self, images: list[PosedImage]) -> "FileSequence":
+        """Return a sequence of the same size with some of this one's images."""
+        return FileSequence(replace(self.scene, images=images), self.options)
 
-    def _image(self, photograph: Photograph) -> Float[Tensor, "3 H W"]:
-        pixels = self._pixels(photograph.image, load_photograph, photograph.lens)
+    def without_damaged(self, bad: BadImages) -> "FileSequence":
+        """Return the images whose pixels can be read, and collect the errors of the others."""
+
+        def read(index: int, image: PosedImage) -> PosedImage:
+            self.views([index])
+            return image
+
+        return self.with_images(bad.read_each(read, enumerate(self.scene.images)))
+
+    def _image(self, image: PosedImage) -> Float[Tensor, "3 H W"]:
+        pixels = self._pixels(image.file, load_image, image.lens)
         return pixels.permute(2, 0, 1).float() / 255
 
-    def _depth(self, photograph: Photograph) -> Float[Tensor, "H W"]:
-        if photograph.depth is None:
-            return torch.zeros(self.cameras.height, self.cameras.width)
-        stored = self._pixels(photograph.depth, load_depth, photograph.lens, nearest=True)
-        return stored * photograph.depth_unit
+    def _depth(self, image: PosedImage) -> Float[Tensor, "H W"]:
+        if image.depth is None:
+            return torch.zeros(self.options.height, self.options.width)
+        return self._pixels(image.depth, load_depth, image.lens, nearest=True) * image.depth_unit
 
-    def _disparity(self, photograph: Photograph) -> Float[Tensor, "H W"]:
-        if photograph.disparity is None:
-            return torch.zeros(self.cameras.height, self.cameras.width)
-        lens = photograph.lens
+    def _disparity(self, image: PosedImage) -> Float[Tensor, "H W"]:
+        if image.disparity is None:
+            return torch.zeros(self.options.height, self.options.width)
+        lens = image.lens
 
         def load_disparity(file: ImageFile) -> ndarray:
-            stored = load_depth(file)
-            height, width = stored.shape
-            # Of a photograph that was since replaced by another.
+            disparity = load_depth(file)
+            height, width = disparity.shape
+            # The image may have been replaced since its disparities were estimated.
             if not same_proportions((width, height), (lens.width, lens.height)):
                 raise InputError(
-                    f"{file} is {width} x {height} and {photograph.image} {lens.width} x "
+                    f"{file} is {width} x {height} and {image.file} {lens.width} x "
                     f"{lens.height}: delete it, and estimate it again with python -m "
                     "asysplat.data.disparity."
                 )
-            return stored
+            return disparity
 
-        return self._pixels(photograph.disparity, load_disparity, lens, nearest=True)
+        return self._pixels(image.disparity, load_disparity, lens, nearest=True)
 
-    def _mask(self, photograph: Photograph) -> Bool[Tensor, "H W"]:
-        lens = photograph.lens
-        if photograph.mask is None:
+    def _mask(self, image: PosedImage) -> Bool[Tensor, "H W"]:
+        lens = image.lens
+        if image.mask is None:
             everywhere = np.ones((lens.height, lens.width), dtype=np.uint8)
             return torch.tensor(self._fit(everywhere, lens, nearest=True)) > 0
-        return self._pixels(photograph.mask, load_mask, lens, nearest=True) > 0
+        return self._pixels(image.mask, load_mask, lens, nearest=True) > 0
 
     def _pixels(
         self,
@@ -215,14 +233,15 @@ class FileSequence:
         def make() -> ndarray:
             return self._fit(load(file), lens, nearest)
 
-        if self._cache is None:
+        cache, size = self.options.cache, (self.options.height, self.options.width)
+        if cache is None:
             pixels = make()
         else:
-            size = (self.cameras.height, self.cameras.width)
-            key = "-".join((content_hash(file), _hash(lens, *size, load.__name__)))
+            made_from = repr((lens, *size, load.__name__)).encode()
+            key = f"{content_hash(file)}-{hashlib.blake2b(made_from, digest_size=8).hexdigest()}"
             # Pixels that are neither undistorted nor resized are as quickly decoded again.
             changed = lens.is_distorted or (lens.height, lens.width) != size
-            pixels = self._cache.get(key, make, to_disk=changed)
+            pixels = cache.get(key, make, to_disk=changed)
         # A copy, since arrays from the cache and from Pillow are read-only.
         return torch.tensor(pixels)
 
@@ -230,8 +249,4 @@ class FileSequence:
         if pixels.dtype == bool:
             pixels = pixels.astype(np.uint8)
         pixels = undistort(pixels, lens, nearest)
-        return resize_and_crop(pixels, self.cameras.height, self.cameras.width, nearest)
-
-
-def _hash(*values) -> str:
-    return hashlib.blake2b(repr(values).encode(), digest_size=8).hexdigest()
+        return resize_and_crop(pixels, self.options.height, self.options.width, nearest)

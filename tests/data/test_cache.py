@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from asysplat.data import ImageCache, ProceduralScene, open_scene
+from asysplat.data import ImageCache, ProceduralScene, SceneOptions, open_scene
 from asysplat.data.cache import GIGABYTE
 from asysplat.data.write import write_transforms
 
@@ -72,10 +72,10 @@ def test_a_file_that_is_cut_short_is_made_again(tmp_path):
 @pytest.mark.parametrize("height, width, files", [(24, 32, 0), (12, 16, 6)])
 def test_views_are_the_same_with_a_cache(scene, tmp_path, height, width, files):
     """Images and depths; those that are used as they are stored are not stored twice."""
-    plain = open_scene(scene, height, width).views(range(3))
+    plain = open_scene(scene, SceneOptions(height, width)).views(range(3))
     for _ in range(2):
         cache = ImageCache(tmp_path / "cache")
-        cached = open_scene(scene, height, width, cache=cache).views(range(3))
+        cached = open_scene(scene, SceneOptions(height, width, cache=cache)).views(range(3))
         assert torch.equal(cached.images, plain.images)
         assert torch.equal(cached.depths, plain.depths)
         assert len(list((tmp_path / "cache").rglob("*.npy"))) == files
@@ -83,10 +83,10 @@ def test_views_are_the_same_with_a_cache(scene, tmp_path, height, width, files):
 
 def test_a_photograph_that_changes_is_read_anew(scene, tmp_path):
     cache = ImageCache(tmp_path / "cache")
-    before = open_scene(scene, 12, 16, cache=cache).views([0, 1])
+    before = open_scene(scene, SceneOptions(12, 16, cache=cache)).views([0, 1])
     first, second = (scene / f"images/0000{index}.png" for index in (0, 1))
     first.write_bytes(second.read_bytes())
-    after = open_scene(scene, 12, 16, cache=cache).views([0, 1])
+    after = open_scene(scene, SceneOptions(12, 16, cache=cache)).views([0, 1])
     assert not torch.equal(before.images[0], before.images[1])
     assert torch.equal(after.images[0], before.images[1])
 
@@ -94,7 +94,5 @@ def test_a_photograph_that_changes_is_read_anew(scene, tmp_path):
 def test_another_size_is_another_entry(scene, tmp_path):
     cache = ImageCache(tmp_path / "cache")
     for height, width in ((12, 16), (6, 8), (12, 12)):
-        assert open_scene(scene, height, width, cache=cache).views([0]).images.shape[-2:] == (
-            height,
-            width,
-        )
+        views = open_scene(scene, SceneOptions(height, width, cache=cache)).views([0])
+        assert views.images.shape[-2:] == (height, width)

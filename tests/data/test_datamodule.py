@@ -15,7 +15,7 @@ from asysplat.data import (
 )
 from asysplat.data.datamodule import FixedTasks, TrainingTasks, collate, load
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection import Selection, every_8th_selection
+from asysplat.data.selection.views import Selection, every_8th_selection
 from asysplat.data.sources import Task
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
@@ -38,7 +38,7 @@ READ_WITH = {
 
 
 def with_test_sets(test_sets, **changes):
-    scenes = {"num_frames": 24, "val_scenes": 1, "test_scenes": 2, "places": "both"}
+    scenes = {"num_images": 24, "val_scenes": 1, "test_scenes": 2, "places": "both"}
     options = {"name": "procedural", **READ_WITH, **scenes}
     return procedural_data(test_sets=test_sets, **(options | changes))
 
@@ -143,7 +143,7 @@ class Counting:
     """A sequence that remembers which frames were decoded."""
 
     def __init__(self, scene):
-        self.scene, self.name, self.num_frames = scene, scene.name, scene.num_frames
+        self.scene, self.name, self.num_images = scene, scene.name, scene.num_images
         self.cameras, self.decoded = scene.cameras, []
 
     def views(self, frames):
@@ -152,7 +152,7 @@ class Counting:
 
 
 def test_an_input_that_is_a_target_is_decoded_once():
-    sequence = Counting(ProceduralScene(3, 16, 16, num_frames=24))
+    sequence = Counting(ProceduralScene(3, 16, 16, num_images=24))
     sample = load(Task(sequence, Selection([9, 2, 5], [5, 7, 9])))
     assert sorted(sequence.decoded) == [2, 5, 7, 9]
     images = sequence.scene.views([9, 2, 5, 7]).images
@@ -161,9 +161,9 @@ def test_an_input_that_is_a_target_is_decoded_once():
 
 
 def test_fixed_tasks_stay_loaded_as_long_as_there_is_room(monkeypatch):
-    sequences = [Counting(ProceduralScene(seed, 16, 16, num_frames=24)) for seed in range(3)]
+    sequences = [Counting(ProceduralScene(seed, 16, 16, num_images=24)) for seed in range(3)]
     tasks = [Task(sequence, Selection([0, 1], [2])) for sequence in sequences]
-    monkeypatch.setattr(datamodule, "KEPT_BYTES", 1.5 * 3 * 3 * 16 * 16 * 4)
+    monkeypatch.setattr(datamodule, "MAX_LOADED_BYTES", 1.5 * 3 * 3 * 16 * 16 * 4)
     fixed = FixedTasks(tasks)
     assert [len(sequence.decoded) for sequence in sequences] == [3, 3, 0]
     for _ in range(2):
@@ -277,13 +277,13 @@ def test_tests_may_have_a_size_that_is_not_trained(tmp_path):
 
 
 def test_which_test_sets_are_tested(tmp_path):
-    scene = ProceduralScene(3, 16, 16, num_frames=24)
+    scene = ProceduralScene(3, 16, 16, num_images=24)
     write_transforms(scene.views(range(24)), tmp_path)
     sets = {"here": {"root": str(tmp_path), "selection": "kmeans"}, "nowhere": {"root": None}}
     assert not with_test_sets(sets).test_sets
     own = {"root": str(tmp_path), "name": "own", "on_bad_image": "fail"} | READ_WITH
     same = {"own": {"root": "elsewhere"}, "more": {"inputs": 5}}
-    with pytest.warns(UserWarning, match=r"Not tested for want of a path: nowhere\. .* paths\.no"):
+    with pytest.warns(UserWarning, match=r"their paths are not set: nowhere\. .* paths\.no"):
         data = files_data(test_sets=sets | same, **own)
     assert list(data.test_sets) == ["here", "more"]
     with pytest.raises(InputError, match=r"data\.test_sets\.own has the name of the data"):
@@ -294,7 +294,7 @@ def test_a_test_set_beside_scenes_that_are_tested(tmp_path):
     """Its root is what it tests, as test_root is of the data set; options are its own."""
     for name, seeds in {"train": (3, 4, 5), "test": (6,), "other": (7,)}.items():
         for seed in seeds:
-            scene = ProceduralScene(seed, 16, 16, num_frames=24)
+            scene = ProceduralScene(seed, 16, 16, num_images=24)
             write_transforms(scene.views(range(24)), tmp_path / name / str(seed))
     data = files_data(
         **{"name": "files", "root": f"{tmp_path}/train", "test_root": f"{tmp_path}/test"},
@@ -315,7 +315,7 @@ def test_a_test_set_beside_scenes_that_are_tested(tmp_path):
 @pytest.mark.parametrize("test_root", [None, "3"], ids=["frames", "scenes"])
 def test_photographs_are_tested_on_the_same_frames_at_another_size(tmp_path, test_root):
     for seed in (3, 4, 5):
-        scene = ProceduralScene(seed, 16, 16, num_frames=24)
+        scene = ProceduralScene(seed, 16, 16, num_images=24)
         write_transforms(scene.views(range(24)), tmp_path / str(seed))
     options = {"name": "files", "root": str(tmp_path), "val_scenes": 1, **READ_WITH}
     options["test_root"] = test_root and str(tmp_path / test_root)
@@ -332,7 +332,7 @@ def test_photographs_are_tested_on_the_same_frames_at_another_size(tmp_path, tes
 
 def test_a_test_set_in_another_folder(tmp_path):
     for seed in (3, 4):
-        scene = ProceduralScene(seed, 16, 16, num_frames=24)
+        scene = ProceduralScene(seed, 16, 16, num_images=24)
         write_transforms(scene.views(range(24)), tmp_path / str(seed))
     options = {"name": "transforms", "root": str(tmp_path / "3"), **READ_WITH}
     data = files_data(test_sets={"other": {"root": str(tmp_path / "4")}}, **options)
@@ -350,7 +350,7 @@ def folders(tmp_path):
     """Scenes to train on, 3, 4 and 5, of which 4 has a photograph that is cut short, and a test."""
     for name, seeds in {"train": (3, 4, 5), "test": (6,)}.items():
         for seed in seeds:
-            scene = ProceduralScene(seed, 16, 16, num_frames=24)
+            scene = ProceduralScene(seed, 16, 16, num_images=24)
             write_transforms(scene.views(range(24)), tmp_path / name / str(seed))
     for image in (tmp_path / "train" / "4" / "images").iterdir():
         image.write_bytes(image.read_bytes()[:100])

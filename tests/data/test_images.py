@@ -7,8 +7,8 @@ from asysplat.data.images import (
     Lens,
     image_size,
     load_depth,
+    load_image,
     load_mask,
-    load_photograph,
     resize_and_crop,
     resized_intrinsics,
     undistort,
@@ -127,7 +127,7 @@ def test_transparency_is_laid_on_white(tmp_path):
     pixels[0], pixels[1] = (200, 100, 0, 255), (200, 100, 0, 0)
     pixels[0, 0, 3] = 51
     Image.fromarray(pixels).save(tmp_path / "a.png")
-    loaded = load_photograph(tmp_path / "a.png")
+    loaded = load_image(tmp_path / "a.png")
     assert loaded[0, 1].tolist() == [200, 100, 0] and loaded[1, 1].tolist() == [255] * 3
     assert np.abs(loaded[0, 0].astype(int) - (244, 224, 204)).max() <= 1
 
@@ -137,7 +137,7 @@ def test_exif_orientation_is_not_applied(tmp_path):
     exif[0x0112] = 6
     Image.new("RGB", (20, 10)).save(tmp_path / "a.jpg", exif=exif)
     assert image_size(tmp_path / "a.jpg") == (20, 10)
-    assert load_photograph(tmp_path / "a.jpg").shape == (10, 20, 3)
+    assert load_image(tmp_path / "a.jpg").shape == (10, 20, 3)
 
 
 def test_depth_keeps_sixteen_bits_and_mask_keeps_what_is_not_zero(tmp_path):
@@ -166,7 +166,7 @@ def test_a_cut_off_file_is_refused_when_opened(tmp_path, suffix):
     Image.fromarray(noise).save(whole)
     cut = tmp_path / f"cut{suffix}"
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    for read in (image_size, load_photograph):
+    for read in (image_size, load_image):
         with pytest.raises(InputError, match=rf"cut\{suffix} cannot be read"):
             read(cut)
 
@@ -174,7 +174,7 @@ def test_a_cut_off_file_is_refused_when_opened(tmp_path, suffix):
 def test_depth_and_photograph_are_not_taken_for_each_other(tmp_path):
     cv2.imwrite(str(tmp_path / "depth.png"), np.full((2, 2), 40000, np.uint16))
     with pytest.raises(InputError, match="8-bit RGB"):
-        load_photograph(tmp_path / "depth.png")
+        load_image(tmp_path / "depth.png")
     Image.new("RGB", (2, 2)).save(tmp_path / "photograph.png")
     with pytest.raises(InputError, match="3 channels"):
         load_depth(tmp_path / "photograph.png")

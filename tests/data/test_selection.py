@@ -5,20 +5,19 @@ import pytest
 import torch
 
 from asysplat.data import ProceduralScene
-from asysplat.data.selection import (
+from asysplat.data.selection import kmeans_selection, named_selection
+from asysplat.data.selection.__main__ import main as index_command
+from asysplat.data.selection.index import Entry, camera_hash, read_index, write_index
+from asysplat.data.selection.kmeans import nearest_to_centers, pose_features
+from asysplat.data.selection.views import (
     Selection,
     every_8th_selection,
     first_96_selection,
     held_out,
-    kmeans_selection,
-    named_selection,
-    training_frames,
+    training_images,
     training_selection,
     uniform_selection,
 )
-from asysplat.data.selection.__main__ import main as index_command
-from asysplat.data.selection.index import Entry, camera_hash, read_index, write_index
-from asysplat.data.selection.kmeans import nearest_to_centers, pose_features
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
@@ -46,27 +45,27 @@ def cameras_at(centers, forwards=None) -> Cameras:
 
 
 def test_evaluation_inputs_are_even_and_targets_midway():
-    selected = uniform_selection(num_frames=17, num_inputs=5, num_targets=4)
+    selected = uniform_selection(num_images=17, num_inputs=5, num_targets=4)
     assert selected.inputs == [0, 4, 8, 12, 16]
     assert selected.targets == [2, 6, 10, 14]
 
 
 def test_evaluation_targets_are_spread_over_the_gaps():
-    selected = uniform_selection(num_frames=81, num_inputs=9, num_targets=2)
+    selected = uniform_selection(num_images=81, num_inputs=9, num_targets=2)
     assert selected.targets == [25, 65]
 
 
 def test_evaluation_uses_every_frame_of_the_shortest_sequence():
-    selected = uniform_selection(num_frames=7, num_inputs=4, num_targets=3)
+    selected = uniform_selection(num_images=7, num_inputs=4, num_targets=3)
     assert selected.inputs == [0, 2, 4, 6]
     assert selected.targets == [1, 3, 5]
 
 
-@pytest.mark.parametrize("num_frames", range(8, 60))
-def test_evaluation_never_shares_or_repeats_a_frame(num_frames):
-    selected = uniform_selection(num_frames, num_inputs=3, num_targets=5)
+@pytest.mark.parametrize("num_images", range(8, 60))
+def test_evaluation_never_shares_or_repeats_a_frame(num_images):
+    selected = uniform_selection(num_images, num_inputs=3, num_targets=5)
     chosen = selected.inputs + selected.targets
-    assert len(set(chosen)) == 8 and min(chosen) >= 0 and max(chosen) < num_frames
+    assert len(set(chosen)) == 8 and min(chosen) >= 0 and max(chosen) < num_images
     assert selected.targets == sorted(selected.targets)
 
 
@@ -98,9 +97,9 @@ def test_window_is_clipped_to_a_short_sequence():
 
 
 def test_too_short_a_sequence_says_what_to_set():
-    with pytest.raises(InputError, match=r"has 6 frames.*data\.inputs and data\.targets.*6"):
+    with pytest.raises(InputError, match=r"has 6 images.*data\.inputs and data\.targets.*6"):
         uniform_selection(6, num_inputs=4, num_targets=3)
-    with pytest.raises(InputError, match="has 6 frames"):
+    with pytest.raises(InputError, match="has 6 images"):
         training_selection(6, 4, 3, (8, 9), np.random.default_rng(0))
 
 
@@ -127,7 +126,7 @@ def test_targets_of_training_may_be_inputs():
 
 
 def test_frames_of_a_folder_are_tested_or_validated_or_trained():
-    sets = [set(held_out(50, "test")), set(held_out(50, "val")), set(training_frames(50))]
+    sets = [set(held_out(50, "test")), set(held_out(50, "val")), set(training_images(50))]
     assert set.union(*sets) == set(range(50))
     assert sum(map(len, sets)) == 50
     selected = every_8th_selection(50, 8, 4, "test")
@@ -155,7 +154,7 @@ def test_validation_sees_no_frame_of_the_test(selection):
     assert not set(selected.inputs + selected.targets) & set(held_out(70, "test"))
     assert set(selected.targets) <= set(held_out(70, "val"))
     tested = named_selection(selection, cameras, 8, 4, "test")
-    assert not set(tested.targets) & set(training_frames(70))
+    assert not set(tested.targets) & set(training_images(70))
 
 
 def test_uniform_is_the_evaluation_of_made_up_scenes():
@@ -168,7 +167,7 @@ def test_unknown_selections_and_short_sequences_are_named():
     with pytest.raises(InputError, match=r"data\.selection is 'k_means': expected one of every_8"):
         named_selection("k_means", cameras, 4, 4, "test")
     for selection in ("every_8th", "kmeans", "first_96"):
-        with pytest.raises(InputError, match=r"20 frames, of which 1\d are not .*data\.inputs"):
+        with pytest.raises(InputError, match=r"20 images, of which 1\d are not .*data\.inputs"):
             named_selection(selection, cameras, 19, 4, "test")
 
 
@@ -285,7 +284,7 @@ def test_pixelsplat_s_index(tmp_path):
     assert index.selection("5aca", line(10), 2) == Selection([2, 9], [2, 4, 9])
     with pytest.raises(InputError, match=r"index\.json, scene 5aca has 2 inputs and data\.inputs"):
         index.selection("5aca", line(10), 3)
-    with pytest.raises(InputError, match="names frame 9, and the scene has 9 frames"):
+    with pytest.raises(InputError, match="names image 9, and the scene has 9 images"):
         index.selection("5aca", line(9), 2)
 
 
@@ -329,8 +328,8 @@ UNUSABLE = {
     "a list": ("[]", "is no index"),
     "a string": ('{"a": "b"}', "scene a, context is None"),
     "no target": ('{"a": {"context": [1]}}', "scene a, target is None"),
-    "a negative number": ('{"a": {"context": [-1], "target": [2]}}', "different frame numbers"),
-    "twice the same": ('{"a": {"context": [1, 1], "target": [2]}}', "different frame numbers"),
+    "a negative number": ('{"a": {"context": [-1], "target": [2]}}', "different image numbers"),
+    "twice the same": ('{"a": {"context": [1, 1], "target": [2]}}', "different image numbers"),
     "not JSON": ("{", "is not JSON"),
 }
 
@@ -345,13 +344,13 @@ def test_an_unusable_index_is_named(case, tmp_path):
 
 def test_the_command_writes_an_index_outside_of_the_data_set(tmp_path, capsys):
     for seed in (3, 4):
-        scene = ProceduralScene(seed, 8, 8, num_frames=24)
+        scene = ProceduralScene(seed, 8, 8, num_images=24)
         write_transforms(scene.views(range(24)), tmp_path / "scenes" / str(seed))
     file = tmp_path / "index.json"
     index_command([str(tmp_path / "scenes"), str(file), "--inputs", "4"])
     assert "2 scenes" in capsys.readouterr().out
     index = read_index(file, 4)
-    cameras = ProceduralScene(4, 8, 8, num_frames=24).cameras
+    cameras = ProceduralScene(4, 8, 8, num_images=24).cameras
     assert index.selection("4", cameras, 4) == kmeans_selection(cameras, 4, 8, "test")
     inside = tmp_path / "scenes/index.json"
     with pytest.raises(SystemExit, match="lies in the data set"):

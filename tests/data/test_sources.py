@@ -6,18 +6,19 @@ import shutil
 import numpy as np
 import pytest
 
-from asysplat.data import FilesSource, scene_folder
+from asysplat.data import FilesSource, SceneOptions, scene_folder
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection import Selection, held_out, kmeans_selection
+from asysplat.data.selection.kmeans import kmeans_selection
+from asysplat.data.selection.views import Selection, held_out
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 
 FRAMES = 24
-SIZE = (8, 8)
+SIZE = SceneOptions(8, 8)
 
 
 def made(seed: int) -> ProceduralScene:
-    return ProceduralScene(seed, *SIZE, num_frames=FRAMES)
+    return ProceduralScene(seed, SIZE.height, SIZE.width, num_images=FRAMES)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,7 @@ def frames(tasks):
 
 
 def test_a_written_scene_trains_like_the_scene_itself(folder):
-    source = FilesSource(folder("one", 3), *SIZE, (12, 24))
+    source = FilesSource(folder("one", 3), SIZE, (12, 24))
     (task,) = source.evaluation("test", 4, 2)
     read = task.sequence.views(task.selection.targets)
     views = made(3).views(task.selection.targets)
@@ -83,13 +84,13 @@ def test_a_written_scene_trains_like_the_scene_itself(folder):
 
 def test_a_folder_without_scenes(tmp_path, written):
     with pytest.raises(InputError, match=r"data\.root"):
-        FilesSource(str(tmp_path), *SIZE, (12, 24))
+        FilesSource(str(tmp_path), SIZE, (12, 24))
     with pytest.raises(InputError, match=r"data\.test_root=.*nowhere"):
-        FilesSource(str(written), *SIZE, (12, 24), test_root=f"{tmp_path}/nowhere")
+        FilesSource(str(written), SIZE, (12, 24), test_root=f"{tmp_path}/nowhere")
 
 
 def test_scenes_are_opened_when_they_are_drawn(folder, opened):
-    source = FilesSource(folder("many", *range(6)), *SIZE, (12, 24), val_scenes=2)
+    source = FilesSource(folder("many", *range(6)), SIZE, (12, 24), val_scenes=2)
     assert opened == []
     (task,) = drawn(source, 1)
     assert opened == [task.sequence.name]
@@ -98,8 +99,8 @@ def test_scenes_are_opened_when_they_are_drawn(folder, opened):
 
 
 def test_scenes_that_were_long_unused_are_closed(folder, opened, monkeypatch):
-    monkeypatch.setattr(scene_folder, "MOST_OPEN", 2)
-    folder = scene_folder.SceneFolder(folder("many", 0, 1, 2), *SIZE)
+    monkeypatch.setattr(scene_folder, "MAX_OPEN", 2)
+    folder = scene_folder.SceneFolder(folder("many", 0, 1, 2), SIZE)
     assert len(folder) == 3
     first = folder[0]
     assert folder[0] is first and folder[1].name == "s1" and folder[0] is first
@@ -111,7 +112,7 @@ def test_scenes_that_were_long_unused_are_closed(folder, opened, monkeypatch):
 def test_tested_scenes_are_not_trained_on(folder):
     """Though the root holds them, deeper down, too."""
     root, tested = folder("all/1K", *range(8)), folder("tested", 2, 5)
-    source = FilesSource(root, *SIZE, (12, 24), test_root=tested, val_scenes=2)
+    source = FilesSource(root, SIZE, (12, 24), test_root=tested, val_scenes=2)
     validated = names(source.evaluation("val", 4, 2))
     assert names(source.evaluation("test", 4, 2)) == {"s2", "s5"}
     trained = names(drawn(source))
@@ -122,17 +123,17 @@ def test_tested_scenes_are_not_trained_on(folder):
 
 def test_a_test_root_leaves_scenes_to_train_on(folder):
     root, tested = folder("all", 0, 1), folder("tested", 1)
-    source = FilesSource(root, *SIZE, (12, 24), test_root=tested, val_scenes=1)
+    source = FilesSource(root, SIZE, (12, 24), test_root=tested, val_scenes=1)
     with pytest.raises(InputError, match=r"data\.root has 1 scenes .*data\.val_scenes is 1"):
         drawn(source)
 
 
 def test_a_damaged_scene_is_never_another_scene(folder):
     root = folder("broken", 0, 1, 2)
-    source = FilesSource(root, *SIZE, (12, 24))
+    source = FilesSource(root, SIZE, (12, 24))
     image = source.scenes.paths[1] / "images/00003.png"
     image.write_bytes(image.read_bytes()[:50])
-    whole = FilesSource(folder("whole", 0, 1, 2), *SIZE, (12, 24))
+    whole = FilesSource(folder("whole", 0, 1, 2), SIZE, (12, 24))
     found = set()
     for seed in range(20):
         rngs = [np.random.default_rng(seed) for _ in range(2)]
@@ -151,7 +152,7 @@ def test_targets_may_be_inputs_where_asked(folder):
     shared = [
         any(
             set(task.selection.inputs) & set(task.selection.targets)
-            for task in drawn(FilesSource(root, *SIZE, (12, 24), targets_may_be_inputs=asked))
+            for task in drawn(FilesSource(root, SIZE, (12, 24), targets_may_be_inputs=asked))
         )
         for asked in (False, True)
     ]
@@ -160,14 +161,14 @@ def test_targets_may_be_inputs_where_asked(folder):
 
 def test_the_selection_is_that_of_the_test(folder):
     root = folder("two", 3, 4)
-    source = FilesSource(root, *SIZE, (12, 24), selection="kmeans")
+    source = FilesSource(root, SIZE, (12, 24), selection="kmeans")
     for task in source.evaluation("test", 4, 2):
         cameras = made(int(task.sequence.name[1:])).cameras
         assert task.selection == kmeans_selection(cameras, 4, 2, "test")
         assert task.selection.targets == [0, 8, 16]
     assert not frames(drawn(source)) & {0, 8, 16}
     with pytest.raises(InputError, match=r"data\.selection is 'k-means'"):
-        FilesSource(root, *SIZE, (12, 24), selection="k-means").evaluation("test", 4, 2)
+        FilesSource(root, SIZE, (12, 24), selection="k-means").evaluation("test", 4, 2)
 
 
 @pytest.fixture
@@ -185,7 +186,7 @@ def index(tmp_path):
 def test_an_index_names_the_scenes_and_frames_of_the_test(folder, index):
     file = index(s2={"context": [3, 20], "target": [3, 9]}, s5=None)
     source = FilesSource(
-        *(folder("all", *range(8)), *SIZE, (12, 24)),
+        *(folder("all", *range(8)), SIZE, (12, 24)),
         **{"test_root": folder("tested", 2, 5), "selection": "index", "index": file},
         val_scenes=2,
     )
@@ -199,12 +200,12 @@ def test_an_index_that_does_not_fit(folder, index):
     root = folder("one", 2)
     entry = {"context": [3, 20], "target": [9]}
     options = {"selection": "index", "index": index(s2=entry, s7=entry, s9=entry)}
-    source = FilesSource(root, *SIZE, (12, 24), **options)
+    source = FilesSource(root, SIZE, (12, 24), **options)
     with pytest.raises(InputError, match=r"names 2 scenes that are not there, such as s7"):
         source.evaluation("test", 2, 2)
     with pytest.raises(InputError, match=r"data\.selection=index would test frames that are"):
         drawn(source)
     with pytest.raises(InputError, match=r"data\.selection is kmeans and data\.index is"):
-        FilesSource(root, *SIZE, (12, 24), **(options | {"selection": "kmeans"}))
+        FilesSource(root, SIZE, (12, 24), **(options | {"selection": "kmeans"}))
     with pytest.raises(InputError, match=r"data\.on_bad_image=skip changes the numbers"):
-        FilesSource(root, *SIZE, (12, 24), on_bad_image="skip", **options)
+        FilesSource(root, SceneOptions(8, 8, on_bad_image="skip"), (12, 24), **options)

@@ -1,22 +1,21 @@
-"""Readers of posed photographs in the layouts in which they are published.
+"""Readers of posed photographs, one for each layout in which they are published.
 
-A layout is how a data set's files are arranged in its folder. Each has a reader, a module with two
+A layout is the arrangement of a data set's files in its folder. Its reader is a module with two
 functions:
 
 find_scenes(root) -> list[Path]         the scenes of this layout that `root` is or holds
-read_scene(scene, bad) -> PosedScene    one of them; frames that cannot be used are noted in `bad`
+read_scene(scene, bad) -> PosedScene    one of them; errors of single images are collected in `bad`
 
-To add a data set whose layout is not here: write such a module (`llff` is a short one, `common` has
-what readers share), add it to LAYOUTS, write conf/data/NAME.yaml and a section of data/README.md,
-and let tests/data/readers/layouts/NAME.py write a scene to read. A data set whose layout is here
-needs no code: see conf/data/mipnerf360.yaml.
+To add a layout: write such a module (`llff` is a short one, `common` has shared functions), add it
+to READERS, write conf/data/NAME.yaml and a section of data/README.md, and add a writer of it in
+tests/data/readers/layouts/NAME.py. A data set in a known layout needs no code: see
+conf/data/mipnerf360.yaml.
 """
 
 from pathlib import Path
 from types import ModuleType
 
-from asysplat.data.bad_images import BadFrames, Policy
-from asysplat.data.cache import ImageCache
+from asysplat.data.bad_images import BadImages
 from asysplat.data.disparity import with_disparities
 from asysplat.data.readers import (
     colmap,
@@ -29,21 +28,12 @@ from asysplat.data.readers import (
     scannetpp,
     transforms,
 )
-from asysplat.data.sequence import FileSequence
+from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.errors import InputError
 
-# Where a folder fits several, the first of them reads it.
-LAYOUTS: dict[str, ModuleType] = {
-    "long_lrm": long_lrm,
-    "realestate10k": realestate10k,
-    "replica": replica,
-    "scannetpp": scannetpp,
-    "dl3dv": dl3dv,
-    "transforms": transforms,
-    "llff": llff,
-    "posed": posed,
-    "colmap": colmap,
-}
+# In this order: the first layout that fits a folder reads it.
+READERS = (long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, llff, posed, colmap)
+LAYOUTS: dict[str, ModuleType] = {reader.__name__.rpartition(".")[2]: reader for reader in READERS}
 
 
 def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]]:
@@ -62,46 +52,32 @@ def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]
     if not root.exists():
         raise InputError(f"{root} does not exist: name a scene, or a folder of scenes.")
     raise InputError(
-        f"{root} holds no scene of layout {layout}: data/README.md shows which files "
-        f"make one; the layouts are {', '.join(LAYOUTS)}."
+        f"{root} holds no scene of layout {layout}: data/README.md lists the files of each "
+        f"layout; the layouts are {', '.join(LAYOUTS)}."
     )
 
 
-def open_scene(
-    scene: Path | str,
-    height: int,
-    width: int,
-    layout: str = "auto",
-    on_bad_image: Policy = "fail",
-    cache: ImageCache | None = None,
-    disparities: Path | str | None = None,
-) -> FileSequence:
-    """Open one scene, its images unread.
+def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
+    """Open one scene without reading pixels.
 
     Args:
         scene: its folder, or a path that `find_scenes` returned.
-        height, width: size of every view, in pixels.
-        layout: a name in LAYOUTS, or auto.
-        on_bad_image: "fail" raises an error that names every frame whose files cannot be used;
-            "skip" leaves them out, with a warning, for which each image is decoded once.
-        cache: where decoded pixels are kept.
-        disparities: the folder of `python -m asysplat.data.disparity`; None reads none.
 
     Raises:
-        InputError: files that cannot be used, or fewer than two frames.
+        InputError: files that cannot be used, or fewer than two images.
     """
-    path = Path(scene).absolute()
+    path, layout = Path(scene).absolute(), options.layout
     if layout == "auto":
         layout, scenes = find_scenes(path)
         if len(scenes) != 1:
             raise InputError(f"{path} holds {len(scenes)} scenes: name one, such as {scenes[0]}.")
         path = scenes[0]
-    bad = BadFrames(on_bad_image)
+    bad = BadImages(options.on_bad_image)
     posed = LAYOUTS[layout].read_scene(path, bad)
-    if disparities is not None:
-        posed = with_disparities(posed, path, Path(disparities))
-    sequence = FileSequence(posed, height, width, cache)
-    if on_bad_image == "skip":
+    if options.disparities is not None:
+        posed = with_disparities(posed, path, Path(options.disparities))
+    sequence = FileSequence(posed, options)
+    if options.on_bad_image == "skip":
         sequence = sequence.without_damaged(bad)
-    bad.settle(str(path), sequence.num_frames)
+    bad.report(str(path), sequence.num_images)
     return sequence

@@ -17,7 +17,7 @@ import pycolmap
 from jaxtyping import Float
 from numpy import ndarray
 
-from asysplat.data.bad_images import BadFrames
+from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.common import (
     folders_with,
@@ -27,7 +27,7 @@ from asysplat.data.readers.common import (
     rigid,
     scaled,
 )
-from asysplat.data.sequence import Photograph, Points, PosedScene
+from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -40,7 +40,7 @@ PARAMETERS = {  # names of each camera model's parameters, in COLMAP's order
     "OPENCV": "fx fy cx cy k1 k2 p1 p2",
     "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
-SHOWN = 5  # names in a warning
+MAX_NAMES = 5  # in a warning
 SAME_WORLD = 1e-3  # greatest difference of rotations, and of positions over the cameras' spread
 
 
@@ -51,113 +51,106 @@ def find_scenes(root: Path) -> list[Path]:
     )
 
 
-def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
+def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     """Read a folder with a model and the images that it names.
 
     The names are relative to `images`, `images_undistort`, `images_2`, `images_4`, `images_8` or
-    the folder itself: the first of those that holds the most of them. Frames are the registered
-    images, ordered by the numbers in their names (2 before 10); a warning lists images that are not
-    registered. Where images are smaller than their cameras say,
-    the intrinsics are scaled.
+    the folder itself: the first of those that holds the most of them. Reads the registered images,
+    ordered by the numbers in their names (2 before 10); a warning lists images that are not
+    registered. Where images are smaller than their cameras' size, the intrinsics are scaled.
 
     Raises:
         InputError: a model that is cut short, a camera model that is not in PARAMETERS, or no
             image that the model names.
     """
-    model = _model_of(scene)
+    model = _find_model(scene)
     if model is None:
         raise InputError(f"{scene} has no COLMAP model: expected one in {', '.join(MODELS)}.")
-    reconstruction = _read(model)
-    images = sorted(_registered(reconstruction), key=lambda image: natural_order(Path(image.name)))
-    folder = _images_folder(scene, model, [image.name for image in images])
-    _tell_unregistered(model, [folder / image.name for image in images])
+    colmap = _read(model)
+    registered = sorted(_registered(colmap), key=lambda image: natural_order(Path(image.name)))
+    folder = _images_folder(scene, model, [image.name for image in registered])
+    _warn_of_unregistered(model, [folder / image.name for image in registered])
     lenses = {
-        camera: _lens(reconstruction.cameras[camera], f"{model}, camera {camera}")
-        for camera in {image.camera_id for image in images}
+        camera: _lens(colmap.cameras[camera], f"{model}, camera {camera}")
+        for camera in {image.camera_id for image in registered}
     }
-    photographs = []
-    for image in images:
-        with bad.caught():
-            path = folder / image.name
-            lens = scaled(lenses[image.camera_id], image_size(path), str(path))
-            photographs.append(Photograph(path, lens, _cam_to_world(image, model)))
-    return PosedScene(scene.name, photographs, partial(_read_points, model))
+
+    def read(image: pycolmap.Image) -> PosedImage:
+        path = folder / image.name
+        lens = scaled(lenses[image.camera_id], image_size(path), str(path))
+        return PosedImage(path, lens, _cam_to_world(image, model))
+
+    images = bad.read_each(read, ((image,) for image in registered))
+    return PosedScene(scene.name, images, partial(_read_points, model))
 
 
-def points_beside(scene: Path, photographs: Sequence[Photograph]) -> Points | None:
-    """Read the sparse points of a model beside photographs whose poses were read elsewhere.
+def points_beside(scene: Path, posed: Sequence[PosedImage]) -> Points | None:
+    """Read the sparse points of a model beside images whose poses were read elsewhere.
 
-    None if there is no model, or if its cameras, found by the images' names, have other poses: then
-    its world is another one.
+    None if there is no model, or if its poses of the images with the same names differ: then its
+    world is another one.
 
     Raises:
         InputError: a model that is cut short.
     """
-    model = _model_of(scene)
+    model = _find_model(scene)
     if model is None:
         return None
-    reconstruction = _read(model)
-    images = {Path(image.name).name: image for image in _registered(reconstruction)}
+    colmap = _read(model)
+    images = {Path(image.name).name: image for image in _registered(colmap)}
     pairs = [
-        (photograph.cam_to_world, _cam_to_world(images[photograph.image.name], model))
-        for photograph in photographs
-        if photograph.image.name in images
+        (image.cam_to_world, _cam_to_world(images[image.file.name], model))
+        for image in posed
+        if image.file.name in images
     ]
-    return _points(reconstruction) if pairs and _same_world(np.array(pairs)) else None
+    return _points(colmap) if pairs and _same_world(np.array(pairs)) else None
 
 
 def _same_world(pairs: Float[ndarray, "N 2 4 4"]) -> bool:
     difference = np.abs(pairs[:, 0] - pairs[:, 1])
     spread = np.ptp(pairs[:, 0, :3, 3], axis=0).max()
-    turned, moved = difference[:, :3, :3].max(), difference[:, :3, 3].max()
-    return bool(turned < SAME_WORLD and moved < SAME_WORLD * spread)
+    rotation, translation = difference[:, :3, :3].max(), difference[:, :3, 3].max()
+    return bool(rotation < SAME_WORLD and translation < SAME_WORLD * spread)
 
 
-def _model_of(scene: Path) -> Path | None:
+def _find_model(scene: Path) -> Path | None:
     models = (scene / name for name in MODELS)
-    return next((model for model in models if _is_binary(model) or _is_text(model)), None)
+    return next((m for m in models if _is_binary(m) or (m / "cameras.txt").is_file()), None)
 
 
 def _is_binary(model: Path) -> bool:
     return (model / "cameras.bin").is_file()
 
 
-def _is_text(model: Path) -> bool:
-    return (model / "cameras.txt").is_file()
-
-
 def _read(model: Path) -> pycolmap.Reconstruction:
-    reconstruction = pycolmap.Reconstruction()
+    colmap, binary = pycolmap.Reconstruction(), _is_binary(model)
     for file in model.glob("*.bin"):
         _check_lengths(file)
     try:
-        if _is_binary(model):
-            reconstruction.read_binary(model)
-        else:
-            reconstruction.read_text(model)
+        (colmap.read_binary if binary else colmap.read_text)(model)
     # Damaged files make COLMAP raise anything from IndexError to MemoryError, with a C++ trace.
     except Exception as error:
         reason = str(error).split("\n")[0]
         raise InputError(
-            f"{model} is not a whole COLMAP model ({reason}): copy its cameras, images and "
+            f"{model} is not a complete COLMAP model ({reason}): copy its cameras, images and "
             "points3D files again."
         ) from error
-    if _is_binary(model):
-        _check_cameras(model / "cameras.bin", reconstruction.cameras.values())
+    if binary:
+        _check_cameras(model / "cameras.bin", colmap.cameras.values())
     else:
-        _check_count(model / "images.txt", reconstruction.num_images())
-        _check_count(model / "points3D.txt", reconstruction.num_points3D())
-    return reconstruction
+        _check_count(model / "images.txt", colmap.num_images())
+        _check_count(model / "points3D.txt", colmap.num_points3D())
+    return colmap
 
 
 def _check_lengths(file: Path) -> None:
-    """Check that the file is as long as it says, as COLMAP would loop for ever if it is not."""
+    """Check the file's length against its counts: COLMAP loops for ever in a file cut short."""
     stored = file.read_bytes()
     try:
         (count,) = struct.unpack_from("<Q", stored)
         end = 8
         if 8 * count > len(stored):
-            raise ValueError(f"it says that it has {count} entries")
+            raise ValueError(f"its header gives {count} entries")
         for _ in range(count if file.name == "images.bin" else 0):
             end = stored.index(b"\0", end + 64) + 1  # after numbers and the name
             end += 8 + 24 * struct.unpack_from("<Q", stored, end)[0]
@@ -182,20 +175,20 @@ def _check_cameras(file: Path, cameras: Iterable[pycolmap.Camera]) -> None:
         )
 
 
-def _check_count(file: Path, found: int) -> None:
+def _check_count(file: Path, count: int) -> None:
     """Check the number of entries against the file's header; COLMAP accepts any number of lines."""
     with file.open(encoding="utf-8", errors="replace") as lines:
         header = "".join(line for _, line in zip(range(4), lines, strict=False))
-    stated = re.search(r"^# Number of \w+: (\d+)", header, re.MULTILINE)
-    if stated and int(stated[1]) != found:
+    expected = re.search(r"^# Number of \w+: (\d+)", header, re.MULTILINE)
+    if expected and int(expected[1]) != count:
         raise InputError(
-            f"{file} holds {found} entries and its header says {stated[1]}: it is cut short, so "
+            f"{file} holds {count} entries and its header gives {expected[1]}: it is cut short, so "
             "copy it again, or correct the header."
         )
 
 
-def _registered(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    return [image for image in reconstruction.images.values() if image.has_pose]
+def _registered(colmap: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [image for image in colmap.images.values() if image.has_pose]
 
 
 def _cam_to_world(image: pycolmap.Image, model: Path) -> Float[ndarray, "4 4"]:
@@ -208,8 +201,8 @@ def _read_points(model: Path) -> Points | None:
     return _points(_read(model))
 
 
-def _points(reconstruction: pycolmap.Reconstruction) -> Points | None:
-    points = sorted(reconstruction.points3D.items())
+def _points(colmap: pycolmap.Reconstruction) -> Points | None:
+    points = sorted(colmap.points3D.items())
     return np.array([point.xyz for _, point in points]) if points else None
 
 
@@ -248,14 +241,14 @@ def _images_folder(scene: Path, model: Path, names: Sequence[str]) -> Path:
     return scene / best
 
 
-def _tell_unregistered(model: Path, registered: Sequence[Path]) -> None:
-    known = set(registered)
+def _warn_of_unregistered(model: Path, registered: Sequence[Path]) -> None:
+    used = set(registered)
     folders = sorted({path.parent for path in registered})
-    left = [path for folder in folders for path in images_in(folder) if path not in known]
+    left = [path for folder in folders for path in images_in(folder) if path not in used]
     if left:
-        names = ", ".join(path.name for path in left[:SHOWN]) + (", ..." * (len(left) > SHOWN))
+        names = ", ".join(path.name for path in left[:MAX_NAMES])
         warnings.warn(
-            f"{model} has not registered {len(left)} of {len(left) + len(known)} images, which are "
-            f"left out: {names}",
+            f"{model} has not registered {len(left)} of {len(left) + len(used)} images, which are "
+            f"left out: {names}{', ...' * (len(left) > MAX_NAMES)}",
             stacklevel=2,
         )

@@ -1,4 +1,7 @@
-"""What several readers need: folders, JSON, images, lenses and poses, each checked."""
+"""Functions that several readers share: folders, JSON, intrinsics and poses, each checked.
+
+`size` is always (width, height) of an image, `where` the file and the image, for messages.
+"""
 
 import json
 import math
@@ -22,9 +25,9 @@ MILLIMETERS = 0.001  # meters: the usual unit of stored depths
 
 
 def folders_with(root: Path, *marks: str, depth: int = DEPTH) -> list[Path]:
-    """Find `root`, if one of the files `marks` lies there, else all such folders below it.
+    """Find `root` if it has one of the files `marks`, else all folders below it that have one.
 
-    Sorted. Folders within a folder that was found are not searched.
+    Sorted; folders within a result are not searched.
     """
     if not root.is_dir():
         return []
@@ -32,7 +35,7 @@ def folders_with(root: Path, *marks: str, depth: int = DEPTH) -> list[Path]:
         return [root]
     if depth == 0:
         return []
-    with os.scandir(root) as entries:  # faster than Path, which asks again for each entry
+    with os.scandir(root) as entries:  # faster than Path, which queries each entry again
         folders = sorted(entry.path for entry in entries if entry.is_dir())
     return [
         scene for folder in folders for scene in folders_with(Path(folder), *marks, depth=depth - 1)
@@ -45,6 +48,11 @@ def natural_order(path: Path) -> list[str | int]:
     return [int(part) if part.isdecimal() else part for part in parts]
 
 
+def read_text(file: Path) -> str:
+    """Read UTF-8 text, with or without a byte order mark."""
+    return file.read_text(encoding="utf-8-sig", errors="replace")
+
+
 def read_json(file: Path) -> Any:
     """Read a JSON file.
 
@@ -53,7 +61,7 @@ def read_json(file: Path) -> Any:
     """
     if not file.is_file():
         raise InputError(f"{file} does not exist: put it there, or name another file.")
-    text = file.read_text(encoding="utf-8-sig", errors="replace")
+    text = read_text(file)
     if not text.strip():
         raise InputError(f"{file} is empty: write it again.")
     try:
@@ -62,11 +70,36 @@ def read_json(file: Path) -> Any:
         raise InputError(f"{file} is not JSON ({error}): repair or write it again.") from error
 
 
+def read_frames(file: Path) -> dict[str, Any]:
+    """Read a JSON object with a list "frames".
+
+    Raises:
+        InputError: it has none.
+    """
+    content = read_json(file)
+    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
+        raise InputError(f'{file} has no list "frames": give one entry for each image.')
+    return content
+
+
+def has_path(entry: Any) -> bool:
+    """Check whether an entry of "frames" names an image file."""
+    return isinstance(entry, dict) and isinstance(entry.get("file_path"), str)
+
+
+def frame_label(file: Path, index: int, entry: Any) -> str:
+    """Return the name of an entry of "frames" for messages.
+
+    Raises:
+        InputError: the entry names no image file.
+    """
+    if not has_path(entry):
+        raise InputError(f"{file}, frame {index} has no file_path: name its image.")
+    return f"{file}, frame {index} ({entry['file_path']})"
+
+
 def number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     """Return the number under `key`, or `default` where there is none.
-
-    Args:
-        where: the file and frame, for the message.
 
     Raises:
         InputError: it is not a finite number.
@@ -85,11 +118,7 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def scaled(lens: Lens, size: tuple[int, int], where: str) -> Lens:
-    """Scale a lens to an image of another size that shows the same.
-
-    Args:
-        size: width and height of the image.
-        where: the file and frame, for the message.
+    """Scale a lens to an image of another size and the same field of view.
 
     Raises:
         InputError: intrinsics that are not finite or focal lengths <= 0, or an image of other
@@ -101,65 +130,52 @@ def scaled(lens: Lens, size: tuple[int, int], where: str) -> Lens:
             f"{where} has intrinsics {', '.join(f'{number:g}' for number in numbers)}: "
             "give finite numbers, and focal lengths > 0 in pixels."
         )
-    stated = (lens.width, lens.height)
+    (width, height), given = size, (lens.width, lens.height)
     # To a pixel of the smaller one, whose size was rounded.
-    if min(stated) < 1 or not same_proportions(*sorted((size, stated))):
+    if min(given) < 1 or not same_proportions(*sorted((size, given))):
         raise InputError(
-            f"{where} is {size[0]} x {size[1]} and its intrinsics are for {stated[0]} x "
-            f"{stated[1]}: give images with those proportions, or the images' own intrinsics."
+            f"{where} is {width} x {height} and its intrinsics are for {given[0]} x {given[1]}: "
+            "give images with those proportions, or the images' own intrinsics."
         )
-    x, y = size[0] / stated[0], size[1] / stated[1]
-    return replace(
-        lens,
-        width=size[0],
-        height=size[1],
-        fx=lens.fx * x,
-        fy=lens.fy * y,
-        cx=lens.cx * x,
-        cy=lens.cy * y,
-    )
+    x, y = width / given[0], height / given[1]
+    focal = {"fx": lens.fx * x, "fy": lens.fy * y, "cx": lens.cx * x, "cy": lens.cy * y}
+    return replace(lens, width=width, height=height, **focal)
 
 
 def beside(path: Path, size: tuple[int, int], where: str) -> Path:
-    """Check a depth map or mask: an image of any size that shows the whole photograph.
-
-    Args:
-        size: width and height of the photograph.
-        where: the file, frame and field, for the message.
-
-    Returns:
-        path
+    """Return the path of a depth map or mask, after checking that it shows the whole image.
 
     Raises:
-        InputError: it is missing, damaged or of other proportions.
+        InputError: it is missing, damaged or of other proportions than `size`.
     """
-    found = image_size(path)
-    if not same_proportions(found, size):
+    width, height = image_size(path)
+    if not same_proportions((width, height), size):
         raise InputError(
-            f"{where}: {path} is {found[0]} x {found[1]} and the image {size[0]} x {size[1]}: "
+            f"{where}: {path} is {width} x {height} and the image {size[0]} x {size[1]}: "
             "give one with the image's proportions."
         )
     return path
 
 
-def rigid(stored: Any, where: str) -> Float[ndarray, "4 4"]:
-    """Check a rigid transform, and make its rotation exactly orthonormal.
+def array_of(stored: Any) -> Float[ndarray, "..."]:
+    """Convert nested lists to float64; empty where they are no numbers or ragged."""
+    try:
+        return np.array(stored, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.empty(0)
 
-    Args:
-        stored: 4 rows of 4 numbers, or an array.
-        where: the file, frame and field, for the message.
+
+def rigid(stored: Any, where: str) -> Float[ndarray, "4 4"]:
+    """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal.
 
     Raises:
         InputError: it is not a rotation and a translation.
     """
-    try:
-        matrix = np.array(stored, dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
+    matrix = array_of(stored)
     if matrix.shape != (4, 4):
         raise InputError(f"{where} is not 4x4: give four rows of four numbers.")
     if not np.isfinite(matrix).all():
-        raise InputError(f"{where} holds NaN or infinity: drop this frame or repair its pose.")
+        raise InputError(f"{where} holds NaN or infinity: remove this image or repair its pose.")
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > ORTHONORMAL_TOLERANCE:
         raise InputError(f"{where} has last row {matrix[3].tolist()}: it must be 0 0 0 1.")
     rotation = matrix[:3, :3]

@@ -1,4 +1,4 @@
-"""Reader of DL3DV-10K: nerfstudio's transforms.json beside images of a smaller size than it names.
+"""Reader of DL3DV-10K: nerfstudio's transforms.json with smaller images than it names.
 
 root/<1K..11K>/<hash>/{transforms.json, images_4/}   DL3DV-ALL-960P (480P has images_8, 2K images_2)
 root/<hash>/nerfstudio/{transforms.json, images_4/}  DL3DV-Benchmark
@@ -9,9 +9,9 @@ https://huggingface.co/datasets/DL3DV/DL3DV-Benchmark
 
 from pathlib import Path
 
-from asysplat.data.bad_images import BadFrames
-from asysplat.data.readers.common import folders_with
-from asysplat.data.readers.transforms import read_frames, read_photographs
+from asysplat.data.bad_images import BadImages
+from asysplat.data.readers.common import folders_with, has_path, read_frames
+from asysplat.data.readers.transforms import read_images
 from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
 
@@ -30,8 +30,8 @@ def find_scenes(root: Path) -> list[Path]:
     return [folder for folder in folders if _is_scene(folder)]
 
 
-def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """Read a scene's folder, or the `nerfstudio` in it: at 960P, else at the size that is there.
+def read_scene(scene: Path, bad: BadImages) -> PosedScene:
+    """Read a scene's folder, or the `nerfstudio` in it: at 960P, else at the available size.
 
     The intrinsics are for the video's size (w x h in the file) and are scaled to the images'.
 
@@ -46,9 +46,15 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
         )
     file = folder / TRANSFORMS
     content = read_frames(file)
-    frames = [_in_folder(entry, images) for entry in content["frames"]]
-    photographs = read_photographs({**content, "frames": frames}, file, bad, resized=True)
-    return PosedScene(scene.parent.name if scene.name == BENCHMARK else scene.name, photographs)
+    # The images lie in `images`, whatever folder the file names.
+    frames = [
+        {**entry, "file_path": f"{images}/{Path(entry['file_path']).name}"}
+        if has_path(entry)
+        else entry
+        for entry in content["frames"]
+    ]
+    posed = read_images({**content, "frames": frames}, file, bad, resized=True)
+    return PosedScene(scene.parent.name if scene.name == BENCHMARK else scene.name, posed)
 
 
 def _content(scene: Path) -> Path:
@@ -63,16 +69,9 @@ def _images(folder: Path) -> str | None:
 
 def _is_scene(folder: Path) -> bool:
     content = _content(folder)
-    own = _is_hash(folder.name) or _is_hash(folder.parent.name) or not (content / "images").is_dir()
-    return own and _images(content) is not None
+    hashed = _is_hash(folder.name) or _is_hash(folder.parent.name)
+    return (hashed or not (content / "images").is_dir()) and _images(content) is not None
 
 
 def _is_hash(name: str) -> bool:
     return len(name) == HASH_LENGTH and not set(name) - set("0123456789abcdef")
-
-
-def _in_folder(entry: object, images: str) -> object:
-    """Return the frame with its image in the folder `images`, whatever folder the file names."""
-    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-        return entry
-    return {**entry, "file_path": f"{images}/{Path(entry['file_path']).name}"}

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from asysplat.data.bad_images import BadFrames
+from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.colmap import points_beside
 from asysplat.data.readers.common import folders_with, images_in, rigid, scaled
-from asysplat.data.sequence import Photograph, PosedScene
+from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
 POSES = "poses_bounds.npy"
@@ -27,25 +27,26 @@ def find_scenes(root: Path) -> list[Path]:
     return folders_with(root, POSES)
 
 
-def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
+def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     """Read a folder with a `poses_bounds.npy` and images.
 
     Row i of the array belongs to the i-th image in sorted order: a row-major 3x5 matrix, whose
     first four columns are camera-to-world with axes down, right, backward and whose fifth is
     height, width and focal length of the full-size image, then the nearest and farthest depth. The
     principal point is the center. Images are taken from the first of `images`, `images_2`,
-    `images_4` and `images_8` that holds one a row: the largest that are all there.
+    `images_4` and `images_8` that holds one image per row.
 
     Raises:
-        InputError: an array that cannot be used, or no folder with an image a row.
+        InputError: an array that cannot be used, or no folder with one image per row.
     """
     file = scene / POSES
     rows = _read_rows(file)
-    photographs = []
-    for index, (image, row) in enumerate(zip(_images(file, len(rows)), rows, strict=True)):
-        with bad.caught():
-            photographs.append(_photograph(image, row, f"{file}, row {index} ({image.name})"))
-    return PosedScene(scene.name, photographs, partial(points_beside, scene, photographs))
+
+    def read(index: int, image: Path) -> PosedImage:
+        return _read_image(image, rows[index], f"{file}, row {index} ({image.name})")
+
+    images = bad.read_each(read, enumerate(_images(file, len(rows))))
+    return PosedScene(scene.name, images, partial(points_beside, scene, images))
 
 
 def _read_rows(file: Path) -> Float[ndarray, "N 17"]:
@@ -56,36 +57,34 @@ def _read_rows(file: Path) -> Float[ndarray, "N 17"]:
             f"{file} cannot be read as a NumPy array ({error}): copy or write it again."
         ) from error
     if not isinstance(rows, ndarray) or rows.ndim != 2 or rows.shape[1] != COLUMNS:
-        found = rows.shape if isinstance(rows, ndarray) else "no array"
-        raise InputError(f"{file} holds {found}: expected a row of {COLUMNS} numbers an image.")
+        content = rows.shape if isinstance(rows, ndarray) else "no array"
+        raise InputError(f"{file} holds {content}: expected a row of {COLUMNS} numbers per image.")
     if rows.dtype.kind not in "fiu":
         raise InputError(f"{file} holds values of type {rows.dtype}: expected numbers.")
     return rows.astype(np.float64)
 
 
 def _images(file: Path, count: int) -> list[Path]:
-    found = {name: images_in(file.parent / name) for name in FOLDERS}
-    for images in found.values():
+    folders = {name: images_in(file.parent / name) for name in FOLDERS}
+    for images in folders.values():
         if len(images) == count:
             return images
-    counts = ", ".join(f"{len(images)} in {name}/" for name, images in found.items() if images)
+    counts = ", ".join(f"{len(images)} in {name}/" for name, images in folders.items() if images)
     raise InputError(
-        f"{file} has {count} rows, but of images there are {counts or 'none'}: "
-        f"give one image a row, in one of {', '.join(FOLDERS)}."
+        f"{file} has {count} rows, but the images there are {counts or 'none'}: "
+        f"give one image per row, in one of {', '.join(FOLDERS)}."
     )
 
 
-def _photograph(image: Path, row: Float[ndarray, "17"], where: str) -> Photograph:
+def _read_image(image: Path, row: Float[ndarray, "17"], where: str) -> PosedImage:
     size = image_size(image)
-    matrix = row[:15].reshape(3, 5)
-    height, width, focal = matrix[:, 4]
-    if not (np.isfinite(matrix[:, 4]).all() and (matrix[:, 4] > 0).all()):
+    down, right, backward, center, (height, width, focal) = row[:15].reshape(3, 5).T
+    if not all(np.isfinite(value) and value > 0 for value in (height, width, focal)):
         raise InputError(
             f"{where} has height, width, focal length {height:g}, {width:g}, {focal:g}: "
             "give three numbers > 0 in pixels."
         )
     lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
-    down, right, backward, center = matrix.T[:4]
     pose = np.eye(4)
     pose[:3] = np.stack((right, down, -backward, center), axis=-1)
-    return Photograph(image, scaled(lens, size, where), rigid(pose, where))
+    return PosedImage(image, scaled(lens, size, where), rigid(pose, where))

@@ -1,4 +1,4 @@
-"""Reader of photographs with `K.txt` and `poses.txt`, the format of deep-video-mvs.
+"""Reader of images with `K.txt` and `poses.txt`, the format of deep-video-mvs.
 
 https://github.com/ardaduz/deep-video-mvs/tree/master/sample-data
 """
@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from asysplat.data.bad_images import BadFrames
+from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.colmap import points_beside
 from asysplat.data.readers.common import MILLIMETERS, beside, folders_with, images_in, rigid, scaled
-from asysplat.data.sequence import Photograph, PosedScene
+from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
-POSES = ("poses_refined.txt", "poses.txt")  # the first that is there is read
+POSES = ("poses_refined.txt", "poses.txt")  # the first file that exists is read
 
 
 def find_scenes(root: Path) -> list[Path]:
@@ -25,47 +25,40 @@ def find_scenes(root: Path) -> list[Path]:
     return folders_with(root, "K.txt")
 
 
-def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """Read a folder with `K.txt`, `poses.txt`, `images/` and, perhaps, `depth/`.
+def read_scene(scene: Path, bad: BadImages) -> PosedScene:
+    """Read a folder with `K.txt`, `poses.txt`, `images/` and, optionally, `depth/`.
 
-    `K.txt` is the 3x3 pinhole matrix for the images as they are. Line i of `poses.txt` belongs to
-    the i-th image in sorted order: camera-to-world 4x4, row-major, OpenCV axes, meters;
-    `poses_refined.txt` is taken in its place where there is one. Depth maps have the images' names,
-    as one-channel PNG of millimeters along z, 0 where unknown.
+    `K.txt` is the 3x3 pinhole matrix for the images as they are. Line i of `poses.txt`, or of
+    `poses_refined.txt` if there is one, belongs to the i-th image in sorted order: camera-to-world
+    4x4, row-major, OpenCV axes, meters. Depth maps have the images' names, as one-channel PNG of
+    millimeters along z, 0 where unknown.
 
     Raises:
-        InputError: text that cannot be used, or not one pose an image.
+        InputError: text that cannot be used, or not one pose per image.
     """
     file = next((scene / name for name in POSES if (scene / name).is_file()), scene / POSES[-1])
     poses, images = _read_numbers(file, 16), images_in(scene / "images")
-    matrix = _read_matrix(scene / "K.txt")
+    (fx, _, cx), (_, fy, cy), _ = _read_matrix(scene / "K.txt").tolist()
+    depths = scene / "depth"
     if len(poses) != len(images):
         raise InputError(
             f"{file} has {len(poses)} poses and {scene / 'images'} {len(images)} images: "
-            "give one line an image."
+            "give one line per image."
         )
-    photographs = []
-    for index, (image, pose) in enumerate(zip(images, poses, strict=True)):
-        with bad.caught():
-            where = f"{file}, pose {index} ({image.name})"
-            photographs.append(_photograph(image, matrix, rigid(pose.reshape(4, 4), where)))
-    return PosedScene(scene.name, photographs, partial(points_beside, scene, photographs))
 
+    def read(index: int, image: Path) -> PosedImage:
+        pose = rigid(poses[index].reshape(4, 4), f"{file}, pose {index} ({image.name})")
+        size, where = image_size(image), str(image)
+        return PosedImage(
+            file=image,
+            lens=scaled(Lens(*size, fx, fy, cx, cy), size, where),
+            cam_to_world=pose,
+            depth=beside(depths / f"{image.stem}.png", size, where) if depths.is_dir() else None,
+            depth_unit=MILLIMETERS,
+        )
 
-def _photograph(
-    image: Path, matrix: Float[ndarray, "3 3"], cam_to_world: Float[ndarray, "4 4"]
-) -> Photograph:
-    size = image_size(image)
-    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
-    depths = image.parents[1] / "depth"
-    depth = depths / f"{image.stem}.png"
-    return Photograph(
-        image=image,
-        lens=scaled(Lens(*size, fx, fy, cx, cy), size, str(image)),
-        cam_to_world=cam_to_world,
-        depth=beside(depth, size, str(image)) if depths.is_dir() else None,
-        depth_unit=MILLIMETERS,
-    )
+    posed = bad.read_each(read, enumerate(images))
+    return PosedScene(scene.name, posed, partial(points_beside, scene, posed))
 
 
 def _read_matrix(file: Path) -> Float[ndarray, "3 3"]:

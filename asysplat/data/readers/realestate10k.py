@@ -21,10 +21,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from asysplat.data.bad_images import BadFrames
+from asysplat.data.bad_images import BadImages
 from asysplat.data.images import EncodedImage, Lens, image_size
 from asysplat.data.readers.common import inverted, read_json, rigid
-from asysplat.data.sequence import Photograph, PosedScene
+from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
 CHUNK = ".torch"
@@ -32,7 +32,7 @@ NUMBERS = 18  # for one camera
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Find scenes, as chunk.torch/key: of a chunk, a folder of chunks, or its train and test."""
+    """Find scenes as chunk.torch/key: in a chunk, a folder of chunks, or its train and test."""
     if any(parent.suffix == CHUNK for parent in root.parents):
         return [root]
     if root.suffix == CHUNK:
@@ -43,8 +43,8 @@ def find_scenes(root: Path) -> list[Path]:
     return [scene for folder in folders for scene in _in_folder(folder)]
 
 
-def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """Read one scene, named chunk.torch/key; its images stay in the file until decoded.
+def read_scene(scene: Path, bad: BadImages) -> PosedScene:
+    """Read one scene, named chunk.torch/key; its images stay in the file until they are decoded.
 
     Raises:
         InputError: a chunk that cannot be used, or without this scene.
@@ -57,11 +57,11 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
     if entry is None:
         raise InputError(f"{chunk} has no scene {key}: name another chunk.")
     cameras, images = _checked(entry, scene)
-    photographs = []
-    for index, (camera, image) in enumerate(zip(cameras, images, strict=True)):
-        with bad.caught():
-            photographs.append(_photograph(camera, image, f"{scene}, frame {index}"))
-    return PosedScene(key, photographs)
+
+    def read(index: int, image: Any) -> PosedImage:
+        return _read_image(cameras[index], image, f"{scene}, frame {index}")
+
+    return PosedScene(key, bad.read_each(read, enumerate(images)))
 
 
 def _in_folder(folder: Path) -> list[Path]:
@@ -72,11 +72,11 @@ def _in_folder(folder: Path) -> list[Path]:
     content = read_json(index)
     if not isinstance(content, dict):
         raise InputError(f"{index} is no object of key: chunk: write it again.")
-    there = {chunk.name for chunk in chunks}
+    names = {chunk.name for chunk in chunks}
     for key, name in content.items():
-        if name not in there:
+        if name not in names:
             raise InputError(
-                f"{index}: scene {key} is in {name!r}, which is not there: copy that chunk, or "
+                f"{index}: scene {key} is in {name!r}, which does not exist: copy that chunk, or "
                 "name single chunks."
             )
     return [folder / name / key for key, name in content.items()]
@@ -93,10 +93,10 @@ def _load(chunk: Path) -> dict[str, dict[str, Any]]:
     return _load_once(chunk, chunk.stat().st_mtime_ns)
 
 
-@lru_cache(maxsize=1)  # scenes are mostly opened one chunk after the other
+@lru_cache(maxsize=1)  # scenes are mostly opened chunk by chunk
 def _load_once(chunk: Path, modified: int) -> dict[str, dict[str, Any]]:
     try:
-        # The form that torch wrote before it wrote zip files cannot be mapped.
+        # Only zip files can be mapped; older versions of torch wrote another format.
         scenes = torch.load(
             chunk, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(chunk)
         )
@@ -120,17 +120,17 @@ def _checked(entry: dict[str, Any], scene: Path) -> tuple[Float[ndarray, "V 18"]
     """Return a scene's cameras and images, checked to be equally many."""
     cameras, images = entry.get("cameras"), entry.get("images")
     if not isinstance(cameras, Tensor) or cameras.ndim != 2 or cameras.shape[1] != NUMBERS:
-        found = tuple(cameras.shape) if isinstance(cameras, Tensor) else type(cameras).__name__
-        raise InputError(f"{scene}: cameras is {found}: give a tensor [V, {NUMBERS}].")
+        kind = tuple(cameras.shape) if isinstance(cameras, Tensor) else type(cameras).__name__
+        raise InputError(f"{scene}: cameras is {kind}: give a tensor [V, {NUMBERS}].")
     if not isinstance(images, list) or len(images) != len(cameras):
-        found = len(images) if isinstance(images, list) else type(images).__name__
+        kind = len(images) if isinstance(images, list) else type(images).__name__
         raise InputError(
-            f"{scene} has {len(cameras)} cameras and images is {found}: give a list of as many."
+            f"{scene} has {len(cameras)} cameras and images is {kind}: give a list of as many."
         )
     return cameras.double().numpy(), images
 
 
-def _photograph(camera: Float[ndarray, "18"], image: Any, where: str) -> Photograph:
+def _read_image(camera: Float[ndarray, "18"], image: Any, where: str) -> PosedImage:
     if not isinstance(image, Tensor) or image.dtype != torch.uint8 or image.ndim != 1:
         raise InputError(f"{where}: its image is no uint8 tensor [bytes]: give a JPEG's bytes.")
     encoded = EncodedImage(where, image.numpy())
@@ -147,8 +147,8 @@ def _photograph(camera: Float[ndarray, "18"], image: Any, where: str) -> Photogr
             "the images."
         )
     world_to_cam = np.vstack((camera[6:].reshape(3, 4), (0, 0, 0, 1)))
-    return Photograph(
-        image=encoded,
+    return PosedImage(
+        file=encoded,
         lens=Lens(width, height, fx * width, fy * height, cx * width, cy * height),
         cam_to_world=inverted(rigid(world_to_cam, f"{where}: its world-to-camera")),
     )

@@ -1,7 +1,7 @@
 """Reader of Replica as published with NICE-SLAM: images, depths and a trajectory of each room.
 
-root/cam_params.json           intrinsics, image size, and depth steps a meter (6553.5)
-root/<scene>/traj.txt          row i: 16 numbers, camera-to-world of frame i, row-major, OpenCV axes
+root/cam_params.json           intrinsics, image size, and depth steps per meter (6553.5)
+root/<scene>/traj.txt          row i: 16 numbers, camera-to-world of image i, row-major, OpenCV axes
 root/<scene>/results/          frame000000.jpg, depth000000.png (16 bits, along z)
 
 https://github.com/cvg/nice-slam (scripts/download_replica.sh, src/utils/datasets.py)
@@ -9,10 +9,10 @@ https://github.com/cvg/nice-slam (scripts/download_replica.sh, src/utils/dataset
 
 from pathlib import Path
 
-from asysplat.data.bad_images import BadFrames
+from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.common import beside, folders_with, number, read_json, rigid
-from asysplat.data.sequence import Photograph, PosedScene
+from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
 TRAJECTORY = "traj.txt"
@@ -25,60 +25,53 @@ def find_scenes(root: Path) -> list[Path]:
     return [folder for folder in folders_with(root, TRAJECTORY) if (folder / "results").is_dir()]
 
 
-def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
+def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     """Read a room's folder.
 
     `cam_params.json` lies above it, or in it if there is one room alone. Every row of `traj.txt`
     must have its image, and, if there is any depth map, its depth map.
 
     Raises:
-        InputError: unusable parameters, or frames without a row.
+        InputError: parameters that cannot be used, or more images than rows.
     """
-    parameters = next(
-        (file for file in (scene / PARAMETERS, scene.parent / PARAMETERS) if file.is_file()), None
-    )
+    files = (scene / PARAMETERS, scene.parent / PARAMETERS)
+    parameters = next((file for file in files if file.is_file()), None)
     if parameters is None:
-        raise InputError(
-            f"{scene.parent / PARAMETERS} does not exist: copy it there from Replica.zip."
-        )
+        raise InputError(f"{files[1]} does not exist: copy it there from Replica.zip.")
     lens, depth_unit = _camera(parameters)
-    trajectory = scene / TRAJECTORY
+    trajectory, results = scene / TRAJECTORY, scene / "results"
     if not trajectory.is_file():
         raise InputError(f"{trajectory} does not exist: name a room's folder.")
     rows = trajectory.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    results = scene / "results"
-    frames = len(list(results.glob("frame*.jpg")))
-    if frames > len(rows):
+    count = len(list(results.glob("frame*.jpg")))
+    if count > len(rows):
         raise InputError(
-            f"{trajectory} has {len(rows)} rows for {frames} frames: give a row of 16 numbers "
+            f"{trajectory} has {len(rows)} rows for {count} images: give a row of 16 numbers "
             "for each, or copy the file again."
         )
     has_depths = next(results.glob("depth*.png"), None) is not None
-    photographs = []
-    for index, row in enumerate(rows):
-        with bad.caught():
-            image = results / f"frame{index:06d}.jpg"
-            size = image_size(image)
-            if size != (lens.width, lens.height):
-                raise InputError(
-                    f"{image} is {size[0]} x {size[1]}, but {parameters} says {lens.width} x "
-                    f"{lens.height}: give intrinsics for the images' own resolution."
-                )
-            depth = results / f"depth{index:06d}.png"
-            photographs.append(
-                Photograph(
-                    image=image,
-                    lens=lens,
-                    cam_to_world=rigid(_four_by_four(row), f"{trajectory}, row {index + 1}"),
-                    depth=beside(depth, size, str(image)) if has_depths else None,
-                    depth_unit=depth_unit,
-                )
+
+    def read(index: int, row: str) -> PosedImage:
+        image, depth = results / f"frame{index:06d}.jpg", results / f"depth{index:06d}.png"
+        size = image_size(image)
+        if size != (lens.width, lens.height):
+            raise InputError(
+                f"{image} is {size[0]} x {size[1]}, but {parameters} is for {lens.width} x "
+                f"{lens.height}: give intrinsics for the images' own resolution."
             )
-    return PosedScene(scene.name, photographs)
+        return PosedImage(
+            file=image,
+            lens=lens,
+            cam_to_world=rigid(_four_by_four(row), f"{trajectory}, row {index + 1}"),
+            depth=beside(depth, size, str(image)) if has_depths else None,
+            depth_unit=depth_unit,
+        )
+
+    return PosedScene(scene.name, bad.read_each(read, enumerate(rows)))
 
 
 def _camera(file: Path) -> tuple[Lens, float]:
-    """Read the lens of all frames, and meters a depth step."""
+    """Read the lens of all images, and the meters of a depth step."""
     content = read_json(file)
     camera = content.get("camera") if isinstance(content, dict) else None
     if not isinstance(camera, dict):

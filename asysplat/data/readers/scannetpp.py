@@ -1,16 +1,17 @@
-"""Reader of ScanNet++: photographs of a reflex camera (DSLR), or of an iPhone with its LiDAR.
+"""Reader of ScanNet++: images of a reflex camera (DSLR), or of an iPhone with its LiDAR.
 
 A scene is named by one of these files of poses; a folder stands for the first that it has:
 
 <scene>/dslr/nerfstudio/transforms_undistorted.json  resized_undistorted_images, .._masks
 <scene>/dslr/nerfstudio/transforms.json              fisheye: resized_images, resized_anon_masks,
                                                      and render_depth, from the toolkit
-<scene>/iphone/nerfstudio/transforms.json            COLMAP's, some frames: rgb, rgb_masks, depth
-<scene>/iphone/pose_intrinsic_imu.json               ARKit's, every frame: the same folders
+<scene>/iphone/nerfstudio/transforms.json            COLMAP's, some images: rgb, rgb_masks, depth
+<scene>/iphone/pose_intrinsic_imu.json               ARKit's, every image: the same folders
 
 Depths are 16-bit PNG, millimeters along z (256 x 192 for the iPhone's 1920 x 1440). Masks are 0
 where a pixel was made anonymous. The world is the laser scan's, in meters: the transforms files
-turn its axes, which is undone, so that both cameras, the sparse points and the mesh agree.
+turn its axes, and this reader turns them back, so that both cameras, the sparse points and the mesh
+agree.
 
 https://kaldir.vc.in.tum.de/scannetpp/documentation
 https://github.com/scannetpp/scannetpp (common/scene_release.py, common/utils/nerfstudio.py)
@@ -24,11 +25,20 @@ from typing import Any
 
 import numpy as np
 
-from asysplat.data.bad_images import BadFrames
+from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
-from asysplat.data.readers.common import MILLIMETERS, beside, folders_with, read_json, rigid
-from asysplat.data.readers.transforms import read_frames, read_photographs
-from asysplat.data.sequence import Photograph, Points, PosedScene
+from asysplat.data.readers.common import (
+    MILLIMETERS,
+    array_of,
+    beside,
+    folders_with,
+    has_path,
+    read_frames,
+    read_json,
+    rigid,
+)
+from asysplat.data.readers.transforms import read_images
+from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
 
 
@@ -73,10 +83,10 @@ TURN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Find the file of poses that each scene's folder stands for, or the named one.
+    """Find the file of poses of each scene's folder, or the named one.
 
-    A scene's folder stands for the first file in the list above whose images are there;
-    <scene>/dslr and <scene>/iphone stand for the first of that camera.
+    A scene's folder stands for the first file in the list above whose images exist; <scene>/dslr
+    and <scene>/iphone stand for the first of that camera.
     """
     if root.is_file():
         return [root] if _key(root) else []
@@ -85,11 +95,11 @@ def find_scenes(root: Path) -> list[Path]:
     return [file for scene in folders_with(root, *PARTS) for file in _first(scene)]
 
 
-def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
-    """Read one camera's photographs and COLMAP's points; the name is <scene>-dslr or -iphone.
+def read_scene(scene: Path, bad: BadImages) -> PosedScene:
+    """Read one camera's images and COLMAP's points; the name is <scene>-dslr or -iphone.
 
-    The benchmark's test frames are among them where their images were published. Frames that the
-    file marks `is_bad` are left out, with a warning.
+    Includes the benchmark's test images where they were published. Images that the file marks
+    `is_bad` are left out, with a warning.
 
     Args:
         scene: a file of poses, or a folder that stands for one.
@@ -110,7 +120,7 @@ def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
     read = _arkit if key == ARKIT else _transforms
     return PosedScene(
         name=f"{folder.parent.name}-{folder.name}",
-        photographs=read(files[0], folder, part, bad),
+        images=read(files[0], folder, part, bad),
         read_points=partial(_points, folder / "colmap/points3D.txt"),
     )
 
@@ -127,25 +137,32 @@ def _first(scene: Path, camera: str = "") -> list[Path]:
     return [scene / key for key in keys[:1]]
 
 
-def _transforms(file: Path, folder: Path, part: Part, bad: BadFrames) -> list[Photograph]:
+def _transforms(file: Path, folder: Path, part: Part, bad: BadImages) -> list[PosedImage]:
     content = read_frames(file)
-    has_masks = content.get("has_mask", (folder / part.masks).is_dir())
-    if has_masks and not (folder / part.masks).is_dir():
+    downloaded = (folder / part.masks).is_dir()
+    masks = content.get("has_mask", downloaded)
+    if masks and not downloaded:
         raise InputError(
             f"{folder / part.masks} does not exist, but {file} has masks: download it."
         )
-    masks = part.masks if has_masks else None
-    depths = part.depths if part.depths and (folder / part.depths).is_dir() else None
-    frames = [
-        _with_paths(entry, part.images, masks, depths)
-        for entry in _good_frames(content, file, folder / part.images)
-    ]
-    found = read_photographs({**content, "frames": frames}, file, bad, folder)
-    return [replace(one, cam_to_world=TURN @ one.cam_to_world) for one in found]
+    depths = part.depths and (folder / part.depths).is_dir()
+    frames = []
+    for entry in _good_frames(content, file, folder / part.images):
+        if has_path(entry):
+            name = f"{Path(entry['file_path']).stem}.png"
+            entry = {
+                **entry,
+                "file_path": f"{part.images}/{entry['file_path']}",
+                "mask_path": f"{part.masks}/{name}" if masks else None,
+                "depth_file_path": f"{part.depths}/{name}" if depths else None,
+            }
+        frames.append(entry)
+    images = read_images({**content, "frames": frames}, file, bad, folder)
+    return [replace(image, cam_to_world=TURN @ image.cam_to_world) for image in images]
 
 
 def _good_frames(content: dict[str, Any], file: Path, images: Path) -> list[Any]:
-    """Return training and published test frames that are not marked as bad."""
+    """Return training entries and published test entries that are not marked as bad."""
     test = [entry for entry in content.get("test_frames", []) if isinstance(entry, dict)]
     if not any((images / str(entry.get("file_path"))).is_file() for entry in test):
         test = []  # hidden ones, or the DSLR's in the iPhone's file
@@ -153,64 +170,45 @@ def _good_frames(content: dict[str, Any], file: Path, images: Path) -> list[Any]
     good = [entry for entry in frames if not (isinstance(entry, dict) and entry.get("is_bad"))]
     if len(good) < len(frames):
         warnings.warn(
-            f"{file}: left out {len(frames) - len(good)} of {len(frames)} frames that the data set "
+            f"{file}: left out {len(frames) - len(good)} of {len(frames)} images that the data set "
             "marks is_bad.",
             stacklevel=2,
         )
     return good
 
 
-def _with_paths(entry: Any, images: str, masks: str | None, depths: str | None) -> Any:
-    """Return the frame with paths of its image, mask and depth from the camera's folder on."""
-    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-        return entry
-    name = f"{Path(entry['file_path']).stem}.png"
-    return {
-        **entry,
-        "file_path": f"{images}/{entry['file_path']}",
-        "mask_path": masks and f"{masks}/{name}",
-        "depth_file_path": depths and f"{depths}/{name}",
-    }
-
-
-def _arkit(file: Path, folder: Path, part: Part, bad: BadFrames) -> list[Photograph]:
-    """Read ARKit's poses: by frame, camera-to-world with OpenCV axes and intrinsics in pixels."""
+def _arkit(file: Path, folder: Path, part: Part, bad: BadImages) -> list[PosedImage]:
+    """Read ARKit's poses, by image: camera-to-world with OpenCV axes and intrinsics in pixels."""
     content = read_json(file)
     if not isinstance(content, dict):
         raise InputError(f"{file} is no object of frames by name: download it again.")
     masks, depths = (
         folder / name if (folder / name).is_dir() else None for name in (part.masks, part.depths)
     )
-    photographs = []
-    for name, entry in sorted(content.items()):
-        with bad.caught():
-            where = f"{file}, {name}"
-            if not isinstance(entry, dict):
-                raise InputError(f"{where} is {entry!r}: give its intrinsic and aligned_pose.")
-            image = folder / part.images / f"{name}.jpg"
-            size = image_size(image)
-            photographs.append(
-                Photograph(
-                    image=image,
-                    lens=_pinhole(entry.get("intrinsic"), size, f"{where}: intrinsic"),
-                    cam_to_world=rigid(entry.get("aligned_pose"), f"{where}: aligned_pose"),
-                    depth=depths and beside(depths / f"{name}.png", size, where),
-                    depth_unit=MILLIMETERS,
-                    mask=masks and beside(masks / f"{name}.png", size, where),
-                )
-            )
-    return photographs
+
+    def read(name: str, entry: Any) -> PosedImage:
+        where = f"{file}, {name}"
+        if not isinstance(entry, dict):
+            raise InputError(f"{where} is {entry!r}: give its intrinsic and aligned_pose.")
+        image = folder / part.images / f"{name}.jpg"
+        size = image_size(image)
+        return PosedImage(
+            file=image,
+            lens=_pinhole(entry.get("intrinsic"), size, f"{where}: intrinsic"),
+            cam_to_world=rigid(entry.get("aligned_pose"), f"{where}: aligned_pose"),
+            depth=depths and beside(depths / f"{name}.png", size, where),
+            depth_unit=MILLIMETERS,
+            mask=masks and beside(masks / f"{name}.png", size, where),
+        )
+
+    return bad.read_each(read, sorted(content.items()))
 
 
 def _pinhole(stored: Any, size: tuple[int, int], where: str) -> Lens:
-    try:
-        matrix = np.array(stored, dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
+    matrix = array_of(stored)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or (np.diag(matrix) <= 0).any():
         raise InputError(f"{where} is {stored}: give 3x3 numbers, fx and fy above 0, in pixels.")
-    width, height = size
-    return Lens(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    return Lens(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
 
 
 def _points(file: Path) -> Points | None:

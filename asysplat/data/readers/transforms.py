@@ -10,21 +10,22 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from asysplat.data.bad_images import BadFrames
+from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers.colmap import points_beside
 from asysplat.data.readers.common import (
     MILLIMETERS,
     beside,
     folders_with,
+    frame_label,
     natural_order,
     number,
     opencv_from_opengl,
-    read_json,
+    read_frames,
     rigid,
     scaled,
 )
-from asysplat.data.sequence import Photograph, PosedScene
+from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -35,143 +36,113 @@ def find_scenes(root: Path) -> list[Path]:
     return [root] if root.suffix == ".json" else folders_with(root, "transforms.json")
 
 
-def read_scene(scene: Path, bad: BadFrames) -> PosedScene:
+def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     """Read a folder with a `transforms.json`, or the json file itself.
 
-    Of the images, only the headers are read. Frames are ordered by the numbers in their names (2
-    before 10), or, if a name has no number, as in the file. Paths in the file are relative to its
-    folder.
+    Reads only the headers of images. Images are ordered by the numbers in their names (2 before
+    10), or, if a name has no number, as in the file. Paths are relative to the file's folder.
 
     Raises:
         InputError: anything in the file that cannot be used.
     """
     file = scene if scene.suffix == ".json" else scene / "transforms.json"
-    photographs = read_photographs(read_frames(file), file, bad)
-    read_points = partial(points_beside, file.parent, photographs)
-    return PosedScene(file.parent.name, photographs, read_points)
+    images = read_images(read_frames(file), file, bad)
+    return PosedScene(file.parent.name, images, partial(points_beside, file.parent, images))
 
 
-def read_frames(file: Path) -> dict[str, Any]:
-    """Read the file's content, which has a list "frames".
-
-    Raises:
-        InputError: it has none.
-    """
-    content = read_json(file)
-    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
-        raise InputError(f'{file} has no list "frames": give one entry an image.')
-    return content
-
-
-def read_photographs(
+def read_images(
     content: dict[str, Any],
     file: Path,
-    bad: BadFrames,
+    bad: BadImages,
     folder: Path | None = None,
     resized: bool = False,
-) -> list[Photograph]:
-    """Return the photographs of a `transforms.json`, or of a layout that uses its fields.
+) -> list[PosedImage]:
+    """Return the images of a `transforms.json`, or of a layout that uses its fields.
 
     Args:
         content: the file's, with a list "frames".
         file: where it was read, for messages.
-        bad: notes the frames that cannot be used.
+        bad: collects the errors of images that cannot be used.
         folder: what its paths are relative to; None: the file's own folder.
-        resized: whether the images may have another size than w x h, to which the intrinsics
-            belong.
+        resized: whether images may have another size than w x h, to which the intrinsics belong.
     """
     folder = folder or file.parent
-    photographs = []
-    shared = None  # the first image that does not state its own size: the others must match it
-    for index, entry in enumerate(content["frames"]):
-        with bad.caught():
-            if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-                raise InputError(f"{file}, frame {index} has no file_path: name its image.")
-            where = f"{file}, frame {index} ({entry['file_path']})"
-            image = _find_image(folder / entry["file_path"])
-            size = image_size(image)
-            if not ("w" in entry and "h" in entry):
-                shared = shared or (image, size)
-                _check_equal_size(image, size, *shared)
-            settings = {**content, **entry}
-            photographs.append(_photograph(settings, image, size, folder, resized, where))
-    if all(re.search(r"\d", photograph.image.stem) for photograph in photographs):
-        photographs.sort(key=lambda photograph: natural_order(photograph.image))
-    return photographs
+    shared: list[tuple[Path, tuple[int, int]]] = []  # images without w and h of their own
 
-
-def _photograph(
-    settings: dict[str, Any],
-    image: Path,
-    size: tuple[int, int],
-    folder: Path,
-    resized: bool,
-    where: str,
-) -> Photograph:
-    return Photograph(
-        image=image,
-        lens=_lens(settings, size, resized, where),
-        cam_to_world=opencv_from_opengl(
-            rigid(settings.get("transform_matrix"), f"{where}: transform_matrix")
-        ),
-        depth=_beside(folder, settings, "depth_file_path", size, where),
-        depth_unit=number(settings, "depth_unit_scale_factor", where, default=MILLIMETERS),
-        mask=_beside(folder, settings, "mask_path", size, where),
-    )
-
-
-def _lens(settings: dict[str, Any], size: tuple[int, int], resized: bool, where: str) -> Lens:
-    """Return the lens of an image of (width, height) `size`."""
-    stated = (settings.get("w", size[0]), settings.get("h", size[1]))
-    if stated == size:
-        return _stated_lens(settings, *size, where)
-    if not resized:
-        raise InputError(
-            f"{where}: w x h is {stated[0]} x {stated[1]}, but the image is {size[0]} x {size[1]}: "
-            "give intrinsics for the images' own resolution."
+    def read(index: int, entry: Any) -> PosedImage:
+        where = frame_label(file, index, entry)
+        image = _find_image(folder / entry["file_path"])
+        size = image_size(image)
+        if not ("w" in entry and "h" in entry):
+            shared.append((image, size))
+            first, (width, height) = shared[0]
+            if size != (width, height):
+                raise InputError(
+                    f"{first} is {width} x {height} and {image} is {size[0]} x {size[1]}: give "
+                    "images of one size, or w, h and intrinsics for every image."
+                )
+        fields = {**content, **entry}
+        pose = rigid(fields.get("transform_matrix"), f"{where}: transform_matrix")
+        return PosedImage(
+            file=image,
+            lens=_lens(fields, size, resized, where),
+            cam_to_world=opencv_from_opengl(pose),
+            depth=_beside(folder, fields, "depth_file_path", size, where),
+            depth_unit=number(fields, "depth_unit_scale_factor", where, default=MILLIMETERS),
+            mask=_beside(folder, fields, "mask_path", size, where),
         )
-    width, height = (round(number(settings, key, where)) for key in ("w", "h"))
-    return scaled(_stated_lens(settings, width, height, where), size, where)
+
+    images = bad.read_each(read, enumerate(content["frames"]))
+    if all(re.search(r"\d", image.file.stem) for image in images):
+        images.sort(key=lambda image: natural_order(image.file))
+    return images
 
 
-def _stated_lens(settings: dict[str, Any], width: int, height: int, where: str) -> Lens:
-    model = settings.get("camera_model", "OPENCV")
-    fisheye = model == "OPENCV_FISHEYE" or bool(settings.get("is_fisheye", False))
+def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: str) -> Lens:
+    """Return the lens of an image of (width, height) `size`."""
+    given = {"w": size[0], "h": size[1], **fields}
+    if (given["w"], given["h"]) != size and not resized:
+        raise InputError(
+            f"{where}: w x h is {given['w']} x {given['h']}, but the image is {size[0]} x "
+            f"{size[1]}: give intrinsics for the images' own resolution."
+        )
+    model = fields.get("camera_model", "OPENCV")
+    fisheye = model == "OPENCV_FISHEYE" or bool(fields.get("is_fisheye", False))
     if not fisheye and model not in PERSPECTIVE_MODELS:
         raise InputError(
             f"{where}: camera_model is {model!r}: undistort the images to PINHOLE, or use one of "
             f"{', '.join(PERSPECTIVE_MODELS)}, OPENCV_FISHEYE."
         )
     # The formats disagree about what k4 means for perspective cameras.
-    if not fisheye and number(settings, "k4", where, default=0.0) != 0:
+    if not fisheye and number(fields, "k4", where, default=0.0) != 0:
         raise InputError(f"{where}: k4 is only known for OPENCV_FISHEYE: undistort the images.")
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-    fx, fy = _focal(settings, width, height, where)
-    return Lens(
-        width=width,
-        height=height,
-        fx=fx,
-        fy=fy,
-        cx=number(settings, "cx", where, default=width / 2),
-        cy=number(settings, "cy", where, default=height / 2),
-        distortion=tuple(number(settings, name, where, default=0.0) for name in names),
+    width, height = (round(number(given, key, where)) for key in ("w", "h"))
+    lens = Lens(
+        width,
+        height,
+        *_focal(fields, width, height, where),
+        cx=number(fields, "cx", where, default=width / 2),
+        cy=number(fields, "cy", where, default=height / 2),
+        distortion=tuple(number(fields, name, where, default=0.0) for name in names),
         fisheye=fisheye,
     )
+    return scaled(lens, size, where)
 
 
-def _focal(settings: dict[str, Any], width: int, height: int, where: str) -> tuple[float, float]:
-    """Return fx and fy in pixels, from focal lengths or fields of view; one stands for both."""
-    found = {}
+def _focal(fields: dict[str, Any], width: int, height: int, where: str) -> tuple[float, float]:
+    """Return fx and fy in pixels, from focal lengths or fields of view; one may give both."""
+    focal = {}
     for axis, pixels in (("x", width), ("y", height)):
-        if f"fl_{axis}" in settings:
-            found[axis] = number(settings, f"fl_{axis}", where)
-        elif f"camera_angle_{axis}" in settings:
-            angle = number(settings, f"camera_angle_{axis}", where)
-            found[axis] = 0.5 * pixels / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
-    if not found:
+        if f"fl_{axis}" in fields:
+            focal[axis] = number(fields, f"fl_{axis}", where)
+        elif f"camera_angle_{axis}" in fields:
+            angle = number(fields, f"camera_angle_{axis}", where)
+            focal[axis] = 0.5 * pixels / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
+    if not focal:
         raise InputError(f"{where} has no intrinsics: give fl_x in pixels, or camera_angle_x.")
-    fx = found.get("x", found.get("y"))
-    fy = found.get("y", fx)
+    fx = focal.get("x", focal.get("y"))
+    fy = focal.get("y", fx)
     if fx <= 0 or fy <= 0:
         raise InputError(
             f"{where}: fl_x or fl_y (or camera_angle_x, camera_angle_y) is out of range: "
@@ -181,30 +152,18 @@ def _focal(settings: dict[str, Any], width: int, height: int, where: str) -> tup
 
 
 def _find_image(path: Path) -> Path:
-    """Return `path`, or the image it means if the extension was left out."""
-    if path.is_file():
-        return path
-    candidates = (path.with_name(path.name + suffix) for suffix in (".png", ".jpg"))
+    """Return `path`, with the extension that the file has if `path` has none."""
+    candidates = (path, *(path.with_name(path.name + suffix) for suffix in (".png", ".jpg")))
     return next((candidate for candidate in candidates if candidate.is_file()), path)
 
 
 def _beside(
-    folder: Path, settings: dict[str, Any], key: str, size: tuple[int, int], where: str
+    folder: Path, fields: dict[str, Any], key: str, size: tuple[int, int], where: str
 ) -> Path | None:
-    """Return the depth map or mask that `key` names; None where there is none."""
-    name = settings.get(key)
+    """Return the depth map or mask under `key`; None where there is none."""
+    name = fields.get(key)
     if name is None:
         return None
     if not isinstance(name, str):
         raise InputError(f"{where}: {key} is {name!r}: give a file name, or leave it out.")
     return beside(folder / name, size, f"{where}: {key}")
-
-
-def _check_equal_size(
-    image: Path, size: tuple[int, int], first: Path, first_size: tuple[int, int]
-) -> None:
-    if size != first_size:
-        raise InputError(
-            f"{first} is {first_size[0]} x {first_size[1]} and {image} is {size[0]} x {size[1]}: "
-            "give images of one size, or w, h and intrinsics in every frame."
-        )

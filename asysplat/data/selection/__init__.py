@@ -1,34 +1,15 @@
-"""Selections: which frames of a scene the network is given, and which it must predict."""
+"""Selections: which images of a scene are given to the network, and which it must predict."""
 
-from asysplat.data.selection.frames import (
+from asysplat.data.selection.kmeans import kmeans_selection
+from asysplat.data.selection.views import (
     Selection,
     Split,
     every_8th_selection,
     first_96_selection,
-    held_out,
-    spread,
-    training_frames,
-    training_selection,
     uniform_selection,
 )
-from asysplat.data.selection.kmeans import kmeans_selection
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
-
-__all__ = [
-    "SELECTIONS",
-    "Selection",
-    "Split",
-    "every_8th_selection",
-    "first_96_selection",
-    "held_out",
-    "kmeans_selection",
-    "named_selection",
-    "spread",
-    "training_frames",
-    "training_selection",
-    "uniform_selection",
-]
 
 SELECTIONS = ("every_8th", "kmeans", "first_96", "uniform")
 
@@ -36,20 +17,20 @@ SELECTIONS = ("every_8th", "kmeans", "first_96", "uniform")
 def named_selection(
     selection: str, cameras: Cameras, num_inputs: int, num_targets: int, split: Split
 ) -> Selection:
-    """Select frames of a scene with these cameras in one of the ways named in SELECTIONS.
+    """Select images of a scene with these cameras by one of the methods in SELECTIONS.
 
     Raises:
-        InputError: an unknown name, or too few frames.
+        InputError: an unknown method, or too few images.
     """
-    frames = cameras.num_views
+    count = cameras.num_views
     if selection == "every_8th":
-        return every_8th_selection(frames, num_inputs, num_targets, split)
+        return every_8th_selection(count, num_inputs, num_targets, split)
     if selection == "kmeans":
         return kmeans_selection(cameras, num_inputs, num_targets, split)
     if selection == "first_96":
-        return first_96_selection(frames, num_inputs, num_targets, split)
+        return first_96_selection(count, num_inputs, num_targets, split)
     if selection == "uniform":
-        return uniform_selection(frames, num_inputs, num_targets)
+        return uniform_selection(count, num_inputs, num_targets)
     raise InputError(
         f"data.selection is {selection!r}: expected one of {', '.join(SELECTIONS)}, index."
     )

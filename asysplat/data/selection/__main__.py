@@ -1,4 +1,4 @@
-"""Write an index of the frames that an evaluation uses.
+"""Write an index of the images that an evaluation uses.
 
 python -m asysplat.data.selection path/to/scenes index.json --selection kmeans --inputs 32
 """
@@ -10,6 +10,7 @@ from pathlib import Path
 from asysplat.data.readers import find_scenes, open_scene
 from asysplat.data.selection import SELECTIONS, named_selection
 from asysplat.data.selection.index import Entry, camera_hash, write_index
+from asysplat.data.sequence import SceneOptions
 from asysplat.errors import InputError
 
 
@@ -23,9 +24,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--targets", type=int, default=8, help="of every_8th and uniform")
     options = parser.parse_args(arguments)
     try:
-        entries = index_entries(
-            options.root, options.layout, options.selection, options.inputs, options.targets
-        )
+        entries = index_entries(options)
         if options.index.resolve().is_relative_to(options.root.resolve()):
             raise InputError(f"{options.index} lies in the data set: name a file outside of it.")
         write_index(options.index, options.selection, entries)
@@ -34,22 +33,22 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"{options.index}: {len(entries)} scenes")
 
 
-def index_entries(
-    root: Path, layout: str, selection: str, num_inputs: int, num_targets: int
-) -> dict[str, Entry]:
-    """Select the test frames of every scene that `root` is or holds.
+def index_entries(options: argparse.Namespace) -> dict[str, Entry]:
+    """Select the test images of every scene that `root` is or holds.
 
     Raises:
-        InputError: a scene that cannot be read, that is too short, or two of one name.
+        InputError: a scene that cannot be read or is too short, or two scenes of one name.
     """
-    layout, scenes = find_scenes(root, layout)
+    layout, scenes = find_scenes(options.root, options.layout)
     entries: dict[str, Entry] = {}
     for scene in scenes:
-        sequence = open_scene(scene, 1, 1, layout)  # cameras alone: no pixel is read
+        sequence = open_scene(scene, SceneOptions(1, 1, layout))  # reads cameras, no pixels
         if sequence.name in entries:
-            raise InputError(f"{root} holds two scenes called {sequence.name}: rename one.")
-        chosen = named_selection(selection, sequence.cameras, num_inputs, num_targets, "test")
-        entries[sequence.name] = Entry(chosen, camera_hash(sequence.cameras))
+            raise InputError(f"{options.root} holds two scenes called {sequence.name}: rename one.")
+        selection = named_selection(
+            options.selection, sequence.cameras, options.inputs, options.targets, "test"
+        )
+        entries[sequence.name] = Entry(selection, camera_hash(sequence.cameras))
     return entries
 
 

@@ -1,4 +1,4 @@
-"""Files that name the frames of each scene: pixelSplat's, Long-LRM's, and our own.
+"""Index files, which name the images of each scene: pixelSplat's, Long-LRM's, and our own.
 
 https://github.com/dcharatan/pixelsplat/blob/main/assets/evaluation_index_re10k.json
 https://github.com/arthurhero/Long-LRM/tree/main/data/example_data
@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from asysplat.data.readers.common import folders_with, read_json
-from asysplat.data.selection.frames import Selection
 from asysplat.data.selection.kmeans import DECIMALS, pose_features
+from asysplat.data.selection.views import Selection
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
 
@@ -26,11 +26,7 @@ LONG_LRM_LIST = re.compile(r"fold_(\d+)_kmeans_(\d+)_input")
 
 @dataclass(frozen=True)
 class Entry:
-    """What an index says of one scene.
-
-    Args:
-        cameras: the hash of the scene's cameras, where the index has one.
-    """
+    """The entry of one scene; `cameras` is the hash of its cameras, where the index has one."""
 
     selection: Selection
     cameras: str | None = None
@@ -38,25 +34,19 @@ class Entry:
 
 @dataclass(frozen=True)
 class ViewIndex:
-    """The selections of the scenes that an index file names.
-
-    Args:
-        path: the index file, for messages.
-        entries: by the name of the scene.
-    """
+    """The entries of an index file by the name of the scene; `path` is for messages."""
 
     path: Path
     entries: Mapping[str, Entry]
 
     def selection(self, scene: str, cameras: Cameras, num_inputs: int) -> Selection:
-        """Return the selection of a scene that the index names.
+        """Return the selection of a scene.
 
         Raises:
-            InputError: the index was made for other cameras or another number of inputs, or names a
-                frame that the scene lacks.
+            InputError: the index was made for other cameras or another number of inputs, or names
+                an image that the scene lacks.
         """
-        entry = self.entries[scene]
-        where = f"{self.path}, scene {scene}"
+        entry, where = self.entries[scene], f"{self.path}, scene {scene}"
         if entry.cameras not in (None, camera_hash(cameras)):
             raise InputError(
                 f"{where}: the index was made for other cameras: write it again for these files."
@@ -70,7 +60,7 @@ class ViewIndex:
         last = max(inputs + targets)
         if last >= cameras.num_views:
             raise InputError(
-                f"{where} names frame {last}, and the scene has {cameras.num_views} frames: it "
+                f"{where} names image {last}, and the scene has {cameras.num_views} images: it "
                 "belongs to another version of the scene; write the index again for this one."
             )
         return entry.selection
@@ -81,8 +71,8 @@ def read_index(path: Path | str, num_inputs: int) -> ViewIndex:
 
     pixelSplat's: {scene: {"context": [...], "target": [...]} or null}; scenes that are null are
     left out, and a target may be an input. Long-LRM's: a scene's own opencv_cameras.json with a
-    list `fold_8_kmeans_32_input`, every 8th frame being a target; for many scenes, their folder.
-    Ours: as `write_index` writes it.
+    list `fold_8_kmeans_32_input`, where every 8th image is a target; for many scenes, their folder.
+    Ours: see `write_index`.
 
     Raises:
         InputError: none of these, a list for another number of inputs, or an index of ours that
@@ -96,8 +86,8 @@ def read_index(path: Path | str, num_inputs: int) -> ViewIndex:
                 f"data.index={path} is a folder without {LONG_LRM_FILE}: name an index file, or "
                 "scenes in the layout of Long-LRM."
             )
-        found = [_long_lrm_entry(file, read_json(file), num_inputs) for file in files]
-        return ViewIndex(path, dict(found))
+        entries = [_long_lrm_entry(file, read_json(file), num_inputs) for file in files]
+        return ViewIndex(path, dict(entries))
     content = read_json(path)
     if not isinstance(content, dict):
         raise InputError(f'{path} is no index: give {{"scene": {{"context": [], "target": []}}}}.')
@@ -113,7 +103,7 @@ def read_index(path: Path | str, num_inputs: int) -> ViewIndex:
 
 
 def write_index(path: Path, selection: str, entries: Mapping[str, Entry]) -> None:
-    """Write an index in our own form; its hash over all of it shows later changes.
+    """Write an index in our own form, with a hash over all of it that reveals later changes.
 
     Raises:
         InputError: the file exists.
@@ -133,7 +123,7 @@ def write_index(path: Path, selection: str, entries: Mapping[str, Entry]) -> Non
 
 
 def camera_hash(cameras: Cameras) -> str:
-    """Hash where a scene's cameras stand and look, whatever the origin and the unit are."""
+    """Hash the cameras' positions and viewing directions, for any origin and unit."""
     steps = (pose_features(cameras) * 10**DECIMALS).round().astype("<i8")
     return _digest(np.ascontiguousarray(steps).tobytes())
 
@@ -155,11 +145,8 @@ def _digest(data: bytes) -> str:
 
 def _entry(where: str, stored: Any) -> Entry:
     entry = stored if isinstance(stored, dict) else {}
-    selection = Selection(
-        _frames(f"{where}, context", entry.get("context")),
-        _frames(f"{where}, target", entry.get("target")),
-    )
-    return Entry(selection, entry.get("cameras"))
+    lists = (_indices(f"{where}, {key}", entry.get(key)) for key in ("context", "target"))
+    return Entry(Selection(*lists), entry.get("cameras"))
 
 
 def _long_lrm_entry(file: Path, content: Any, num_inputs: int) -> tuple[str, Entry]:
@@ -170,18 +157,18 @@ def _long_lrm_entry(file: Path, content: Any, num_inputs: int) -> tuple[str, Ent
     for name, match in lists.items():
         fold, count = map(int, match.groups())
         if count == num_inputs and fold > 0:
-            inputs = _frames(f"{file}, {name}", content[name])
+            inputs = _indices(f"{file}, {name}", content[name])
             selection = Selection(inputs, list(range(0, len(frames), fold)))
             return str(content.get("scene_name", file.parent.name)), Entry(selection)
-    there = ", ".join(lists) or "none"
     raise InputError(
-        f"{file} has no list fold_8_kmeans_{num_inputs}_input (there: {there}): set data.inputs to "
-        "the number of a list, or use data.selection=kmeans."
+        f"{file} has no list fold_8_kmeans_{num_inputs}_input (its lists: "
+        f"{', '.join(lists) or 'none'}): set data.inputs to the number of a list, or use "
+        "data.selection=kmeans."
     )
 
 
-def _frames(where: str, stored: Any) -> list[int]:
-    usable = isinstance(stored, list) and stored and all(type(n) is int and n >= 0 for n in stored)
-    if not usable or len(set(stored)) != len(stored):
-        raise InputError(f"{where} is {stored!r}: give a list of different frame numbers from 0.")
+def _indices(where: str, stored: Any) -> list[int]:
+    valid = isinstance(stored, list) and stored and all(type(n) is int and n >= 0 for n in stored)
+    if not valid or len(set(stored)) != len(stored):
+        raise InputError(f"{where} is {stored!r}: give a list of different image numbers from 0.")
     return stored

@@ -7,10 +7,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from threadpoolctl import threadpool_limits
 
-from asysplat.data.selection.frames import Selection, Split, check_held_out, paper_frames
+from asysplat.data.selection.views import Selection, Split, check_held_out, paper_split
 from asysplat.scene import Cameras
 
-DECIMALS = 4  # of features of length 1: above float noise, below the differences between frames
+DECIMALS = 4  # of features of length 1: above float noise, below the differences between cameras
 
 
 def kmeans_selection(
@@ -18,20 +18,20 @@ def kmeans_selection(
 ) -> Selection:
     """Select as the paper's tests do: inputs by k-means on positions and viewing directions.
 
-    Every 8th frame is a target; of the others, those nearest to the centers are inputs.
+    Every 8th image is a target; of the others, those nearest to the centers are inputs.
     Deterministic, on every machine.
 
     Raises:
         InputError: the sequence is too short.
     """
-    frames, targets = paper_frames(cameras.num_views, num_targets, split)
-    check_held_out(cameras.num_views, len(frames), num_inputs, split)
-    chosen = nearest_to_centers(pose_features(cameras.select(frames)), num_inputs)
-    return Selection([frames[index] for index in chosen], targets)
+    images, targets = paper_split(cameras.num_views, num_targets, split)
+    check_held_out(cameras.num_views, len(images), num_inputs, split)
+    chosen = nearest_to_centers(pose_features(cameras.select(images)), num_inputs)
+    return Selection([images[index] for index in chosen], targets)
 
 
 def pose_features(cameras: Cameras) -> Float[ndarray, "V 6"]:
-    """Return positions and viewing directions, scaled to weigh alike.
+    """Return positions and viewing directions, scaled to equal weight.
 
     Positions are relative to their mean, in units of their root mean square; directions have length
     1. Rounded, so that float noise makes no difference.
@@ -49,8 +49,7 @@ def pose_features(cameras: Cameras) -> Float[ndarray, "V 6"]:
 def nearest_to_centers(features: Float[ndarray, "V d"], count: int) -> list[int]:
     """Choose `count` different rows, each near a center of k-means; sorted.
 
-    The nearest pair of a center and a row is taken first, and neither is used again; of equally
-    near rows, the first is taken.
+    Matches centers and rows greedily by distance; of equally near rows, the first is taken.
     """
     from sklearn.cluster import KMeans  # slow to import
 
@@ -63,8 +62,8 @@ def nearest_to_centers(features: Float[ndarray, "V d"], count: int) -> list[int]
     distances = np.linalg.norm(features[:, None] - centers, axis=-1).round(DECIMALS)
     rows, free = [], set(range(count))
     # Row-major, and stable: of equal distances the first row comes first.
-    for place in np.argsort(distances, axis=None, kind="stable"):
-        row, center = divmod(int(place), count)
+    for position in np.argsort(distances, axis=None, kind="stable"):
+        row, center = divmod(int(position), count)
         if center in free and row not in rows:
             free.remove(center)
             rows.append(row)

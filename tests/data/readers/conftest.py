@@ -15,7 +15,7 @@ HEIGHT, WIDTH = 24, 32
 def centerd_views() -> Views:
     """Twelve views of a room, 24 x 32, as 8-bit images and depths of whole millimeters can hold
     them; one focal length, and the principal point at the center."""
-    scene = ProceduralScene(1, HEIGHT, WIDTH, num_frames=40, places="rooms")
+    scene = ProceduralScene(1, HEIGHT, WIDTH, num_images=40, places="rooms")
     views = scene.views(range(12))
     return replace(
         views,

@@ -8,8 +8,8 @@ import pytest
 from layouts import colmap as layout
 from layouts import save_image
 
-from asysplat.data import open_scene
-from asysplat.data.bad_images import BadFrames
+from asysplat.data import SceneOptions, open_scene
+from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens
 from asysplat.data.readers import colmap
 from asysplat.errors import InputError
@@ -24,18 +24,18 @@ def scene(views, tmp_path):
 
 
 def read(folder):
-    bad = BadFrames()
+    bad = BadImages()
     found = colmap.read_scene(folder, bad)
-    bad.settle(str(folder), len(found.photographs))
+    bad.report(str(folder), len(found.images))
     return found
 
 
 def cameras_of(found):
-    return np.array([photograph.cam_to_world for photograph in found.photographs])
+    return np.array([photograph.cam_to_world for photograph in found.images])
 
 
 def names_of(found):
-    return [photograph.image.name for photograph in found.photographs]
+    return [photograph.file.name for photograph in found.images]
 
 
 def edit(file, change):
@@ -74,7 +74,7 @@ def test_frames_follow_their_numbers(scene):
 def test_text_and_binary_are_the_same(scene, old):
     text, binary = read(scene), read(as_binary(scene, old))
     assert names_of(text) == names_of(binary)
-    assert [p.lens for p in text.photographs] == [p.lens for p in binary.photographs]
+    assert [p.lens for p in text.images] == [p.lens for p in binary.images]
     np.testing.assert_allclose(cameras_of(text), cameras_of(binary), atol=1e-12)
     np.testing.assert_allclose(text.points, binary.points, atol=1e-12)
 
@@ -87,7 +87,7 @@ def test_the_model_may_lie_elsewhere(scene, place):
     shutil.copytree(scene / "model", scene / place, dirs_exist_ok=True)
     shutil.rmtree(scene / "model")
     assert colmap.find_scenes(scene.parent) == [scene]
-    assert len(read(scene).photographs) == 12
+    assert len(read(scene).images) == 12
 
 
 NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -104,7 +104,7 @@ LENSES = {
 @pytest.mark.parametrize("line", LENSES, ids=lambda line: line.split()[0])
 def test_camera_models(scene, line):
     fx, fy, distortion = LENSES[line]
-    found = read(with_camera(scene, line)).photographs[0].lens
+    found = read(with_camera(scene, line)).images[0].lens
     assert found == Lens(32, 24, fx, fy, 15.0, 11.0, distortion, line.startswith("OPENCV_FISHEYE"))
     # The same pixels as COLMAP itself would find.
     in_camera = np.random.default_rng(0).uniform((-0.5, -0.4, 1), (0.5, 0.4, 1), (20, 3))
@@ -115,7 +115,7 @@ def test_camera_models(scene, line):
         in_camera[:, None], still, still, matrix, np.array(found.distortion)
     )
     np.testing.assert_allclose(pixels[:, 0], camera.img_from_cam(in_camera), atol=1e-9)
-    open_scene(scene, HEIGHT, WIDTH, layout="colmap").views([0]).validate()
+    open_scene(scene, SceneOptions(HEIGHT, WIDTH, layout="colmap")).views([0]).validate()
 
 
 @pytest.mark.parametrize(
@@ -137,24 +137,24 @@ def test_every_image_has_its_own_camera(scene, views):
         scene / "sparse/0/cameras.txt",
         lambda text: text.replace("\n3 PINHOLE", "\n3 SIMPLE_PINHOLE 32 24 50 16 12 #"),
     )
-    focals = [photograph.lens.fx for photograph in read(scene).photographs]
+    focals = [photograph.lens.fx for photograph in read(scene).images]
     assert focals[2] == 50 and focals[1] == pytest.approx(views.cameras.intrinsics[1, 0, 0].item())
 
 
 def test_intrinsics_are_scaled_to_smaller_images(scene):
     (scene / "images").rename(scene / "images_4")
     with_camera(scene, "OPENCV 130 97 120 124 60 44 0.1 0 0 0")
-    lens = read(scene).photographs[0].lens
+    lens = read(scene).images[0].lens
     x, y = 32 / 130, 24 / 97
     assert lens == Lens(32, 24, 120 * x, 124 * y, 60 * x, 44 * y, (0.1, 0.0, 0.0, 0.0, 0.0))
 
 
 def test_the_full_size_wins(scene, views):
     shutil.copytree(scene / "images", scene / "images_2")
-    assert read(scene).photographs[0].image == scene / "images/0.png"
+    assert read(scene).images[0].file == scene / "images/0.png"
     for name in ("0.png", "1.png"):
         (scene / "images" / name).unlink()
-    assert read(scene).photographs[0].image == scene / "images_2/0.png"
+    assert read(scene).images[0].file == scene / "images_2/0.png"
 
 
 def test_images_of_other_proportions_are_bad_frames(scene):
@@ -169,7 +169,7 @@ def test_names_may_have_folders_and_any_letters(scene, views):
     edit(scene / "sparse/0/images.txt", lambda text: text.replace("3.png", "左cam/ä3.png", 1))
     found = read(scene)
     expected = views.cameras.cam_to_world[3].double().numpy()
-    (photograph,) = (p for p in found.photographs if p.image.name == "ä3.png")
+    (photograph,) = (p for p in found.images if p.file.name == "ä3.png")
     np.testing.assert_allclose(photograph.cam_to_world, expected, atol=1e-6)
     binary = read(as_binary(scene))
     assert names_of(binary) == names_of(found)
@@ -183,7 +183,7 @@ def test_images_that_are_not_registered_are_told(scene, views):
     message = str(caught.list[0].message)
     assert len(caught) == 1 and "not registered 7 of 19" in message
     assert message.endswith("50.png, 51.png, 52.png, 53.png, 54.png, ...")
-    assert len(found.photographs) == 12
+    assert len(found.images) == 12
 
 
 def test_bad_images_are_listed_together_or_skipped(scene):
@@ -193,13 +193,13 @@ def test_bad_images_are_listed_together_or_skipped(scene):
     edit(scene / "sparse/0/images.txt", lambda text: text.replace(" 10.png", " gone/10.png"))
     (scene / "images/10.png").unlink()
     with pytest.raises(InputError) as error:
-        open_scene(scene, HEIGHT, WIDTH, layout="colmap")
+        open_scene(scene, SceneOptions(HEIGHT, WIDTH, layout="colmap"))
     message = str(error.value)
     assert "3 of 12" in message and "4.png does not exist" in message
     assert "7.png cannot be read" in message and "gone/10.png does not exist" in message
     with pytest.warns(UserWarning, match="left out 3 of 12"):
-        sequence = open_scene(scene, HEIGHT, WIDTH, layout="colmap", on_bad_image="skip")
-    assert sequence.num_frames == 9
+        sequence = open_scene(scene, SceneOptions(HEIGHT, WIDTH, "colmap", "skip"))
+    assert sequence.num_images == 9
 
 
 @pytest.mark.parametrize("binary", [False, True])
@@ -256,11 +256,11 @@ def test_a_model_of_no_image_is_refused(scene):
 def test_a_model_without_points_has_none(scene):
     (scene / "sparse/0/points3D.txt").write_text("")
     found = read(scene)
-    assert found.points is None and len(found.photographs) == 12
+    assert found.points is None and len(found.images) == 12
 
 
 def test_points_beside_photographs_of_the_same_world(scene, views):
-    photographs = read(scene).photographs
+    photographs = read(scene).images
     points = colmap.points_beside(scene, photographs[3:8])
     np.testing.assert_allclose(points, layout.points_of(views), atol=1e-9)
     assert colmap.points_beside(scene / "images", photographs) is None
@@ -278,8 +278,8 @@ def test_points_of_another_world_are_not_taken(scene, change):
     if change == "scaled":
         poses[:, :3, 3] *= 1.05
     photographs = [
-        type(photograph)(photograph.image, photograph.lens, pose)
-        for photograph, pose in zip(found.photographs, poses, strict=True)
+        type(photograph)(photograph.file, photograph.lens, pose)
+        for photograph, pose in zip(found.images, poses, strict=True)
     ]
     if change == "other images":
         edit(scene / "sparse/0/images.txt", lambda text: text.replace(".png", ".jpg"))

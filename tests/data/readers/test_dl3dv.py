@@ -6,7 +6,7 @@ import torch
 from layouts import save_image
 from layouts.dl3dv import HASH, LENS, write, write_benchmark, write_scene
 
-from asysplat.data import open_scene
+from asysplat.data import SceneOptions, open_scene
 from asysplat.data.readers import dl3dv
 from asysplat.errors import InputError
 
@@ -22,7 +22,7 @@ def scene(few, tmp_path):
 
 
 def opened(path, height=24, width=32, **options):
-    return open_scene(path, height, width, layout="dl3dv", **options)
+    return open_scene(path, SceneOptions(height, width, layout="dl3dv", **options))
 
 
 def change(scene, edit):
@@ -50,7 +50,7 @@ def test_the_benchmark_is_read_at_960p(few, tmp_path):
 def test_smaller_images_are_read_where_there_are_no_others(few, tmp_path):
     write_scene(few, tmp_path / HASH, level=8)
     sequence = opened(tmp_path / HASH)
-    lens = sequence.scene.photographs[0].lens
+    lens = sequence.scene.images[0].lens
     assert (lens.width, lens.height) == (16, 12)
     torch.testing.assert_close(
         sequence.cameras.intrinsics, few.cameras.intrinsics, rtol=0, atol=1e-5
@@ -61,7 +61,7 @@ def test_distortion_does_not_depend_on_the_images_size(few, tmp_path):
     lens = LENS | {"k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": -0.004}
     write_scene(few, tmp_path / HASH, lens=lens)
     sequence = opened(tmp_path / HASH)
-    assert sequence.scene.photographs[0].lens.distortion == (0.1, -0.02, 0.003, -0.004, 0)
+    assert sequence.scene.images[0].lens.distortion == (0.1, -0.02, 0.003, -0.004, 0)
     views = sequence.views([0])
     assert views.masks is not None and (views.images - few.images[:1]).abs().max() > 0.01
 
@@ -114,22 +114,22 @@ FRAMES = {
 @pytest.mark.parametrize("damage, message", FRAMES.values(), ids=FRAMES.keys())
 def test_a_bad_frame_is_named_or_left_out(scene, damage, message):
     damage(scene)
-    with pytest.raises(InputError, match=f"1 of 4 frames cannot be used(.|\n)*{message}"):
+    with pytest.raises(InputError, match=f"1 of 4 images cannot be used(.|\n)*{message}"):
         opened(scene)
-    with pytest.warns(UserWarning, match=f"left out 1 of 4 frames(.|\n)*{message}"):
-        assert opened(scene, on_bad_image="skip").num_frames == 3
+    with pytest.warns(UserWarning, match=f"left out 1 of 4 images(.|\n)*{message}"):
+        assert opened(scene, on_bad_image="skip").num_images == 3
 
 
 def test_all_bad_frames_are_told_together(scene):
     nan(scene)
     (scene / "images_4/frame_00002.png").unlink()
-    with pytest.raises(InputError, match=r"2 of 4 frames(.|\n)*002.png does(.|\n)*holds NaN"):
+    with pytest.raises(InputError, match=r"2 of 4 images(.|\n)*002.png does(.|\n)*holds NaN"):
         opened(scene)
 
 
 def test_other_proportions_of_all_images_are_refused(scene):
     change(scene, lambda content: content.update(h=4 * 32))
-    with pytest.raises(InputError, match="4 of 4 frames cannot be used"):
+    with pytest.raises(InputError, match="4 of 4 images cannot be used"):
         opened(scene)
 
 

@@ -5,7 +5,7 @@ import pytest
 from layouts import colmap as colmap_layout
 from layouts import llff as layout
 
-from asysplat.data import open_scene
+from asysplat.data import SceneOptions, open_scene
 from asysplat.errors import InputError
 
 HEIGHT, WIDTH = 24, 32
@@ -17,7 +17,7 @@ def scene(centerd_views, tmp_path):
 
 
 def open_llff(scene, **options):
-    return open_scene(scene, HEIGHT, WIDTH, layout="llff", **options)
+    return open_scene(scene, SceneOptions(HEIGHT, WIDTH, layout="llff", **options))
 
 
 def change(scene, edit):
@@ -38,9 +38,9 @@ def test_the_largest_folder_that_is_whole_counts(scene):
     shutil.copytree(scene / "images_8", scene / "images")
     shutil.copytree(scene / "images_8", scene / "images_4")
     (scene / "images/.DS_Store").write_text("")
-    assert open_llff(scene).scene.photographs[0].image.parent.name == "images"
+    assert open_llff(scene).scene.images[0].file.parent.name == "images"
     (scene / "images/image003.png").unlink()
-    assert open_llff(scene).scene.photographs[0].image.parent.name == "images_4"
+    assert open_llff(scene).scene.images[0].file.parent.name == "images_4"
 
 
 def test_images_and_rows_that_differ_in_number_are_refused(scene):
@@ -48,7 +48,7 @@ def test_images_and_rows_that_differ_in_number_are_refused(scene):
     with pytest.raises(InputError, match=r"npy has 12 rows, but .* 11 in images_8/"):
         open_llff(scene)
     shutil.rmtree(scene / "images_8")
-    with pytest.raises(InputError, match="of images there are none"):
+    with pytest.raises(InputError, match="the images there are none"):
         open_llff(scene)
 
 
@@ -61,7 +61,7 @@ def test_all_bad_frames_are_listed_or_skipped(scene):
     with pytest.raises(InputError) as error:
         open_llff(scene)
     summary, *sentences = str(error.value).splitlines()
-    assert "4 of 12 frames" in summary
+    assert "4 of 12 images" in summary
     expected = [
         "image001.png cannot be read",
         "row 3 (image003.png) holds NaN",
@@ -71,7 +71,7 @@ def test_all_bad_frames_are_listed_or_skipped(scene):
     for sentence, part in zip(sentences, expected, strict=True):
         assert part in sentence
     with pytest.warns(UserWarning, match="left out 4 of 12"):
-        assert open_llff(scene, on_bad_image="skip").num_frames == 8
+        assert open_llff(scene, on_bad_image="skip").num_images == 8
 
 
 ARRAYS = {

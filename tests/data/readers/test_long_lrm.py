@@ -3,7 +3,7 @@ import json
 import pytest
 from layouts import long_lrm as layout
 
-from asysplat.data import find_scenes, open_scene
+from asysplat.data import SceneOptions, find_scenes, open_scene
 from asysplat.errors import InputError
 
 HEIGHT, WIDTH = 24, 32
@@ -28,14 +28,14 @@ def change(scene, edit):
 
 
 def names_of(sequence):
-    return [photograph.image.name for photograph in sequence.scene.photographs]
+    return [photograph.file.name for photograph in sequence.scene.images]
 
 
 def test_a_scene_is_found_from_its_list_json_or_folder(listed, scene):
     file = scene / "opencv_cameras.json"
     assert find_scenes(listed) == find_scenes(file) == ("long_lrm", [file])
     assert find_scenes(scene) == find_scenes(listed.parent) == ("long_lrm", [scene])
-    assert open_scene(listed, 8, 8).name == open_scene(scene, 8, 8).name == "desk"
+    assert {open_scene(path, SceneOptions(8, 8)).name for path in (listed, scene)} == {"desk"}
     file.rename(scene / "cameras.json")
     assert find_scenes(scene / "cameras.json") == ("long_lrm", [scene / "cameras.json"])
 
@@ -50,9 +50,9 @@ def test_other_text_and_json_files_are_no_scenes_of_it(scene, tmp_path):
 
 def test_frames_are_in_the_file_s_order(scene):
     names = [f"frame{10 * index}.png" for index in range(12)]
-    assert names_of(open_scene(scene, 8, 8)) == names
+    assert names_of(open_scene(scene, SceneOptions(8, 8))) == names
     change(scene, lambda frames: frames.reverse())
-    assert names_of(open_scene(scene, 8, 8)) == names[::-1]
+    assert names_of(open_scene(scene, SceneOptions(8, 8))) == names[::-1]
 
 
 def test_intrinsics_of_larger_images_are_scaled(scene, views):
@@ -61,7 +61,7 @@ def test_intrinsics_of_larger_images_are_scaled(scene, views):
             for name in ("fx", "fy", "cx", "cy", "w", "h"):
                 frame[name] *= 4
 
-    sequence = open_scene(change(scene, enlarge), HEIGHT, WIDTH)
+    sequence = open_scene(change(scene, enlarge), SceneOptions(HEIGHT, WIDTH))
     difference = sequence.cameras.intrinsics - views.cameras.intrinsics
     assert difference.abs().max() < 1e-5
 
@@ -82,9 +82,9 @@ def test_all_bad_frames_are_listed_or_skipped(scene):
         frames[8]["w"] = None
 
     with pytest.raises(InputError) as error:
-        open_scene(change(scene, damage), HEIGHT, WIDTH)
+        open_scene(change(scene, damage), SceneOptions(HEIGHT, WIDTH))
     summary, *sentences = str(error.value).splitlines()
-    assert "9 of 12 frames" in summary
+    assert "9 of 12 images" in summary
     expected = [
         "frame0.png does not exist",
         "frame10.png cannot be read",
@@ -99,7 +99,7 @@ def test_all_bad_frames_are_listed_or_skipped(scene):
     for sentence, part in zip(sentences, expected, strict=True):
         assert part in sentence
     with pytest.warns(UserWarning, match="left out 9 of 12"):
-        sequence = open_scene(scene, HEIGHT, WIDTH, on_bad_image="skip")
+        sequence = open_scene(scene, SceneOptions(HEIGHT, WIDTH, on_bad_image="skip"))
     assert names_of(sequence) == ["frame90.png", "frame100.png", "frame110.png"]
 
 
@@ -107,10 +107,10 @@ def test_a_cut_json_is_refused(scene):
     file = scene / "opencv_cameras.json"
     file.write_text(file.read_text()[:1000])
     with pytest.raises(InputError, match=r"opencv_cameras\.json is not JSON"):
-        open_scene(scene, HEIGHT, WIDTH)
+        open_scene(scene, SceneOptions(HEIGHT, WIDTH))
 
 
 def test_a_listed_file_that_is_missing_is_refused(listed):
     listed.write_text("gone/opencv_cameras.json")
     with pytest.raises(InputError, match=r"gone/opencv_cameras\.json does not exist"):
-        open_scene(listed, HEIGHT, WIDTH)
+        open_scene(listed, SceneOptions(HEIGHT, WIDTH))

@@ -3,7 +3,7 @@ import pytest
 from layouts import posed as layout
 from PIL import Image
 
-from asysplat.data import open_scene
+from asysplat.data import SceneOptions, open_scene
 from asysplat.errors import InputError
 
 HEIGHT, WIDTH = 24, 32
@@ -15,7 +15,7 @@ def scene(views, tmp_path):
 
 
 def open_posed(scene, **options):
-    return open_scene(scene, HEIGHT, WIDTH, layout="posed", **options)
+    return open_scene(scene, SceneOptions(HEIGHT, WIDTH, layout="posed", **options))
 
 
 def test_refined_poses_are_preferred(scene):
@@ -49,7 +49,7 @@ def test_all_bad_frames_are_listed_or_skipped(scene):
     with pytest.raises(InputError) as error:
         open_posed(scene)
     summary, *sentences = str(error.value).splitlines()
-    assert "5 of 12 frames" in summary
+    assert "5 of 12 images" in summary
     expected = [
         "00001.png cannot be read",
         "depth/00002.png does not exist",
@@ -60,7 +60,7 @@ def test_all_bad_frames_are_listed_or_skipped(scene):
     for sentence, part in zip(sentences, expected, strict=True):
         assert part in sentence
     with pytest.warns(UserWarning, match="left out 5 of 12"):
-        assert open_posed(scene, on_bad_image="skip").num_frames == 7
+        assert open_posed(scene, on_bad_image="skip").num_images == 7
 
 
 def test_poses_and_images_that_differ_in_number_are_refused(scene):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from asysplat.data import open_scene
-from asysplat.data.bad_images import BadFrames
+from asysplat.data import SceneOptions, open_scene
+from asysplat.data.bad_images import BadImages
 from asysplat.data.points import depths_of_points
 from asysplat.data.readers import colmap, llff, long_lrm, posed, transforms
 
@@ -20,18 +20,18 @@ def scene(request, shared):
 
 
 def read(layout, folder):
-    bad = BadFrames()
+    bad = BadImages()
     scenes = layout.find_scenes(folder)
     scene = layout.read_scene(scenes[0], bad)
-    assert len(scenes) == 1 and not bad.sentences
+    assert len(scenes) == 1 and not bad.errors
     return scene
 
 
 def test_both_readers_give_the_same_cameras(scene):
     own = {
-        photograph.image: photograph for photograph in read(SCENES[scene.name], scene).photographs
+        photograph.file: photograph for photograph in read(SCENES[scene.name], scene).images
     }
-    model = {photograph.image: photograph for photograph in read(colmap, scene).photographs}
+    model = {photograph.file: photograph for photograph in read(colmap, scene).images}
     common = sorted(own.keys() & model.keys())
     assert len(common) == len(own) == len(model)
     poses = np.array([own[image].cam_to_world for image in common])
@@ -49,15 +49,15 @@ def test_both_readers_give_the_same_cameras(scene):
 
 
 def test_it_opens_in_its_own_layout(scene):
-    sequence = open_scene(scene, 64, 64)
-    views = sequence.views([0, sequence.num_frames // 2, sequence.num_frames - 1]).validate()
+    sequence = open_scene(scene, SceneOptions(64, 64))
+    views = sequence.views([0, sequence.num_images // 2, sequence.num_images - 1]).validate()
     assert views.images.std() > 0.05
     assert (views.depths is not None) == (scene.name == "hololens-000")
 
 
 def test_points_seen_lie_on_the_surfaces(scene):
-    sequence = open_scene(scene, 64, 64)
-    views = sequence.views(range(0, sequence.num_frames, 10))
+    sequence = open_scene(scene, SceneOptions(64, 64))
+    views = sequence.views(range(0, sequence.num_images, 10))
     depths = depths_of_points(sequence.points, views.cameras)
     assert (depths > 0).sum((1, 2)).median() > 200
     if views.depths is not None:
@@ -70,7 +70,7 @@ def test_points_seen_lie_on_the_surfaces(scene):
 def test_points_lie_before_the_cameras_that_see_them(scene):
     found = read(colmap, scene)
     in_front = []
-    for photograph in found.photographs:
+    for photograph in found.images:
         world_to_cam = np.linalg.inv(photograph.cam_to_world)
         x, y, z = world_to_cam[:3, :3] @ found.points.T + world_to_cam[:3, 3:]
         lens = photograph.lens

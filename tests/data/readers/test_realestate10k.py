@@ -6,7 +6,7 @@ import pytest
 import torch
 from layouts.realestate10k import KEY, cameras, encoded, scene, write
 
-from asysplat.data import open_scene
+from asysplat.data import SceneOptions, open_scene
 from asysplat.data.readers import realestate10k
 from asysplat.errors import InputError
 
@@ -34,7 +34,7 @@ def chunk(few, tmp_path):
 
 
 def opened(path, height=24, width=32, **options):
-    return open_scene(path, height, width, layout="realestate10k", **options)
+    return open_scene(path, SceneOptions(height, width, layout="realestate10k", **options))
 
 
 def test_scenes_are_found_by_the_index_by_chunk_and_by_address(few, tmp_path):
@@ -86,9 +86,9 @@ def test_the_form_before_zips_is_read(few, tmp_path):
 
 def test_a_chunk_that_was_written_anew_is_read_anew(few, chunk):
     file = chunk()
-    assert opened(file / KEY).num_frames == 4
+    assert opened(file / KEY).num_images == 4
     torch.save([scene(few.select([0, 1]))], file)
-    assert opened(file / KEY).num_frames == 2
+    assert opened(file / KEY).num_images == 2
 
 
 def set_camera(index, column, value):
@@ -125,10 +125,10 @@ FRAMES = {
 @pytest.mark.parametrize("change, message", FRAMES.values(), ids=FRAMES.keys())
 def test_a_bad_frame_is_named_or_left_out(chunk, change, message):
     address = chunk(change) / KEY
-    with pytest.raises(InputError, match=f"1 of 4 frames cannot be used(.|\n)*{message}"):
+    with pytest.raises(InputError, match=f"1 of 4 images cannot be used(.|\n)*{message}"):
         opened(address)
-    with pytest.warns(UserWarning, match=f"left out 1 of 4 frames(.|\n)*{message}"):
-        assert opened(address, on_bad_image="skip").num_frames == 3
+    with pytest.warns(UserWarning, match=f"left out 1 of 4 images(.|\n)*{message}"):
+        assert opened(address, on_bad_image="skip").num_images == 3
 
 
 SCENES = {
@@ -190,7 +190,7 @@ def test_code_in_a_chunk_is_not_run(few, tmp_path, zipped):
 @pytest.mark.skipif(not MAPS.exists(), reason="needs Linux's list of mapped files")
 def test_bytes_stay_in_the_file(few, chunk):
     file = chunk()
-    image = opened(file / KEY).scene.photographs[1].image
+    image = opened(file / KEY).scene.images[1].file
     assert bytes(image.data) == bytes(encoded(few.images[1]).numpy())
     mapped = [line.split()[0].split("-") for line in MAPS.open() if str(file) in line]
     address = image.data.ctypes.data

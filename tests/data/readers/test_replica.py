@@ -7,7 +7,7 @@ import torch
 from layouts import save_depth, save_image
 from layouts.replica import write
 
-from asysplat.data import open_scene
+from asysplat.data import SceneOptions, open_scene
 from asysplat.errors import InputError
 
 STEPS = 6553.5  # a meter, in the published files
@@ -19,7 +19,7 @@ def room(views, tmp_path):
 
 
 def opened(room, height=24, width=32, **options):
-    return open_scene(room, height, width, layout="replica", **options)
+    return open_scene(room, SceneOptions(height, width, layout="replica", **options))
 
 
 def change_camera(room, **values):
@@ -50,7 +50,7 @@ def test_the_principal_point_counts_from_the_corner(room):
 
 def test_a_room_on_its_own_has_the_parameters_in_it(room):
     (room.parent / "cam_params.json").rename(room / "cam_params.json")
-    assert opened(room).num_frames == 4
+    assert opened(room).num_images == 4
 
 
 def test_without_depth_maps_there_are_no_depths(room):
@@ -107,17 +107,17 @@ FRAMES = {
 @pytest.mark.parametrize("damage, message", FRAMES.values(), ids=FRAMES.keys())
 def test_a_bad_frame_is_named_or_left_out(room, damage, message):
     damage(room)
-    with pytest.raises(InputError, match=f"1 of 4 frames cannot be used(.|\n)*{message}"):
+    with pytest.raises(InputError, match=f"1 of 4 images cannot be used(.|\n)*{message}"):
         opened(room)
-    with pytest.warns(UserWarning, match=f"left out 1 of 4 frames(.|\n)*{message}"):
-        assert opened(room, on_bad_image="skip").num_frames == 3
+    with pytest.warns(UserWarning, match=f"left out 1 of 4 images(.|\n)*{message}"):
+        assert opened(room, on_bad_image="skip").num_images == 3
 
 
 def test_all_bad_frames_are_told_together(room):
     for damage, _ in (FRAMES["missing"], FRAMES["nan"]):
         damage(room)
     change_row(room, 0, lambda row: "1 2 3")
-    with pytest.raises(InputError, match=r"2 of 4 frames(.|\n)*row 1 is not(.|\n)*002.jpg does"):
+    with pytest.raises(InputError, match=r"2 of 4 images(.|\n)*row 1 is not(.|\n)*002.jpg does"):
         opened(room)
 
 

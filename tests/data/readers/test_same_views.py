@@ -7,7 +7,7 @@ import layouts
 import pytest
 import torch
 
-from asysplat.data import find_scenes, open_scene
+from asysplat.data import SceneOptions, find_scenes, open_scene
 
 NAMES = [module.name for module in iter_modules(layouts.__path__)]
 
@@ -20,9 +20,9 @@ def test_every_layout_gives_the_same_views(name, views, centerd_views, tmp_path)
     found, scenes = find_scenes(root)
     assert found == name and len(scenes) == 1
     height, width = expected.images.shape[-2:]
-    sequence = open_scene(scenes[0], height, width, layout=name)
-    assert sequence.num_frames == expected.num_views
-    read = sequence.views(range(sequence.num_frames)).validate()
+    sequence = open_scene(scenes[0], SceneOptions(height, width, name))
+    assert sequence.num_images == expected.num_views
+    read = sequence.views(range(sequence.num_images)).validate()
 
     def same(found, wanted):
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)

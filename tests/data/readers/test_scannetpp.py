@@ -7,7 +7,7 @@ import torch
 from layouts import save_depth, save_image
 from layouts.scannetpp import SCENE, write_dslr, write_iphone
 
-from asysplat.data import open_scene
+from asysplat.data import SceneOptions, open_scene
 from asysplat.data.readers import scannetpp
 from asysplat.errors import InputError
 
@@ -34,7 +34,7 @@ def dslr(few, tmp_path):
 
 
 def opened(path, height=24, width=32, **options):
-    return open_scene(path, height, width, layout="scannetpp", **options)
+    return open_scene(path, SceneOptions(height, width, layout="scannetpp", **options))
 
 
 def same(found, expected):
@@ -109,7 +109,7 @@ def test_the_iphone_s_colmap_comes_before_arkit(few, iphone):
 def test_fisheye_is_undistorted(few, dslr):
     write_dslr(few, dslr, lens=FISHEYE)
     sequence = opened(dslr / "nerfstudio/transforms.json")
-    lens = sequence.scene.photographs[0].lens
+    lens = sequence.scene.images[0].lens
     assert lens.fisheye and lens.distortion == tuple(FISHEYE.values())
     assert sequence.views([0]).masks is not None
 
@@ -152,7 +152,7 @@ def test_published_test_frames_are_among_the_photographs(few, dslr):
 def test_one_missing_test_frame_is_a_bad_frame(few, dslr):
     write_dslr(few, dslr, test=[1, 3])
     (dslr / "resized_undistorted_images/DSC00002.JPG").unlink()
-    with pytest.raises(InputError, match=r"1 of 4 frames(.|\n)*DSC00002.JPG does not exist"):
+    with pytest.raises(InputError, match=r"1 of 4 images(.|\n)*DSC00002.JPG does not exist"):
         opened(dslr)
 
 
@@ -161,8 +161,8 @@ def test_frames_that_the_data_set_marks_are_left_out_and_told(few, dslr):
         content["frames"][1]["is_bad"] = True
 
     edit(dslr / "nerfstudio/transforms_undistorted.json", mark)
-    with pytest.warns(UserWarning, match="left out 1 of 4 frames that the data set marks is_bad"):
-        assert opened(dslr).num_frames == 3
+    with pytest.warns(UserWarning, match="left out 1 of 4 images that the data set marks is_bad"):
+        assert opened(dslr).num_images == 3
 
 
 def test_sparse_points_are_kept(dslr):
@@ -221,10 +221,10 @@ FRAMES = {
 @pytest.mark.parametrize("damage, message", FRAMES.values(), ids=FRAMES.keys())
 def test_a_bad_frame_is_named_or_left_out(iphone, damage, message):
     damage(iphone)
-    with pytest.raises(InputError, match=f"1 of 4 frames cannot be used(.|\n)*{message}"):
+    with pytest.raises(InputError, match=f"1 of 4 images cannot be used(.|\n)*{message}"):
         opened(iphone)
-    with pytest.warns(UserWarning, match=f"left out 1 of 4 frames(.|\n)*{message}"):
-        assert opened(iphone, on_bad_image="skip").num_frames == 3
+    with pytest.warns(UserWarning, match=f"left out 1 of 4 images(.|\n)*{message}"):
+        assert opened(iphone, on_bad_image="skip").num_images == 3
 
 
 def test_a_frame_without_numbers_is_a_bad_frame(iphone):

@@ -7,6 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
+from asysplat.data import SceneOptions
 from asysplat.data import open_scene as open_at
 from asysplat.data.sequence import ImageSequence
 from asysplat.errors import InputError
@@ -25,7 +26,7 @@ def pose(index: int) -> np.ndarray:
 
 
 def open_scene(folder, height=HEIGHT, width=WIDTH):
-    return open_at(folder, height, width)
+    return open_at(folder, SceneOptions(height, width))
 
 
 @pytest.fixture
@@ -54,7 +55,7 @@ def test_cameras_and_images_are_the_file_s(scene):
     folder = scene()
     sequence = open_scene(folder)
     assert isinstance(sequence, ImageSequence)
-    assert sequence.name == folder.name and sequence.num_frames == 4
+    assert sequence.name == folder.name and sequence.num_images == 4
     cameras = sequence.cameras.validate()
     expected = np.stack([pose(i) @ FLIP for i in range(4)])
     assert np.abs(cameras.cam_to_world.numpy() - expected).max() < 1e-6
@@ -77,7 +78,7 @@ def test_the_json_file_itself_may_be_named(scene):
     folder = scene()
     (folder / "transforms.json").rename(folder / "transforms_train.json")
     sequence = open_scene(folder / "transforms_train.json")
-    assert sequence.num_frames == 4 and sequence.name == folder.name
+    assert sequence.num_images == 4 and sequence.name == folder.name
 
 
 def test_field_of_view_alone_is_enough(scene):
@@ -197,7 +198,7 @@ def drop(*keys):
 
 BROKEN = {
     "no frames": (drop("frames"), r'transforms\.json has no list "frames"'),
-    "empty frames": (set_scene(frames=[]), r"has 0 usable frame"),
+    "empty frames": (set_scene(frames=[]), r"has 0 usable image"),
     "one frame": (lambda content: content["frames"].__delitem__(slice(1, None)), "has 1 usable"),
     "no path": (set_frame(file_path=None), r"frame 2 has no file_path"),
     "missing image": (set_frame(file_path="images/7.png"), r"7\.png does not exist"),
@@ -309,7 +310,7 @@ def test_real_photographs_meet_their_cameras(shared, tmp_path):
         pytest.skip(f"{folder} is absent")
     frames = [0, 6]
     sequence = open_scene(folder, height=720, width=405)
-    assert sequence.num_frames == 50
+    assert sequence.num_images == 50
     assert epipolar_error(sequence.views(frames).validate()) < 0.5
     # Smaller, with another shape: intrinsics and pixels must still agree.
     assert epipolar_error(open_scene(folder, 480, 360).views(frames)) < 0.5

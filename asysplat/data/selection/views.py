@@ -1,0 +1,165 @@
+"""Selections that need only the number of images."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from asysplat.errors import InputError
+
+HELD_OUT_STEP = 8
+HELD_OUT_START = {"test": 0, "val": 4}
+ABLATION_IMAGES = 96
+
+Split = Literal["val", "test"]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Indices of inputs and targets; unless stated, no image is both."""
+
+    inputs: list[int]
+    targets: list[int]
+
+
+def uniform_selection(num_images: int, num_inputs: int, num_targets: int) -> Selection:
+    """Select inputs evenly over the whole sequence, targets midway between neighboring inputs.
+
+    Deterministic. If there are fewer gaps than targets, the targets are spread over all images that
+    are not inputs.
+
+    Raises:
+        InputError: the sequence is too short.
+    """
+    _check_length(num_images, num_inputs, num_targets)
+    inputs = spread(range(num_images), num_inputs)
+    gaps = pairwise(inputs)
+    candidates = [(before + after) // 2 for before, after in gaps if after - before > 1]
+    if len(candidates) < num_targets:
+        candidates = sorted(set(range(num_images)) - set(inputs))
+    # The middles of equal parts, so that neither end of the sequence is favored.
+    chosen = [(2 * i + 1) * len(candidates) // (2 * num_targets) for i in range(num_targets)]
+    return Selection(inputs, [candidates[index] for index in chosen])
+
+
+def training_selection(
+    num_images: int,
+    num_inputs: int,
+    num_targets: int,
+    window: tuple[int, int],
+    rng: np.random.Generator,
+    targets_may_be_inputs: bool = False,
+) -> Selection:
+    """Select inputs evenly over a random window, and random targets within it.
+
+    Args:
+        window: the least and the greatest number of images to draw from, both included; clipped
+            to the sequence.
+        targets_may_be_inputs: whether targets are drawn from all images of the window.
+
+    Raises:
+        InputError: the sequence or the window is too short.
+    """
+    _check_length(num_images, num_inputs, num_targets)
+    shortest, longest = window
+    if not num_inputs + num_targets <= shortest <= longest:
+        raise InputError(
+            f"data.window is {shortest} to {longest} images: give two increasing numbers, the "
+            f"first at least data.inputs + data.targets = {num_inputs + num_targets}."
+        )
+    length = int(rng.integers(min(shortest, num_images), min(longest, num_images) + 1))
+    start = int(rng.integers(num_images - length + 1))
+    images = range(start, start + length)
+    inputs = spread(images, num_inputs)
+    candidates = images if targets_may_be_inputs else sorted(set(images) - set(inputs))
+    return Selection(inputs, sorted(rng.choice(candidates, num_targets, replace=False).tolist()))
+
+
+def held_out(num_images: int, split: Split) -> list[int]:
+    """Return images 0, 8, 16, ... for test (paper, Suppl. A), 4, 12, 20, ... for val."""
+    return list(range(HELD_OUT_START[split], num_images, HELD_OUT_STEP))
+
+
+def training_images(num_images: int) -> list[int]:
+    """Return the images that neither validation nor test holds out."""
+    out = held_out(num_images, "val") + held_out(num_images, "test")
+    return sorted(set(range(num_images)) - set(out))
+
+
+def every_8th_selection(
+    num_images: int, num_inputs: int, num_targets: int, split: Split
+) -> Selection:
+    """Select inputs evenly over the training images, targets evenly over the held-out images.
+
+    Deterministic; there are at most `num_targets` targets.
+
+    Raises:
+        InputError: the sequence is too short.
+    """
+    inputs, targets = training_images(num_images), held_out(num_images, split)
+    check_held_out(num_images, len(inputs), num_inputs, split)
+    return Selection(spread(inputs, num_inputs), spread(targets, min(num_targets, len(targets))))
+
+
+def first_96_selection(
+    num_images: int, num_inputs: int, num_targets: int, split: Split
+) -> Selection:
+    """Select as the paper's ablations do (Suppl. A).
+
+    Of the first 96 images every 8th is a target, and inputs lie evenly over the others.
+    Deterministic.
+
+    Raises:
+        InputError: the sequence is too short.
+    """
+    inputs, targets = paper_split(min(num_images, ABLATION_IMAGES), num_targets, split)
+    check_held_out(num_images, len(inputs), num_inputs, split)
+    return Selection(spread(inputs, num_inputs), targets)
+
+
+def paper_split(num_images: int, num_targets: int, split: Split) -> tuple[list[int], list[int]]:
+    """Return the images that inputs are chosen from, and the targets.
+
+    For test, every 8th image is a target, and inputs are chosen from all others. For val, no target
+    of the test is used: there are at most `num_targets` targets, and inputs are chosen from the
+    training images.
+    """
+    targets = held_out(num_images, split)
+    if split == "val":
+        return training_images(num_images), spread(targets, min(num_targets, len(targets)))
+    return sorted(set(range(num_images)) - set(targets)), targets
+
+
+def spread(images: Sequence[int], count: int) -> list[int]:
+    """Choose `count` different images at even distances, the first and the last among them."""
+    positions = np.linspace(0, len(images) - 1, count)
+    return [images[int(position + 0.5)] for position in positions]
+
+
+def check_held_out(num_images: int, left: int, num_inputs: int, split: Split) -> None:
+    """Check that there are targets, and enough images `left` to choose the inputs from.
+
+    Raises:
+        InputError: there are not.
+    """
+    if left < num_inputs or not held_out(num_images, split):
+        raise InputError(
+            f"The sequence has {num_images} images, of which {left} are not held out for "
+            f"{split}: set data.inputs to at most that, or give a longer sequence."
+        )
+
+
+def _check_length(num_images: int, num_inputs: int, num_targets: int) -> None:
+    if num_inputs < 1 or num_targets < 0:
+        raise InputError(
+            f"data.inputs is {num_inputs} and data.targets {num_targets}: "
+            "give at least one input and no negative number."
+        )
+    if num_images < num_inputs + num_targets:
+        raise InputError(
+            f"The sequence has {num_images} images, fewer than {num_inputs} inputs and "
+            f"{num_targets} targets: set data.inputs and data.targets to at most {num_images} "
+            "together."
+        )
