@@ -15,9 +15,8 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from asysplat.benchmark.compare import compare, read_old
-from asysplat.benchmark.machine import describe_machine
-from asysplat.benchmark.options import check_repeats, find_suite
-from asysplat.benchmark.written import write_results
+from asysplat.benchmark.options import check_repeats, describe_machine, find_suite
+from asysplat.benchmark.output import write_results
 from asysplat.errors import input_error_behind
 from asysplat.interrupts import keep_interrupts
 from asysplat.overrides import exit_at_unknown_overrides
@@ -50,7 +49,7 @@ def benchmark(options: DictConfig) -> bool:
     for table in tables:
         console.print(table)
     written = write_results(results, tables, suite.plot(results), suite.WATCHED, path)
-    for name, place in zip(("numbers", "tables", "picture", "tensorboard"), written, strict=True):
+    for name, place in zip(("numbers", "tables", "figure", "tensorboard"), written, strict=True):
         console.print(f"{name}: {place}", soft_wrap=True)
     if hasattr(suite, "page"):
         path.with_suffix(".md").write_text(suite.page(results))

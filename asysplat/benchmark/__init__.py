@@ -1,15 +1,14 @@
-"""Run time against error, in one process: the suites of benchmark.py.
+"""The suites of benchmark.py: run time against error, measured in one process.
 
-A suite is a folder named in `options.SUITES`; its suite.py has three functions, and what of the
-results compare=old.json looks at:
+A suite is a module named in `options.SUITES`. It has
 
 measure(options, console) -> results    plain numbers, words, lists and dictionaries
-tables(results) -> rich tables          by `table.make_table`
-plot(results) -> figure                 by `plot.time_against_error`, `bars` or `against_seconds`
-WATCHED                                a `compare.Watched`
+tables(results) -> rich tables          made by `table.make_table`
+plot(results) -> figure                 made by `plot.time_against_error` or `plot.bars`
+WATCHED                                 what compare=old.json compares: a `compare.Watched`
 
-It may have two more:
+and may have
 
-page(results) -> Markdown               written as <suite>.md
-verdict(results) -> sentence or None    a complaint, printed at the end; the exit status is 1
+page(results) -> Markdown               written as <suite>.md in place of the tables
+verdict(results) -> sentence or None    a failure, printed at the end; the exit status is 1
 """

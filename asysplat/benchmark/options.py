@@ -1,36 +1,50 @@
-"""The options that several suites share: they are checked here, a mistake is one sentence."""
+"""The options that several suites share, and the machine that they run on."""
 
+import os
+import platform
+import re
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from types import ModuleType
 
+import llvmlite.binding
 import torch
 
 from asysplat.errors import InputError
 
-SUITES = ("render", "ops", "model", "data", "reconstruct", "pareto", "bench", "stability")
+SUITES = {
+    name: f"asysplat.benchmark.{name}"
+    for name in ("render", "ops", "model", "data", "pareto", "bench", "stability")
+}
+SUITES["stability"] += ".report"
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
+CPU = torch.device("cpu")
+CPU_INFO = Path("/proc/cpuinfo")  # Linux alone
+PACKAGES = ("torch", "numba", "triton", "gsplat")
 
 
 def find_suite(name: str) -> ModuleType:
-    """Import the file suite.py of the suite called `name`.
+    """Import the suite called `name`.
 
     Raises:
         InputError: no suite has this name.
     """
     check_names("suite", [name], SUITES)
-    return import_module(f"asysplat.benchmark.{name}.suite")
+    return import_module(SUITES[name])
 
 
 def check_names(option: str, names: Iterable[str], known: Iterable[str]) -> None:
-    """Raise InputError unless there are names for this option, and each is known."""
+    """Raise InputError unless this option has at least one name, and all names are known."""
     for name in list(names) or [None]:
         if name not in known:
             raise InputError(f"{option}={name} is unknown: choose from {', '.join(known)}.")
 
 
 def check_repeats(repeats: object) -> None:
-    """Raise InputError unless it is a whole number from 1."""
+    """Raise InputError unless `repeats` is a whole number from 1."""
     if not isinstance(repeats, int) or repeats < 1:
         raise InputError(f"repeats={repeats} cannot be: give a whole number from 1.")
 
@@ -39,9 +53,27 @@ def find_device(name: str) -> torch.device:
     """Return the device called `name`; "auto" is the GPU where there is one.
 
     Raises:
-        InputError: another name, or a GPU that is not there.
+        InputError: another name, or a GPU where there is none.
     """
     check_names("device", [name], ("auto", "cpu", "cuda"))
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("device=cuda is not there: torch finds no GPU; take device=cpu.")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def describe_machine() -> dict[str, str | int]:
+    """Return the processor, cores, torch's threads, the GPU if any, and versions of PACKAGES."""
+    model = CPU_INFO.exists() and re.search(r"model name\s*:\s*(.+)", CPU_INFO.read_text())
+    machine = {
+        "cpu": model[1] if model else platform.processor() or platform.machine(),
+        "instructions": llvmlite.binding.get_host_cpu_name(),  # what Numba compiles for
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+    }
+    if torch.cuda.is_available():
+        machine["gpu"] = torch.cuda.get_device_name()
+    for package in PACKAGES:
+        with suppress(PackageNotFoundError):
+            machine[package] = version(package)
+    return machine

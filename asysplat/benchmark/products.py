@@ -1,7 +1,7 @@
 """Matrix products and convolutions by themselves: the least that a computation made of them takes.
 
-Matrices are contiguous, whatever their strides were in the computation they stand for; images keep
-their channels innermost where they had them so.
+Matrices are contiguous, whatever their strides in the computation they stand for; images keep
+channels innermost where they had them so.
 """
 
 from collections import Counter
@@ -15,26 +15,26 @@ import torch
 from torch import Tensor
 from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.benchmark import Timer
 
-from asysplat.benchmark.timing import seconds_of
 from asysplat.evaluation.cost import true_flops
 from asysplat.ops.ssd.chunked import CHUNK
 
 aten = torch.ops.aten
 CALLS = {call.default for call in (aten.mm, aten.addmm, aten.bmm, aten.baddbmm, aten.convolution)}
 # Numbers of one operand or result: few enough to stay in a cache, enough to fill a GPU.
-LARGEST = {"cpu": 2**22, "cuda": 2**26}
-MOST_CALLS = 16  # of a product that are timed together
-# Multiplications of a plane sweep for a pixel and a plane: to find its place, to interpolate there,
+MAX_NUMBERS = {"cpu": 2**22, "cuda": 2**26}
+MAX_CALLS = 16  # of a product that are timed together
+# Multiplications of a plane sweep for a pixel and a plane: to project it, to interpolate there,
 # and for the square and the product that are summed over patches.
-SWEEP_TERMS = 3 + 3 + 2
+PLANE_SWEEP_TERMS = 3 + 3 + 2
 
-Size = tuple[int, int, int, int]  # [m, k] x [k, n], as often as the first says
+Size = tuple[int, int, int, int]  # count, m, k, n: so many products [m, k] x [k, n]
 
 
 @dataclass(frozen=True)
 class Operand:
-    """All of a tensor but its values."""
+    """The shape, type and layout of a tensor."""
 
     shape: tuple[int, ...]
     dtype: torch.dtype
@@ -70,21 +70,16 @@ class Product:
 
     def seconds(self, count: int, device: torch.device) -> float:
         """Return the seconds of one of `count` calls."""
-        call, calls = self.prepare(device), min(count, MOST_CALLS)
-        call()
-
-        def run() -> None:
-            for _ in range(calls):
-                call()
-
-        return seconds_of(run, device) / calls
+        scope = {"call": self.prepare(device)}
+        timer = Timer("call()", globals=scope, num_threads=torch.get_num_threads())
+        return timer.timeit(min(count, MAX_CALLS)).mean
 
 
 Counts = Mapping[Product, int]
 
 
 class RecordProducts(TorchDispatchMode):
-    """Counts the products of everything that torch is asked for meanwhile, by `label()`."""
+    """Counts the products of all torch operators that are called in its context, by `label()`."""
 
     def __init__(self, label: Callable[[], str]):
         super().__init__()
@@ -114,14 +109,15 @@ def _products_of_call(func: OpOverload, args: tuple) -> Counts:
 def _without_values(value: Any) -> Operand | Any:
     if isinstance(value, Tensor):
         innermost = value.ndim == 4 and value.is_contiguous(memory_format=torch.channels_last)
-        if innermost and not value.is_contiguous():
-            return Operand(tuple(value.shape), value.dtype, torch.channels_last)
-        return Operand(tuple(value.shape), value.dtype)
+        layout = torch.channels_last if innermost else torch.contiguous_format
+        if value.is_contiguous():
+            layout = torch.contiguous_format
+        return Operand(tuple(value.shape), value.dtype, layout)
     return tuple(value) if isinstance(value, list) else value
 
 
 def ssd_sizes(batch: int, length: int, heads: int, head_dim: int, state: int) -> list[Size]:
-    """List the products of the chunked form, the last chunk whole.
+    """List the products of the chunked form, the last chunk padded to a whole one.
 
     C B^T, scores x inputs, the state's update and its reading.
     """
@@ -142,53 +138,49 @@ def attention_sizes(heads: int, queries: int, keys: int, head_dim: int) -> list[
 def grid_attention_sizes(
     batch: int, views: int, height: int, width: int, heads: int, head_dim: int, grid: int
 ) -> list[Size]:
-    """List the products of each grid place by itself, maps padded to whole grids."""
+    """List the products of each place of the grid, maps padded to whole grids."""
     tokens = views * -(-height // grid) * -(-width // grid)
     return attention_sizes(batch * grid**2 * heads, tokens, tokens, head_dim)
 
 
-def sweep_sizes(pairs: int, planes: int, height: int, width: int) -> list[Size]:
-    """List products with as many multiplications as the costs of a plane sweep.
+def plane_sweep_sizes(
+    batch: int, views: int, height: int, width: int, planes: int, neighbors: int, **_: int
+) -> list[Size]:
+    """List products with as many multiplications as the costs of a plane sweep, which has none.
 
-    It has none itself; images are compared twice, first at half the size.
-
-    Args:
-        pairs: of a view and a neighbor.
+    Images are compared twice, first at half the size.
     """
-    pixels = height * width
-    return [(pairs, size, SWEEP_TERMS, planes) for size in (pixels, pixels // 4)]
+    pairs, pixels = batch * views * neighbors, height * width
+    return [(pairs, size, PLANE_SWEEP_TERMS, planes) for size in (pixels, pixels // 4)]
 
 
 def with_gradients(sizes: Iterable[Size]) -> list[Size]:
-    """Add to each product those that give the gradients of both its operands."""
+    """Add to each product the two that give the gradients of its operands."""
     return [size for b, m, k, n in sizes for size in ((b, m, k, n), (b, m, n, k), (b, k, m, n))]
 
 
 def products(sizes: Iterable[Size], dtype: torch.dtype, device: torch.device) -> Counter[Product]:
-    """Split products into calls whose operands and results have at most LARGEST numbers each."""
+    """Split products into calls whose operands and results have at most MAX_NUMBERS each."""
     counts: Counter[Product] = Counter()
-    largest = LARGEST[device.type]
+    limit = MAX_NUMBERS[device.type]
     for batch, m, k, n in sizes:
-        rows = _largest_divisor(m, largest // max(k, n))
-        entries = _largest_divisor(batch, largest // max(rows * k, k * n, rows * n))
-        left, right = (rows, k), (k, n)
-        function = aten.mm.default
-        if entries > 1:
-            left, right = (entries, *left), (entries, *right)
-            function = aten.bmm.default
-        product = Product(function, (Operand(left, dtype), Operand(right, dtype)))
-        counts[product] += batch // entries * (m // rows)
+        rows = _largest_divisor(m, limit // max(k, n))
+        entries = _largest_divisor(batch, limit // max(rows * k, k * n, rows * n))
+        leading = (entries,) if entries > 1 else ()
+        operands = Operand((*leading, rows, k), dtype), Operand((*leading, k, n), dtype)
+        function = aten.bmm.default if leading else aten.mm.default
+        counts[Product(function, operands)] += batch // entries * (m // rows)
     return counts
 
 
-def _largest_divisor(number: int, most: int) -> int:
-    return next(d for d in range(max(1, min(number, most)), 0, -1) if number % d == 0)
+def _largest_divisor(number: int, limit: int) -> int:
+    return next(d for d in range(max(1, min(number, limit)), 0, -1) if number % d == 0)
 
 
 def time_products(groups: Mapping[Hashable, Counts], device: torch.device) -> dict[Hashable, float]:
     """Time each product once; return the seconds of one call of it, and those of each group."""
-    every = reduce(or_, map(Counter, groups.values()))  # with the greatest count of any group
-    seconds = {product: product.seconds(count, device) for product, count in every.items()}
+    union = reduce(or_, map(Counter, groups.values()))  # with the greatest count of any group
+    seconds = {product: product.seconds(count, device) for product, count in union.items()}
     sums = {
         name: sum((count * seconds[product] for product, count in counts.items()), 0.0)
         for name, counts in groups.items()

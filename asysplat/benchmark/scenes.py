@@ -1,4 +1,4 @@
-"""Synthetic scenes to measure renderers on: nothing to download, the same on every machine."""
+"""Procedural scenes to measure renderers on: nothing to download, the same on every machine."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -9,18 +9,24 @@ from torch import Tensor
 from asysplat.benchmark.options import check_names
 from asysplat.scene import Cameras, Gaussians
 
-Draw = Callable[..., Tensor]
+Sample = Callable[..., Tensor]
 Scene = tuple[Gaussians, Cameras]
 
 FOCAL = 0.9  # of the image's width
-DISTANCE = 4.0  # from the camera to what networks predict
+DISTANCE = 4.0  # from the camera to pixel-aligned Gaussians
 ARC = 0.5  # radians
 
 
-def random_numbers(seed: int) -> tuple[Draw, Draw]:
+def random_numbers(seed: int) -> tuple[Sample, Sample]:
     """Return functions that draw uniform and normal numbers of a shape in float64."""
     options = {"generator": torch.Generator().manual_seed(seed), "dtype": torch.float64}
     return partial(torch.rand, **options), partial(torch.randn, **options)
+
+
+def camera_at_origin(focal: float, height: int, width: int) -> Cameras:
+    """Return one camera at the world's origin, its focal length in pixels; float32."""
+    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Cameras(intrinsics[None], torch.eye(4)[None], height, width)
 
 
 def random_scene(count: int, height: int, width: int, seed: int = 0) -> Scene:
@@ -34,10 +40,10 @@ def random_scene(count: int, height: int, width: int, seed: int = 0) -> Scene:
     """
     uniform, normal = random_numbers(seed)
     depths = 2 + 8 * uniform(count)
-    place = 1.2 * uniform(count, 2) - 0.1
+    position = 1.2 * uniform(count, 2) - 0.1
     sigma = 2 * (0.6 * normal(count, 3)).exp()
     opacities = 0.05 + 0.9 * uniform(count)
-    return _scene(place, depths, sigma, opacities, (height, width), normal)
+    return _scene(position, depths, sigma, opacities, (height, width), normal)
 
 
 def pixel_aligned_scene(side: int, height: int, width: int, seed: int = 0) -> Scene:
@@ -53,16 +59,16 @@ def pixel_aligned_scene(side: int, height: int, width: int, seed: int = 0) -> Sc
     count = 2 * side * side
     steps = torch.arange(side, dtype=torch.float64)
     grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).flatten(0, 1).repeat(2, 1)
-    place = (grid + uniform(count, 2)) / side
-    waves = (6 * place[:, 0]).sin() * (5 * place[:, 1]).cos()
+    position = (grid + uniform(count, 2)) / side
+    waves = (6 * position[:, 0]).sin() * (5 * position[:, 1]).cos()
     depths = 4 + 0.5 * waves + 0.01 * normal(count)
     sigma = 0.8 * width / side * (0.4 * normal(count, 3)).exp()
     opacities = (2 * normal(count)).sigmoid()
-    return _scene(place, depths, sigma, opacities, (height, width), normal)
+    return _scene(position, depths, sigma, opacities, (height, width), normal)
 
 
 def on_an_arc(camera: Cameras, views: int) -> Cameras:
-    """Copy a camera to `views` places on an arc of ARC radians about what is DISTANCE before it."""
+    """Copy a camera to `views` positions on an arc of ARC radians about a point at DISTANCE."""
     angles = torch.linspace(-ARC / 2, ARC / 2, views)
     turns = torch.zeros(views, 4, 4)
     turns[:, 0, 0] = turns[:, 2, 2] = angles.cos()
@@ -80,20 +86,20 @@ def _scene_on_an_arc(views: int) -> Scene:
 
 
 def _scene(
-    place: Tensor,
+    position: Tensor,
     depths: Tensor,
     sigma: Tensor,
     opacities: Tensor,
     size: tuple[int, int],
-    normal: Draw,
+    normal: Sample,
 ) -> Scene:
-    """Make Gaussians that project to `place`, in parts of the image, and the camera they do so in.
+    """Make a camera of height and width `size`, and Gaussians that project to `position`.
 
-    Their deviations there are `sigma` pixels, the height and width of the image are `size`.
+    Positions are in shares of the image, deviations `sigma` in pixels.
     """
     height, width = size
     focal = FOCAL * width
-    offsets = place * torch.tensor([width, height]) - torch.tensor([width / 2, height / 2])
+    offsets = position * torch.tensor([width, height]) - torch.tensor([width / 2, height / 2])
     gaussians = Gaussians(
         means=torch.cat((offsets / focal * depths[:, None], depths[:, None]), -1),
         quats=normal(len(depths), 4),
@@ -101,9 +107,7 @@ def _scene(
         opacities=opacities,
         sh=normal(len(depths), 1, 3),
     )
-    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    cameras = Cameras(intrinsics[None], torch.eye(4)[None], height, width)
-    return gaussians.to(torch.float32), cameras.to(torch.float32)
+    return gaussians.to(torch.float32), camera_at_origin(focal, height, width)
 
 
 SCENES = {
@@ -114,7 +118,7 @@ SCENES = {
     "4M": partial(pixel_aligned_scene, 1414, 540, 960),
     "131kx16": partial(_scene_on_an_arc, 16),
 }
-SMALLER = {  # that float64 can afford: errors are measured on these instead
+SMALLER = {  # scenes that float64 can afford: errors are measured on these instead
     "4M": partial(pixel_aligned_scene, 354, 135, 240),
     "131kx16": partial(_scene_on_an_arc, 2),
 }
@@ -129,14 +133,3 @@ def find_scenes(names: str | Sequence[str]) -> list[str]:
     names = [names] if isinstance(names, str) else list(names)
     check_names("scenes", names, [*SCENES, "all"])
     return list(SCENES) if "all" in names else names
-
-
-def describe(scene: Scene) -> dict[str, int]:
-    """Count its Gaussians, views and pixels."""
-    gaussians, cameras = scene
-    return {
-        "gaussians": gaussians.num_gaussians,
-        "views": cameras.num_views,
-        "height": cameras.height,
-        "width": cameras.width,
-    }

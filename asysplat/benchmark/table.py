@@ -1,4 +1,4 @@
-"""The tables of all suites on the terminal: a column is a heading and what writes its cells."""
+"""The tables of all suites: a column is a heading and a function that writes its cells."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -27,8 +27,8 @@ def make_table(
     return table
 
 
-def measured_on(results: Result) -> str:
-    """Write the note that every suite begins with: the machine, and what ± means."""
+def machine_note(results: Result) -> str:
+    """Write the note that every suite begins with: the machine, and the meaning of ±."""
     machine = ", ".join(f"{key} {value}" for key, value in results["machine"].items())
     return f"{machine}\nmedian ± interquartile range; busy: that is over {BUSY:.0%} of the median"
 
@@ -37,15 +37,11 @@ def markdown(table: Table) -> str:
     """Write a table as GitHub Markdown, its title above and its notes below."""
     headings = [" ".join(str(column.header).split()) for column in table.columns]
     rules = [":--" if column.justify == "left" else "--:" for column in table.columns]
-    cells = [[_plain(cell) for cell in column.cells] for column in table.columns]
+    cells = [list(map(str, column.cells)) for column in table.columns]
     rows = [[escape(cell) for cell in row] for row in (headings, *zip(*cells, strict=True))]
     lines = [f"| {' | '.join(row)} |" for row in (rows[0], rules, *rows[1:])]
     notes = [f"- {escape(line)}" for line in str(table.caption or "").splitlines()]
     return "\n".join([f"## {escape(str(table.title))}", "", *lines, "", *notes]) + "\n"
-
-
-def _plain(cell: str | Text) -> str:
-    return cell.plain if isinstance(cell, Text) else cell
 
 
 def at(row: Result, path: str) -> Any:
@@ -53,6 +49,12 @@ def at(row: Result, path: str) -> Any:
     for key in path.split("."):
         row = row.get(key) if row else None
     return row
+
+
+def worst(row: Result, path: str) -> float:
+    """Return the number at a path; of several numbers, the largest."""
+    value = at(row, path)
+    return max(value.values()) if isinstance(value, Mapping) else value
 
 
 def text(pattern: str) -> Write:
@@ -66,7 +68,7 @@ def number(path: str, pattern: str, unit: float = 1.0) -> Write:
 
 
 def spread(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> Write:
-    """Write median ± interquartile range, and where it was busy; seconds in milliseconds."""
+    """Write median ± interquartile range, and "busy" where that is wide; seconds in ms."""
 
     def write(value: Result) -> str:
         numbers = [value[name] for name in ("median", "iqr")]
@@ -82,7 +84,6 @@ def limited(path: str, limit: float) -> Write:
 
 
 def _cell(path: str, write: Callable[[Any], str | Text]) -> Write:
-    """Write the value at a path, or NOTHING."""
     return lambda row: NOTHING if at(row, path) is None else write(at(row, path))
 
 
@@ -92,14 +93,8 @@ def error(path: str) -> Write:
     def write(row: Result) -> str:
         if row["error"] is None:
             return NOTHING
-        sizes, measured_on = row.get("sizes", row), row["error"]["measured_on"]
-        smaller = any(sizes[key] != size for key, size in measured_on.items())
+        sizes, own_sizes = row["error"]["measured_on"], row.get("sizes", row)
+        smaller = any(own_sizes[key] != size for key, size in sizes.items())
         return f"{worst(row, path):.1e}{'*' if smaller else ''}"
 
     return write
-
-
-def worst(row: Result, path: str) -> float:
-    """Return the error at a path; of several, such as those of gradients, the largest."""
-    found = at(row, path)
-    return max(found.values()) if isinstance(found, Mapping) else found

@@ -1,4 +1,4 @@
-"""The regression watch: its pairs are what they say, and a slower workload is named."""
+"""The regression watch: all pairs run, and a slower workload is named."""
 
 import pytest
 import torch
@@ -6,10 +6,10 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from asysplat.benchmark.bench import suite
-from asysplat.benchmark.bench.pairs import Pair, make_pairs
+from asysplat.benchmark import bench
+from asysplat.benchmark.bench import Pair, make_pairs
 from asysplat.benchmark.compare import compare
-from asysplat.benchmark.machine import describe_machine
+from asysplat.benchmark.options import describe_machine
 
 NAMES = ["ssd", "selective_scan", "plane_sweep", "render", "refinement", "image_loss", "adam"]
 NAMES += ["asysplat_plane_sweep"]
@@ -22,12 +22,12 @@ def test_every_pair_runs(repository):
         assert [pair.name for pair in pairs] == NAMES
         for pair in pairs:
             pair.workload()
-            pair.yardstick()
+            pair.baseline()
         assert compose("benchmark").compare is None
 
 
 def measure(monkeypatch, *times):
-    """Measure a workload that computes the same as its yardstick, so many times."""
+    """Measure workloads that compute the same as their baseline, so many times."""
     numbers = torch.rand(200_000)
 
     def work(count):
@@ -37,8 +37,8 @@ def measure(monkeypatch, *times):
     pairs = [
         Pair(f"{i}", "once", lambda n=n: work(n), lambda: work(8)) for i, n in enumerate(times)
     ]
-    monkeypatch.setattr(suite, "make_pairs", lambda: pairs)
-    found = suite.measure(OmegaConf.create({"repeats": 5}), Console(quiet=True))
+    monkeypatch.setattr(bench, "make_pairs", lambda: pairs)
+    found = bench.measure(OmegaConf.create({"repeats": 5}), Console(quiet=True))
     return {"machine": describe_machine(), **found}
 
 
@@ -48,16 +48,16 @@ def test_a_workload_that_became_slower_is_named(monkeypatch):
     assert torch.get_num_threads() == threads
     ratios = [row["ratio"]["median"] for row in old["rows"]]
     assert 1.3 < ratios[0] / ratios[1] < 3
-    assert compare(old, old, suite.WATCHED).worse == []
-    (worse,) = compare(old, measure(monkeypatch, 8, 32), suite.WATCHED).worse
+    assert compare(old, old, bench.WATCHED).worse == []
+    (worse,) = compare(old, measure(monkeypatch, 8, 32), bench.WATCHED).worse
     assert worse.startswith("slower: 1/once, ratio: ")
 
 
-def test_table_and_picture_have_every_workload(monkeypatch):
+def test_table_and_figure_have_every_workload(monkeypatch):
     found = measure(monkeypatch, 1, 1)
-    (table,) = suite.tables(found)
+    (table,) = bench.tables(found)
     assert [list(column.cells) for column in table.columns][:2] == [["0", "1"], ["its once"] * 2]
-    (axes,) = suite.plot(found).axes
+    (axes,) = bench.plot(found).axes
     assert [bar.get_width() for bar in axes.patches] == [
         row["ratio"]["median"] for row in found["rows"]
     ]

@@ -1,34 +1,62 @@
-"""The tables and pictures of the results in docs/ can be made anew."""
+"""The committed results in docs/ can be read, shown and compared with."""
 
 import json
+from copy import deepcopy
 from io import StringIO
 
 import pytest
 from rich.console import Console
 
+from asysplat.benchmark.compare import compare
 from asysplat.benchmark.options import find_suite
+from asysplat.benchmark.output import dumps
 
 # Cells as they were published; a suite's later columns may be empty in an older file.
 CELLS = {
-    "render": ["15.2 ± 4.9", "3.1e-07", "1.7e-06*", "7934.2 ± 1063.5", "no ellipse skip"],
+    "render": ["15.2 ± 4.9", "3.1e-07", "1.7e-06*", "7934.2 ± 1063.5", "no ellipse culling"],
     "ops": ["166.6 ± 13.4", "1.5e-07*", "28.0", "102.0", "1.06"],
     "model": ["20957.8 ± 0.0", "50449.0 ± 0.0", "1.73", "1,868", "of which grid_attention"],
-    "growth/model": ["10320.5 ± 0.0", "1.28", "192"],
-    "parts/reconstruct": ["28.77", "0.039", "831", "34.7 ± 1.1", "1.27", "no_cool_down"],
-    "budgets/reconstruct": ["29.51", "33.59", "mcmc"],
+    "growth/model": ["10320.5 ± 0.0", "1.28", "216"],
     "bench": ["selective_scan", "its chunked", "its products"],
     "data": ["179.6 ± 6.0", "1329 ± 46", "33.1", "40 ± 5 frames / s"],
+    "pareto": ["plane_sweep_48", "22.59", "Refined, means over scenes"],
 }
+TIMED = {"data": "frames_per_second", "bench": "ratio", "pareto": "seconds"}
+
+
+@pytest.fixture
+def read(repository):
+    return lambda name: json.loads((repository / "docs" / "results" / f"{name}.json").read_text())
 
 
 @pytest.mark.parametrize("name", CELLS)
-def test_tables_and_picture(repository, name):
-    results = json.loads((repository / "docs" / "results" / f"{name}.json").read_text())
-    suite = find_suite(name.rpartition("/")[2])
+def test_tables_and_figure(read, name):
+    results, suite = read(name), find_suite(name.rpartition("/")[2])
     console = Console(width=500, file=StringIO())
     for table in suite.tables(results):
         console.print(table)
-    text = console.file.getvalue()
+    text = " ".join(console.file.getvalue().split())  # notes are wrapped
     assert [cell for cell in CELLS[name] if cell not in text] == []
     assert results["machine"]["cpu"] in text
     assert suite.plot(results).axes
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_results_are_compared_with_themselves(read, name):
+    suite, results = find_suite(name.rpartition("/")[2]), read(name)
+    comparison = compare(results, results, suite.WATCHED)
+    assert comparison.compared > 2
+    assert comparison.worse == comparison.better == comparison.missing == []
+    slower, key = deepcopy(results), TIMED.get(name, "forward")
+    for row in slower[suite.WATCHED.rows]:
+        if row[key]:
+            row[key]["median"] *= 0.1 if name == "data" else 10
+    worse = compare(results, slower, suite.WATCHED).worse
+    assert worse and all(sentence.startswith("slower: ") for sentence in worse)
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_files_are_compact(repository, read, name):
+    assert (repository / "docs" / "results" / f"{name}.json").read_text() == dumps(
+        read(name)
+    ) + "\n"

@@ -1,22 +1,23 @@
 """The suite on operators of a moment, and the products that they are compared with."""
 
-import json
 import math
-import runpy
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from asysplat.benchmark.ops.cases import SCANS, Case
-from asysplat.benchmark.ops.paths import make_path
-from asysplat.benchmark.ops.suite import PASSES, make_rows
-from asysplat.benchmark.ops.sweep import SLANT, SweepCase
-from asysplat.benchmark.options import PRECISIONS, check_names, check_repeats, find_device
+from asysplat.benchmark.ops import (
+    PASSES,
+    SCANS,
+    SLANT,
+    OpCase,
+    PlaneSweepCase,
+    make_path,
+    make_rows,
+)
+from asysplat.benchmark.options import CPU, PRECISIONS, check_names, check_repeats, find_device
 from asysplat.benchmark.products import (
-    LARGEST,
-    SWEEP_TERMS,
+    MAX_NUMBERS,
+    PLANE_SWEEP_TERMS,
     Operand,
     RecordProducts,
     products,
@@ -29,9 +30,8 @@ from asysplat.scene import Cameras
 
 pytestmark = pytest.mark.medium
 
-CPU = torch.device("cpu")
 BOUNDS = {"fp32": 2e-6, "bf16": 1e-2}
-MOST_OF_SWEEP = 1e-5  # a pixel whose best two planes cost the same to the last bit may turn
+PLANE_SWEEP_BOUND = 1e-5  # a pixel whose best two planes cost the same to the last bit may turn
 LENGTH, LOOP_TOKENS = 150, 50
 TINY = {
     "ssd": {"batch": 1, "length": LENGTH, "heads": 8, "head_dim": 16, "state": 8},
@@ -66,25 +66,13 @@ ATTENTION = ("grid_attention/1", "grid_attention/2")
 
 
 @pytest.fixture(scope="module")
-def options(repository):
-    """conf/benchmark.yaml, its operators of a moment."""
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        config = compose("benchmark", ["suite=ops", "repeats=2", "device=cpu"])
-    return OmegaConf.merge(config, {"ops": TINY})
+def rows(run_suite):
+    """The rows by operator, precision and path."""
+    found = run_suite("ops", {"ops": TINY})["rows"]
+    return {(row["operator"], row["precision"], row["path"]): row for row in found}
 
 
-@pytest.fixture(scope="module")
-def measured(options, repository, tmp_path_factory):
-    """The numbers, and the folder they are in."""
-    folder = tmp_path_factory.mktemp("benchmark")
-    script = runpy.run_path(str(repository / "benchmark.py"))
-    script["benchmark"](OmegaConf.merge(options, {"output": str(folder)}))
-    results = json.loads((folder / "ops.json").read_text())
-    return {(r["operator"], r["precision"], r["path"]): r for r in results["rows"]}, folder
-
-
-def test_every_operator_has_a_path_and_what_it_is_compared_with(measured):
-    rows, folder = measured
+def test_every_operator_has_a_path_and_what_it_is_compared_with(rows):
     for operator in (*SCANS, *ATTENTION):
         for precision in BOUNDS:
             paths = {path for name, p, path in rows if (name, p) == (operator, precision)}
@@ -93,11 +81,9 @@ def test_every_operator_has_a_path_and_what_it_is_compared_with(measured):
             assert ("loop" in paths) == (operator in SCANS and precision == "fp32")
     sweeps = {(precision, path) for name, precision, path in rows if name == "plane_sweep"}
     assert sweeps == {("fp32", path) for path in ("reference", "cpu", "matmuls")}
-    assert (folder / "ops.png").stat().st_size > 0
 
 
-def test_errors_are_below_their_bounds(measured):
-    rows, _ = measured
+def test_errors_are_below_their_bounds(rows):
     for (operator, precision, path), row in rows.items():
         if path == "matmuls":
             assert row["error"] is None
@@ -106,7 +92,7 @@ def test_errors_are_below_their_bounds(measured):
         assert error["measured_on"] != row["sizes"]
         if operator == "plane_sweep":
             assert error["gradients"] is None
-            assert 0 < error["forward"] < MOST_OF_SWEEP, path
+            assert 0 < error["forward"] < PLANE_SWEEP_BOUND, path
             continue
         names = {"q", "k", "v"} if operator in ATTENTION else {"x", "dt", "A", "B", "C", "D"}
         assert error["gradients"].keys() == names
@@ -114,8 +100,7 @@ def test_errors_are_below_their_bounds(measured):
         assert 0 < worst < BOUNDS[precision], (operator, precision, path)
 
 
-def test_ratios_are_those_of_the_times(measured):
-    rows, _ = measured
+def test_ratios_are_those_of_the_times(rows):
     for (operator, precision, _), row in rows.items():
         loop = rows.get((operator, "fp32", "loop")) or rows.get((operator, "fp32", "reference"))
         matmuls = rows.get((operator, precision, "matmuls"))
@@ -140,9 +125,9 @@ def test_ratios_are_those_of_the_times(measured):
 
 
 def test_an_error_is_seen():
-    case = Case("selective_scan", {"batch": 1, "length": 5, "channels": 3, "state": 2})
+    case = OpCase("selective_scan", {"batch": 1, "length": 5, "channels": 3, "state": 2})
     path = make_path(case, "reference", torch.float32, CPU)
-    output, gradients = path.truth()
+    output, gradients = path.exact()
     wrong = 2 * output, {name: 4 * grad for name, grad in gradients.items()}
     found = path.errors(wrong)
     assert found["forward"] == pytest.approx(1 / 2, abs=1e-5)
@@ -157,7 +142,7 @@ def flops_of(counts):
 
 MAPS = {"batch": 1, "views": 3, "height": 4, "width": 8, "heads": 2, "head_dim": 16, "grid": 2}
 SEQUENCE = {"batch": 2, "length": 256, "heads": 4, "head_dim": 16, "state": 32}
-CASES = [(Case("ssd", SEQUENCE), "chunked"), (Case("grid_attention", MAPS), "sdpa")]
+CASES = [(OpCase("ssd", SEQUENCE), "chunked"), (OpCase("grid_attention", MAPS), "sdpa")]
 
 
 @pytest.mark.parametrize("case, path", CASES, ids=lambda value: getattr(value, "name", None))
@@ -179,7 +164,7 @@ def test_large_products_are_done_in_parts_that_add_up():
     assert flops_of(counts) == 2 * batch * m * k * n
     for product in counts:
         a, b = (operand.shape for operand in product.arguments)
-        assert max(math.prod(a), math.prod(b), a[-2] * b[-1]) <= LARGEST["cpu"]
+        assert max(math.prod(a), math.prod(b), a[-2] * b[-1]) <= MAX_NUMBERS["cpu"]
 
 
 def test_calls_are_recorded_under_their_label():
@@ -220,14 +205,14 @@ def test_unknown_options_are_named():
 
 
 def test_a_wrong_size_is_not_taken_for_a_path_that_is_not_there():
-    case = Case("grid_attention", MAPS | {"grid": 0})
+    case = OpCase("grid_attention", MAPS | {"grid": 0})
     with pytest.raises(InputError, match="grid=0"):
         make_rows(case, PRECISIONS, LOOP_TOKENS, CPU)
 
 
 def test_a_sweep_is_of_a_wall_that_can_be_found():
     sizes = {"batch": 2, "views": 4, "height": 24, "width": 32}
-    case = SweepCase("plane_sweep", sizes | {"stride": 2, "planes": 24, "neighbors": 3})
+    case = PlaneSweepCase("plane_sweep", sizes | {"stride": 2, "planes": 24, "neighbors": 3})
     tensors = case.tensors()
     assert tensors["images"].min() >= 0 and tensors["images"].max() <= 1
     found = case.run({name: tensor.float() for name, tensor in tensors.items()}, "cpu")
@@ -245,7 +230,7 @@ def test_a_sweep_is_of_a_wall_that_can_be_found():
 
 def test_products_of_a_sweep_multiply_as_often_as_its_costs():
     sizes = {"batch": 1, "views": 3, "height": 16, "width": 24, "stride": 2, "planes": 20}
-    case = SweepCase("plane_sweep", sizes | {"neighbors": 2})
+    case = PlaneSweepCase("plane_sweep", sizes | {"neighbors": 2})
     counts = products(case.products(), torch.float32, CPU)
     costs = 3 * 2 * 20 * (16 * 24 + 8 * 12)
-    assert flops_of(counts) == 2 * SWEEP_TERMS * costs
+    assert flops_of(counts) == 2 * PLANE_SWEEP_TERMS * costs

@@ -1,24 +1,30 @@
-"""The suite on a small scene: what it finds is complete, and is what the parts give."""
-
-import json
+"""The suite on a small scene: its results are complete, and are those of its parts."""
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from asysplat.benchmark.data.photographs import write_photographs
-from asysplat.benchmark.pareto import suite
-from asysplat.benchmark.pareto.measured import picture_error
-from asysplat.benchmark.pareto.scenes import find_scenes
-from asysplat.benchmark.pareto.settings import BASE, FAMILIES, find_settings
-from asysplat.benchmark.pareto.shown import plot, summarize, tables
+from asysplat import load
+from asysplat.benchmark import pareto
+from asysplat.benchmark.data import write_photographs
+from asysplat.benchmark.options import CPU
+from asysplat.benchmark.pareto import (
+    BASE,
+    FAMILIES,
+    find_families,
+    find_scenes,
+    image_error,
+    plot,
+    select_inputs,
+    summarize,
+    tables,
+)
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
-from asysplat.refinement import mean_color
+from asysplat.refinement import RefinementSettings, mean_color, refine
+from asysplat.refinement.init import initial_gaussians
 from asysplat.rendering import render
-from asysplat.training.load import load
 
 SIDE = 32
 KNOBS = {
@@ -26,79 +32,91 @@ KNOBS = {
         "bf16": {"precision": "bf16"},
         "side_16": {"side": 16},
         "one_view_at_once": {"views_at_once": 1},
-        "fewer": {"least_opacity": 0.2, "most": 500, "sh_degree": 0},
+        "fewer": {"min_opacity": 0.2, "max_gaussians": 500, "sh_degree": 0},
         "side_24": {"side": 24},  # which the network cannot take
     },
     "networks": {"8m": {"overrides": ["model.layers=1m", "width=0.125", "state_size=8"]}},
     "refined": {"one_step": {"steps": 1}, "no_densify": {"refinement": {"densify": "none"}}},
+    "reconstruct": {
+        "start": {"seconds": None, "steps": 0},
+        "from_points": {"init": "points"},  # of which the scene has none
+        "no_densify": {"refinement": {"densify": "none"}},
+    },
 }
+ABSENT = {"side_24": "multiples of 16", "from_points": "no sparse points"}
 SMALL = {
     "feed_forward": {"views": 3},
     "networks": {"views": 3, "overrides": ["model.layers=1m1s", "width=0.125", "state_size=8"]},
     "refined": {"views": 4, "steps": 3},
+    "reconstruct": {"seconds": 0.01},
 }
 
 
 @pytest.fixture(scope="module")
-def make_options(repository, tmp_path_factory):
+def shared_folder(tmp_path_factory):
+    """A folder with data/mine, of 12 photographs."""
+    folder = tmp_path_factory.mktemp("shared")
+    write_photographs(folder / "data" / "mine", 12, 40, 60)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def make_pareto(make_options, shared_folder):
     """The options of conf/benchmark.yaml, made small and changed."""
-    shared = tmp_path_factory.mktemp("shared")
 
     def options(**changes):
-        with initialize_config_dir(str(repository / "conf"), version_base=None):
-            found = compose("benchmark", ["suite=pareto", "repeats=2", "device=cpu"])
-        OmegaConf.set_struct(found, False)
-        wanted = found.pareto
-        wanted.merge_with({"shared": str(shared), "scenes": ["room", "fern"], "side": SIDE})
+        config = make_options("pareto", {})
+        wanted = config.pareto
+        wanted.merge_with({"shared": str(shared_folder), "scenes": ["room", "fern"], "side": SIDE})
         for family, knobs in KNOBS.items():
             wanted[family].knobs = knobs
             wanted[family].base.merge_with(SMALL[family])
-        wanted.merge_with(changes)
-        return found
+        sizes = {"side": SIDE, "inputs": 8, "targets": 2}
+        wanted.reconstruct.merge_with({"scenes": ["room", "mine"], "photographs": sizes})
+        wanted.merge_with({"families": list(KNOBS)} | changes)
+        return config
 
     return options
 
 
 @pytest.fixture(scope="module")
-def measured(make_options):
-    options = make_options()
-    found = suite.measure(options, Console(quiet=True))
-    return options, {"machine": {"cpu": "one"}, "revision": "r", **found}
+def measured(make_pareto, run_suite):
+    options = make_pareto()
+    return options, run_suite("pareto", OmegaConf.to_container(options))
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    scenes, _ = find_scenes(["room"], tmp_path_factory.mktemp("none"), SIDE)
-    return scenes["room"]()
+    scenes, _ = find_scenes(["room"], tmp_path_factory.mktemp("none"))
+    return scenes["room"](SIDE, 16, 4)
 
 
 @pytest.mark.medium
-def test_rows_are_complete_and_strict(measured):
+def test_rows_are_complete(measured):
     options, results = measured
-    json.dumps(results, allow_nan=False)
-    wanted = OmegaConf.to_container(options.pareto, resolve=True)
+    config = OmegaConf.to_container(options.pareto, resolve=True)
     rows = {(row["family"], row["setting"]): row for row in results["rows"]}
     assert list(rows) == [(f, name) for f, knobs in KNOBS.items() for name in (BASE, *knobs)]
     for (family, name), row in rows.items():
         assert (row["scene"], row["side"]) == ("room", SIDE)
-        of_family = wanted[family]
-        asked = of_family["base"] | of_family["knobs"].get(name, {})
-        assert {key: row["values"][key] for key in asked} == asked
-        if name == "side_24":
-            assert "multiples of 16" in row["not_measured"]
+        wanted = config[family]["base"] | config[family]["knobs"].get(name, {})
+        assert {key: row["values"][key] for key in wanted} == wanted
+        if name in ABSENT:
+            assert ABSENT[name] in row["not_measured"]
             assert {row[key] for key in ("seconds", "over_base", "peak_gb", "psnr")} == {None}
             continue
         assert row["not_measured"] is None and row["lpips"] is None
-        assert row["seconds"]["median"] > 0 and row["peak_gb"] >= 0
+        assert row["seconds"]["median"] > 0
+        assert (row["peak_gb"] is None) == (family == "reconstruct") == ("noise" in row)
         assert (row["psnr"] is None) == (family == "networks")
-        assert (row["error"] is None) == ((family, name) == ("refined", BASE))
+        assert (row["error"] is None) == (name == BASE and family in ("refined", "reconstruct"))
     for family in KNOBS:
         ratio = rows[family, BASE]["over_base"]
         assert (ratio["median"], ratio["iqr"]) == (1, 0)
 
 
 @pytest.mark.medium
-def test_what_is_absent_is_not_measured(measured):
+def test_absent_scenes_are_not_measured(measured):
     _, results = measured
     absent = results["not_measured"]
     assert absent["fern"].endswith("is no folder") and "weights" in absent["LPIPS"]
@@ -122,51 +140,68 @@ def test_errors_grow_with_what_is_left_out(measured):
 
 @pytest.mark.medium
 def test_a_row_is_what_the_network_and_the_renderer_give(measured, room):
-    _, results = measured
-    row = results["rows"][0]
-    inputs, targets = room.given(3, SIDE)
-    assert inputs.num_views == 3 and room.inputs.num_views > 3
+    row = measured[1]["rows"][0]
+    scene = select_inputs(room, 3, SIDE)
+    assert scene.inputs.num_views == 3 and room.inputs.num_views > 3
     with torch.no_grad():
-        gaussians = load()(inputs)
-        image = render(gaussians, targets.cameras, mean_color(inputs), depth=False).image
-    assert row["psnr"] == pytest.approx(psnr(image, targets.images).mean().item(), abs=1e-4)
+        gaussians, background = load()(scene.inputs), mean_color(scene.inputs)
+        image = render(gaussians, scene.held_out.cameras, background, depth=False).image
+    assert row["psnr"] == pytest.approx(psnr(image, scene.held_out.images).mean().item(), abs=1e-4)
 
 
-def test_gaussians_that_are_left_out_are_fewer(make_options, room, monkeypatch):
-    options, seen = make_options(), []
+def test_a_refined_image_is_that_of_so_many_steps(make_pareto, shared_folder):
+    options = make_pareto()
+    families = find_families(OmegaConf.to_container(options.pareto, resolve=True))
+    scene = find_scenes(["mine"], shared_folder / "data")[0]["mine"](SIDE, 8, 2)
+    setting = pareto.Refined(None, None, steps=2, refinement={"densify": "none"})
+    image = setting.prepare(options.refinement, CPU)(scene)
+    settings = RefinementSettings(densify="none")
+    start = initial_gaussians("plane_sweep", scene, settings.max_gaussians)
+    background = mean_color(scene.inputs)
+    gaussians = refine(start, scene.inputs, settings, steps=2, background=background)
+    for of, shown in ((gaussians, image), (start, _start(families, options)(scene))):
+        with torch.no_grad():
+            expected = render(of, scene.held_out.cameras, background, depth=False).image
+        torch.testing.assert_close(shown, expected, rtol=0, atol=1e-5)
+
+
+def _start(families, options):
+    return families["reconstruct"]["start"].prepare(options.refinement, CPU)
+
+
+def test_knobs_leave_gaussians_out(make_pareto, room, monkeypatch):
+    options, rendered = make_pareto(), []
 
     def count(gaussians, *args, **kwargs):
-        seen.append(
+        rendered.append(
             (gaussians.num_gaussians, gaussians.opacities.min().item(), kwargs["sh_degree"])
         )
         return render(gaussians, *args, **kwargs)
 
-    monkeypatch.setattr("asysplat.benchmark.pareto.settings.render", count)
-    settings = suite.find_families(OmegaConf.to_container(options.pareto, resolve=True))
+    monkeypatch.setattr(pareto, "render", count)
+    families = find_families(OmegaConf.to_container(options.pareto, resolve=True))
     for name in (BASE, "fewer"):
-        draw = settings["feed_forward"][name].prepare(options.refinement, torch.device("cpu"))
-        draw(room)
-    assert seen[0][0] == 3 * SIDE**2 and seen[0][2] is None
-    assert 0 < seen[1][0] <= 500 and seen[1][1] >= 0.05 and seen[1][2] == 0
+        families["feed_forward"][name].prepare(options.refinement, CPU)(room)
+    assert rendered[0][0] == 3 * SIDE**2 and rendered[0][2] is None
+    assert 0 < rendered[1][0] <= 500 and rendered[1][1] >= 0.05 and rendered[1][2] == 0
 
 
-def test_pictures_that_are_the_same_have_no_infinite_error():
+def test_equal_images_have_no_infinite_error():
     same = torch.rand(1, 3, 4, 4)
-    assert picture_error(same, same) == {"decibels": pytest.approx(200), "max": 0}
-    found = picture_error(torch.full((1, 3, 4, 4), 1.5), torch.full((1, 3, 4, 4), 0.9).double())
-    assert found == {"decibels": pytest.approx(20), "max": pytest.approx(0.1)}
+    assert image_error(same, same) == {"decibels": pytest.approx(200), "max": 0}
+    error = image_error(torch.full((1, 3, 4, 4), 1.5), torch.full((1, 3, 4, 4), 0.9).double())
+    assert error == {"decibels": pytest.approx(20), "max": pytest.approx(0.1)}
 
 
-def test_a_folder_of_photographs_is_a_scene(tmp_path):
-    write_photographs(tmp_path / "mine", 12, 40, 60)
-    scenes, absent = find_scenes(["mine", "fox"], tmp_path, SIDE)
-    scene = scenes["mine"]()
+def test_a_folder_of_photographs_is_a_scene(shared_folder):
+    scenes, absent = find_scenes(["mine", "fox"], shared_folder / "data")
+    scene = scenes["mine"](SIDE, 16, 4)
     assert absent.keys() == {"fox"} and scene.name == "mine"
-    assert (scene.inputs.num_views, scene.targets.num_views) == (10, 2)
+    assert (scene.inputs.num_views, scene.held_out.num_views) == (10, 2)
     assert scene.inputs.images.shape[-2:] == (SIDE, SIDE)
 
 
-def made_up(family, scene, setting, seconds, busy=False, **numbers):
+def make_row(family, scene, setting, seconds, busy=False, **numbers):
     row = {"family": family, "scene": scene, "setting": setting, "not_measured": None}
     row |= {"psnr": None, "lpips": None, "error": None, "peak_gb": 0.1}
     timed = seconds and {"median": seconds, "iqr": 0.0, "busy": busy}
@@ -174,31 +209,31 @@ def made_up(family, scene, setting, seconds, busy=False, **numbers):
     return row | {"seconds": timed, "over_base": over} | numbers
 
 
-MADE_UP = [
-    made_up("refined", "a", BASE, 4.0, psnr=30.0),
-    made_up("refined", "b", BASE, 4.0, psnr=20.0),
-    made_up("refined", "a", "quick", 1.0, psnr=29.0, error={"decibels": 40.0, "max": 0.1}),
-    made_up("refined", "b", "quick", 4.0, True, psnr=19.5, error={"decibels": 30.0, "max": 0.3}),
-    made_up("refined", "a", "slow", 8.0, psnr=25.0),
-    made_up("refined", "b", "slow", 8.0, psnr=25.0),
-    made_up("refined", "a", "absent", None),
-    made_up("networks", "a", BASE, 4.0, error={"decibels": 90.0, "max": 0.0}),
-    made_up("networks", "a", "other", 3.0, error={"decibels": 80.0, "max": 0.0}),
-    made_up("networks", "a", "worse", 3.5, error={"decibels": 70.0, "max": 0.0}),
+MADE_ROWS = [
+    make_row("refined", "a", BASE, 4.0, psnr=30.0),
+    make_row("refined", "b", BASE, 4.0, psnr=20.0),
+    make_row("refined", "a", "quick", 1.0, psnr=29.0, error={"decibels": 40.0, "max": 0.1}),
+    make_row("refined", "b", "quick", 4.0, True, psnr=19.5, error={"decibels": 30.0, "max": 0.3}),
+    make_row("refined", "a", "slow", 8.0, psnr=25.0),
+    make_row("refined", "b", "slow", 8.0, psnr=25.0),
+    make_row("refined", "a", "absent", None),
+    make_row("networks", "a", BASE, 4.0, error={"decibels": 90.0, "max": 0.0}),
+    make_row("networks", "a", "other", 3.0, error={"decibels": 80.0, "max": 0.0}),
+    make_row("networks", "a", "worse", 3.5, error={"decibels": 70.0, "max": 0.0}),
 ]
 
 
 def test_means_are_over_scenes():
-    found = {(row["family"], row["setting"]): row for row in summarize(MADE_UP)}
-    quick = found["refined", "quick"]
+    means = {(row["family"], row["setting"]): row for row in summarize(MADE_ROWS)}
+    quick = means["refined", "quick"]
     assert (quick["scenes"], quick["seconds"], quick["psnr"]) == (2, 2.5, 24.25)
     assert quick["over_base"] == pytest.approx(0.5)
     assert (quick["lost"], quick["most_lost"]) == (0.75, 1.0)
     assert (quick["error_decibels"], quick["error_max"]) == (35.0, 0.3)
-    assert quick["busy"] and not found["refined", BASE]["busy"]
-    absent = found["refined", "absent"]
+    assert quick["busy"] and not means["refined", BASE]["busy"]
+    absent = means["refined", "absent"]
     assert absent["scenes"] == 0 and absent["seconds"] is absent["psnr"] is absent["lost"] is None
-    front = [name for name, row in found.items() if row["on_front"]]
+    front = [name for name, row in means.items() if row["on_front"]]
     assert front == [
         ("refined", BASE),
         ("refined", "quick"),
@@ -207,9 +242,9 @@ def test_means_are_over_scenes():
     ]
 
 
-def test_tables_and_picture_have_every_setting():
-    results = {"machine": {"cpu": "one"}, "rows": MADE_UP, "not_measured": {}}
-    results |= {"settings": summarize(MADE_UP)}
+def test_tables_and_figure_have_every_setting():
+    results = {"machine": {"cpu": "one"}, "rows": MADE_ROWS, "not_measured": {}}
+    results |= {"settings": summarize(MADE_ROWS)}
     shown = tables(results)
     assert [len(table.rows) for table in shown] == [4, 3, 3, 4, 3]
     cells = {row[0]: row for row in zip(*(c.cells for c in shown[3].columns), strict=True)}
@@ -248,6 +283,14 @@ MISTAKES = {
         {"refined": {"knobs": {"a": {"views": 0}}}},
         r"^pareto\.refined\.a: views=0: give a whole number from 1\.",
     ),
+    "a limit": (
+        {"reconstruct": {"knobs": {"a": {"seconds": 0}}}},
+        r"^pareto\.reconstruct\.a: steps=None and seconds=0: give one of them, above 0\.",
+    ),
+    "a start": (
+        {"reconstruct": {"knobs": {"a": {"init": "dust"}}}},
+        r"^pareto\.reconstruct\.a: init=dust is unknown: choose from",
+    ),
     "no settings": ({"refined": {"knobs": {"a": 3}}}, r"^pareto\.refined\.a=3 is no setting"),
     "an override": (
         {"feed_forward": {"knobs": {"a": {"overrides": ["model.layer=8m"]}}}},
@@ -265,19 +308,18 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_are_named(make_options, mistake):
+def test_mistakes_are_named(make_pareto, mistake):
     changes, says = MISTAKES[mistake]
     with pytest.raises(InputError, match=says) as raised:
-        suite.measure(make_options(**changes), Console(quiet=True))
+        pareto.measure(make_pareto(**changes), Console(quiet=True))
     assert "\n" not in str(raised.value)
 
 
-def test_every_knob_of_the_configuration_is_a_setting(repository):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        wanted = OmegaConf.to_container(compose("benchmark").pareto, resolve=True)
-    for family in FAMILIES:
-        found = find_settings(family, wanted[family]["base"], wanted[family]["knobs"])
-        assert len(found) > 6
-        assert [name for name in found if name != BASE and found[name] == found[BASE]] == []
-    some = suite.find_families(wanted | {"knobs": ["bf16"]})
+def test_every_knob_of_the_configuration_is_a_setting(make_options):
+    config = OmegaConf.to_container(make_options("pareto", {}).pareto, resolve=True)
+    for family, settings in find_families(config | {"families": list(FAMILIES)}).items():
+        assert len(settings) > 6
+        same = [name for name in settings if settings[name] == settings[BASE]]
+        assert same == [BASE], family
+    some = find_families(config | {"knobs": ["bf16"]})
     assert some["feed_forward"].keys() == {BASE, "bf16"} and some["refined"].keys() == {BASE}

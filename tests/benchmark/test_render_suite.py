@@ -1,28 +1,29 @@
 """The suite on a tiny scene, and what benchmark.py says to a user."""
 
-import json
 import math
 import os
-import runpy
 import subprocess
 import sys
 from functools import partial
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
-from asysplat.benchmark.options import find_suite
-from asysplat.benchmark.render.floor import COUNT, RASTER, SIDE, hot_scene
-from asysplat.benchmark.render.run import (
+from asysplat.benchmark.options import CPU, find_suite
+from asysplat.benchmark.render import (
     CULLING,
     FIELDS,
+    FLOOR_COUNT,
+    FLOOR_SIDE,
+    RASTER,
+    Backend,
     errors,
     find_backends,
     flips,
+    floor_scene,
     prepare,
     run,
-    truth,
+    run_exact,
 )
 from asysplat.benchmark.scenes import (
     SCENES,
@@ -38,18 +39,12 @@ from asysplat.rendering import INRIA, Culling
 
 
 @pytest.fixture(scope="module")
-def measured(repository, tmp_path_factory):
-    """benchmark.py on two scenes of a moment; the numbers, and the folder they are in."""
-    folder = tmp_path_factory.mktemp("benchmark")
-    script = runpy.run_path(str(repository / "benchmark.py"))
-    options = {"suite": "render", "scenes": ["tiny", "twin"], "repeats": 2, "output": folder}
-    options["compare"] = None
+def results(run_suite):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(SCENES, "tiny", partial(random_scene, 500, 24, 40))
         patch.setitem(SCENES, "twin", partial(pixel_aligned_scene, 16, 32, 32))
         patch.setitem(SMALLER, "twin", partial(pixel_aligned_scene, 8, 16, 16))
-        script["benchmark"](OmegaConf.create(options))
-    return json.loads((folder / "render.json").read_text()), folder
+        return run_suite("render", {"scenes": ["tiny", "twin"]})
 
 
 def numbers(value):
@@ -61,8 +56,7 @@ def numbers(value):
 
 
 @pytest.mark.medium
-def test_json_has_every_backend_and_skip(measured):
-    results, folder = measured
+def test_json_has_every_backend_and_culling(results):
     assert {"cpu", "cores", "threads", "torch", "numba"} <= results["machine"].keys()
     assert all(math.isfinite(number) for number in numbers(results))
     rows = {(row["scene"], row["backend"], row["without"]): row for row in results["rows"]}
@@ -89,28 +83,25 @@ def test_json_has_every_backend_and_skip(measured):
                 floor = row["stats"]["rows"] * raster["hot_row"] / row["threads"]
                 assert raster["floor"] == pytest.approx(floor)
                 assert raster["whole_over_raster"] > 1 and raster["over_floor"] > 0
-    assert (folder / "render.png").stat().st_size > 0
 
 
 @pytest.mark.medium
-def test_a_skip_leaves_the_error_as_it_is(measured):
-    results, _ = measured
+def test_culling_leaves_the_error_unchanged(results):
     for scene in ("tiny", "twin"):
         rows = [r for r in results["rows"] if (r["scene"], r["backend"]) == (scene, "cpu")]
         assert all(row["error"] == rows[0]["error"] for row in rows)
-        by_skip = {row["without"]: row["stats"]["rows"] for row in rows}
-        assert by_skip["rows"] > by_skip[None]
+        by_culling = {row["without"]: row["stats"]["rows"] for row in rows}
+        assert by_culling["rows"] > by_culling[None]
 
 
-def test_hot_rows_are_all_rows_of_all_tiles():
-    """What the floor is made of: nothing is skipped, and the kernels take nearly all the time."""
-    (backend,) = [backend for backend in find_backends() if backend.name == "cpu"]
-    run(backend, Culling(), hot_scene())  # kernels are loaded, or compiled, when first used
-    outputs = run(backend, Culling(), hot_scene())
+def test_the_floor_scene_evaluates_all_rows_of_all_tiles():
+    backend = Backend("cpu")
+    run(backend, Culling(), floor_scene())  # kernels are loaded, or compiled, when first used
+    outputs = run(backend, Culling(), floor_scene())
     seconds = outputs.kernels
-    tiles = (SIDE // outputs.stats["tile_size"]) ** 2
-    assert outputs.stats["visible"] == COUNT and outputs.stats["pairs"] == COUNT * tiles
-    assert outputs.stats["rows"] == COUNT * tiles * outputs.stats["tile_size"]
+    tiles = (FLOOR_SIDE // outputs.stats["tile_size"]) ** 2
+    assert outputs.stats["visible"] == FLOOR_COUNT and outputs.stats["pairs"] == FLOOR_COUNT * tiles
+    assert outputs.stats["rows"] == FLOOR_COUNT * tiles * outputs.stats["tile_size"]
     assert outputs.image.min() > 0
     taken = sum(seconds[kernel] for kernel in RASTER.values())
     assert taken > 0.5 * sum(seconds.values())
@@ -119,10 +110,10 @@ def test_hot_rows_are_all_rows_of_all_tiles():
 
 def test_errors_are_those_of_image_and_gradients():
     scene = random_scene(200, 20, 20)
-    exact = truth(scene, INRIA)
-    found = run(find_backends()[0], Culling(), prepare(scene, "cpu"))
+    exact = run_exact(scene, INRIA)
+    outputs = run(find_backends()[0], Culling(), prepare(scene))
     none = flips(exact, exact)
-    close = errors(found, exact, none)
+    close = errors(outputs, exact, none)
     assert (
         not none.any() and 0 < close["image_max"] < 1e-3 and max(close["gradients"].values()) < 1e-2
     )
@@ -141,14 +132,14 @@ def test_errors_are_those_of_image_and_gradients():
 
 @pytest.mark.skipif(not os.access(CLEAR_PEAK, os.W_OK), reason="peaks cannot be started anew")
 def test_peak_memory_is_the_rise():
-    kept = torch.ones(50_000_000)
-    rise = rise_gb(lambda: torch.ones(25_000_000), torch.device("cpu"))
+    held = torch.ones(50_000_000)
+    rise = rise_gb(lambda: torch.ones(25_000_000), CPU)
     assert rise == pytest.approx(0.1, abs=0.02)
-    del kept
+    del held
 
 
 def test_unknown_options_are_named():
-    known = "render, ops, model, data, reconstruct, pareto, bench, stability"
+    known = "render, ops, model, data, pareto, bench, stability"
     with pytest.raises(InputError, match=rf"^suite=rendr is unknown: choose from {known}\.$"):
         find_suite("rendr")
     with pytest.raises(InputError, match=r"^scenes=D is unknown: .*A, B, C, 524k, 4M"):

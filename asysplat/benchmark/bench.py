@@ -1,0 +1,184 @@
+"""Small workloads over their baselines: ratios that a change of the code must not raise."""
+
+import time
+from collections.abc import Iterator
+from functools import partial
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from matplotlib.figure import Figure
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from asysplat.benchmark.compare import RATIO, Watched
+from asysplat.benchmark.model import Workload, make_net, make_views, record_products
+from asysplat.benchmark.ops import OpCase, PlaneSweepCase, make_path
+from asysplat.benchmark.options import CPU
+from asysplat.benchmark.plot import bars
+from asysplat.benchmark.render import Backend, prepare, run
+from asysplat.benchmark.scenes import random_scene
+from asysplat.benchmark.table import machine_note, make_table, spread, text
+from asysplat.benchmark.timing import Measurement, Result, Run, summary, time_in_rounds
+from asysplat.ops.adam.cpu import adam_step_cpu
+from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
+from asysplat.ops.image_loss import image_loss
+from asysplat.refinement import Refinement
+from asysplat.rendering import Culling
+from asysplat.scene import Views
+
+BEST_OF = 3  # runs in a round: interruptions only make a run slower
+WATCHED = Watched(names=("workload", "over"), alike=(), kinds={"ratio": RATIO})
+SWEEP = {"batch": 1, "views": 4, "height": 32, "width": 32, "stride": 2}
+CASES = {
+    "chunked": (
+        OpCase("ssd", {"batch": 1, "length": 512, "heads": 4, "head_dim": 64, "state": 64}),
+        OpCase("selective_scan", {"batch": 8, "length": 128, "channels": 64, "state": 16}),
+    ),
+    "reference": (PlaneSweepCase("plane_sweep", SWEEP | {"planes": 48, "neighbors": 3}),),
+}
+GAUSSIANS, SIDE = 5000, 96  # of the renderer's scene
+ROWS = 20_000  # of which Adam updates half
+NETWORK, VIEWS, VIEW_SIDE = "asysplat_plane_sweep", 4, 64
+
+
+class Pair(NamedTuple):
+    """A workload and its baseline."""
+
+    name: str
+    over: str  # what the baseline is
+    workload: Run
+    baseline: Run
+
+
+def make_pairs() -> Iterator[Pair]:
+    """Make all pairs; the same numbers at every call."""
+    for over, cases in CASES.items():
+        for case in cases:
+            paths = [make_path(case, name, torch.float32, CPU) for name in ("cpu", over)]
+            yield Pair(case.name, over, *(path.forward_backward for path in paths))
+    yield from _render_and_refinement()
+    yield _image_loss()
+    yield _adam()
+    yield _network()
+
+
+def _render_and_refinement() -> Iterator[Pair]:
+    """Pair both passes of the renderer, and a step of the refinement, with the reference's."""
+    gaussians, camera = random_scene(GAUSSIANS, SIDE, SIDE)
+    inputs = prepare((gaussians, camera))
+    passes = {name: partial(run, Backend(name), Culling(), inputs) for name in ("cpu", "reference")}
+    yield Pair("render", "reference", passes["cpu"], passes["reference"])
+    generator = torch.Generator().manual_seed(0)
+    photograph = Views(camera, torch.rand(1, 3, SIDE, SIDE, generator=generator))
+    refinement = Refinement(gaussians, photograph)
+    yield Pair("refinement", "reference", lambda: refinement.step(1.0), passes["reference"])
+
+
+def _image_loss() -> Pair:
+    generator = torch.Generator().manual_seed(0)
+    rendered, target = torch.rand(2, 3, 2 * SIDE, 2 * SIDE, generator=generator)
+    rendered.requires_grad_()
+
+    def both_passes(backend: str) -> None:
+        loss = image_loss(rendered, target, backend=backend)
+        torch.autograd.grad(loss, rendered)
+
+    runs = [partial(both_passes, name) for name in ("cpu", "reference")]
+    return Pair("image_loss", "reference", *runs)
+
+
+def _adam() -> Pair:
+    generator = torch.Generator().manual_seed(0)
+    visible = torch.rand(ROWS, generator=generator) < 0.5
+    settings = AdamSettings(0.9, 0.999, 1e-15)
+    runs = []
+    for step in (adam_step_cpu, adam_step_reference):
+        numbers = torch.rand(4, ROWS, 12, generator=generator)  # mean and square: above 0
+        rows = Rows(*numbers, torch.zeros(ROWS, dtype=torch.int32), torch.full((12,), 1e-3))
+        runs.append(partial(step, [rows], visible, settings))
+    return Pair("adam", "reference", *runs)
+
+
+def _network() -> Pair:
+    """Pair a forward pass with its matrix products and convolutions."""
+    net, _ = make_net(NETWORK, {"scale": "laptop"}, CPU)
+    workload = Workload(NETWORK, net, "fp32", make_views(VIEWS, VIEW_SIDE, VIEW_SIDE, CPU))
+    counts = record_products(workload.forward)["forward"]
+    calls = [product.prepare(CPU) for product, count in counts.items() for _ in range(count)]
+
+    def run_products() -> None:
+        for call in calls:
+            call()
+
+    return Pair(NETWORK, "products", workload.forward, run_products)
+
+
+def measure(options: DictConfig, console: Console) -> Result:
+    """Time every workload and its baseline one after the other, in `options.repeats` rounds.
+
+    On one thread, in processor time: other programs on the machine do not count.
+
+    Returns:
+        "rows": of each workload its "seconds", those of its "baseline", and the
+        "ratio" of both in the same round.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        pairs = list(make_pairs())
+        rounds = [Measurement(partial(_seconds, pair)) for pair in pairs]
+        with console.status(f"{options.repeats} rounds"):
+            time_in_rounds(rounds, options.repeats)
+    finally:
+        torch.set_num_threads(threads)
+    rows = []
+    for pair, timed in zip(pairs, rounds, strict=True):
+        own, baseline = timed.seconds["workload"], timed.seconds["baseline"]
+        row = {"workload": pair.name, "over": pair.over}
+        row |= {"seconds": summary(own), "baseline": summary(baseline)}
+        rows.append(row | {"ratio": summary([a / b for a, b in zip(own, baseline, strict=True)])})
+    return {"rows": rows}
+
+
+def _seconds(pair: Pair) -> dict[str, float]:
+    return {"workload": _best(pair.workload), "baseline": _best(pair.baseline)}
+
+
+def _best(run: Run) -> float:
+    """Return the least processor time of BEST_OF runs, in seconds."""
+    times = [time.process_time()]
+    for _ in range(BEST_OF):
+        run()
+        times.append(time.process_time())
+    return min(end - start for start, end in pairwise(times))
+
+
+def tables(results: Result) -> list[Table]:
+    """Show the ratio of each workload to its baseline."""
+    columns = {
+        "workload": text("{workload}"),
+        "baseline": text("its {over}"),
+        "ms": spread("seconds", "{:.2f}"),
+        "baseline\nms": spread("baseline", "{:.2f}"),
+        "ratio": spread("ratio", "{:.3f}", unit=1.0),
+    }
+    notes = (
+        f"{machine_note(results)}\n"
+        f"one thread, processor time, the best of {BEST_OF} runs in each round"
+    )
+    return [make_table("Ratios to a baseline", columns, results["rows"], notes, names=2)]
+
+
+def plot(results: Result) -> Figure:
+    """Plot the ratios, and 1."""
+    rows = results["rows"]
+    ratios = [row["ratio"] for row in rows]
+    return bars(
+        [f"{row['workload']} / its {row['over']}" for row in rows],
+        {"ratio": [ratio["median"] for ratio in ratios]},
+        ("as long", [1.0] * len(rows)),
+        "seconds over those of the baseline",
+        spread=[ratio["iqr"] for ratio in ratios],
+    )

@@ -1,1 +1,0 @@
-"""The regression watch: every kernel beside something that does the same without it."""

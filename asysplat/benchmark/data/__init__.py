@@ -1,1 +1,0 @@
-"""Photographs on disk."""

@@ -1,0 +1,690 @@
+"""Run time against error: every knob of a prediction and of a refinement, one at a time.
+
+A setting renders all held-out views of a scene from photographs in memory. A knob is what a
+setting changes of the base of its family.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache, partial
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import matplotlib
+import torch
+import torch.nn.functional as F
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from lpips import LPIPS
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from asysplat import load
+from asysplat.benchmark.compare import DECIBELS, LPIPS_DISTANCE, TIME, Watched
+from asysplat.benchmark.options import CPU, PRECISIONS, check_names, find_device
+from asysplat.benchmark.plot import plain_log_ticks
+from asysplat.benchmark.table import (
+    Columns,
+    at,
+    machine_note,
+    make_table,
+    number,
+    spread,
+    text,
+)
+from asysplat.benchmark.timing import (
+    Measurement,
+    Result,
+    rise_gb,
+    seconds_of,
+    summary,
+    time_in_rounds,
+)
+from asysplat.data.normalize import Normalization, normalize
+from asysplat.data.procedural import ProceduralScene
+from asysplat.data.procedural.scene import split_seed
+from asysplat.data.selection.views import spread as select_evenly
+from asysplat.data.selection.views import uniform_selection
+from asysplat.errors import InputError, input_error_behind
+from asysplat.evaluation.lpips import load_lpips
+from asysplat.evaluation.protocol import Protocol
+from asysplat.models.network import Network
+from asysplat.refinement import RefinementSettings, mean_color, merge_to_limit, refine
+from asysplat.refinement.init import INITS, initial_gaussians
+from asysplat.refinement.photographs import Photographs, open_photographs
+from asysplat.rendering import INRIA, render
+from asysplat.report.front import draw_front, pareto_front
+from asysplat.report.style import FAINT, OURS, STYLE
+from asysplat.scene import Views
+
+ALL = "all"
+BASE = "base"  # the setting that each knob changes
+EXACT = "fp64"
+SIZES = {"inputs": 16, "targets": 4}  # most views of a scene, unless its family says otherwise
+FRAMES = 96  # of a procedural scene
+PROCEDURAL = {"room": "rooms", "outdoors": "outdoors"}  # test scenes, by their `places`
+REAL = ("fern", "fox", "hololens-000", "mydesk")  # folders of data/; others may be there, too
+HELD_OUT_EVERY = 8
+MIN_SQUARED_ERROR = 1e-20  # of images that are equal: 200 dB, as JSON has no infinity
+# The PSNR after so many seconds depends on the load of the machine: half of 0.5 dB, and of LPIPS.
+NOISE_OF_SECONDS = {"psnr": 0.25, "lpips": 0.02}
+WATCHED = Watched(
+    names=("family", "scene", "setting"),
+    alike=("side", "values"),
+    kinds={
+        "seconds": TIME,
+        "error.decibels": replace(DECIBELS, min_change=1.0),
+        "psnr": DECIBELS,
+        "lpips": LPIPS_DISTANCE,
+    },
+)
+TITLES = {
+    "feed_forward": "Feed-forward",
+    "networks": "Other layers, untrained",
+    "refined": "Refined",
+    "reconstruct": "Refined for some seconds",
+}
+QUALITIES = {  # higher is better
+    "psnr": "PSNR against photographs, dB",
+    "error_decibels": "PSNR against the exact images, dB",
+}
+NOTES = """\
+-: not measured; photographs in memory to all held-out views; / base: in the same round, in turns
+error: of images in [0, 1] against the base in float64, of other layers against their own, of \
+refinements against the base"""
+
+RenderScene = Callable[[Photographs], Tensor]  # all held-out views [V, 3, H, W]
+
+
+@dataclass(frozen=True)
+class FeedForward:
+    """A network's prediction, with some of its Gaussians merged or left out, rendered.
+
+    Args:
+        views: input views.
+        side: of the input views, pixels.
+        checkpoint: see `load`; None: untrained, whose images are compared with its own in float64.
+        overrides: of train.py; with a checkpoint they may change no weights.
+        precision: of the network: fp32, bf16 by autocast, or fp64, in which all is computed.
+        min_opacity: below which Gaussians are dropped.
+        cell: side of the cells whose Gaussians are merged, in pixels; None: none are.
+        max_gaussians: cells grow until so few are left; None: any number.
+        sh_degree: up to which colors are rendered; None: all.
+        views_at_once: rendered views; None: all.
+        convention: cut-offs of the renderer that differ, see `Convention`.
+    """
+
+    views: int
+    side: int
+    checkpoint: str | None = "shipped"
+    overrides: Sequence[str] = ()
+    precision: str = "fp32"
+    min_opacity: float = 0.0
+    cell: float | None = None
+    max_gaussians: int | None = None
+    sh_degree: int | None = None
+    views_at_once: int | None = None
+    convention: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self):
+        check_names("precision", [self.precision], [*PRECISIONS, EXACT])
+        _check_whole(self, "views", "side")
+        _check_whole(self, "max_gaussians", "views_at_once", optional=True)
+        if self.convention:
+            check_names("convention", self.convention, [each.name for each in fields(INRIA)])
+
+    @property
+    def trained(self) -> bool:
+        return self.checkpoint is not None
+
+    def exact(self, base: "FeedForward") -> "FeedForward":
+        """Return the setting whose images this one's are compared with."""
+        return replace(base if self.trained else self, precision=EXACT)
+
+    def prepare(self, refinement: DictConfig, device: torch.device) -> RenderScene:
+        """Load the network; return the function that renders a scene on the device.
+
+        Raises:
+            InputError: no such file or override, or weights that do not fit.
+        """
+        net = _load_network(self.checkpoint, tuple(self.overrides))
+        dtype = torch.float64 if self.precision == EXACT else torch.float32
+        if (device, dtype) != (CPU, torch.float32):
+            net = deepcopy(net).to(device, dtype)
+        return lambda scene: self._render(scene, net, dtype)
+
+    @torch.no_grad()
+    def _render(self, scene: Photographs, net: Network, dtype: torch.dtype) -> Tensor:
+        scene = select_inputs(scene, self.views, self.side)
+        inputs, targets = scene.inputs.to(dtype), scene.held_out.to(dtype)
+        half = PRECISIONS.get(self.precision) == torch.bfloat16
+        with torch.autocast(inputs.images.device.type, torch.bfloat16, enabled=half):
+            gaussians = net(inputs)
+        gaussians = gaussians.to(dtype)
+        if self.min_opacity > 0:
+            gaussians = gaussians.keep(gaussians.opacities >= self.min_opacity)
+        if self.cell is not None or self.max_gaussians is not None:
+            limit = self.max_gaussians or gaussians.num_gaussians
+            gaussians = merge_to_limit(gaussians, inputs.cameras, self.cell or 1.0, limit)
+        out = render(
+            gaussians,
+            targets.cameras,
+            mean_color(inputs),
+            depth=False,
+            sh_degree=self.sh_degree,
+            convention=replace(INRIA, **self.convention),
+            views_at_once=self.views_at_once,
+        )
+        return out.image
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A start and a refinement of so many steps or seconds, rendered.
+
+    Args:
+        views: input views; None: all of the scene, as they are.
+        side: of the input views, pixels; None with `views`.
+        steps: of the refinement: every round gives the same bits; 0: the start alone.
+        seconds: in place of steps.
+        init: see `initial_gaussians`; the network is the shipped one.
+        refinement: what differs from `refinement`, a file of conf/refinement.
+    """
+
+    views: int | None
+    side: int | None
+    steps: int | None = None
+    seconds: float | None = None
+    init: str = "plane_sweep"
+    refinement: Mapping[str, Any] = field(default_factory=dict)
+
+    trained = True
+
+    def __post_init__(self):
+        check_names("init", [self.init], INITS)
+        _check_whole(self, "views", "side", optional=True)
+        _check_whole(self, "steps", minimum=0, optional=True)
+        given = self.steps is not None, self.seconds is not None and 0 < self.seconds < math.inf
+        if given.count(True) != 1:
+            raise InputError(
+                f"steps={self.steps} and seconds={self.seconds}: give one of them, above 0."
+            )
+
+    def exact(self, base: "Refined") -> "Refined":
+        """Return the setting whose images this one's are compared with."""
+        return base
+
+    def prepare(self, refinement: DictConfig, device: torch.device) -> RenderScene:
+        """Read the settings; return the function that renders a scene on the CPU.
+
+        Raises:
+            InputError: an unknown setting or one out of range.
+        """
+        try:
+            settings = instantiate(OmegaConf.merge(refinement, dict(self.refinement)))
+        except (OmegaConfBaseException, InstantiationException, TypeError, ValueError) as error:
+            message = f"{self.refinement} are no settings of a refinement."
+            raise InputError(str(input_error_behind(error) or message)) from None
+        net = _load_network("shipped", ()) if self.init == "network" else None
+        return lambda scene: self._render(scene, settings, net)
+
+    def _render(
+        self, scene: Photographs, settings: RefinementSettings, net: Network | None
+    ) -> Tensor:
+        scene = select_inputs(scene, self.views, self.side)
+        gaussians = initial_gaussians(self.init, scene, settings.max_gaussians, net)
+        background = mean_color(scene.inputs)
+        if self.steps != 0:
+            limit = {"steps": self.steps, "seconds": self.seconds}
+            gaussians = refine(gaussians, scene.inputs, settings, background=background, **limit)
+        with torch.no_grad():
+            return render(gaussians, scene.held_out.cameras, background, depth=False).image
+
+
+FAMILIES = {
+    "feed_forward": FeedForward,
+    "networks": FeedForward,
+    "refined": Refined,
+    "reconstruct": Refined,
+}
+Setting = FeedForward | Refined
+
+
+def _check_whole(setting: Setting, *names: str, minimum: int = 1, optional: bool = False) -> None:
+    for name in names:
+        value = getattr(setting, name)
+        if not (optional and value is None) and (type(value) is not int or value < minimum):
+            raise InputError(f"{name}={value}: give a whole number from {minimum}.")
+
+
+@cache
+def _load_network(checkpoint: str | None, overrides: tuple[str, ...]) -> Network:
+    torch.manual_seed(0)
+    return load(checkpoint, overrides)
+
+
+def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
+    """Return the settings of each family of `config.families`: the base, and those of its knobs.
+
+    Raises:
+        InputError: an unknown family, knob or field of a setting, or a value out of range.
+    """
+    check_names("pareto.families", config["families"], FAMILIES)
+    families = {
+        family: _make_settings(family, config[family]["base"], config[family]["knobs"] or {})
+        for family in config["families"]
+    }
+    if config["knobs"] == ALL:
+        return families
+    every = dict.fromkeys(name for settings in families.values() for name in settings)
+    check_names("pareto.knobs", config["knobs"], [*every, ALL])
+    return {
+        family: {n: setting for n, setting in settings.items() if n in (BASE, *config["knobs"])}
+        for family, settings in families.items()
+    }
+
+
+def _make_settings(family: str, base: Mapping, knobs: Mapping[str, Mapping]) -> dict[str, Setting]:
+    settings = {}
+    for name, changes in ({BASE: {}} | dict(knobs)).items():
+        where = f"pareto.{family}.{name}"
+        if not isinstance(changes, Mapping):
+            raise InputError(f"{where}={changes} is no setting: give {{name: value}}.")
+        known = [each.name for each in fields(FAMILIES[family])]
+        check_names(where, {**base, **changes}, known)
+        try:
+            settings[name] = FAMILIES[family](**(dict(base) | dict(changes)))
+        except (InputError, TypeError) as error:
+            raise InputError(f"{where}: {error}") from error
+    return settings
+
+
+def find_scenes(
+    names: Sequence[str], folder: Path
+) -> tuple[dict[str, Callable[[int, int, int], Photographs]], dict[str, str]]:
+    """Return functions that open scenes, and the reasons why others are not measured.
+
+    The functions take the side of the photographs in pixels, and the largest numbers of input and
+    of held-out views.
+
+    Args:
+        names: of PROCEDURAL, REAL, or folders in `folder`.
+        folder: holds scenes of photographs.
+
+    Raises:
+        InputError: a name that no scene has, or no scene is there.
+    """
+    folders = [path for path in folder.iterdir() if path.is_dir()] if folder.is_dir() else []
+    present = sorted(path.name for path in folders)
+    check_names("pareto.scenes", names, dict.fromkeys([*PROCEDURAL, *REAL, *present]))
+    scenes, absent = {}, {}
+    for name in names:
+        if name in PROCEDURAL:
+            scenes[name] = partial(_procedural_scene, name)
+        elif name in present:
+            scenes[name] = partial(_real_scene, folder / name)
+        else:
+            absent[name] = f"{folder / name} is no folder"
+    if not scenes:
+        raise InputError(
+            f"pareto.scenes={list(names)}: none is a folder of {folder}; set ASYSPLAT_SHARED to "
+            f"the folder that holds data/, or take of {', '.join(PROCEDURAL)}."
+        )
+    return scenes, absent
+
+
+def _procedural_scene(name: str, side: int, inputs: int, targets: int) -> Photographs:
+    scene = ProceduralScene(split_seed("test", 0), side, side, FRAMES, places=PROCEDURAL[name])
+    frames = uniform_selection(FRAMES, inputs, targets)
+    views = [_without_depths(scene.views(chosen)) for chosen in (frames.inputs, frames.targets)]
+    frame = Normalization(torch.eye(4, dtype=torch.float64), 1.0)
+    return Photographs(name, *views, [], [], frame, None)
+
+
+def _real_scene(path: Path, side: int, inputs: int, targets: int) -> Photographs:
+    # The check of the cameras needs more pixels: its warning is dropped.
+    limits = {"views": inputs, "held_out_every": HELD_OUT_EVERY, "max_held_out": targets}
+    return open_photographs(path, side, side, **limits, say=lambda _: None)
+
+
+def _without_depths(views: Views) -> Views:
+    return replace(views, depths=None, masks=None, point_depths=None)
+
+
+def select_inputs(scene: Photographs, views: int | None, side: int | None) -> Photographs:
+    """Return a scene with `views` of its inputs, evenly, of side x side pixels, without depths.
+
+    It is normalized anew. A scene with fewer views gives all of them; None: the scene as it is.
+
+    Raises:
+        InputError: more pixels than the photographs have.
+    """
+    if views is None or side is None:
+        return scene
+    cameras = scene.inputs.cameras
+    if side > cameras.height:
+        raise InputError(
+            f"pareto has a setting with side={side}: give at most pareto.side={cameras.height}."
+        )
+    selected = select_evenly(range(cameras.num_views), min(views, cameras.num_views))
+    inputs = _without_depths(scene.inputs.select(selected))
+    if side != cameras.height:
+        images = F.interpolate(inputs.images, (side, side), mode="area")
+        inputs = Views(inputs.cameras.resized(side, side), images)
+    inputs, targets, _ = normalize(inputs, _without_depths(scene.held_out))
+    return replace(scene, inputs=inputs, held_out=targets)
+
+
+@dataclass(frozen=True)
+class Meter:
+    """How settings are measured on every scene.
+
+    Args:
+        protocol: of the metrics.
+        lpips: see `load_lpips`; None for no LPIPS.
+        refinement: a file of conf/refinement.
+        device: of the networks; refinements are on the CPU.
+        repeats: timed rounds.
+    """
+
+    protocol: Protocol
+    lpips: LPIPS | None
+    refinement: DictConfig
+    device: torch.device
+    repeats: int
+
+    def rows(
+        self,
+        scene: Photographs,
+        settings: Mapping[str, Setting],
+        renderers: Mapping[str, RenderScene],
+    ) -> list[Result]:
+        """Measure all settings in turns, those with a limit in seconds once; a row for each.
+
+        Raises:
+            InputError: the setting BASE cannot render this scene. Of another that cannot, all
+                numbers are None, and "not_measured" says why.
+        """
+        base = settings[BASE]
+        device = CPU if isinstance(base, Refined) else self.device
+        scene = replace(scene, inputs=scene.inputs.to(device), held_out=scene.held_out.to(device))
+        images: dict[str, Tensor] = {}
+        measurements: dict[str, Measurement] = {}
+        absent: dict[str, str] = {}
+
+        def run(name: str) -> None:
+            images[name] = renderers[name](scene)
+
+        once = isinstance(base, Refined) and base.seconds is not None
+        if once:  # compiles kernels
+            replace(base, seconds=None, steps=1).prepare(self.refinement, CPU)(scene)
+        for name in settings:
+            run_once = partial(run, name)
+            try:
+                if once:
+                    seconds = {"seconds": [seconds_of(run_once, device)]}
+                    measurements[name] = Measurement(dict, {"peak_gb": None}, seconds)
+                else:
+                    costs = {"peak_gb": max(0.0, rise_gb(run_once, device))}
+                    timer = partial(_time, run_once, device)
+                    measurements[name] = Measurement(timer, costs)
+            except InputError as error:
+                if name == BASE:
+                    raise
+                absent[name] = str(error)
+        if not once:
+            time_in_rounds(list(measurements.values()), self.repeats)
+        exact = self._exact_images(scene, settings, images)
+        rows = []
+        for name, setting in settings.items():
+            row = {"setting": name, "values": asdict(setting), "not_measured": absent.get(name)}
+            row |= dict.fromkeys(("seconds", "over_base", "peak_gb"))
+            row |= dict.fromkeys(("error", "psnr", "ssim", "lpips"))
+            if name in measurements:
+                timed, image = measurements[name], images[name]
+                own, of_base = (m.seconds["seconds"] for m in (timed, measurements[BASE]))
+                ratios = [a / b for a, b in zip(own, of_base, strict=True)]
+                row |= {"seconds": summary(own), "over_base": summary(ratios)} | timed.row
+                if name in exact:
+                    row["error"] = image_error(image, exact[name])
+                if setting.trained:
+                    metrics = self.protocol.image_metrics(image, scene.held_out, self.lpips)
+                    row |= {metric: values.mean().item() for metric, values in metrics.items()}
+            rows.append(row | ({"noise": NOISE_OF_SECONDS} if once else {}))
+        return rows
+
+    def _exact_images(
+        self, scene: Photographs, settings: Mapping[str, Setting], images: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """Render what each setting's images are compared with; an exact setting has none."""
+        rendered: list[tuple[Setting, Tensor]] = [(settings[BASE], images[BASE])]
+        exact_images = {}
+        for name in images:
+            exact = settings[name].exact(settings[BASE])
+            if exact == settings[name]:
+                continue
+            if exact not in [setting for setting, _ in rendered]:
+                rendered.append((exact, exact.prepare(self.refinement, self.device)(scene)))
+            exact_images[name] = next(image for setting, image in rendered if setting == exact)
+        return exact_images
+
+
+def _time(run: Callable[[], None], device: torch.device) -> dict[str, float]:
+    return {"seconds": seconds_of(run, device)}
+
+
+def image_error(image: Tensor, exact: Tensor) -> Result:
+    """Compare images, clamped to [0, 1]: decibels of the mean squared error, and the largest."""
+    error = image.double().clamp(0, 1) - exact.double().clamp(0, 1)
+    squared = error.square().mean().clamp_min(MIN_SQUARED_ERROR)
+    return {"decibels": -10 * squared.log10().item(), "max": error.abs().max().item()}
+
+
+def measure(options: DictConfig, console: Console) -> Result:
+    """Render the held-out views of `options.pareto.scenes` with every knob.
+
+    By a network's prediction ("feed_forward"), by untrained networks of other layers
+    ("networks"), by a refinement of so many steps ("refined") or seconds ("reconstruct"). All
+    settings of a family take turns on a scene, in `options.repeats` rounds; those of seconds run
+    once.
+
+    Returns:
+        "rows": one for each family, scene and setting: "seconds", their ratio to the base's of the
+        same round "over_base", "peak_gb" above what was held before, "error" of the images
+        against the exact ones ("decibels", "max"), and "psnr", "ssim" and "lpips" against the
+        photographs; None for what was not measured. "settings": the means over scenes, see
+        `summarize`. "not_measured": what, and why.
+
+    Raises:
+        InputError: an unknown family, scene or knob, or a value out of range.
+    """
+    config = OmegaConf.to_container(options.pareto, resolve=True)
+    shared = Path(config["shared"])
+    families = find_families(config)
+    protocol = instantiate(options.metrics)
+    lpips = load_lpips(protocol.lpips_net, shared / "weights")
+    device = find_device(options.device)
+    renderers = {
+        family: {n: each.prepare(options.refinement, device) for n, each in settings.items()}
+        for family, settings in families.items()
+    }
+    scenes, absent = find_scenes(config["scenes"], shared / "data")
+    meter = Meter(protocol, lpips, options.refinement, device, options.repeats)
+    if lpips is None:
+        absent["LPIPS"] = f"{shared / 'weights'} has no weights of its backbone"
+    if not torch.cuda.is_available():
+        absent["a GPU"] = "there is none"
+    rows: list[Result] = []
+    for name, open_scene in scenes.items():
+        for family, settings in families.items():
+            if name not in (config[family]["scenes"] or scenes):
+                continue
+            sizes = {"side": config["side"]} | SIZES | (config[family].get("photographs") or {})
+            with console.status(f"{name}: {len(settings)} settings, {family}"):
+                found = meter.rows(open_scene(**sizes), settings, renderers[family])
+            console.print(f"{name}: {family}, {len(found)} settings", highlight=False)
+            where = {"family": family, "scene": name, "side": sizes["side"]}
+            rows += [where | row for row in found]
+    absent |= {
+        "{family}, {scene}, {setting}".format(**row): row["not_measured"]
+        for row in rows
+        if row["not_measured"]
+    }
+    return {
+        "protocol": protocol.sentences(),
+        "not_measured": absent,
+        "rows": rows,
+        "settings": summarize(rows),
+    }
+
+
+def summarize(rows: Sequence[Result]) -> list[Result]:
+    """Average each setting of each family over its scenes.
+
+    Returns:
+        "scenes" counts those that it was measured on; "seconds", "psnr", "lpips" and
+        "error_decibels" are means; "over_base" is a geometric one; "lost" is the PSNR below the
+        base's, "most_lost" that of the worst scene; "error_max" and "peak_gb" are the largest;
+        "busy" whether any measurement was; "on_front" whether no other setting of the family
+        has both less seconds and a higher PSNR (a lower error, where there is no PSNR). None for
+        what was measured on no scene.
+    """
+    bases = {(row["family"], row["scene"]): row for row in rows if row["setting"] == BASE}
+    means = [
+        {"family": family, "setting": name, **_means(group, bases)}
+        for (family, name), group in _grouped(rows, "family", "setting").items()
+    ]
+    for own in _grouped(means, "family").values():
+        quality = next((name for name in QUALITIES if points(own, name)), None)
+        front = [name for name, *_ in pareto_front(points(own, quality), "higher")]
+        for row in own:
+            row["on_front"] = row["setting"] in front
+    return means
+
+
+def _means(group: Sequence[Result], bases: Mapping[tuple[str, str], Result]) -> Result:
+    measured = [row for row in group if row["seconds"]]
+
+    def values(path: str) -> list[float]:
+        return [value for row in measured if (value := at(row, path)) is not None]
+
+    def mean(numbers: Sequence[float]) -> float | None:
+        return fmean(numbers) if numbers else None
+
+    lost = [
+        bases[row["family"], row["scene"]]["psnr"] - row["psnr"]
+        for row in measured
+        if row["psnr"] is not None
+    ]
+    ratios = values("over_base.median")
+    return {
+        "scenes": len(measured),
+        "seconds": mean(values("seconds.median")),
+        "over_base": math.exp(fmean(map(math.log, ratios))) if ratios else None,
+        "psnr": mean(values("psnr")),
+        "lost": mean(lost),
+        "most_lost": max(lost, default=None),
+        "lpips": mean(values("lpips")),
+        "error_decibels": mean(values("error.decibels")),
+        "error_max": max(values("error.max"), default=None),
+        "peak_gb": max(values("peak_gb"), default=None),
+        "busy": any(row["seconds"]["busy"] for row in measured),
+    }
+
+
+def points(rows: Sequence[Result], quality: str | None) -> list[tuple[str, float, float]]:
+    """Return name, seconds and quality of the settings that have both."""
+    return [
+        (row["setting"], row["seconds"], row[quality])
+        for row in rows
+        if quality and row["seconds"] is not None and row[quality] is not None
+    ]
+
+
+def _grouped(rows: Sequence[Result], *names: str) -> dict[tuple[str, ...], list[Result]]:
+    groups: dict[tuple[str, ...], list[Result]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups
+
+
+def tables(results: Result) -> list[Table]:
+    """Show each scene's settings, then the means over scenes of each family."""
+    absent = "\n".join(f"not measured: {k}, {why}" for k, why in results["not_measured"].items())
+    notes = "\n".join(filter(None, (machine_note(results), NOTES, absent)))
+    scenes = _grouped(results["rows"], "family", "scene").items()
+    families = _grouped(results["settings"], "family").items()
+    return [
+        *(make_table(f"{TITLES[name]}, {scene}", ROWS, rows) for (name, scene), rows in scenes),
+        *(
+            make_table(f"{TITLES[name]}, means over scenes", MEANS, rows, notes)
+            for (name,), rows in families
+        ),
+    ]
+
+
+def plot(results: Result) -> Figure:
+    """Plot each quality against seconds: a column for each family, the front drawn."""
+    families = _grouped(results["settings"], "family")
+    shown = [name for name in QUALITIES if points(results["settings"], name)]
+    with matplotlib.rc_context(STYLE):
+        size = (1.0 + 5.2 * len(families), 0.8 + 4.2 * len(shown))
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(len(shown), len(families), squeeze=False)
+        for column, (family,) in enumerate(families):
+            for axes, quality in zip(grid[:, column], shown, strict=True):
+                axes.set(title=TITLES[family], xlabel="seconds", ylabel=QUALITIES[quality])
+        for column, rows in enumerate(families.values()):
+            busy = [row["setting"] for row in rows if row["busy"]]
+            for axes, quality in zip(grid[:, column], shown, strict=True):
+                _plot_points(axes, points(rows, quality), busy)
+        note = "hollow: measured while the machine was busy; crowded names are left out"
+        figure.supxlabel(note, fontsize=9, color=FAINT)
+    return figure
+
+
+def _plot_points(
+    axes: Axes, found: Sequence[tuple[str, float, float]], busy: Sequence[str]
+) -> None:
+    if not found:
+        axes.text(0.5, 0.5, "not measured", color=FAINT, ha="center", transform=axes.transAxes)
+        axes.set_axis_off()
+        return
+    axes.set_xscale("log")
+    plain_log_ticks(axes, (1, 2, 3, 5))
+    draw_front(axes, found, "higher", OURS, busy)
+
+
+ROWS: Columns = {
+    "setting": text("{setting}"),
+    "ms": spread("seconds"),
+    "/ base": spread("over_base", "{:.2f}", unit=1.0),
+    "PSNR": number("psnr", "{:.2f}"),
+    "LPIPS": number("lpips", "{:.3f}"),
+    "error\ndB": number("error.decibels", "{:.1f}"),
+    "error\nmax": number("error.max", "{:.1e}"),
+    "MB": number("peak_gb", "{:.0f}", unit=1e-3),
+}
+MEANS: Columns = {
+    "setting": text("{setting}"),
+    "front": lambda row: "*" if row["on_front"] else "",
+    "scenes": text("{scenes}"),
+    "ms": number("seconds", "{:.0f}", unit=1e-3),
+    "": lambda row: "busy" if row["busy"] else "",
+    "/ base": number("over_base", "{:.2f}"),
+    "PSNR": number("psnr", "{:.2f}"),
+    "PSNR\nlost": number("lost", "{:+.2f}"),
+    "at\nmost": number("most_lost", "{:+.2f}"),
+    "LPIPS": number("lpips", "{:.3f}"),
+    "error\ndB": number("error_decibels", "{:.1f}"),
+    "error\nmax": number("error_max", "{:.1e}"),
+    "MB": number("peak_gb", "{:.0f}", unit=1e-3),
+}

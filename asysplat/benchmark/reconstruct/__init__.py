@@ -1,1 +1,0 @@
-"""Scenes fitted to their photographs."""

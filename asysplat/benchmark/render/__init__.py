@@ -1,1 +1,0 @@
-"""Every backend of the renderer."""
