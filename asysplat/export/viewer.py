@@ -1,48 +1,67 @@
-"""A scene in the browser: the server renders what the camera of each open page sees."""
+"""A viewer in the browser: the server renders each open page's camera."""
 
 import math
 import time
-from threading import Event
+from dataclasses import dataclass
+from threading import Event, Thread
 from typing import Any
 
 import torch
-from numpy import ndarray
 
 from asysplat.errors import InputError
 from asysplat.export.frame import (
-    Frame,
-    camera_of,
+    clicked_camera,
     distance_along,
     field_of_view,
     frustum_length,
     mean_up,
-    pointed_at,
+    page_camera,
+    page_frame,
     quaternion,
 )
-from asysplat.export.layers import LAYERS, Look, draw, photograph_at, thumbnail
-from asysplat.export.page import MOST_PIXELS, Page
+from asysplat.export.layers import LAYERS, draw_layer, image_at, thumbnail
 from asysplat.scene import Gaussians, Views
 
-IN_ONE_PLACE = 1e-3  # how near a camera stands to where a photograph was taken
-WAITING = "Waiting for the first picture; where the renderer compiles for it, that takes minutes."
-NO_PHOTOGRAPH = "To see the error, click a camera: it is known where a photograph was taken."
+SAME_POSITION = 1e-3  # distance of a camera to an input camera, in the page's unit
+WAITING = "Waiting for the first rendering; kernels may have to compile, for minutes."
+NO_IMAGE = "To see the error, click a camera: it is known where an image was taken."
+POLL_SECONDS = 0.01  # between two checks for changes
+TARGET_SECONDS = 0.05  # of a rendering while something changes
+REST_SECONDS = 0.2  # without a change, before rendering at full resolution
+MIN_PIXELS, MAX_PIXELS = 320 * 200, 1920 * 1080  # of a rendering
+
+
+@dataclass
+class Page:
+    """The rendering state of an open page.
+
+    Args:
+        state: what was rendered last.
+        pixels: of a rendering while something changes.
+        due: time of the rendering at full resolution.
+        seconds: of the last such rendering.
+    """
+
+    state: object = None
+    pixels: int = MAX_PIXELS // 16
+    due: float = math.inf
+    seconds: float = 0.0
 
 
 class Viewer:
-    """Show a scene of Gaussians in the browser, among the photographs that it was made from.
+    """Show Gaussians in the browser, among the input cameras and images.
 
-    Each page that opens `url` has a camera of its own; what is chosen in the panel holds for all.
-    Pictures are coarse while something changes, and in full once it rests. A click on a camera
-    leads there. The page works in the units of `Frame`, so scenes may be of any size.
+    Each page that opens `url` has its own camera; the panel's settings hold for all pages. A click
+    on a camera moves the page's camera there. Scenes may have any size.
 
         with Viewer(views, gaussians) as viewer:
             viewer.wait()
 
     Args:
-        views: the photographs, [V].
-        gaussians: [N]; None to give them later, to `show`.
-        port: where it is taken, the next free one is used; 0 is any free one.
-        host: the address to listen at; 0.0.0.0 lets other machines in.
+        views: input views, [V].
+        gaussians: [N]; None to `show` them later.
+        port: the next free one is used if it is taken; 0: any free one.
+        host: address to listen at; 0.0.0.0 admits other machines.
 
     Raises:
         InputError: viser is not installed; views or Gaussians with batch dimensions.
@@ -62,45 +81,48 @@ class Viewer:
         _check_one_scene("views", views.images.shape[:-4])
         if gaussians is not None:
             _check_one_scene("gaussians", gaussians.opacities.shape[:-1])
-        self._frame = Frame.of(views.cameras, gaussians)
-        masks = None if views.masks is None else views.masks.cpu()
-        cameras = self._frame.cameras(views.cameras)
-        self._views = Views(cameras, views.images.cpu(), masks=masks)
-        self._up = mean_up(cameras)
+        self._frame = page_frame(views.cameras, gaussians)
+        self._views = self._frame.apply(
+            Views(views.cameras, views.images, masks=views.masks).to("cpu")
+        )
+        self._cameras = self._views.cameras
+        self._up, self._length = mean_up(self._cameras), frustum_length(self._cameras)
         self._scene: tuple[Gaussians | None, str] = (None, WAITING)
-        self._pages: dict[int, Page] = {}
+        self._version = object()
         self._closed = Event()
         self._server = viser.ViserServer(host=host, port=port, label="asysplat", verbose=False)
         self._add_panel()
         self._add_cameras()
         if gaussians is not None:
             self.show(gaussians)
-        self._set_first_camera()
-        self._server.on_client_connect(self._open_page)
-        self._server.on_client_disconnect(self._close_page)
+        first = self._server.initial_camera
+        first.position, first.look_at, first.up, first.fov = self._pose(0)
+        # At an input camera, its own thumbnail must not hide the scene.
+        first.near = 1.5 * self._length
+        self._thread = Thread(target=self._render_pages, name="asysplat-viewer", daemon=True)
+        self._thread.start()
 
     @property
     def url(self) -> str:
-        """Return the address to open in a browser."""
+        """The address to open in a browser."""
         host = self._server.get_host()
         return f"http://{'localhost' if host == '0.0.0.0' else host}:{self._server.get_port()}"
 
     def show(self, gaussians: Gaussians, text: str = "") -> None:
-        """Show another state of the scene from now on; may be called from any thread.
-
-        The Gaussians are copied, so the caller may go on to change them in place. Nothing waits
-        for the pages: each draws the newest scene when it gets to it.
+        """Show another state of the scene; may be called from any thread, and does not block.
 
         Args:
-            gaussians: [N].
-            text: what to write in the panel, in Markdown.
+            gaussians: [N], copied.
+            text: Markdown for the panel.
 
         Raises:
             InputError: Gaussians with batch dimensions.
         """
         _check_one_scene("gaussians", gaussians.opacities.shape[:-1])
-        # Kernels run without bounds checks: what they read must not change meanwhile.
-        self._scene = (self._frame.gaussians(gaussians), text)
+        # Copied, as kernels run without bounds checks: their inputs must not change meanwhile.
+        with torch.no_grad():
+            shown = self._frame.to_network(gaussians).map(lambda field: field.float().clone())
+        self._scene = (shown, text)
         degree = math.isqrt(gaussians.sh.shape[-2]) - 1
         if degree != self._sh_degree.max:
             self._sh_degree.max = degree
@@ -115,15 +137,11 @@ class Viewer:
             self.close()
 
     def close(self) -> None:
-        """Stop the server, after the pictures that are being drawn."""
+        """Stop the server, after the current rendering."""
         if self._closed.is_set():
             return
         self._closed.set()
-        pages = list(self._pages.values())
-        for page in pages:
-            page.leave()
-        for page in pages:
-            page.join()
+        self._thread.join()
         self._server.stop()
 
     def __enter__(self) -> "Viewer":
@@ -134,127 +152,115 @@ class Viewer:
 
     def _add_panel(self) -> None:
         gui = self._server.gui
-        # Its button would let anyone in, through a server of viser's.
+        # The share button would open the viewer to anyone, through a server of viser's.
         gui.configure_theme(show_logo=False, show_share_button=False)
         self._layer = gui.add_dropdown("Layer", LAYERS)
         self._sh_degree = gui.add_slider("SH degree", 0, 3, 1, 3)
-        self._least_opacity = gui.add_slider("Least opacity", 0.0, 1.0, 0.01, 0.0)
+        self._min_opacity = gui.add_slider("Minimum opacity", 0.0, 1.0, 0.01, 0.0)
         self._size = gui.add_slider("Size", 0.05, 1.0, 0.05, 1.0)
-        for handle in (self._layer, self._sh_degree, self._least_opacity, self._size):
+        for handle in (self._layer, self._sh_degree, self._min_opacity, self._size):
             handle.on_update(lambda _: self._change())
-        self._cameras_shown = gui.add_checkbox("Cameras", True)
+        self._show_cameras = gui.add_checkbox("Cameras", True)
         self._text = gui.add_markdown(WAITING)
 
     def _add_cameras(self) -> None:
-        scene, cameras = self._server.scene, self._views.cameras
+        scene = self._server.scene
         scene.set_up_direction(self._up.numpy())
         parent = scene.add_frame("/cameras", show_axes=False)
-        self._length = length = frustum_length(cameras)
-        # Who stands in a camera should see the scene, and not the photograph in its frustum.
-        self._server.initial_camera.near = 1.5 * length
-        for view in range(cameras.num_views):
-            fov, aspect = field_of_view(cameras, view)
+        for view in range(self._cameras.num_views):
+            fov, aspect = field_of_view(self._cameras, view)
             frustum = scene.add_camera_frustum(
                 f"/cameras/{view}",
                 fov=fov,
                 aspect=aspect,
                 # viser's scale is the cube root of the frustum's volume, not its length.
-                scale=length * (aspect * math.tan(fov / 2) ** 2 / 3) ** (1 / 3),
+                scale=self._length * (aspect * math.tan(fov / 2) ** 2 / 3) ** (1 / 3),
                 thickness=1.5,
                 thickness_units="screen",
                 color=(209, 98, 45),
                 image=thumbnail(self._views.images[view]),
-                wxyz=quaternion(cameras, view),
-                position=cameras.centers[view].numpy(),
+                wxyz=quaternion(self._cameras, view),
+                position=self._cameras.centers[view].numpy(),
             )
             frustum.on_click(self._click)
-
-        @self._cameras_shown.on_update
-        def _(_: Any) -> None:
-            parent.visible = self._cameras_shown.value
-
-    def _set_first_camera(self) -> None:
-        first = self._server.initial_camera
-        first.position, first.look_at, first.up, first.fov = self._stand(0)
+        self._show_cameras.on_update(lambda _: setattr(parent, "visible", self._show_cameras.value))
 
     def _click(self, event: Any) -> None:
-        # The page takes what it does not draw, in front of its near plane, for what was clicked.
-        camera, _ = camera_of(event.client.camera, MOST_PIXELS)
+        # The browser also reports clicks on frustums before its near plane, which are invisible.
+        camera, _ = page_camera(event.client.camera, MAX_PIXELS)
         start, ray = (torch.tensor(v).float() for v in (event.ray_origin, event.ray_direction))
         to_near = event.client.camera.near / (ray @ camera.cam_to_world[0, :3, 2])
-        view = pointed_at(self._views.cameras, self._length, start, to_near * ray)
+        view = clicked_camera(self._cameras, self._length, start, to_near * ray)
         if view is not None:
-            self._fly(event.client, view)
+            self._move(event.client, view)
 
-    def _fly(self, client: Any, view: int) -> None:
+    def _move(self, client: Any, view: int) -> None:
         camera = client.camera
         with client.atomic():
-            camera.position, camera.look_at, camera.up_direction, camera.fov = self._stand(view)
+            camera.position, camera.look_at, camera.up_direction, camera.fov = self._pose(view)
 
-    def _stand(self, view: int) -> tuple[ndarray, ndarray, ndarray, float]:
-        """Return position, look-at, up and field of view of a browser in an input camera.
+    def _pose(self, view: int) -> tuple:
+        """Return position, look-at, up and field of view of a page at an input camera.
 
-        The up is that of the scene, but for the camera's roll.
+        The up is the scene's, corrected for the camera's roll.
         """
-        cameras = self._views.cameras
-        right, _, forward = cameras.cam_to_world[view, :3, :3].unbind(-1)
-        position = cameras.centers[view]
+        right, _, forward = self._cameras.cam_to_world[view, :3, :3].unbind(-1)
+        position = self._cameras.centers[view]
         gaussians, _ = self._scene
         distance = 1.0 if gaussians is None else distance_along(gaussians, position, forward)
         up = self._up - (self._up @ right) * right
         vectors = (position, position + distance * forward, up)
-        return *(vector.numpy() for vector in vectors), field_of_view(cameras, view)[0]
-
-    # A coroutine runs before the page's next event, so that the page is known when it leaves.
-    async def _open_page(self, client: Any) -> None:
-        page = Page(lambda pixels: self._draw(client, pixels))
-        self._pages[client.client_id] = page
-        page.start()
-
-        async def moved(_: Any) -> None:
-            page.change()
-
-        client.camera.on_update(moved)
-
-    def _close_page(self, client: Any) -> None:
-        page = self._pages[client.client_id]
-        page.leave()
-        page.join()
-        del self._pages[client.client_id]
+        return *(vector.numpy() for vector in vectors), field_of_view(self._cameras, view)[0]
 
     def _change(self) -> None:
-        for page in list(self._pages.values()):
-            page.change()
+        self._version = object()
 
-    def _draw(self, client: Any, pixels: int) -> bool:
-        """Send a page what its camera sees, in about so many pixels; return whether in full."""
-        try:
-            return self._draw_newest(client, pixels)
-        except Exception as error:  # nobody waits for this thread: the panel tells
-            self._text.content = f"**{type(error).__name__}:** {error}"
-            return True
+    def _render_pages(self) -> None:
+        """Render each open page: coarsely after a change, and in full once nothing changes."""
+        pages: dict[int, Page] = {}
+        while not self._closed.wait(POLL_SECONDS):
+            for key, client in self._server.get_clients().items():
+                page, start = pages.setdefault(key, Page()), time.perf_counter()
+                state = (client.camera.update_timestamp, self._version)
+                changed = state != page.state
+                if not changed and start < page.due:
+                    continue
+                page.state, page.due = state, math.inf
+                in_full = self._draw(client, page.pixels if changed else MAX_PIXELS)
+                end = time.perf_counter()
+                if not changed:
+                    page.seconds = end - start
+                    continue
+                factor = min(max(TARGET_SECONDS / (end - start), 0.5), 2)
+                page.pixels = round(min(max(factor * page.pixels, MIN_PIXELS), MAX_PIXELS))
+                if not in_full:  # the pause leaves the machine at least half of its time
+                    page.due = end + max(REST_SECONDS, page.seconds)
 
-    def _draw_newest(self, client: Any, pixels: int) -> bool:
+    def _draw(self, client: Any, max_pixels: int) -> bool:
+        """Render a page's camera and send the image; return whether at full resolution."""
         start = time.perf_counter()
         gaussians, text = self._scene
         if gaussians is None:
             return True
-        look = Look(
-            self._layer.value, self._sh_degree.value, self._least_opacity.value, self._size.value
-        )
-        camera, in_full = camera_of(client.camera, pixels)
-        photograph = None
-        if look.layer == "error":
-            photograph = photograph_at(self._views, camera, IN_ONE_PLACE)
-            text = text if photograph is not None else f"{NO_PHOTOGRAPH}\n\n{text}"
-        picture = draw(gaussians, camera.to(gaussians.means.device), look, photograph)
-        if not self._pages[client.client_id].is_open:
+        try:
+            camera, in_full = page_camera(client.camera, max_pixels)
+            settings = (self._layer, self._sh_degree, self._min_opacity, self._size)
+            layer, *values = (handle.value for handle in settings)
+            target = image_at(self._views, camera, SAME_POSITION) if layer == "error" else None
+            if layer == "error" and target is None:
+                text = f"{NO_IMAGE}\n\n{text}"
+            camera = camera.to(gaussians.means.device)
+            image = draw_layer(gaussians, camera, layer, *values, target)
+            if client.client_id not in self._server.get_clients():  # closed meanwhile
+                return True
+            client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
+            client.flush()
+        except Exception as error:  # nothing reads this thread's errors but the panel
+            self._text.content = f"**{type(error).__name__}:** {error}"
             return True
-        client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90)
-        client.flush()
-        took = 1000 * (time.perf_counter() - start)
-        told = f"{gaussians.num_gaussians:,} Gaussians, {camera.width} x {camera.height} pixels "
-        self._text.content = f"{told}in {took:.0f} ms\n\n{text}"
+        size = f"{gaussians.num_gaussians:,} Gaussians, {camera.width} x {camera.height} pixels"
+        milliseconds = 1000 * (time.perf_counter() - start)
+        self._text.content = f"{size} in {milliseconds:.0f} ms\n\n{text}"
         return in_full
 
 

@@ -14,7 +14,7 @@ from rich.table import Table
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.evaluation.baselines import mean_color_images, nearest_view_images
+from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.scene import measure_scene
@@ -145,9 +145,8 @@ class Results:
 
     def _baselines(self, inputs: Views, held_out: Views) -> dict[str, float]:
         """Measure what a copy of the nearest input, and the mean color of all, achieve."""
-        baselines = {"nearest_view": nearest_view_images, "mean_color": mean_color_images}
         values: dict[str, list[float]] = {}
-        for name, draw in baselines.items():
+        for name, draw in BASELINES.items():
             images = draw(inputs, held_out)
             for view in range(held_out.num_views):  # SSIM of all at once takes much memory
                 metrics = self._protocol.image_metrics(

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from asysplat.errors import InputError
 from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
-from asysplat.refinement.isotropic import footprints, isotropic_gaussians, project
+from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import SPREAD, merge_to_limit
 from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.views import resize
@@ -130,8 +130,8 @@ def sample_colors(points: Float[Tensor, "N 3"], views: Views) -> Float[Tensor, "
     """Compute the mean color of the pixels that points project to; gray if all are masked out."""
     total, count = torch.zeros_like(points), torch.zeros_like(points[:, :1])
     for view in range(views.num_views):
-        pixels, depth = project(points, views.cameras.select([view]))
-        visible = depth[0].nonzero()[:, 0]
+        pixels, _, inside = views.cameras.select([view]).project(points)
+        visible = inside[0].nonzero()[:, 0]
         column, row = pixels[0, visible].long().unbind(-1)
         if views.masks is not None:
             valid = views.masks[view, row, column]

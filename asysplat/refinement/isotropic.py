@@ -26,19 +26,6 @@ def isotropic_gaussians(
     )
 
 
-def project(
-    points: Float[Tensor, "N 3"], cameras: Cameras
-) -> tuple[Float[Tensor, "V N 2"], Float[Tensor, "V N"]]:
-    """Project points into each image: positions in pixels and depths, 0 outside the image."""
-    rotation = cameras.cam_to_world[:, :3, :3]
-    local = (points - cameras.centers[:, None]) @ rotation
-    depth = local[..., 2]
-    pixels = (local @ cameras.intrinsics.mT)[..., :2] / depth.clamp_min(1e-12)[..., None]
-    size = pixels.new_tensor([cameras.width, cameras.height])
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
-    return pixels, depth.where(inside, 0)
-
-
 def footprints(points: Float[Tensor, "N 3"], cameras: Cameras) -> Float[Tensor, "N"]:
     """Compute the size of a pixel at each point: the smallest over the views that show the point.
 
@@ -49,9 +36,9 @@ def footprints(points: Float[Tensor, "N 3"], cameras: Cameras) -> Float[Tensor, 
     outside = visible.clone()
     for view in range(cameras.num_views):
         camera = cameras.select([view])
-        _, depth = project(points, camera)
+        _, depth, inside = camera.project(points)
         size = depth[0] / focal[view]
-        visible = torch.minimum(visible, size.where(depth[0] > 0, torch.inf))
+        visible = torch.minimum(visible, size.where(inside[0], torch.inf))
         outside = torch.minimum(outside, (points - camera.centers).norm(dim=-1) / focal[view])
     sizes = torch.where(visible.isfinite(), visible, outside)
     return sizes.clamp_min(torch.finfo(points.dtype).tiny)

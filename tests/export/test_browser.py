@@ -9,10 +9,9 @@ import pytest
 from browser import find_chromium, open_page
 
 from asysplat.data import ProceduralScene
-from asysplat.export.frame import camera_of
-from asysplat.export.layers import Look, draw
-from asysplat.export.page import MOST_PIXELS
-from asysplat.export.viewer import Viewer
+from asysplat.export.frame import page_camera
+from asysplat.export.layers import draw_layer
+from asysplat.export.viewer import MAX_PIXELS, Viewer
 
 pytest.importorskip("viser", minversion="1.1")
 HEIGHT, WIDTH = 480, 900
@@ -50,8 +49,8 @@ def arrive(tab, viewer, client, view, folder):
     until(lambda: np.allclose(client.camera.position, place, atol=1e-4))
 
     def apart():
-        camera, _ = camera_of(client.camera, MOST_PIXELS)
-        rendered = draw(viewer._scene[0], camera, Look()) / 255
+        camera, _ = page_camera(client.camera, MAX_PIXELS)
+        rendered = draw_layer(viewer._scene[0], camera) / 255
         screenshot = tab.screenshot()
         cv2.imwrite(str(folder / f"{view}.png"), (255 * screenshot[..., ::-1]).astype(np.uint8))
         rendered = cv2.resize(rendered, (WIDTH, HEIGHT))  # a slow page has fewer pixels
@@ -64,17 +63,17 @@ def arrive(tab, viewer, client, view, folder):
 @pytest.mark.medium
 def test_a_person_sees_what_is_rendered_and_flies_by_clicks(chromium, viewer, tmp_path):
     cameras = viewer._views.cameras
-    viewer._cameras_shown.value = False
+    viewer._show_cameras.value = False
     with open_page(chromium, viewer.url, tmp_path, WIDTH, HEIGHT) as tab:
         (client,) = until(viewer._server.get_clients).values()
         arrive(tab, viewer, client, 0, tmp_path)
 
         # Click on the third camera, from behind them all.
-        viewer._cameras_shown.value = True
+        viewer._show_cameras.value = True
         center, forward = cameras.centers.mean(0), cameras.cam_to_world[0, :3, 2]
         client.camera.position = (center - 2 * forward).numpy()
         client.camera.look_at = center.numpy()
-        camera, _ = camera_of(client.camera, MOST_PIXELS)
+        camera, _ = page_camera(client.camera, MAX_PIXELS)
         inside = camera.cam_to_world[0].inverse() @ cameras.cam_to_world[2]
         place = camera.intrinsics[0] @ (inside[:3, 3] + 0.02 * inside[:3, 2])
 
@@ -83,6 +82,6 @@ def test_a_person_sees_what_is_rendered_and_flies_by_clicks(chromium, viewer, tm
             return np.allclose(client.camera.position, cameras.centers[2], atol=1e-4)
 
         until(clicked)
-        viewer._cameras_shown.value = False
+        viewer._show_cameras.value = False
         arrive(tab, viewer, client, 2, tmp_path)
         assert tab.errors == []

@@ -7,16 +7,16 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from asysplat import render
+from asysplat import Views, render
 from asysplat.export.frame import (
-    FRUSTUM,
-    Frame,
-    camera_of,
+    FRUSTUM_LENGTHS,
+    clicked_camera,
     distance_along,
     field_of_view,
     frustum_length,
     mean_up,
-    pointed_at,
+    page_camera,
+    page_frame,
     quaternion,
 )
 
@@ -27,6 +27,11 @@ def moved(cameras, factor, offset):
     return replace(cameras, cam_to_world=poses)
 
 
+def in_frame(frame, cameras):
+    images = torch.zeros(cameras.num_views, 3, cameras.height, cameras.width)
+    return frame.apply(Views(cameras, images)).cameras
+
+
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e4])
 def test_a_scene_of_any_size_looks_the_same(make_scene, factor):
     gaussians, cameras = make_scene(count=60, views=4, height=24, width=32, dtype=torch.float32)
@@ -34,30 +39,19 @@ def test_a_scene_of_any_size_looks_the_same(make_scene, factor):
     scaled = gaussians.scale_by(factor)
     scaled = replace(scaled, means=scaled.means + offset)
     placed = moved(cameras, factor, offset)
-    frame = Frame.of(placed, scaled)
-    inside = frame.cameras(placed)
+    frame = page_frame(placed, scaled)
+    inside = in_frame(frame, placed)
     assert inside.centers.mean(0).norm() < 1e-4
     assert inside.centers.norm(dim=-1).max() == pytest.approx(1, abs=1e-3)
-    image = render(frame.gaussians(scaled), inside).image
+    image = render(frame.to_network(scaled), inside).image
     torch.testing.assert_close(image, render(gaussians, cameras).image, atol=2e-3, rtol=0)
 
 
 def test_cameras_in_one_place_leave_the_unit_to_the_gaussians(make_scene):
     gaussians, cameras = make_scene(count=60, dtype=torch.float32)
-    assert Frame.of(cameras, None).unit == 1
-    frame = Frame.of(cameras, gaussians.scale_by(1000.0))
-    assert 2000 < frame.unit < 6000
-
-
-def test_gaussians_are_copied(make_scene):
-    gaussians, cameras = make_scene(views=3, dtype=torch.float32)
-    copy = Frame.of(cameras, None).gaussians(gaussians.map(lambda tensor: tensor.requires_grad_()))
-    before = copy.map(torch.clone)
-    with torch.no_grad():
-        gaussians.map(lambda tensor: tensor.zero_())
-    for name in ("means", "quats", "scales", "opacities", "sh"):
-        torch.testing.assert_close(getattr(copy, name), getattr(before, name), rtol=0, atol=0)
-        assert not getattr(copy, name).requires_grad
+    assert page_frame(cameras, None).scale == 1
+    frame = page_frame(cameras, gaussians.scale_by(1000.0))
+    assert 2000 < 1 / frame.scale < 6000
 
 
 def test_up_is_the_mean_of_the_cameras(make_scene):
@@ -73,10 +67,10 @@ def test_up_is_the_mean_of_the_cameras(make_scene):
 def test_frustums_are_half_as_long_as_cameras_are_apart(make_scene):
     _, cameras = make_scene(views=3, dtype=torch.float32)
     poses = cameras.cam_to_world.clone()
-    for apart, length in ((0.2, 0.1), (1e-3, FRUSTUM[0]), (5.0, FRUSTUM[1])):
+    for apart, length in ((0.2, 0.1), (1e-3, FRUSTUM_LENGTHS[0]), (5.0, FRUSTUM_LENGTHS[1])):
         poses[:, :3, 3] = torch.arange(3.0)[:, None] * torch.tensor([apart, 0, 0])
         assert frustum_length(replace(cameras, cam_to_world=poses)) == pytest.approx(length)
-    assert frustum_length(cameras.select([0])) == FRUSTUM[1]
+    assert frustum_length(cameras.select([0])) == FRUSTUM_LENGTHS[1]
 
 
 def test_the_look_at_is_where_the_gaussians_are(make_scene):
@@ -102,7 +96,7 @@ def test_a_page_that_stands_in_a_camera_has_it(make_scene):
     focal = torch.tensor([[70.0, 0, 40], [0, 70, 30], [0, 0, 1]])
     cameras = replace(cameras, intrinsics=focal.repeat(3, 1, 1))
     for view in range(3):
-        camera, in_full = camera_of(page_of(cameras, view), 60 * 80)
+        camera, in_full = page_camera(page_of(cameras, view), 60 * 80)
         assert in_full and (camera.height, camera.width) == (60, 80)
         torch.testing.assert_close(camera.intrinsics[0], focal)
         torch.testing.assert_close(camera.cam_to_world[0], cameras.cam_to_world[view])
@@ -111,7 +105,7 @@ def test_a_page_that_stands_in_a_camera_has_it(make_scene):
 
 def test_fewer_pixels_see_as_much(make_scene):
     _, cameras = make_scene(height=600, width=800, dtype=torch.float32)
-    camera, in_full = camera_of(page_of(cameras, 0), 30_000)
+    camera, in_full = page_camera(page_of(cameras, 0), 30_000)
     assert not in_full and (camera.height, camera.width) == (150, 200)
     expected = 2 * math.atan(75 / camera.intrinsics[0, 1, 1].item())
     assert expected == pytest.approx(field_of_view(cameras, 0)[0])
@@ -123,13 +117,13 @@ def test_a_ray_meets_the_first_photograph_that_is_drawn(make_scene):
     poses[:, 2, 3] = torch.tensor([0.0, 1, 2])  # one behind the other, looking ahead
     cameras = replace(cameras, cam_to_world=poses)
     start, ahead = torch.zeros(3), torch.tensor([0.01, 0.01, 1])
-    assert pointed_at(cameras, 0.1, start, 0.01 * ahead) == 0
-    assert pointed_at(cameras, 0.1, start, 0.15 * ahead) == 1
-    assert pointed_at(cameras, 0.1, start, 1.15 * ahead) == 2
-    assert pointed_at(cameras, 0.1, torch.tensor([0.0, 0, 5]), -0.01 * ahead) == 2
-    assert pointed_at(cameras, 0.1, start, -0.01 * ahead) is None
-    assert pointed_at(cameras, 0.1, torch.tensor([0.2, 0, 0]), 0.01 * ahead) is None
+    assert clicked_camera(cameras, 0.1, start, 0.01 * ahead) == 0
+    assert clicked_camera(cameras, 0.1, start, 0.15 * ahead) == 1
+    assert clicked_camera(cameras, 0.1, start, 1.15 * ahead) == 2
+    assert clicked_camera(cameras, 0.1, torch.tensor([0.0, 0, 5]), -0.01 * ahead) == 2
+    assert clicked_camera(cameras, 0.1, start, -0.01 * ahead) is None
+    assert clicked_camera(cameras, 0.1, torch.tensor([0.2, 0, 0]), 0.01 * ahead) is None
     # 0.1 * 80 / 80 wide: 0.05 to each side.
     for x, met in ((0.049, 0), (0.051, None)):
         ray = torch.tensor([0, 0, 0.01])
-        assert pointed_at(cameras, 0.1, torch.tensor([x, 0, 0]), ray) == met
+        assert clicked_camera(cameras, 0.1, torch.tensor([x, 0, 0]), ray) == met

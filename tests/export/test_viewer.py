@@ -15,8 +15,8 @@ import torch
 from asysplat import Views
 from asysplat.errors import InputError
 from asysplat.export.frame import quaternion
-from asysplat.export.layers import LAYERS, Look, draw
-from asysplat.export.viewer import IN_ONE_PLACE, NO_PHOTOGRAPH, Viewer, photograph_at
+from asysplat.export.layers import LAYERS, draw_layer, image_at
+from asysplat.export.viewer import MAX_PIXELS, NO_IMAGE, SAME_POSITION, Viewer
 
 pytest.importorskip("viser", minversion="1.1")
 from wire import TOLERANCE, open_page
@@ -40,8 +40,8 @@ def viewer(scene):
 
 
 def inside(viewer, gaussians):
-    """What the viewer makes of a scene and its cameras, to draw from."""
-    return viewer._frame.gaussians(gaussians), viewer._views.cameras
+    """Return a scene and the cameras in the frame of the pages."""
+    return viewer._frame.to_network(gaussians), viewer._views.cameras
 
 
 def until(condition):
@@ -106,25 +106,26 @@ def test_pages_are_sent_what_render_gives_for_their_cameras(scene, viewer):
     with open_page(viewer) as first, open_page(viewer) as second:
         for page, view in ((first, 0), (second, 3), (first, 2)):
             page.stand(cameras, view)
-            page.picture_like(draw(shown, cameras.select([view]), Look()))
+            page.picture_like(draw_layer(shown, cameras.select([view])))
         viewer.show(gaussians)
-        first.picture_like(draw(gaussians, views.cameras.select([2]), Look()))
+        first.picture_like(draw_layer(gaussians, views.cameras.select([2])))
 
 
 def test_the_panel_changes_what_is_sent(scene, viewer):
     gaussians, cameras = inside(viewer, scene[0])
     camera = cameras.select([1])
-    photograph = photograph_at(viewer._views, camera, IN_ONE_PLACE)
-    looks = [*map(Look, LAYERS), Look("color", 0, 0.5, 0.5)]
-    expected = [draw(gaussians, camera, look, photograph) for look in looks]
+    target = image_at(viewer._views, camera, SAME_POSITION)
+    settings = [(layer, 1, 0.0, 1.0) for layer in LAYERS] + [("color", 0, 0.5, 0.5)]
+    expected = [draw_layer(gaussians, camera, *values, target) for values in settings]
     for one, other in combinations(expected, 2):
         assert np.abs(one.astype(int) - other).mean() > 2 * TOLERANCE
     with open_page(viewer) as page:
         page.stand(cameras, 1)
-        for look, picture in zip(looks, expected, strict=True):
-            viewer._layer.value, viewer._sh_degree.value = look.layer, min(look.sh_degree, 1)
-            viewer._least_opacity.value, viewer._size.value = look.least_opacity, look.size
-            page.picture_like(picture)
+        handles = (viewer._layer, viewer._sh_degree, viewer._min_opacity, viewer._size)
+        for values, image in zip(settings, expected, strict=True):
+            for handle, value in zip(handles, values, strict=True):
+                handle.value = value
+            page.picture_like(image)
 
 
 def test_error_asks_for_a_place_where_a_photograph_was_taken(scene, viewer):
@@ -134,10 +135,10 @@ def test_error_asks_for_a_place_where_a_photograph_was_taken(scene, viewer):
     poses[0, 0, 3] += 0.1
     with open_page(viewer) as page:
         page.stand(replace(cameras, cam_to_world=poses), 0)
-        until(lambda: NO_PHOTOGRAPH in viewer._text.content)
+        until(lambda: NO_IMAGE in viewer._text.content)
         page.stand(cameras, 0)
         until(lambda: "Gaussians" in viewer._text.content.partition("\n")[0])
-        until(lambda: NO_PHOTOGRAPH not in viewer._text.content)
+        until(lambda: NO_IMAGE not in viewer._text.content)
 
 
 def test_the_newest_scene_wins_and_nobody_waits_for_a_picture(scene, monkeypatch):
@@ -149,9 +150,9 @@ def test_the_newest_scene_wins_and_nobody_waits_for_a_picture(scene, monkeypatch
         drawn.append(gaussians.num_gaussians)
         started.set()
         assert turn.wait(60)
-        return draw(gaussians, *rest)
+        return draw_layer(gaussians, *rest)
 
-    monkeypatch.setattr("asysplat.export.viewer.draw", slow)
+    monkeypatch.setattr("asysplat.export.viewer.draw_layer", slow)
     with Viewer(views, port=0) as viewer, open_page(viewer) as page:
         page.stand(viewer._views.cameras, 0)
         viewer.show(gaussians)
@@ -172,7 +173,7 @@ def test_a_scene_that_changes_in_place_is_shown_as_it_was(scene, viewer):
     gaussians.sh.zero_()
     with open_page(viewer) as page:
         page.stand(cameras, 0)
-        page.picture_like(draw(before, cameras.select([0]), Look()))
+        page.picture_like(draw_layer(before, cameras.select([0])))
 
 
 def test_many_scenes_from_another_thread(scene, viewer):
@@ -191,8 +192,8 @@ def test_many_scenes_from_another_thread(scene, viewer):
         for view in (1, 2, 3, 0):
             page.stand(cameras, view)
         thread.join()
-        shown = viewer._frame.gaussians(gaussians)
-        page.picture_like(draw(shown, cameras.select([0]), Look()))
+        shown = viewer._frame.to_network(gaussians)
+        page.picture_like(draw_layer(shown, cameras.select([0])))
         until(lambda: "29/29" in viewer._text.content)
 
 
@@ -207,52 +208,68 @@ def test_the_degrees_of_sh_follow_the_scene(scene, viewer):
     assert viewer._sh_degree.value == 1
 
 
-def test_what_goes_wrong_is_told_in_the_panel_and_mended_by_the_next_scene(scene, viewer):
+def test_errors_are_in_the_panel_until_the_next_scene(scene, viewer, monkeypatch):
     gaussians, _ = scene
     shown, cameras = inside(viewer, gaussians)
+
+    def fail(*_):
+        raise RuntimeError("broken")
+
     with open_page(viewer) as page:
         page.stand(cameras, 0)
-        viewer.show(gaussians.map(lambda tensor: tensor.to("meta")))
-        until(lambda: viewer._text.content.startswith("**"))
+        with monkeypatch.context() as patch:
+            patch.setattr("asysplat.export.viewer.draw_layer", fail)
+            viewer.show(gaussians)
+            until(lambda: viewer._text.content == "**RuntimeError:** broken")
         viewer.show(gaussians, "fixed")
-        page.picture_like(draw(shown, cameras.select([0]), Look()))
+        page.picture_like(draw_layer(shown, cameras.select([0])))
         until(lambda: "fixed" in viewer._text.content)
 
 
-def test_a_page_that_leaves_is_dropped(scene, viewer):
-    _, cameras = inside(viewer, scene[0])
-    with open_page(viewer) as first:
-        first.stand(cameras, 0)
-        until(lambda: viewer._pages)
-        (page,) = viewer._pages.values()
-        with open_page(viewer) as second:
-            second.stand(cameras, 1)
-            until(lambda: len(viewer._pages) == 2)
-        until(lambda: list(viewer._pages.values()) == [page])
-    until(lambda: not viewer._pages)
-    page.join()
-
-
-def test_closing_with_a_page_open(scene):
+def test_coarse_after_a_change_and_in_full_at_rest(scene, monkeypatch):
     gaussians, views = scene
+    pixels = []
+
+    def draw(gaussians, camera, *rest):
+        pixels.append(camera.height * camera.width)
+        return draw_layer(gaussians, camera, *rest)
+
+    monkeypatch.setattr("asysplat.export.viewer.draw_layer", draw)
     with Viewer(views, gaussians, port=0) as viewer, open_page(viewer) as page:
-        page.stand(viewer._views.cameras, 0)
-        page.picture()
-        pages = list(viewer._pages.values())
-        viewer.close()
-        for page in pages:
-            page.join()
-    assert len(pages) == 1
+        page.stand(viewer._views.cameras.resized(600, 800), 0)
+        until(lambda: pixels and pixels[-1] == 600 * 800)
+        time.sleep(0.5)
+        assert len(pixels) == 2 and pixels[0] < MAX_PIXELS / 15
+        page.stand(viewer._views.cameras.resized(600, 800), 1)
+        until(lambda: len(pixels) > 2)
+        assert pixels[2] < 600 * 800
+        until(lambda: pixels[-1] == 600 * 800)
+
+
+def test_pages_come_and_go(scene):
+    gaussians, views = scene
+    with Viewer(views, gaussians, port=0) as viewer:
+        cameras = viewer._views.cameras
+        with open_page(viewer) as first:
+            first.stand(cameras, 0)
+            with open_page(viewer) as second:
+                second.stand(cameras, 1)
+                until(lambda: len(viewer._server.get_clients()) == 2)
+            until(lambda: len(viewer._server.get_clients()) == 1)
+            first.stand(cameras, 2)
+            first.picture_like(draw_layer(inside(viewer, gaussians)[0], cameras.select([2])))
+            viewer.close()
+            assert not viewer._thread.is_alive()
 
 
 def test_a_click_on_a_camera_leads_there(scene, viewer):
     gaussians, cameras = inside(viewer, scene[0])
     with open_page(viewer) as page:
         page.stand(cameras, 0)
-        until(lambda: viewer._pages)
+        until(viewer._server.get_clients)
         (client,) = viewer._server.get_clients().values()
         for view in (2, 3, 0):
-            viewer._fly(client, view)
+            viewer._move(client, view)
             pose = cameras.cam_to_world[view]
             np.testing.assert_allclose(client.camera.position, pose[:3, 3], atol=1e-5)
             forward = client.camera.look_at - client.camera.position
@@ -269,7 +286,7 @@ def test_without_gaussians_it_waits_for_them(scene):
     with Viewer(views, port=0) as viewer, open_page(viewer) as page:
         _, cameras = inside(viewer, gaussians)
         page.stand(cameras, 0)
-        until(lambda: viewer._pages)
+        until(viewer._server.get_clients)
         assert "Waiting" in viewer._text.content
         viewer.show(gaussians, "here")
-        page.picture_like(draw(viewer._frame.gaussians(gaussians), cameras.select([0]), Look()))
+        page.picture_like(draw_layer(viewer._frame.to_network(gaussians), cameras.select([0])))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from asysplat import Cameras, Gaussians, Views, render
-from asysplat.export.layers import LAYERS, Look, draw, photograph_at, thumbnail
+from asysplat.export.layers import LAYERS, draw_layer, image_at, thumbnail
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def bytes_of(image):
 
 def test_color_and_alpha_are_those_of_the_renderer(scene):
     rendering = render(*scene)
-    color, alpha = draw(*scene, Look()), draw(*scene, Look(layer="alpha"))
+    color, alpha = draw_layer(*scene), draw_layer(*scene, layer="alpha")
     np.testing.assert_array_equal(color, bytes_of(rendering.image[0]).transpose(1, 2, 0))
     for channel in range(3):
         np.testing.assert_array_equal(alpha[..., channel], bytes_of(rendering.alpha[0]))
@@ -30,7 +30,7 @@ def test_color_and_alpha_are_those_of_the_renderer(scene):
 
 @pytest.mark.parametrize("layer", LAYERS)
 def test_every_layer_is_a_picture_for_the_browser(scene, layer):
-    picture = draw(*scene, Look(layer=layer), torch.rand(3, 24, 32))
+    picture = draw_layer(*scene, layer=layer, target=torch.rand(3, 24, 32))
     assert picture.shape == (24, 32, 3) and picture.dtype == np.uint8
     assert np.ptp(picture) > 50
 
@@ -46,7 +46,7 @@ def test_the_nearest_is_the_brightest():
         opacities=torch.full((2,), 0.99),
         sh=torch.zeros(2, 1, 3),
     )
-    picture = draw(gaussians, camera, Look(layer="depth")).astype(int)
+    picture = draw_layer(gaussians, camera, layer="depth").astype(int)
     near, far, nothing = (picture[8, column].sum() for column in (6, 26, 16))
     assert near > far > nothing
 
@@ -54,49 +54,49 @@ def test_the_nearest_is_the_brightest():
 def test_an_empty_picture_has_no_depth(scene):
     gaussians, camera = scene
     behind = replace(gaussians, means=gaussians.means * torch.tensor([1, 1, -1.0]))
-    assert np.ptp(draw(behind, camera, Look(layer="depth")), axis=(0, 1)).max() == 0
+    assert np.ptp(draw_layer(behind, camera, layer="depth"), axis=(0, 1)).max() == 0
 
 
 def test_what_is_hidden_is_not_there(scene):
     gaussians, camera = scene
     least = gaussians.opacities.median().item()
     kept = gaussians.keep(gaussians.opacities >= least)
-    hidden = draw(gaussians, camera, Look(least_opacity=least))
-    np.testing.assert_array_equal(hidden, draw(kept, camera, Look()))
+    hidden = draw_layer(gaussians, camera, min_opacity=least)
+    np.testing.assert_array_equal(hidden, draw_layer(kept, camera))
     assert 0 < kept.num_gaussians < gaussians.num_gaussians
 
 
 def test_sh_of_higher_degrees_are_left_out(scene):
     gaussians, camera = scene
     constant = replace(gaussians, sh=gaussians.sh[:, :1])
-    drawn = draw(gaussians, camera, Look(sh_degree=0))
-    np.testing.assert_array_equal(drawn, draw(constant, camera, Look()))
-    assert (drawn != draw(gaussians, camera, Look(sh_degree=1))).any()
+    drawn = draw_layer(gaussians, camera, sh_degree=0)
+    np.testing.assert_array_equal(drawn, draw_layer(constant, camera))
+    assert (drawn != draw_layer(gaussians, camera, sh_degree=1)).any()
 
 
 def test_smaller_gaussians_cover_less(scene):
     gaussians, camera = scene
-    half = draw(gaussians, camera, Look(layer="alpha", size=0.5))
+    half = draw_layer(gaussians, camera, layer="alpha", size=0.5)
     smaller = replace(gaussians, scales=gaussians.scales / 2)
-    np.testing.assert_array_equal(half, draw(smaller, camera, Look(layer="alpha")))
-    assert half.mean() < 0.8 * draw(gaussians, camera, Look(layer="alpha")).mean()
+    np.testing.assert_array_equal(half, draw_layer(smaller, camera, layer="alpha"))
+    assert half.mean() < 0.8 * draw_layer(gaussians, camera, layer="alpha").mean()
 
 
 def test_error_is_dark_where_right_and_where_nothing_is_known(scene):
     rendered = render(*scene).image[0].clamp(0, 1)
-    black = draw(*scene, Look(layer="error"), rendered)
+    black = draw_layer(*scene, layer="error", target=rendered)
     assert np.ptp(black, axis=(0, 1)).max() == 0
     wrong = rendered.clone()
     wrong[:, :12] = (wrong[:, :12] + 0.5) % 1
     wrong[:, :, :16] = torch.nan
-    error = draw(*scene, Look(layer="error"), wrong)
+    error = draw_layer(*scene, layer="error", target=wrong)
     assert (error[:12, 16:] != black[:12, 16:]).any(-1).all()
     np.testing.assert_array_equal(error[:, :16], black[:, :16])
     np.testing.assert_array_equal(error[12:], black[12:])
 
 
 def test_without_a_photograph_error_shows_the_color(scene):
-    np.testing.assert_array_equal(draw(*scene, Look(layer="error")), draw(*scene, Look()))
+    np.testing.assert_array_equal(draw_layer(*scene, layer="error"), draw_layer(*scene))
 
 
 def sky(cameras):
@@ -112,7 +112,7 @@ def photographs(make_scene):
 
 def test_from_its_own_camera_the_photograph_comes_back(photographs):
     for view in range(3):
-        seen = photograph_at(photographs, photographs.cameras.select([view]), 1e-3)
+        seen = image_at(photographs, photographs.cameras.select([view]), 1e-3)
         torch.testing.assert_close(seen, photographs.images[view], atol=1e-4, rtol=0)
 
 
@@ -125,7 +125,7 @@ def test_another_camera_in_its_place_sees_the_same_directions(photographs):
     )
     intrinsics = torch.tensor([[[30.0, 0, 20], [0, 30, 15], [0, 0, 1]]])
     camera = Cameras(intrinsics, own.cam_to_world @ turn, 30, 40)
-    seen = photograph_at(photographs, camera, 1e-3)
+    seen = image_at(photographs, camera, 1e-3)
     known = seen.isfinite().all(0)
     assert 0.3 < known.float().mean() < 1
     torch.testing.assert_close(seen[:, known], sky(camera)[0][:, known], atol=0.01, rtol=0)
@@ -135,14 +135,14 @@ def test_behind_a_camera_there_is_no_photograph(photographs):
     around = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
     camera = photographs.cameras.select([0])
     camera = replace(camera, cam_to_world=camera.cam_to_world @ around)
-    assert photograph_at(photographs, camera, 1e-3).isnan().all()
+    assert image_at(photographs, camera, 1e-3).isnan().all()
 
 
 def test_masked_pixels_are_not_known(photographs):
     masks = torch.ones(3, 48, 64, dtype=torch.bool)
     masks[:, 10:20] = False
     masked = replace(photographs, masks=masks)
-    seen = photograph_at(masked, photographs.cameras.select([2]), 1e-3)
+    seen = image_at(masked, photographs.cameras.select([2]), 1e-3)
     torch.testing.assert_close(seen.isfinite().all(0), masks[2])
 
 
@@ -150,7 +150,7 @@ def test_where_no_one_stood_there_is_none(photographs):
     camera = photographs.cameras.select([0])
     poses = camera.cam_to_world.clone()
     poses[:, 0, 3] += 0.01
-    assert photograph_at(photographs, replace(camera, cam_to_world=poses), 1e-3) is None
+    assert image_at(photographs, replace(camera, cam_to_world=poses), 1e-3) is None
 
 
 def test_of_several_in_one_place_the_one_that_looks_that_way(photographs):
@@ -159,7 +159,7 @@ def test_of_several_in_one_place_the_one_that_looks_that_way(photographs):
     cameras = replace(photographs.cameras.select([0, 0]), cam_to_world=poses)
     views = Views(cameras, sky(cameras))
     for view in range(2):
-        seen = photograph_at(views, cameras.select([view]), 1e-3)
+        seen = image_at(views, cameras.select([view]), 1e-3)
         torch.testing.assert_close(seen, views.images[view], atol=1e-4, rtol=0)
 
 

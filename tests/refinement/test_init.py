@@ -14,7 +14,7 @@ from asysplat.refinement.init import (
     gaussians_from_prior,
     sample_colors,
 )
-from asysplat.refinement.isotropic import footprints, project
+from asysplat.refinement.isotropic import footprints
 from asysplat.refinement.merge import SPREAD
 from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Cameras, Views
@@ -49,7 +49,7 @@ def test_a_prior_puts_a_gaussian_where_each_pixel_sees_its_surface(room):
     assert gaussians.num_gaussians == room.depths.numel()
     for view in range(room.num_views):
         part = slice(view * 24 * 32, (view + 1) * 24 * 32)
-        pixels, depth = project(gaussians.means[part], room.cameras.select([view]))
+        pixels, depth, _ = room.cameras.select([view]).project(gaussians.means[part])
         torch.testing.assert_close(depth[0], room.depths[view].flatten(), rtol=1e-4, atol=0)
         y, x = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(32) + 0.5, indexing="ij")
         at = torch.stack((x, y), -1).flatten(0, 1)
@@ -99,16 +99,6 @@ def test_masked_pixels_get_no_gaussian():
     assert torch.equal(some.means, expected.means) and torch.equal(some.sh, expected.sh)
     none = gaussians_from_prior(replace(views, masks=torch.zeros_like(masks)), prior)
     assert torch.equal(none.means, every.means)
-
-
-def test_points_fall_where_the_renderer_draws_them():
-    views = front_views(places=[(0.0, 0, 0), (1.0, 0, 0)])
-    points = torch.tensor([[0.0, 0, 2], [1.0, -1, 4], [0.0, 0, -2], [-3.0, 0, 2], [0.0, 0, 0]])
-    pixels, depth = project(points, views.cameras)
-    # x = 5 X / Z + 5, y = 5 Y / Z + 4
-    torch.testing.assert_close(pixels[0, :2], torch.tensor([[5.0, 4], [6.25, 2.75]]))
-    torch.testing.assert_close(pixels[1, :2], torch.tensor([[2.5, 4], [5.0, 2.75]]))
-    assert depth.tolist() == [[2, 4, 0, 0, 0], [2, 4, 0, 0, 0]]
 
 
 def test_footprints_are_those_of_the_finest_camera_that_sees_a_point():

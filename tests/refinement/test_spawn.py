@@ -12,7 +12,7 @@ from asysplat.refinement.densification.spawn import (
     render_views,
     spawn_at_errors,
 )
-from asysplat.refinement.isotropic import isotropic_gaussians, project
+from asysplat.refinement.isotropic import isotropic_gaussians
 from asysplat.rendering import render
 from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Views
@@ -40,7 +40,7 @@ def test_they_are_at_wrong_pixels_on_the_surface_in_its_color(room):
     found = spawn_at_errors(room, rendered, room.depths, 40, generator()).validate()
     assert found.num_gaussians == 40
     camera = room.cameras.select([2])
-    pixels, depth = (each[0] for each in project(found.means, camera))
+    (pixels,), (depth,), _ = camera.project(found.means)
     column, row = pixels.long().unbind(-1)
     assert (pixels - pixels.floor() - 0.5).abs().max() <= 1e-3  # at their centers
     # An error is averaged over 3 x 3 pixels.
