@@ -4,7 +4,7 @@ import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import fields, replace
-from functools import cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +19,8 @@ from torch import Tensor
 from asysplat.benchmark.compare import ERROR, TIME, Watched
 from asysplat.benchmark.options import CPU
 from asysplat.benchmark.plot import time_against_error
-from asysplat.benchmark.scenes import SCENES, SMALLER, Scene, camera_at_origin, find_scenes
-from asysplat.benchmark.table import error, limited, machine_note, make_table, number, spread, text
+from asysplat.benchmark.scenes import SCENES, SMALLER, Scene, find_scenes
+from asysplat.benchmark.table import error, machine_note, make_table, number, spread, text
 from asysplat.benchmark.timing import (
     Measurement,
     Result,
@@ -44,14 +44,7 @@ CULLING = tuple(field.name for field in fields(Culling))
 CUDA_CULLING = tuple(name for name in CULLING if name != "rows")
 FIELDS = tuple(field.name for field in fields(Gaussians))
 FLIP = 1e-4  # a difference that rounding alone does not make; a flip makes up to 1/255
-# Limits of the cpu backend with all its culling, in red where exceeded.
-MAX_OVER_FLOOR, MAX_WHOLE_OVER_RASTER = 2.5, 2.0
-
-RASTER = {"forward": "rasterize", "backward": "rasterize_backward"}  # kernels of the cpu backend
-FLOOR_REPEATS = 3  # of which the best counts: interruptions only make a loop slower
-FLOOR_SIDE = 256  # pixels of the image whose rows are timed
-FLOOR_COUNT = 512  # Gaussians: two million rows, tens of milliseconds
-FLOOR_OPACITY = 0.01  # leaves every pixel some transmittance behind all Gaussians
+PASSES = ("forward", "backward")
 
 
 class Backend(NamedTuple):
@@ -174,29 +167,6 @@ def errors(outputs: Outputs, exact: Outputs, ignored: Tensor) -> Result:
     }
 
 
-@cache
-def floor_scene() -> Inputs:
-    """Place faint Gaussians one behind the other, each wider than the image.
-
-    Every row of every tile is evaluated for each Gaussian, as nothing can be culled.
-    """
-    gaussians = Gaussians(
-        means=torch.tensor([0.0, 0.0, 4.0]).repeat(FLOOR_COUNT, 1),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(FLOOR_COUNT, 1),
-        scales=torch.tensor([40.0, 40.0, 0.01]).repeat(FLOOR_COUNT, 1),
-        opacities=torch.full((FLOOR_COUNT,), FLOOR_OPACITY),
-        sh=torch.full((FLOOR_COUNT, 1, 3), 0.5),
-    )
-    return prepare((gaussians, camera_at_origin(FLOOR_SIDE, FLOOR_SIDE, FLOOR_SIDE)))
-
-
-def row_seconds() -> dict[str, float]:
-    """Time a 16-pixel row of a tile in `floor_scene`, by direction: seconds of a core."""
-    runs = [run(Backend("cpu"), Culling(), floor_scene()) for _ in range(FLOOR_REPEATS)]
-    rows = runs[0].stats["rows"] / torch.get_num_threads()
-    return {name: min(r.kernels[kernel] for r in runs) / rows for name, kernel in RASTER.items()}
-
-
 def measure(options: DictConfig, console: Console) -> Result:
     """Time every backend on the scenes `options.scenes`, `options.repeats` times.
 
@@ -239,16 +209,14 @@ def _measure_scene(name: str, repeats: int) -> list[Result]:
                 "peak_gb": rise_gb(run_once, backend.device),
             }
             measurements.append(Measurement(partial(_seconds, run_once, row), row))
-    floor = Measurement(row_seconds)
-    time_in_rounds([*measurements, floor], repeats)
+    time_in_rounds(measurements, repeats)
     for timed in measurements:
         row = timed.row
-        row |= {direction: timed.summary(direction) for direction in RASTER}
-        row["faster_than_reference"] = ratios(measurements[0].row, row, RASTER)
+        row |= {name: timed.summary(name) for name in PASSES}
+        row["faster_than_reference"] = ratios(measurements[0].row, row, PASSES)
         if row["backend"] == "cpu":
-            kernels = [name for name in timed.seconds if name not in RASTER]
+            kernels = [name for name in timed.seconds if name not in PASSES]
             row["stages"] = {name: timed.summary(name) for name in kernels}
-            row["raster"] = {name: _compare_with_floor(row, name, floor) for name in RASTER}
     return [timed.row for timed in measurements]
 
 
@@ -265,22 +233,8 @@ def _seconds(run_once: Callable[[], Outputs], row: Result) -> dict[str, float]:
     return outputs.seconds | outputs.kernels
 
 
-def _compare_with_floor(row: Result, direction: str, floor: Measurement) -> Result:
-    """Compare a raster kernel with its floor, and the whole pass with the raster kernel.
-
-    The floor is the number of evaluated rows times the seconds of a row of `floor_scene`, over
-    the threads.
-    """
-    hot_row = floor.summary(direction)["median"]
-    least = row["stats"]["rows"] * hot_row / row["threads"]
-    raster = row["stages"][RASTER[direction]]["median"]
-    over_raster = row[direction]["median"] / raster
-    found = {"hot_row": hot_row, "floor": least, "over_floor": raster / least}
-    return found | {"whole_over_raster": over_raster}
-
-
 def tables(results: Result) -> list[Table]:
-    """Show all rows, the kernels of the cpu backend, and how near they are to their floor."""
+    """Show all rows, and the kernels of the cpu backend."""
     rows = results["rows"]
     ours = [row for row in rows if row["backend"] == "cpu" and row["without"] is None]
     notes = (
@@ -302,26 +256,9 @@ def tables(results: Result) -> list[Table]:
     }
     kernels = ours[0]["stages"] if ours else ()
     passes = {name.replace("_", "\n"): spread(f"stages.{name}") for name in kernels}
-    limits = {
-        "scene": text("{scene}"),
-        "pass": text("{pass}"),
-        "rows\nmillions": number("stats.rows", "{:.2f}", unit=1e6),
-        "hot row\nns": number("hot_row", "{:.1f}", unit=1e-9),
-        "floor\nms": number("floor", "{:.1f}", unit=1e-3),
-        "raster\n/ floor": limited("over_floor", MAX_OVER_FLOOR),
-        "whole\n/ raster": limited("whole_over_raster", MAX_WHOLE_OVER_RASTER),
-        "reference\n/ cpu": number("faster", "{:.1f}"),
-    }
-    both = [
-        row | row["raster"][name] | {"pass": name, "faster": row["faster_than_reference"][name]}
-        for row in ours
-        for name in RASTER
-    ]
-    limit_notes = f"limits: raster / floor {MAX_OVER_FLOOR}, whole / raster {MAX_WHOLE_OVER_RASTER}"
     return [
         make_table("Every backend, and without one kind of culling", columns, rows, notes, names=2),
         make_table("Kernels of the cpu backend, ms", {"scene": text("{scene}"), **passes}, ours),
-        make_table("The cpu backend's limits", limits, both, limit_notes, names=2),
     ]
 
 

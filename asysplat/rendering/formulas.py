@@ -212,7 +212,7 @@ def covariance_gradient(g_abc, g_det0, g_det, abc, mx, my, eps):
         abc: from `whitening`.
         mx, my, eps: arguments of `covariance`.
     """
-    _, xy, yy, minors, _, det = covariance(mx, my, eps)
+    _, _, yy, minors, _, det = covariance(mx, my, eps)
     var_y = yy + eps
     g_var_y = (g_abc[0] * abc[0] - g_abc[1] * abc[1] - g_abc[2] * abc[2]) / (2 * var_y)
     g_xy = -g_abc[1] * abc[0] / var_y

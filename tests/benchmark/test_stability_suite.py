@@ -1,4 +1,4 @@
-"""The page of stability is green, and a fault that is planted turns it red."""
+"""The stability suite is green, and a planted fault turns it red."""
 
 import inspect
 import json
@@ -18,10 +18,10 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from asysplat.benchmark.stability import prior, renderer
-from asysplat.benchmark.stability.judge import Case, Comparison, judge, unit
-from asysplat.benchmark.stability.suite import AREAS, measure, page, plot, tables, verdict
-from asysplat.benchmark.stability.views import PHOTOGRAPHS, POSES, Hostile
+from asysplat.benchmark.stability.comparison import StabilityCase, compare_to_reference, unit
+from asysplat.benchmark.stability.hostile import HOSTILE_GAUSSIANS, IMAGES, POSES, HostileViews
+from asysplat.benchmark.stability.models import prior_cases
+from asysplat.benchmark.stability.report import AREAS, measure, page, plot, tables, verdict
 from asysplat.errors import InputError
 from asysplat.models import head
 from asysplat.rendering.reference import tiles
@@ -89,7 +89,7 @@ def cubed(tensors):
 
 
 def compare(fast, **inputs):
-    return judge(Comparison(fast, cubed, inputs or {"x": torch.rand(9) + 1}, leaves=("x",)))
+    return compare_to_reference(fast, cubed, inputs or {"x": torch.rand(9) + 1}, ("x",))
 
 
 def test_rounding_is_green_and_more_is_red():
@@ -103,9 +103,11 @@ def test_rounding_is_green_and_more_is_red():
 def test_tolerances_follow_what_is_badly_conditioned():
     """Of a difference of large numbers that nearly agree, few digits are known."""
     inputs = {"x": torch.tensor([1.0, 2.0]), "z": torch.tensor([1.00001, 2.00002])}
-    row = judge(
-        Comparison(lambda t: {"y": t["x"] - t["z"]}, lambda t: {"y": t["x"] - t["z"]}, inputs)
-    )
+
+    def difference(tensors):
+        return {"y": tensors["x"] - tensors["z"]}
+
+    row = compare_to_reference(difference, difference, inputs)
     assert row["green"] and row["tolerance"] > 0.05
     assert compare(cubed)["tolerance"] < 1e-5
 
@@ -121,16 +123,16 @@ def test_a_case_that_raises_is_red():
     def fails():
         raise InputError("no.")
 
-    row = Case("area", "name", "fp32", fails).row()
+    row = StabilityCase("area", "name", "fp32", fails).row()
     assert not row["green"] and row["compared"] == "raised InputError: no."
 
 
 def test_hostile_views_can_be_used():
-    for photographs in PHOTOGRAPHS:
-        Hostile(photographs).views().validate()
+    for images in IMAGES:
+        HostileViews(images).views().validate()
     for poses in POSES:
         for count in (1, 3):
-            Hostile(poses=poses, count=count).views().validate()
+            HostileViews(poses=poses, count=count).views().validate()
 
 
 @pytest.mark.medium
@@ -142,7 +144,7 @@ def test_a_small_page_is_green(options, configured):
     assert verdict(results) is None
     areas = [row["area"] for row in results["rows"]]
     assert list(dict.fromkeys(areas)) == FEW["areas"]
-    assert areas.count("refinement") == len(renderer.GAUSSIANS)
+    assert areas.count("refinement") == len(HOSTILE_GAUSSIANS)
     for row in results["rows"]:
         assert row["green"], row
         assert row["area"] != "renderer" or 0 <= row["error"] <= row["tolerance"]
@@ -156,7 +158,9 @@ def test_a_small_page_is_green(options, configured):
 
 
 def test_a_red_page_says_so_and_the_command_fails(tmp_path, run_script, monkeypatch):
-    monkeypatch.setitem(AREAS, "prior", lambda _: [Case("prior", "dark", "fp32", lambda: 1 / 0)])
+    monkeypatch.setitem(
+        AREAS, "prior", lambda _: [StabilityCase("prior", "dark", "fp32", lambda: 1 / 0)]
+    )
     small = [f"output={tmp_path}", "stability.areas=[prior]"]
     done = run_script("benchmark.py", "suite=stability", *small)
     assert done.returncode == 1
@@ -169,7 +173,7 @@ def test_a_red_page_says_so_and_the_command_fails(tmp_path, run_script, monkeypa
 @pytest.mark.medium
 def test_priors_of_views_that_say_nothing_are_green():
     names = ("black photographs", "white photographs", "views: 1")
-    rows = [case.row() for case in prior.cases([1]) if case.name in names]
+    rows = [case.row() for case in prior_cases([1]) if case.name in names]
     assert len(rows) == 3 and all(row["green"] for row in rows)
 
 

@@ -10,7 +10,7 @@ from backends import EXACT, FIELDS, INPUTS, Backend, both_ways, random_gradient,
 from torch import Tensor
 
 from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
-from asysplat.benchmark.stability.band import boundary_band
+from asysplat.benchmark.stability.boundary_band import boundary_band
 from asysplat.rendering.interface import RenderSettings
 
 OTHERS = tuple(name for name in INPUTS if name not in FIELDS)

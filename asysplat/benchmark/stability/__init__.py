@@ -1,5 +1,5 @@
-"""Hostile inputs: what they do to operators, prior, renderer, network, training and refinement.
+"""Hostile inputs for operators, prior, renderer, network, training and refinement.
 
-Each file named like an area has `cases`, which yields what is measured there; `judge.py` holds the
-one rule by which an error is green or red.
+`hostile.py` lists the inputs, for this suite and for tests/stress. The file of each area yields its
+cases, and `comparison.py` holds the one rule by which an error is green or red.
 """

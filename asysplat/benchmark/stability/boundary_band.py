@@ -1,4 +1,4 @@
-"""Where rounding may decide: pixels at which an alpha or a transmittance is at a cut-off."""
+"""Pixels where rounding may decide: an alpha or a transmittance is close to a cut-off."""
 
 import torch
 from torch import Tensor
@@ -7,18 +7,18 @@ from asysplat.rendering.interface import RenderSettings
 from asysplat.rendering.reference.project import project
 from asysplat.scene import Cameras, Gaussians
 
-ALPHA_ROUNDING = 1e-5  # of itself; float32 leaves a tenth of it
-# The transmittance collects the rounding of 1 - alpha, which is up to 100 times that of alpha.
+ALPHA_ROUNDING = 1e-5  # relative, ten times the error of float32
+# The transmittance accumulates the rounding of 1 - alpha, up to 100 times that of alpha.
 TRANSMITTANCE_ROUNDING = 1e-3
 ROWS = 8  # of pixels at a time
 
 
 @torch.no_grad()
 def boundary_band(gaussians: Gaussians, cameras: Cameras, settings: RenderSettings) -> Tensor:
-    """Find the pixels where rounding may decide, in float64: [V, H, W].
+    """Compute the mask [V, H, W] of pixels where rounding may decide, in float64.
 
     There some alpha is within rounding of alpha_min or alpha_max, or some transmittance of
-    transmittance_min or, for the median depth, of a half.
+    transmittance_min or, for the median depth, of 0.5.
     """
     convention = settings.convention
     scene = gaussians.map(lambda t: t[None].double())
@@ -45,7 +45,7 @@ def boundary_band(gaussians: Gaussians, cameras: Cameras, settings: RenderSettin
             jump |= near(left, convention.transmittance_min, TRANSMITTANCE_ROUNDING)
             if settings.depth == "median":
                 jump |= near(left, 0.5, ALPHA_ROUNDING)
-            # What lies behind the stop shows nowhere.
+            # Splats behind the stop are invisible.
             before = torch.cat((torch.ones_like(left[:1]), left[:-1]))
             reached = before > convention.transmittance_min * (1 - TRANSMITTANCE_ROUNDING)
             band[view, rows] = (jump & reached).any(0)

@@ -1,0 +1,210 @@
+"""The rule of the suite: compare a result with float64, and allow for what rounding explains."""
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from asysplat.benchmark.options import PRECISIONS
+from asysplat.benchmark.timing import Result
+
+ALL_PRECISIONS = PRECISIONS | {"fp16": torch.float16}
+ROUNDINGS = 256  # roundings of an operator in sequence
+PERTURBATIONS = 2  # random perturbations of the inputs; the worst counts
+RULE = (
+    f"R = {ROUNDINGS**0.5:g} roundings, the sum of {ROUNDINGS} in sequence as a random walk (for a "
+    "network in fp32 32, the sum of 1,024). The tolerance is the change of the float64 result when "
+    "each input is moved by R halves of a unit in its last place, up or down at random (the worse "
+    f"of {PERTURBATIONS} such changes; in a network each layer's output and gradient move too), "
+    "plus R halves of a unit in the last place of the result"
+)
+NEGLIGIBLE = 1e-12  # of all gradients: a smaller one that consists of noise is 0 in truth
+
+Tensors = dict[str, Tensor]
+Function = Callable[[Tensors], Tensors]
+
+
+@dataclass(frozen=True)
+class StabilityCase:
+    """A row of the results.
+
+    Args:
+        area: the part of the project.
+        name: the function and the hostile input.
+        precision: one of ALL_PRECISIONS.
+        measure: returns the rest of the row, see `make_row`.
+    """
+
+    area: str
+    name: str
+    precision: str
+    measure: Callable[[], Result]
+
+    def row(self) -> Result:
+        """Measure; an exception makes the row red, and the other cases still run."""
+        row = {"area": self.area, "case": self.name, "precision": self.precision}
+        try:
+            return row | self.measure()
+        except Exception as error:
+            return row | make_row(f"raised {type(error).__name__}: {error}", {}, green=False)
+
+
+def make_row(
+    compared: str,
+    tensors: Mapping[str, Tensor],
+    gradients: Collection[str] = (),
+    *,
+    green: bool,
+    **numbers: object,
+) -> Result:
+    """Count the non-finite numbers among the results; any of them makes the row red.
+
+    Args:
+        compared: what the results are compared with, in words.
+        tensors: results by name.
+        gradients: the names of the gradients among them.
+        green: whether all other conditions hold.
+        numbers: other keys of the row.
+
+    Returns:
+        "compared"; "worst", "error" and "tolerance", None unless given; "nan" and "inf", their
+        numbers in all tensors; "gradients", whether all are finite, None without any; "green".
+    """
+    nan = sum(int(tensor.isnan().sum()) for tensor in tensors.values())
+    inf = sum(int(tensor.isinf().sum()) for tensor in tensors.values())
+    finite = all(bool(tensors[name].isfinite().all()) for name in gradients)
+    row = {"compared": compared, "worst": None, "error": None, "tolerance": None} | numbers
+    return row | {
+        "nan": nan,
+        "inf": inf,
+        "gradients": finite if gradients else None,
+        "green": green and nan == inf == 0,
+    }
+
+
+def compare_to_reference(
+    fast: Function,
+    exact: Function,
+    inputs: Tensors,
+    leaves: tuple[str, ...] = (),
+    *,
+    arithmetic: torch.dtype = torch.float32,
+    network: nn.Module | None = None,
+    roundings: int = ROUNDINGS,
+    exponent: float = 1.0,
+    magnitude: float = 0.0,
+    note: str = "",
+) -> Result:
+    """Compare outputs and gradients with float64, each by its L2 norm, and apply RULE.
+
+    Args:
+        fast: the function under test, from named tensors to named tensors.
+        exact: the same function, for float64.
+        inputs: of `fast`; `exact` gets the same numbers.
+        leaves: names of the inputs whose gradients are compared too.
+        arithmetic: the float type in which `fast` computes, whatever its inputs are.
+        network: of `exact`, to perturb the outputs and gradients of its layers.
+        roundings: number of roundings in sequence.
+        exponent: the largest argument of an exponential: e^s errs by s roundings.
+        magnitude: of an output's numbers; errors of smaller outputs are relative to it.
+        note: an addition to the row's "compared".
+
+    Returns:
+        See `make_row`. "worst" names the tensor with the largest ratio of error and tolerance;
+        "error" and "tolerance" are its own, relative to its norm.
+    """
+    results = forward_backward(fast, inputs, leaves)
+    inputs = {name: tensor.double() for name, tensor in inputs.items()}
+    truth = forward_backward(exact, inputs, leaves)
+    share = roundings**0.5  # as many roundings, all to one side, err as much
+    step = share * unit(arithmetic)
+    perturbed = [
+        _perturb(exact, inputs, leaves, network, step, seed) for seed in range(PERTURBATIONS)
+    ]
+    gradients = [f"gradient of {name}" for name in leaves]
+    total = torch.stack([torch.zeros(()).double(), *(truth[n].norm() for n in gradients)]).norm()
+    numbers = {}
+    for name, true in truth.items():
+        result, root = results[name], true.numel() ** 0.5
+        sensitivity = torch.stack([(other[name] - true).norm() for other in perturbed]).max()
+        norm = true.norm().clamp_min(magnitude * root)
+        own = exponent * unit(result.dtype) * norm
+        if 0 < norm <= NEGLIGIBLE * total and sensitivity >= norm / 2:
+            own = unit(result.dtype) * total
+        own = own + smallest_step(result.dtype) * root
+        tolerance = float(sensitivity + share * own)
+        error = float((result.double() - true).norm())
+        ratio = error / tolerance
+        numbers[name] = (math.inf if math.isnan(ratio) else ratio, error, tolerance, norm)
+    worst = max(numbers, key=lambda name: numbers[name][0])
+    ratio, error, tolerance, norm = numbers[worst]
+    relative = {
+        "error": error / (float(norm) or 1.0),
+        "tolerance": tolerance / (float(norm) or 1.0),
+    }
+    if not all(map(math.isfinite, relative.values())):
+        relative = dict.fromkeys(relative)
+    compared = "float64" + (f"; {note}" if note else "")
+    return make_row(compared, results, gradients, green=ratio <= 1, worst=worst, **relative)
+
+
+def forward_backward(function: Function, inputs: Tensors, leaves: Collection[str]) -> Tensors:
+    """Compute outputs, and gradients of the leaves from random gradients of the outputs."""
+    if not leaves:
+        with torch.no_grad():
+            return function(inputs)
+    inputs = {n: t.detach().requires_grad_() if n in leaves else t for n, t in inputs.items()}
+    outputs = function(inputs)
+    weights = [_weights(output, seed) for seed, output in enumerate(outputs.values())]
+    own = [inputs[name] for name in leaves]
+    grads = torch.autograd.grad(list(outputs.values()), own, weights, materialize_grads=True)
+    named = {f"gradient of {name}": grad for name, grad in zip(leaves, grads, strict=True)}
+    return {name: output.detach() for name, output in outputs.items()} | named
+
+
+def _weights(output: Tensor, seed: int) -> Tensor:
+    """Draw random numbers that every precision represents exactly."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(output.shape, generator=generator).bfloat16().to(output)
+
+
+def _perturb(
+    exact: Function,
+    inputs: Tensors,
+    leaves: Collection[str],
+    network: nn.Module | None,
+    step: float,
+    seed: int,
+) -> Tensors:
+    """Run the float64 function with each number moved by a relative `step`, up or down."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def move(tensor: Tensor) -> Tensor:
+        up = torch.rand(tensor.shape, generator=generator) < 0.5
+        return tensor * torch.where(up, 1 + step, 1 - step)
+
+    layers = [] if network is None else list(network.modules())
+    layers = [layer for layer in layers if list(layer.parameters(recurse=False))]
+    hooks = [layer.register_forward_hook(lambda _, __, output: move(output)) for layer in layers]
+    hooks += [
+        layer.register_full_backward_pre_hook(lambda _, grads: tuple(map(move, grads)))
+        for layer in layers
+    ]
+    try:
+        moved = {name: move(tensor) for name, tensor in inputs.items()}
+        return forward_backward(exact, moved, leaves)
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def unit(dtype: torch.dtype) -> float:
+    """Return half a unit in the last place of 1, the largest error of a rounding."""
+    return torch.finfo(dtype).eps / 2
+
+
+def smallest_step(dtype: torch.dtype) -> float:
+    """Return the smallest step between numbers, the error of products that nearly underflow."""
+    return torch.finfo(dtype).tiny * torch.finfo(dtype).eps
