@@ -1,23 +1,23 @@
-"""The one error that users are meant to read."""
+"""The error that is shown to users."""
 
 
 class InputError(ValueError):
-    """Something the user gave cannot be used.
+    """Invalid input of a user.
 
-    The message is one sentence that names the field or file, says what was found and what was
-    expected, and how to fix it. Scripts print it alone, without a traceback.
+    The message is one sentence: the field or file, what was found, what is expected, and how to fix
+    it. Scripts print it without a traceback.
     """
 
 
 def input_error_behind(error: BaseException) -> InputError | None:
-    """Return the InputError that `error` is or was raised from, else None.
+    """Return the InputError that `error` is or was raised from, or None.
 
-    Hydra wraps the errors of the constructors that it calls.
+    Hydra wraps the errors of constructors that it calls.
     """
     seen: BaseException | None = error
     while seen is not None and not isinstance(seen, InputError):
         seen = seen.__cause__ or seen.__context__
     if seen is None:
         return None
-    # A loader's worker puts its traceback before the sentence.
+    # Data-loader workers prepend their traceback.
     return InputError(str(seen).rpartition(f"{InputError.__module__}.InputError: ")[2])

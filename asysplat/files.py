@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all: written aside, then moved into place."""
+"""Atomic writes: to a temporary file, which is then moved into place."""
 
 import os
 import shutil
@@ -12,15 +12,15 @@ from asysplat.errors import InputError
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Give a temporary path to write to, in the same folder; move it to `path` at the end.
+    """Yield a temporary path in the same folder to write to, then move it to `path`.
 
-    The file is on the disk before it is moved. Whatever is raised meanwhile, a KeyboardInterrupt
-    too, leaves `path` as it was and no temporary file behind.
+    The file is synced to disk before. Any exception, KeyboardInterrupt too, leaves `path` unchanged
+    and no temporary file.
 
     Raises:
-        InputError: the file cannot be written: no such folder, not allowed, a full disk.
+        InputError: the file cannot be written: no such folder, no permission, a full disk.
     """
-    target = Path(path).resolve()  # behind a link, so that the link stays
+    target = Path(path).resolve()  # keeps a symbolic link
     if target.exists() and not target.is_file():
         raise InputError(f"{path} is a folder or a device: name a file.")
     partial = target.with_name(f".{target.stem}.{uuid4().hex[:8]}{target.suffix}")
@@ -32,12 +32,12 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             shutil.copymode(target, partial)
         os.replace(partial, target)
     except OSError as error:
-        # Of another file, from which is read what is written here.
+        # The error of another file, which is read meanwhile.
         if error.filename is not None and str(error.filename) != str(partial):
             raise
         raise InputError(
-            f"{path} cannot be written ({error.strerror or error}): name a folder that is there, "
-            "that you may write to and that has room; what was there before is unchanged."
+            f"{path} cannot be written ({error.strerror or error}): name an existing folder "
+            "that you may write to and that has room; a previous file is unchanged."
         ) from error
     finally:
         partial.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Ctrl-C that is not lost."""
+"""Keep KeyboardInterrupts that Python would ignore."""
 
 import signal
 import sys
@@ -6,32 +6,32 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-AGAIN_AFTER = 0.01  # seconds, in which the callback returns
+DELAY = 0.01  # seconds until the callback has returned
 
 
-class _Again:
-    """What Python calls with errors that it ignores; interrupts come again."""
+class _RepeatInterrupts:
+    """Hook for ignored errors that repeats interrupts."""
 
-    def __init__(self, otherwise: Callable[["sys.UnraisableHookArgs"], Any]):
-        self.otherwise = otherwise
+    def __init__(self, previous: Callable[["sys.UnraisableHookArgs"], Any]):
+        self.previous = previous
         self.timer: threading.Timer | None = None
 
     def __call__(self, ignored: "sys.UnraisableHookArgs") -> None:
         if not isinstance(ignored.exc_value, KeyboardInterrupt):
-            self.otherwise(ignored)
+            self.previous(ignored)
             return
-        under_way = self.timer is not None and self.timer.is_alive()
-        # At the end of the process no thread starts any more, and all is done.
-        if not under_way and not sys.is_finalizing():
+        pending = self.timer is not None and self.timer.is_alive()
+        # No thread can start at the end of the process.
+        if not pending and not sys.is_finalizing():
             main = threading.main_thread().ident
-            self.timer = threading.Timer(AGAIN_AFTER, signal.pthread_kill, (main, signal.SIGINT))
+            self.timer = threading.Timer(DELAY, signal.pthread_kill, (main, signal.SIGINT))
             self.timer.start()
 
 
 def keep_interrupts() -> None:
-    """Raise a KeyboardInterrupt again where Python could only print it.
+    """Repeat a KeyboardInterrupt that Python can only print.
 
-    In a callback of C code, such as Numba's when it loads a kernel, and in a finalizer, Python
-    prints what is raised and goes on: Ctrl-C at such a moment would stop nothing.
+    In a finalizer, or a callback of C code (such as Numba's when it loads a kernel), Python prints
+    exceptions and continues: Ctrl-C at such a moment would be lost.
     """
-    sys.unraisablehook = _Again(sys.unraisablehook)
+    sys.unraisablehook = _RepeatInterrupts(sys.unraisablehook)

@@ -1,4 +1,4 @@
-"""Check the overrides of a command before Hydra reads them: what they name must exist."""
+"""Check the overrides of a command line before Hydra reads them."""
 
 import contextlib
 import difflib
@@ -17,19 +17,19 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.errors import InputError
 
 CONF = Path(__file__).parents[1] / "conf"
-ALIKE = 0.8  # difflib's ratio of widht and width
+MIN_SIMILARITY = 0.8  # difflib's ratio of widht and width
 
 
 def check_overrides(overrides: Iterable[str], script: str = "train") -> None:
-    """Check that each override sets an existing option, or chooses an existing file of a group.
+    """Check that each override sets an existing option or an existing choice of a group.
 
     Args:
-        overrides: `key=value` as Hydra takes them; those of Hydra's own options are left to Hydra.
-        script: name of the file in conf/ that lists the options.
+        overrides: `key=value`, in Hydra's syntax; Hydra's own options are not checked.
+        script: name of the configuration file in conf/.
 
     Raises:
-        InputError: an override cannot be read, or names something that does not exist; the message
-            suggests the nearest names.
+        InputError: an override cannot be parsed, or an unknown name; the message suggests the
+            nearest ones.
     """
     parsed = [_parse(override) for override in overrides]
     ours = [override for override in parsed if not override.key_or_group.startswith("hydra")]
@@ -40,20 +40,20 @@ def check_overrides(overrides: Iterable[str], script: str = "train") -> None:
     if not settings:
         return
     config = _compose(script, composed)
-    known = set(_paths(config))
+    options = set(_paths(config))
     for override in settings:
         key = override.key_or_group
-        if key not in known:
-            raise InputError(f"{key} is unknown: {_hint(key, known, script)}")
+        if key not in options:
+            raise InputError(f"{key} is unknown: {_hint(key, options, script)}")
         if key == "stage":
             _check_stage(override, config)
 
 
 def exit_at_unknown_overrides(script: str) -> None:
-    """Run `check_overrides` on this process's command line; exit with the message of an error."""
+    """Run `check_overrides` on this process's command line; exit with the message on an error."""
     given = get_args_parser().parse_args()
     if given.config_dir or given.config_name or given.config_path or given.shell_completion:
-        return  # other files than those in conf/, or no run
+        return  # other configuration files, or no run
     try:
         check_overrides(given.overrides, script)
     except InputError as error:
@@ -95,7 +95,7 @@ def _check_choices(override: Override) -> None:
 
 
 def _check_stage(override: Override, config: DictConfig) -> None:
-    """Check that the scale has the training stages, for which other keys look values up."""
+    """Check that the scale has the training stage."""
     for stage in _values(override):
         if stage not in config.stages:
             *others, last = config.stages
@@ -109,7 +109,7 @@ def _folder(override: Override) -> Path | None:
 
 
 def _values(override: Override) -> list[str]:
-    """Return the values as they were typed; each value of a sweep, if the sweep lists them."""
+    """Return the values as typed; for a sweep that lists its values, all of them."""
     if not override.is_sweep_override():
         return [override.get_value_element_as_str()]
     listed = isinstance(override.value(), ChoiceSweep | RangeSweep)
@@ -117,7 +117,7 @@ def _values(override: Override) -> list[str]:
 
 
 def _compose(script: str, overrides: Sequence[Override]) -> DictConfig:
-    """Compose the configuration with these overrides, taking the first value of each sweep."""
+    """Compose the configuration with these overrides, with the first value of each sweep."""
     given = [override.input_line for override in overrides if override.is_delete()]
     for override in overrides:
         if not override.is_delete():
@@ -159,7 +159,7 @@ def _hint(key: str, known: Collection[str], script: str) -> str:
 
 
 def _nearest(key: str, known: Collection[str]) -> str | None:
-    """Return the known path that is spelled like `key`, in whole or from one of its dots on."""
+    """Return the option that is spelled like `key`, in whole or from one of its dots on."""
     name = key.rpartition(".")[2]
     if name in known:  # at the top: steps for trainer.steps
         return name
@@ -168,4 +168,6 @@ def _nearest(key: str, known: Collection[str]) -> str | None:
         parts = path.split(".")
         for start in range(len(parts)):
             ends.setdefault(".".join(parts[start:]), path)
-    return next((ends[end] for end in difflib.get_close_matches(key, ends, 1, ALIKE)), None)
+    return next(
+        (ends[end] for end in difflib.get_close_matches(key, ends, 1, MIN_SIMILARITY)), None
+    )

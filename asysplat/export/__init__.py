@@ -1,4 +1,4 @@
-"""A scene that leaves and comes in: files of Gaussians, camera paths, videos, the browser."""
+"""Files of Gaussians, camera paths, videos and the viewer."""
 
 from asysplat.export.gaussians import read_gaussians, write_gaussians
 from asysplat.export.orbit import orbit

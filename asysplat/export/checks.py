@@ -1,4 +1,4 @@
-"""What every format asks of a file that is read, and of a scene that is written."""
+"""Checks of files that are read and of scenes that are written, for all formats."""
 
 from pathlib import Path
 
@@ -7,30 +7,30 @@ import torch
 from asysplat.errors import InputError
 from asysplat.scene import Gaussians
 
-TINY = torch.finfo(torch.float32).tiny  # in place of a scale or opacity that rounds to 0
+TINY = torch.finfo(torch.float32).tiny  # replaces scales and opacities that round to 0
 
 
 def existing(path: str | Path) -> Path:
-    """Return the path of a file that is there.
+    """Return the path of an existing file.
 
     Raises:
-        InputError: there is none.
+        InputError: it does not exist.
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path} is no file: name one that is there.")
+        raise InputError(f"{path} is not a file: name an existing one.")
     return path
 
 
 def as_written(gaussians: Gaussians) -> Gaussians:
-    """Return one scene in float32, on the CPU and without gradients.
+    """Convert one scene to float32, on the CPU and without gradients.
 
     Raises:
-        InputError: a batch dimension, no Gaussians, or what `Gaussians.validate` refuses.
+        InputError: a batch dimension, no Gaussians, or see `Gaussians.validate`.
     """
     if gaussians.opacities.ndim != 1:
         raise InputError(
-            f"Gaussians.opacities has shape {tuple(gaussians.opacities.shape)}: expected [N], so "
+            f"Gaussians.opacities has shape {tuple(gaussians.opacities.shape)}: expected [N]; "
             "write the scenes of a batch one by one."
         )
     if gaussians.num_gaussians == 0:
@@ -39,10 +39,10 @@ def as_written(gaussians: Gaussians) -> Gaussians:
 
 
 def as_read(path: Path, gaussians: Gaussians) -> Gaussians:
-    """Return a scene that was read from `path`.
+    """Check a scene that was read from `path`.
 
     Raises:
-        InputError: a batch dimension, no Gaussians, or what `Gaussians.validate` refuses.
+        InputError: a batch dimension, no Gaussians, or see `Gaussians.validate`.
     """
     if gaussians.opacities.ndim != 1 or gaussians.num_gaussians == 0:
         shape = tuple(gaussians.opacities.shape)

@@ -1,4 +1,4 @@
-"""Read and write Gaussians in the format that a file's suffix names."""
+"""Read and write Gaussians in the format of the file's suffix."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,27 +21,27 @@ def read_gaussians(path: str | Path) -> Gaussians:
     """Read a scene from a .ply, .splat or .safetensors file, in float32.
 
     Raises:
-        InputError: another suffix, or what the format's reader refuses.
+        InputError: another suffix, or see the format's reader.
     """
-    return _of_suffix(READERS, path, "read")(path)
+    return _by_suffix(READERS, path, "read")(path)
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
     """Write one scene, without batch dimension, to a .ply or .safetensors file.
 
-    A file that is there already is replaced once the new one is whole.
+    An existing file is replaced once the new one is complete.
 
     Raises:
-        InputError: another suffix, or what the format's writer refuses.
+        InputError: another suffix, or see the format's writer.
     """
-    _of_suffix(WRITERS, path, "written")(path, gaussians)
+    _by_suffix(WRITERS, path, "written")(path, gaussians)
 
 
-def _of_suffix(functions: dict[str, Callable], path: str | Path, done: str) -> Callable:
+def _by_suffix(functions: dict[str, Callable], path: str | Path, verb: str) -> Callable:
     suffix = Path(path).suffix.lower()
     if suffix not in functions:
         raise InputError(
-            f"{path} cannot be {done}: its suffix is {suffix or 'missing'}, expected "
+            f"{path} cannot be {verb}: its suffix is {suffix or 'missing'}, expected "
             f"{' or '.join(functions)}."
         )
     return functions[suffix]

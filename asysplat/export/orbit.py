@@ -1,73 +1,76 @@
-"""Cameras of a video around what the photographs show."""
+"""Camera path of a video that orbits the scene."""
+
+from dataclasses import replace
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from asysplat.export.poses import SAME, checked_poses, features, lengths, spread, with_poses
+from asysplat.export.poses import ROUNDING, checked_poses, lengths, pose_vectors, spread, with_poses
 from asysplat.scene import Cameras
 
-PARALLEL = 0.01  # mean square of the angles between axes and their mean: 6 degrees
-AHEAD = 4.0  # times the cameras' spread: how far what they show is, where axes do not tell
-MOST_TILTED = 0.5  # the cosine between the world's up and the cameras' mean up: 60 degrees
-WIDEST_GAP = np.radians(90)  # between neighbors on a circle that is seen from all around
-LEAST_SWING = np.radians(5)  # to either side
-STEEPEST = 10.0  # times the radius: a distance from which no camera looks straight down
+PARALLEL = 0.01  # mean squared angle between axes and their mean, below it parallel: 6 degrees
+FOCUS_DISTANCE = 4.0  # in spreads of the cameras, if their axes do not meet
+MIN_UP_COSINE = 0.5  # between the world's up and the cameras' mean up: 60 degrees
+MAX_GAP = np.radians(90)  # between neighbors on a full circle
+MIN_SWING = np.radians(5)  # to either side
+MAX_STEEPNESS = 10.0  # distance over radius, so that no camera looks straight down
 
 
 def orbit(cameras: Cameras, frames: int) -> Cameras:
-    """Go around the point that the cameras look at, at their mean height and distance.
+    """Build a closed path around the focus point, at the cameras' mean height and distance.
 
-    In a full circle where the cameras stand all around, else to and fro within the arc that they
-    span: nothing was seen from elsewhere. After the last frame comes the first.
+    A full circle if the cameras are all around, else to and fro within their arc, as other sides of
+    the scene are unobserved.
 
     Args:
         cameras: [V], without batch dimension.
-        frames: of the video.
+        frames: number of video frames.
 
     Returns:
-        [frames] that look at the point, upright, with the mean intrinsics.
+        [frames] upright cameras that look at the point, with the mean intrinsics.
 
     Raises:
         InputError: a batch dimension, no views, no frames, or what `Cameras.validate` refuses.
     """
     poses = checked_poses(cameras, frames)
-    apart = features(poses)
-    middle = int(lengths(apart - apart.mean(0)).argmin())
+    vectors = pose_vectors(poses)
+    middle = int(lengths(vectors - vectors.mean(0)).argmin())
     focus = _focus(poses, cameras, middle)
-    sees = _sees(focus, poses, cameras)
-    sees[middle] = True
+    visible = _visible(focus, poses, cameras)
+    visible[middle] = True
     up = _up(poses, middle)
-    offsets = poses[sees, :3, 3] - focus
+    offsets = poses[visible, :3, 3] - focus
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
-    radius = max(lengths(flat).mean(), lengths(offsets).mean() / STEEPEST)
-    x, y = _axes_across(up, poses[middle, :3, 3] - focus)
+    radius = max(lengths(flat).mean(), lengths(offsets).mean() / MAX_STEEPNESS)
+    x, y = _perpendicular_axes(up, poses[middle, :3, 3] - focus)
     angles = _angles(np.arctan2(flat @ y, flat @ x), frames)[:, None]
     circle = radius * (np.cos(angles) * x + np.sin(angles) * y)
-    return with_poses(cameras, _looking_at(focus, focus + heights.mean() * up + circle, up))
+    return with_poses(cameras, _look_at(focus, focus + heights.mean() * up + circle, up))
 
 
 def _up(poses: Float[ndarray, "V 4 4"], middle: int) -> Float[ndarray, "3"]:
-    """Return the direction that is upwards in the world.
+    """Return the world's up direction.
 
-    Photographs are taken with a level horizon, however far the camera looks down: up is across all
-    cameras' x axes. Where those do not tell, it is the cameras' mean up.
+    Photographers keep the horizon level, so that up is perpendicular to all cameras' x axes. If
+    these are parallel, up is the cameras' mean up.
     """
     right, up = poses[:, :3, 0], -poses[:, :3, 1].mean(0)
-    if np.linalg.norm(up) < SAME:  # they cancel
+    if np.linalg.norm(up) < ROUNDING:  # they cancel
         up = -poses[middle, :3, 1]
     up /= np.linalg.norm(up)
-    spreads, directions = np.linalg.eigh(right.T @ right / len(right))
+    variances, directions = np.linalg.eigh(right.T @ right / len(right))
     across = directions[:, 0] * np.sign(directions[:, 0] @ up)
-    return across if spreads[1] > PARALLEL and across @ up > MOST_TILTED else up
+    return across if variances[1] > PARALLEL and across @ up > MIN_UP_COSINE else up
 
 
 def _focus(poses: Float[ndarray, "V 4 4"], cameras: Cameras, middle: int) -> Float[ndarray, "3"]:
-    """Return the point nearest to all optical axes, if most cameras see it.
+    """Return the point nearest to all optical axes, if it is visible in most views.
 
-    Else one in front of the middle camera: axes that are nearly parallel, or meet where the
-    cameras stand or behind them, do not tell how far away things are.
+    Otherwise (axes nearly parallel, or meeting at or behind the cameras) return a point in front of
+    the middle camera.
     """
     centers, axes, size = poses[:, :3, 3], poses[:, :3, 2], spread(poses)
     if size:
@@ -75,47 +78,45 @@ def _focus(poses: Float[ndarray, "V 4 4"], cameras: Cameras, middle: int) -> Flo
         matrix = across.mean(0)
         if np.linalg.eigvalsh(matrix)[0] > PARALLEL:
             point = np.linalg.solve(matrix, np.einsum("vij,vj->i", across, centers) / len(poses))
-            if _sees(point, poses, cameras).mean() > 0.5:
+            if _visible(point, poses, cameras).mean() > 0.5:
                 return point
-    return centers[middle] + (AHEAD * size or 1.0) * axes[middle]
+    return centers[middle] + (FOCUS_DISTANCE * size or 1.0) * axes[middle]
 
 
-def _sees(
+def _visible(
     point: Float[ndarray, "3"], poses: Float[ndarray, "V 4 4"], cameras: Cameras
 ) -> Bool[ndarray, " V"]:
-    """Tell which cameras have a point in their image."""
-    inside = np.einsum("vij,vi->vj", poses[:, :3, :3], point - poses[:, :3, 3])
-    intrinsics = cameras.intrinsics.detach().cpu().double().numpy()
-    x, y, depth = np.einsum("vij,vj->iv", intrinsics, inside)
-    in_width = (x >= 0) & (x <= cameras.width * depth)
-    return (depth > 0) & in_width & (y >= 0) & (y <= cameras.height * depth)
+    """Check which cameras show a point."""
+    exact = replace(cameras.to("cpu", torch.float64), cam_to_world=torch.from_numpy(poses))
+    _, _, inside = exact.project(torch.from_numpy(point[None]))
+    return inside[:, 0].detach().numpy()
 
 
-def _axes_across(
+def _perpendicular_axes(
     up: Float[ndarray, "3"], direction: Float[ndarray, "3"]
 ) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
-    """Return two unit vectors across `up` and each other; the first is nearest to a direction."""
+    """Return orthonormal vectors perpendicular to `up`; the first is nearest to a direction."""
     x = direction - (direction @ up) * up
-    if np.linalg.norm(x) < SAME * np.linalg.norm(direction):
+    if np.linalg.norm(x) < ROUNDING * np.linalg.norm(direction):
         x = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     x /= np.linalg.norm(x)
     return x, np.cross(up, x)
 
 
-def _angles(seen: Float[ndarray, " S"], frames: int) -> Float[ndarray, " T"]:
-    """Return the frames' angles: all around, or to and fro between those that were seen from."""
+def _angles(angles: Float[ndarray, " S"], frames: int) -> Float[ndarray, " T"]:
+    """Return the frames' angles: a full circle, or to and fro over the cameras' arc."""
     turn = 2 * np.pi * np.arange(frames) / frames
-    seen = np.sort(seen)
-    gaps = np.diff(seen, append=seen[0] + 2 * np.pi)
+    angles = np.sort(angles)
+    gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
     widest = gaps.argmax()
-    if gaps[widest] < WIDEST_GAP:
+    if gaps[widest] < MAX_GAP:
         return turn
     swing = (2 * np.pi - gaps[widest]) / 2
-    middle = seen[widest] + gaps[widest] + swing
-    return middle + max(swing, LEAST_SWING) * np.sin(turn)
+    middle = angles[widest] + gaps[widest] + swing
+    return middle + max(swing, MIN_SWING) * np.sin(turn)
 
 
-def _looking_at(
+def _look_at(
     point: Float[ndarray, "3"], centers: Float[ndarray, "T 3"], up: Float[ndarray, "3"]
 ) -> Float[ndarray, "T 4 4"]:
     forward = point - centers

@@ -1,84 +1,84 @@
-"""Cameras of a video along the photographs' own way."""
+"""Camera path of a video along the input cameras."""
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from asysplat.export.poses import SAME, checked_poses, features, lengths, with_poses
+from asysplat.export.poses import ROUNDING, checked_poses, lengths, pose_vectors, with_poses
 from asysplat.rendering.reference.math import rotations
 from asysplat.scene import Cameras
 
-JUMPING = 1.5  # times the shorter way: then the views' order is not that of a walk
-SAMPLES = 2000  # of a way, before it is smoothed
-SMOOTHING = 0.02  # of a way's length: the Gaussian filter's standard deviation
+MAX_DETOUR = 1.5  # of the given order, over that of nearest neighbors
+SAMPLES = 2000  # of a path, before it is smoothed
+SMOOTHING = 0.02  # standard deviation of the Gaussian filter, over the path's length
 
 
 def smoothed_path(cameras: Cameras, frames: int) -> Cameras:
-    """Follow the cameras' own way, smoothly and at constant speed, from the first to the last.
+    """Build a smooth path through the cameras at constant speed, from the first to the last.
 
-    Turns take time too: one radian as much as a way of the cameras' spread. Views whose order
-    jumps about are first brought into one that is a short way.
+    A turn of one radian counts as much as a translation by the cameras' spread. Cameras that are
+    not in the order of a walk are sorted by nearest neighbors first.
 
     Args:
         cameras: [V], without batch dimension.
-        frames: of the video.
+        frames: number of video frames.
 
     Returns:
-        [frames] with the mean intrinsics, all alike where the cameras are.
+        [frames] with the mean intrinsics, all equal if the cameras are.
 
     Raises:
         InputError: a batch dimension, no views, no frames, or what `Cameras.validate` refuses.
     """
     poses = checked_poses(cameras, frames)
-    poses = poses[_short_order(features(poses))]
-    steps = lengths(np.diff(features(poses), axis=0))
-    moves = steps > SAME
+    poses = poses[_short_order(pose_vectors(poses))]
+    steps = lengths(np.diff(pose_vectors(poses), axis=0))
+    moves = steps > ROUNDING
     if not moves.any():
         return with_poses(cameras, poses[:1].repeat(frames, 0))
-    way = np.append(0.0, steps[moves].cumsum())
-    smooth = _smoothed(poses[np.append(True, moves)], way)
-    way = np.append(0.0, lengths(np.diff(features(_rigid(smooth)), axis=0)).cumsum())
-    times = np.linspace(0, way[-1], frames)
-    evenly = np.stack([np.interp(times, way, column) for column in smooth.T], 1)
+    positions = np.append(0.0, steps[moves].cumsum())
+    smooth = _smoothed(poses[np.append(True, moves)], positions)
+    positions = np.append(0.0, lengths(np.diff(pose_vectors(_rigid(smooth)), axis=0)).cumsum())
+    times = np.linspace(0, positions[-1], frames)
+    evenly = np.stack([np.interp(times, positions, column) for column in smooth.T], 1)
     return with_poses(cameras, _rigid(evenly))
 
 
-def _short_order(features: Float[ndarray, "V 12"]) -> Int[ndarray, " V"]:
+def _short_order(vectors: Float[ndarray, "V 12"]) -> Int[ndarray, " V"]:
     """Return the given order, or that of nearest neighbors if it is far shorter.
 
-    This starts with the view that is farthest from the mean: an end of the way.
+    The latter starts with the view farthest from the mean, an end of the path.
     """
-    given = np.arange(len(features))
-    order = [int(lengths(features - features.mean(0)).argmax())]
+    given = np.arange(len(vectors))
+    order = [int(lengths(vectors - vectors.mean(0)).argmax())]
     left = np.delete(given, order[0])
     while len(left):
-        nearest = lengths(features[left] - features[order[-1]]).argmin()
+        nearest = lengths(vectors[left] - vectors[order[-1]]).argmin()
         order.append(int(left[nearest]))
         left = np.delete(left, nearest)
-    as_given, short = (lengths(np.diff(features[o], axis=0)).sum() for o in (given, order))
-    return np.array(order) if as_given > JUMPING * short else given
+    as_given, short = (lengths(np.diff(vectors[o], axis=0)).sum() for o in (given, order))
+    return np.array(order) if as_given > MAX_DETOUR * short else given
 
 
 def _smoothed(
-    poses: Float[ndarray, "V 4 4"], way: Float[ndarray, " V"]
+    poses: Float[ndarray, "V 4 4"], positions: Float[ndarray, " V"]
 ) -> Float[ndarray, "samples 7"]:
-    """Lay splines through poses and smooth them.
+    """Interpolate poses by splines and smooth these.
 
     Args:
-        way: from the first pose to each, increasing.
+        positions: of the poses along the path, increasing.
 
     Returns:
-        centers and quaternions wxyz of any length, close together.
+        centers and quaternions wxyz of any norm.
     """
-    # Here, as these would slow down import asysplat.
+    # Here, as they would slow down import asysplat.
     from scipy.interpolate import CubicSpline
     from scipy.ndimage import gaussian_filter1d
     from scipy.spatial.transform import Rotation, RotationSpline
 
-    samples = np.linspace(0, way[-1], SAMPLES)
-    centers = CubicSpline(way, poses[:, :3, 3])(samples)
-    quats = RotationSpline(way, Rotation.from_matrix(poses[:, :3, :3]))(samples)
+    samples = np.linspace(0, positions[-1], SAMPLES)
+    centers = CubicSpline(positions, poses[:, :3, 3])(samples)
+    quats = RotationSpline(positions, Rotation.from_matrix(poses[:, :3, :3]))(samples)
     quats = quats.as_quat(scalar_first=True)
     # q and -q are the same rotation: neighbors get the same sign.
     flips = (quats[1:] * quats[:-1]).sum(1) < 0

@@ -1,8 +1,7 @@
 """Gaussians as PLY, in the layout of Kerbl et al. 2023 that trainers and viewers share.
 
-A vertex is a Gaussian, its properties are float32: the mean, a normal that nobody uses, SH (of
-degree 0, then all others of one color after another), the logit of the opacity, the logarithms of
-the scales, and a quaternion wxyz.
+A vertex is a Gaussian with float32 properties: the mean, an unused normal, SH (degree 0, then the
+other degrees of red, of green and of blue), the opacity's logit, log scales, a quaternion wxyz.
 """
 
 from pathlib import Path
@@ -19,8 +18,8 @@ from asysplat.scene import Gaussians
 
 MEAN, NORMAL, COLOR = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
 SCALE, ROTATION = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
-REST = (0, 9, 24, 45)  # numbers of properties f_rest_*, of SH of degree 0 to 3
-CERTAIN = 1 - 1e-7  # the largest opacity whose logit is written: that of 1 is infinite
+REST_COUNTS = (0, 9, 24, 45)  # of properties f_rest_*, for SH of degree 0 to 3
+MAX_OPACITY = 1 - 1e-7  # the logit of 1 is infinite
 
 
 def write_ply(path: str | Path, gaussians: Gaussians) -> None:
@@ -31,10 +30,10 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
             written as 1 - 1e-7.
 
     Raises:
-        InputError: numbers that cannot be rendered, or a file that cannot be written.
+        InputError: invalid Gaussians, or a file that cannot be written.
     """
     gaussians = as_written(gaussians)
-    opacities = gaussians.opacities.double().clamp_max(CERTAIN)
+    opacities = gaussians.opacities.double().clamp_max(MAX_OPACITY)
     columns = (
         gaussians.means,
         torch.zeros_like(gaussians.means),
@@ -62,23 +61,22 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
 def read_ply(path: str | Path) -> Gaussians:
     """Read one scene from PLY, little-endian, big-endian or ASCII, in float32.
 
-    Properties may stand in any order, and others than those of Gaussians are ignored.
+    Properties may have any order; unknown ones are ignored.
 
     Raises:
-        InputError: no PLY file, one that is cut off, a missing property, no Gaussians, or numbers
-            that cannot be rendered.
+        InputError: not a PLY file, a truncated one, a missing property, or invalid Gaussians.
     """
     path = existing(path)
     vertices = read_vertices(path)
-    there = vertices.dtype.names
-    count = sum(name.startswith("f_rest_") for name in there)
-    if count not in REST:
+    properties = vertices.dtype.names
+    count = sum(name.startswith("f_rest_") for name in properties)
+    if count not in REST_COUNTS:
         raise InputError(
-            f"{path} has {count} properties f_rest_*: expected {', '.join(map(str, REST))} (SH of "
-            "degree 0 to 3)."
+            f"{path} has {count} properties f_rest_*: expected "
+            f"{', '.join(map(str, REST_COUNTS))} (SH of degree 0 to 3)."
         )
     names = [*MEAN, *COLOR, *_rest(count), "opacity", *SCALE, *ROTATION]
-    missing = [name for name in names if name not in there]
+    missing = [name for name in names if name not in properties]
     if missing:
         raise InputError(
             f"{path} has no property {missing[0]}: expected the properties of 3D Gaussians, "

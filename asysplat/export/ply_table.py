@@ -18,15 +18,15 @@ BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">
 TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"}
 TYPES |= {"uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
-LONGEST = 4096  # bytes of a header's line: what is no PLY file may have no lines
+MAX_LINE = 4096  # bytes of a header's line: other files may have no lines
 
 
 @dataclass(frozen=True)
 class Element:
-    """What a header says of one kind of rows.
+    """One kind of rows, as declared by the header.
 
     Args:
-        name: "vertex", "face" or any other.
+        name: "vertex", "face" or another.
         count: number of rows.
         types: numpy's type of each property, in the file's order; None for a list.
     """
@@ -44,18 +44,18 @@ def read_vertices(path: Path) -> ndarray:
     """Read all vertices: [N], with a field for each property.
 
     Raises:
-        InputError: no PLY file, none with vertices, a list before or in them, or one that is cut
-            off.
+        InputError: not a PLY file, a truncated one, or one without vertices or with lists before or
+            in them.
     """
     with open(path, "rb") as file:
         byte_order, elements = _read_header(file, path)
         vertex = _find_vertices(file, path, byte_order, elements)
         row = vertex.row(byte_order)
-        # Before there is an array for them: a damaged header may ask for any number.
+        # Before allocating: a damaged header may declare any number.
         left = path.stat().st_size - file.tell()
         smallest = row.itemsize if byte_order else 2 * len(row)
         if vertex.count * smallest > left + (not byte_order):
-            raise _cut_off(path, vertex.count, f"{left} bytes")
+            raise _truncated(path, vertex.count, f"{left} bytes")
         if byte_order:
             return np.fromfile(file, row, vertex.count)
         try:
@@ -68,16 +68,16 @@ def read_vertices(path: Path) -> ndarray:
                 "a line."
             ) from error
     if len(rows) < vertex.count:
-        raise _cut_off(path, vertex.count, f"{len(rows)} lines")
+        raise _truncated(path, vertex.count, f"{len(rows)} lines")
     return rows
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
     """Read the byte order and all elements."""
-    if file.readline(LONGEST).strip() != b"ply":
-        raise InputError(f"{path} is no PLY file: expected 'ply' as its first line.")
+    if file.readline(MAX_LINE).strip() != b"ply":
+        raise InputError(f"{path} is not a PLY file: expected 'ply' as its first line.")
     byte_order, elements = None, []
-    while (line := file.readline(LONGEST)).strip() != b"end_header":
+    while (line := file.readline(MAX_LINE)).strip() != b"end_header":
         match line.decode("latin-1").split():
             case ["comment" | "obj_info", *_]:
                 pass
@@ -92,9 +92,9 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
             ):
                 elements[-1].types[name] = TYPES[kind]
             case words:
-                told = repr(" ".join(words)[:80]) if line else "no end_header"
+                found = repr(" ".join(words)[:80]) if line else "no end_header"
                 raise InputError(
-                    f"{path} has {told} in its header: expected format, element, property and "
+                    f"{path} has {found} in its header: expected format, element, property and "
                     "end_header as PLY 1.0 has them; write it again."
                 )
     if byte_order is None:
@@ -103,7 +103,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
 
 
 def _find_vertices(file: BinaryIO, path: Path, byte_order: str, elements: list[Element]) -> Element:
-    """Go from the header's end to the first vertex."""
+    """Seek from the header's end to the first vertex."""
     for element in elements:
         if None in element.types.values():
             raise InputError(
@@ -123,7 +123,8 @@ def _find_vertices(file: BinaryIO, path: Path, byte_order: str, elements: list[E
     return element
 
 
-def _cut_off(path: Path, count: int, found: str) -> InputError:
+def _truncated(path: Path, count: int, found: str) -> InputError:
     return InputError(
-        f"{path} is cut off: its header names {count} vertices, and {found} follow; copy it again."
+        f"{path} is cut off: its header declares {count} vertices, but {found} follow; copy it "
+        "again."
     )

@@ -1,4 +1,4 @@
-"""Cameras as poses in float64, and how far apart they are: what paths are made from."""
+"""Camera poses in float64 and distances between them, for camera paths."""
 
 from dataclasses import replace
 
@@ -10,11 +10,11 @@ from numpy import ndarray
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
 
-SAME = 1e-6  # of the coordinates, or radians: smaller differences are rounding
+ROUNDING = 1e-6  # relative to coordinates, or in radians; smaller differences are rounding
 
 
 def checked_poses(cameras: Cameras, frames: int) -> Float[ndarray, "V 4 4"]:
-    """Return the cam_to_world of one scene's cameras, of which a path of `frames` is made.
+    """Return the cam_to_world of the cameras of one scene, after checks for a path.
 
     Raises:
         InputError: a batch dimension, no views, no frames, or what `Cameras.validate` refuses.
@@ -30,7 +30,7 @@ def checked_poses(cameras: Cameras, frames: int) -> Float[ndarray, "V 4 4"]:
 
 
 def with_poses(cameras: Cameras, poses: Float[ndarray, "T 4 4"]) -> Cameras:
-    """Return cameras at other poses, with the mean intrinsics."""
+    """Return cameras with other poses and the mean intrinsics."""
     return replace(
         cameras,
         intrinsics=cameras.intrinsics.mean(0).repeat(len(poses), 1, 1),
@@ -39,14 +39,14 @@ def with_poses(cameras: Cameras, poses: Float[ndarray, "T 4 4"]) -> Cameras:
 
 
 def spread(poses: Float[ndarray, "V 4 4"]) -> float:
-    """Return the centers' distance from their mean (root mean square), 0 where it is rounding."""
+    """Return the RMS distance of the centers from their mean, 0 if it is rounding."""
     centers = poses[:, :3, 3]
     size = float(np.sqrt(np.square(centers - centers.mean(0)).sum(1).mean()))
-    return size if size > SAME * np.abs(centers).max() else 0.0
+    return size if size > ROUNDING * np.abs(centers).max() else 0.0
 
 
-def features(poses: Float[ndarray, "V 4 4"]) -> Float[ndarray, "V 12"]:
-    """Return vectors that are as far apart as poses: in spreads, and for small turns in radians."""
+def pose_vectors(poses: Float[ndarray, "V 4 4"]) -> Float[ndarray, "V 12"]:
+    """Return vectors with the distances of poses: in spreads, and in radians for small turns."""
     size = spread(poses)
     centers = poses[:, :3, 3] / size if size else np.zeros((len(poses), 3))
     return np.concatenate((centers, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2)), 1)

@@ -1,4 +1,4 @@
-"""Gaussians from .splat files, as antimatter15's viewer and many phone apps use: 32 bytes each."""
+"""Gaussians from .splat files, 32 bytes each, of antimatter15's viewer and many phone apps."""
 
 from pathlib import Path
 
@@ -20,8 +20,7 @@ def read_splat(path: str | Path) -> Gaussians:
     Format: https://github.com/antimatter15/splat
 
     Raises:
-        InputError: no file, one that is no whole number of rows, or numbers that cannot be
-            rendered.
+        InputError: no file, a size that is no multiple of a row, or invalid Gaussians.
     """
     path = existing(path)
     size = path.stat().st_size

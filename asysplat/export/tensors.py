@@ -1,4 +1,4 @@
-"""Gaussians as safetensors: the fields as they are, and what is to be said about them."""
+"""Gaussians as safetensors, with metadata."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -21,10 +21,10 @@ def write_safetensors(
 
     Args:
         gaussians: one scene, without batch dimension.
-        metadata: kept beside them, such as units or where the scene comes from.
+        metadata: stored with them, such as units or the scene's origin.
 
     Raises:
-        InputError: numbers that cannot be rendered, or a file that cannot be written.
+        InputError: invalid Gaussians, or a file that cannot be written.
     """
     gaussians = as_written(gaussians)
     content = save({name: getattr(gaussians, name).contiguous() for name in NAMES}, metadata)
@@ -33,10 +33,10 @@ def write_safetensors(
 
 
 def read_safetensors(path: str | Path) -> tuple[Gaussians, dict[str, str]]:
-    """Read what `write_safetensors` has written: a scene in float32, and its metadata.
+    """Read a scene in float32 and its metadata, as written by `write_safetensors`.
 
     Raises:
-        InputError: no such file, a missing field, or numbers that cannot be rendered.
+        InputError: no such file, a missing field, or invalid Gaussians.
     """
     path = existing(path)
     try:

@@ -1,4 +1,4 @@
-"""Images as an mp4 that browsers play."""
+"""Videos (mp4) that browsers play."""
 
 from collections.abc import Iterable
 from fractions import Fraction
@@ -12,35 +12,35 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
 
-ENCODING = {"crf": "18"}  # x264's quality: hardly to be told from the images
+ENCODING = {"crf": "18"}  # x264's quality: visually lossless
 BT709 = 1  # its number in H.264
-INDEX_FIRST = {"movflags": "+faststart"}  # a browser plays before it has all
+INDEX_FIRST = {"movflags": "+faststart"}  # browsers start before the download ends
 
 
 def write_video(
     path: str | Path, images: Iterable[Float[Tensor, "3 H W"]], fps: int | float = 30
 ) -> None:
-    """Write images, one after the other, as H.264 in yuv420p; none is kept.
+    """Write images as H.264 in yuv420p, one at a time.
 
-    An odd height or width gets one more row or column of pixels, a copy of the last.
+    The last row or column is repeated where a height or width is odd.
 
     Args:
         path: ends in .mp4.
         images: RGB, clamped to [0, 1], all of one size.
-        fps: frames a second, > 0.
+        fps: frames per second, > 0.
 
     Raises:
         InputError: PyAV is missing, another suffix, no image, NaN, images of different sizes, or a
             file that cannot be written.
     """
     try:
-        import av  # of an extra
+        import av  # optional dependency
     except ImportError as error:
         raise InputError("write_video needs PyAV: pip install 'asysplat[video]'.") from error
     if Path(path).suffix.lower() != ".mp4":
-        raise InputError(f"{path} is no name for a video: give one that ends in .mp4.")
+        raise InputError(f"{path} is not the name of a video: give one that ends in .mp4.")
     if not fps > 0:
-        raise InputError(f"fps is {fps}: give frames a second, more than 0.")
+        raise InputError(f"fps is {fps}: give frames per second, more than 0.")
     stream = None
     with atomic_write(path) as partial, av.open(partial, "w", options=INDEX_FIRST) as container:
         for index, image in enumerate(images):
@@ -49,7 +49,7 @@ def write_video(
                 rate = Fraction(fps).limit_denominator(1001)
                 stream = container.add_stream("libx264", rate, options=ENCODING)
                 stream.pix_fmt, stream.height, stream.width = "yuv420p", *pixels.shape[:2]
-                # Said, so that no player guesses: standards differ for small and large images.
+                # Explicit, as players guess differently for small and large images.
                 for field in ("colorspace", "color_primaries", "color_trc"):
                     setattr(stream.codec_context, field, BT709)
             if pixels.shape[:2] != (stream.height, stream.width):

@@ -212,9 +212,9 @@ def test_scenes_that_cannot_be_used_are_refused(written, case, text):
 
 
 BYTES = {
-    "empty": (lambda content: b"", "is no PLY file"),
-    "another format": (lambda content: b"\x89PNG\r\n" + content, "is no PLY file"),
-    "one long line": (lambda content: bytes(10**6), "is no PLY file"),
+    "empty": (lambda content: b"", "is not a PLY file"),
+    "another format": (lambda content: b"\x89PNG\r\n" + content, "is not a PLY file"),
+    "one long line": (lambda content: bytes(10**6), "is not a PLY file"),
     "cut in the header": (lambda content: content[:200], "in its header"),
     "cut at a line of the header": (
         lambda content: content[: content.index(b"end_header")],
@@ -223,7 +223,7 @@ BYTES = {
     "cut in the vertices": (lambda content: content[:-1], "is cut off"),
     "cut behind the header": (
         lambda content: content[: content.index(b"end_header") + 11],
-        "is cut off: its header names 12 vertices, and 0 bytes follow",
+        "is cut off: its header declares 12 vertices, but 0 bytes follow",
     ),
     "more vertices than memory": (
         lambda content: content.replace(b"vertex 12", b"vertex 12000000000000"),
@@ -253,7 +253,7 @@ def test_damaged_files_are_refused(written, case):
 
 
 TEXTS = {
-    "a line missing": (lambda lines: lines[:-1], "is cut off: .* and 11 lines follow"),
+    "a line missing": (lambda lines: lines[:-1], "is cut off: .* but 11 lines follow"),
     "all lines missing": (lambda lines: lines[:-12], "is cut off"),
     "a number missing": (
         lambda lines: [*lines[:-1], lines[-1].rsplit(" ", 1)[0]],
@@ -276,7 +276,7 @@ def test_damaged_text_is_refused(written, case):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"absent\.ply is no file"):
+    with pytest.raises(InputError, match=r"absent\.ply is not a file"):
         read_ply(tmp_path / "absent.ply")
 
 

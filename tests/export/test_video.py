@@ -120,7 +120,7 @@ def test_a_full_disk_leaves_the_old_file(old, size):
 @pytest.mark.parametrize(
     ("name", "fps", "message"),
     [
-        ("way.avi", 30, r"way\.avi is no name for a video"),
+        ("way.avi", 30, r"way\.avi is not the name of a video"),
         ("way.mp4", 0, "fps is 0"),
         ("absent/way.mp4", 30, r"absent/way\.mp4 cannot be written \(No such file"),
     ],

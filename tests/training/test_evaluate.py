@@ -140,7 +140,7 @@ def test_interrupted_it_goes_on_where_it_was(whole, evaluated, evaluate, tmp_pat
     with monkeypatch.context() as patch:
         patch.setattr(scenes, "save_result", interrupted)
         stopped = evaluate(*command, STEPS)
-    assert stopped.returncode != 0 and "the same command goes on" in stopped.stderr
+    assert stopped.returncode != 0 and "the same command resumes" in stopped.stderr
     assert not list(tmp_path.rglob("evaluation.json"))
     kept = {path: path.read_bytes() for path in tmp_path.rglob("procedural-*.json")}
     assert len(kept) == 2
@@ -164,7 +164,7 @@ def test_interrupted_it_goes_on_where_it_was(whole, evaluated, evaluate, tmp_pat
 def photographs(tmp_path_factory) -> Path:
     """A folder with a scene on disk."""
     folder = tmp_path_factory.mktemp("scene")
-    scene = ProceduralScene(3, 32, 32, num_frames=24)
+    scene = ProceduralScene(3, 32, 32, num_images=24)
     write_transforms(scene.views(range(24)), folder)
     return folder
 
@@ -192,7 +192,7 @@ def test_a_file_of_gaussians_in_the_worlds_units(whole, photographs, evaluate, t
 
     behind = replace(gaussians, means=gaussians.means - torch.tensor([0.0, 0.0, 1000.0]))
     write_gaussians(path, sample["frame"].to_world(behind))
-    assert "see none of them" in refusal(evaluate(f"scene={path}", *data))
+    assert "none is visible in the input views" in refusal(evaluate(f"scene={path}", *data))
     synthetic = evaluate(f"scene={path}", *VIEWS, *TINY_SCENES)
     assert "is one scene, and the data has 2" in refusal(synthetic)
 
@@ -210,7 +210,7 @@ REFUSED = {
     "no run": (["run=nowhere"], "run=nowhere has no metrics.json"),
     "no runs": (["run=last"], "run=last found no finished run in"),
     "no weights": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
-    "no file": (["scene=none.ply", "data.test_scenes=1"], "none.ply is no file"),
+    "no file": (["scene=none.ply", "data.test_scenes=1"], "none.ply is not a file"),
     "no folder": (["init_path=shipped", "data=files"], "add data.root=..."),
     "another model": (
         ["init_path=shipped", "width=0.125"],
