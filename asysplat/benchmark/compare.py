@@ -17,22 +17,14 @@ NO_ERROR = 1e-12  # errors below are taken for it
 
 @dataclass(frozen=True)
 class Kind:
-    """The kind of a number, and from which change on it counts.
+    """The kind of a number, and from which change on it counts."""
 
-    Args:
-        unit: of the number; dB are compared by their difference, all others by their ratio.
-        worse, better: words for a change.
-        min_change: change that counts, of the logarithm or in dB.
-        sign: 1 where more is worse, -1 where less is.
-        any_machine: whether it may be compared with another machine's.
-    """
-
-    unit: str
-    worse: str
+    unit: str  # dB are compared by their difference, all others by their ratio
+    worse: str  # words for a change
     better: str
-    min_change: float
-    sign: int = 1
-    any_machine: bool = True
+    min_change: float  # that counts, of the logarithm or in dB
+    sign: int = 1  # where more is worse; -1 where less is
+    any_machine: bool = True  # whether it may be compared with another machine's
 
     def change(self, old: float, new: float) -> float:
         """Return how much worse the number became; below 0 where it became better."""
@@ -50,20 +42,14 @@ LPIPS_DISTANCE = Kind("", "less exact", "more exact", math.log(1.05))
 
 
 class Watched(NamedTuple):
-    """What is compared of a suite's results.
+    """What is compared of a suite's results."""
 
-    Args:
-        names: keys of a row that name it.
-        alike: paths in a row of what must be equal, too: sizes.
-        kinds: by the path in a row of a number, of a median with its interquartile range, or of
-            several numbers, of which the largest is compared.
-        rows: the key of the rows in the results.
-    """
-
-    names: tuple[str, ...]
-    alike: tuple[str, ...]
+    names: tuple[str, ...]  # keys of a row that name it
+    alike: tuple[str, ...]  # paths in a row of what must be equal, too: sizes
+    # By the path in a row of a number, of a median with its interquartile range, or of several
+    # numbers, of which the largest is compared.
     kinds: Mapping[str, Kind]
-    rows: str = "rows"
+    rows: str = "rows"  # the key of the rows in the results
 
 
 class Key(NamedTuple):
@@ -87,20 +73,13 @@ class Value(NamedTuple):
 
 @dataclass
 class ResultsComparison:
-    """The differences of two files, in sentences.
+    """The differences of two files, in sentences."""
 
-    Args:
-        worse, better: beyond noise.
-        missing: measured in the old file and not in the new one.
-        notes: on what could not be compared.
-        compared: how many numbers were.
-    """
-
-    worse: list[str] = field(default_factory=list)
+    worse: list[str] = field(default_factory=list)  # beyond noise
     better: list[str] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    compared: int = 0
+    missing: list[str] = field(default_factory=list)  # only in the old file
+    notes: list[str] = field(default_factory=list)  # on what could not be compared
+    compared: int = 0  # numbers
 
     def sentences(self) -> list[str]:
         """Return all sentences, the verdict last."""

@@ -23,7 +23,7 @@ from asysplat.benchmark.options import PRECISIONS, check_names, find_device
 from asysplat.benchmark.plot import bars
 from asysplat.benchmark.products import Counts, Product, RecordProducts, time_products
 from asysplat.benchmark.scenes import on_an_arc, random_scene
-from asysplat.benchmark.table import limited, machine_note, make_table, number, spread, text
+from asysplat.benchmark.table import machine_note, make_table, number, spread, text
 from asysplat.benchmark.timing import (
     Measurement,
     Result,
@@ -64,12 +64,10 @@ LAYER_CODES = {
 OPERATOR_CODES = {inspect.unwrap(getattr(ops, name)).__code__: name for name in OPERATORS}
 BACKWARD = 2  # products in the backward pass for each of the forward pass
 MAX_FILLED = 0.75  # of the memory, by the estimate of a step
-MAX_OVER_FLOOR = 2.5  # limit of the forward pass, in red where exceeded
 NOTES = """\
 floor: the forward pass's matrix products and convolutions by themselves; a step's is \
 three times that
-step: forward and backward; -: not measured, or would not fit into memory
-tokens: those of the largest patch"""
+step: forward and backward; -: not measured, or would not fit into memory"""
 
 
 @dataclass(frozen=True)
@@ -84,12 +82,6 @@ class Workload:
     @property
     def device(self) -> torch.device:
         return self.views.images.device
-
-    @property
-    def tokens(self) -> int:
-        """Count the tokens of the network's largest patch, on which most layers work."""
-        cameras = self.views.cameras
-        return cameras.num_views * cameras.height * cameras.width // self.net.patch**2
 
     def forward(self) -> Gaussians:
         """Predict the scene's Gaussians."""
@@ -236,19 +228,16 @@ def _prepare(workload: Workload, steps: bool) -> Measurement:
         of_passes = {name: seconds_of(run, device) for name, run in passes.items()}
         return of_passes | part_seconds(workload.forward, device)
 
-    peak_gb = {name: rise_gb(run, device) for name, run in passes.items()}
     row = {
         "model": workload.name,
         "parameters": count_parameters(workload.net),
         "views": cameras.num_views,
         "height": cameras.height,
         "width": cameras.width,
-        "tokens": workload.tokens,
         "precision": workload.precision,
         "threads": torch.get_num_threads(),
         "step_needs_gb": workload.step_gb,
-        "peak_gb": peak_gb,
-        "bytes_per_token": {name: GB * gb / workload.tokens for name, gb in peak_gb.items()},
+        "peak_gb": {name: rise_gb(run, device) for name, run in passes.items()},
     }
     return Measurement(seconds, row)
 
@@ -318,11 +307,10 @@ NETWORKS = {
     "inputs": text("{views} x {height}x{width}, {precision}"),
     "forward\nms": spread("forward"),
     "floor\nms": spread("floor"),
-    "forward\n/ floor": limited("over_floor.forward", MAX_OVER_FLOOR),
+    "forward\n/ floor": number("over_floor.forward", "{:.2f}"),
     "step\nms": spread("step"),
     "step\n/ floor": number("over_floor.step", "{:.2f}"),
-    "forward\nkB / token": number("bytes_per_token.forward", "{:,.0f}", unit=1e3),
-    "step\nkB / token": number("bytes_per_token.step", "{:,.0f}", unit=1e3),
+    "forward\nGB": number("peak_gb.forward", "{:.2f}"),
     "step\nGB": number("peak_gb.step", "{:.2f}"),
 }
 FORWARD = {

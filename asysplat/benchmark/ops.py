@@ -1,4 +1,4 @@
-"""Every path of the operators: time beside the sequential loop and bare products; error; memory."""
+"""Every path of the operators: time beside the sequential loop and bare products; error."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -21,7 +21,6 @@ from asysplat.benchmark.plot import time_against_error
 from asysplat.benchmark.products import (
     Size,
     grid_attention_sizes,
-    plane_sweep_sizes,
     products,
     ssd_sizes,
     time_products,
@@ -34,19 +33,17 @@ from asysplat.benchmark.scenes import (
     on_an_arc,
     random_numbers,
 )
-from asysplat.benchmark.table import error, limited, machine_note, make_table, number, spread, text
+from asysplat.benchmark.table import error, machine_note, make_table, number, spread, text
 from asysplat.benchmark.timing import (
     Measurement,
     Result,
     Timer,
     ratios,
     relative_l2,
-    rise_gb,
     seconds_of,
     time_in_rounds,
 )
 from asysplat.errors import InputError
-from asysplat.evaluation.cost import GB
 from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.scene import Cameras
 
@@ -58,16 +55,14 @@ WATCHED = Watched(
     kinds=dict.fromkeys(PASSES, TIME) | dict.fromkeys(ERRORS.values(), ERROR),
 )
 LOOP, REFERENCE, MATMULS = "loop", "reference", "matmuls"
-MAX_OVER_MATMULS = 2.5  # limit of ssd, in red where exceeded
 NOTES = """\
 loop: reference.py in fp32 on {loop} tokens, times scaled to the whole sequence; of plane_sweep \
 the reference
-matmuls: the operator's matrix products by themselves; of plane_sweep as many multiplications
+matmuls: the operator's matrix products by themselves
 error: against the reference in float64, relative in L2; *: of a smaller one of its kind"""
 
 STEPS = (1e-3, 1e-1)  # dt of an untrained network
 SCANS = ("ssd", "selective_scan")
-TOKENS = ("batch", "length", "views", "height", "width")  # sizes whose product is their number
 FP32_INPUTS = ("dt", "A", "D")
 # The shape of each input, in the order that they are drawn.
 SHAPES = {
@@ -122,10 +117,6 @@ class OpCase:
     @property
     def backends(self) -> tuple[str, ...]:
         return ("chunked" if self.operator in SCANS else "sdpa", "cpu", "cuda")
-
-    @property
-    def tokens(self) -> int:
-        return math.prod(size for side, size in self.sizes.items() if side in TOKENS)
 
     @property
     def small(self) -> "OpCase":
@@ -197,9 +188,6 @@ class PlaneSweepCase(OpCase):
         cameras = Cameras(tensors["intrinsics"], tensors["cam_to_world"], *images.shape[-2:])
         return plane_sweep(images, cameras, **self.options, backend=backend).inverse_depth
 
-    def products(self) -> list[Size]:
-        return plane_sweep_sizes(**self.sizes)
-
 
 def _images_of_wall(cameras: Cameras) -> Tensor:
     """Render a wall at about DISTANCE, z = DISTANCE + SLANT x: [V, 3, H, W] in [0, 1]."""
@@ -252,11 +240,6 @@ class Path:
         """Time each pass once."""
         return {name: seconds_of(run, self.weights.device) for name, run in self.passes().items()}
 
-    def bytes_per_token(self) -> dict[str, float]:
-        """Measure the peak memory of each pass."""
-        device, tokens = self.weights.device, self.case.tokens
-        return {name: GB * rise_gb(run, device) / tokens for name, run in self.passes().items()}
-
     def exact(self) -> Gradients:
         """Run the reference in float64 on the CPU, on inputs rounded as this path's are."""
         inputs = {n: t.detach().cpu().double().requires_grad_() for n, t in self.inputs.items()}
@@ -292,8 +275,8 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": one for each operator, precision and path, times in seconds. The path "loop" is the
         reference in fp32 on a shorter sequence, its times scaled to the whole; "matmuls" are the
-        operator's matrix products by themselves. plane_sweep, which has neither and no gradients,
-        has its reference on all pixels, and products with as many multiplications.
+        operator's matrix products by themselves. plane_sweep has neither and no gradients, but its
+        reference on all pixels.
 
     Raises:
         InputError: an unknown precision or device, sizes an operator cannot take.
@@ -340,8 +323,7 @@ def make_rows(
             except InputError:  # the operator has no such backend, or it cannot run here
                 continue
             path = make_path(case, backend, dtype, device)
-            costs = {"error": errors, "bytes_per_token": path.bytes_per_token()}
-            rows.append(_row(case, precision, backend, path.seconds, **costs))
+            rows.append(_row(case, precision, backend, path.seconds, error=errors))
         if case.products():
             sizes = {"forward": case.products()}
             if case.differentiable:
@@ -363,37 +345,31 @@ def _loop(case: OpCase, tokens: int, device: torch.device) -> Measurement:
         LOOP,
         lambda: {name: scale * value for name, value in path.seconds().items()},
         error=small.errors(small.exact()),
-        bytes_per_token=path.bytes_per_token(),
         loop_tokens=length,
     )
 
 
 def _row(case: OpCase, precision: str, path: str, timer: Timer, **costs: Any) -> Measurement:
     row = {"operator": case.name, "sizes": dict(case.sizes), "precision": precision, "path": path}
-    row |= {"threads": torch.get_num_threads(), "error": None, "bytes_per_token": None}
+    row |= {"threads": torch.get_num_threads(), "error": None}
     return Measurement(timer, row | costs)
 
 
 def tables(results: Result) -> list[Table]:
-    """Show each pass: its time, against the sequential loop and bare products; error; memory."""
+    """Show each pass: its time, against the sequential loop and bare products; error."""
     rows = results["rows"]
     loop = max((row["loop_tokens"] for row in rows if row["path"] == LOOP), default=0)
     notes = f"{machine_note(results)}\n{NOTES.format(loop=loop)}"
     shown = []
     for name, title in PASSES.items():
-        with_limit = limited(f"over_matmuls.{name}", MAX_OVER_MATMULS)
-        without = number(f"over_matmuls.{name}", "{:.2f}")
         columns = {
             "operator": text("{operator}"),
             "inputs": text("{precision}"),
             "path": text("{path}"),
             "ms": spread(name),
             "loop\n/ path": number(f"faster_than_loop.{name}", "{:.1f}"),
-            "path\n/ matmuls": lambda row, ssd=with_limit, other=without: (
-                ssd if row["operator"] == "ssd" else other
-            )(row),
+            "path\n/ matmuls": number(f"over_matmuls.{name}", "{:.2f}"),
             "error": error(ERRORS[name]),
-            "kB\n/ token": number(f"bytes_per_token.{name}", "{:.2f}", unit=1e3),
         }
         shown.append(make_table(title, columns, [row for row in rows if row[name]], notes, 3))
     return shown

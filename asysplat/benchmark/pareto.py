@@ -106,38 +106,23 @@ RenderScene = Callable[[Photographs], Tensor]  # all held-out views [V, 3, H, W]
 
 @dataclass(frozen=True)
 class FeedForward:
-    """A network's prediction, with some of its Gaussians merged or left out, rendered.
+    """A network's prediction, with some of its Gaussians merged or left out, rendered."""
 
-    Args:
-        views: input views.
-        side: of the input views, pixels.
-        checkpoint: see `load`; None: untrained, whose images are compared with its own in float64.
-        overrides: of train.py; with a checkpoint they may change no weights.
-        precision: of the network: fp32, bf16 by autocast, or fp64, in which all is computed.
-        min_opacity: below which Gaussians are dropped.
-        cell: side of the cells whose Gaussians are merged, in pixels; None: none are.
-        max_gaussians: cells grow until so few are left; None: any number.
-        sh_degree: up to which colors are rendered; None: all.
-        views_at_once: rendered views; None: all.
-        convention: cut-offs of the renderer that differ, see `Convention`.
-    """
-
-    views: int
-    side: int
-    checkpoint: str | None = "shipped"
-    overrides: Sequence[str] = ()
-    precision: str = "fp32"
-    min_opacity: float = 0.0
-    cell: float | None = None
-    max_gaussians: int | None = None
-    sh_degree: int | None = None
-    views_at_once: int | None = None
-    convention: Mapping[str, float] = field(default_factory=dict)
+    views: int  # input views
+    side: int  # of the input views, pixels
+    checkpoint: str | None = "shipped"  # see `load`; None: untrained
+    overrides: Sequence[str] = ()  # of train.py; with a checkpoint they may change no weights
+    precision: str = "fp32"  # of the network: fp32, bf16 by autocast, or fp64, for all else too
+    min_opacity: float = 0.0  # below which Gaussians are dropped
+    cell: float | None = None  # pixels: Gaussians in a cell are merged; None: none are
+    max_gaussians: int | None = None  # cells grow until so few are left
+    sh_degree: int | None = None  # of the rendered colors; None: all
+    views_at_once: int | None = None  # rendered; None: all
+    convention: Mapping[str, float] = field(default_factory=dict)  # fields of `Convention`
 
     def __post_init__(self):
         check_names("precision", [self.precision], [*PRECISIONS, EXACT])
-        _check_whole(self, "views", "side")
-        _check_whole(self, "max_gaussians", "views_at_once", optional=True)
+        _check_whole(self, "views", "side", "max_gaussians", "views_at_once")
         if self.convention:
             check_names("convention", self.convention, [each.name for each in fields(INRIA)])
 
@@ -188,30 +173,21 @@ class FeedForward:
 
 @dataclass(frozen=True)
 class Refined:
-    """A start and a refinement of so many steps or seconds, rendered.
+    """A start and a refinement of so many steps or seconds, rendered."""
 
-    Args:
-        views: input views; None: all of the scene, as they are.
-        side: of the input views, pixels; None with `views`.
-        steps: of the refinement: every round gives the same bits; 0: the start alone.
-        seconds: in place of steps.
-        init: see `initial_gaussians`; the network is the shipped one.
-        refinement: what differs from `refinement`, a file of conf/refinement.
-    """
-
-    views: int | None
-    side: int | None
-    steps: int | None = None
-    seconds: float | None = None
-    init: str = "plane_sweep"
-    refinement: Mapping[str, Any] = field(default_factory=dict)
+    views: int | None  # input views; None: all, as they are
+    side: int | None  # of the input views, pixels; None with `views`
+    steps: int | None = None  # every round gives the same bits; 0: the start alone
+    seconds: float | int | None = None  # in place of steps
+    init: str = "plane_sweep"  # see `initial_gaussians`; the network is the shipped one
+    refinement: Mapping[str, Any] = field(default_factory=dict)  # over the file of conf/refinement
 
     trained = True
 
     def __post_init__(self):
         check_names("init", [self.init], INITS)
-        _check_whole(self, "views", "side", optional=True)
-        _check_whole(self, "steps", minimum=0, optional=True)
+        _check_whole(self, "views", "side")
+        _check_whole(self, "steps", minimum=0)
         given = self.steps is not None, self.seconds is not None and 0 < self.seconds < math.inf
         if given.count(True) != 1:
             raise InputError(
@@ -258,10 +234,10 @@ FAMILIES = {
 Setting = FeedForward | Refined
 
 
-def _check_whole(setting: Setting, *names: str, minimum: int = 1, optional: bool = False) -> None:
+def _check_whole(setting: Setting, *names: str, minimum: int = 1) -> None:
     for name in names:
         value = getattr(setting, name)
-        if not (optional and value is None) and (type(value) is not int or value < minimum):
+        if value is not None and (type(value) is not int or value < minimum):
             raise InputError(f"{name}={value}: give a whole number from {minimum}.")
 
 
@@ -385,21 +361,13 @@ def select_inputs(scene: Photographs, views: int | None, side: int | None) -> Ph
 
 @dataclass(frozen=True)
 class Meter:
-    """How settings are measured on every scene.
-
-    Args:
-        protocol: of the metrics.
-        lpips: see `load_lpips`; None for no LPIPS.
-        refinement: a file of conf/refinement.
-        device: of the networks; refinements are on the CPU.
-        repeats: timed rounds.
-    """
+    """How settings are measured on every scene."""
 
     protocol: Protocol
-    lpips: LPIPS | None
-    refinement: DictConfig
-    device: torch.device
-    repeats: int
+    lpips: LPIPS | None  # see `load_lpips`; None: no LPIPS
+    refinement: DictConfig  # a file of conf/refinement
+    device: torch.device  # of the networks; refinements are on the CPU
+    repeats: int  # timed rounds
 
     def rows(
         self,
@@ -434,8 +402,8 @@ class Meter:
                     measurements[name] = Measurement(dict, {"peak_gb": None}, seconds)
                 else:
                     costs = {"peak_gb": max(0.0, rise_gb(run_once, device))}
-                    timer = partial(_time, run_once, device)
-                    measurements[name] = Measurement(timer, costs)
+                    timer = partial(seconds_of, run_once, device)
+                    measurements[name] = Measurement(lambda t=timer: {"seconds": t()}, costs)
             except InputError as error:
                 if name == BASE:
                     raise
@@ -475,10 +443,6 @@ class Meter:
                 rendered.append((exact, exact.prepare(self.refinement, self.device)(scene)))
             exact_images[name] = next(image for setting, image in rendered if setting == exact)
         return exact_images
-
-
-def _time(run: Callable[[], None], device: torch.device) -> dict[str, float]:
-    return {"seconds": seconds_of(run, device)}
 
 
 def image_error(image: Tensor, exact: Tensor) -> Result:

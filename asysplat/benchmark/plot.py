@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -85,7 +86,7 @@ def bars(
     return figure
 
 
-def plain_log_ticks(axes: Any, steps: Sequence[float]) -> None:
+def plain_log_ticks(axes: Axes, steps: Sequence[int]) -> None:
     """Label a logarithmic x axis with plain numbers at `steps` of each decade."""
     axes.xaxis.set_major_locator(LogLocator(subs=steps))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -25,9 +25,6 @@ CALLS = {call.default for call in (aten.mm, aten.addmm, aten.bmm, aten.baddbmm, 
 # Numbers of one operand or result: few enough to stay in a cache, enough to fill a GPU.
 MAX_NUMBERS = {"cpu": 2**22, "cuda": 2**26}
 MAX_CALLS = 16  # of a product that are timed together
-# Multiplications of a plane sweep for a pixel and a plane: to project it, to interpolate there,
-# and for the square and the product that are summed over patches.
-PLANE_SWEEP_TERMS = 3 + 3 + 2
 
 Size = tuple[int, int, int, int]  # count, m, k, n: so many products [m, k] x [k, n]
 
@@ -51,12 +48,6 @@ class Product:
 
     function: OpOverload  # of torch.ops.aten
     arguments: tuple[Operand | Any, ...]  # its positional ones; lists as tuples
-
-    def __str__(self) -> str:
-        operands = [value for value in self.arguments if isinstance(value, Operand)]
-        shapes = " ".join("x".join(map(str, operand.shape)) for operand in operands)
-        dtype = str(operands[0].dtype).removeprefix("torch.")
-        return f"{self.function.overloadpacket.__name__} {shapes} {dtype}"
 
     def prepare(self, device: torch.device | str) -> Callable[[], Tensor]:
         """Make operands; return the call of the function on them."""
@@ -141,17 +132,6 @@ def grid_attention_sizes(
     """List the products of each place of the grid, maps padded to whole grids."""
     tokens = views * -(-height // grid) * -(-width // grid)
     return attention_sizes(batch * grid**2 * heads, tokens, tokens, head_dim)
-
-
-def plane_sweep_sizes(
-    batch: int, views: int, height: int, width: int, planes: int, neighbors: int, **_: int
-) -> list[Size]:
-    """List products with as many multiplications as the costs of a plane sweep, which has none.
-
-    Images are compared twice, first at half the size.
-    """
-    pairs, pixels = batch * views * neighbors, height * width
-    return [(pairs, size, PLANE_SWEEP_TERMS, planes) for size in (pixels, pixels // 4)]
 
 
 def with_gradients(sizes: Iterable[Size]) -> list[Size]:

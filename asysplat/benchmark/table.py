@@ -78,11 +78,6 @@ def spread(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> Write:
     return _cell(path, write)
 
 
-def limited(path: str, limit: float) -> Write:
-    """Write a ratio, in red above the limit."""
-    return _cell(path, lambda value: Text(f"{value:.2f}", "bold red" if value > limit else ""))
-
-
 def _cell(path: str, write: Callable[[Any], str | Text]) -> Write:
     return lambda row: NOTHING if at(row, path) is None else write(at(row, path))
 

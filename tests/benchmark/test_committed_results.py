@@ -15,8 +15,8 @@ from asysplat.benchmark.output import dumps
 CELLS = {
     "render": ["15.2 ± 4.9", "3.1e-07", "1.7e-06*", "7934.2 ± 1063.5", "no ellipse culling"],
     "ops": ["166.6 ± 13.4", "1.5e-07*", "28.0", "102.0", "1.06"],
-    "model": ["20957.8 ± 0.0", "50449.0 ± 0.0", "1.73", "1,868", "of which grid_attention"],
-    "growth/model": ["10320.5 ± 0.0", "1.28", "216"],
+    "model": ["20957.8 ± 0.0", "50449.0 ± 0.0", "1.73", "of which grid_attention"],
+    "growth/model": ["10320.5 ± 0.0", "1.28", "0.44"],
     "bench": ["selective_scan", "its chunked", "its products"],
     "data": ["179.6 ± 6.0", "1329 ± 46", "33.1", "40 ± 5 frames / s"],
     "pareto": ["plane_sweep_48", "22.59", "Refined, means over scenes"],

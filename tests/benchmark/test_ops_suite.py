@@ -17,7 +17,6 @@ from asysplat.benchmark.ops import (
 from asysplat.benchmark.options import CPU, PRECISIONS, check_names, check_repeats, find_device
 from asysplat.benchmark.products import (
     MAX_NUMBERS,
-    PLANE_SWEEP_TERMS,
     Operand,
     RecordProducts,
     products,
@@ -80,7 +79,7 @@ def test_every_operator_has_a_path_and_what_it_is_compared_with(rows):
             assert ("matmuls" in paths) == (operator != "selective_scan")
             assert ("loop" in paths) == (operator in SCANS and precision == "fp32")
     sweeps = {(precision, path) for name, precision, path in rows if name == "plane_sweep"}
-    assert sweeps == {("fp32", path) for path in ("reference", "cpu", "matmuls")}
+    assert sweeps == {("fp32", path) for path in ("reference", "cpu")}
 
 
 def test_errors_are_below_their_bounds(rows):
@@ -120,8 +119,6 @@ def test_ratios_are_those_of_the_times(rows):
         assert bool(matmuls) == bool(row["over_matmuls"])
         if row["path"] == "loop":
             assert row["loop_tokens"] == LOOP_TOKENS
-        if row["path"] != "matmuls":
-            assert all(value >= 0 for value in row["bytes_per_token"].values())
 
 
 def test_an_error_is_seen():
@@ -187,7 +184,6 @@ def test_calls_are_recorded_under_their_label():
     (product,) = recorder.counts["second"]
     assert [operand.shape for operand in product.arguments] == [(2, 5, 8), (2, 8, 5)]
     assert product.arguments[0] == Operand((2, 5, 8), torch.float32)
-    assert str(product) == "bmm 2x5x8 2x8x5 float32"
     assert product.seconds(3, CPU) > 0
 
 
@@ -226,11 +222,3 @@ def test_a_sweep_is_of_a_wall_that_can_be_found():
     missing = (DISTANCE + SLANT * x - z)[..., None, None]
     depth = missing / (rays[..., 2] - SLANT * rays[..., 0])
     assert (found * depth - 1).abs().median() < 0.03
-
-
-def test_products_of_a_sweep_multiply_as_often_as_its_costs():
-    sizes = {"batch": 1, "views": 3, "height": 16, "width": 24, "stride": 2, "planes": 20}
-    case = PlaneSweepCase("plane_sweep", sizes | {"neighbors": 2})
-    counts = products(case.products(), torch.float32, CPU)
-    costs = 3 * 2 * 20 * (16 * 24 + 8 * 12)
-    assert flops_of(counts) == 2 * PLANE_SWEEP_TERMS * costs

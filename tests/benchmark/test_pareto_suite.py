@@ -149,24 +149,18 @@ def test_a_row_is_what_the_network_and_the_renderer_give(measured, room):
     assert row["psnr"] == pytest.approx(psnr(image, scene.held_out.images).mean().item(), abs=1e-4)
 
 
-def test_a_refined_image_is_that_of_so_many_steps(make_pareto, shared_folder):
-    options = make_pareto()
-    families = find_families(OmegaConf.to_container(options.pareto, resolve=True))
+@pytest.mark.parametrize("steps", [0, 2])
+def test_a_refined_image_is_that_of_so_many_steps(make_options, shared_folder, steps):
     scene = find_scenes(["mine"], shared_folder / "data")[0]["mine"](SIDE, 8, 2)
-    setting = pareto.Refined(None, None, steps=2, refinement={"densify": "none"})
-    image = setting.prepare(options.refinement, CPU)(scene)
-    settings = RefinementSettings(densify="none")
-    start = initial_gaussians("plane_sweep", scene, settings.max_gaussians)
-    background = mean_color(scene.inputs)
-    gaussians = refine(start, scene.inputs, settings, steps=2, background=background)
-    for of, shown in ((gaussians, image), (start, _start(families, options)(scene))):
-        with torch.no_grad():
-            expected = render(of, scene.held_out.cameras, background, depth=False).image
-        torch.testing.assert_close(shown, expected, rtol=0, atol=1e-5)
-
-
-def _start(families, options):
-    return families["reconstruct"]["start"].prepare(options.refinement, CPU)
+    setting = pareto.Refined(None, None, steps=steps, refinement={"densify": "none"})
+    image = setting.prepare(make_options("pareto", {}).refinement, CPU)(scene)
+    settings, background = RefinementSettings(densify="none"), mean_color(scene.inputs)
+    gaussians = initial_gaussians("plane_sweep", scene, settings.max_gaussians)
+    if steps:
+        gaussians = refine(gaussians, scene.inputs, settings, steps=steps, background=background)
+    with torch.no_grad():
+        expected = render(gaussians, scene.held_out.cameras, background, depth=False).image
+    torch.testing.assert_close(image, expected, rtol=0, atol=1e-5)
 
 
 def test_knobs_leave_gaussians_out(make_pareto, room, monkeypatch):
