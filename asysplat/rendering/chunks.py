@@ -1,4 +1,4 @@
-"""Render a few views at a time, in the memory that these take."""
+"""Render a few views at a time, in the memory of these views."""
 
 import dataclasses
 import warnings
@@ -15,7 +15,7 @@ from asysplat.scene import Cameras, Gaussians
 Draw = Callable[[Gaussians, Cameras, RenderSettings, Tensor | None], RenderOutputs]
 PER_VIEW = ("cam_to_world", "intrinsics")
 NAMES = (*(field.name for field in dataclasses.fields(Gaussians)), *PER_VIEW)
-SAME_IN_ALL = ("tile_size",)  # statistics that do not add up
+NOT_SUMMED = ("tile_size",)  # statistics that are the same for all chunks
 
 
 def draw_in_chunks(
@@ -28,74 +28,63 @@ def draw_in_chunks(
 ) -> RenderOutputs:
     """Draw all views at once, or `views_at_once` of every scene at a time.
 
-    Where memory does not hold that many, half as many are tried, and a warning says so.
+    If memory is too small, try half as many, with a warning.
 
     Raises:
         InputError: views_at_once below 1.
     """
     if views_at_once is not None and views_at_once < 1:
         raise InputError(f"render's views_at_once is {views_at_once}: give at least 1, or None.")
-    together = min(views_at_once or cameras.num_views, cameras.num_views)
+    num_views = min(views_at_once or cameras.num_views, cameras.num_views)
     while True:
         try:
-            return _draw(draw, gaussians, cameras, settings, masks, together)
+            if num_views == cameras.num_views:
+                return draw(gaussians, cameras, settings, masks)
+            chunks = _Chunks(draw, settings, masks, (cameras.height, cameras.width), num_views, {})
+            fields = [getattr(gaussians, name) for name in NAMES if name not in PER_VIEW]
+            poses = (cameras.cam_to_world, cameras.intrinsics)
+            *images, origins = _Deferred.apply(chunks, *fields, *poses)
+            return RenderOutputs(*images, chunks.stats, origins)
         except (torch.OutOfMemoryError, MemoryError) as error:
-            if together <= 1:
+            if num_views <= 1:
                 raise
-            together = -(-together // 2)
+            num_views = -(-num_views // 2)
             warnings.warn(
-                f"render: memory does not hold so many views at once ({error}); drawing {together} "
-                f"at a time, and again in the backward pass (views_at_once={together}).",
+                f"render: memory does not hold so many views at once ({error}); drawing "
+                f"{num_views} at a time, and again in the backward pass "
+                f"(views_at_once={num_views}).",
                 stacklevel=3,
             )
 
 
-def _draw(
-    draw: Draw,
-    gaussians: Gaussians,
-    cameras: Cameras,
-    settings: RenderSettings,
-    masks: Tensor | None,
-    views_at_once: int,
-) -> RenderOutputs:
-    if views_at_once >= cameras.num_views:
-        return draw(gaussians, cameras, settings, masks)
-    stats: dict[str, int] = {}
-    job = _Job(draw, settings, masks, cameras.height, cameras.width, views_at_once, stats)
-    fields = [getattr(gaussians, name) for name in NAMES if name not in PER_VIEW]
-    *images, origins = _Deferred.apply(job, *fields, cameras.cam_to_world, cameras.intrinsics)
-    return RenderOutputs(*images, stats, origins)
-
-
 @dataclasses.dataclass(frozen=True)
-class _Job:
-    """How to draw some of the views; `stats` is filled on the way."""
+class _Chunks:
+    """The arguments for drawing some of the views; each chunk adds to `stats`."""
 
     draw: Draw
     settings: RenderSettings
     masks: Tensor | None
-    height: int
-    width: int
+    size: tuple[int, int]
     views_at_once: int
     stats: dict[str, int]
 
-    def chunks(self, num_views: int) -> list[slice]:
-        """Divide the views."""
+    def slices(self, num_views: int) -> list[slice]:
+        """Split the views."""
         starts = range(0, num_views, self.views_at_once)
         return [slice(start, start + self.views_at_once) for start in starts]
 
-    def part(self, tensors: Sequence[Tensor], views: slice) -> list[Tensor]:
-        """Take what belongs to some views from all tensors."""
+    def select(self, tensors: Sequence[Tensor], views: slice) -> list[Tensor]:
+        """Select the inputs for some views."""
         *fields, poses, intrinsics = tensors
         return [*fields, poses[:, views], intrinsics[:, views]]
 
-    def draw_part(
-        self, part: Sequence[Tensor], views: slice
+    def draw_views(
+        self, inputs: Sequence[Tensor], views: slice
     ) -> tuple[list[Tensor | None], dict[str, int]]:
-        """Draw the `part` of `views`; return images as [B, views, ...], and statistics."""
-        *fields, poses, intrinsics = part
-        cameras = Cameras(intrinsics, poses, self.height, self.width)
+        """Draw `views` from their `inputs`; return images as [B, views, ...], and statistics."""
+        *fields, poses, intrinsics = inputs
         masks = None if self.masks is None else self.masks[:, views]
+        cameras = Cameras(intrinsics, poses, *self.size)
         out = self.draw(Gaussians(*fields), cameras, self.settings, masks)
         shape = poses.shape[:2]
         images = (out.image, out.alpha, out.transmittance, out.depth, out.depth_origin)
@@ -103,19 +92,20 @@ class _Job:
 
 
 class _Deferred(torch.autograd.Function):
-    """Keeps the inputs alone; the backward pass draws each chunk again, with a graph."""
+    """Saves only the inputs; the backward pass draws each chunk again, with a graph."""
 
     @staticmethod
-    def forward(ctx, job: _Job, *tensors: Tensor) -> tuple[Tensor | None, ...]:
-        ctx.job = job
+    def forward(ctx, chunks: _Chunks, *tensors: Tensor) -> tuple[Tensor | None, ...]:
+        ctx.chunks = chunks
         ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
         parts = []
-        for views in job.chunks(tensors[-1].shape[1]):
-            images, stats = job.draw_part(job.part(tensors, views), views)
+        for views in chunks.slices(tensors[-1].shape[1]):
+            images, stats = chunks.draw_views(chunks.select(tensors, views), views)
             parts.append(images)
             for name, count in stats.items():
-                job.stats[name] = count + (0 if name in SAME_IN_ALL else job.stats.get(name, 0))
+                total = 0 if name in NOT_SUMMED else chunks.stats.get(name, 0)
+                chunks.stats[name] = count + total
         return tuple(
             None if images[0] is None else torch.cat(images, 1).flatten(0, 1)
             for images in zip(*parts, strict=True)
@@ -124,26 +114,28 @@ class _Deferred(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        job, shape = ctx.job, ctx.saved_tensors[-1].shape[:2]
+        chunks, shape = ctx.chunks, ctx.saved_tensors[-1].shape[:2]
         needed = ctx.needs_input_grad[1:]
         totals = [
             torch.zeros_like(tensor) if need else None
             for tensor, need in zip(ctx.saved_tensors, needed, strict=True)
         ]
-        for views in job.chunks(shape[1]):
-            part = [
+        for views in chunks.slices(shape[1]):
+            inputs = [
                 tensor.detach().requires_grad_(need)
-                for tensor, need in zip(job.part(ctx.saved_tensors, views), needed, strict=True)
+                for tensor, need in zip(
+                    chunks.select(ctx.saved_tensors, views), needed, strict=True
+                )
             ]
             with torch.enable_grad():
-                images, _ = job.draw_part(part, views)
-            seen = [
+                images, _ = chunks.draw_views(inputs, views)
+            outputs = [
                 (image, grad.unflatten(0, shape)[:, views])
                 for image, grad in zip(images, grads, strict=True)
                 if grad is not None and image is not None and image.requires_grad
             ]
-            torch.autograd.backward(*map(list, zip(*seen, strict=True)))
-            for name, total, tensor in zip(NAMES, totals, part, strict=True):
+            torch.autograd.backward(*map(list, zip(*outputs, strict=True)))
+            for name, total, tensor in zip(NAMES, totals, inputs, strict=True):
                 if total is not None and tensor.grad is not None:
                     (total[:, views] if name in PER_VIEW else total).add_(tensor.grad)
         return (None, *totals)

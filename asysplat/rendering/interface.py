@@ -1,6 +1,6 @@
-"""What `render` asks of a backend, and what a backend returns."""
+"""The arguments and results of a rendering backend."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -20,26 +20,25 @@ MAX_SPLATS_PER_TILE = 2**24  # what float32 can count
 def single(value: float) -> float:
     """Return the float32 nearest to `value`.
 
-    The renderers that set the constants below compute in float32, where two clamped alphas reach
-    the stop, and float64 has to decide as they do.
+    The renderers that define the constants below compute in float32, where two clamped alphas reach
+    the stop, and float64 has to take the same decisions.
     """
     return float(np.float32(value))
 
 
 @dataclass(frozen=True)
 class Convention:
-    """The cut-offs of alpha compositing, which decide what a pixel sees; a PSNR depends on them.
+    """The cut-offs of alpha compositing, which decide the value of a pixel; a PSNR depends on them.
 
     Args:
         alpha_max: alpha is clamped to this value.
-        alpha_min: a smaller alpha is skipped.
+        alpha_min: a smaller alpha counts as 0.
         transmittance_min: the Gaussian that would push the transmittance below this value is
             dropped, with all behind it.
         eps2d: variance added to every projected Gaussian, in pixels squared.
         near: Gaussians whose mean has a depth <= near are culled, in scene units.
         frustum_margin: the Jacobian is taken inside the view widened by this share on each side.
-        compensation_min: least share of a splat's area that antialiasing leaves of its opacity,
-            squared.
+        compensation_min: minimum of the squared factor of the opacity for antialiasing.
     """
 
     alpha_max: float = single(0.99)
@@ -60,21 +59,19 @@ CONVENTIONS = {"inria": INRIA, "gsplat-1.5": GSPLAT_1_5}
 
 @dataclass(frozen=True)
 class Culling:
-    """Work that is left out without changing a bit of the image or of a gradient.
+    """Exact culling: work that can be left out without changing a bit of an image or a gradient.
 
-    Each skip can be switched off.
+    Each kind can be switched off.
 
     Args:
-        opacity: Gaussians below alpha_min are culled before they are projected.
-        frustum: Gaussians that show in no pixel of the image are culled before their color is
-            computed.
-        extent: a splat ends where its own alpha falls below alpha_min, not where that of an opaque
-            one does.
-        ellipse: tiles that a splat's ellipse does not touch are left out, not only those that its
-            box misses.
-        masks: tiles in which no pixel counts are left out.
-        rows: rows of a tile's pixels that a splat does not show in are left out.
-        opaque: what lies behind opaque rows and tiles is left out.
+        opacity: cull Gaussians below alpha_min before the projection.
+        frustum: cull Gaussians outside the image before their color is computed.
+        extent: end a splat where its own alpha falls below alpha_min, not where that of an opaque
+            splat does.
+        ellipse: cull tiles of a splat's box that its ellipse does not touch.
+        masks: cull tiles without a pixel that counts.
+        rows: cull rows of a tile's pixels that a splat does not reach.
+        opaque: cull splats behind opaque rows and tiles.
     """
 
     opacity: bool = True
@@ -86,19 +83,19 @@ class Culling:
     opaque: bool = True
 
     def disable(self, name: str) -> "Culling":
-        """Return these skips with `name` switched off."""
-        return Culling(**{f.name: getattr(self, f.name) and f.name != name for f in fields(self)})
+        """Return this culling with `name` switched off."""
+        return replace(self, **{name: False})
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How to draw.
+    """Settings of a rendering.
 
     Args:
         convention: cut-offs of alpha compositing.
-        antialiased: opacity is lowered by what eps2d adds to a splat's area (Yu et al. 2024).
+        antialiased: lower the opacity by what eps2d adds to a splat's area (Yu et al. 2024).
         depth: one of DEPTHS, or None.
-        culling: work to leave out.
+        culling: exact culling.
 
     Raises:
         InputError: an unknown depth.
@@ -110,7 +107,6 @@ class RenderSettings:
     culling: Culling = Culling()
 
     def __post_init__(self):
-        """Check the name of the depth."""
         if self.depth is not None and self.depth not in DEPTHS:
             raise InputError(
                 f"render's depth is {self.depth!r}: choose True, False or one of "
@@ -125,12 +121,11 @@ class RenderOutputs:
     Args:
         image: [I, 3, H, W] sum of w_i c_i.
         alpha: [I, H, W] sum of w_i.
-        transmittance: [I, H, W] 1 - alpha, but to float32's relative precision also where it is
-            nearly 0.
+        transmittance: [I, H, W] 1 - alpha, to float32's relative precision also near 0.
         depth: [I, H, W] sum of w_i (z_i - depth_origin), or the depth of the Gaussian that takes
-            the transmittance to half or below, 0 where none does; None unless asked for.
-        stats: counts of what was done and of what was skipped.
-        depth_origin: [I, H, W] without a gradient, near the depths that are blended, so that their
+            the transmittance to half or below, 0 where none does; None if settings.depth is None.
+        stats: counts of visible Gaussians, pairs with tiles, and what was culled.
+        depth_origin: [I, H, W] without a gradient, near the blended depths, so that their
             differences are not lost to rounding; None for 0.
     """
 
@@ -143,11 +138,11 @@ class RenderOutputs:
 
 
 def check_pairs(pairs: int, longest: int = 0) -> None:
-    """Raise InputError if a backend's lists cannot hold what they would have to.
+    """Raise InputError if a backend's lists cannot hold so many entries.
 
     Args:
-        pairs: pairs of Gaussian and tile, of which a list can number MAX_PAIRS.
-        longest: Gaussians in the tile that has most, of which it can count MAX_SPLATS_PER_TILE.
+        pairs: pairs of Gaussian and tile, at most MAX_PAIRS.
+        longest: Gaussians in the fullest tile, at most MAX_SPLATS_PER_TILE.
     """
     if longest > MAX_SPLATS_PER_TILE:
         raise InputError(

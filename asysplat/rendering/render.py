@@ -1,4 +1,4 @@
-"""The renderer's one public function."""
+"""The renderer's public function."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -16,14 +16,14 @@ from asysplat.rendering.chunks import draw_in_chunks
 from asysplat.rendering.interface import INRIA, Convention, Culling, RenderOutputs, RenderSettings
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
-DEPTH_SWITCH = {True: "expected", False: None}  # what depth=True and depth=False stand for
-ALPHA_TINY = 1e-6  # an alpha below 1/255 is exactly 0, so any value between will do
+DEPTH_SWITCH = {True: "expected", False: None}  # of depth=True and depth=False
+MIN_ALPHA = 1e-6  # avoids division by 0; an alpha below 1/255 is exactly 0
 
 
 def _draw_by_cuda(
     gaussians: Gaussians, cameras: Cameras, settings: RenderSettings, masks: Tensor | None = None
 ) -> RenderOutputs:
-    """Import Triton at the first call only: a machine without a GPU may lack it."""
+    """Import Triton at the first call: a machine without a GPU may lack it."""
     try:
         from asysplat.rendering.cuda.draw import draw
     except ImportError as error:
@@ -36,14 +36,14 @@ BACKENDS = {"reference": reference.draw, "cpu": cpu.draw, "cuda": _draw_by_cuda}
 
 @dataclass(frozen=True)
 class Rendering(TensorRecord):
-    """What `render` returns, in float32, or in float64 for float64 inputs.
+    """The result of `render`, in float32, or in float64 for float64 inputs.
 
     Args:
         image: [..., V, 3, H, W] >= 0; no upper bound.
         alpha: [..., V, H, W] in [0, 1).
-        depth: [..., V, H, W] in scene units, 0 where no Gaussian is seen; None unless asked for.
-        stats: visible (pairs of Gaussian and view), pairs (of those with tiles), tile_size, and
-            what the backend skipped.
+        depth: [..., V, H, W] in scene units, 0 without a visible Gaussian; None if not requested.
+        stats: visible (pairs of Gaussian and view), pairs (of these with tiles), tile_size, and
+            what the backend culled.
     """
 
     image: Float[Tensor, "*batch V 3 H W"]
@@ -69,33 +69,33 @@ def render(
 ) -> Rendering:
     """Render every view, by alpha compositing in depth order (Kerbl et al. 2023).
 
-    Differentiable in all fields of `gaussians` and `cameras`, and in `background`; a Gaussian that
-    is culled (see `reference.project.project`) has gradient 0. Half-precision inputs are
-    computed in float32, also under autocast. The same inputs give the same bits on one device, on a
-    CPU on any number of threads.
+    Differentiable in all fields of `gaussians` and `cameras`, and in `background`; a culled
+    Gaussian (see `reference.project.project`) has gradient 0. Half-precision inputs are computed in
+    float32, also under autocast. The same inputs give the same bits on one device, and on a CPU
+    with any number of threads.
 
     Args:
         gaussians: [..., N].
         cameras: [..., V], with the batch dimensions of `gaussians`. Skew is ignored.
-        background: RGB [3], or [..., V, 3] one a view; None is black.
-        backend: "reference", "cpu", "cuda" or "auto": the fast one for the device, the reference
+        background: RGB [3], or [..., V, 3] for each view; None is black.
+        backend: "reference", "cpu", "cuda" or "auto": the fast backend of the device, the reference
             for float64, and on a GPU without Triton.
         depth: True or "expected": sum_i w_i z_i / alpha. "accumulated": not divided by alpha.
             "median": z of the Gaussian that takes the transmittance to half or below. False: none.
         antialiased: lower opacities by what the dilation adds to a splat's area (Yu et al. 2024).
-        sh_degree: leave SH of higher degrees out.
+        sh_degree: ignore SH of higher degrees.
         convention: cut-offs of alpha compositing; see `CONVENTIONS`.
-        culling: exact culling, each of which can be switched off.
+        culling: exact culling; each kind can be switched off.
         masks: True where a pixel counts; the others show the background, and tiles without a pixel
             that counts cost nothing.
-        views_at_once: draw this many views of each scene at a time, keep nothing but the inputs,
-            and draw again in the backward pass (deferred backpropagation, Zhang et al. 2022): the
-            same gradient, in the memory that these views take. None draws all at once.
+        views_at_once: draw this many views of each scene at a time, keep only the inputs, and draw
+            again in the backward pass (deferred backpropagation, Zhang et al. 2022): the same
+            gradient with the memory of these views. None draws all at once.
         validate: check every number of `gaussians` and `cameras` first.
 
     Raises:
-        InputError: an unknown backend or depth, shapes, devices or types that do not fit together,
-            more pairs of Gaussian and tile than a list can number; with `validate`, what
+        InputError: an unknown backend or depth; incompatible shapes, devices or types; more pairs
+            of Gaussian and tile than a list can number; with `validate`, everything that
             `Gaussians.validate` and `Cameras.validate` refuse.
     """
     if sh_degree not in (None, 0, 1, 2, 3):
@@ -133,17 +133,17 @@ def render(
 
 
 def _depth(out: RenderOutputs, settings: RenderSettings) -> Tensor:
-    """Compute the depth [I, H, W] of the kind that was asked for."""
+    """Compute the depth [I, H, W] of the requested kind."""
     if settings.depth == "median":
         return out.depth
     origin = 0 if out.depth_origin is None else out.depth_origin
     if settings.depth == "accumulated":
         return out.depth + origin * out.alpha
-    return out.depth / out.alpha.clamp_min(ALPHA_TINY) + origin * (out.alpha > 0)
+    return out.depth / out.alpha.clamp_min(MIN_ALPHA) + origin * (out.alpha > 0)
 
 
 def _fast_backend(device: torch.device, dtype: torch.dtype) -> str:
-    """Name the fastest backend for the device that computes in `dtype`."""
+    """Return the name of the fastest backend for the device and dtype."""
     if dtype == torch.float32 and device.type == "cpu":
         return "cpu"
     if dtype == torch.float32 and device.type == "cuda" and find_spec("triton"):
@@ -152,14 +152,14 @@ def _fast_backend(device: torch.device, dtype: torch.dtype) -> str:
 
 
 def _one_batch(tensor: Tensor, batch: tuple[int, ...]) -> Tensor:
-    """Flatten the batch dimensions into one, of length 1 where there are none."""
+    """Flatten the batch dimensions into one, of length 1 without any."""
     return tensor.reshape(math.prod(batch), *tensor.shape[len(batch) :])
 
 
 def _check(
     gaussians: Gaussians, cameras: Cameras, background: Tensor | None, masks: Tensor | None
 ) -> tuple[int, ...]:
-    """Check that all tensors go together; return their batch dimensions."""
+    """Check that all tensors are compatible; return their batch dimensions."""
     batch, views = tuple(gaussians.opacities.shape[:-1]), tuple(cameras.intrinsics.shape[:-2])
     if batch != views[:-1]:
         raise InputError(

@@ -9,7 +9,7 @@ from asysplat.rendering import INRIA
 from asysplat.rendering.cpu.splat import TILE
 from asysplat.rendering.formulas import EXPONENT_MARGIN, PIXEL_MARGIN
 from asysplat.rendering.interface import RenderSettings
-from asysplat.rendering.reference.project import find_footprint
+from asysplat.rendering.reference.project import project_footprints
 from asysplat.scene import Cameras, Gaussians
 
 BAND = 2e-5  # pixels
@@ -38,7 +38,7 @@ def tangent_scene(
     side = torch.arange(count) % 4
     both = torch.arange(count) // 4 % 8 == 0
     for _ in range(2):
-        footprint = find_footprint(
+        footprint = project_footprints(
             gaussians.means, gaussians.quats, gaussians.scales, pose, pinhole, (width, height),
             RenderSettings(),
         )  # fmt: skip

@@ -49,12 +49,6 @@ sh_basis_gradient = inline(sh.sh_basis_gradient)
 
 
 @inline
-def row3(array, row, column=0):
-    """Read three float64 from a row of an array."""
-    return (float(array[row, column]), float(array[row, column + 1]), float(array[row, column + 2]))
-
-
-@inline
 def triple(array, start):
     """Read three float64 from a flat array."""
     return (float(array[start]), float(array[start + 1]), float(array[start + 2]))

@@ -19,7 +19,6 @@ from asysplat.rendering.cpu.math import (
     log2,
     plus,
     project_mean,
-    row3,
     triple,
     unit_quaternion,
     whitening,
@@ -235,7 +234,7 @@ def _store_color(inputs, g, image, basis, splats, d):
     count = sh.shape[1]
     x = y = z = 0.0
     if count > 1:
-        offset = plus(row3(inputs.means, g), -1.0, row3(inputs.cameras, image, CENTER))
+        offset = plus(triple(inputs.means[g], 0), -1.0, triple(inputs.cameras[image], CENTER))
         length = math.sqrt(max(dot(offset, offset), MIN_SQUARED_DISTANCE))
         x, y, z = offset[0] / length, offset[1] / length, offset[2] / length
     write_sh_basis(x, y, z, count, basis)

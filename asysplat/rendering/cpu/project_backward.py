@@ -15,7 +15,6 @@ from asysplat.rendering.cpu.math import (
     load_camera,
     plus,
     project_mean,
-    row3,
     scaled,
     sh_basis_gradient,
     triple,
@@ -162,7 +161,7 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
     fx, fy = camera.focal
 
     # Repeat the forward pass.
-    mean = row3(inputs.means, g)
+    mean = triple(inputs.means[g], 0)
     offset, _, inverse_z, tangents, clamped, row_x, row_y = project_mean(
         mean, axes, camera.center, (fx, fy), camera.limits
     )

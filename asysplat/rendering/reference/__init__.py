@@ -1,4 +1,4 @@
-"""The renderer in plain torch: on any device, in any float type, a step at a time."""
+"""Render in plain torch, on any device and in any float type."""
 
 from asysplat.rendering.reference.draw import draw
 

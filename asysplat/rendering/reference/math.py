@@ -10,9 +10,9 @@ def whiten(row_x: Tensor, row_y: Tensor, settings: RenderSettings) -> tuple[Tens
     """Factorize the covariance M M^T + eps I, M = (row_x; row_y).
 
     Return the whitening (a, b, c), which is the Cholesky factor of the inverse; the standard
-    deviations along x and y; the factor that antialiasing lowers the opacity by. The determinant is
-    a sum of squares (Cauchy-Binet), so no needle makes it cancel to zero, and it is divided by Syy
-    early, so no large scale overflows.
+    deviations along x and y; the factor of the opacity for antialiasing. The determinant is a sum
+    of squares (Cauchy-Binet), which cancels to zero for no needle; it is divided by Syy early, so
+    that no large scale overflows.
     """
     eps = settings.convention.eps2d
     xx, xy, yy = ((p * q).sum(-1) for p, q in ((row_x, row_x), (row_x, row_y), (row_y, row_y)))
@@ -31,7 +31,7 @@ def whiten(row_x: Tensor, row_y: Tensor, settings: RenderSettings) -> tuple[Tens
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """Turn quaternions [..., 4] wxyz of any length into rotations [..., 3, 3]."""
+    """Convert quaternions [..., 4] wxyz of any length to rotations [..., 3, 3]."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = (
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

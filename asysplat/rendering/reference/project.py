@@ -1,4 +1,4 @@
-"""3D Gaussians to 2D splats: what each image sees, where, and how large (EWA splatting)."""
+"""Project 3D Gaussians to 2D splats: EWA splatting."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from asysplat.rendering.reference.math import rotations, whiten
 from asysplat.rendering.sh import sh_colors
 from asysplat.scene import Cameras, Gaussians
 
-BOUNDS_MARGIN = 1e-3  # pixels; more than the rounding of an extent
+BOUNDS_MARGIN = 1e-3  # pixels, more than the rounding error of an extent
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Splats:
 
 
 class Footprint(NamedTuple):
-    """Where a Gaussian lies in an image, and how large it is."""
+    """The position and size of a Gaussian in an image."""
 
     offsets: Tensor  # [..., 3] mean - camera center, world axes
     depths: Tensor  # [...]
@@ -52,20 +52,20 @@ class Footprint(NamedTuple):
 
 
 def project(gaussians: Gaussians, cameras: Cameras, settings: RenderSettings) -> Splats:
-    """Find the splats of every view of every scene.
+    """Project the Gaussians of every scene to every view.
 
     Args:
         gaussians: with one batch dimension, [B, N].
         cameras: [B, V], zero skew; image b * V + v is view v of scene b.
         settings: convention and antialiasing.
 
-    Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel center within its
-    extent, and whatever does not project to finite numbers (NaN, infinity, a zero quaternion).
+    Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel center within the extent,
+    and Gaussians that do not project to finite numbers (NaN, infinity, a zero quaternion).
     """
     size = (cameras.width, cameras.height)
-    images, indices = find_visible(gaussians, cameras, settings)
-    # Only visible pairs enter the graph, so nothing that was culled can send a NaN back.
-    footprint = find_footprint(
+    images, indices = select_visible(gaussians, cameras, settings)
+    # Only visible pairs enter the graph: culled ones cannot send a NaN back.
+    footprint = project_footprints(
         *(
             field.flatten(0, 1).index_select(0, indices)
             for field in (gaussians.means, gaussians.quats, gaussians.scales)
@@ -91,12 +91,12 @@ def project(gaussians: Gaussians, cameras: Cameras, settings: RenderSettings) ->
 
 
 @torch.no_grad()
-def find_visible(
+def select_visible(
     gaussians: Gaussians, cameras: Cameras, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
     """Return image and flat Gaussian index of every visible pair, in the order of `Splats`."""
     size = (cameras.width, cameras.height)
-    footprint = find_footprint(
+    footprint = project_footprints(
         gaussians.means[:, None],
         gaussians.quats[:, None],
         gaussians.scales[:, None],
@@ -107,7 +107,7 @@ def find_visible(
     )
     opacities = gaussians.opacities[:, None] * footprint.compensation
     first, last = _pixel_range(footprint, opacities, size, settings)
-    # Written so that NaN compares false.
+    # Comparisons with NaN are false.
     visible = (
         (footprint.depths > settings.convention.near)
         & (footprint.depths < MAX_MAGNITUDE)
@@ -128,7 +128,7 @@ def find_visible(
     return images, order[images, ranks] + scenes * gaussians.num_gaussians
 
 
-def find_footprint(
+def project_footprints(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -139,7 +139,7 @@ def find_footprint(
 ) -> Footprint:
     """Project Gaussians; all arguments broadcast over their leading dimensions."""
     rotation = cam_to_world[..., :3, :3]
-    # Relative to the camera first: exact for scenes far from the origin.
+    # The offset comes first: it is exact for scenes far from the origin.
     offsets = means - cam_to_world[..., :3, 3]
     x, y, z = (offsets[..., None, :] @ rotation).squeeze(-2).unbind(-1)
     tangents = torch.stack((x / z, y / z), -1)
@@ -151,7 +151,7 @@ def find_footprint(
     clamped = torch.clamp(
         tangents, (-principal - margin) / focal, (size - principal + margin) / focal
     )
-    # Rows of J R^T: how the pixel moves with the mean, in world axes.
+    # Rows of J R^T, in world axes.
     jacobian = (focal / z[..., None])[..., None] * (
         rotation.mT[..., :2, :] - clamped[..., None] * rotation.mT[..., 2:, :]
     )
@@ -164,7 +164,7 @@ def find_footprint(
 def _pixel_range(
     footprint: Footprint, opacities: Tensor, size: tuple[int, int], settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return first and last pixel (x, y) whose center is in the box around alpha >= alpha_min."""
+    """Compute the first and last pixel (x, y) whose center is in the box of alpha >= alpha_min."""
     distance = (2 * (opacities / settings.convention.alpha_min).log().clamp_min(0)).sqrt()
     extent = footprint.deviations * distance[..., None] + BOUNDS_MARGIN
     size = extent.new_tensor(size)

@@ -1,8 +1,7 @@
 """Alpha compositing in plain torch, on any device and in any float type.
 
-Tiles with lists of similar length are padded and composited together, in groups small enough to
-stay in the processor's cache. The backward pass recomputes what the forward pass computed, so only
-the inputs are kept.
+Tiles with lists of similar length are padded and composited together, in groups that fit into the
+processor's cache. The backward pass recomputes the forward pass, so only the inputs are saved.
 """
 
 from collections.abc import Iterator
@@ -29,18 +28,18 @@ def rasterize(
 ) -> Float[Tensor, "T C P"]:
     """Composite sum_i w_i values_i at every pixel of every tile, front to back.
 
+    w_i = alpha_i prod_{j<i} (1 - alpha_j), Kerbl et al. 2023.
+
     Args:
         splats: M splats, sorted by depth within their image.
-        values: what each splat shows.
+        values: of each splat.
         lists: from `list_tiles`; P = size * size pixels a tile, row by row.
         convention: the cut-offs.
-        median: of the last value, take that of the splat at which the transmittance falls to half
-            or below; 0 where it never does.
-
-    w_i = alpha_i prod_{j<i} (1 - alpha_j), Kerbl et al. 2023.
+        median: take the last value from the splat at which the transmittance falls to half or
+            below; 0 where it never does.
     """
     packed = torch.cat((splats.xy, splats.whitening, splats.opacities[:, None], values), -1)
-    # The last row is what padding shows: opacity 0.
+    # The last row is the padding, with opacity 0.
     packed = torch.nn.functional.pad(packed, (0, 0, 0, 1))
     return _Rasterize.apply(packed, lists, convention, median)
 
@@ -70,7 +69,7 @@ class _Rasterize(torch.autograd.Function):
                 _gather_rows(packed, splats), lists.origins(tiles), lists.size, *ctx.options
             )
             rows = block.backward(grad_output.index_select(0, tiles))
-            # On a CPU this sums in a fixed order: the same bits every time.
+            # A CPU sums in a fixed order: the same bits every time.
             grad.index_add_(0, splats.flatten(), rows.flatten(0, 1))
         return grad, None, None, None
 
@@ -78,7 +77,7 @@ class _Rasterize(torch.autograd.Function):
 def _groups(lists: Lists, padding: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield tiles [t] and their splats [t, K], about GROUP_ELEMENTS (splat, pixel) pairs at a time.
 
-    Covers all tiles that have splats, longest list first; shorter ones end in `padding`.
+    Covers all tiles with splats, longest list first; shorter lists end in `padding`.
     """
     padded = torch.nn.functional.pad(lists.splats, (0, 1), value=padding)
     starts = lists.lengths.cumsum(0) - lists.lengths
@@ -100,7 +99,7 @@ def _gather_rows(packed: Tensor, index: Tensor) -> Tensor:
 
 
 def _zero_below(values: Tensor, gate: Tensor, limit: float) -> None:
-    """Set values to 0 where gate < limit; one vectorized pass, several times faster than where."""
+    """Set values to 0 where gate < limit, in one vectorized pass."""
     below = torch.nextafter(gate.new_tensor(limit), gate.new_zeros(())).item()
     torch.ops.aten.threshold_backward.grad_input(values, gate, below, grad_input=values)
 
@@ -111,7 +110,7 @@ class _Block:
     def __init__(
         self, packed: Tensor, origins: Tensor, size: int, convention: Convention, median: bool
     ):
-        """Take packed [t, K, 6 + C] and origins [t, 2]; all temporaries are [t, K, P]."""
+        """Compute alphas [t, K, P] from packed [t, K, 6 + C] and origins [t, 2]."""
         self.convention, self.median = convention, median
         self.x, self.y, self.a, self.b, self.c, self.opacity = packed[..., :6].unbind(-1)
         self.values = packed[..., 6:]
@@ -128,11 +127,11 @@ class _Block:
         _zero_below(self.alpha, self.alpha, convention.alpha_min)
         self.passing = 1 - self.alpha
         self.transmittance = self.passing.cumprod(1)  # behind each splat
-        # It never grows, so dropping below the limit drops everything behind as well.
+        # It never grows: all behind the first splat below the limit is dropped too.
         _zero_below(self.alpha, self.transmittance, convention.transmittance_min)
 
     def weights(self) -> Tensor:
-        """Return alpha times the transmittance in front of each splat."""
+        """Compute alpha times the transmittance in front of each splat."""
         weights = self.alpha.clone()
         weights[:, 1:] *= self.transmittance[:, :-1]
         return weights
@@ -144,14 +143,14 @@ class _Block:
         return crosses.to(before.dtype)
 
     def forward(self) -> Tensor:
-        """Return the composited values [t, C, P]."""
+        """Composite the values: [t, C, P]."""
         if not self.median:
             return self.values.mT @ self.weights()
         blended = self.values[..., :-1].mT @ self.weights()
         return torch.cat((blended, self.values[..., -1:].mT @ self.median_weights()), 1)
 
     def backward(self, grad_output: Tensor) -> Tensor:
-        """Return the gradient of `packed` from that, [t, C, P], of the composited values."""
+        """Compute the gradient of `packed` from that of the composited values, [t, C, P]."""
         weights = self.weights()
         grad_values = weights @ grad_output.mT
         values = self.values

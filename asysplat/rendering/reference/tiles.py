@@ -1,4 +1,4 @@
-"""Which tiles a splat touches, and the list of splats of every tile."""
+"""Compute which tiles a splat touches, and the list of splats of every tile."""
 
 from dataclasses import dataclass
 
@@ -47,7 +47,7 @@ def list_tiles(splats: Splats, images: int, height: int, width: int, size: int) 
     """Sort the splats of `images` images into tiles of size x size pixels."""
     rows, columns = -(-height // size), -(-width // size)
     first, last = splats.first // size, splats.last // size
-    # A range that rounding emptied since the visibility test gives no pair.
+    # Rounding can empty a range after the visibility test.
     spans = (last - first + 1).clamp_min(0)
     counts = spans.prod(-1)
     check_pairs(int(counts.sum()))
