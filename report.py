@@ -1,4 +1,4 @@
-"""Finished sweeps beside the paper's tables.
+"""Write finished sweeps beside the paper's tables.
 
 python report.py table=layers costs=true
 """
@@ -51,7 +51,7 @@ def report(options: DictConfig) -> None:
 
 
 def sweep_overrides(overrides: Sequence[str]) -> list[str]:
-    """Find the overrides of the command that choose the sweeps' data and scale."""
+    """Select the overrides of the command that are those of the sweeps."""
     return [override for override in overrides if override.partition("=")[0] not in OWN_OPTIONS]
 
 

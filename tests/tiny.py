@@ -1,4 +1,4 @@
-"""The overrides for a run of the tiniest size."""
+"""Options for a run of the tiniest size."""
 
 SIZE = ["width=0.125", "state_size=8"]
 NETWORK = [*SIZE, "model.layers=1m1s"]
@@ -7,3 +7,10 @@ VIEWS = [
 ]
 SCENES = ["data.num_images=24", "data.window=[12,24]", "data.val_scenes=1", "data.test_scenes=1"]
 STEPS = ["steps=4", "validate_every=2", "trainer.log_every_n_steps=1"]
+# A Lightning trainer that only trains or tests.
+QUIET = {
+    "accelerator": "cpu",
+    "logger": False,
+    "enable_progress_bar": False,
+    "enable_model_summary": False,
+}

@@ -1,1 +1,1 @@
-"""Metrics and their protocols, baselines, costs, and pictures of what was rendered."""
+"""Metrics and their protocols, baselines, costs, and figures."""

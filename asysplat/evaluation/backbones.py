@@ -1,6 +1,6 @@
-"""ImageNet features for LPIPS and the perceptual loss, from files already on this machine.
+"""Load ImageNet features for LPIPS and the perceptual loss from files on this machine.
 
-Nothing is downloaded unasked: without the files, runs go on without LPIPS and that loss.
+Without the files, runs continue without LPIPS and that loss; nothing is downloaded unless asked.
 """
 
 import pickle
@@ -17,7 +17,7 @@ from torchvision.models import alexnet, get_model_weights, vgg16, vgg19
 from asysplat.errors import InputError
 
 BUILDERS = {"alexnet": alexnet, "vgg16": vgg16, "vgg19": vgg19}
-# torchvision's own files in torch's hub cache; the part after the dash is a hash.
+# torchvision's files in torch's hub cache; the part after the dash is a hash.
 HUB_FILES = {"alexnet": "alexnet-owt-*.pth", "vgg16": "vgg16-*.pth", "vgg19": "vgg19-*.pth"}
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -29,14 +29,14 @@ def find_backbone(
 ) -> dict[str, Tensor] | None:
     """Load torchvision's ImageNet weights of a network's convolutions.
 
-    Looks in torch's hub cache, then for `<name>_features_fp16.pth` in `backbone_dir`; where neither
-    has them, they are downloaded into the cache if `download` allows it.
+    They are read from torch's hub cache or else from `<name>_features_fp16.pth` in `backbone_dir`.
+    If neither exists, they are downloaded into the cache if `download` allows it.
 
     Returns:
         `features.N.weight` and `features.N.bias` in fp32, or None if the weights were not found.
 
     Raises:
-        InputError: the file found cannot be read or holds something else, or the download failed.
+        InputError: the file cannot be read or holds other weights, or the download failed.
     """
     candidates = sorted(_hub_cache().glob(HUB_FILES[name]))
     if backbone_dir is not None:
@@ -77,8 +77,8 @@ def _features(name: str, state: Any, source: Path) -> dict[str, Tensor]:
     with torch.device("meta"):
         expected = BUILDERS[name]().features.state_dict(prefix="features.")
     for key, tensor in expected.items():
-        found = state.get(key) if isinstance(state, dict) else None
-        if not isinstance(found, Tensor) or found.shape != tensor.shape:
+        loaded = state.get(key) if isinstance(state, dict) else None
+        if not isinstance(loaded, Tensor) or loaded.shape != tensor.shape:
             raise InputError(
                 f"{source} has no {key} of shape {tuple(tensor.shape)}: "
                 f"give torchvision's ImageNet weights of {name}."
@@ -87,14 +87,14 @@ def _features(name: str, state: Any, source: Path) -> dict[str, Tensor]:
 
 
 class VGGFeatures(nn.Module):
-    """Frozen activations of VGG16 or VGG19 (Simonyan and Zisserman 2015).
+    """Computes frozen activations of VGG16 or VGG19 (Simonyan and Zisserman 2015).
 
     Args:
         name: of the network.
-        weights: what `find_backbone(name, ...)` returned.
+        weights: from `find_backbone(name, ...)`.
         taps: indices of the layers of torchvision's `features` whose outputs are returned.
-        std: RGB; images, less ImageNet's mean color, are divided by it.
-        mean_pooling: whether to pool by the mean in place of the maximum.
+        std: RGB; divides the images after ImageNet's mean color is subtracted.
+        mean_pooling: pool by the mean instead of the maximum.
     """
 
     def __init__(

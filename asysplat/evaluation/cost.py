@@ -29,9 +29,9 @@ def module_flops(net: nn.Module, run: Callable[[], object]) -> int:
     """Count the FLOPs of one `run()`, which calls `net`, as the paper counts them.
 
     2 x multiply-adds of Linear, Conv1d and Conv2d modules, 4 operations an element for LayerNorm
-    and BatchNorm. Not counted, as a profiler of modules does not see them: attention products,
-    scans, RMSNorm, activations, biases, and depthwise Conv1d (Mamba runs it in a fused kernel).
-    Works on the meta device.
+    and BatchNorm. Like a profiler of modules, it does not count attention products, scans, RMSNorm,
+    activations, biases, and depthwise Conv1d (Mamba runs it in a fused kernel). Works on the meta
+    device.
     """
     total = 0
 
@@ -63,11 +63,10 @@ def _flops_per_output(module: nn.Module) -> int:
 
 
 def true_flops(run: Callable[[], object]) -> int:
-    """Count the FLOPs of one `run()` with every matrix product, einsum and attention.
+    """Count the FLOPs of one `run()`: every matrix product, einsum, attention and scan.
 
-    Run it on the meta device, which needs no memory: elsewhere the kernel that torch picks may be
-    unknown to its counter (some releases count attention on a CPU as 0). Scans count with their
-    matrix products and their recurrence; other element-wise work never.
+    Run it on the meta device, which needs no memory; elsewhere torch's counter may not know the
+    kernel (some releases count attention on a CPU as 0). Other element-wise work is not counted.
     """
     with FlopCounterMode(display=False) as counter:
         run()
@@ -75,7 +74,7 @@ def true_flops(run: Callable[[], object]) -> int:
 
 
 def memory_gb(device: torch.device | str) -> float:
-    """Return the memory of the device in 1e9 bytes: a CPU's is that of the machine."""
+    """Return the memory of the device in 1e9 bytes; for a CPU, that of the machine."""
     if torch.device(device).type == "cuda":
         return torch.cuda.get_device_properties(device).total_memory / GB
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GB
@@ -85,7 +84,7 @@ def reset_peak_memory(device: torch.device | str) -> bool:
     """Reset the peak that `peak_memory_gb` reads to the memory in use now.
 
     Returns:
-        Whether that is possible: on CUDA, and on Linux where /proc is writable.
+        Whether the peak was reset: on CUDA, and on Linux if /proc is writable.
     """
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -98,12 +97,12 @@ def reset_peak_memory(device: torch.device | str) -> bool:
 
 
 def memory_before_gb(device: torch.device | str) -> float:
-    """Give freed memory back to the system and reset the peak; return it, the memory in use now.
+    """Return freed memory to the system, reset the peak, and return the memory in use now.
 
-    Work that gets freed memory again would not show as a rise of the peak above this.
+    Without this, work that reuses freed memory would not raise the peak.
     """
     gc.collect()
-    with suppress(OSError, AttributeError):  # glibc alone can be asked
+    with suppress(OSError, AttributeError):  # only glibc has it
         ctypes.CDLL(None).malloc_trim(0)
     reset_peak_memory(device)
     return peak_memory_gb(device)
@@ -112,8 +111,8 @@ def memory_before_gb(device: torch.device | str) -> float:
 def peak_memory_gb(device: torch.device | str) -> float:
     """Read the peak memory in 1e9 bytes since `reset_peak_memory` or the process's start.
 
-    On CUDA that of the tensors; elsewhere the resident set of the whole process, with its
-    libraries, its data, and memory that was freed but not given back to the system.
+    On CUDA this is the memory of the tensors; elsewhere the resident set of the whole process, with
+    libraries, data, and freed memory that was not returned to the system.
     """
     if torch.device(device).type == "cuda":
         return torch.cuda.max_memory_allocated(device) / GB

@@ -1,4 +1,4 @@
-"""Figures of a run: input, target, rendering, error and depth side by side; learning curve."""
+"""Draw figures of a run: comparisons of renderings with targets, and the learning curve."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,7 +12,7 @@ from asysplat.evaluation.metrics import psnr
 from asysplat.rendering import Rendering
 from asysplat.scene import Views
 
-ERROR_RANGE = 0.5  # the error that is shown brightest
+MAX_ERROR = 0.5  # at the bright end of the color map
 
 
 def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Figure:
@@ -22,47 +22,49 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
     rendered inverse depth and, if the data has depths, the true one on the same scale. Pixels that
     a mask excludes are blank in the last three.
     """
-    nearest = nearest_view_images(inputs, targets)
+    images = {
+        "nearest input": nearest_view_images(inputs, targets),
+        "target": targets.images,
+        "rendered": rendering.image,
+    }
+    maps = {
+        "error": (rendering.image.clamp(0, 1) - targets.images).abs().mean(1),
+        "inverse depth": disparity(rendering.depth),
+    }
+    if targets.depths is not None:
+        maps["true inverse depth"] = disparity(targets.depths)
+    if targets.masks is not None:
+        maps = {name: each.where(targets.masks, torch.nan) for name, each in maps.items()}
+    titles = (*images, *maps)
     quality = psnr(targets.masked(rendering.image), targets.images)
-    everywhere = torch.ones_like(targets.images[:, 0], dtype=torch.bool)
-    counts = everywhere if targets.masks is None else targets.masks
-    columns = 5 if targets.depths is None else 6
-    rows = targets.num_views
     aspect = targets.cameras.height / targets.cameras.width
-    figure = Figure(figsize=(2 * columns, 2 * aspect * rows + 0.3), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
-    titles = ("nearest input", "target", "rendered", "error", "inverse depth", "true inverse depth")
-    for axis, title in zip(axes[0], titles, strict=False):
+    size = (2 * len(titles), 2 * aspect * targets.num_views + 0.3)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(targets.num_views, len(titles), squeeze=False)
+    for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=9)
     for view, row in enumerate(axes):
-        target = targets.images[view]
-        error = (rendering.image[view].clamp(0, 1) - target).abs().mean(0)
-        error = error.where(counts[view], torch.nan)
-        disparities = [disparity(rendering.depth[view]).where(counts[view], torch.nan)]
-        if targets.depths is not None:
-            disparities.append(disparity(targets.depths[view]).where(counts[view], torch.nan))
-        nearest_is_bright = disparities[-1].flatten().nanquantile(0.99).nan_to_num().item()
-        for axis, image in zip(row, (nearest[view], target, rendering.image[view]), strict=False):
-            axis.imshow(image.clamp(0, 1).permute(1, 2, 0).cpu().float().numpy())
+        for axis, image in zip(row, images.values(), strict=False):
+            axis.imshow(image[view].clamp(0, 1).permute(1, 2, 0).cpu().float().numpy())
         row[2].set_xlabel(f"{quality[view]:.1f} dB", fontsize=8)
-        row[3].imshow(error.cpu().float().numpy(), cmap="magma", vmin=0, vmax=ERROR_RANGE)
+        error, *disparities = (each[view].cpu().float() for each in maps.values())
+        row[3].imshow(error.numpy(), cmap="magma", vmin=0, vmax=MAX_ERROR)
+        near = disparities[-1].flatten().nanquantile(0.99).nan_to_num().item()
         for axis, values in zip(row[4:], disparities, strict=True):
-            axis.imshow(
-                values.cpu().float().numpy(), cmap="viridis", vmin=0, vmax=nearest_is_bright
-            )
+            axis.imshow(values.numpy(), cmap="viridis", vmin=0, vmax=near)
         for axis in row:
             axis.set_xticks([])
             axis.set_yticks([])
     return figure
 
 
-def disparity(depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-    """Compute 1 / depth; 0, as at infinity, where the depth is unknown."""
+def disparity(depth: Float[Tensor, "*views H W"]) -> Float[Tensor, "*views H W"]:
+    """Compute 1 / depth; 0, as at infinity, for an unknown depth."""
     return torch.where(depth > 0, 1 / depth.where(depth > 0, 1), 0)
 
 
 def learning_curve(rows: Sequence[Mapping[str, float | int]]) -> Figure:
-    """Draw the validation PSNR over training, and that of two baselines without training.
+    """Draw the validation PSNR over training, and the PSNR of two baselines.
 
     Args:
         rows: one for each validation, with minutes, step, psnr, nearest_view/psnr and

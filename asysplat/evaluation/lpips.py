@@ -1,4 +1,4 @@
-"""LPIPS v0.1 (Zhang et al. 2018)."""
+"""Compute LPIPS v0.1 (Zhang et al. 2018)."""
 
 import warnings
 from pathlib import Path
@@ -18,18 +18,18 @@ def load_lpips(
 ) -> lpips.LPIPS | None:
     """Build the frozen LPIPS network, or return None if its backbone is not on this machine.
 
-    Build it once and keep it; the linear heads come with the lpips package.
+    The linear heads come with the lpips package.
 
     Args:
         net: the backbone, AlexNet or VGG16.
         backbone_dir: folder that may hold the backbone's weights, see `find_backbone`.
-        download: whether to fetch them if they are missing.
+        download: whether to download missing weights.
     """
     backbone = find_backbone("alexnet" if net == "alex" else "vgg16", backbone_dir, download)
     if backbone is None:
         return None
-    # On meta, because the package would fill a whole torchvision model at random, 0.55 GB for VGG;
-    # the warning is about an argument that it gives to torchvision.
+    # On meta, because the package would initialize a whole torchvision model, 0.55 GB for VGG; the
+    # warning is about an argument that it passes to torchvision.
     with torch.device("meta"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         network = lpips.LPIPS(net=net, pretrained=False, pnet_rand=True, verbose=False)
@@ -51,7 +51,7 @@ def lpips_distance(
 ) -> Float[Tensor, "*batch V"]:
     """Compute LPIPS of each image in [0, 1] (`rendered` is clamped), at least 32x32 pixels.
 
-    One image at a time: VGG needs 1.5 GB for a pair of 540x960, AlexNet 0.2 GB.
+    Images are compared one by one: VGG needs 1.5 GB for a pair of 540x960, AlexNet 0.2 GB.
     """
     pairs = zip(
         rendered.float().clamp(0, 1).flatten(0, -4), target.float().flatten(0, -4), strict=True

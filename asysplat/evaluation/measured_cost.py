@@ -15,11 +15,11 @@ SECONDS = (
     "mean of all measurements but the longest, which is left out as an outlier; "
     "of a single measurement, that one"
 )
-RENDERINGS = 6  # timed; the longest, which may have compiled, does not count
+RENDERINGS = 6  # timed; the longest, which may include compilation, is left out
 
 
 def mean_but_longest(seconds: Sequence[float]) -> float:
-    """Compute the mean of all but the longest; a single measurement is its own mean.
+    """Compute the mean of all measurements but the longest; return a single one as it is.
 
     Source: the paper's supplement, "Inference overhead".
     """
@@ -27,7 +27,7 @@ def mean_but_longest(seconds: Sequence[float]) -> float:
 
 
 def wait_for(device: torch.device) -> None:
-    """Wait until a GPU has finished: it works on after a call returns."""
+    """Wait until a GPU has finished its queued work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -35,10 +35,10 @@ def wait_for(device: torch.device) -> None:
 class CostMeter:
     """Measures seconds and peak memory from each `start` to its `stop`.
 
-    All meters share the process's one peak: none may start between the start and stop of another.
+    All meters share the process's peak, so their intervals must not overlap.
 
     Args:
-        device: where the work is done.
+        device: of the work.
     """
 
     def __init__(self, device: torch.device):
@@ -70,13 +70,13 @@ class CostMeter:
 def render_seconds(
     gaussians: Gaussians, cameras: Cameras, background: Tensor, depth: bool
 ) -> float:
-    """Measure the seconds of rendering once and of the gradients of all Gaussian fields.
+    """Measure the seconds of one rendering with the gradients of all Gaussian fields.
 
     Args:
         gaussians, cameras, background, depth: as for `render`.
 
     Returns:
-        The `mean_but_longest` of several renderings.
+        The `mean_but_longest` of RENDERINGS renderings.
     """
     leaves = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     meter = CostMeter(gaussians.means.device)

@@ -1,4 +1,4 @@
-"""Image and depth metrics: one number for each view, in fp32; `Protocol` sets their options."""
+"""Compute image and depth metrics: one number for each view, in fp32."""
 
 import math
 from typing import Literal
@@ -40,12 +40,12 @@ def ssim(
 ) -> PerView:
     """Compute the SSIM of each image in [0, 1] (Wang et al. 2004), mean over the channels.
 
-    `rendered` is clamped, the data range is 1, and only windows wholly inside the image count.
+    `rendered` is clamped, the data range is 1, and only windows inside the image count.
 
     Args:
         window: "gaussian": 11x11, sigma 1.5, or "uniform": 7x7.
-        covariance: weighted sum of the products of deviations within a window ("biased"), or that
-            times n / (n - 1) for its n pixels ("sample"), as scikit-image computes it.
+        covariance: weighted sum of the products of deviations within a window ("biased"), or this
+            sum times n / (n - 1) for its n pixels ("sample"), as in scikit-image.
 
     Raises:
         InputError: an image is smaller than the window.
@@ -53,7 +53,7 @@ def ssim(
     height, width = rendered.shape[-2:]
     check_ssim_size(height, width, window)
     size = SSIM_WINDOWS[window]
-    # Scaling all variances by n / (n - 1) is the same as dividing their constant, k2^2, by it.
+    # Scaling all variances by n / (n - 1) equals dividing their constant, k2^2, by it.
     k2 = SSIM_K2 if covariance == "biased" else SSIM_K2 * math.sqrt(1 - 1 / size**2)
     with without_autocast(rendered):
         _, similarity = structural_similarity_index_measure(
@@ -67,7 +67,7 @@ def ssim(
             k2=k2,
             return_full_image=True,
         )
-    # torchmetrics mirrors the image at its border; like scikit-image, leave those windows out.
+    # torchmetrics mirrors the image at its border; leave those windows out, like scikit-image.
     border = size // 2
     inside = similarity[..., border : height - border, border : width - border]
     return inside.mean((-3, -2, -1)).reshape(rendered.shape[:-3])
@@ -89,14 +89,14 @@ def abs_rel(depth: Depths, target_depth: Depths, alignment: Alignment = "none") 
     Args:
         depth, target_depth: along the camera's z axis; a target of 0 is unknown.
         alignment: "median" first scales each view's depth so that the medians agree
-            (the lower of the two middle values of an even number of pixels); a view whose scale
-            would not be finite is left as it is.
+            (the lower of the two middle values of an even number of pixels), unless the scale would
+            not be finite.
 
     Returns:
         NaN for a view without a known depth.
     """
-    depth, target, known = _prepare(depth, target_depth, alignment)
-    return _mean_where(known, (depth - target).abs() / target)
+    depth, target, valid = _prepare(depth, target_depth, alignment)
+    return _mean_where(valid, (depth - target).abs() / target)
 
 
 def delta1(depth: Depths, target_depth: Depths, alignment: Alignment = "none") -> PerView:
@@ -104,20 +104,20 @@ def delta1(depth: Depths, target_depth: Depths, alignment: Alignment = "none") -
 
     Only pixels with target > 0 count. Arguments and NaN as in `abs_rel`.
     """
-    depth, target, known = _prepare(depth, target_depth, alignment)
-    # Without a division, a depth <= 0 is simply wrong.
+    depth, target, valid = _prepare(depth, target_depth, alignment)
+    # Without a division, a depth <= 0 is wrong rather than NaN.
     close = (depth < DELTA * target) & (target < DELTA * depth)
-    return _mean_where(known, close.float())
+    return _mean_where(valid, close.float())
 
 
 def _prepare(
     depth: Depths, target: Depths, alignment: Alignment
 ) -> tuple[Depths, Depths, Bool[Tensor, "*batch V H W"]]:
-    depth, target, known = depth.float(), target.float(), target > 0
+    depth, target, valid = depth.float(), target.float(), target > 0
     if alignment == "median":
-        scale = _median_where(known, target) / _median_where(known, depth)
+        scale = _median_where(valid, target) / _median_where(valid, depth)
         depth = depth * scale.where(scale.isfinite(), 1)[..., None, None]
-    return depth, target, known
+    return depth, target, valid
 
 
 def _median_where(mask: Bool[Tensor, "*batch V H W"], values: Depths) -> PerView:

@@ -1,9 +1,9 @@
-"""The floating-point operations a second that a GPU can do at most."""
+"""Return the peak floating-point operations per second of a GPU."""
 
 import torch
 
 TERA = 1e12
-# By torch's name of the device: dense bf16, TF32 and fp32 in TFLOP/s, of NVIDIA's data sheets.
+# By torch's name of the device: dense bf16, TF32 and fp32 in TFLOP/s, from NVIDIA's data sheets.
 PEAKS = {
     "NVIDIA H200": (989.4, 494.7, 66.9),
     "NVIDIA H100 80GB HBM3": (989.4, 494.7, 66.9),
@@ -19,7 +19,7 @@ PEAKS = {
 
 
 def peak_flops(device: torch.device, precision: str) -> float | None:
-    """Return the peak of a device in FLOP/s; None where it is not known, as of every CPU.
+    """Return the peak of a device in FLOP/s; None if unknown, and for every CPU.
 
     Args:
         precision: Lightning's, such as bf16-mixed or 32-true.

@@ -1,4 +1,4 @@
-"""Protocols: named settings of the metrics, on which their numbers depend."""
+"""Define protocols: named options of the metrics, which their numbers depend on."""
 
 from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_type_hints
@@ -29,21 +29,21 @@ BACKBONES = {"alex": "AlexNet", "vgg": "VGG16"}
 
 @dataclass(frozen=True)
 class Protocol:
-    """How renderings are measured; numbers of different protocols cannot be compared.
+    """Computes metrics with fixed options; numbers of different protocols cannot be compared.
 
-    Pixels that a view's mask excludes are taken from the photograph in every image metric and left
-    out of every depth metric.
+    Pixels that a view's mask excludes are copied from the target image in every image metric and
+    left out of every depth metric.
 
     Args:
-        name: shown beside the numbers.
-        eight_bit: whether renderings are first cut to 8 bits a channel, as in an image file.
+        name: printed with the numbers.
+        eight_bit: whether to truncate renderings to 8 bits a channel first, as in an image file.
         ssim_window, ssim_covariance: see `metrics.ssim`.
         lpips_net: LPIPS' backbone, "alex" or "vgg".
         mean_over: "images": all images alike, or "scenes": first the mean of each scene's images.
         depth_alignment: see `metrics.abs_rel`; for data without metric depth "median".
 
     Raises:
-        InputError: a setting is none of its choices.
+        InputError: an option is none of its choices.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Protocol:
 
     def psnr(self, rendered: Images, targets: Views) -> PerView:
         """Compute the PSNR of each image in dB."""
-        return psnr(self._shown(rendered, targets), targets.images)
+        return psnr(self._prepare(rendered, targets), targets.images)
 
     def image_metrics(
         self, rendered: Images, targets: Views, lpips: LPIPS | None
@@ -80,39 +80,41 @@ class Protocol:
         Args:
             lpips: network with the backbone `lpips_net`, see `load_lpips`; None for no LPIPS.
         """
-        shown, target = self._shown(rendered, targets), targets.images
+        prepared, target = self._prepare(rendered, targets), targets.images
         values = {
-            "psnr": psnr(shown, target),
-            "ssim": ssim(shown, target, self.ssim_window, self.ssim_covariance),
+            "psnr": psnr(prepared, target),
+            "ssim": ssim(prepared, target, self.ssim_window, self.ssim_covariance),
         }
         if lpips is not None:
-            values["lpips"] = lpips_distance(lpips, shown, target)
+            values["lpips"] = lpips_distance(lpips, prepared, target)
         return values
 
     def without_lpips(self) -> str:
-        """Say that LPIPS is not measured, and how to get its backbone."""
+        """Return a warning that LPIPS is not computed, and how to get its backbone."""
         return (
             f"{BACKBONES[self.lpips_net]} is neither in torch's hub cache nor in paths.weights: "
             "the run goes on without LPIPS; paths.download=true fetches it."
         )
 
-    def _shown(self, rendered: Images, targets: Views) -> Images:
-        """Clamp to [0, 1], cut to 8 bits if set, and fill in the photograph at excluded pixels."""
+    def _prepare(self, rendered: Images, targets: Views) -> Images:
+        """Clamp to [0, 1], truncate to 8 bits if set, and copy the target at excluded pixels."""
         rendered = rendered.float().clamp(0, 1)
         return targets.masked((rendered * 255).floor() / 255 if self.eight_bit else rendered)
 
     def depth_metrics(self, depth: Depths, targets: Views) -> dict[str, PerView]:
-        """Compute AbsRel and delta < 1.25 of each view; nothing if the data has no depths."""
+        """Compute AbsRel and delta < 1.25 of each view; {} if the data has no depths."""
         if targets.depths is None:
             return {}
-        known = targets.depths if targets.masks is None else targets.depths.where(targets.masks, 0)
+        target = targets.depths
+        if targets.masks is not None:
+            target = target.where(targets.masks, 0)
         return {
-            "absrel": abs_rel(depth, known, self.depth_alignment),
-            "delta1": delta1(depth, known, self.depth_alignment),
+            "absrel": abs_rel(depth, target, self.depth_alignment),
+            "delta1": delta1(depth, target, self.depth_alignment),
         }
 
     def sentences(self) -> dict[str, str]:
-        """Return the protocol's name and, for each metric, a sentence on what is computed."""
+        """Return the protocol's name and a sentence for each metric."""
         size = SSIM_WINDOWS[self.ssim_window]
         window = f"{self.ssim_window} window {size}x{size}"
         if self.ssim_window == "gaussian":
@@ -125,7 +127,7 @@ class Protocol:
         aligned = "depth not aligned"
         if self.depth_alignment == "median":
             aligned = "depth of each view scaled to the true median"
-        known = "the pixels of a view that its mask includes and whose depth is known"
+        pixels = "the pixels of a view that its mask includes and whose depth is known"
         return {
             "name": self.name,
             "psnr": f"{images}, from each image's own MSE (at most 100 dB), {mean}",
@@ -133,6 +135,6 @@ class Protocol:
             f"windows wholly inside the image, mean over channels, {mean}",
             "lpips": f"v0.1 with {BACKBONES[self.lpips_net]}, {images} and scaled to [-1, 1], "
             f"full resolution, {mean}",
-            "absrel": f"mean of |d - t| / t over {known}, {aligned}, {mean}",
-            "delta1": f"share with max(d/t, t/d) < 1.25 of {known}, {aligned}, {mean}",
+            "absrel": f"mean of |d - t| / t over {pixels}, {aligned}, {mean}",
+            "delta1": f"share with max(d/t, t/d) < 1.25 of {pixels}, {aligned}, {mean}",
         }

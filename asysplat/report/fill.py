@@ -1,7 +1,7 @@
-"""The paper's tables filled with our numbers: from finished runs, and costs without any."""
+"""Fill the paper's tables with our numbers: those of finished runs, and costs, which need none."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
@@ -10,16 +10,16 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.evaluation.static_cost import static_costs
-from asysplat.report.filled import Costs, FilledRow, FilledTable, Number
-from asysplat.report.paper import PaperRow, PaperTable, our_sets
+from asysplat.report.paper import Column, PaperRow, PaperTable, our_sets, set_titles
 from asysplat.training.runs import Run, config_hash, data_of, find_runs
 from asysplat.training.stages import describe_stage, stage_configs
 
 # Overrides of train.py -> its configuration, the node `hydra` included.
 Compose = Callable[[Sequence[str]], DictConfig]
 Runs = dict[str, list[Run]]  # by config_hash, oldest first
+Number = int | float
+Costs = dict[str, Number]  # see `static_costs`
 
-BASELINES = ("mean_color", "nearest_view")
 # Columns that every run measures: their keys in metrics.json, without and with post-optimization.
 MEASURED = {
     "seconds_per_step": ("cost/seconds_per_step", None),
@@ -27,8 +27,73 @@ MEASURED = {
     "inference_seconds": ("cost/inference_seconds", "cost/post{}/seconds"),
     "inference_gb": ("cost/inference_gb", "cost/post{}/gb"),
 }
-# Columns that are settings of a run.
-SETTINGS = {"batch": "data.batch_size", "train_steps": "steps"}
+BASELINES = {"mean_color": "mean color", "nearest_view": "nearest view, copied"}
+# Columns that are options of a run.
+OPTIONS = {"batch": "data.batch_size", "train_steps": "steps"}
+# Columns that need no run: they are printed with the costs, at the paper's scale.
+COMPUTED = ("parameters", "gflops", "gaussians")
+
+
+@dataclass(frozen=True)
+class FilledRow:
+    """One method with our numbers.
+
+    Args:
+        paper: the row of the paper.
+        costs: at the paper's scale; None if not requested, and for quoted rows.
+        reading_costs: one for each of `paper.readings`, or empty if not requested.
+        values: column key -> measured numbers, one for each seed; a column without any is left out.
+        seeds: of the runs.
+        revisions: of the code of the runs, see `asysplat.training.revision`.
+        note: a remark on this row, such as "seeds still to run: 2".
+    """
+
+    paper: PaperRow
+    costs: Costs | None = None
+    reading_costs: tuple[Costs, ...] = ()
+    values: dict[str, list[Number]] = field(default_factory=dict)
+    seeds: tuple[int, ...] = ()
+    revisions: tuple[str, ...] = ()
+    note: str = ""
+
+    @property
+    def name(self) -> str:
+        return self.paper.name + (" †" if self.paper.unverified else "")
+
+
+@dataclass(frozen=True)
+class FilledTable:
+    """One table of the paper with our rows.
+
+    Args:
+        paper: the table of the paper.
+        rows: in the paper's order.
+        sets: the paper's test set -> ours that is compared with it.
+        metrics: the protocols of our metrics, a sentence for each; several if runs differ.
+        notes: label -> how our numbers were made: Ours (the scale), Not tested (the paper's test
+            sets whose path no run was given), Baselines, Data, Machine, Command; "" if unknown.
+    """
+
+    paper: PaperTable
+    rows: tuple[FilledRow, ...]
+    sets: dict[str, str] = field(default_factory=dict)
+    metrics: tuple[str, ...] = ()
+    notes: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        number = self.paper.number
+        return f"{'Ours' if number is None else f'Table {number}'}: {self.paper.title}"
+
+    @property
+    def ranked_column(self) -> Column | None:
+        """Return the column whose order is compared with the paper's."""
+        return next((c for c in self.paper.columns if c.key == self.paper.rank_by), None)
+
+    def our_title(self, column: Column) -> str:
+        """Return the title of our numbers, which names our test set if it is another."""
+        ours = self.sets.get(column.test_set, column.test_set)
+        return column.title(None if ours == column.test_set else ours)
 
 
 def finished_runs(logs: Path) -> Runs:
@@ -42,60 +107,54 @@ def finished_runs(logs: Path) -> Runs:
 def fill_table(
     table: PaperTable, overrides: Sequence[str], compose: Compose, runs: Runs
 ) -> FilledTable:
-    """Fill a table with every finished run whose configuration is that of a row of its sweep.
+    """Fill a table with every finished run that has the configuration of one of its rows.
 
     Args:
         table: the paper's.
-        overrides: of the command that started the sweep, but for `sweeps=`. Paths may be left out;
-            a path that is given must have the name of the run's.
-        compose: gives train.py's configuration.
-        runs: those to look among.
+        overrides: of the command that started the sweep, without `sweeps=`. Paths may be left out;
+            a given path must have the same name as the run's.
+        compose: returns train.py's configuration.
+        runs: to select from.
     """
     overrides = [f"sweeps={table.key}", *overrides]
     config = compose(overrides)
     sets = our_sets(table, config.data.name, config.data.test_sets or ())
-    seeds = str(config.hydra.sweeper.params.get("seed", config.seed))
-    wanted = [int(seed) for seed in seeds.split(",")]
+    seeds = str(config.hydra.sweeper.params.get("seed", config.seed)).split(",")
     rows: list[FilledRow] = []
-    found: list[Run] = []
+    used: list[Run] = []
     for row in table.rows:
         if row.quoted:
             rows.append(FilledRow(row))
             continue
-        row_config = _without_hydra(compose([*overrides, *row.run]))
-        same = _runs_of(row_config, runs)
-        found += same.values()
-        rows.append(_measured_row(row, table, row_config, same, wanted, sets))
-    return FilledTable(
-        table,
-        tuple(rows),
-        scale=_scale_text(config),
-        command=f"python train.py {' '.join(overrides)}",
-        sets=sets,
-        protocols=_protocols(found, config.metrics.name),
-        baselines=_baselines(sets, found),
-        machine=", ".join(sorted({run.results.get("run/machine", "") for run in found})),
-        folders=tuple(sorted({_folders(run) for run in found} - {""})),
-        untested=_untested(sets, config, rows),
-    )
+        row_config = compose([*overrides, *row.run])
+        row_config = OmegaConf.masked_copy(row_config, [k for k in row_config if k != "hydra"])
+        row_runs = _runs_of(row_config, runs)
+        used += row_runs.values()
+        rows.append(_fill_row(row, table, row_config, row_runs, list(map(int, seeds)), sets))
+    notes = {
+        "Ours": _scale(config),
+        "Not tested": _untested(sets, config, rows),
+        "Baselines": _baselines(sets, used),
+        "Data": _folders(used),
+        "Machine": ", ".join(sorted({run.results.get("run/machine", "") for run in used})),
+        "Command": f"python train.py {' '.join(overrides)}",
+    }
+    return FilledTable(table, tuple(rows), sets, _metrics(table, config, used), notes)
 
 
 def with_costs(filled: FilledTable, compose: Compose) -> FilledTable:
-    """Add every row's costs at the paper's scale, those of other readings included."""
+    """Add the costs of every row and its other readings at the paper's scale."""
 
-    def costs(run: tuple[str, ...], row: PaperRow) -> Costs:
+    def costs(row: PaperRow, run: tuple[str, ...]) -> Costs:
         return _costs(compose, run, row.views, row.size)
 
-    rows = [
-        row
-        if row.paper.quoted or row.paper.post_optimization
-        else replace(
-            row,
-            costs=costs(row.paper.run, row.paper),
-            reading_costs=tuple(costs(reading.run, row.paper) for reading in row.paper.readings),
-        )
-        for row in filled.rows
-    ]
+    rows = []
+    for row in filled.rows:
+        paper = row.paper
+        if not paper.quoted and not paper.post_optimization:
+            readings = tuple(costs(paper, reading.run) for reading in paper.readings)
+            row = replace(row, costs=costs(paper, paper.run), reading_costs=readings)
+        rows.append(row)
     return replace(filled, rows=tuple(rows))
 
 
@@ -108,47 +167,43 @@ def _costs(compose: Compose, run: tuple[str, ...], views: int, size: tuple[int, 
 
 
 def _runs_of(config: DictConfig, runs: Runs) -> dict[int, Run]:
-    """Find a run for each seed: of several the newest that was tested on all of the data."""
+    """Find a run for each seed: the newest, first among those tested on all of the data."""
     data = data_of(config)
     same = [run for run in runs.get(config_hash(config), []) if run.agrees(data)]
     return {run.seed: run for run in sorted(same, key=lambda run: run.covers(data))}
 
 
-def _without_hydra(config: DictConfig) -> DictConfig:
-    """Return the configuration that the run itself is given."""
-    return OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
-
-
-def _measured_row(
+def _fill_row(
     row: PaperRow,
     table: PaperTable,
     config: DictConfig,
     runs: dict[int, Run],
-    wanted: Sequence[int],
+    seeds: Sequence[int],
     sets: dict[str, str],
 ) -> FilledRow:
     values: dict[str, list[Number]] = {}
     for column in table.columns:
-        if column.key in SETTINGS and runs:
-            values[column.key] = [OmegaConf.select(config, SETTINGS[column.key])]
-            continue
-        key = _result_key(column.key, row, sets)
-        numbers = [runs[seed].results.get(key) for seed in sorted(runs)]
-        present = [number for number in numbers if number is not None]
-        if present:
-            values[column.key] = present
-    return FilledRow(
-        row,
-        values=values,
-        seeds=tuple(sorted(runs)) if values else (),
-        revisions=tuple(sorted({run.revision for run in runs.values()})) if values else (),
-        missing=tuple(seed for seed in wanted if seed not in runs),
-        note=_note(row, values, runs, wanted),
-    )
+        if column.key in OPTIONS:
+            numbers = [OmegaConf.select(config, OPTIONS[column.key])] if runs else []
+        else:
+            key = _result_key(column.key, row, sets)
+            numbers = [runs[seed].results.get(key) for seed in sorted(runs)]
+            numbers = [number for number in numbers if number is not None]
+        if numbers:
+            values[column.key] = numbers
+    missing = ", ".join(str(seed) for seed in seeds if seed not in runs)
+    note = ""
+    if values and missing:
+        note = f"seeds still to run: {missing}"
+    elif row.post_optimization and not values:
+        note = "not run: python evaluate.py run=... adds post-optimization to a finished run"
+    used = runs if values else {}
+    revisions = tuple(sorted({run.revision for run in used.values()}))
+    return FilledRow(row, None, (), values, tuple(sorted(used)), revisions, note)
 
 
 def _result_key(column: str, row: PaperRow, sets: dict[str, str]) -> str | None:
-    """Return the key of a number in metrics.json or evaluation.json; None where no run has it."""
+    """Return the key of a number in metrics.json or evaluation.json; None if no run has it."""
     steps = row.post_optimization
     if column in MEASURED:
         plain, optimized = MEASURED[column]
@@ -162,18 +217,7 @@ def _result_key(column: str, row: PaperRow, sets: dict[str, str]) -> str | None:
     return f"test/{ours}/post{steps}/{metric}" if steps else f"test/{ours}/{metric}"
 
 
-def _note(
-    row: PaperRow, values: dict[str, list[Number]], runs: dict[int, Run], wanted: Sequence[int]
-) -> str:
-    if row.post_optimization and not values:
-        return "not run: python evaluate.py run=... adds post-optimization to a finished run"
-    missing = [str(seed) for seed in wanted if seed not in runs]
-    if values and missing:
-        return f"seeds still to run: {', '.join(missing)}"
-    return ""
-
-
-def _scale_text(config: DictConfig) -> str:
+def _scale(config: DictConfig) -> str:
     data = config.data
     height, width = data.test_size or (data.height, data.width)
     stages = ", then ".join(describe_stage(stage) for stage in stage_configs(config))
@@ -183,40 +227,45 @@ def _scale_text(config: DictConfig) -> str:
     )
 
 
-def _protocols(runs: Sequence[Run], name: str) -> tuple[dict[str, str], ...]:
-    """List the protocols that runs state, each once; without a run the configuration's name."""
-    stated: list[dict[str, str]] = []
-    for run in runs:
-        keys = [key for key in run.results if key.startswith("protocol/")]
-        one = {"name": name} | {key.partition("/")[2]: run.results[key] for key in keys}
-        if one not in stated:
-            stated.append(one)
-    return tuple(stated) or ({"name": name},)
+def _metrics(table: PaperTable, config: DictConfig, runs: Sequence[Run]) -> tuple[str, ...]:
+    """Describe the metrics of the table in each run's protocol; without a run, name it."""
+    kinds = {column.key.rpartition("/")[-1]: column.kind for column in table.columns}
+    texts = []
+    for results in [run.results for run in runs] or [{}]:
+        protocol = {k.partition("/")[2]: v for k, v in results.items() if k.startswith("protocol/")}
+        sentences = [f"{kinds[kind]}: {text}" for kind, text in protocol.items() if kind in kinds]
+        name = protocol.get("name", config.metrics.name)
+        texts.append(". ".join([f"protocol {name}", *sentences]))
+    return tuple(dict.fromkeys(texts))
 
 
-def _baselines(sets: dict[str, str], runs: Sequence[Run]) -> dict[str, dict[str, Number]]:
-    """Find the baselines of each test set, the same in every run that was tested on it."""
-    found: dict[str, dict[str, Number]] = {}
+def _baselines(sets: dict[str, str], runs: Sequence[Run]) -> str:
+    """Write the PSNR of each test set's baselines, the same in every run tested on it."""
+    texts = {}
     for name in dict.fromkeys(sets.values()):
         for run in runs:
-            keys = {baseline: f"baseline/{name}/{baseline}/psnr" for baseline in BASELINES}
-            if all(key in run.results for key in keys.values()):
-                found[name] = {baseline: run.results[key] for baseline, key in keys.items()}
-    return found
+            psnrs = {k: run.results.get(f"baseline/{name}/{k}/psnr") for k in BASELINES}
+            if None not in psnrs.values():
+                numbers = (f"{BASELINES[k]} {psnr:.2f} dB" for k, psnr in psnrs.items())
+                texts[name] = f"{name}: {', '.join(numbers)}"
+    return "; ".join(texts.values())
 
 
-def _folders(run: Run) -> str:
+def _folders(runs: Sequence[Run]) -> str:
+    """Write the names of the folders of the runs' data."""
     keys = ("run/data/root", "run/data/test_root")
-    return " and ".join(run.results[key] for key in keys if key in run.results)
+    of_runs = {" and ".join(run.results[k] for k in keys if k in run.results) for run in runs}
+    folders = sorted(of_runs - {""})
+    mixed = "runs on several are mixed, name one with data.root=... in overrides: "
+    return mixed * (len(folders) > 1) + "; ".join(folders)
 
 
-def _untested(
-    sets: dict[str, str], config: DictConfig, rows: Sequence[FilledRow]
-) -> tuple[str, ...]:
-    """Find the paper's test sets that the sweep names but has no path of, and no row numbers of."""
+def _untested(sets: dict[str, str], config: DictConfig, rows: Sequence[FilledRow]) -> str:
+    """List the paper's test sets that the sweep names without a path, and no row has numbers of."""
     measured = {key.partition("/")[0] for row in rows for key in row.values}
     data = OmegaConf.to_container(config.data, resolve=True)
-    if "root" not in data:  # synthetic data, which tests none on disk
-        return ()
-    lacking = [name for name, how in data["test_sets"].items() if how.get("root", "") is None]
-    return tuple(key for key, ours in sets.items() if ours in lacking and key not in measured)
+    if "root" not in data:  # synthetic data has no test sets on disk
+        return ""
+    no_path = [name for name, how in data["test_sets"].items() if how.get("root", "") is None]
+    untested = [key for key, ours in sets.items() if ours in no_path and key not in measured]
+    return "; ".join(f"{set_titles()[key]}, without paths.{key}=..." for key in untested)

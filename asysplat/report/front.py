@@ -1,28 +1,20 @@
-"""The points that no other beats in cost and in quality: found, and drawn before the rest."""
+"""Find and draw the Pareto front: the points that no other beats in both cost and quality."""
 
 from collections.abc import Collection, Sequence
-from typing import NamedTuple
 
 from matplotlib.axes import Axes
-from matplotlib.transforms import Bbox
 
 from asysplat.report.style import FAINT, INK
 
 Point = tuple[str, float, float]  # name, cost, quality
-
-
-class Place(NamedTuple):
-    """Where a name stands beside its point: offsets in typographic points, and alignment."""
-
-    x: float
-    y: float
-    ha: str
-    va: str
-
-
-ABOVE, BELOW = Place(0, 6, "center", "bottom"), Place(0, -6, "center", "top")
-LEFT, RIGHT = Place(-7, 0, "right", "center"), Place(7, 0, "left", "center")
-ABOVE_LEFT, ABOVE_RIGHT = Place(0, 6, "right", "bottom"), Place(0, 6, "left", "bottom")
+# Where a name is beside its point: offset in typographic points, alignments.
+Place = tuple[tuple[int, int], str, str]
+ABOVE: Place = ((0, 6), "center", "bottom")
+BELOW: Place = ((0, -6), "center", "top")
+LEFT: Place = ((-7, 0), "right", "center")
+RIGHT: Place = ((7, 0), "left", "center")
+ABOVE_LEFT: Place = ((0, 6), "right", "bottom")
+ABOVE_RIGHT: Place = ((0, 6), "left", "bottom")
 FONT = 9
 
 
@@ -42,9 +34,9 @@ def pareto_front(points: Sequence[Point], better: str) -> list[Point]:
 def draw_front(
     axes: Axes, points: Sequence[Point], better: str, color: str, hollow: Collection[str] = ()
 ) -> None:
-    """Draw the front as a line, the other points faded; each has its name.
+    """Draw the front as a line and the other points faded, each with its name.
 
-    A name of a faded point for which there is no room is left out.
+    The name of a faded point is left out if there is no room for it.
 
     Args:
         points: at least one.
@@ -60,32 +52,23 @@ def draw_front(
         face = "none" if point[0] in hollow else own
         axes.plot(*point[1:], "o", color=own, mfc=face, ms=6 if point in rest else 7, alpha=alpha)
     axes.margins(x=0.2, y=0.18)
-    axes.figure.draw_without_rendering()  # so that places in pixels are known
-    taken: list[Bbox] = []
+    axes.figure.draw_without_rendering()  # fixes the points' places in pixels
+    labels = []
     for point in front:
         first = ABOVE_RIGHT if point == front[-1] else ABOVE_LEFT
-        _label(axes, point, INK, (first, LEFT, RIGHT, BELOW, first), taken)
-    for point in rest:
-        _label(axes, point, FAINT, (BELOW, ABOVE, RIGHT, LEFT), taken)
-
-
-def _label(
-    axes: Axes, point: Point, color: str, places: Sequence[Place], taken: list[Bbox]
-) -> None:
-    """Write a name at the first place that is free, or at the last if it is the first again."""
-    for number, place in enumerate(places):
-        text = axes.annotate(
-            point[0],
-            point[1:],
-            (place.x, place.y),
-            textcoords="offset points",
-            ha=place.ha,
-            va=place.va,
-            color=color,
-            fontsize=FONT,
-        )
-        box = text.get_window_extent()
-        if not any(map(box.overlaps, taken)) or place in places[:number]:
-            taken.append(box)
-            return
-        text.remove()
+        labels.append((point, INK, (first, LEFT, RIGHT, BELOW, first)))
+    labels += [(point, FAINT, (BELOW, ABOVE, RIGHT, LEFT)) for point in rest]
+    occupied = []
+    for (name, *position), ink, places in labels:
+        for number, place in enumerate(places):
+            offset, ha, va = place
+            text = axes.annotate(
+                name, position, offset, textcoords="offset points", ha=ha, va=va, color=ink,
+                fontsize=FONT,
+            )  # fmt: skip
+            box = text.get_window_extent()
+            # The last place of a point on the front, which repeats the first, is always taken.
+            if not any(map(box.overlaps, occupied)) or place in places[:number]:
+                occupied.append(box)
+                break
+            text.remove()

@@ -1,4 +1,4 @@
-"""Filled tables as one HTML page that needs nothing else: no network, no script."""
+"""Write filled tables as one HTML page without other files, network access or scripts."""
 
 import io
 import re
@@ -10,8 +10,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from asysplat.report.cells import INTRODUCTION, TITLE, make_overview, make_sheet
-from asysplat.report.filled import FilledTable
+from asysplat.report.cells import INTRODUCTION, TITLE, make_overview, make_section
+from asysplat.report.fill import FilledTable
 from asysplat.report.plots import make_plots
 from asysplat.report.style import FAINT, INK, OURS, PAPER, STYLE
 
@@ -22,15 +22,19 @@ TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-
-
-# In a page the colors are the page's variables, so that a dark page has light ink.
+# A plot's colors become the page's variables, so that a dark page has light ink.
 VARIABLES = {INK: "--ink", FAINT: "--faint", OURS: "--ours", PAPER: "--paper"}
 
 
 def render_html(tables: Sequence[FilledTable]) -> str:
     """Write the page: an overview that links to a section for each table, with its plots."""
-    sections = [(make_sheet(filled), _plots(filled)) for filled in tables]
+    sections = []
+    for filled in tables:
+        plots = [
+            (caption, Markup(inline_svg(figure, f"{filled.paper.key}-{number}")))
+            for number, (caption, figure) in enumerate(make_plots(filled))
+        ]
+        sections.append((make_section(filled), plots))
     return TEMPLATES.get_template("page.html.jinja").render(
         title=TITLE,
         introduction=INTRODUCTION,
@@ -39,16 +43,8 @@ def render_html(tables: Sequence[FilledTable]) -> str:
     )
 
 
-def _plots(filled: FilledTable) -> list[tuple[str, Markup]]:
-    """Draw each plot; return its caption and its SVG."""
-    return [
-        (caption, Markup(inline_svg(figure, f"{filled.paper.key}-{number}")))
-        for number, (caption, figure) in enumerate(make_plots(filled))
-    ]
-
-
 def inline_svg(figure: Figure, salt: str) -> str:
-    """Draw a figure as an `<svg>` element that needs nothing else; `salt` makes its ids unique."""
+    """Draw a figure as an `<svg>` element for a page; `salt` makes its ids unique."""
     buffer = io.StringIO()
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": salt}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})

@@ -1,20 +1,15 @@
-"""The paper's tables as values, and ours: paper.yaml holds every number that the paper prints.
-
-ours.yaml has the rows of tables that the paper does not have.
-"""
+"""Read the paper's tables, every number of which is in paper.yaml, and ours, in ours.yaml."""
 
 import difflib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
-
-PAPER = Path(__file__).with_name("paper.yaml")
-OURS = Path(__file__).with_name("ours.yaml")
 
 
 @dataclass(frozen=True)
@@ -24,9 +19,9 @@ class Column:
     Args:
         key: "parameters", "gflops", ..., or "<test set>/<metric>" such as "dl3dv/psnr".
         kind: of number, as printed, such as "PSNR".
-        better: "higher" or "lower"; None where neither is.
+        better: "higher" or "lower"; None if neither is.
         format: of one number in `unit`, as for str.format.
-        unit: what the title's unit is worth, such as 1e6 where it says (M).
+        unit: the value of the unit in `kind`, such as 1e6 for (M).
     """
 
     key: str
@@ -37,25 +32,21 @@ class Column:
 
     @property
     def test_set(self) -> str:
-        """Return the key of its test set; "" where the number belongs to none."""
+        """Return the key of its test set; "" if the number belongs to none."""
         return self.key.rpartition("/")[0]
 
-    @property
-    def title(self) -> str:
-        """Return the title that the paper prints."""
-        return self.title_of(set_titles()[self.test_set]) if self.test_set else self.kind
-
-    def title_of(self, test_set: str) -> str:
-        """Return the title of the same kind of number, measured on a set of this name."""
-        return f"{test_set} {self.kind}"
+    def title(self, test_set: str | None = None) -> str:
+        """Return the paper's title, or the title of this kind of number on `test_set`."""
+        if not self.test_set:
+            return self.kind
+        return f"{test_set or set_titles()[self.test_set]} {self.kind}"
 
     def text(self, value: float) -> str:
-        """Write a number, the paper's or ours, as the paper prints it."""
+        """Format a number as the paper prints it."""
         return self.format.format(value / self.unit)
 
 
-@dataclass(frozen=True)
-class Reading:
+class Reading(NamedTuple):
     """Another architecture that the paper's text allows.
 
     Args:
@@ -72,15 +63,14 @@ class PaperRow:
     """One method of a table.
 
     Args:
-        name: as the paper prints it, with what sets it apart from the table's other rows.
+        name: as the paper prints it, with what distinguishes it from the table's other rows.
         numbers: column key -> the paper's number.
         run: overrides of train.py that give it; None for a method that is only quoted.
-        views, size: input views, height and width that its costs are computed at.
-        bounds: column key -> what the paper prints where it gives only a bound: "<1".
+        views, size: input views, height and width for its costs.
+        bounds: column key -> the bound that the paper prints in place of a number: "<1".
         post_optimization: steps on the Gaussians; such rows need evaluate.py.
-        test_set: of the run, in the place of the stand-in; None for the stand-in.
-        unverified: why the architecture of this row is not known to be the paper's; None where it
-            is.
+        test_set: of our run, in place of the one that `our_sets` gives; None for that one.
+        unverified: why this row's architecture may differ from the paper's; None if it is known.
         readings: the other architectures of an unverified row.
     """
 
@@ -100,7 +90,7 @@ class PaperRow:
         return self.run is None
 
     def text(self, column: Column) -> str:
-        """Return what the paper prints in `column`; "" where it prints nothing."""
+        """Return what the paper prints in `column`; "" if it prints nothing."""
         if column.key in self.numbers:
             return column.text(self.numbers[column.key])
         return self.bounds.get(column.key, "")
@@ -108,14 +98,13 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One table of the paper, and the sweep of the same key that reproduces it; or one of ours.
+    """One table of the paper, or one of ours, and the sweep of the same key that reproduces it.
 
     Args:
         key: name of the file in sweeps/.
-        number: in the paper, such as "6b" or "A3"; None of a table of ours, which has no numbers of
-            the paper.
+        number: in the paper, such as "6b" or "A3"; None for a table of ours.
         title: what it compares.
-        protocol: what the paper measured it with.
+        protocol: how the paper measured it.
         columns, rows: in the paper's order.
         rank_by: key of the column whose order is compared with the paper's; None without one.
     """
@@ -137,18 +126,17 @@ class PaperTable:
 @cache
 def load_paper() -> dict[str, PaperTable]:
     """Read every table of the paper; by key, in its order."""
-    return {key: _table(key, entry) for key, entry in _raw()["tables"].items()}
+    return {key: _table(key, entry) for key, entry in _read("paper")["tables"].items()}
 
 
 @cache
 def load_ours() -> dict[str, PaperTable]:
     """Read every table of ours; by key."""
-    tables = OmegaConf.to_container(OmegaConf.load(OURS))["tables"]
-    return {key: _table(key, entry) for key, entry in tables.items()}
+    return {key: _table(key, entry) for key, entry in _read("ours")["tables"].items()}
 
 
 def find_tables(names: str | Sequence[str]) -> list[PaperTable]:
-    """Find the tables called `names`, the paper's and ours: one, some with commas, or "all".
+    """Find tables of the paper or ours by name: one, several with commas, or "all".
 
     Raises:
         InputError: a name that no table has, with the nearest ones.
@@ -159,46 +147,40 @@ def find_tables(names: str | Sequence[str]) -> list[PaperTable]:
         return list(tables.values())
     for name in names:
         if name not in tables:
+            nearest = difflib.get_close_matches(name, tables, n=3, cutoff=0.3) or tables
             raise InputError(
-                f"table={name} is unknown: did you mean {_nearest(name, tables)}? "
+                f"table={name} is unknown: did you mean {', '.join(nearest)}? "
                 "All tables: table=all."
             )
     return [tables[name] for name in names]
 
 
 def our_sets(table: PaperTable, data: str, test_sets: Collection[str]) -> dict[str, str]:
-    """Map each test set of a table to the one of ours whose numbers stand beside the paper's.
+    """Map each test set of a table to the test set of ours that is compared with it.
 
-    It is the stand-in that this data has for it. Without one, it is the data itself for the table's
-    first set, if the sweep does not name that set; otherwise it is the set itself.
+    It is the substitute that this data has for it. Without one, it is the data itself for the
+    table's first set, if the sweep does not name that set; otherwise it is the set itself.
 
     Args:
         data: the data set of the runs, which is tested as well.
         test_sets: the further ones that their configuration names.
     """
-    stand_ins = _raw()["stand_ins"].get(data, {})
-    itself = {key: key for key in table.test_sets}
-    first = {key: data for key in table.test_sets[:1] if key not in test_sets}
-    return itself | first | {key: stand_ins[key] for key in itself if key in stand_ins}
+    substitutes = _read("paper")["substitutes"].get(data, {})
+    sets = {key: substitutes.get(key, key) for key in table.test_sets}
+    for first in table.test_sets[:1]:
+        if first not in test_sets and first not in substitutes:
+            sets[first] = data
+    return sets
 
 
 def set_titles() -> dict[str, str]:
     """Return the paper's test sets, as it prints them, by key."""
-    return _raw()["test_sets"]
-
-
-def kind_titles() -> dict[str, str]:
-    """Return the kinds of numbers, as printed, by the last part of a column's key."""
-    return {kind: entry["title"] for kind, entry in _raw()["columns"].items()}
+    return _read("paper")["test_sets"]
 
 
 @cache
-def _raw() -> dict:
-    return OmegaConf.to_container(OmegaConf.load(PAPER))
-
-
-def _nearest(name: str, known: Iterable[str]) -> str:
-    return ", ".join(difflib.get_close_matches(name, known, n=3, cutoff=0.3) or known)
+def _read(name: str) -> dict:
+    return OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name(f"{name}.yaml")))
 
 
 def _table(key: str, entry: dict) -> PaperTable:
@@ -214,26 +196,24 @@ def _table(key: str, entry: dict) -> PaperTable:
 
 
 def _column(key: str) -> Column:
-    """Make a column from its key, whose last part is the kind of its numbers."""
-    entry = _raw()["columns"][key.rpartition("/")[-1]]
+    entry = _read("paper")["columns"][key.rpartition("/")[-1]]
     unit = float(entry.get("unit", 1))
     return Column(key, entry["title"], entry.get("better"), entry["format"], unit)
 
 
 def _row(row: dict, table: dict) -> PaperRow:
-    """Make a row; its views and size are its table's unless it names its own."""
-    printed = dict(zip(table["columns"], row["paper"], strict=True)) if "paper" in row else {}
+    """Build a row; its views and size are its table's unless it names its own."""
+    printed = row.get("paper", [None] * len(table["columns"]))
+    printed = dict(zip(table["columns"], printed, strict=True))
     return PaperRow(
         name=row["name"],
-        numbers={k: float(v) for k, v in printed.items() if isinstance(v, int | float)},
+        numbers={key: float(v) for key, v in printed.items() if isinstance(v, int | float)},
         run=tuple(row["run"]) if "run" in row else None,
         views=row.get("views", table["views"]),
         size=tuple(row.get("size", table["size"])),
-        bounds={k: v for k, v in printed.items() if isinstance(v, str)},
+        bounds={key: v for key, v in printed.items() if isinstance(v, str)},
         post_optimization=row.get("post_optimization", 0),
         test_set=row.get("test_set"),
         unverified=row.get("unverified"),
-        readings=tuple(
-            Reading(reading["name"], tuple(reading["run"])) for reading in row.get("readings", ())
-        ),
+        readings=tuple(Reading(r["name"], tuple(r["run"])) for r in row.get("readings", ())),
     )

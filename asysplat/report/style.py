@@ -1,4 +1,4 @@
-"""The look of every plot."""
+"""Define the style of every plot."""
 
 INK, FAINT, OURS, PAPER = "#101112", "#909192", "#1f6feb", "#c2570c"
 STYLE = {

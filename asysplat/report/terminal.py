@@ -1,4 +1,4 @@
-"""Filled tables on the terminal."""
+"""Print filled tables on the terminal."""
 
 from collections.abc import Sequence
 
@@ -8,23 +8,22 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from asysplat.report.cells import make_overview, make_sheet
-from asysplat.report.filled import FilledTable
-from asysplat.report.sheet import Cell, Grid, Heading, Note
+from asysplat.report.cells import make_overview, make_section
+from asysplat.report.fill import FilledTable
+from asysplat.report.table import Grid, Heading, Note
 
 STYLES = {"": "", "best": "bold green", "muted": "dim", "alarm": "bold red"}
-# What rich puts around the text of a column: a space on either side, and a line.
-BORDER = 3
+BORDER = 3  # rich surrounds the text of a column with two spaces and a line
 
 
 def render_terminal(tables: Sequence[FilledTable], console: Console) -> None:
-    """Print the tables one after the other, the overview last, where it is seen."""
-    for sheet in map(make_sheet, tables):
-        console.print(Text(sheet.title, style="bold underline"))
-        _print_notes(sheet.above, console)
-        for grid in sheet.grids:
+    """Print the tables one after the other, and the overview last."""
+    for section in map(make_section, tables):
+        console.print(Text(section.title, style="bold underline"))
+        _print_notes(section.above, console)
+        for grid in section.grids:
             _print_grid(grid, console)
-        _print_notes(sheet.notes, console)
+        _print_notes(section.notes, console)
         console.print()
     if len(tables) > 1:
         _print_grid(make_overview(tables), console)
@@ -36,42 +35,37 @@ def _print_notes(notes: Sequence[Note], console: Console) -> None:
 
 
 def _print_grid(grid: Grid, console: Console) -> None:
-    """Print a grid; one wider than the console goes on below, with the names of its rows again."""
+    """Print a grid; one wider than the console continues below, with its row names again."""
     console.print(Text(grid.caption, style="italic"))
-    # Names wrap; what is measured of a row never does.
-    widths = [_width(grid, number) for number in range(len(grid.headings))]
+    titles = [_title(heading) for heading in grid.headings]
+    texts = [title.split("\n") for title in titles]
+    for row in grid.rows:
+        texts = [[*column, cell.text] for column, cell in zip(texts, row, strict=True)]
+    # Row names wrap, numbers never do.
+    widths = [max(map(cell_len, column)) for column in texts]
     widths[0] = min(widths[0], console.width // 3)
     for columns in _blocks(grid, widths, console.width):
         table = Table(box=ROUNDED)
-        table.add_column(Text("\n".join(_title(grid.headings[0]))), width=widths[0])
+        table.add_column(Text(titles[0]), width=widths[0])
         for number in columns:
-            title = Text("\n".join(_title(grid.headings[number])))
-            table.add_column(title, justify="right", no_wrap=True)
+            table.add_column(Text(titles[number]), justify="right", no_wrap=True)
         for row in grid.rows:
-            table.add_row(*(_text(row[number]) for number in (0, *columns)))
+            cells = (row[number] for number in (0, *columns))
+            table.add_row(*(Text(cell.text, style=STYLES[cell.style]) for cell in cells))
         console.print(table)
 
 
 def _blocks(grid: Grid, widths: list[int], total: int) -> list[list[int]]:
-    """Split the columns besides the names into blocks; those of one title stay together."""
+    """Split the columns after the names into blocks; those of one title stay together."""
     blocks: list[list[int]] = [[]]
     for _, columns in grid.groups()[1:]:
-        shown = [0, *blocks[-1], *columns]
-        if blocks[-1] and 1 + sum(BORDER + widths[number] for number in shown) > total:
+        block = [0, *blocks[-1], *columns]
+        if blocks[-1] and 1 + sum(BORDER + widths[number] for number in block) > total:
             blocks.append([])
         blocks[-1] += columns
     return blocks
 
 
-def _width(grid: Grid, number: int) -> int:
-    texts = [*_title(grid.headings[number]), *(row[number].text for row in grid.rows)]
-    return max(map(cell_len, texts))
-
-
-def _title(heading: Heading) -> list[str]:
-    """Split a heading into a line for each word."""
-    return [word for word in (*heading.title.split(" "), heading.part) if word]
-
-
-def _text(cell: Cell) -> Text:
-    return Text(cell.text, style=STYLES[cell.look])
+def _title(heading: Heading) -> str:
+    """Write a heading with a line for each word."""
+    return "\n".join(word for word in (*heading.title.split(" "), heading.part) if word)

@@ -1,4 +1,4 @@
-"""Histograms of what a network predicts, counted scene by scene."""
+"""Count histograms of a network's predictions, scene by scene."""
 
 from dataclasses import dataclass
 
@@ -11,11 +11,11 @@ BINS = 60
 
 @dataclass
 class Histogram:
-    """Counts of numbers between two bounds; those beyond count in the first and the last bin.
+    """Counts of numbers between two bounds; numbers beyond them are in the first or last bin.
 
     Args:
         low, high: the bounds.
-        counts: of the bins, which are equally wide; float64.
+        counts: of bins of equal width; float64.
     """
 
     low: float
@@ -31,12 +31,12 @@ class Histogram:
         return torch.linspace(self.low, self.high, len(self.counts) + 1)
 
     def add(self, numbers: Tensor) -> None:
-        """Count numbers of any shape; NaN is left out."""
+        """Count numbers of any shape; NaN is ignored."""
         numbers = numbers[~numbers.isnan()].clamp(self.low, self.high)
         self.counts += torch.histc(numbers.float(), len(self.counts), self.low, self.high)
 
     def median(self) -> float:
-        """Return the median, interpolated within its bin; NaN where nothing was counted."""
+        """Return the median, interpolated within its bin; NaN if nothing was counted."""
         counts = self.counts.cpu()
         below = torch.cat((counts.new_zeros(1), counts.cumsum(0)))
         if not below[-1]:

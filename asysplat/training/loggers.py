@@ -1,4 +1,4 @@
-"""What a run is logged to besides its files, and what of it is no number: pictures, histograms."""
+"""Create the Weights & Biases logger; log figures and histograms."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,26 +11,26 @@ from asysplat.training.histogram import Histogram
 
 
 def make_wandb_logger(folder: Path | str, project: str, name: str, offline: bool) -> WandbLogger:
-    """Make a logger to Weights & Biases, which wants an account unless it is offline.
+    """Create a logger to Weights & Biases, which needs an account unless it is offline.
 
     Args:
         folder: of the run.
-        project, name: under which the run is shown.
-        offline: keep everything in the folder; `wandb sync` sends it later.
+        project, name: of the run at Weights & Biases.
+        offline: write to the folder only; `wandb sync` uploads it later.
 
     Raises:
         InputError: wandb is not installed.
     """
     if find_spec("wandb") is None:
         raise InputError(
-            "logger=wandb needs wandb: pip install 'asysplat[wandb]', or take logger=tensorboard, "
+            "logger=wandb needs wandb: pip install 'asysplat[wandb]', or use logger=tensorboard, "
             "which needs no account."
         )
     return WandbLogger(save_dir=folder, project=project, name=name, offline=offline)
 
 
 def log_figure(logger: Logger, name: str, figure: Figure, step: int) -> None:
-    """Log a figure where the logger shows figures."""
+    """Log a figure to TensorBoard or Weights & Biases."""
     if isinstance(logger, TensorBoardLogger):
         logger.experiment.add_figure(name, figure, step)
     elif isinstance(logger, WandbLogger):
@@ -38,7 +38,7 @@ def log_figure(logger: Logger, name: str, figure: Figure, step: int) -> None:
 
 
 def log_histogram(logger: Logger, name: str, histogram: Histogram, step: int) -> None:
-    """Log a histogram where the logger shows histograms."""
+    """Log a histogram to TensorBoard or Weights & Biases."""
     edges, counts = histogram.edges, histogram.counts.cpu()
     middles = ((edges[1:] + edges[:-1]) / 2).double()
     if isinstance(logger, TensorBoardLogger):
@@ -56,5 +56,5 @@ def log_histogram(logger: Logger, name: str, histogram: Histogram, step: int) ->
     elif isinstance(logger, WandbLogger):
         import wandb  # an extra
 
-        shown = wandb.Histogram(np_histogram=(counts.numpy(), edges.numpy()))
-        logger.experiment.log({name: shown, "trainer/global_step": step})
+        value = wandb.Histogram(np_histogram=(counts.numpy(), edges.numpy()))
+        logger.experiment.log({name: value, "trainer/global_step": step})

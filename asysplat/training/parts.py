@@ -1,4 +1,4 @@
-"""The seconds of a training step, part by part."""
+"""Measure the seconds of each part of a training step."""
 
 import time
 from collections import defaultdict
@@ -18,7 +18,7 @@ PARTS = ("data", "prior", "network", "rendering", "loss", "backward", "optimizer
 
 @dataclass
 class _Thread:
-    """What one thread measured, and how long the parts inside of those that are open took."""
+    """The seconds of each part in one thread, and of the parts inside each open part."""
 
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     inner: list[float] = field(default_factory=list)
@@ -27,35 +27,35 @@ class _Thread:
 class Parts:
     """Measures the parts of a step between `start` and `stop`; in other steps it costs nothing.
 
-    A part within a part is its own: its seconds are not those of the outer one. Of threads that
-    work side by side, the mean counts. A GPU is waited for where a part begins and ends.
+    The seconds of an inner part do not count for the outer one. Seconds of parallel threads are
+    averaged. A part waits for the GPU where it begins and ends.
     """
 
     def __init__(self):
         self.measuring = False
 
     def start(self, device: torch.device) -> None:
-        """Measure from now on what is computed on `device`."""
+        """Start measuring work on `device`."""
         self.device, self.measuring = device, True
-        self._own = get_ident()
+        self._main = get_ident()
         self._threads: dict[int, _Thread] = defaultdict(_Thread)
 
     def stop(self) -> dict[str, float]:
         """Stop measuring, and return the seconds of each part."""
         self.measuring = False
-        seconds = self._threads.pop(self._own, _Thread()).seconds
+        seconds = self._threads.pop(self._main, _Thread()).seconds
         for thread in self._threads.values():
             for name, spent in thread.seconds.items():
                 seconds[name] += spent / len(self._threads)
         return dict(seconds)
 
     def add(self, name: str, seconds: float) -> None:
-        """Add seconds that were measured otherwise."""
+        """Add seconds measured elsewhere."""
         self._threads[get_ident()].seconds[name] += seconds
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Measure what is done inside as the part `name`."""
+        """Measure the body as the part `name`."""
         if not self.measuring:
             yield
             return
@@ -72,7 +72,7 @@ class Parts:
 
     @contextmanager
     def of(self, name: str, module: nn.Module | None) -> Iterator[None]:
-        """Measure the calls of a module that are made inside; None measures nothing."""
+        """Measure the module's calls in the body; None measures nothing."""
         if not self.measuring or module is None:
             yield
             return

@@ -1,4 +1,4 @@
-"""What the micro-batches of an optimizer step give together, on all processes."""
+"""Average over the micro-batches of an optimizer step and over all processes."""
 
 from collections.abc import Callable
 
@@ -8,9 +8,9 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 
 class StepMeans:
-    """Averages over an optimizer step: the terms of its loss, and the moves of running means.
+    """Averages the terms of the loss and the running means of batch norms over an optimizer step.
 
-    Both are those of one process that holds the whole batch. Every micro-batch starts from the same
+    Both equal those of one process with the whole batch. Every micro-batch starts from the same
     running means.
 
     Args:
@@ -21,31 +21,31 @@ class StepMeans:
         norms = [module for module in net.modules() if isinstance(module, _BatchNorm)]
         self.buffers = [b for norm in norms for b in (norm.running_mean, norm.running_var)]
         self.terms: list[dict[str, Tensor]] = []
-        self.moved: list[list[Tensor]] = []
+        self.updated: list[list[Tensor]] = []
 
     def start(self) -> None:
         """Begin an optimizer step."""
         self.before = [buffer.clone() for buffer in self.buffers]
-        self.terms, self.moved = [], []
+        self.terms, self.updated = [], []
 
     def add(self, terms: dict[str, Tensor]) -> None:
-        """Count a micro-batch, which has just been computed."""
+        """Add a micro-batch after its forward pass."""
         self.terms.append({name: term.detach() for name, term in terms.items()})
-        self.moved.append([buffer.clone() for buffer in self.buffers])
+        self.updated.append([buffer.clone() for buffer in self.buffers])
         self._set(self.before)
 
     def finish(self, reduce: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
-        """Move the running means; return the mean of every term.
+        """Update the running means; return the mean of every term.
 
         Args:
             reduce: a tensor of this process -> its mean over all processes.
         """
-        self._set([reduce(torch.stack(each).mean(0)) for each in zip(*self.moved, strict=True)])
+        self._set([reduce(torch.stack(each).mean(0)) for each in zip(*self.updated, strict=True)])
         names = list(self.terms[0])
         means = torch.stack([torch.stack([each[n] for each in self.terms]).mean() for n in names])
         return dict(zip(names, reduce(means), strict=True))
 
     def _set(self, values: list[Tensor]) -> None:
         for buffer, value in zip(self.buffers, values, strict=True):
-            # By .data: a batch norm's backward pass, still to come, holds the buffer unread.
+            # By .data, as a batch norm's pending backward pass has saved the buffer.
             buffer.data.copy_(value)

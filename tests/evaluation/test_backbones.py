@@ -1,4 +1,4 @@
-"""Downloads of ImageNet weights: asked for, into torch's hub cache, once; no test has a network."""
+"""Weights are downloaded once, into torch's hub cache, if requested; no test uses a network."""
 
 from urllib.error import URLError
 
@@ -9,66 +9,125 @@ from omegaconf import OmegaConf
 from torchvision.models import alexnet
 
 from asysplat.errors import InputError
-from asysplat.evaluation import backbones
-from asysplat.evaluation.backbones import find_backbone
+from asysplat.evaluation.backbones import VGGFeatures, find_backbone
+from asysplat.evaluation.lpips import load_lpips
+
+ALEXNET = "alexnet-owt-7be5be79.pth"
+
+
+def write_alexnet(path, value, dtype=torch.float32):
+    """AlexNet's weights, all equal to `value`; stored as one number a tensor."""
+    with torch.device("meta"):
+        shapes = {key: tensor.shape for key, tensor in alexnet().state_dict().items()}
+    state = {key: torch.tensor(value, dtype=dtype).expand(shape) for key, shape in shapes.items()}
+    torch.save(state, path)
 
 
 @pytest.fixture
-def network(tmp_path, monkeypatch):
-    """Addresses that were asked; each answers with torchvision's file of zeros, as stored."""
-    asked = []
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+def requests(monkeypatch):
+    """Requested addresses; each responds with torchvision's file, of zeros."""
+    addresses = []
 
     def download(url, file, *_, **__):
-        asked.append(url)
-        with torch.device("meta"):
-            shapes = {key: tensor.shape for key, tensor in alexnet().state_dict().items()}
-        torch.save({key: torch.zeros(1).expand(shape) for key, shape in shapes.items()}, file)
+        addresses.append(url)
+        write_alexnet(file, 0.0)
 
     monkeypatch.setattr("torch.hub.download_url_to_file", download)
-    return asked
+    return addresses
 
 
-def test_it_is_downloaded_once_and_only_where_asked(network):
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """The folder of torch's hub cache, empty."""
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    (tmp_path / "hub" / "checkpoints").mkdir(parents=True)
+    return tmp_path / "hub" / "checkpoints"
+
+
+def test_it_is_downloaded_once_and_only_if_requested(requests, hub, tmp_path):
+    assert load_lpips("alex", None) is None
+    assert load_lpips("vgg", tmp_path) is None
     assert find_backbone("alexnet", None) is None
-    assert not network
+    assert not requests
     found = find_backbone("alexnet", None, download=True)
     again = find_backbone("alexnet", None, download=True)
-    assert len(network) == 1 and network[0].startswith("https://") and "alexnet" in network[0]
+    assert len(requests) == 1 and requests[0].startswith("https://") and "alexnet" in requests[0]
     assert found.keys() == again.keys() == find_backbone("alexnet", None).keys()
     assert found["features.0.weight"].shape == (64, 3, 11, 11)
 
 
-def test_a_folder_s_file_needs_no_download(network, tmp_path):
-    backbones.get_model_weights("alexnet").IMAGENET1K_V1.get_state_dict(progress=False)
-    (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").rename(
-        tmp_path / "alexnet_features_fp16.pth"
+def test_hub_cache_comes_first_and_features_are_fp32(requests, hub, tmp_path):
+    write_alexnet(tmp_path / "alexnet_features_fp16.pth", 2.0, torch.float16)
+    found = find_backbone("alexnet", tmp_path, download=True)
+    assert found["features.0.bias"].dtype == torch.float32 and not requests
+    assert found["features.0.bias"].unique().tolist() == [2.0]
+    write_alexnet(hub / ALEXNET, 1.0)
+    found = find_backbone("alexnet", tmp_path)
+    assert found["features.10.weight"].unique().tolist() == [1.0]
+    assert sorted(found) == sorted(
+        f"features.{n}.{part}" for n in (0, 3, 6, 8, 10) for part in ("weight", "bias")
     )
-    assert find_backbone("alexnet", tmp_path, download=True)
-    assert len(network) == 1
 
 
-def test_the_option_reaches_everything_that_looks_for_backbones(repository):
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut short"])
+def test_error_of_a_broken_file(hub, content):
+    (hub / "vgg16-397923af.pth").write_bytes(content)
+    with pytest.raises(InputError, match=r"vgg16-397923af\.pth cannot be read"):
+        find_backbone("vgg16", None)
+
+
+@pytest.mark.parametrize("content", [[1, 2], {"features.0.weight": torch.zeros(1)}])
+def test_error_of_a_file_with_other_content(hub, content):
+    torch.save(content, hub / ALEXNET)
+    with pytest.raises(InputError, match=r"7be5be79\.pth has no features\.0\.weight of shape"):
+        find_backbone("alexnet", None)
+
+
+def test_the_option_reaches_every_user_of_backbones(repository):
     with initialize_config_dir(str(repository / "conf"), version_base=None):
         config = compose("train", ["paths.download=true", "paths.run=unused"])
 
-    def looking(node):
+    def users(node):
         if isinstance(node, dict):
             if "_target_" in node and "backbone_dir" in node:
                 yield node
             for value in node.values():
-                yield from looking(value)
+                yield from users(value)
 
-    found = list(looking(OmegaConf.to_container(config, resolve=True)))
+    found = list(users(OmegaConf.to_container(config, resolve=True)))
     assert len(found) == 2  # LPIPS and the perceptual term
     assert all(node["download"] is True for node in found)
 
 
 @pytest.mark.parametrize("error", [URLError("no route"), RuntimeError("invalid hash value")])
-def test_a_download_that_fails_is_one_sentence(network, monkeypatch, error):
+def test_a_failed_download_is_an_input_error(hub, monkeypatch, error):
     def fail(*_, **__):
         raise error
 
     monkeypatch.setattr("torch.hub.download_url_to_file", fail)
     with pytest.raises(InputError, match=r"alexnet.* could not be downloaded \(.*paths\.download"):
         find_backbone("alexnet", None, download=True)
+
+
+def test_vgg_features_are_the_five_named_activations(shared, hub):
+    if not (shared / "weights" / "vgg16_features_fp16.pth").is_file():
+        pytest.skip("the weights are absent: set ASYSPLAT_SHARED")
+    backbone = find_backbone("vgg16", shared / "weights")
+    features = VGGFeatures("vgg16", backbone, (3, 8, 15, 22, 29), (0.229, 0.224, 0.225))
+    assert not any(parameter.requires_grad for parameter in features.parameters())
+    images = torch.rand(2, 3, 32, 48, requires_grad=True)
+    activations = features(images)
+    shapes = [tuple(a.shape) for a in activations]
+    channels = (64, 128, 256, 512, 512)
+    assert shapes == [(2, c, 32 >> i, 48 >> i) for i, c in enumerate(channels)]
+
+    # ReLU 1_2 by hand; a gradient reaches the images.
+    mean = torch.tensor([0.485, 0.456, 0.406])[:, None, None]
+    std = torch.tensor([0.229, 0.224, 0.225])[:, None, None]
+    x = (images - mean) / std
+    for n in (0, 2):
+        weight, bias = backbone[f"features.{n}.weight"], backbone[f"features.{n}.bias"]
+        x = torch.nn.functional.conv2d(x, weight, bias, padding=1).relu()
+    torch.testing.assert_close(activations[0], x)
+    activations[-1].sum().backward()
+    assert images.grad.abs().sum() > 0

@@ -22,7 +22,7 @@ def make_views(positions, yaws_in_degrees, images=None):
     return Views(cameras, images)
 
 
-def chosen(inputs, targets):
+def nearest(inputs, targets):
     return (nearest_view_images(inputs, targets)[..., 0, 0, 0] * 10).round().int().tolist()
 
 
@@ -42,21 +42,21 @@ def test_mean_color_is_of_all_inputs_of_the_scene():
 def test_nearest_by_center_then_by_direction():
     inputs = make_views([[0, 0, 0], [4, 0, 0], [4, 0, 0]], [0, 0, 90])
     targets = make_views([[1, 0, 0], [3, 0, 0], [3, 0, 0], [4, 9, 0]], [0, 10, 80, 50])
-    assert chosen(inputs, targets) == [0, 1, 2, 2]
+    assert nearest(inputs, targets) == [0, 1, 2, 2]
 
 
 def test_the_rule_weighs_distance_by_spread_and_angle_by_pi():
     # Spread 10. Input 0: 4/10 + 0. Input 1: 0 + yaw/180: the winner changes at a yaw of 72.
     target = make_views([[4, 0, 0]], [0])
-    assert chosen(make_views([[0, 0, 0], [4, 0, 0], [10, 0, 0]], [0, 71, 180]), target) == [1]
-    assert chosen(make_views([[0, 0, 0], [4, 0, 0], [10, 0, 0]], [0, 73, 180]), target) == [0]
+    assert nearest(make_views([[0, 0, 0], [4, 0, 0], [10, 0, 0]], [0, 71, 180]), target) == [1]
+    assert nearest(make_views([[0, 0, 0], [4, 0, 0], [10, 0, 0]], [0, 73, 180]), target) == [0]
 
 
-def test_coincident_centers_are_told_apart_by_direction():
+def test_coincident_centers_are_distinguished_by_direction():
     inputs = make_views([[5, 0, 0]] * 3, [0, 60, 120])
-    assert chosen(inputs, make_views([[0, 0, 0], [0, 7, 0]], [100, 20])) == [2, 0]
+    assert nearest(inputs, make_views([[0, 0, 0], [0, 7, 0]], [100, 20])) == [2, 0]
     single = make_views([[5, 0, 0]], [0])
-    assert chosen(single, make_views([[0, 0, 0]], [180])) == [0]
+    assert nearest(single, make_views([[0, 0, 0]], [180])) == [0]
 
 
 def test_batched_choice_equals_scene_by_scene():

@@ -1,4 +1,4 @@
-"""Pictures: the columns there are, and what is shown where nothing is known."""
+"""Columns of the figures, and their content where depths are unknown or masked."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ def scene(depths=True):
     return views, Rendering(images, torch.ones(2, 16, 16), torch.full((2, 16, 16), 2.0), {})
 
 
-def test_no_depth_is_shown_as_far_away():
+def test_disparity_of_an_unknown_depth_is_0():
     found = disparity(torch.tensor([[0.0, 0.5], [2.0, 4.0]]))
     torch.testing.assert_close(found, torch.tensor([[0.0, 2.0], [0.5, 0.25]]))
 
@@ -30,30 +30,30 @@ def test_a_row_for_each_view_and_true_depth_where_known():
         assert axes[2].get_xlabel() == "100.0 dB"
 
 
-def test_masked_pixels_are_blank_and_no_part_of_the_colors_range():
+def test_masked_pixels_are_blank_and_not_in_the_color_range():
     views, rendering = scene()
     masks = torch.ones(2, 16, 16, dtype=torch.bool)
     masks[:, :, :4] = False
-    depths = torch.where(masks, 2.0, 0.01)  # what is masked would be the brightest by far
+    depths = torch.where(masks, 2.0, 0.01)  # masked depths would be the brightest
     image = torch.where(masks[:, None], rendering.image, 0)
     rendering = replace(rendering, image=image, depth=torch.where(masks, 2.0, 0.0))
     figure = comparison_figure(views, replace(views, depths=depths, masks=masks), rendering)
     for row in (figure.axes[:6], figure.axes[6:]):
         assert row[2].get_xlabel() == "100.0 dB"
         for axis, value in zip(row[3:], (0.0, 0.5, 0.5), strict=True):
-            (picture,) = axis.images
-            shown = picture.get_array()
-            assert shown.mask[:, :4].all() and (shown[:, 4:] == value).all()
+            (image,) = axis.images
+            values = image.get_array()
+            assert values.mask[:, :4].all() and (values[:, 4:] == value).all()
         assert row[4].images[0].get_clim() == row[5].images[0].get_clim() == (0, 0.5)
 
 
-def test_a_view_that_is_masked_as_a_whole_can_be_drawn():
+def test_a_fully_masked_view_can_be_drawn():
     views, rendering = scene()
     views = replace(views, masks=torch.zeros(2, 16, 16, dtype=torch.bool))
     comparison_figure(views, views, rendering).canvas.draw()
 
 
-def test_curve_shows_every_validation():
+def test_curve_has_every_validation():
     rows = [
         {"step": s, "minutes": s / 10, "psnr": 15 + s, "nearest_view/psnr": 16} for s in range(3)
     ]

@@ -34,9 +34,9 @@ def test_work_is_timed_from_start_to_stop(monkeypatch):
 
 
 @pytest.mark.skipif(not reset_peak_memory("cpu"), reason="the peak of the process cannot be reset")
-def test_memory_is_that_of_the_work_alone():
-    def hold(numbers):
-        """4 bytes each, of the system itself: memory that was freed before would be no rise."""
+def test_memory_is_that_of_the_work_only():
+    def allocate(numbers):
+        """Allocate 4 bytes each from the system: reused memory would not raise the peak."""
         with mmap.mmap(-1, 4 * numbers) as memory:
             for page in range(0, len(memory), mmap.PAGESIZE):
                 memory[page] = 1
@@ -44,13 +44,13 @@ def test_memory_is_that_of_the_work_alone():
     small, large = CostMeter(CPU), CostMeter(CPU)
     for work, numbers in ((small, 1000), (large, 50_000_000), (large, 1000), (small, 1000)):
         work.start()
-        hold(numbers)
+        allocate(numbers)
         work.stop()
     rise = large.costs("large")["large_gb"] - small.costs("small")["small_gb"]
     assert rise == pytest.approx(0.2, abs=0.02)
 
 
-def test_no_memory_where_the_peak_cannot_start_anew(monkeypatch):
+def test_no_memory_if_the_peak_cannot_be_reset(monkeypatch):
     monkeypatch.setattr(measured_cost, "reset_peak_memory", lambda device: False)
     work = CostMeter(CPU)
     work.start()

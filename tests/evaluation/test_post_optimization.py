@@ -1,4 +1,4 @@
-"""The paper's post-optimization, measured: what rises, what is counted, what is refused."""
+"""Measurements of the paper's post-optimization: quality, costs, invalid steps."""
 
 import itertools
 import time
@@ -21,7 +21,7 @@ BLACK = torch.zeros(3)
 
 @pytest.fixture(scope="module")
 def scene(make_scene):
-    """Photographs of Gaussians, 4 inputs and 2 targets, and a prediction that is off."""
+    """Images of Gaussians, 4 inputs and 2 targets, and a noisy prediction."""
     true, cameras = make_scene(60, 6, SIZE, SIZE, dtype=torch.float32)
     with torch.no_grad():
         drawn = render(true, cameras, BLACK)
@@ -45,7 +45,7 @@ def psnrs(result, images):
     ]
 
 
-def test_inputs_rise_with_every_step_and_targets_with_them(scene):
+def test_psnr_of_inputs_rises_with_every_step(scene):
     gaussians, inputs, targets = scene
     measure = PostOptimization(range(29), PROTOCOL, None, BLACK)
     result = measure("synthetic", lambda _: gaussians, inputs, targets)
@@ -57,7 +57,7 @@ def test_inputs_rise_with_every_step_and_targets_with_them(scene):
 
 
 @pytest.mark.parametrize("steps", [1, 7])
-def test_a_state_on_the_way_is_that_of_so_many_steps(scene, steps):
+def test_intermediate_steps_equal_a_shorter_refinement(scene, steps):
     gaussians, inputs, targets = scene
     result = PostOptimization((0, steps, 9), PROTOCOL, None, BLACK)(
         "synthetic", lambda _: gaussians, inputs, targets
@@ -84,7 +84,7 @@ def test_every_image_has_a_row_with_its_metrics(scene):
     assert {"psnr", "ssim", "absrel", "delta1"} <= first.keys()
 
 
-def test_what_measuring_takes_does_not_count(scene, monkeypatch):
+def test_costs_do_not_include_the_metrics(scene, monkeypatch):
     """On a clock that a prediction moves by 1, a step by 10 and a measurement by 100."""
     gaussians, inputs, targets = scene
     now = [0.0]
@@ -111,6 +111,6 @@ def test_what_measuring_takes_does_not_count(scene, monkeypatch):
 
 
 @pytest.mark.parametrize("steps", [(), (3, 3), (10, 3), (-1, 2)])
-def test_steps_have_to_increase(steps):
+def test_steps_must_increase(steps):
     with pytest.raises(InputError, match="above the one before"):
         PostOptimization(steps, PROTOCOL, None)

@@ -33,7 +33,7 @@ SCENES = {
 }
 
 
-def test_a_scene_is_read_as_it_was_kept(tmp_path):
+def test_a_scene_is_read_as_it_was_saved(tmp_path):
     path = tmp_path / "main-0.json"
     assert load_result(path) is None
     save_result(path, SCENES["main"][0])

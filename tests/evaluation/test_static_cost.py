@@ -15,18 +15,18 @@ def test_full_width_at_32_views_of_256(build):
     assert 20 < costs["activation_gb"] < 30
 
 
-def test_activation_memory_is_what_a_forward_pass_keeps(build):
+def test_activation_memory_is_what_a_forward_pass_saves(build):
     net = build("model=asysplat_4m4s", "width=0.125", "state_size=8")
     views = blank_views(2, 64, 64).map(torch.zeros_like)
     parameters = {p.untyped_storage().data_ptr() for p in [*net.parameters(), *net.buffers()]}
-    kept = {}
+    saved = {}
 
-    def keep(tensor):
+    def save(tensor):
         storage = tensor.untyped_storage()
         if storage.data_ptr() not in parameters:
-            kept[storage.data_ptr()] = storage
+            saved[storage.data_ptr()] = storage
         return tensor
 
-    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+    with torch.autograd.graph.saved_tensors_hooks(save, lambda tensor: tensor):
         net(views)
-    assert activation_gb(net, 2, 64, 64) == sum(s.nbytes() for s in kept.values()) / 1e9
+    assert activation_gb(net, 2, 64, 64) == sum(s.nbytes() for s in saved.values()) / 1e9

@@ -12,8 +12,8 @@ from hydra import initialize_config_dir
 
 from asysplat.evaluation import static_cost
 from asysplat.evaluation.static_cost import Activations
+from asysplat.report.compare import check_costs, fits
 from asysplat.report.fill import fill_table, finished_runs, with_costs
-from asysplat.report.filled import check, fits
 from asysplat.report.paper import find_tables, load_ours, load_paper
 from asysplat.training.revision import revision
 from asysplat.training.runs import describe_run, find_run
@@ -51,16 +51,16 @@ def test_costs_of_every_row_are_the_papers_or_flagged(compose, table, monkeypatc
     # The paper prints none, and they take longer than all else.
     monkeypatch.setattr(static_cost, "count_activations", lambda *_: Activations(0.0, 0.0))
     filled = with_costs(fill_table(load_paper()[table], [], compose, {}), compose)
-    for row in filled.networks:
-        if row.paper.quoted:
+    for row in filled.rows:
+        if row.paper.quoted or row.paper.post_optimization:
             continue
         if row.paper.unverified:
             # Both readings are there, and one of them has the paper's costs.
             assert len(row.reading_costs) == len(row.paper.readings) > 0
-            assert check(row).startswith("unverified")
+            assert check_costs(row).startswith("unverified")
             assert any(fits(row.paper, costs) for costs in (row.costs, *row.reading_costs))
         else:
-            assert check(row) in ("fits", "not printed")
+            assert check_costs(row) in ("fits", "not printed")
 
 
 @pytest.fixture
@@ -81,11 +81,11 @@ def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
     rows = {row.paper.run: row for row in filled.rows}
     row = rows[("model=asysplat_7m1t",)]
     assert row.values["dl3dv/psnr"] == [20.0, 21.0]
-    assert row.seeds == (0, 2) and row.missing == (1,)
-    assert "1" in row.note
+    assert row.seeds == (0, 2) and row.note == "seeds still to run: 1"
     assert not rows[("model=asysplat_8t",)].values
-    assert filled.baselines == {"procedural": {"mean_color": 13.0, "nearest_view": 16.0}}
-    assert filled.command == "python train.py sweeps=layers steps=7"
+    baselines = "procedural: mean color 13.00 dB, nearest view, copied 16.00 dB"
+    assert filled.notes["Baselines"] == baselines
+    assert filled.notes["Command"] == "python train.py sweeps=layers steps=7"
 
 
 def test_one_run_serves_every_table_that_names_its_configuration(compose, logs, tmp_path):
@@ -109,23 +109,40 @@ def test_runs_on_the_papers_data(compose, tmp_path):
         ["sweeps=geometry_ratio", "model=asysplat_4m4s", *DL3DV, "paths.mipnerf360=/a/360_v2"]
     )
     numbers = {"test/dl3dv/psnr": 19.0, "test/mipnerf360/psnr": 17.0, "protocol/name": "longlrm"}
-    write_run(tmp_path / "run", config, numbers | {"protocol/psnr": "of each image"}, 0)
+    numbers |= {"protocol/psnr": "of each image", "protocol/absrel": "of depths"}  # not printed
+    write_run(tmp_path / "run", config, numbers, 0)
     runs = finished_runs(tmp_path)
     filled = fill_table(load_paper()["geometry_ratio"], ["data=dl3dv"], compose, runs)
     assert filled.rows[0].values == {"dl3dv/psnr": [19.0], "mipnerf360/psnr": [17.0]}
     assert filled.sets == {"dl3dv": "dl3dv", "mipnerf360": "mipnerf360"}
-    assert filled.protocols == ({"name": "longlrm", "psnr": "of each image"},)
-    assert filled.folders == ("DL3DV and Benchmark",)
+    assert filled.metrics == ("protocol longlrm. PSNR: of each image",)
+    assert filled.notes["Data"] == "DL3DV and Benchmark"
     assert filled.rows[0].revisions == (revision(),)
-    assert filled.untested == ()
+    assert filled.notes["Not tested"] == ""
 
     filled = fill_table(load_paper()["mamba_ratio"], ["data=dl3dv"], compose, {})
-    assert filled.untested == ("mipnerf360", "scannetpp")
-    assert filled.protocols == ({"name": "longlrm"},)
+    untested = "MipNeRF-360, without paths.mipnerf360=...; ScanNet++, without paths.scannetpp=..."
+    assert filled.notes["Not tested"] == untested
+    assert filled.metrics == ("protocol longlrm",)
     other = ["data=dl3dv", "data.root=/a/DL3DV-small"]
     assert not fill_table(load_paper()["layers"], other, compose, runs).rows[0].values
     moved = ["data=dl3dv", "data.root=/b/c/DL3DV"]
     assert fill_table(load_paper()["layers"], moved, compose, runs).rows[0].values
+
+
+def test_mixed_protocols_and_folders_are_reported(compose, tmp_path):
+    for seed, root, name in ((0, "/a/DL3DV", "longlrm"), (1, "/a/DL3DV-small", "default")):
+        overrides = ["sweeps=layers", "model=asysplat_4m4s", "data=dl3dv", f"data.root={root}"]
+        numbers = {"test/dl3dv/psnr": 19.0, "protocol/name": name, "protocol/psnr": "of pixels"}
+        write_run(tmp_path / name, compose(overrides), numbers, seed)
+    filled = fill_table(load_paper()["layers"], ["data=dl3dv"], compose, finished_runs(tmp_path))
+    assert set(filled.metrics) == {
+        "protocol longlrm. PSNR: of pixels",
+        "protocol default. PSNR: of pixels",
+    }
+    assert filled.notes["Data"].endswith(
+        "are mixed, name one with data.root=... in overrides: DL3DV; DL3DV-small"
+    )
 
 
 def test_a_run_that_was_tested_on_all_sets_comes_first(compose, tmp_path):
@@ -160,8 +177,8 @@ def test_a_row_of_a_further_test_set_has_its_costs(compose, tmp_path):
 @pytest.mark.parametrize("data", ["files", "colmap", "mipnerf360", "replica", "realestate10k"])
 def test_a_table_on_any_data(compose, data):
     filled = fill_table(load_paper()["more_views"], [f"data={data}"], compose, {})
-    assert filled.sets == {"dl3dv": data} and filled.untested == ()
-    assert f"{data} data" in filled.scale
+    assert filled.sets == {"dl3dv": data} and filled.notes["Not tested"] == ""
+    assert f"{data} data" in filled.notes["Ours"]
 
 
 def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, tmp_path):
@@ -172,7 +189,7 @@ def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, t
     for key, column in columns.items():
         filled = fill_table(load_paper()[key], [], compose, runs)
         assert [column in row.values for row in filled.rows].count(True) == 1
-    scale = fill_table(load_paper()["two_views"], [], compose, runs).scale
+    scale = fill_table(load_paper()["two_views"], [], compose, runs).notes["Ours"]
     assert "2 input views of 64x64, " in scale
     sizes = [f"{stage.data.height}x{stage.data.width}" for stage in stage_configs(config)]
     assert [words.split(" at ")[1] for words in scale.split(", then ")][:2] == sizes[:2]

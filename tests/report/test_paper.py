@@ -131,7 +131,7 @@ def test_text_is_in_the_unit_of_the_title():
     feed_forward, post_optimized = overhead.rows[:2]
     assert [feed_forward.text(c) for c in overhead.columns] == ["142.0", "<1", "20,200", "26", "8"]
     assert [post_optimized.text(c) for c in overhead.columns] == ["142.0", "50", "", "31", "8"]
-    assert load_paper()["layers"].columns[1].title == "DL3DV-140 PSNR"
+    assert load_paper()["layers"].columns[1].title() == "DL3DV-140 PSNR"
 
 
 def test_a_table_is_found_by_its_name():

@@ -8,7 +8,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from asysplat.report.filled import COMPUTED, FilledRow, FilledTable
+from asysplat.report.fill import COMPUTED, FilledRow, FilledTable
 from asysplat.report.front import pareto_front
 from asysplat.report.html import render_html
 from asysplat.report.markdown import escape, render_markdown
@@ -68,7 +68,6 @@ def table() -> FilledTable:
             costs(91e6),
             values=values(20.5, 20.7, seconds=0.1),
             seeds=(0, 1),
-            missing=(2,),
             note="2 of 3 seeds",
         ),
         FilledRow(
@@ -87,12 +86,13 @@ def table() -> FilledTable:
     return FilledTable(
         paper,
         rows,
-        "laptop: 8 views of 64x64",
-        "python train.py sweeps=layers",
         {"dl3dv": "my_rooms"},
-        ({"name": "longlrm", "psnr": "mean of *all* images", "absrel": "of depths"},),
-        {"my_rooms": {"mean_color": 13.2, "nearest_view": 14.5}},
-        "2 cores",
+        ("protocol longlrm. PSNR: mean of *all* images",),
+        {
+            "Ours": "laptop: 8 views of 64x64",
+            "Machine": "2 cores",
+            "Command": "python train.py sweeps=layers",
+        },
     )
 
 
@@ -107,7 +107,7 @@ def ratios(table) -> FilledTable:
         "geometry_ratio", "A3", "Share", "32 views", COLUMNS[2:3], tuple(r.paper for r in rows),
         "dl3dv/psnr",
     )  # fmt: skip
-    return FilledTable(paper, rows, "laptop", "python train.py sweeps=geometry_ratio")
+    return FilledTable(paper, rows)
 
 
 class Page(HTMLParser):
@@ -175,8 +175,7 @@ def test_notes_under_a_table(table):
     for note in (
         "**Paper**: 32 views",
         "**Ours**: laptop: 8 views of 64x64",
-        "**Stand-ins**: DL3DV-140 by our test set my\\_rooms",
-        "**For nothing**: my\\_rooms: mean color 13.20 dB, nearest view, copied 14.50 dB",
+        "**Substitutes**: DL3DV-140 by our test set my\\_rooms",
         "**Seeds**: 0, 1, 2: mean ± sample standard deviation over them",
         # Means 22, 20.6, 21.5: 0.71 between rows; sqrt((2 + 0.02) / 3) = 0.82 between seeds,
         # of which there are two a row on average.
@@ -229,7 +228,7 @@ def test_a_table_of_ours_has_no_columns_of_the_paper(table):
     )
     paper = replace(table.paper, number=None, protocol="", rank_by=None)
     text = render_markdown([replace(table, paper=paper, rows=rows)])
-    assert text.count("## Ours: ") == 1 and "paper |" not in text and "Stand-ins" not in text
+    assert text.count("## Ours: ") == 1 and "paper |" not in text and "Substitutes" not in text
     measured = [column for column in columns if column not in COMPUTED]
     assert len(line(text, "Net\\*")) == len(measured)
 
@@ -237,33 +236,29 @@ def test_a_table_of_ours_has_no_columns_of_the_paper(table):
 def test_a_set_of_the_papers_has_one_heading(table):
     text = render_markdown([replace(table, sets={"dl3dv": "dl3dv"})])
     assert "| DL3DV-140 PSNR\u00a0↑ paper | DL3DV-140 PSNR\u00a0↑ ours |" in text
-    assert "Stand-ins" not in text
+    assert "Substitutes" not in text
 
 
-def test_the_protocol_stands_above_the_numbers(table):
-    """It tells how each metric that the table prints was taken."""
+def test_the_protocol_is_above_the_numbers(table):
     console = Console(width=200, file=StringIO())
     render_terminal([table], console)
     page = Page(render_html([table]))
     for text in (render_markdown([table]), console.file.getvalue(), " ".join(page.cells)):
         text = text.replace("\\", "")
         assert text.index("protocol longlrm. PSNR: mean of *all* images") < text.index("Measured")
-        assert "of depths" not in text
 
 
-def test_several_protocols_and_revisions_are_told(table):
+def test_several_protocols_and_revisions_are_reported(table):
     rows = [replace(row, revisions=("0123456",) if row.values else ()) for row in table.rows]
     one = render_markdown([replace(table, rows=tuple(rows))])
     assert "- **Revision**: 0123456\n" in one and "mixed" not in one
     rows[1] = replace(rows[1], revisions=("0123456", "789abcd+12"))
-    protocols = (*table.protocols, {"name": "default", "psnr": "of all pixels"})
-    folders = ("DL3DV", "DL3DV-small")
-    text = render_markdown([replace(table, rows=tuple(rows), protocols=protocols, folders=folders)])
+    metrics = (*table.metrics, "protocol default. PSNR: of all pixels")
+    text = render_markdown([replace(table, rows=tuple(rows), metrics=metrics)])
     assert "- **Metrics**: runs of several protocols are mixed" in text
-    assert "protocol longlrm. PSNR: mean" in text
-    assert "protocol default. PSNR: of all pixels" in text
+    assert "- **Metrics**: protocol longlrm. PSNR: mean" in text
+    assert "- **Metrics**: protocol default. PSNR: of all pixels" in text
     assert "runs of several are mixed: 0123456: Net\\*, Off, Open †; 789abcd+12: Net\\*" in text
-    assert "are mixed, name one with data.root=... in overrides: DL3DV; DL3DV-small" in text
 
 
 def test_overview_has_a_line_a_table(table, ratios):

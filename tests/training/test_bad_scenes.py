@@ -3,6 +3,7 @@
 import lightning
 import pytest
 import torch
+from tiny import QUIET
 from torch.utils.data import DataLoader
 
 from asysplat.errors import InputError
@@ -24,13 +25,10 @@ class Module(lightning.LightningModule):
 def fit(bad_scenes, folder, **options):
     counter = BadScenes(**options)
     trainer = lightning.Trainer(
-        accelerator="cpu",
+        **QUIET,
         max_epochs=1,
         callbacks=[counter],
-        logger=False,
         enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
         default_root_dir=folder,
     )
     batches = [{"bad_scenes": errors} for errors in bad_scenes]

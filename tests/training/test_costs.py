@@ -1,10 +1,11 @@
-"""What a test's costs are of: the network alone, the rendering, the measuring."""
+"""Costs of a test: of the network alone and of the rendering, without the metrics."""
 
 from types import SimpleNamespace
 
 import lightning
 import pytest
 import torch
+from tiny import QUIET
 from torch import nn
 from torch.utils.data import DataLoader
 
@@ -15,17 +16,17 @@ from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.training.callbacks import Costs
 
 MB = 1_000_000
-# What else the process does meanwhile was under 1 MB; ten times that and more is still no buffer.
+# The process's other work was under 1 MB; the tolerance is far below a buffer.
 TOLERANCE_GB = 0.02
 
 
-def hold(megabytes):
+def allocate(megabytes):
     torch.ones(megabytes * MB // 4)  # written, so resident; given back to the system when freed
 
 
 class Net(nn.Module):
     def forward(self, megabytes):
-        hold(megabytes)
+        allocate(megabytes)
 
 
 class Module(lightning.LightningModule):
@@ -35,14 +36,14 @@ class Module(lightning.LightningModule):
 
     def test_step(self, batch, batch_idx, dataloader_idx=0):
         self.net(batch)
-        hold(self.rendering)
+        allocate(self.rendering)
 
 
 class Afterwards(lightning.Callback):
-    """Like the callbacks that measure and draw, it works when a test step has ended."""
+    """Works at the end of a test step, like the callbacks Metrics and Figures."""
 
     def on_test_batch_end(self, *_):
-        hold(700)
+        allocate(700)
 
 
 def measure(sets, rendering=1):
@@ -51,13 +52,7 @@ def measure(sets, rendering=1):
     data.name, data.tests = "main", sets
     data.test_dataloader = lambda: [DataLoader(list(s), batch_size=None) for s in sets.values()]
     costs, module = Costs(), Module(rendering)
-    trainer = lightning.Trainer(
-        accelerator="cpu",
-        logger=False,
-        callbacks=[costs, Afterwards()],
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
+    trainer = lightning.Trainer(**QUIET, callbacks=[costs, Afterwards()])
     trainer.test(module, data, verbose=False)
     assert not module.net._forward_hooks and not module.net._forward_pre_hooks
     return {key.removeprefix("cost/"): value for key, value in costs.values.items()}
@@ -69,7 +64,7 @@ resident = pytest.mark.skipif(
 
 
 @resident
-def test_inference_memory_is_that_of_the_prediction_alone():
+def test_inference_memory_is_that_of_the_prediction():
     plain = measure({"main": [1, 1]})
     predicting = measure({"main": [1, 300, 1]})
     rendering = measure({"main": [1, 1]}, rendering=300)
@@ -82,7 +77,7 @@ def test_inference_memory_is_that_of_the_prediction_alone():
 
 
 @resident
-def test_each_test_set_has_costs_of_its_own():
+def test_each_test_set_has_its_own_costs():
     found = measure({"main": [1, 1], "more_views": [200, 1]})
     rise = found["more_views/inference_gb"] - found["inference_gb"]
     assert rise == pytest.approx(0.2, abs=TOLERANCE_GB)
@@ -90,7 +85,7 @@ def test_each_test_set_has_costs_of_its_own():
 
 
 def test_seconds_leave_the_longest_out(monkeypatch):
-    # Four times a scene: predicting starts and ends, rendering starts and ends.
+    # Four times per scene: start and end of the prediction and of the rendering.
     clock = iter([0.0, 1.0, 1.0, 2.0, 10.0, 40.0, 40.0, 44.0, 50.0, 53.0, 53.0, 59.0])
     monkeypatch.setattr(measured_cost, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     found = measure({"main": [1, 1, 1]})

@@ -10,7 +10,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from tiny import NETWORK, STEPS, VIEWS
+from tiny import NETWORK, QUIET, STEPS, VIEWS
 from torch import nn
 from torch.utils.data import DataLoader
 
@@ -65,12 +65,10 @@ class Module(lightning.LightningModule):
 def fit(module, folder, loader=None, **options):
     callback = NonFiniteSteps(folder, **options)
     trainer = lightning.Trainer(
-        accelerator="cpu",
+        **QUIET,
         max_epochs=1,
         callbacks=[callback],
-        logger=False,
         enable_checkpointing=False,
-        enable_progress_bar=False,
         default_root_dir=folder,
         gradient_clip_val=1.0,
     )

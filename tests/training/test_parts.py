@@ -1,4 +1,4 @@
-"""Seconds by part: whose they are where parts nest, call modules, and work side by side."""
+"""Seconds of nested parts, of modules and of parallel threads."""
 
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier, get_ident
@@ -16,7 +16,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Seconds of each thread by its own clock, which only moves when a test says so."""
+    """A clock for each thread that only a test advances."""
     seconds = {}
 
     class Clock:
@@ -32,7 +32,7 @@ def clock(monkeypatch):
     return Clock
 
 
-def test_a_part_within_a_part_is_its_own(clock):
+def test_an_inner_part_does_not_count_for_the_outer(clock):
     prior = nn.Identity()
     prior.register_forward_pre_hook(lambda *_: clock.wait(3))
     parts = Parts()
@@ -42,12 +42,12 @@ def test_a_part_within_a_part_is_its_own(clock):
         prior(torch.zeros(1))
         clock.wait(4)
     parts.add("data", 0.5)
-    # The test's own hook, which was there first, is outside of what is measured.
+    # The test's own hook, registered earlier, runs before the measurement.
     assert parts.stop() == {"network": 8, "prior": 0, "data": 0.5}
     assert len(prior._forward_pre_hooks) == 1 and not prior._forward_hooks
 
 
-def test_a_module_is_measured_where_it_is_called(clock):
+def test_a_module_is_measured_at_its_calls(clock):
     class Prior(nn.Module):
         def forward(self, x):
             clock.wait(3)
@@ -61,7 +61,7 @@ def test_a_module_is_measured_where_it_is_called(clock):
     assert parts.stop() == {"network": 1, "prior": 6}
 
 
-def test_of_threads_side_by_side_the_mean_counts(clock):
+def test_seconds_of_parallel_threads_are_averaged(clock):
     parts, together = Parts(), Barrier(2)
     parts.start(CPU)
 
@@ -77,7 +77,7 @@ def test_of_threads_side_by_side_the_mean_counts(clock):
     assert parts.stop() == {"network": 3, "loss": 7}
 
 
-def test_nothing_is_measured_unless_asked_for(clock):
+def test_nothing_is_measured_before_start(clock):
     parts, prior = Parts(), nn.Identity()
     with parts("network"), parts.of("prior", prior):
         assert not prior._forward_hooks
@@ -87,7 +87,7 @@ def test_nothing_is_measured_unless_asked_for(clock):
 
 
 def test_a_step_of_scenes_side_by_side(module):  # noqa: F811
-    """Every part that the step has, in every other step the same bits."""
+    """All parts of a step are measured, and measuring does not change the result."""
     batch, found = make_batch(), []
     start = {name: buffer.clone() for name, buffer in module.net.named_buffers()}
     for measured in (True, False):

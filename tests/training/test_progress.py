@@ -1,4 +1,4 @@
-"""What a run shows of its progress: its steps, wherever it began; bars only on a terminal."""
+"""Progress of a run: bars on a terminal, lines elsewhere; also when resumed."""
 
 import io
 
@@ -6,6 +6,7 @@ import lightning
 import pytest
 import torch
 from rich.console import Console
+from tiny import QUIET
 from torch.utils.data import DataLoader
 
 from asysplat.training.callbacks import TrainingProgressBar, progress
@@ -39,14 +40,12 @@ def loader(count=2):
 def fit(tmp_path, steps, checkpoint=None):
     """Two steps an epoch, a validation after each, then a test of two sets of three scenes."""
     trainer = lightning.Trainer(
-        accelerator="cpu",
+        **QUIET | {"enable_progress_bar": True},
         max_steps=steps,
         max_epochs=-1,
         num_sanity_val_steps=0,
         callbacks=[TrainingProgressBar()],
-        logger=False,
         enable_checkpointing=False,
-        enable_model_summary=False,
         default_root_dir=tmp_path,
     )
     trainer.fit(Module(), loader(), loader(3), ckpt_path=checkpoint, weights_only=True)
@@ -58,7 +57,7 @@ def lines(text):
     return [line for line in text.splitlines() if line.startswith("step")]
 
 
-def test_without_a_terminal_a_line_after_each_validation(tmp_path, capsys):
+def test_lines_after_each_validation_without_a_terminal(tmp_path, capsys):
     fit(tmp_path, 6)
     output = lines(capsys.readouterr().out)
     assert [line.partition(" left")[0].rpartition(",")[0] for line in output] == [
@@ -69,7 +68,7 @@ def test_without_a_terminal_a_line_after_each_validation(tmp_path, capsys):
     assert all(line.endswith("left: PSNR 20.0, validation 18.5") for line in output)
 
 
-def test_in_between_a_line_when_a_minute_and_a_share_have_passed(tmp_path, capsys, monkeypatch):
+def test_lines_between_validations(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(progress, "LINE_SECONDS", 0)
     monkeypatch.setattr(progress, "LINE_SHARE", 0.5)
     fit(tmp_path, 2)
@@ -95,7 +94,7 @@ def terminal(monkeypatch):
     return screen
 
 
-def test_on_a_terminal_bars_of_training_validation_and_test(tmp_path, capsys, terminal):
+def test_bars_of_training_validation_and_test_on_a_terminal(tmp_path, capsys, terminal):
     fit(tmp_path, 6)
     assert not lines(capsys.readouterr().out)
     shown = terminal.getvalue()
@@ -107,7 +106,7 @@ def test_on_a_terminal_bars_of_training_validation_and_test(tmp_path, capsys, te
     assert shown.count(hidden) == shown.count(restored) == 2
 
 
-def test_an_error_gives_the_terminal_back(tmp_path, terminal, monkeypatch):
+def test_an_error_restores_the_terminal(tmp_path, terminal, monkeypatch):
     def fail(*_):
         raise RuntimeError("out of memory")
 

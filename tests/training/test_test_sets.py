@@ -1,15 +1,15 @@
-"""Several test sets of one model are one run: each set's numbers are those it has alone."""
+"""Several test sets are tested in one run: each has the same numbers as alone."""
 
 import csv
 import warnings
-from pathlib import Path
+from types import SimpleNamespace
 
 import lightning
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from tiny import NETWORK, SCENES, VIEWS
+from tiny import NETWORK, QUIET, SCENES, VIEWS
 
 from asysplat.training.callbacks import Costs, Figures, Metrics
 from asysplat.training.callbacks.metrics import gather
@@ -20,12 +20,9 @@ pytestmark = pytest.mark.medium
 TINY = [*NETWORK, *VIEWS, *SCENES, "paths.run=unused"]
 
 
-measured_costs: dict[Path, dict] = {}  # by the folder of a run
-
-
 @pytest.fixture(scope="module")
 def measure(repository, tmp_path_factory):
-    """The test of an untrained model: its results and the folder it wrote."""
+    """The test of an untrained model: its results, folder and costs."""
 
     def run(*overrides):
         with initialize_config_dir(str(repository / "conf"), version_base=None):
@@ -37,16 +34,10 @@ def measure(repository, tmp_path_factory):
             warnings.simplefilter("ignore")
             metrics = Metrics(instantiate(config.metrics), str(folder), backbone_dir=str(folder))
             costs = Costs()
-            measured_costs[folder] = costs.values
-            trainer = lightning.Trainer(
-                accelerator="cpu",
-                logger=False,
-                callbacks=[costs, metrics, Figures(str(folder), scenes=2)],
-                enable_progress_bar=False,
-                enable_model_summary=False,
-            )
+            callbacks = [costs, metrics, Figures(str(folder), scenes=2)]
+            trainer = lightning.Trainer(**QUIET, callbacks=callbacks)
             trainer.test(module, instantiate(config.data), verbose=False)
-        return metrics.results, folder
+        return SimpleNamespace(results=metrics.results, folder=folder, costs=costs.values)
 
     return run
 
@@ -73,30 +64,28 @@ ALONE = {
 
 
 @pytest.mark.parametrize("name", ALONE)
-def test_a_set_has_the_numbers_it_has_alone(measure, together, name):
-    expected, _ = measure("data.test_sets=null", f"data.name={name}", *ALONE[name])
+def test_a_set_has_the_same_numbers_as_alone(measure, together, name):
+    expected = measure("data.test_sets=null", f"data.name={name}", *ALONE[name]).results
     assert {f"test/{name}/psnr", f"baseline/{name}/nearest_view/ssim"} <= expected.keys()
     alone, among_others = (
         {key: value for key, value in results.items() if key.split("/")[1] == name}
-        for results in (expected, together[0])
+        for results in (expected, together.results)
     )
     assert among_others == alone
 
 
-def test_every_image_is_a_row_that_names_its_set(together):
-    results, folder = together
-    with (folder / "metrics.csv").open() as file:
+def test_every_image_has_a_row_with_its_set(together):
+    with (together.folder / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert next(iter(rows[0])) == "set"
     counts = {name: sum(row["set"] == name for row in rows) for name in ALONE}
     assert counts == {"procedural": 2, "rooms": 2, "outdoors": 2, "more_views": 4, "wide": 2}
     values = [float(row["psnr"]) for row in rows if row["set"] == "rooms"]
-    assert abs(sum(values) / 2 - results["test/rooms/psnr"]) < 1e-4
+    assert abs(sum(values) / 2 - together.results["test/rooms/psnr"]) < 1e-4
 
 
-def test_a_set_has_costs_of_its_own(together):
-    """Those of another set, of more or larger views, are no part of them."""
-    costs = measured_costs[together[1]]
+def test_a_set_has_its_own_costs(together):
+    costs = together.costs
     prefixes = ["cost", *(f"cost/{name}" for name in ALONE if name != "procedural")]
     keys = {f"{prefix}/{kind}" for prefix in prefixes for kind in KINDS}
     assert set(costs) == keys and all(value > 0 for value in costs.values())
@@ -104,26 +93,21 @@ def test_a_set_has_costs_of_its_own(together):
 
 
 def test_only_the_main_set_is_drawn(measure, together):
-    _, alone = measure("data.test_sets=null")
-    (drawn,), (expected,) = ((at / "figures").iterdir() for at in (together[1], alone))
+    alone = measure("data.test_sets=null")
+    (drawn,), (expected,) = ((run.folder / "figures").iterdir() for run in (together, alone))
     assert drawn.name == "test-0.png" and drawn.read_bytes() == expected.read_bytes()
 
 
 def test_the_summary_shows_every_set(together, capsys):
-    results, folder = together
     costs = {"cost/parameters": 1e6, "cost/geometry_share": 0.7, "cost/gaussians": 10}
     costs |= {"cost/peak_gb": 2.0, "cost/peak_bytes_per_token": 35e3}
-    print_summary(results | costs, "procedural", folder)
+    print_summary(together.results | costs, "procedural", together.folder)
     printed = capsys.readouterr().out
     assert "2.00 GB at most, 35 kB a token" in printed
     for name in ("rooms", "outdoors", "more_views"):
         (line,) = (line for line in printed.splitlines() if name in line)
-        for kind in (
-            "test/{}/psnr",
-            "baseline/{}/nearest_view/psnr",
-            "baseline/{}/mean_color/psnr",
-        ):
-            assert f"{results[kind.format(name)]:.3f}" in line
+        for key in ("test/{}", "baseline/{}/nearest_view", "baseline/{}/mean_color"):
+            assert f"{together.results[key.format(name) + '/psnr']:.3f}" in line
 
 
 def test_processes_count_an_image_once_in_each_set(monkeypatch):

@@ -9,6 +9,7 @@ makes depths from them.
 from types import ModuleType
 
 from torch import Tensor
+from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.ops.dispatch import (
     FAST,
@@ -38,6 +39,6 @@ def choose_backend(backend: str, x: Tensor) -> str:
 
 
 def load_backend(backend: str, x: Tensor) -> ModuleType:
-    """Return the module that computes with x; on the meta device, the reference."""
-    name = "reference" if x.is_meta else choose_backend(backend, x)
+    """Return the module that computes with x; for a tensor without content, the reference."""
+    name = "reference" if x.is_meta or is_fake(x) else choose_backend(backend, x)
     return reference if name == "reference" else load_kernels("plane_sweep", name)

@@ -4,10 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asysplat.report.filled import (
-    FilledRow,
-    FilledTable,
-    check,
+from asysplat.report.compare import (
+    check_costs,
     cost_errors,
     fits,
     mean_and_spread,
@@ -15,6 +13,7 @@ from asysplat.report.filled import (
     rank_agreement,
     spearman,
 )
+from asysplat.report.fill import FilledRow, FilledTable
 from asysplat.report.paper import Column, PaperRow, PaperTable
 
 PSNR = Column("dl3dv/psnr", "PSNR", "higher", "{:.2f}")
@@ -33,7 +32,7 @@ def filled(paper: list[float], ours: list[list[float]]) -> FilledTable:
     table = PaperTable(
         "t", "1", "title", "protocol", (PSNR,), tuple(r.paper for r in rows), "dl3dv/psnr"
     )
-    return FilledTable(table, rows, "laptop", "python train.py")
+    return FilledTable(table, rows)
 
 
 def test_mean_and_spread():
@@ -60,7 +59,7 @@ def test_spearman(first, second, rho):
     assert spearman(np.array(first), np.array(second)) == pytest.approx(rho)
 
 
-def test_spearman_says_nothing_of_two_rows_or_of_equal_rows():
+def test_spearman_of_two_rows_or_of_equal_rows_is_none():
     assert spearman(np.array([1.0, 2.0]), np.array([1.0, 2.0])) is None
     assert spearman(np.array([1.0, 2.0, 3.0]), np.array([5.0, 5.0, 5.0])) is None
 
@@ -95,14 +94,14 @@ def test_limits_of_a_fit():
     assert not fits(paper, {"parameters": 100e6, "gflops": 1938.0})
 
 
-def test_check():
+def test_check_costs():
     paper = row(parameters=100e6)
     good, bad = {"parameters": 101e6}, {"parameters": 110e6}
     unverified = replace(paper, unverified="no layers are named")
-    assert check(FilledRow(paper, good)) == "fits"
-    assert check(FilledRow(paper, bad)) == "off"
-    assert check(FilledRow(unverified, good)) == "unverified, fits"
-    assert check(FilledRow(unverified, bad)) == "unverified, no fit"
-    assert check(FilledRow(row(run=None, parameters=1e6))) == "quoted"
-    assert check(FilledRow(paper)) == "not computed"
-    assert check(FilledRow(row(psnr=19.0), good)) == "not printed"
+    assert check_costs(FilledRow(paper, good)) == "fits"
+    assert check_costs(FilledRow(paper, bad)) == "off"
+    assert check_costs(FilledRow(unverified, good)) == "unverified, fits"
+    assert check_costs(FilledRow(unverified, bad)) == "unverified, no fit"
+    assert check_costs(FilledRow(row(run=None, parameters=1e6))) == "quoted"
+    assert check_costs(FilledRow(paper)) == "not computed"
+    assert check_costs(FilledRow(row(psnr=19.0), good)) == "not printed"

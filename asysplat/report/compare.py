@@ -1,0 +1,99 @@
+"""Compare our numbers with the paper's: the order of a table's rows, and the costs of each."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from asysplat.report.fill import Costs, FilledRow, FilledTable, Number
+from asysplat.report.paper import PaperRow
+
+# A smaller `signal` may come from the seeds alone: one table in twenty of six equal rows and three
+# seeds exceeds it (the F distribution's 95 % is 3.1 = 1.76 ** 2).
+CLEAR_SIGNAL = 1.76
+# The largest accepted difference of our costs from the paper's, as a fraction of the paper's.
+LIMITS = {"parameters": 0.015, "gflops": 0.03}
+
+
+class RankAgreement(NamedTuple):
+    """The agreement of our order of the rows with the paper's.
+
+    Args:
+        rho: Spearman's; None below three rows, and where all rows are equal.
+        rows: how many have both numbers.
+        signal: standard deviation between the rows' means, over the one that such means of equal
+            rows would have by their seeds alone: the root of the F statistic, about 1 where rows
+            are equal. None where every row has a single seed.
+    """
+
+    rho: float | None
+    rows: int
+    signal: float | None
+
+
+def mean_and_spread(values: Sequence[Number]) -> tuple[float, float | None]:
+    """Return mean and sample standard deviation over seeds; None for that of a single seed."""
+    spread = float(np.std(values, ddof=1)) if len(values) > 1 else None
+    return float(np.mean(values)), spread
+
+
+def rank_agreement(filled: FilledTable, column: str) -> RankAgreement:
+    """Compare the paper's numbers with our means in the column of this key."""
+    both = [row for row in filled.rows if column in row.paper.numbers and row.values.get(column)]
+    ours = np.array([np.mean(row.values[column]) for row in both])
+    paper = np.array([row.paper.numbers[column] for row in both])
+    within = pooled_spread([row.values[column] for row in both])
+    signal = None
+    if len(both) > 1 and within is not None:
+        seeds = float(np.mean([len(row.values[column]) for row in both]))
+        between = float(np.std(ours, ddof=1))
+        signal = between / (within / math.sqrt(seeds)) if within else math.inf
+    return RankAgreement(spearman(paper, ours), len(both), signal)
+
+
+def spearman(first: np.ndarray, second: np.ndarray) -> float | None:
+    """Return the correlation of the ranks; equal values share their mean rank.
+
+    None below three values, and where either side is constant.
+    """
+    if len(first) < 3 or np.ptp(first) == 0 or np.ptp(second) == 0:
+        return None
+    return float(spearmanr(first, second).statistic)
+
+
+def pooled_spread(groups: Sequence[Sequence[Number]]) -> float | None:
+    """Return the standard deviation within groups, weighted by their degrees of freedom.
+
+    None where each has a single value.
+    """
+    freedom = sum(len(group) - 1 for group in groups)
+    if freedom <= 0:
+        return None
+    squares = sum(float(np.var(group)) * len(group) for group in groups)
+    return math.sqrt(squares / freedom)
+
+
+def cost_errors(row: PaperRow, costs: Costs) -> dict[str, float]:
+    """Return the relative error of each cost that has a limit and that the paper prints."""
+    return {key: costs[key] / row.numbers[key] - 1 for key in LIMITS if key in row.numbers}
+
+
+def fits(row: PaperRow, costs: Costs) -> bool:
+    """Return whether every cost is within its limit of the paper's."""
+    return all(abs(error) <= LIMITS[key] for key, error in cost_errors(row, costs).items())
+
+
+def check_costs(filled: FilledRow) -> str:
+    """Compare a row's costs with the paper's; only a row of known architecture can be "off"."""
+    if filled.paper.quoted:
+        return "quoted"
+    if filled.costs is None:
+        return "not computed"
+    if not cost_errors(filled.paper, filled.costs):
+        return "not printed"
+    fit = fits(filled.paper, filled.costs)
+    if filled.paper.unverified:
+        return "unverified, fits" if fit else "unverified, no fit"
+    return "fits" if fit else "off"

@@ -1,0 +1,63 @@
+"""The template data of a table's section: grids of cells and notes, the same for all renderers."""
+
+import re
+from typing import NamedTuple
+
+
+class Cell(NamedTuple):
+    """A text; `style` is best, muted, alarm or ""; `link` is the anchor of a section."""
+
+    text: str
+    style: str = ""
+    link: str = ""
+
+
+class Heading(NamedTuple):
+    """A column's title, and the part of it, "paper", "ours" or "error", if it has several."""
+
+    title: str
+    part: str = ""
+
+
+class Grid(NamedTuple):
+    """A table of cells; the first column names the row."""
+
+    caption: str
+    headings: list[Heading]
+    rows: list[list[Cell]]
+
+    def groups(self) -> list[tuple[str, list[int]]]:
+        """Group neighboring columns by title: each title and the numbers of its columns."""
+        groups: list[tuple[str, list[int]]] = []
+        for number, heading in enumerate(self.headings):
+            if heading.part and groups and groups[-1][0] == heading.title:
+                groups[-1][1].append(number)
+            else:
+                groups.append((heading.title, [number]))
+        return groups
+
+
+class Note(NamedTuple):
+    """A line above or below a table; `code` is set in typewriter."""
+
+    label: str
+    text: str
+    code: bool = False
+
+
+class Section(NamedTuple):
+    """One table of the report."""
+
+    title: str
+    above: list[Note]
+    grids: list[Grid]
+    notes: list[Note]
+
+    @property
+    def anchor(self) -> str:
+        return anchor(self.title)
+
+
+def anchor(title: str) -> str:
+    """Return the anchor that GitHub gives a heading, so that a link works in Markdown and HTML."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
