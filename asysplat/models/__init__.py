@@ -1,4 +1,4 @@
-"""Images to Gaussians: plain torch modules, every ablated part a component of its own."""
+"""Networks from images to Gaussians: plain torch modules, each ablated part a component."""
 
 from asysplat.models.asysplat import AsySplat, build_asysplat
 from asysplat.models.attention import FullAttention, SparseAttention

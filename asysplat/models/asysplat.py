@@ -25,7 +25,7 @@ class AsySplat(Network):
 
     Args:
         widths: of both branches.
-        stage_ratios: r_s, one a network stage.
+        stage_ratios: r_s of each network stage.
         layers: the layer mix of every stage, such as "4m4s": counts and letters of `blocks`.
         blocks: letter -> component built from a StageShape.
         appearance_block: component built from the appearance branch's StageShape.
@@ -65,7 +65,7 @@ class AsySplat(Network):
         if len(stage_ratios) != len(widths.stages):
             raise InputError(
                 f"model.stage_ratios has {len(stage_ratios)} entries for {len(widths.stages)} "
-                "stages: give one MLP ratio a stage."
+                "stages: give one MLP ratio for each stage."
             )
         self.appearance_layers = appearance_layers
         shapes = [
@@ -150,15 +150,15 @@ def build_asysplat(
 ) -> AsySplat:
     """Build an AsySplat of the given widths times `width`.
 
-    With a `geometry_ratio`, it has the widths that give the geometry branch that share of the
+    With a `geometry_ratio`, choose the widths that give the geometry branch that share of the
     parameters, at the same total.
 
     Args:
         stage_widths, fine_width, head_dim: d_s, d_f and the head_dim at width 1.
         appearance_layers: N_v.
-        width: multiplies the widths.
+        width: factor of the widths.
         geometry_ratio: between 0 and 1, or None for the given widths.
-        parameter_budget: with a ratio, the total to meet over that of the given widths.
+        parameter_budget: with a ratio, total parameters over those of the given widths.
         components: the other arguments of AsySplat.
 
     Raises:

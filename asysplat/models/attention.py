@@ -1,4 +1,4 @@
-"""Attention blocks: full and sparse self-attention over all views, cross-attention in a frame.
+"""Attention blocks: full and sparse self-attention over all views, cross-attention within a view.
 
 All are pre-norm with an MLP, bias-free, and apply RMSNorm to queries and keys (paper, Suppl. A).
 """
@@ -37,7 +37,7 @@ class QueryKeyNorm(nn.Module):
 
 
 class SelfAttention(nn.Module):
-    """x + o(attn(qkv(LN x))), then x + MLP(LN x), over the tokens of the same grid place."""
+    """x + o(attn(qkv(LN x))), then x + MLP(LN x), over the tokens at the same grid place."""
 
     def __init__(self, shape: StageShape, grid: int = 1):
         super().__init__()
@@ -64,13 +64,13 @@ class FullAttention(SelfAttention):
 
 
 class SparseAttention(nn.Module):
-    """The letter s: convolutions within a frame, then attention within a grid place (Sec. 3.3).
+    """The letter s: convolutions within a view, then attention within a grid place (Sec. 3.3).
 
     Args:
         grid: p_g.
-        conv_blocks: whether to have the two conv blocks, which connect the grid places of a frame.
-        group_width: channels of one group of the convolutions at the paper's head_dim of 64; it
-            shrinks with the head_dim.
+        conv_blocks: whether to add the two conv blocks, which connect the grid places of a view.
+        group_width: channels of a convolution group at the paper's head_dim of 64; proportional
+            to the head_dim.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class SparseAttention(nn.Module):
 
 
 class ConvBlocks(nn.Module):
-    """x + two of [grouped Conv 3x3, BatchNorm, GELU], on every frame by itself."""
+    """x + two of [grouped Conv 3x3, BatchNorm, GELU], on each view separately."""
 
     def __init__(self, width: int, group_width: int):
         super().__init__()
@@ -104,11 +104,11 @@ class ConvBlocks(nn.Module):
 
 
 class CrossAttention(nn.Module):
-    """x + o(attn(q(LN x), kv(LN context))), then x + MLP(LN x), within each frame.
+    """x + o(attn(q(LN x), kv(LN context))), then x + MLP(LN x), within each view.
 
     Args:
-        shape: of the tokens that attend.
-        context_width: width of the tokens they attend to.
+        shape: of the attending tokens.
+        context_width: width of the attended tokens.
         inner_width: width of queries, keys and values.
     """
 

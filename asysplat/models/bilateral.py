@@ -1,4 +1,4 @@
-"""The bilateral connection between the branches, one component a link (paper, Eq. 3)."""
+"""The bilateral links between the branches (paper, Eq. 3)."""
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -8,7 +8,7 @@ from asysplat.models.shapes import StageShape
 
 
 class CoarseReadsFine(CrossAttention):
-    """C^s = CrossAttn(C~, F~): details for the geometry branch; attention is d_f wide."""
+    """C^s = CrossAttn(C~, F~): details for the geometry branch; attention has width d_f."""
 
     def __init__(self, coarse: StageShape, fine: StageShape):
         super().__init__(coarse, context_width=fine.width, inner_width=fine.width)
@@ -26,12 +26,12 @@ class FineReadsCoarse(nn.Module):
         self, fine: Float[Tensor, "B V h w d"], coarse: Float[Tensor, "B V h2 w2 c"]
     ) -> Float[Tensor, "B V h w d"]:
         read = self.cross(fine, coarse)
-        # Views move into the batch: each frame attends to itself alone.
+        # With views in the batch, each view attends to itself alone.
         return self.attention(read.flatten(0, 1)[:, None]).view_as(read)
 
 
 class NoLink(nn.Module):
-    """No link: the branch goes on with its own tokens."""
+    """No link: the branch keeps its own tokens."""
 
     def __init__(self, coarse: StageShape, fine: StageShape):
         super().__init__()

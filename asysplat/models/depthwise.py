@@ -1,4 +1,4 @@
-"""Convolution along the tokens, each channel by itself."""
+"""Depthwise convolution along the tokens."""
 
 import torch
 import torch.nn.functional as F
@@ -15,9 +15,9 @@ def depthwise_conv(
     bias: Float[Tensor, " C"] | None,
     before: int,
 ) -> Float[Tensor, "B L C"]:
-    """Convolve in the tokens' type.
+    """Convolve each token with `before` tokens before it and K - 1 - before tokens after it.
 
-    Each token sees itself, the `before` tokens before it and the K - 1 - before after it.
+    The result has the tokens' type.
     """
     with without_autocast(tokens):
         bias = None if bias is None else bias.to(tokens.dtype)
@@ -25,7 +25,7 @@ def depthwise_conv(
 
 
 class _DepthwiseConv(torch.autograd.Function):
-    """Has its own backward pass: torch's takes long for the weights' gradient on a CPU."""
+    """With its own backward pass: torch computes the weights' gradient slowly on a CPU."""
 
     @staticmethod
     def forward(ctx, tokens, weight, bias, before):
@@ -50,8 +50,7 @@ class _DepthwiseConv(torch.autograd.Function):
 def _convolve(tokens: Tensor, weight: Tensor, bias: Tensor | None, before: int) -> Tensor:
     """Convolve the tokens as an image one pixel high.
 
-    The channels of such an image may be innermost; those of a sequence torch would copy outermost
-    and back.
+    An image's channels may be innermost in memory; torch would copy those of a sequence.
     """
     image = _pad(tokens, weight.shape[-1], before).mT.unsqueeze(-2)
     return F.conv2d(image, weight.unsqueeze(-2), bias, groups=len(weight)).squeeze(-2).mT

@@ -1,7 +1,6 @@
-"""Thresholds of what a prediction leaves out because its scene does not need it.
+"""Early exit: thresholds above which a prediction skips layers or the whole network.
 
-No result is the exact one any more: docs/results/skips.json has the measured curves from which the
-values of conf/speed/ were chosen.
+The results are no longer exact; the values of conf/speed/ were chosen from measured curves.
 """
 
 from dataclasses import dataclass, fields
@@ -11,28 +10,18 @@ from asysplat.errors import InputError
 
 @dataclass(frozen=True)
 class EarlyExit:
-    """Thresholds in (0, 1], or None where nothing is left out.
-
-    All but `faint` look at the prior: a scene of which it knows nothing keeps its network, and a
-    network without a prior takes no skips.
+    """Thresholds of the prior's mean confidence in a scene, in (0, 1]; None skips nothing.
 
     Args:
-        coverage: the share of what the input views see that those which meet the network have to
-            see; the Gaussians of the others are the prior's own.
-        sure: mean confidence of the prior from which a network leaves out what it names
-            `dispensable`.
-        known: mean confidence from which no view meets the network.
-        faint: Gaussians of less opacity are dropped, none of which gives any pixel more than this
-            share of its color.
+        skip_layers_above: skip the network's `skippable_layers` from this confidence on.
+        skip_network_above: skip the network: the Gaussians are the prior's own.
 
     Raises:
         InputError: a threshold is out of range.
     """
 
-    coverage: float | None = None
-    sure: float | None = None
-    known: float | None = None
-    faint: float | None = None
+    skip_layers_above: float | None = None
+    skip_network_above: float | None = None
 
     def __post_init__(self):
         for field in fields(self):
@@ -40,8 +29,14 @@ class EarlyExit:
             if value is not None and not 0 < value <= 1:
                 raise InputError(
                     f"speed.{field.name}={value}: give a number above 0 and up to 1, or null to "
-                    "leave nothing out."
+                    "skip nothing."
                 )
+
+    def decide(self, confidence: float) -> tuple[bool, bool]:
+        """Return whether a scene of this mean confidence skips the network, and the layers."""
+        thresholds = (self.skip_network_above, self.skip_layers_above)
+        network, layers = (limit is not None and confidence >= limit for limit in thresholds)
+        return network, layers
 
 
 EXACT = EarlyExit()

@@ -1,4 +1,4 @@
-"""How a geometry_ratio is met: widths that give the geometry branch its share of parameters."""
+"""Find widths that give the geometry branch its share of parameters, the geometry_ratio."""
 
 from collections.abc import Callable
 from itertools import combinations_with_replacement
@@ -10,8 +10,8 @@ from asysplat.errors import InputError
 from asysplat.models.shapes import Widths
 
 SHARE_TOLERANCE = 0.015
-TOTAL_TOLERANCE = 0.0095  # so that any two totals are within 2 %
-ATTEMPTS = 10  # widths that are built and counted, for each number of layers
+TOTAL_TOLERANCE = 0.0095  # any two totals are then within 2 %
+ATTEMPTS = 10  # models built and counted, for each number of layers
 
 Build = Callable[[Widths, int], nn.Module]
 
@@ -19,27 +19,26 @@ Build = Callable[[Widths, int], nn.Module]
 def solve_widths(
     build: Build, base: Widths, layers: int, ratio: float, budget: float = 1.0
 ) -> tuple[Widths, int]:
-    """Find widths and appearance layers whose model meets the budget and has the asked share.
+    """Find widths and appearance layers whose model has the budget and the geometry ratio.
 
-    The number of layers changes only where the widths alone, multiples of the head_dim, cannot
-    give the ratio. Parameter counts are quadratic polynomials in the widths, and what another
-    layer adds is one in the fine width: a few models on the meta device determine them, and the
-    search is then free.
+    The number of layers changes only if the widths, multiples of the head_dim, cannot give the
+    ratio. Parameter counts are quadratic polynomials in the widths, and the addition of a layer is
+    one in the fine width: a few models on the meta device determine them, so the search is cheap.
 
     Args:
         build: widths, appearance layers -> model with a `geometry_share()`.
-        base: the widths that set the total, together with `layers`.
+        base: the widths that define the total, together with `layers`.
         layers: N_v, the layers of an appearance stage.
         ratio: parameters of the geometry branch over all.
-        budget: the total to meet, as a multiple of that of `base` and `layers`.
+        budget: total parameters over those of `base` and `layers`.
 
     Raises:
-        InputError: nothing comes within 0.015 of the ratio and 1 % of the total; the message says
-            what comes closest.
+        InputError: no model is within 0.015 of the ratio and 1 % of the total; the message names
+            the closest.
     """
     if not 0 < ratio < 1:
         raise InputError(f"geometry_ratio={ratio}: give a share between 0 and 1, such as 0.9.")
-    wanted = budget * _count(build(base, layers))[0]
+    target = budget * _count(build(base, layers))[0]
     candidates = _candidates(base)
     heads = candidates / base.head_dim
     samples = _samples(len(base.stages) + 1)
@@ -47,13 +46,13 @@ def solve_widths(
     predicted = _quadratic_fit(samples, counts, heads)
     added = None  # by another layer
     fine_alone = (samples[:, :-1] == samples[0, :-1]).all(axis=1)  # three samples: a quadratic
-    # Among the widths that fit, those are best that keep the proportions of the stages.
+    # Of all widths within the tolerances, prefer those with the proportions of the stages.
     shape_error = np.log(candidates[:, :-1] / np.array(base.stages)).std(axis=1)
 
     def errors(total: np.ndarray | int, geometry: np.ndarray | float) -> np.ndarray | float:
-        """Return at most 1 where both tolerances are kept."""
+        """Return the larger error, in units of its tolerance."""
         share = np.abs(geometry / total - ratio) / SHARE_TOLERANCE
-        return np.maximum(share, np.abs(total / wanted - 1) / TOTAL_TOLERANCE)
+        return np.maximum(share, np.abs(total / target - 1) / TOTAL_TOLERANCE)
 
     closest, description = np.inf, ""
     for count in sorted(range(1, 3 * layers + 1), key=lambda n: (abs(n - layers), -n)):
@@ -64,25 +63,25 @@ def solve_widths(
         error = errors(*here.T)
         rank = np.where(error < 1, error / 2 + shape_error, 1e3 + error)
         order = np.argsort(rank, kind="stable")  # the same widths on every machine
-        # The polynomial ignores rounding and stages of equal width, so candidates are built and
-        # counted: the best ten, or, if none fits, only the closest for the message.
+        # The polynomial ignores rounding and stages of equal width, so build and count the best
+        # candidates, or if none is within the tolerances, only the closest for the message.
         attempts = ATTEMPTS if error[order[0]] < 1 else 1
         for row in candidates[order[:attempts]]:
             *stages, fine = (int(width) for width in row)
             widths = Widths(tuple(stages), fine, base.head_dim)
             total, geometry = _count(build(widths, count))
-            found = float(errors(total, geometry))
-            if found < 1:
+            exact = float(errors(total, geometry))
+            if exact < 1:
                 return widths, count
-            if found < closest:
-                closest = found
+            if exact < closest:
+                closest = exact
                 description = (
                     f"stages {'/'.join(map(str, stages))} and an appearance branch {fine} wide in "
                     f"{count} layers a stage, with {geometry / total:.3f} of {total / 1e6:.2f}M"
                 )
     raise InputError(
         f"geometry_ratio={ratio} cannot be met within {SHARE_TOLERANCE} at "
-        f"{wanted / 1e6:.2f}M parameters with head_dim {base.head_dim}: closest come "
+        f"{target / 1e6:.2f}M parameters with head_dim {base.head_dim}: closest come "
         f"{description}; ask for that share, or for another width."
     )
 
@@ -121,8 +120,8 @@ def _samples(columns: int) -> np.ndarray:
     """Return as many points as a quadratic has coefficients, in general position.
 
     They are the base, one and two steps along each axis, and one step along each pair of axes.
-    Numbers of heads are even, so that halves and sixteenths of a width are whole; no two stages are
-    equally wide, where the projection between them would vanish.
+    Numbers of heads are even, so that halves and sixteenths of a width are whole; stages differ in
+    width, since equal ones have no projection between them.
     """
     base = 4.0 + 8 * np.arange(columns)
     axes = 2 * np.eye(columns)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from asysplat.models.prior import Prior
 from asysplat.ops.precision import without_autocast
 from asysplat.rendering.sh import SH_C0
-from asysplat.scene import Cameras, Gaussians, Views
+from asysplat.scene import Gaussians, Views
 
 # With a prior the network's corrections are bounded: on scenes unlike those of its training it is
 # wrong more often than the prior. In logits of the place in the head's range, and of opacity; in
@@ -157,13 +157,13 @@ class PhotographHead(GaussianHead):
         cameras = views.cameras.resized(*raw.opacities.shape[2:])
         origins, directions = cameras.rays()
         distance = self.near * (self.far / self.near) ** raw.depth_fraction
+        pixel = (1 / cameras.intrinsics[..., 0, 0])[..., None, None, None]  # width at distance 1
+        sizes = (raw.scales + self.scale_bias).clamp(-5, 3).exp()
         identity = raw.quats.new_tensor([1.0, 0.0, 0.0, 0.0])
         return Gaussians(
             means=origins + distance * directions,
             quats=raw.quats + identity,
-            scales=(raw.scales + self.scale_bias).clamp(-5, 3).exp()
-            * distance
-            * footprint(cameras),
+            scales=sizes * distance * pixel,
             opacities=raw.opacities,
             sh=torch.cat((raw.sh[..., :1, :] + self._colors(views), raw.sh[..., 1:, :]), dim=-2),
         )
@@ -226,8 +226,3 @@ class LongLRMHead(GaussianHead):
 def bounded(values: Tensor, bound: Tensor | float) -> Tensor:
     """Squash numbers into [-bound, bound]; small ones hardly change."""
     return bound * (values / bound).tanh()
-
-
-def footprint(cameras: Cameras) -> Float[Tensor, "B V 1 1 1"]:
-    """Return the width of a pixel at distance 1, in scene units."""
-    return (1 / cameras.intrinsics[..., 0, 0])[..., None, None, None]

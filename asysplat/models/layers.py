@@ -1,4 +1,4 @@
-"""Layers one after the other; the backward pass keeps what they compute, or computes it again."""
+"""A sequence of layers, optionally with activation checkpointing."""
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, nullcontext
@@ -10,20 +10,20 @@ from torch.utils.checkpoint import checkpoint
 
 
 class Layers(nn.Sequential):
-    """Layers one after the other.
+    """Layers in sequence.
 
-    With `checkpointing`, the backward pass computes each layer again, so that only the tokens
-    between layers are kept (Chen et al. 2016).
+    With `checkpointing`, the backward pass computes each layer again, and only the tokens between
+    layers stay in memory (Chen et al. 2016).
     """
 
     checkpointing = False
 
     def forward(
-        self, tokens: Float[Tensor, "B V h w d"], without: Collection[nn.Module] = ()
+        self, tokens: Float[Tensor, "B V h w d"], skip_layers: Collection[nn.Module] = ()
     ) -> Float[Tensor, "B V h w d"]:
-        """Apply the layers but those that are left out."""
+        """Apply the layers in order, except `skip_layers`."""
         for layer in self:
-            if layer in without:
+            if layer in skip_layers:
                 continue
             if self.checkpointing and torch.is_grad_enabled():
                 contexts = (nullcontext(), _without_running_means(layer))
@@ -37,7 +37,7 @@ class Layers(nn.Sequential):
 
 @contextmanager
 def _without_running_means(layer: nn.Module) -> Iterator[None]:
-    """Leave the running means of BatchNorm alone: the layer has counted this batch already."""
+    """Freeze the running means of BatchNorm: the layer has counted this batch already."""
     norms = [m for m in layer.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)]
     momenta = [norm.momentum for norm in norms]
     for norm in norms:

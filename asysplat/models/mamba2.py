@@ -41,7 +41,7 @@ class BiMamba2(nn.Module):
 
 
 class Mamba2Direction(nn.Module):
-    """One direction, with its own convolution, scan parameters and gated RMSNorm."""
+    """One direction with its own convolution, scan parameters and gated RMSNorm."""
 
     def __init__(self, inner: int, heads: int, state_size: int, reverse: bool):
         super().__init__()
@@ -64,14 +64,14 @@ class Mamba2Direction(nn.Module):
         return self.norm(y * F.silu(z))
 
     def _causal_conv(self, x: Tensor) -> Tensor:
-        """Let each token see the CONV_KERNEL - 1 before it in the direction of the scan."""
+        """Convolve each token with the CONV_KERNEL - 1 tokens before it in scan order."""
         if self.reverse:
             return depthwise_conv(x, self.conv.weight.flip(-1), self.conv.bias, before=0)
         return depthwise_conv(x, self.conv.weight, self.conv.bias, before=CONV_KERNEL - 1)
 
 
 def log_uniform(count: int, low: float, high: float) -> Float[Tensor, " count"]:
-    """Draw numbers from low to high whose logarithms are uniform."""
+    """Draw log-uniform numbers from low to high."""
     return torch.empty(count).uniform_(math.log(low), math.log(high)).exp()
 
 

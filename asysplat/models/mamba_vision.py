@@ -1,4 +1,4 @@
-"""MambaVision layer (Hatamizadeh and Kautz 2025), within each frame (paper, Eq. 2)."""
+"""MambaVision layer (Hatamizadeh and Kautz 2025), within each view (paper, Eq. 2)."""
 
 import torch
 import torch.nn.functional as F
@@ -35,7 +35,7 @@ class MambaVision(nn.Module):
 
 
 class MambaVisionMixer(nn.Module):
-    """Scan one half of the channels, only convolve the other, then mix both."""
+    """Scan half of the channels, only convolve the others, then mix both."""
 
     def __init__(self, width: int, state_size: int):
         super().__init__()
@@ -52,7 +52,7 @@ class MambaVisionMixer(nn.Module):
         self.reset_dt()
 
     def reset_dt(self) -> None:
-        """Let steps start between 1e-3 and 1e-1 (Gu and Dao 2023, Sec. 3.6)."""
+        """Initialize steps between 1e-3 and 1e-1 (Gu and Dao 2023, Sec. 3.6)."""
         with torch.no_grad():
             self.dt_proj.bias.copy_(inverse_softplus(log_uniform(len(self.D), 1e-3, 1e-1)))
 

@@ -1,4 +1,4 @@
-"""RMSNorm (Zhang and Sennrich 2019) that autocast does not round."""
+"""RMSNorm (Zhang and Sennrich 2019) without autocast."""
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -9,7 +9,7 @@ from asysplat.ops.precision import without_autocast
 class RMSNorm(nn.RMSNorm):
     """RMSNorm computed in the type of its weights, fp32, and returned in the input's.
 
-    With weights and inputs of two types torch would not use its fused kernel.
+    If weights and inputs differ in type, torch does not use its fused kernel.
 
     Args:
         width: of the last dimension.

@@ -1,11 +1,11 @@
-"""The sizes of a model: the widths of its network stages and what follows from them."""
+"""The sizes of a model: the widths of its network stages."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class StageShape:
-    """What every block of one network stage is built from.
+    """The sizes of every block of a network stage.
 
     Args:
         width: d_s, or d_f in the appearance branch.
@@ -33,7 +33,7 @@ class Widths:
     head_dim: int
 
     def scaled(self, factor: float) -> "Widths":
-        """Multiply the widths by `factor`, with as many heads, each of at least 4 channels."""
+        """Multiply the widths by `factor`; keep the number of heads, of at least 4 channels."""
         head_dim = max(4, round(self.head_dim * factor / 4) * 4)
         stages = tuple(width // self.head_dim * head_dim for width in self.stages)
         return Widths(stages, self.fine // self.head_dim * head_dim, head_dim)

@@ -1,10 +1,8 @@
 """Models of one branch: the paper's single-branch ablation, and Long-LRM, its baseline."""
 
-import math
 from collections.abc import Collection, Mapping, Sequence
 
 import torch
-from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -12,7 +10,7 @@ from asysplat.errors import InputError
 from asysplat.models.attention import SparseAttention
 from asysplat.models.network import Network
 from asysplat.models.shapes import StageShape, Widths
-from asysplat.models.stage import Component, build_layers, to_width
+from asysplat.models.stage import Component, Stage
 from asysplat.models.tokenizer import Tokenizer
 
 
@@ -23,16 +21,16 @@ class SingleBranch(Network):
         widths: of the network stages; `widths.fine` is not used.
         stage_ratios: MLP ratio of each stage.
         stage_layers: layer mix of each stage, counts and letters of `blocks`.
-        merges: whether 2 x 2 tokens become one before the stage.
+        merges: whether 2 x 2 tokens become one, before each stage.
         blocks: letter -> component built from a StageShape.
         head: component that decodes Gaussians.
         patch: side of a token's patch before any merge.
-        global_tokens: number of learned tokens that come before the others and have no place.
+        global_tokens: number of learned tokens that come first in the sequence and have no place.
         prior: of Network.
 
     Raises:
         InputError: lists of unequal length, an unusable layer mix, or global tokens with sparse
-            attention, which sorts tokens by their places.
+            attention, which needs the tokens' places.
     """
 
     def __init__(
@@ -61,7 +59,7 @@ class SingleBranch(Network):
             for width, ratio in zip(widths.stages, stage_ratios, strict=True)
         ]
         self.stages = nn.ModuleList(
-            MergingStage(previous.width, shape, layers, blocks, merge, global_tokens > 0)
+            Stage(previous.width, shape, layers, blocks, merge, global_tokens > 0)
             for previous, shape, layers, merge in zip(
                 [shapes[0], *shapes[:-1]], shapes, stage_layers, merges, strict=True
             )
@@ -69,8 +67,8 @@ class SingleBranch(Network):
         if global_tokens and any(isinstance(m, SparseAttention) for m in self.modules()):
             raise InputError(
                 f"model.global_tokens={global_tokens} with sparse attention among "
-                f"model.stage_layers={list(stage_layers)}: global tokens have no place in a frame; "
-                "take layers m and t, or model.global_tokens=0."
+                f"model.stage_layers={list(stage_layers)}: global tokens have no place in an "
+                "image; take layers m and t, or model.global_tokens=0."
             )
         self.global_tokens = None
         if global_tokens:
@@ -79,82 +77,19 @@ class SingleBranch(Network):
         self.head = head(widths.stages[-1], self.patch, self.patch)
 
     def tokens(
-        self, pixels: Float[Tensor, "B V H W c"], without: Collection[nn.Module] = ()
+        self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()
     ) -> Float[Tensor, "B V h w d"]:
         tokens = self.tokenizer(pixels)
         extra = None
         if self.global_tokens is not None:
             extra = self.tokenizer.norm(self.global_tokens).expand(len(tokens), -1, -1)
         for stage in self.stages:
-            tokens, extra = stage(tokens, extra, without)
+            tokens, extra = stage(tokens, skip_layers, extra)
         return tokens
 
     def geometry_share(self) -> float:
         """Return 1: there is no appearance branch."""
         return 1.0
-
-
-class MergingStage(nn.Module):
-    """A network stage that merges or projects its tokens, then applies the layer mix.
-
-    The layers see the global tokens and the others as one sequence.
-
-    Args:
-        previous_width: of the tokens that come in.
-        shape: of this stage.
-        layers: the layer mix, letters of `blocks`.
-        blocks: letter -> component built from a StageShape.
-        merge: whether 2 x 2 tokens become one.
-        has_global: whether there are global tokens.
-    """
-
-    def __init__(
-        self,
-        previous_width: int,
-        shape: StageShape,
-        layers: str,
-        blocks: Mapping[str, Component],
-        merge: bool,
-        has_global: bool,
-    ):
-        super().__init__()
-        self.merge = TokenMerge(previous_width, shape.width) if merge else None
-        # After a merge only the global tokens are left to project.
-        needed = has_global or not merge
-        self.project = to_width(previous_width, shape.width) if needed else None
-        self.layers = build_layers(shape, layers, blocks)
-
-    def forward(
-        self,
-        tokens: Float[Tensor, "B V h w d"],
-        extra: Float[Tensor, "B G d"] | None,
-        without: Collection[nn.Module] = (),
-    ) -> tuple[Float[Tensor, "B V h2 w2 e"], Float[Tensor, "B G e"] | None]:
-        tokens = self.project(tokens) if self.merge is None else self.merge(tokens)
-        if extra is None:
-            return self.layers(tokens, without), None
-        sequence = torch.cat((self.project(extra), tokens.flatten(1, 3)), dim=1)
-        # As one row of one frame: none of these layers looks at places.
-        sequence = self.layers(sequence[:, None, None], without)[:, 0, 0]
-        count = extra.shape[1]
-        return sequence[:, count:].reshape(tokens.shape), sequence[:, :count]
-
-
-class TokenMerge(nn.Module):
-    """A convolution of stride 2 that turns 2 x 2 tokens of a frame into one of the new width.
-
-    As in Long-LRM (Ziwen et al. 2025), each old channel makes the same number of new ones. Where
-    the new width is no multiple of the old, the smallest groups of channels that divide both do.
-    """
-
-    def __init__(self, width: int, new_width: int):
-        super().__init__()
-        groups = math.gcd(width, new_width)
-        self.conv = nn.Conv2d(width, new_width, kernel_size=2, stride=2, groups=groups)
-
-    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h//2 w//2 e"]:
-        maps = rearrange(tokens, "b v h w d -> (b v) d h w")
-        return rearrange(self.conv(maps), "(b v) d h w -> b v h w d", b=len(tokens))
 
 
 def build_single_branch(
@@ -170,7 +105,7 @@ def build_single_branch(
     Args:
         stage_widths, head_dim: at width 1.
         width: multiplies the widths.
-        geometry_ratio, parameter_budget: must be None and 1: there is nothing to share.
+        geometry_ratio, parameter_budget: must be None and 1: there is one branch.
         components: the other arguments of SingleBranch.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The token map that Gaussians are predicted from (paper, Eq. 4 and Table 6a)."""
+"""The tokens that Gaussians are predicted from (paper, Eq. 4 and Table 6a)."""
 
 from einops import rearrange
 from jaxtyping import Float

@@ -1,8 +1,11 @@
 """One network stage: tokens to its width, then its layer mix (paper, Eq. 1 and Table 6b)."""
 
+import math
 import re
 from collections.abc import Callable, Collection, Mapping
 
+import torch
+from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -14,13 +17,17 @@ Component = Callable[..., nn.Module]
 
 
 class Stage(nn.Module):
-    """A network stage: project the tokens to d_s, then apply the layer mix.
+    """A network stage: merge or project the tokens to d_s, then apply the layer mix.
+
+    The layers see global tokens and the others as one sequence.
 
     Args:
-        previous_width: of the tokens that come in.
+        previous_width: of the incoming tokens.
         shape: of this stage.
-        layers: the layer mix, counts and letters of `blocks`; the same in every stage.
-        blocks: letter -> component built from a StageShape, as conf/model/blocks.yaml has them.
+        layers: the layer mix, counts and letters of `blocks`.
+        blocks: letter -> component built from a StageShape, as in conf/model/blocks.yaml.
+        merge: whether 2 x 2 tokens become one.
+        has_global: whether there are global tokens.
 
     Raises:
         InputError: an unusable layer mix.
@@ -32,29 +39,50 @@ class Stage(nn.Module):
         shape: StageShape,
         layers: str,
         blocks: Mapping[str, Component],
+        merge: bool = False,
+        has_global: bool = False,
     ):
         super().__init__()
-        self.project = to_width(previous_width, shape.width)
-        self.layers = build_layers(shape, layers, blocks)
+        self.merge = TokenMerge(previous_width, shape.width) if merge else None
+        self.project = None
+        if has_global or not merge:  # after a merge only global tokens are left to project
+            same = previous_width == shape.width
+            self.project = nn.Identity() if same else nn.Linear(previous_width, shape.width)
+        letters = parse_layer_mix(layers, set(blocks))
+        self.layers = Layers(*(blocks[letter](shape) for letter in letters))
 
     def forward(
-        self, tokens: Float[Tensor, "B V h w d"], without: Collection[nn.Module] = ()
-    ) -> Float[Tensor, "B V h w e"]:
-        return self.layers(self.project(tokens), without)
+        self,
+        tokens: Float[Tensor, "B V h w d"],
+        skip_layers: Collection[nn.Module] = (),
+        extra: Float[Tensor, "B G d"] | None = None,
+    ) -> tuple[Float[Tensor, "B V h2 w2 e"], Float[Tensor, "B G e"] | None]:
+        """Return the tokens and the global tokens `extra` after this stage."""
+        tokens = self.project(tokens) if self.merge is None else self.merge(tokens)
+        if extra is None:
+            return self.layers(tokens, skip_layers), None
+        sequence = torch.cat((self.project(extra), tokens.flatten(1, 3)), dim=1)
+        # As one row of one image: none of these layers depends on the tokens' places.
+        sequence = self.layers(sequence[:, None, None], skip_layers)[:, 0, 0]
+        count = extra.shape[1]
+        return sequence[:, count:].reshape(tokens.shape), sequence[:, :count]
 
 
-def to_width(previous_width: int, width: int) -> nn.Module:
-    """Build a projection, or nothing where both widths are the same."""
-    return nn.Identity() if previous_width == width else nn.Linear(previous_width, width)
+class TokenMerge(nn.Module):
+    """A convolution of stride 2 that turns 2 x 2 tokens of a view into one of the new width.
 
-
-def build_layers(shape: StageShape, layers: str, blocks: Mapping[str, Component]) -> Layers:
-    """Build the layer mix of a network stage, counts and letters of `blocks`.
-
-    Raises:
-        InputError: an unusable layer mix.
+    As in Long-LRM (Ziwen et al. 2025), each old channel makes the same number of new ones. If the
+    new width is no multiple of the old, the smallest groups of channels that divide both do.
     """
-    return Layers(*(blocks[letter](shape) for letter in parse_layer_mix(layers, set(blocks))))
+
+    def __init__(self, width: int, new_width: int):
+        super().__init__()
+        groups = math.gcd(width, new_width)
+        self.conv = nn.Conv2d(width, new_width, kernel_size=2, stride=2, groups=groups)
+
+    def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h//2 w//2 e"]:
+        maps = rearrange(tokens, "b v h w d -> (b v) d h w")
+        return rearrange(self.conv(maps), "(b v) d h w -> b v h w d", b=len(tokens))
 
 
 def parse_layer_mix(mix: str, letters: set[str]) -> list[str]:
@@ -62,7 +90,7 @@ def parse_layer_mix(mix: str, letters: set[str]) -> list[str]:
 
     Args:
         mix: counts and letters.
-        letters: the letters that name a block.
+        letters: those that name a block.
 
     Raises:
         InputError: anything else, or no layer at all.

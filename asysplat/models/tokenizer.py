@@ -1,4 +1,4 @@
-"""Photographs and Plücker rays to tokens (paper, Sec. 3.2)."""
+"""Images and Plücker rays to tokens (paper, Sec. 3.2)."""
 
 import torch
 from einops import rearrange
@@ -27,7 +27,7 @@ class Tokenizer(nn.Module):
     Args:
         patch: p_c or p_f, in pixels.
         width: d_c or d_f.
-        channels: of a pixel, PIXEL_CHANNELS and those of the prior.
+        channels: of a pixel, PIXEL_CHANNELS plus those of the prior.
     """
 
     def __init__(self, patch: int, width: int, channels: int = PIXEL_CHANNELS):

@@ -1,4 +1,4 @@
-"""Where numbers must not be rounded to half precision."""
+"""Computations that autocast must not round to half precision."""
 
 from contextlib import AbstractContextManager, nullcontext
 

@@ -1,7 +1,6 @@
-"""The first-order linear recurrence that both scans come down to.
+"""The first-order linear recurrence of both scans, as one operator of torch.
 
-It is an operator of its own to torch, so that the meta device and the FLOP counter need not walk
-through its tokens.
+So the meta device and the FLOP counter do not go through its tokens.
 """
 
 import torch
@@ -76,5 +75,5 @@ def _flops(decay_shape, inputs_shape, *_, **__) -> int:
 
 @register_flop_formula(torch.ops.asysplat.linear_recurrence_backward)
 def _backward_flops(decay_shape, states_shape, *_, **__) -> int:
-    """Count the recurrence once more, and the gradient of the decay."""
+    """Count the recurrence again, and the gradient of the decay."""
     return 3 * torch.Size(states_shape).numel()

@@ -59,7 +59,7 @@ def initial_gaussians(
         gaussians = gaussians_from_points(photographs.points, views)
         return merge_to_limit(gaussians, views.cameras, 1.0, max_gaussians)
     if init == "network":
-        gaussians = network.eval()(_resize(views, NETWORK_MAX_SIDE, network.size_multiple))
+        gaussians = network.eval()(_resize(views, NETWORK_MAX_SIDE, network.patch))
         side = PRIOR_MAX_SIDE
     elif init in ("plane_sweep", "depth"):
         if init == "depth" and views.depths is None:

@@ -1,5 +1,5 @@
-"""Every file under conf/ and sweeps/ composes, builds its model, trains a step, and says first how
-to use it. New files are found by themselves."""
+"""Every file under conf/ and sweeps/ composes, builds its model, trains a step, and starts with its
+command."""
 
 from pathlib import Path
 
@@ -49,9 +49,9 @@ def test_composes_and_builds_its_model(group):
     assert sum(p.numel() for p in net.parameters()) > 1e6
 
 
-def test_refinements_are_the_defaults_of_the_code():
-    known = {path.stem for path in (CONF / "refinement").glob("*.yaml")}
-    assert known == {"default", "paper"}
+def test_refinement_files_equal_the_defaults_of_the_code():
+    names = {path.stem for path in (CONF / "refinement").glob("*.yaml")}
+    assert names == {"default", "paper"}
     for name, expected in (("default", RefinementSettings()), ("paper", PAPER)):
         config = compose_train(f"refinement={name}", script="reconstruct")
         assert instantiate(config.refinement) == expected
@@ -85,8 +85,8 @@ def test_trains_a_step_at_a_tiny_size(choice):
     batch = collate([TrainingTasks(data)[0]])
     optimizer = module.configure_optimizers()["optimizer"]
     before = [parameter.detach().clone() for parameter in module.net.head.parameters()]
-    outcome = module.reconstruct(batch, depth=module.loss.needs_depth)
-    loss = module.loss(outcome, batch)["loss"]
+    prediction = module(batch, depth=module.loss.needs_depth)
+    loss = module.loss(prediction, batch)["loss"]
     loss.backward()
     optimizer.step()
     assert loss.isfinite()
@@ -108,7 +108,7 @@ def test_first_comment_is_the_command(path):
 
 
 @pytest.mark.parametrize("scale", ["laptop", "gpu", "paper"])
-def test_a_stage_sets_what_its_scale_says(scale):
+def test_a_stage_sets_the_sizes_of_its_scale(scale):
     for stage in STAGES:
         config = compose_train(f"scale={scale}", f"stage={stage}")
         assert set(config.stages) == set(STAGES)
@@ -127,7 +127,7 @@ def test_a_stage_sets_what_its_scale_says(scale):
     sorted(CONF.rglob("*.yaml")) + sorted(SWEEPS.glob("*.yaml")),
     ids=lambda path: path.stem,
 )
-def test_keys_of_its_own_have_a_place_among_the_defaults(path):
+def test_files_with_keys_of_their_own_name_self_among_the_defaults(path):
     keys = set(OmegaConf.load(path))
     if "defaults" in keys and len(keys) > 1:
         assert "_self_" in OmegaConf.load(path).defaults

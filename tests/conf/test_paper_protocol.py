@@ -1,4 +1,4 @@
-"""What every sweep composes on the paper's data, against what the paper says of its tables."""
+"""The configuration of every sweep on the paper's data, against the paper's protocol."""
 
 from itertools import product
 from pathlib import Path
@@ -96,20 +96,20 @@ def test_table_5_takes_the_frames_of_an_index(compose_train):
 
 
 @pytest.mark.parametrize("data", ["dl3dv", "realestate10k"])
-def test_data_with_scenes_to_test_asks_for_them(compose_train, data):
+def test_data_with_test_scenes_needs_their_folder(compose_train, data):
     config = compose_train(f"data={data}", "data.root=train", "paths.run=here")
     task = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
     assert OmegaConf.missing_keys(task) == {"data.test_root"}
 
 
-def test_a_set_has_the_path_that_is_given(compose_train):
+def test_a_test_set_has_the_given_path(compose_train):
     config = compose_train("sweeps=layers", "data=dl3dv", *PLACES, "paths.mipnerf360=elsewhere")
     assert config.data.test_sets.mipnerf360.root == "elsewhere"
     assert config.data.test_sets.scannetpp.root is None
 
 
 def test_the_command_for_a_cluster(compose_train):
-    """As docs/tables.md has it, and every one of its jobs."""
+    """The command of docs/tables.md, and each of its jobs."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     printed = (ROOT / "docs" / "tables.md").read_text().splitlines()
     (line,) = (line for line in printed if "hydra/launcher=submitit_slurm" in line)
@@ -130,7 +130,7 @@ def test_the_command_for_a_cluster(compose_train):
 
 
 def test_the_options_for_several_nodes(compose_train):
-    """As docs/tables.md has them, they go together."""
+    """The options of docs/tables.md fit together."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     printed = (ROOT / "docs" / "tables.md").read_text().replace("\\\n", "").splitlines()
     (line,) = (line for line in printed if "trainer.num_nodes" in line)
@@ -143,7 +143,7 @@ def test_the_options_for_several_nodes(compose_train):
     assert f"`{split}`" in " ".join(printed)
 
 
-def test_a_test_set_that_is_none_is_named():
+def test_an_unknown_test_set_is_named():
     check_overrides(["test_sets=[mipnerf360,replica]", "test_sets=[]"])
     with pytest.raises(InputError, match=r"test_sets=mipnerf is unknown: did you mean mipnerf360"):
         check_overrides(["test_sets=[replica,mipnerf]"])

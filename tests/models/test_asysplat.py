@@ -1,4 +1,4 @@
-"""The whole network: the paper's parameter counts, what it reads, and its components."""
+"""The whole network: the paper's parameter counts, its inputs and components."""
 
 import pytest
 import torch
@@ -93,7 +93,7 @@ def test_parameter_budget(build):
         (["model=single_branch", "model.global_tokens=2"], "model.global_tokens=2 with sparse"),
     ],
 )
-def test_what_a_model_refuses(build, overrides, complaint):
+def test_arguments_that_a_model_refuses(build, overrides, complaint):
     with pytest.raises(InstantiationException) as caught:
         build(*overrides, device="meta")
     assert complaint in str(input_error_behind(caught.value))
@@ -127,11 +127,11 @@ def test_one_gaussian_per_output_pixel_at_its_ray(build):
     torch.testing.assert_close(pixels[..., 1], y.expand(2, 3, 16, 32), atol=1e-3, rtol=0)
 
 
-def test_untrained_colors_are_the_photographs(build):
+def test_untrained_colors_are_those_of_the_images(build):
     views = make_views()
     dc = build("model=asysplat_4m4s", *TINY)(views).sh[..., 0, :] * 0.28209479 + 0.5
-    photographs = torch.nn.functional.avg_pool2d(views.images.flatten(0, 1), 2)
-    expected = photographs.permute(0, 2, 3, 1).reshape(2, -1, 3)
+    images = torch.nn.functional.avg_pool2d(views.images.flatten(0, 1), 2)
+    expected = images.permute(0, 2, 3, 1).reshape(2, -1, 3)
     assert (dc - expected).abs().mean() < 0.02
 
 
@@ -169,20 +169,20 @@ def test_every_component_trains(build, override):
 
 
 def test_views_exchange_only_through_the_geometry_branch(build):
-    """With the coarse tokens out of play, what one view predicts ignores the others."""
+    """Without the coarse tokens, the prediction of a view is independent of the others."""
     views = make_views(batch=())
     changed = views.images.clone()
     changed[1] = torch.rand_like(changed[1])
     other = Views(views.cameras, changed)
 
-    def moved(*overrides):
+    def change(*overrides):
         torch.manual_seed(0)
         net = build("model=asysplat_4m4s", *TINY, *overrides).eval()
         first_view = 16 * 32
         return (net(views).opacities - net(other).opacities)[:first_view].abs().max()
 
-    assert moved() > 0
-    assert moved("model/source=fine", "model/links=only_fine_to_coarse") == 0
+    assert change() > 0
+    assert change("model/source=fine", "model/links=only_fine_to_coarse") == 0
 
 
 def test_bfloat16_autocast_keeps_gaussians_in_fp32(build):
@@ -194,22 +194,13 @@ def test_bfloat16_autocast_keeps_gaussians_in_fp32(build):
     torch.testing.assert_close(gaussians.means, net(views).means, atol=0.1, rtol=0.05)
 
 
-def test_double_precision_agrees(build):
-    views = make_views()
-    net = build(*TINY).eval()
-    single = net(views)
-    double = net.double()(views.to(torch.float64))
-    assert double.means.dtype == torch.float64
-    torch.testing.assert_close(single.means, double.means.float(), atol=1e-4, rtol=1e-4)
-
-
-def test_resolution_that_the_patches_do_not_take(build):
+def test_image_size_that_is_no_multiple_of_the_patch(build):
     with pytest.raises(InputError, match="set 48x48"):
         build(*TINY)(make_views(height=48, width=40))
 
 
 @pytest.mark.parametrize("model", ["asysplat_4m4s", "asysplat_7m1s"])
-def test_token_maps_that_the_grid_does_not_divide(build, model):
+def test_token_maps_of_any_size(build, model):
     gaussians = build(*TINY, f"model={model}")(make_views(height=48, width=80))
     assert all(field.isfinite().all() for field in (gaussians.means, gaussians.sh))
 
@@ -222,7 +213,7 @@ def test_layer_mix(mix, layers):
 
 
 @pytest.mark.parametrize("mix", ["", "4x4s", "m4", "0m", "4m-4s"])
-def test_layer_mix_that_cannot_be_read(mix):
+def test_bad_layer_mix(mix):
     with pytest.raises(InputError, match="such as 4m4s"):
         parse_layer_mix(mix, {"m", "s", "t"})
 
@@ -232,6 +223,6 @@ def test_gpu_agrees_with_cpu(build):
     views = make_views()
     net = build(*TINY).eval()
     expected = net(views)
-    found = net.cuda()(views.to("cuda")).to("cpu")
-    torch.testing.assert_close(found.means, expected.means, atol=1e-3, rtol=1e-3)
-    torch.testing.assert_close(found.sh, expected.sh, atol=1e-3, rtol=1e-3)
+    on_gpu = net.cuda()(views.to("cuda")).to("cpu")
+    torch.testing.assert_close(on_gpu.means, expected.means, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(on_gpu.sh, expected.sh, atol=1e-3, rtol=1e-3)

@@ -1,4 +1,4 @@
-"""Against torch's convolution of sequences."""
+"""The depthwise convolution against torch's convolution of sequences."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ def as_sequences(tokens, weight, bias, before):
 
 
 @pytest.mark.parametrize("size, before", SIZES)
-def test_values_and_gradients_are_those_of_sequences(size, before):
+def test_values_and_gradients_equal_torch(size, before):
     leaves = inputs(size)
     y, expected = depthwise_conv(*leaves, before), as_sequences(*leaves, before)
     torch.testing.assert_close(y, expected, rtol=0, atol=1e-12)
@@ -32,7 +32,7 @@ def test_values_and_gradients_are_those_of_sequences(size, before):
 
 
 def test_tokens_in_half_precision():
-    """As autocast gives them; the weights stay fp32, and so do their gradients."""
+    """Under autocast the weights and their gradients stay fp32."""
     leaves = inputs(4, torch.float32, length=200)
     half = [leaves[0].bfloat16().detach().requires_grad_(), *leaves[1:]]
     grad_output = torch.randn(2, 200, 6, generator=torch.Generator().manual_seed(1))
@@ -42,8 +42,8 @@ def test_tokens_in_half_precision():
     expected = as_sequences(*leaves, 3)
     exact = torch.autograd.grad(expected, leaves, grad_output)
     assert y.dtype == grads[0].dtype == torch.bfloat16 and grads[1].dtype == torch.float32
-    for found, value in zip((y, *grads), (expected, *exact), strict=True):
-        assert (found.float() - value).norm() <= 1e-2 * value.norm()
+    for result, value in zip((y, *grads), (expected, *exact), strict=True):
+        assert (result.float() - value).norm() <= 1e-2 * value.norm()
 
 
 def test_no_bias():

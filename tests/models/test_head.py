@@ -1,4 +1,4 @@
-"""Both heads: an untrained Gaussian, the ranges, extreme numbers, and every model with either."""
+"""Both heads: untrained Gaussians, ranges, extreme numbers, and every model with either."""
 
 import math
 from pathlib import Path
@@ -36,7 +36,7 @@ def decode(kind, fill, views=None, stride=2):
 
 
 def distances(gaussians, views):
-    """How far the means are from the camera that predicts them, [V, n]."""
+    """Distances of the means from their view's camera, [V, n]."""
     centers = views.cameras.centers.reshape(-1, 1, 3)
     return (gaussians.means.reshape(len(centers), -1, 3) - centers).norm(dim=-1)
 
@@ -52,8 +52,8 @@ def test_untrained_photograph():
     assert (gaussians.opacities == 0.5).all()
     assert (gaussians.quats == torch.tensor([1.0, 0, 0, 0])).all()
     colors = gaussians.sh[0, :, 0].reshape(2, 8, 8, 3) * 0.28209479 + 0.5
-    photographs = torch.nn.functional.avg_pool2d(views.images[0], 2).permute(0, 2, 3, 1)
-    torch.testing.assert_close(colors, photographs)
+    images = torch.nn.functional.avg_pool2d(views.images[0], 2).permute(0, 2, 3, 1)
+    torch.testing.assert_close(colors, images)
     assert (gaussians.sh[0, :, 1:] == 0).all()
 
 
@@ -65,11 +65,11 @@ def test_untrained_longlrm():
     torch.testing.assert_close(gaussians.scales, size)
     opacity = torch.full_like(gaussians.opacities, 1 / (1 + math.exp(2)))
     torch.testing.assert_close(gaussians.opacities, opacity)
-    assert (gaussians.sh == 0).all()  # gray, whatever the photograph
+    assert (gaussians.sh == 0).all()  # gray, whatever the image
 
 
 def test_longlrm_by_hand():
-    """Position 3, quaternion 4, scale 3, opacity 1, colors: all as they are decoded."""
+    """Position 3, quaternion 4, scale 3, opacity 1, colors: all as decoded."""
     views = make_views()
     numbers = torch.arange(59.0) / 10 - 2
     gaussians, _ = decode("longlrm", numbers, views)
@@ -105,14 +105,14 @@ def test_extreme_numbers_stay_in_range_and_render_with_finite_gradients(kind, ra
 
 
 @pytest.mark.parametrize("kind", HEADS)
-def test_gradients_of_every_number_at_a_start(kind):
+def test_gradients_of_every_decoded_number(kind):
     torch.manual_seed(0)
     gaussians, leaf = decode(kind, 0.1 * torch.randn(59))
     sum((field.square()).sum() for field in vars(gaussians).values()).backward()
     assert leaf.grad.isfinite().all() and (leaf.grad != 0).all()
 
 
-def test_a_distance_of_500_is_drawn():
+def test_a_distance_of_500_is_rendered():
     """A Gaussian at the far end of Long-LRM's range, large enough to cover pixels."""
     views = make_views()
     numbers = torch.zeros(59)
@@ -121,8 +121,8 @@ def test_a_distance_of_500_is_drawn():
     gaussians, _ = decode("longlrm", numbers, views)
     rendering = render(gaussians, views.cameras, torch.zeros(3), depth=True)
     assert (rendering.alpha.amax((-1, -2)) > 0.5).all()
-    seen = rendering.depth[rendering.alpha > 0.5]
-    assert ((seen > 400) & (seen < 501)).all()
+    depths = rendering.depth[rendering.alpha > 0.5]
+    assert ((depths > 400) & (depths < 501)).all()
 
 
 @pytest.mark.parametrize("head", HEADS)

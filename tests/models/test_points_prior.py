@@ -1,4 +1,4 @@
-"""Sparse points as a prior, exact at a point and less trusted away from it, and in a sweep."""
+"""Sparse points as a prior, and as the range of a plane sweep."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -26,7 +26,7 @@ def depth(prior, views):
     return prior.distance / length
 
 
-def test_points_are_kept_and_spread():
+def test_points_spread_to_their_surroundings():
     points = torch.zeros(1, 2, 32, 32)
     points[0, 0, 4, 4], points[0, 0, 5, 5] = 2.0, 6.0  # one block
     points[0, 0, 20, 28] = 5.0
@@ -39,14 +39,14 @@ def test_points_are_kept_and_spread():
     assert depths[:6, :6].max() < depths[8:12, 12:].min()
     confidence = prior.confidence[0]
     assert confidence[0, 2, 2:8].tolist() == [1, 0.75, 0.5, 0.25, 0.25, 0]
-    assert confidence[1].max() == 0  # the other view sees no point,
-    assert 2.9 < depth(prior, views)[0, 1].mean() < 5.1  # but the scene's depth
+    assert confidence[1].max() == 0  # the other view has no point,
+    assert 2.9 < depth(prior, views)[0, 1].mean() < 5.1  # but the scene's mean depth
 
 
 def test_views_without_points_are_unknown():
     unknown = PointsPrior()(make_views(), SIZE)
-    none_seen = PointsPrior()(make_views(torch.zeros(1, 2, 32, 32)), SIZE)
-    for prior in (unknown, none_seen):
+    none_visible = PointsPrior()(make_views(torch.zeros(1, 2, 32, 32)), SIZE)
+    for prior in (unknown, none_visible):
         assert prior.confidence.max() == 0
         assert (prior.distance == UNKNOWN_DISTANCE).all()
 
@@ -59,8 +59,8 @@ def test_gaussians_start_at_the_points(build):
     torch.testing.assert_close(gaussians.means[..., 2], torch.full((1, 2048), 4.0))
 
 
-def test_a_sweep_looks_where_the_points_are(monkeypatch):
-    """As far as they say in a view with enough of them, and as the cameras say in the other."""
+def test_points_set_the_range_of_a_plane_sweep(monkeypatch):
+    """In a view with enough points; the cameras set the range of the other view."""
     given = []
 
     def spy(images, cameras, stride, ranges, **options):
@@ -83,7 +83,7 @@ def test_a_sweep_looks_where_the_points_are(monkeypatch):
     assert not torch.equal(known.distance, cameras.distance)
 
 
-def test_a_sweep_of_one_view_with_points_is_unknown():
+def test_a_plane_sweep_of_one_view_is_unknown():
     views = make_views(torch.full((1, 2, 32, 32), 2.0)).map(lambda tensor: tensor[:, :1])
     prior = PlaneSweepPrior()(views, SIZE)
     assert prior.confidence.max() == 0 and prior.distance.isfinite().all()

@@ -1,12 +1,10 @@
-"""Priors: what they give to tokens and heads, what is unknown, and all models with one."""
+"""Priors: their maps, unknown depths, their effect on heads, and all models with one."""
 
 import math
 from dataclasses import replace
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 from test_head import make_views
 
 from asysplat.evaluation.static_cost import static_costs
@@ -16,11 +14,12 @@ from asysplat.models.prior.prior import COVER, UNKNOWN_DISTANCE, Prior
 from asysplat.scene import Cameras, Views
 
 MODELS = ["asysplat_4m4s", "longlrm", "single_branch", "asysplat_pred_fine"]
-PRIORS = {"sweep": PlaneSweepPrior, "depth": DepthPrior}
+SMALL = ["width=0.125", "state_size=8"]
+PRIORS = {"plane_sweep": PlaneSweepPrior, "depth": DepthPrior}
 
 
 def wall(views=4, size=32, depth=2.0, step=0.15):
-    """Cameras side by side in front of a textured wall, and its depths."""
+    """Views of a textured wall from cameras side by side, with depths."""
     poses = torch.eye(4).repeat(1, views, 1, 1)
     poses[0, :, 0, 3] = step * torch.arange(views)
     intrinsics = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
@@ -31,17 +30,6 @@ def wall(views=4, size=32, depth=2.0, step=0.15):
     images = 0.5 + 0.4 * torch.sin(places[..., :2] @ waves.T).permute(0, 1, 4, 2, 3)
     depths = torch.full(images.shape[:2] + images.shape[-2:], depth)
     return Views(cameras, images, depths)
-
-
-def make_net(*overrides):
-    with initialize_config_dir(str(CONF), version_base=None):
-        return instantiate(compose("train", [*overrides, "width=0.125", "state_size=8"]).model)
-
-
-@pytest.fixture(autouse=True)
-def conf(repository):
-    global CONF
-    CONF = repository / "conf"
 
 
 @pytest.mark.parametrize("name", PRIORS)
@@ -55,7 +43,7 @@ def test_a_wall_is_where_it_is(name):
 
 
 @pytest.mark.parametrize("knob", [{"planes": 8}, {"neighbors": 1}, {"longest_side": 16}])
-def test_a_coarser_sweep_finds_the_wall_less_exactly(knob):
+def test_a_coarser_plane_sweep_is_less_exact(knob):
     views = wall()
     length = views.cameras.resized(16, 16).pixel_directions().norm(dim=-1)
 
@@ -68,7 +56,7 @@ def test_a_coarser_sweep_finds_the_wall_less_exactly(knob):
 
 @pytest.mark.parametrize("name", PRIORS)
 @pytest.mark.parametrize("case", ["one view", "one place", "black", "apart"])
-def test_what_cannot_be_known_is_unknown(name, case):
+def test_depths_without_parallax_or_texture_are_unknown(name, case):
     views = replace(wall(), depths=None)
     if case == "one view":
         views = Views(views.cameras.select([0]), views.images[:, :1])
@@ -103,7 +91,7 @@ def test_unknown_is_the_untrained_distance():
 
 
 @pytest.mark.parametrize("head", [PhotographHead, LongLRMHead])
-def test_gaussians_start_where_the_prior_says(head):
+def test_gaussians_start_at_the_priors_distance(head):
     views = make_views()
     built = head(8, 16, 8)
     torch.nn.init.zeros_(built.decode.weight)
@@ -118,7 +106,7 @@ def test_gaussians_start_where_the_prior_says(head):
 
 
 @pytest.mark.parametrize("confident", [0.0, 1.0])
-def test_corrections_are_bounded_where_something_is_known(confident):
+def test_corrections_are_bounded_if_a_depth_is_known(confident):
     views, shape = make_views(), (1, 2, 8, 8)
     head = PhotographHead(8, 16, 8)
     torch.nn.init.normal_(head.decode.weight, std=100.0)
@@ -128,15 +116,15 @@ def test_corrections_are_bounded_where_something_is_known(confident):
     tokens = torch.randn(1, 2, 1, 1, 8)
     start = PhotographHead(8, 16, 8)
     torch.nn.init.zeros_(start.decode.weight)
-    moved, before = head(tokens, views, prior), start(tokens, views, prior)
+    corrected, before = head(tokens, views, prior), start(tokens, views, prior)
     origins = views.cameras.centers[0, :, None].expand(2, 64, 3).reshape(-1, 3)
-    ratio = (moved.means[0] - origins).norm(dim=-1) / (before.means[0] - origins).norm(dim=-1)
+    ratio = (corrected.means[0] - origins).norm(dim=-1) / (before.means[0] - origins).norm(dim=-1)
     # A logit is at most a quarter of the range, which is a factor of 1000.
     bound = MAX_DEPTH_CORRECTION * (CONFIDENT_FACTOR if confident else 1) / 4 * math.log(1000)
     assert ratio[1:].log().abs().max() <= 1.001 * bound
-    assert (moved.opacities.logit() - before.opacities.logit()).abs().max() <= 0.501
+    assert (corrected.opacities.logit() - before.opacities.logit()).abs().max() <= 0.501
     # Sizes are in pixels, so that they follow the distance.
-    assert (moved.scales / before.scales).log().abs().max() <= 1.001 * (
+    assert (corrected.scales / before.scales).log().abs().max() <= 1.001 * (
         1 + 0.3 / 4 * math.log(1000)
     )
     unknown = replace(prior, confidence=torch.zeros(shape))
@@ -154,24 +142,26 @@ def test_features_are_bounded_at_any_distance():
 
 @pytest.mark.parametrize("name", PRIORS)
 @pytest.mark.parametrize("views", [2, 4, 8])
-def test_those_who_see_a_wall_hide_it_together(name, views):
+def test_views_share_the_opacity_of_a_wall(name, views):
     prior = PRIORS[name]()(wall(views, step=0.1), (16, 16))
     middle = prior.opacity[:, views // 2, 4:12, 4:12]
     hidden = 1 - (1 - middle) ** views
     assert hidden.median() > 0.8 and hidden.max() < 0.98
 
 
-def test_what_one_view_alone_sees_is_opaque():
-    views = wall(2, step=1.5)  # three quarters of a picture at the wall's distance
+def test_a_surface_in_one_view_alone_is_opaque():
+    views = wall(2, step=1.5)  # three quarters of an image at the wall's distance
     prior = DepthPrior()(views, (16, 16))
     assert (prior.opacity[:, 0, :, :11] - COVER).abs().max() < 1e-3
     assert prior.opacity[:, 0, :, 13:].max() < 0.8
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_every_model_takes_a_prior(model):
+def test_every_model_takes_a_prior(build, model):
     views = wall(2)
-    plain, swept = (make_net(f"model={model}", f"model/prior={p}") for p in ("none", "plane_sweep"))
+    plain, swept = (
+        build(*SMALL, f"model={model}", f"model/prior={prior}") for prior in ("none", "plane_sweep")
+    )
     gaussians = swept(views)
     assert gaussians.num_gaussians == plain(views).num_gaussians
     sum(field.sum() for field in vars(gaussians).values()).backward()
@@ -185,12 +175,12 @@ def test_every_model_takes_a_prior(model):
     assert different == tokenizers
 
 
-def test_costs_are_counted_without_content():
-    costs = static_costs(make_net("model=asysplat_plane_sweep"), 3, 32, 32)
+def test_costs_are_counted_on_the_meta_device(build):
+    costs = static_costs(build(*SMALL, "model=asysplat_plane_sweep"), 3, 32, 32)
     assert costs["gaussians"] == 3 * 32 * 32 and costs["activation_gb"] > 0
 
 
-def test_depth_of_the_data_is_averaged_where_it_is_known():
+def test_depth_maps_are_averaged_over_known_pixels():
     views = wall(1)
     depths = views.depths.clone()
     depths[..., :16] = 0
@@ -200,4 +190,4 @@ def test_depth_of_the_data_is_averaged_where_it_is_known():
     assert prior.confidence[0, 0, 0, 8] == 0.25 and prior.confidence[..., :8].max() == 0
     length = views.cameras.resized(16, 16).pixel_directions().norm(dim=-1)
     assert (prior.distance[..., 10:] / length[..., 10:]).mean().item() == pytest.approx(2, rel=1e-3)
-    assert prior.distance.min() > 1.5  # gaps are filled from around
+    assert prior.distance.min() > 1.5  # gaps are filled from their surroundings

@@ -5,12 +5,12 @@ import torch
 from tiny import SIZE as TINY
 
 from asysplat.evaluation.static_cost import blank_views
-from asysplat.models.single_branch import TokenMerge
+from asysplat.models.stage import TokenMerge
 
 
 @pytest.mark.parametrize(("width", "new_width", "group"), [(2, 6, 1), (4, 6, 2)])
-def test_merge_takes_a_place_and_its_three_neighbors(width, new_width, group):
-    """As published each channel makes its own new ones; else groups that divide both widths."""
+def test_merge_combines_2_x_2_tokens(width, new_width, group):
+    """As published each channel makes new ones, or else groups that divide both widths."""
     merge = TokenMerge(width, new_width)
     tokens = torch.randn(1, 3, 4, 6, width)
     merged = merge(tokens)
@@ -23,15 +23,15 @@ def test_merge_takes_a_place_and_its_three_neighbors(width, new_width, group):
 
 
 def test_global_tokens_are_part_of_the_sequence_and_are_read(build):
-    """The same Gaussians as from one sequence put together by hand; all of it is trained."""
+    """The layers get one sequence; the global tokens change the result and are trained."""
     net = build(*TINY, "model=longlrm").eval()
     assert net.global_tokens.shape[0] == 2
-    seen = []
+    shapes = []
     for block in (layer for stage in net.stages for layer in stage.layers):
-        block.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].shape))
+        block.register_forward_pre_hook(lambda _, inputs: shapes.append(inputs[0].shape))
     views = blank_views(3, 32, 48).map(lambda tensor: torch.rand(tensor.shape))
     gaussians = net(views)
-    assert seen[0][1:4] == (1, 1, 2 + 3 * 4 * 6) and seen[-1][1:4] == (1, 1, 2 + 3 * 2 * 3)
+    assert shapes[0][1:4] == (1, 1, 2 + 3 * 4 * 6) and shapes[-1][1:4] == (1, 1, 2 + 3 * 2 * 3)
     sum(field.sum() for field in (gaussians.means, gaussians.sh, gaussians.opacities)).backward()
     assert net.global_tokens.grad.abs().sum() > 0
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Textured surfaces that cameras look at, with the depth of every pixel."""
+"""Cameras in front of textured surfaces, with the depth of every pixel."""
 
 import math
 
@@ -11,7 +11,7 @@ HEIGHT, WIDTH = 24, 32
 
 
 def turned(cameras: Cameras, degrees: float) -> Cameras:
-    """The same cameras, each turned about its own vertical axis."""
+    """Rotate each camera about its vertical axis."""
     angle = math.radians(degrees)
     turn = torch.eye(4).to(cameras.cam_to_world)
     turn[0, 0] = turn[2, 2] = math.cos(angle)
@@ -37,7 +37,7 @@ def cameras_at(
 
 
 def four_cameras(height: int = HEIGHT, width: int = WIDTH, scale: float = 1.0) -> Cameras:
-    """Four cameras at the corners of a square, of which the surfaces are seen from nearby."""
+    """Four cameras at the corners of a square."""
     side = 0.3 * scale
     corners = [(0.0, 0.0, 0.0), (side, 0.0, 0.0), (0.0, side, 0.0), (side, side, 0.1 * scale)]
     return cameras_at(corners, height=height, width=width)

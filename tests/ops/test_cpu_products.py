@@ -50,7 +50,7 @@ def test_product_takes_a_transpose():
     assert_close(out, a.T.astype(float) @ b)
 
 
-def test_nothing_kept_forgets_what_is_no_number():
+def test_a_factor_of_zero_overwrites_nan():
     a, b = draw(ROWS + 1, 5), draw(5, LANES)
     out = np.full((ROWS + 1, LANES), np.nan, np.float32)
     product(out, a, b, np.float32(0))
@@ -67,7 +67,7 @@ def test_triangle(upper):
 
 
 @pytest.mark.parametrize("upper", [False, True])
-def test_triangle_reads_no_zero_beside_the_diagonal(upper):
+def test_triangle_reads_no_zero_outside_the_diagonal_tiles(upper):
     blocks = np.arange(SIDE) // ROWS
     beside = blocks[:, None] > blocks if upper else blocks[:, None] < blocks
     a, b, out = draw(SIDE, SIDE), draw(SIDE, LANES), np.zeros((SIDE, LANES), np.float32)

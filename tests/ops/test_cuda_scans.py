@@ -5,11 +5,10 @@ in a process that has it set: there, what is marked `kernel` runs on a CPU.
 """
 
 import os
-import subprocess
-import sys
 
 import pytest
 import torch
+from compiler import run_interpreted
 
 from asysplat.errors import InputError
 from asysplat.ops import selective_scan, ssd
@@ -63,7 +62,7 @@ def check(name, tensors, reverse=False, tolerance=2e-6, backend="reference", dim
         assert (error <= tolerance * scale).all(), (part, error / scale)
 
 
-# Where each result has its heads or channels.
+# The dimension of the heads or channels in each result.
 OWN = {"y": 2, "x": 2, "dt": 2, "A": 0, "B": None, "C": None, "D": 0}
 
 
@@ -71,14 +70,14 @@ OWN = {"y": 2, "x": 2, "dt": 2, "A": 0, "B": None, "C": None, "D": 0}
 @pytest.mark.parametrize("name", SCANS)
 @pytest.mark.parametrize("reverse", [False, True])
 @pytest.mark.parametrize("chunks, more", [(0, 1), (1, -1), (1, 0), (1, 1), (3, 5)])
-def test_output_and_gradients_are_those_of_the_reference(name, chunks, more, reverse):
+def test_output_and_gradients_equal_the_reference(name, chunks, more, reverse):
     check(name, arguments(name, chunks * CHUNKS[name] + more), reverse)
 
 
 @kernel
 @pytest.mark.parametrize("name", SCANS)
 def test_wide_heads_and_states(name):
-    channels = 2 if name == "ssd" else 18  # more than a program has
+    channels = 2 if name == "ssd" else 18  # more than a program's
     check(name, arguments(name, 17, batch=1, channels=channels, head_dim=64, state=64))
     if name == "ssd":  # of more than a program's columns
         check(name, arguments(name, 17, batch=1, channels=1, state=128))
@@ -113,7 +112,7 @@ def test_mixed_steps_and_rates(name):
 
 @kernel
 @pytest.mark.parametrize("name", SCANS)
-def test_a_token_that_forgets_everything_leaves_small_decays_exact(name):
+def test_a_huge_step_leaves_small_decays_exact(name):
     tensors = arguments(name, CHUNKS[name] + 3, channels=2)
     tensors[1] *= 1e-3
     tensors[1][:, 1] = 1e12
@@ -148,7 +147,7 @@ def test_sizes_that_kernels_cannot_take(name, sizes, message):
 @pytest.mark.skipif(INTERPRETED, reason="too large")
 @pytest.mark.parametrize("name", SCANS)
 @pytest.mark.parametrize("reverse", [False, True])
-def test_long_sequences_are_those_of_the_chunked_form_and_the_same_every_time(name, reverse):
+def test_long_sequences_equal_the_chunked_form_and_repeat(name, reverse):
     tensors = arguments(name, 10_007, channels=28, head_dim=64, state=256 if name == "ssd" else 16)
     check(name, tensors, reverse, backend="chunked")
     check(
@@ -166,10 +165,4 @@ def test_long_sequences_are_those_of_the_chunked_form_and_the_same_every_time(na
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
 def test_kernels_in_the_interpreter():
     pytest.importorskip("triton")
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", __file__],
-        env={**os.environ, "TRITON_INTERPRET": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout
+    run_interpreted(__file__)

@@ -1,5 +1,4 @@
-"""The scans' kernels compile for GPUs that are not at hand: what the interpreter takes, the
-compiler may not."""
+"""The scans' kernels compile for GPUs: the interpreter accepts more than the compiler."""
 
 from importlib import import_module
 
@@ -44,7 +43,7 @@ def test_all_kernels_compile(monkeypatch, name, architecture, dtype):
 
     monkeypatch.setattr(JITFunction, "run", run)
     monkeypatch.setattr("asysplat.ops.dispatch._interpreted", lambda backend: True)
-    # As few unrolled tokens as show all: the compiler takes seconds for each.
+    # Few unrolled tokens: the compiler takes seconds for each.
     monkeypatch.setattr(scan, "FORWARD_CHUNK", 2)
     monkeypatch.setattr(scan, "BACKWARD_CHUNK", 2)
     heads, state = ((2, 16), 128) if name == "ssd" else ((2,), 16)

@@ -1,4 +1,4 @@
-"""The loss of images: its formula, the kernel against it in float64, and what must not matter."""
+"""The image loss: its formula, the kernel against it in float64, and invariances."""
 
 import inspect
 
@@ -17,7 +17,7 @@ VALUE, GRADIENT = 1e-6, 1e-5  # of the kernel against float64, the latter relati
 
 @pytest.fixture
 def threads():
-    """Sets their number, until the test's end."""
+    """Set the number of threads until the test's end."""
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
@@ -65,14 +65,14 @@ def test_gradients_of_the_reference_are_finite_differences(weight):
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_it_is_l1_and_the_ssim_that_is_published(backend):
+def test_the_loss_is_l1_and_the_published_ssim(backend):
     rendered, target = images("alike", 2, 2, 3, 24, 31)
     rendered = rendered.clamp(0, 1)
     l1, similarity = (rendered - target).abs().mean((-3, -2, -1)), ssim(rendered, target)
     for weight in (0.0, 0.2, 1.0):
         expected = (1 - weight) * l1 + weight * (1 - similarity)
-        found = image_loss(rendered, target, weight, backend=backend)
-        torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
+        loss = image_loss(rendered, target, weight, backend=backend)
+        torch.testing.assert_close(loss, expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
@@ -94,7 +94,7 @@ def test_identical_images_have_no_loss_and_no_gradient(size):
 
 
 def test_constant_images():
-    """Without contrast SSIM is that of the means; a window's gradient adds up to its derivative."""
+    """Without contrast SSIM compares the means; the gradient sums to its derivative."""
     x, y, C1 = 0.6, 0.5, 1e-4
     similarity = (2 * x * y + C1) / (x**2 + y**2 + C1)
     slope = (2 * y - 2 * x * similarity) / (x**2 + y**2 + C1)
@@ -116,7 +116,7 @@ def test_masked_pixels_take_the_targets_values(dtype):
     assert nothing.abs().max() < 1e-12 and (none == 0).all()
 
 
-def test_images_of_a_batch_do_not_meet():
+def test_images_of_a_batch_are_independent():
     rendered, target = images("noise", 2, 2, 3, 40, 33)
     together = both_ways(rendered, target)
     assert together[0].shape == (2, 2)
@@ -139,7 +139,7 @@ def test_any_number_of_threads_gives_the_same_bits(threads):
 
 @pytest.mark.parametrize("size", [(40, 33), (7, 5)], ids=str)
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_what_is_not_a_number_stays_none_in_its_image(size, value):
+def test_non_finite_pixels_affect_their_image_only(size, value):
     rendered, target = images("noise", 3, 3, *size)
     clean = both_ways(rendered, target)
     rendered[1, 2, 3, 4] = value
@@ -152,7 +152,7 @@ def test_what_is_not_a_number_stays_none_in_its_image(size, value):
         assert grad[1, 2, 3, 4].isnan()
 
 
-def test_gradients_are_taken_when_and_as_often_as_asked():
+def test_gradients_on_demand():
     rendered, target = images("noise", 2, 3, 20, 20)
     assert not image_loss(rendered, target).requires_grad
     rendered.requires_grad_()
@@ -198,7 +198,7 @@ def test_mistakes_are_named():
     }
     for sentence, args in wrong.items():
         with pytest.raises(InputError, match=sentence):
-            inspect.unwrap(image_loss)(*args)  # without the checks of types that tests have
+            inspect.unwrap(image_loss)(*args)  # without the tests' type checker
     with pytest.raises(InputError, match="backend='gpu': expected one of auto, reference, cpu"):
         image_loss(rendered, target, backend="gpu")
     with pytest.raises(InputError, match="computes in float32"):

@@ -1,16 +1,15 @@
-"""The plane sweep: its back ends against the reference in float64, and depths that are known.
+"""The plane sweep: its backends against the reference in float64, and known depths.
 
 Triton reads TRITON_INTERPRET when it is first imported, so one test runs this file a second time,
 in a process that has it set: there, "cuda" runs on a CPU.
 """
 
 import os
-import subprocess
-import sys
 from importlib import import_module
 
 import pytest
 import torch
+from compiler import run_interpreted
 from swept import cameras_at, depth_of_plane, four_cameras, slanted_plane, texture
 
 from asysplat.models.prior.plane_sweep import plane_sweep
@@ -135,7 +134,7 @@ def test_a_textured_plane_is_found(stride):
     assert found.confidence.median() > 0.9 and found.confidence.mean() > 0.85
 
 
-def test_exposure_changes_nothing_much():
+def test_exposure_changes_little():
     cameras = four_cameras()
     images, depth = slanted_plane(cameras)
     gain = torch.tensor([1, 0.6, 0.8, 1], dtype=torch.float64).view(1, 4, 1, 1, 1)
@@ -146,8 +145,8 @@ def test_exposure_changes_nothing_much():
     assert found.confidence.mean() > 0.9
 
 
-def test_what_is_hidden_is_less_certain():
-    """A square before a wall, seen by two cameras: some of the wall is seen by one alone."""
+def test_occluded_points_have_less_confidence():
+    """A square in front of a wall: one of two cameras sees some of the wall alone."""
     cameras = cameras_at([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0)])
     wall, wall_points = depth_of_plane(cameras, 3.0)
     square, square_points = depth_of_plane(cameras, 1.5)
@@ -159,7 +158,7 @@ def test_what_is_hidden_is_less_certain():
     images = torch.where(
         covered[:, :, None], texture(square_points, scale=0.5, seed=1), texture(wall_points)
     )
-    # Where the other camera's ray to the wall goes through the square's plane.
+    # Points of the wall that the square occludes in the other view.
     other = cameras.centers.flip(1)[..., None, None, :]
     hidden = within(other + (wall_points - other) / 2) & ~covered
     open_wall = ~hidden & ~covered
@@ -168,7 +167,7 @@ def test_what_is_hidden_is_less_certain():
     assert found.confidence[hidden].mean() < 0.75 * found.confidence[open_wall].mean()
 
 
-def test_a_unit_of_length_is_as_good_as_another():
+def test_results_scale_with_the_unit_of_length():
     cameras = four_cameras()
     images, _ = slanted_plane(cameras)
     at_one = plane_sweep(images, cameras)
@@ -184,7 +183,7 @@ def test_a_unit_of_length_is_as_good_as_another():
             torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-6)
 
 
-def test_scenes_of_a_batch_do_not_meet():
+def test_scenes_of_a_batch_are_independent():
     cameras = four_cameras()
     scenes = [slanted_plane(cameras, seed=seed)[0].float() for seed in range(2)]
     both = Cameras(
@@ -204,10 +203,4 @@ def test_scenes_of_a_batch_do_not_meet():
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
 def test_kernels_in_the_interpreter():
     pytest.importorskip("triton")
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", __file__, "-k", "cuda"],
-        env={**os.environ, "TRITON_INTERPRET": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout
+    run_interpreted(__file__, "-k", "cuda")

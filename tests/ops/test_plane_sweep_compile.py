@@ -1,5 +1,4 @@
-"""The plane sweep's kernels compile for GPUs that are not at hand: what the interpreter takes, the
-compiler may not."""
+"""The plane sweep's kernels compile for GPUs: the interpreter accepts more than the compiler."""
 
 import pytest
 import torch

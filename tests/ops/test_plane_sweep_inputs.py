@@ -1,4 +1,4 @@
-"""What is computed once for a whole sweep: smaller images, their edges, and projections."""
+"""The inputs of a plane sweep: shrunk images, their edges, and projections."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ def test_smaller_images_are_means_over_areas(size):
     torch.testing.assert_close(shrink(images, *size), F.interpolate(images, size, mode="area"))
 
 
-def test_edges_are_where_the_color_changes():
+def test_edges_are_color_changes():
     images = torch.zeros(1, 1, 3, 4, 5)
     images[..., 2:] = torch.tensor([0.3, 0.6, 0.9])[:, None, None]
     left, above = edges(images)[0, 0]
@@ -25,8 +25,8 @@ def test_edges_are_where_the_color_changes():
     torch.testing.assert_close(edges(images.mT)[0, 0, 1], left.T)
 
 
-def test_projections_are_of_every_size():
-    """As those of cameras that are resized, and as points that are projected one by one."""
+def test_projections_for_images_of_any_size():
+    """They equal those of resized cameras, and points projected one by one."""
     cameras = turned(four_cameras(), 20)
     cameras = Cameras(
         cameras.intrinsics * torch.tensor([1, 1.2, 1])[:, None], cameras.cam_to_world, 24, 32

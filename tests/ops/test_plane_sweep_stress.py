@@ -1,4 +1,4 @@
-"""Views that say little or nothing of depth: the plane sweep knows that, and never fails."""
+"""Views without depth information: low confidence and no failure."""
 
 import inspect
 
@@ -39,12 +39,12 @@ def sweep(cameras, backend, images=None):
 
 
 @pytest.mark.parametrize("views", [1, 2, 5])
-def test_nothing_is_known_without_parallax(backend, views):
+def test_no_depth_without_parallax(backend, views):
     found = sweep(cameras_at([(0.3, -2.0, 1.0)] * views), backend)
     assert not found.confidence.any() and not found.inverse_depth.any()
 
 
-def test_nothing_is_known_of_what_no_other_view_sees(backend):
+def test_no_depth_of_points_in_one_view_alone(backend):
     ahead = cameras_at([(0.0, 0.0, 1.0)])
     behind = turned(cameras_at([(0.0, 0.0, -1.0)]), 180)
     found = sweep(joined(ahead, behind), backend)
@@ -86,14 +86,14 @@ def test_cameras_of_different_focal_lengths(backend):
 
 
 @pytest.mark.parametrize("value", [0.0, 0.37, 1.0])
-def test_blank_images_say_nothing(backend, value):
+def test_blank_images_have_no_confidence(backend, value):
     cameras = four_cameras()
     found = sweep(cameras, backend, torch.full((1, 4, 3, cameras.height, cameras.width), value))
     assert found.confidence.max() < 0.05
 
 
 @pytest.mark.parametrize("value", [0.37, 0.99])
-def test_rounding_of_blank_images_says_nothing(backend, value):
+def test_nearly_blank_images_have_no_confidence(backend, value):
     """Its variance is 1e-12: beside the squares of the pixels it would be noise of 1e-7."""
     cameras = four_cameras()
     images = value + 1e-6 * torch.rand(1, 4, 3, cameras.height, cameras.width)
@@ -106,7 +106,7 @@ def test_blank_images_give_numbers(backend, value):
     sweep(cameras, backend, torch.full((1, 4, 3, cameras.height, cameras.width), value))
 
 
-def test_noise_is_believed_less_than_texture(backend):
+def test_noise_has_less_confidence_than_texture(backend):
     cameras = four_cameras()
     noise = sweep(cameras, backend).confidence.mean()
     assert noise < 0.75 * sweep(cameras, backend, slanted_plane(cameras)[0]).confidence.mean()
@@ -128,7 +128,7 @@ def test_any_number_of_threads_gives_the_same_bits():
         assert torch.equal(other.confidence, found[0].confidence)
 
 
-def test_shapes_on_a_device_without_content():
+def test_shapes_on_the_meta_device():
     cameras = four_cameras().to("meta", torch.float32)
     images = torch.empty(1, 4, 3, cameras.height, cameras.width, device="meta")
     found = plane_sweep(images, cameras, stride=4)
@@ -157,8 +157,8 @@ def test_shapes_on_a_device_without_content():
         ),
     ],
 )
-def test_input_that_cannot_be_swept(change, message):
+def test_bad_input(change, message):
     arguments = {"images": torch.zeros(1, 4, 3, 24, 32), "cameras": four_cameras()} | change
     with pytest.raises(InputError, match=message):
-        # Behind the back of the tests' type checker, which would be first to complain.
+        # Without the tests' type checker, which would raise first.
         inspect.unwrap(plane_sweep)(**arguments)

@@ -1,7 +1,8 @@
-"""Adam for CPUs (Numba): a task takes blocks of rows, a vector sixteen numbers that lie together.
+"""Adam for CPUs (Numba): a task takes blocks of rows, a vector sixteen neighboring numbers.
 
-Sixteen rows of K numbers are K vectors; a row of sixteen numbers or more is taken by itself. In all
-tensors a block's gradients are looked through before one is changed; they are in the cache then.
+Sixteen rows of K numbers are K vectors; a row of sixteen numbers or more is updated alone. The
+gradients of a block are checked in all tensors before the update, which then finds them in the
+cache.
 """
 
 import math
@@ -32,11 +33,11 @@ from asysplat.ops.simd.vectors import (
 )
 
 BLOCK = 1024  # rows
-ROUNDING = 2.0**-25  # what is less does not change 1 in float32
+ROUNDING = 2.0**-25  # adding less does not change 1 in float32
 
 
 class FlatRows(NamedTuple):
-    """`Rows` as [N * K] each, and of the K numbers of LANES rows, [K, LANES], rates and rows."""
+    """`Rows`, each as [N * K], with the rates and row numbers of LANES rows, [K, LANES]."""
 
     parameter: np.ndarray
     gradient: np.ndarray
@@ -48,7 +49,7 @@ class FlatRows(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """AdamSettings, 1 - beta as `new`; [steps, 2] what a step's mean and root are multiplied by."""
+    """AdamSettings, 1 - beta as `new`, and the factors [steps, 2] of a step's mean and root."""
 
     beta2: np.float32
     new1: np.float32
@@ -57,8 +58,10 @@ class Constants(NamedTuple):
     corrections: np.ndarray
 
 
-def adam_step_cpu(tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: AdamSettings) -> int:
-    """Update the rows that were seen; see `asysplat.ops.adam.adam_step`."""
+def adam_step_cpu(
+    tensors: Sequence[Rows], visible: Bool[Tensor, "N"], settings: AdamSettings
+) -> int:
+    """Update the visible rows; see `asysplat.ops.adam.adam_step`."""
     flat = tuple(
         FlatRows(
             *(tensor.view(-1).numpy() for tensor in rows[:4]),
@@ -68,8 +71,8 @@ def adam_step_cpu(tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: Ad
         )
         for rows in tensors
     )
-    blocks = even_bounds(-(-len(seen) // BLOCK))
-    return sum(run_blocks(update_blocks, blocks, flat, seen.numpy(), _constants(settings)))
+    blocks = even_bounds(-(-len(visible) // BLOCK))
+    return sum(run_blocks(update_blocks, blocks, flat, visible.numpy(), _constants(settings)))
 
 
 @cache
@@ -79,10 +82,10 @@ def _rows_of_numbers(numbers: int) -> np.ndarray:
 
 @cache
 def _constants(settings: AdamSettings) -> Constants:
-    """Tabulate 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t), up to a step from where they are 1."""
+    """Tabulate 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t), up to a step after which they are 1."""
     slowest = max(settings.beta1, settings.beta2, ROUNDING)
     t = np.arange(2 + math.ceil(math.log(ROUNDING) / math.log(slowest)))
-    t[0] = 1  # is not used: a row's first step is 1
+    t[0] = 1  # unused: a row's first step is 1
     first, second = 1 - settings.beta1**t, 1 - settings.beta2**t
     return Constants(
         beta2=np.float32(settings.beta2),
@@ -94,47 +97,47 @@ def _constants(settings: AdamSettings) -> Constants:
 
 
 @kernel
-def update_blocks(start, stop, tensors, seen, constants):
-    """Update the rows of the blocks start to stop; return how many were seen and are not finite.
+def update_blocks(start, stop, tensors, visible, constants):
+    """Update the rows of the blocks start to stop; return how many visible ones are not finite.
 
     Args:
         tensors: a tuple of `FlatRows`.
-        seen: [N].
+        visible: [N].
         constants: see `Constants`.
     """
     alive = np.zeros(BLOCK, np.bool_)
     factors = np.zeros((1, BLOCK, 2), np.float32)
-    skipped = 0
+    dropped_rows = 0
     for block in range(start, stop):
         first = block * BLOCK
-        rows = min(BLOCK, len(seen) - first)
-        alive[:rows] = seen[first : first + rows]
+        rows = min(BLOCK, len(visible) - first)
+        alive[:rows] = visible[first : first + rows]
         alive[rows:] = False
         for k in range(len(tensors)):
-            skipped += _drop_not_finite(alive, tensors[k], first)
+            dropped_rows += _drop_not_finite(alive, tensors[k], first)
         for k in range(len(tensors)):
             _count(factors, alive, tensors[k], first, constants.corrections)
             _update(factors, alive, tensors[k], first, constants)
-    return skipped
+    return dropped_rows
 
 
 @inline
 def _rows_at_a_time(numbers):
-    """Say how many rows make whole vectors: LANES, or if one fills a vector, itself is enough."""
+    """Return how many rows make whole vectors: LANES, or 1 if a row fills a vector."""
     return LANES if numbers < LANES else 1
 
 
 @inline
 def _any(flags, first, count):
-    found = False
+    result = False
     for i in range(first, first + count):
-        found |= flags[i]
-    return found
+        result |= flags[i]
+    return result
 
 
 @inline
 def _drop_not_finite(alive, tensor, first):
-    """Take rows whose gradient is not finite out of `alive`; return how many."""
+    """Remove rows with a non-finite gradient from `alive`; return their number."""
     numbers, size = len(tensor.rates), len(tensor.gradient)
     rows = _rows_at_a_time(numbers)
     dropped = 0
@@ -158,19 +161,19 @@ def _drop_not_finite(alive, tensor, first):
 
 @inline
 def _count(factors, alive, tensor, first, corrections):
-    """Count the step of each row and write its corrections; the first is 0 if it is not updated."""
+    """Count each row's step and write its corrections; the first is 0 if the row is not updated."""
     last = np.int32(len(corrections) - 1)
     for row in range(min(len(alive), len(tensor.steps) - first)):
         steps = tensor.steps[first + row] + np.int32(alive[row])
         tensor.steps[first + row] = steps
-        known = np.uint32(min(steps, last))
-        factors[0, row, 0] = corrections[known, 0] * np.float32(alive[row])
-        factors[0, row, 1] = corrections[known, 1]
+        index = np.uint32(min(steps, last))
+        factors[0, row, 0] = corrections[index, 0] * np.float32(alive[row])
+        factors[0, row, 1] = corrections[index, 1]
 
 
 @inline
 def _update(factors, alive, tensor, first, constants):
-    """Update the rows that are `alive`."""
+    """Update the `alive` rows."""
     numbers, size = len(tensor.rates), len(tensor.parameter)
     rows = _rows_at_a_time(numbers)
     for row in range(0, len(alive), rows):

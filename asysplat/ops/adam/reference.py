@@ -1,4 +1,4 @@
-"""Adam as its formulas, in torch: for any device and float type."""
+"""Adam by its formulas in torch, for any device and float type."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,14 +9,14 @@ from torch import Tensor
 
 
 class Rows(NamedTuple):
-    """A tensor of N rows, each K numbers, and what Adam knows of it.
+    """A tensor of N rows of K numbers, with its gradient and the state of Adam.
 
     Args:
-        parameter: is changed, as `mean`, `square` and `steps` are.
-        gradient: of what is minimized.
+        parameter: updated in place, like `mean`, `square` and `steps`.
+        gradient: of the loss.
         mean, square: the decaying averages of the gradient and of its square.
-        steps: how often each row was updated.
-        rates: of each number of a row, >= 0.
+        steps: number of updates of each row.
+        rates: learning rate of each number of a row, >= 0.
     """
 
     parameter: Float[Tensor, "N K"]
@@ -28,7 +28,7 @@ class Rows(NamedTuple):
 
 
 class AdamSettings(NamedTuple):
-    """How fast both averages decay, each in [0, 1), and what is added to the square's root, > 0."""
+    """The decay of both averages, in [0, 1), and the term > 0 added to the root of the square."""
 
     beta1: float
     beta2: float
@@ -36,11 +36,11 @@ class AdamSettings(NamedTuple):
 
 
 def adam_step_reference(
-    tensors: Sequence[Rows], seen: Bool[Tensor, "N"], settings: AdamSettings
+    tensors: Sequence[Rows], visible: Bool[Tensor, "N"], settings: AdamSettings
 ) -> int:
-    """Update the rows that were seen; see `asysplat.ops.adam.adam_step`."""
+    """Update the visible rows; see `asysplat.ops.adam.adam_step`."""
     finite = torch.stack([rows.gradient.isfinite().all(1) for rows in tensors]).all(0)
-    index = (seen & finite).nonzero().squeeze(1)
+    index = (visible & finite).nonzero().squeeze(1)
     for parameter, gradient, mean, square, steps, rates in tensors:
         steps[index] += 1
         t = steps[index, None].to(parameter.dtype)
@@ -50,4 +50,4 @@ def adam_step_reference(
         corrected_mean = mean[index] / (1 - settings.beta1**t)
         corrected_square = square[index] / (1 - settings.beta2**t)
         parameter[index] -= rates * corrected_mean / (corrected_square.sqrt() + settings.eps)
-    return int((seen & ~finite).sum())
+    return int((visible & ~finite).sum())

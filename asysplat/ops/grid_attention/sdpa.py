@@ -33,7 +33,7 @@ def grid_attention_sdpa(
 def _real_tokens(
     height: int, width: int, grid: int, padded: Float[Tensor, "B V h w H P"]
 ) -> Bool[Tensor, "place 1 1 key"]:
-    """Return which keys of a grid place are no padding; all where it has nothing else to see."""
+    """Return which keys of a grid place are no padding; all of them if all are padding."""
     batch, views, rows, columns = padded.shape[:4]
     real = torch.zeros(rows, columns, dtype=torch.bool, device=padded.device)
     real[:height, :width] = True

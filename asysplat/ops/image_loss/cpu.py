@@ -1,14 +1,14 @@
-"""Loss and gradient for CPUs (Numba), in one pass: a task takes a band of rows of a channel.
+"""Loss and gradient for CPUs (Numba) in one pass: a task takes a band of rows of a channel.
 
 Of the sum s = x + y and the difference d = x - y of both images, with their means S, D and their
 variances V, U in a window, SSIM is
 
     (1 - D^2 / P) (1 - U / Q),  P = (S^2 + D^2) / 2 + C1,  Q = (V + U) / 2 + C2.
 
-Nothing cancels in it where the images are alike, nor in a variance: it is the mean of those within
-the window's columns and that of the columns' means. The gradient of 1 - SSIM is at each pixel
-a + b d + c s, where a, b and c are sums over its windows; what they are for one window follows from
-S, D, V and U.
+Nothing cancels where the images are alike, nor in a variance, which is the mean of the variances
+within the window's columns plus the variance of the columns' means. The gradient of 1 - SSIM at
+each pixel is a + b d + c s, where a, b and c are sums over its windows; for one window they follow
+from S, D, V and U.
 """
 
 from typing import NamedTuple
@@ -36,7 +36,7 @@ from asysplat.ops.simd.vectors import (
     zeros,
 )
 
-BAND = 64  # rows of a task; for their gradients it also takes the windows that begin above
+BAND = 64  # rows of a task; for their gradients it also computes the windows that begin above
 REACH = SIZE - 1
 WINDOW = window_weights().float().numpy()
 C1, C2 = np.float32(reference.C1), np.float32(reference.C2)
@@ -51,7 +51,7 @@ class Images(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """What |d| of a pixel and 1 - SSIM of a window weigh in the loss."""
+    """The weights of a pixel's |d| and a window's 1 - SSIM in the loss."""
 
     pixel: np.float32
     window: np.float32
@@ -67,7 +67,7 @@ class Statistics(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """What each window adds to a, b and c: those of a row [width], or summed along rows."""
+    """The terms of each window in a, b and c, of a row [width], or summed along rows."""
 
     a: np.ndarray
     b: np.ndarray
@@ -85,7 +85,7 @@ def image_loss_cpu(
 
 
 class _ImageLoss(torch.autograd.Function):
-    """The loss, which leaves nothing but its gradient for the backward pass."""
+    """The loss, which saves only its gradient for the backward pass."""
 
     @staticmethod
     def forward(ctx, rendered, target, ssim_weight, keep):
@@ -121,15 +121,15 @@ def compare_bands(start, stop, images, weights, sums, gradient):
     Args:
         images, weights: see `Images` and `Weights`.
         sums: [bands, 2], written: of |d| over a band's pixels, and of 1 - SSIM over the windows
-            that begin in it.
-        gradient: of the loss, as `images.rendered`, written; None costs nothing.
+            that begin in the band.
+        gradient: of the loss, shaped as `images.rendered`, written; or None.
     """
     _, H, W = images.rendered.shape
     bands = -(-H // BAND)
     windows = H - REACH if weights.window > ZERO else 0  # rows of them
-    above = REACH if gradient is not None else 0  # rows of windows that reach into a band
+    above = REACH if gradient is not None else 0  # rows of windows that overlap a band
     width = -(-W // LANES) * LANES
-    # What lies beyond the image, and windows that are not wholly inside it, are zeros.
+    # Pixels beyond the image, and windows not wholly inside it, are zeros.
     padded = np.zeros((7, width + LANES), np.float32)
     columns = Statistics(padded[0], padded[1], padded[2], padded[3])
     factors = Factors(padded[4], padded[5], padded[6])
@@ -143,8 +143,8 @@ def compare_bands(start, stop, images, weights, sums, gradient):
             row, inside = y - (top - above), 0 <= y < windows
             if inside:
                 _compare_columns(columns, images, (plane * H + y) * W)
-                found = _compare_windows(factors, columns, W - REACH)
-                dissimilar += found if y >= top else 0.0
+                row_sum = _compare_windows(factors, columns, W - REACH)
+                dissimilar += row_sum if y >= top else 0.0
             if gradient is not None and inside:
                 _sum_along_row(sums_along, row, factors)
             elif gradient is not None:
@@ -158,7 +158,7 @@ def compare_bands(start, stop, images, weights, sums, gradient):
 
 @inline
 def _compare_columns(columns, images, first):
-    """Write the statistics of columns of SIZE pixels, the topmost of which begin at `first`."""
+    """Write the statistics of columns of SIZE pixels whose top row begins at `first`."""
     W = images.rendered.shape[2]
     for x in range(0, W, LANES):
         count = min(LANES, W - x)
@@ -231,7 +231,7 @@ def _sum_along_row(sums, row, factors):
 def _finish_row(gradient, sums, row, images, first, weights):
     """Return the sum of |d| over the row of pixels at `first`; write its gradient.
 
-    Its windows are those of the rows `row` and below of `sums`.
+    Its windows are in `sums` from `row` on.
     """
     W, width = images.rendered.shape[2], sums.a.shape[1]
     absolute = zeros()
@@ -242,7 +242,7 @@ def _finish_row(gradient, sums, row, images, first, weights):
         d = rendered - target
         absolute = absolute + max(d, ZERO - d)
         if gradient is not None:
-            # Of 0 and of NaN it is that itself.
+            # The sign of 0 is 0, that of NaN is NaN.
             sign = where(less(zeros(), d), zeros() + ONE, where(less(d, zeros()), zeros() - ONE, d))
             a, b, c = zeros(), zeros(), zeros()
             if weights.window > ZERO:

@@ -1,12 +1,12 @@
-"""The loss of images as the formula, in torch: for any device and float type."""
+"""The image loss by its formula in torch, for any device and float type."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-SIZE = 11  # of a window, in pixels on a side
+SIZE = 11  # pixels along a side of a window
 SIGMA = 1.5
-C1, C2 = 0.01**2, 0.03**2  # of Wang et al. 2004, for a data range of 1
+C1, C2 = 0.01**2, 0.03**2  # Wang et al. 2004, for a data range of 1
 
 
 def window_weights() -> Float[Tensor, "11"]:
@@ -29,7 +29,7 @@ def image_loss_reference(
 
 
 def _ssim(x: Float[Tensor, "*batch 3 H W"], y: Float[Tensor, "*batch 3 H W"]) -> Tensor:
-    """Compute the SSIM of each window that lies wholly inside the image (Wang et al. 2004)."""
+    """Compute the SSIM of each window inside the image (Wang et al. 2004)."""
     mean_x, mean_y = _blur(x), _blur(y)
     variance_x, variance_y = _blur(x * x) - mean_x**2, _blur(y * y) - mean_y**2
     covariance = _blur(x * y) - mean_x * mean_y

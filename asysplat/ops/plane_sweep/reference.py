@@ -93,7 +93,7 @@ def _compare(
     x, y, z = points.unbind(1)
     front = z.clamp_min(FRONT)
     x, y = x / front, y / front
-    seen = (z > FRONT) & (x > 0) & (x < W) & (y > 0) & (y < H)
+    visible = (z > FRONT) & (x > 0) & (x < W) & (y > 0) & (y < H)
     places = torch.stack((x / W, y / H), dim=-1).clamp(-1, 2) * 2 - 1
     warped = F.grid_sample(
         other.expand(len(places), 1, H, W), places, padding_mode="border", align_corners=False
@@ -103,7 +103,7 @@ def _compare(
     variance = patch_mean(image**2) - mean**2
     other_variance = patch_mean(warped**2) - other_mean**2
     norm = (variance.clamp_min(0) + NOISE) * (other_variance.clamp_min(0) + NOISE)
-    return torch.where(seen, 1 - both / norm.sqrt(), UNSEEN)
+    return torch.where(visible, 1 - both / norm.sqrt(), UNSEEN)
 
 
 def patch_mean(values: Float[Tensor, "*more H W"]) -> Float[Tensor, "*more H W"]:

@@ -1,4 +1,4 @@
-"""Selective scan of Mamba (Gu and Dao 2023, Eq. 2), as MambaVision uses it within a frame."""
+"""Selective scan of Mamba (Gu and Dao 2023, Eq. 2), which MambaVision applies within each image."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -9,7 +9,7 @@ from asysplat.ops.selective_scan.reference import selective_scan_reference
 
 
 def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int, int]:
-    """Count a multiplication and an addition for each new state, and for each that is read.
+    """Count a multiplication and an addition to update each state, and to read it.
 
     The backward pass computes the states again, and four gradients.
     """
@@ -38,17 +38,17 @@ def selective_scan(
     """Scan h_t = exp(dt_t A) h_{t-1} + dt_t B_t x_t, y_t = C_t . h_t + D x_t, per channel.
 
     Args:
-        x: inputs; half precision is computed in fp32 and returned as it came.
+        x: inputs; half precision is computed in fp32, returned in the same type.
         dt: step sizes > 0, after the softplus.
         A: < 0, so that no exponent is positive.
         B, C: input and output projections, shared by the channels.
         D: skip weight of each channel.
         backend: "cpu" or "cuda", "chunked" (torch, any device and float type), "reference", or
-            "auto", which is the fast one for the device, and "chunked" for float64.
+            "auto": the kernels of the device, and "chunked" for float64.
         reverse: scan from the last token to the first.
 
     Raises:
         InputError: an unknown backend, or one that cannot take these tensors; shapes or devices
-            that do not go together; integers; no token.
+            that do not fit together; integers; no token.
     """
     return _SCAN(ScanInputs(x, dt, A, B, C, D), backend, reverse)

@@ -1,7 +1,7 @@
 """The selective scan in torch, a chunk of tokens at a time: any device, any float type.
 
-Within a chunk everything but the recurrence itself is done for all tokens at once. The backward
-pass computes a chunk again, so that the states of one chunk alone are in memory.
+Within a chunk only the recurrence is sequential. The backward pass computes each chunk again, so
+that only the states of one chunk are in memory.
 """
 
 import torch
@@ -31,7 +31,7 @@ def selective_scan_chunked(inputs: ScanInputs) -> Float[Tensor, "B L D"]:
 def _chunk(
     x: Tensor, dt: Tensor, B: Tensor, C: Tensor, A: Tensor, D: Tensor, state: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return y of the chunk, and the state after it."""
+    """Return y of a chunk, and the state after it."""
     # Time comes first, so that each step of the recurrence reads contiguous memory.
     xs, dts, Bs, Cs = (tensor.transpose(0, 1) for tensor in (x, dt, B, C))
     decay = torch.exp(dts[..., None] * A)

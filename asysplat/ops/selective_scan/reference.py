@@ -1,4 +1,4 @@
-"""The selective scan as its formula reads, one token after the other."""
+"""The selective scan by its formula, token by token."""
 
 import torch
 from jaxtyping import Float

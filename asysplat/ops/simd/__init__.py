@@ -1,1 +1,1 @@
-"""What all kernels for CPUs have in common: how they are compiled (Numba), threads and vectors."""
+"""The toolkit of the CPU kernels (Numba): compilation, threads, vectors, gathers, products."""

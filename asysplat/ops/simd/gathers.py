@@ -1,12 +1,20 @@
-"""Numbers at sixteen places of an image at once, two neighbors in one read."""
+"""Gathers from sixteen places of an image at once, two neighbors in one read."""
 
 import numba
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
-from asysplat.ops.simd.vectors import FLOATS, INTEGERS, LANES, VECTOR, check_range, lanes, splat
+from asysplat.ops.simd.vectors import (
+    FLOATS,
+    INTEGERS,
+    LANES,
+    VECTOR,
+    call_llvm,
+    check_range,
+    lanes,
+    splat,
+)
 
 HALF = LANES // 2
 PAIR = ir.IntType(64)
@@ -17,7 +25,7 @@ def gather_pairs(typing_context, image, y, x):
     """Return both numbers at LANES places of a contiguous array [H, W, 2].
 
     Args:
-        y, x: vectors of the places, >= 0; what they have beside whole numbers does not count.
+        y, x: vectors of the places, >= 0, rounded down.
     """
 
     def generate(context, builder, signature, args):
@@ -36,8 +44,8 @@ def gather_squares(typing_context, image, y, x):
         y, x: vectors of the places, from 0 to less than H - 1 and W - 1.
 
     Returns:
-        The numbers above on the left and right, and below; how far the place is below and right of
-        the first, in [0, 1).
+        The numbers above left and right, and below left and right; the place relative to the first,
+        down and right, in [0, 1).
     """
 
     def generate(context, builder, signature, args):
@@ -56,7 +64,7 @@ def gather_squares(typing_context, image, y, x):
 
 
 class _Image:
-    """A contiguous float32 array [H, W] or [H, W, 2], in the code that is generated."""
+    """A contiguous float32 array [H, W] or [H, W, 2] in generated code."""
 
     def __init__(self, context, builder, signature, args):
         self.context, self.builder = context, builder
@@ -72,19 +80,17 @@ class _Image:
         return self.builder.add(self.builder.mul(row, self.width), column)
 
     def pairs(self, index: ir.Value, kind: ir.Type) -> list[ir.Value]:
-        """Return the numbers at indices, and those after them; a pair is read as one of 64 bits.
+        """Return the numbers at indices and those after them; a pair is read as one of 64 bits.
 
         Args:
-            index: counted in numbers or in pairs, as `kind` says.
+            index: in units of `kind`, numbers or pairs.
         """
         builder = self.builder
         self._check(index, kind)
         pointer = self.array.data
         pointers, bits = ir.VectorType(pointer.type, HALF), ir.VectorType(PAIR, HALF)
         every = ir.Constant(ir.VectorType(ir.IntType(1), HALF), [1] * HALF)
-        function = ir.FunctionType(bits, [pointers, ir.IntType(32), every.type, bits])
         name = f"llvm.masked.gather.v{HALF}i64.v{HALF}p0"
-        gather = cgutils.get_or_insert_function(builder.module, function, name)
         first = builder.insert_element(
             ir.Constant(pointers, ir.Undefined), pointer, ir.IntType(32)(0)
         )
@@ -94,8 +100,9 @@ class _Image:
             some = builder.shuffle_vector(index, index, lanes(begin, begin + HALF))
             places = builder.gep(base, [some], source_etype=kind)
             nothing = ir.Constant(bits, [0] * HALF)
-            found = builder.call(gather, [places, ir.IntType(32)(4), every, nothing])
-            halves.append(builder.bitcast(found, FLOATS))
+            align = ir.IntType(32)(4)
+            gathered = call_llvm(builder, bits, name, places, align, every, nothing)
+            halves.append(builder.bitcast(gathered, FLOATS))
         return [builder.shuffle_vector(*halves, lanes(k, 2 * LANES, 2)) for k in (0, 1)]
 
     def _check(self, index: ir.Value, kind: ir.Type) -> None:

@@ -1,4 +1,4 @@
-"""How every kernel for CPUs is compiled: once, kept on disk, and without Python's lock."""
+"""Compilation of the CPU kernels: cached on disk, and run without Python's global lock."""
 
 import hashlib
 import inspect
@@ -15,7 +15,7 @@ PACKAGE = HERE.parent.parent
 
 
 def kernel(function: Callable) -> Callable:
-    """Compile what threads run; with NUMBA_BOUNDSCHECK=1 every index is checked, for tests."""
+    """Compile a kernel for `run_blocks`; with NUMBA_BOUNDSCHECK=1 it checks every index."""
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = _cache_folder(before)
     try:
@@ -25,26 +25,26 @@ def kernel(function: Callable) -> Callable:
 
 
 def inline(function: Callable) -> Callable:
-    """Compile a function into each kernel that calls it."""
+    """Compile a function inline into each kernel that calls it."""
     return njit(inline="always", error_model="numpy")(_bare(function))
 
 
 def _bare(function: Callable) -> Callable:
-    """Take off what a type checker has put around a function, which cannot be compiled."""
+    """Remove a type checker's wrapper, which cannot be compiled."""
     return inspect.unwrap(function)
 
 
 @cache
-def _cache_folder(asked: str) -> str:
-    """Return the folder for this version of the sources, checked kernels in one of their own.
+def _cache_folder(parent: str) -> str:
+    """Return the folder for this version of the sources; bounds-checked kernels have their own.
 
-    Numba itself looks only at a kernel's own file: it would go on using a compiled kernel whose
-    parts, in other files, have changed.
+    Numba compares only a kernel's own file: it would reuse a kernel after changes of its parts in
+    other files.
     """
     paths = [path for folder in ("ops", "rendering") for path in (PACKAGE / folder).rglob("*.py")]
     sources = b"".join(path.read_bytes() for path in sorted(paths))
     beside = HERE / "__pycache__"
     home = Path.home() / ".cache" / "asysplat"
-    root = asked or (beside if os.access(HERE, os.W_OK) else home)
+    root = parent or (beside if os.access(HERE, os.W_OK) else home)
     checks = "-checked" if numba.config.BOUNDSCHECK else ""
     return str(Path(root) / f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}{checks}")

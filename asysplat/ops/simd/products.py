@@ -1,7 +1,7 @@
-"""Products of small matrices inside kernels, whose factors are in the cache already.
+"""Products of small matrices inside kernels, whose factors are in the cache.
 
 A tile of ROWS x LANES sums stays in registers, and every sum is taken in the order of its terms,
-rounded once a term: how the matrices are cut changes no bit.
+rounded once a term: the tiling changes no bit.
 """
 
 import llvmlite.binding
@@ -41,7 +41,7 @@ def add_product(out, a, b, keep):
 def add_triangle(out, a, b, upper):
     """Compute out += a b, where square `a` has zeros below its diagonal (`upper`) or above it.
 
-    Its side is a multiple of ROWS; beside the squares of ROWS on the diagonal, no zero is read.
+    Its side is a multiple of ROWS; of its zeros, only those in the diagonal tiles are read.
     """
     side = len(a)
     for column in range(0, out.shape[1], LANES):
@@ -79,7 +79,7 @@ def transpose_tile(typing_context, matrix, out, row, column):
             builder.load(source.vector(builder.add(row, row.type(i)), column), align=BYTES)
             for i in range(LANES)
         ]
-        # To put the second half's rows between those of the first, four times, swaps the indices.
+        # Interleaving the rows of both halves four times swaps the indices.
         half = LANES // 2
         for _ in range(LANES.bit_length() - 1):
             vectors = [
@@ -102,9 +102,9 @@ def _interleaved(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, first: int) ->
 
 
 def _tile(rows: int):
-    """Make the intrinsic that computes keep out + a b for rows x LANES numbers of `out`.
+    """Return the intrinsic that computes keep out + a b for rows x LANES numbers of `out`.
 
-    They begin at `row` and `column`; the terms summed are `first` to `last`.
+    They begin at `row` and `column`; the sum is over the terms `first` to `last`.
     """
 
     @intrinsic
@@ -129,12 +129,12 @@ def _generate_tile(builder, rows, matrices, row, column, first, last, keep):
     b.check(first, terms, column, LANES)
     numbers = [builder.add(row, row.type(i)) for i in range(rows)]
     places = [out.vector(number, column) for number in numbers]
-    # LLVM keeps in registers what is written to such places alone.
+    # LLVM keeps such local variables in registers.
     sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(rows)]
-    forget = builder.fcmp_ordered("==", keep, keep.type(0.0))
+    overwrite = builder.fcmp_ordered("==", keep, keep.type(0.0))
     for place, value in zip(places, sums, strict=True):
-        kept = builder.fmul(builder.load(place, align=BYTES), splat(builder, keep))
-        builder.store(builder.select(forget, ir.Constant(FLOATS, [0.0] * LANES), kept), value)
+        scaled = builder.fmul(builder.load(place, align=BYTES), splat(builder, keep))
+        builder.store(builder.select(overwrite, ir.Constant(FLOATS, [0.0] * LANES), scaled), value)
     with cgutils.for_range_slice(builder, first, last, first.type(1)) as (term, _):
         vector = builder.load(b.vector(term, column), align=BYTES)
         for number, value in zip(numbers, sums, strict=True):
@@ -145,7 +145,7 @@ def _generate_tile(builder, rows, matrices, row, column, first, last, keep):
 
 
 class _Matrix:
-    """A float32 array of any strides, in the code that is generated."""
+    """A float32 array of any strides in generated code."""
 
     def __init__(self, context: BaseContext, builder: ir.IRBuilder, kind: types.Array, value):
         array = context.make_array(kind)(context, builder, value)
@@ -155,7 +155,7 @@ class _Matrix:
         self.strides = [builder.extract_value(array.strides, axis) for axis in range(2)]
 
     def check(self, row, rows, column, columns) -> None:
-        """Check both ranges by `check_range`; counts are int or values of the generated code."""
+        """Check both ranges by `check_range`; counts are int or generated values."""
         for first, count, length in zip((row, column), (rows, columns), self.shape, strict=True):
             count = first.type(count) if isinstance(count, int) else count
             check_range(self.context, self.builder, first, count, length)

@@ -1,4 +1,4 @@
-"""Blocks of work on as many threads as torch has; the kernels let go of Python's lock."""
+"""Kernels on as many threads as torch uses."""
 
 import os
 import time
@@ -14,15 +14,15 @@ import numpy as np
 import torch
 
 Result = TypeVar("Result")
-PER_THREAD = 4  # portions of the work: other threads take more of them while one is slow
+PER_THREAD = 4  # portions of the work for each thread: the fast threads take more of them
 _timed: ContextVar[dict[str, float] | None] = ContextVar("_timed", default=None)
 
 
 def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:
     """Run `kernel(start, stop, *args)` for neighboring numbers of `bounds`, in any order.
 
-    The results are returned in the order of `bounds`.
-    What a kernel writes must depend on its range alone: then the number of threads changes no bit.
+    The results are returned in the order of `bounds`. A kernel's output must depend on its range
+    alone, so that the number of threads changes no bit.
     """
     seconds = _timed.get()
     if seconds is None:
@@ -47,7 +47,7 @@ def _run(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> li
 
 @contextmanager
 def time_kernels() -> Iterator[dict[str, float]]:
-    """Add up the seconds of the kernels that `run_blocks` runs meanwhile, by their names."""
+    """Sum the seconds of the kernels run by `run_blocks` in this context, by name."""
     seconds: dict[str, float] = {}
     before = _timed.set(seconds)
     try:
@@ -57,12 +57,12 @@ def time_kernels() -> Iterator[dict[str, float]]:
 
 
 def even_bounds(count: int) -> np.ndarray:
-    """Cut `count` blocks of equal cost into portions."""
+    """Divide `count` blocks of equal cost into portions."""
     return np.linspace(0, count, min(count, _portions()) + 1).astype(np.int64)
 
 
 def weighted_bounds(ends: np.ndarray) -> np.ndarray:
-    """Cut blocks whose costs add up to `ends`, [0, ..., total], into portions."""
+    """Divide blocks with cumulative costs `ends`, [0, ..., total], into portions."""
     targets = np.linspace(ends[0], ends[-1], _portions() + 1)
     bounds = np.searchsorted(ends, targets)
     bounds[0], bounds[-1] = 0, len(ends) - 1
@@ -76,7 +76,7 @@ def _portions() -> int:
 
 @cache
 def _pool(threads: int, caller: int) -> ThreadPoolExecutor:
-    """Return the threads of `caller`: those that compute side by side do not wait for another's."""
+    """Return the thread pool of a calling thread: callers do not wait for each other."""
     return ThreadPoolExecutor(threads, thread_name_prefix="asysplat")
 
 

@@ -1,6 +1,6 @@
-"""Sixteen float32 as one value of Numba's, which a loop keeps in a register.
+"""Sixteen float32 as one Numba value, which a loop keeps in a register.
 
-A float32 stands for sixteen equal ones wherever a vector is asked for.
+A float32 becomes sixteen equal ones wherever a vector is expected.
 """
 
 import operator
@@ -23,9 +23,9 @@ HAS_FMA = bool(llvmlite.binding.get_host_cpu_features().get("fma", True))
 FLOATS, INTEGERS = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(32), LANES)
 
 ZERO, ONE = np.float32(0), np.float32(1)
-# Added and taken away again, it rounds a float32 to an integer that stands in its lowest bits.
+# Adding and subtracting it rounds a float32 to an integer, which is in the lowest bits of the sum.
 ROUND = np.float32(1.5 * 2**23)
-UNDERFLOW = np.float32(-127)  # its exponent's bits, and with them all bits of `exp2`, are 0
+UNDERFLOW = np.float32(-127)  # all bits of its `exp2` are 0
 # 2^f on [-1/2, 1/2]: the Chebyshev interpolation, relative error 2e-9.
 P0, P1, P2, P3, P4, P5, P6 = (
     np.float32(c)
@@ -71,21 +71,26 @@ def _splat(context, builder, from_type, to_type, value):
     return splat(builder, value)
 
 
+def call_llvm(builder: ir.IRBuilder, result: ir.Type, name: str, *args: ir.Value, **options):
+    """Call an LLVM intrinsic such as llvm.sqrt.v16f32."""
+    kind = ir.FunctionType(result, [arg.type for arg in args])
+    function = cgutils.get_or_insert_function(builder.module, kind, name)
+    return builder.call(function, args, **options)
+
+
 def emit_fma(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
-    """Return a * b + c of vectors or float32, rounded once where the processor can do that."""
+    """Return a * b + c of vectors or float32, rounded once if the processor supports it."""
     if not HAS_FMA:
         return builder.fadd(builder.fmul(a, b), c)
     if a.type != FLOATS:
         return builder.fma(a, b, c)
-    function = ir.FunctionType(FLOATS, [FLOATS] * 3)
-    name = f"llvm.fma.v{LANES}f32"
-    return builder.call(cgutils.get_or_insert_function(builder.module, function, name), [a, b, c])
+    return call_llvm(builder, FLOATS, f"llvm.fma.v{LANES}f32", a, b, c)
 
 
 def check_range(context, builder, first, count, length) -> None:
-    """With NUMBA_BOUNDSCHECK=1, let the kernel raise IndexError for a range outside an array.
+    """With NUMBA_BOUNDSCHECK=1, raise IndexError in the kernel for a range outside an array.
 
-    It does unless `count` elements from `first` on are among `length`, as Numba does for one index.
+    That is, unless `count` elements from `first` on are among `length`.
     """
     if not numba.config.BOUNDSCHECK:
         return
@@ -97,7 +102,7 @@ def check_range(context, builder, first, count, length) -> None:
 
 @intrinsic
 def fma(typing_context, a, b, c):
-    """Return a * b + c of vectors or float32, rounded once where the processor can do that."""
+    """Return a * b + c of vectors or float32, rounded once if the processor supports it."""
     kind = VECTOR if VECTOR in (a, b, c) else a
 
     def generate(context, builder, signature, args):
@@ -133,11 +138,9 @@ def load_some(typing_context, numbers, first, count):
 
     def generate(context, builder, signature, args):
         pointer, mask = _some(context, builder, signature, args)
-        kind = ir.FunctionType(FLOATS, [pointer.type, ir.IntType(32), mask.type, FLOATS])
-        name = f"llvm.masked.load.v{LANES}f32.p0"
-        function = cgutils.get_or_insert_function(builder.module, kind, name)
         nothing = ir.Constant(FLOATS, [0.0] * LANES)
-        return builder.call(function, [pointer, ir.IntType(32)(4), mask, nothing])
+        name = f"llvm.masked.load.v{LANES}f32.p0"
+        return call_llvm(builder, FLOATS, name, pointer, ir.IntType(32)(4), mask, nothing)
 
     return VECTOR(numbers, first, count), generate
 
@@ -148,10 +151,8 @@ def store_some(typing_context, numbers, first, count, value):
 
     def generate(context, builder, signature, args):
         pointer, mask = _some(context, builder, signature, args)
-        kind = ir.FunctionType(ir.VoidType(), [FLOATS, pointer.type, ir.IntType(32), mask.type])
         name = f"llvm.masked.store.v{LANES}f32.p0"
-        function = cgutils.get_or_insert_function(builder.module, kind, name)
-        builder.call(function, [args[3], pointer, ir.IntType(32)(4), mask])
+        call_llvm(builder, ir.VoidType(), name, args[3], pointer, ir.IntType(32)(4), mask)
         return context.get_dummy_value()
 
     return types.void(numbers, first, count, VECTOR), generate
@@ -167,23 +168,52 @@ def zeros(typing_context):
     return VECTOR(), generate
 
 
-@intrinsic
-def total(typing_context, value):
-    """Return the sum of a vector's numbers."""
+def _unary(result: types.Type, emit: Callable[[ir.IRBuilder, ir.Value], ir.Value]):
+    """Return an intrinsic of one vector."""
 
-    def generate(context, builder, signature, args):
-        return sum_of(builder, args[0])
+    @intrinsic
+    def compute(typing_context, value):
+        def generate(context, builder, signature, args):
+            return emit(builder, args[0])
 
-    return types.float32(VECTOR), generate
+        return result(VECTOR), generate
+
+    return compute
 
 
 def sum_of(builder: ir.IRBuilder, vector: ir.Value) -> ir.Value:
     """Return the sum of a vector's numbers."""
-    kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), FLOATS])
-    name = f"llvm.vector.reduce.fadd.v{LANES}f32"
-    function = cgutils.get_or_insert_function(builder.module, kind, name)
-    # "reassoc" frees the compiler to add in the order that is fastest on the processor.
-    return builder.call(function, [ir.FloatType()(-0.0), vector], fastmath=("reassoc",))
+    start, name = ir.FloatType()(-0.0), f"llvm.vector.reduce.fadd.v{LANES}f32"
+    # "reassoc" lets the compiler add in the order that is fastest on the processor.
+    return call_llvm(builder, ir.FloatType(), name, start, vector, fastmath=("reassoc",))
+
+
+def _emit_sqrt(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    return call_llvm(builder, FLOATS, f"llvm.sqrt.v{LANES}f32", value)
+
+
+def _emit_rsqrt(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    root = _emit_sqrt(builder, value)
+    # "arcp" lets the compiler refine the processor's estimate, in a third of the time.
+    return builder.fdiv(ir.Constant(FLOATS, [1.0] * LANES), root, flags=("arcp",))
+
+
+def _emit_least(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    count = LANES
+    while count > 1:
+        count //= 2
+        halves = [
+            builder.shuffle_vector(value, value, lanes(first, first + count))
+            for first in (0, count)
+        ]
+        value = builder.select(builder.fcmp_ordered("<", *halves), *halves)
+    return builder.extract_element(value, ir.IntType(32)(0))
+
+
+total = _unary(types.float32, sum_of)  # the sum of a vector's numbers
+least = _unary(types.float32, _emit_least)  # the least of a vector's numbers
+sqrt = _unary(VECTOR, _emit_sqrt)  # the square root of every number
+rsqrt = _unary(VECTOR, _emit_rsqrt)  # 1 / sqrt(x) of every number, to a relative error of 3e-7
 
 
 def vector_at(context, builder, signature, args, step=LANES):
@@ -209,13 +239,13 @@ def _some(context, builder, signature, args):
     return pointer, builder.icmp_signed("<", lanes(0, LANES), splat(builder, few))
 
 
-def _arithmetic(symbol: Callable, instruction: str) -> None:
-    """Overload `symbol` for vectors."""
+def _overload(symbol: Callable, emit: Callable[..., ir.Value]) -> None:
+    """Overload an operator or function of two numbers for vectors."""
 
     @intrinsic
     def compute(typing_context, a, b):
         def generate(context, builder, signature, args):
-            return getattr(builder, instruction)(*args)
+            return emit(builder, *args)
 
         return VECTOR(VECTOR, VECTOR), generate
 
@@ -225,58 +255,13 @@ def _arithmetic(symbol: Callable, instruction: str) -> None:
             return lambda a, b: compute(a, b)
 
 
-_arithmetic(operator.add, "fadd")
-_arithmetic(operator.sub, "fsub")
-_arithmetic(operator.mul, "fmul")
-_arithmetic(operator.truediv, "fdiv")
-
-
-def _extremum(symbol: Callable, comparison: str) -> None:
-    """Overload `symbol`, max or min, for vectors: the second number where the first is NaN."""
-
-    @intrinsic
-    def choose(typing_context, a, b):
-        def generate(context, builder, signature, args):
-            return builder.select(builder.fcmp_ordered(comparison, *args), *args)
-
-        return VECTOR(VECTOR, VECTOR), generate
-
-    @overload(symbol)
-    def _(a, b):
-        if VECTOR in (a, b):
-            return lambda a, b: choose(a, b)
-
-
-_extremum(max, ">")
-_extremum(min, "<")
-
-
-def emit_sqrt(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
-    """Emit the square root of every number of a vector."""
-    kind, name = ir.FunctionType(FLOATS, [FLOATS]), f"llvm.sqrt.v{LANES}f32"
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [value])
-
-
-@intrinsic
-def sqrt(typing_context, value):
-    """Compute the square root of every number of a vector."""
-
-    def generate(context, builder, signature, args):
-        return emit_sqrt(builder, args[0])
-
-    return VECTOR(VECTOR), generate
-
-
-@intrinsic
-def rsqrt(typing_context, value):
-    """Compute 1 / sqrt(x) of every number of a vector, to 3e-7 of itself."""
-
-    def generate(context, builder, signature, args):
-        root = emit_sqrt(builder, args[0])
-        # "arcp" lets the compiler refine the processor's estimate, in a third of the time.
-        return builder.fdiv(ir.Constant(FLOATS, [1.0] * LANES), root, flags=("arcp",))
-
-    return VECTOR(VECTOR), generate
+_overload(operator.add, lambda builder, a, b: builder.fadd(a, b))
+_overload(operator.sub, lambda builder, a, b: builder.fsub(a, b))
+_overload(operator.mul, lambda builder, a, b: builder.fmul(a, b))
+_overload(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
+# Both give the second number where the first is NaN.
+_overload(max, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+_overload(min, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 
 
 @intrinsic
@@ -300,34 +285,15 @@ def where(typing_context, mask, yes, no):
     return VECTOR(MASK, VECTOR, VECTOR), generate
 
 
-@intrinsic
-def least(typing_context, value):
-    """Return the least of a vector's numbers."""
-
-    def generate(context, builder, signature, args):
-        (rest,) = args
-        count = LANES
-        while count > 1:
-            count //= 2
-            halves = [
-                builder.shuffle_vector(rest, rest, lanes(first, first + count))
-                for first in (0, count)
-            ]
-            rest = builder.select(builder.fcmp_ordered("<", *halves), *halves)
-        return builder.extract_element(rest, ir.IntType(32)(0))
-
-    return types.float32(VECTOR), generate
-
-
 def lanes(start: int, stop: int, step: int = 1) -> ir.Constant:
-    """Return a vector of whole numbers, such as those that choose others."""
+    """Return a vector of integers, such as the mask of a shuffle."""
     numbers = list(range(start, stop, step))
     return ir.Constant(ir.VectorType(ir.IntType(32), len(numbers)), numbers)
 
 
 @intrinsic
 def add_to_exponent(typing_context, value, number):
-    """Compute value * 2^n, where n stands in the lowest bits of `number`."""
+    """Compute value * 2^n, where n is in the lowest bits of `number`."""
 
     def generate(context, builder, signature, args):
         bits = INTEGERS if value == VECTOR else ir.IntType(32)
@@ -341,7 +307,7 @@ def add_to_exponent(typing_context, value, number):
 
 @inline
 def exp2(x):
-    """Compute 2^x for x from -126 to 126, to 8e-8 of itself."""
+    """Compute 2^x for x from -126 to 126, to a relative error of 8e-8."""
     shifted = x + ROUND
     f = x - (shifted - ROUND)
     p = fma(P6, f, P5)
@@ -355,5 +321,5 @@ def exp2(x):
 
 @inline
 def decay2(x):
-    """Compute 2^x for x <= 0, to 8e-8 of itself or 1e-38; 0 from UNDERFLOW on."""
+    """Compute 2^x for x <= 0, to a relative error of 8e-8 or 1e-38; 0 below UNDERFLOW."""
     return exp2(max(x, UNDERFLOW))

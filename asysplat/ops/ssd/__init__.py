@@ -16,17 +16,9 @@ def count_flops(x_shape: tuple[int, ...], B_shape: tuple[int, ...]) -> tuple[int
     within = 2 * tokens * CHUNK * heads * head_dim
     states = 4 * tokens * heads * head_dim * state_size
     forward = scores + within + states
-    # Scores and states again; then every product has two gradients, and the decays need what was
-    # read of the state.
+    # Scores and states again, two gradients for every product, and the states' outputs for the
+    # gradients of the decays.
     return forward, 3 * scores + 2 * within + 3 * states
-
-
-_SCAN = Scan(
-    "ssd",
-    axes={"x": "B L H P", "dt": "B L H", "A": "H", "B": "B L N", "C": "B L N", "D": "H"},
-    forms={"chunked": ssd_chunked, "reference": ssd_reference},
-    count_flops=count_flops,
-)
 
 
 def ssd(
@@ -42,18 +34,19 @@ def ssd(
     """Scan h_t = exp(dt_t A) h_{t-1} + dt_t B_t x_t^T, y_t = C_t h_t + D x_t, per head.
 
     Args:
-        x: inputs of H heads, P the head_dim; half precision is computed in fp32, returned as it
-            came.
-        dt: step sizes > 0, after the softplus.
-        A: < 0, so that no exponent is positive.
-        B, C: input and output projections, shared by the heads.
-        D: skip weight of each head.
-        backend: "cpu" or "cuda", "chunked" (torch, any device and float type), "reference", or
-            "auto", which is the fast one for the device, and "chunked" for float64.
-        reverse: scan from the last token to the first.
+        x: inputs of H heads, P the head_dim; half precision is computed in fp32, returned in the
+            same type.
+        dt, A, B, C, D, backend, reverse: see `selective_scan`, with heads in place of channels.
 
     Raises:
-        InputError: an unknown backend, or one that cannot take these tensors; shapes or devices
-            that do not go together; integers; no token.
+        InputError: see `selective_scan`.
     """
     return _SCAN(ScanInputs(x, dt, A, B, C, D), backend, reverse)
+
+
+_SCAN = Scan(
+    "ssd",
+    axes={"x": "B L H P", "dt": "B L H", "A": "H", "B": "B L N", "C": "B L N", "D": "H"},
+    forms={"chunked": ssd_chunked, "reference": ssd_reference},
+    count_flops=count_flops,
+)

@@ -12,7 +12,7 @@ from torch import Tensor
 from asysplat.ops.recurrence import linear_recurrence
 from asysplat.ops.scan import ScanInputs
 
-CHUNK = 64  # tokens of a chunk on every backend; FLOPs and the benchmark's floors assume it
+CHUNK = 64  # tokens of a chunk on every backend; the FLOP counts depend on it
 
 
 def ssd_chunked(inputs: ScanInputs) -> Float[Tensor, "B L H P"]:
@@ -51,8 +51,8 @@ def _into_chunks(tensor: Tensor) -> Tensor:
 def _decay_between(exponents: Float[Tensor, "b c q h"]) -> Float[Tensor, "b c q q h"]:
     """Return exp of the sum of exponents from token s (without) to token t >= s; 0 for later s.
 
-    They are sums, not differences of sums from the chunk's start: a token that forgets everything
-    would leave its rounding in all decays after it.
+    They are sums, not differences of sums from the chunk's start, in which a huge step would leave
+    its rounding error.
     """
     q = exponents.shape[2]
     ones = torch.ones(q, q, dtype=torch.bool, device=exponents.device)

@@ -1,4 +1,4 @@
-"""The SSD recurrence as its formula reads, one token after the other."""
+"""The SSD recurrence by its formula, token by token."""
 
 import torch
 from jaxtyping import Float

@@ -1,4 +1,4 @@
-"""Every stress case runs on every path: a scan, and a back end of it."""
+"""Every stress case runs on every path: a scan and one of its backends."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ def reverse(request) -> bool:
 
 @pytest.fixture
 def threads():
-    """Sets their number, until the test's end."""
+    """Set the number of threads until the test's end."""
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)

@@ -1,6 +1,6 @@
 """Both scans as one loop over the tokens, with gradients by hand: exact in float64, at any length.
 
-In float32 it shows what a plain loop makes of a case that is badly conditioned.
+In float32 it shows the error of a plain loop on a badly conditioned case.
 """
 
 import numba

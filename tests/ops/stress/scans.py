@@ -1,4 +1,4 @@
-"""The scans and back ends under test, their arguments, and what one makes of them both ways."""
+"""The scans and backends under test, their arguments, and both passes."""
 
 import os
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ PATHS = [(name, backend) for name in SCANS for backend in BACKENDS]
 EXACT_PATHS = [(name, backend) for name in SCANS for backend in ("reference", "chunked")]  # float64
 
 ERROR = {torch.float32: 2e-6, torch.bfloat16: 1e-2, torch.float16: 1e-2}  # relative, L2
-UNDERFLOW = 1e-30  # a smaller result may be 0: float32 cannot hold what it is a product of
+UNDERFLOW = 1e-30  # a smaller result may be 0: float32 cannot hold its factors
 
-# dt: about alike for all tokens, of every size, and tokens that forget among those that keep.
+# dt: about equal for all tokens, of every size, and a mixture of huge and tiny ones.
 STEPS = ("1e-8", "1e-4", "1", "1e3", "spread", "mixed")
 RATES = ("1e-4", "1e-2", "1", "1e4", "spread")  # -A
 
@@ -51,8 +51,8 @@ def make_arguments(
     """x, dt, A, B, C, D: x, B and C in `dtype`, the others in float32.
 
     Args:
-        steps, rates: dt and -A: a number, within a half of which they lie, or a name of STEPS or
-            RATES.
+        steps, rates: dt and -A: a number, from half to one and a half of which they are drawn, or
+            a name of STEPS or RATES.
         channels: heads, for ssd; each of `head_dim`.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -75,7 +75,7 @@ def make_arguments(
 
 
 def random_grad_output(x: Tensor) -> Tensor:
-    """A gradient of y, the same every time."""
+    """Return a gradient of y, the same every time."""
     return torch.randn(x.shape, generator=torch.Generator().manual_seed(9)).to(x.dtype)
 
 
@@ -85,7 +85,7 @@ def both_ways(
     grad_output: Tensor | None = None,
     reverse: bool = False,
 ) -> Result:
-    """What a back end gives, forward and backward from `grad_output`; a random one unless told."""
+    """Run a backend forward and backward from `grad_output`, by default a random one."""
     name, backend = path
     leaves = [argument.detach().clone().requires_grad_() for argument in arguments]
     y = SCANS[name](*leaves, backend=backend, reverse=reverse)
@@ -131,11 +131,11 @@ def assert_exact(
     reverse: bool = False,
     slack: float = 0,
 ) -> None:
-    """Finite, and within the error that is allowed, in the output and all gradients.
+    """Check that the output and all gradients are finite and within the allowed error.
 
     Args:
-        slack: for a case that is badly conditioned: an error that is larger than allowed, but not
-            than so many times that of the loop over the tokens in float32, passes too.
+        slack: for badly conditioned cases: an error up to so many times that of the loop in
+            float32 passes, too.
     """
     result = both_ways(path, arguments, grad_output, reverse)
     for name, value in result.named().items():

@@ -1,5 +1,4 @@
-"""Grid attention: all sizes and values against the formula in float64, on one grid place's tokens
-at a time."""
+"""Grid attention: all sizes and values against the formula in float64."""
 
 import inspect
 
@@ -25,7 +24,7 @@ def make_qkv(batch=2, views=3, height=4, width=6, heads=2, head_dim=8, dtype=tor
 
 
 def by_formula(q, k, v, grid):
-    """softmax(q k^T / sqrt(P)) v of the tokens of one grid place after the other."""
+    """Compute softmax(q k^T / sqrt(P)) v for one grid place at a time."""
     output = torch.empty_like(v)
     for i in range(min(grid, q.shape[2])):
         for j in range(min(grid, q.shape[3])):
@@ -67,7 +66,7 @@ def test_every_grid(backend, dtype, grid, batch, views):
 @pytest.mark.parametrize("height, width", [(1, 1), (1, 5), (3, 6), (5, 7), (7, 2)])
 @pytest.mark.parametrize("grid", [2, 3])
 def test_maps_that_the_grid_does_not_divide(backend, dtype, height, width, grid):
-    """Nothing of the padding is seen, not even where a grid place has no token."""
+    """Padding has no effect, not even where a grid place has no token."""
     assert_exact(backend, make_qkv(2, 3, height, width, dtype=dtype), grid)
 
 
@@ -87,7 +86,7 @@ def test_values_of_every_size(backend, dtype, factor):
 
 @per_backend
 @pytest.mark.parametrize("factor", [0, 1e-18])
-def test_queries_and_keys_that_say_nothing(backend, factor):
+def test_tiny_queries_and_keys(backend, factor):
     q, k, v = make_qkv()
     assert_exact(backend, (q * factor, k, v), 2)
     assert_exact(backend, (q, k * factor, v), 2)
@@ -120,7 +119,7 @@ def test_huge_scores(backend):
 
 @per_backend
 def test_constants(backend):
-    """Each token has the mean of the others; scores that all move together have gradient 0."""
+    """Each token gets the mean of the others; a common shift of all scores has gradient 0."""
     ones = [torch.ones_like(t) for t in make_qkv()]
     grad_output = torch.ones_like(ones[0])
     results = both_ways(lambda *t: grid_attention(*t, 2, backend=backend), ones, grad_output)
@@ -202,7 +201,7 @@ def test_permuting_views_and_heads(backend, order, seed):
 
 
 def unchecked(*arguments, **options):
-    """Behind the back of the tests' type checker, which would be first to complain."""
+    """Call it without the tests' type checker, which would raise first."""
     return inspect.unwrap(grid_attention)(*arguments, **options)
 
 
@@ -228,6 +227,6 @@ def test_bad_input(backend, name):
 
 @per_backend
 @pytest.mark.parametrize("grid", [0, -1])
-def test_grids_of_no_place(backend, grid):
+def test_bad_grids(backend, grid):
     with pytest.raises(InputError, match=rf"grid={grid}"):
         grid_attention(*make_qkv(), grid, backend)

@@ -26,7 +26,7 @@ def test_any_number_of_threads_gives_the_same_bits(path, threads, dtype, reverse
 
 @pytest.fixture
 def poisoned_memory(monkeypatch):
-    """Memory that nobody has written holds NaN."""
+    """Fill uninitialized memory with NaN."""
 
     def poisoned(shape, dtype=float, **options):
         array = allocate(shape, dtype, **options)

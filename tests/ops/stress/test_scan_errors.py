@@ -1,4 +1,4 @@
-"""What no scan can use: one error that names the argument, what it is and what was expected."""
+"""Bad inputs of a scan: one error that names the argument, its value and the expected one."""
 
 import inspect
 
@@ -10,7 +10,7 @@ from asysplat.errors import InputError
 
 
 def run(path, arguments):
-    """Behind the back of the tests' type checker, which would be first to complain."""
+    """Call it without the tests' type checker, which would raise first."""
     return inspect.unwrap(SCANS[path[0]])(*arguments, backend=path[1])
 
 
@@ -26,7 +26,7 @@ def test_sizes_that_do_not_fit(path, name, dimension):
     def longer(tensor):
         return torch.cat((tensor, tensor), min(dimension, tensor.ndim - 1))
 
-    # Where two tensors disagree on the size of a state, either may be named.
+    # If two tensors disagree on the size of a state, the error may name either.
     blamed = r"\w+" if name in "ABC" and dimension else name
     with pytest.raises(InputError, match=rf"{path[0]}'s {blamed} has shape \(.*\): expected [([]"):
         run(path, with_argument(path, name, longer))
@@ -64,7 +64,7 @@ def test_devices_that_differ(path, name):
 
 @pytest.mark.parametrize("backend", ["cpu", "cuda"])
 @pytest.mark.parametrize("name", SCANS)
-def test_float64_is_not_for_the_fast_ones(name, backend):
+def test_kernels_refuse_float64(name, backend):
     arguments = [argument.double() for argument in make_arguments(name, 7)]
     with pytest.raises(InputError, match=rf"{name}'s backend '{backend}' .* x is float64"):
         run((name, backend), arguments)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scans import EXACT_PATHS, SCANS, make_arguments
 
-# Within a chunk, over its end, and with tokens of which the next keeps nothing.
+# Within a chunk, over its end, and with steps that clear the state.
 CASES = {"short": (5, "0.1"), "long": (66, "0.1"), "forgetful": (66, "3")}
 
 

@@ -1,4 +1,4 @@
-"""Inputs as they come: strided, expanded, of other types, and those that need no gradient."""
+"""Strided and expanded inputs, other types, and inputs without gradients."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ def test_strided_inputs_and_gradient(path, reverse):
     exact = by_loop(path, arguments, reverse=reverse)
 
     def spread_out(tensor):
-        """Its dimensions in the opposite order, and a second number beside each."""
+        """Reverse the dimensions in memory and interleave a copy."""
         return torch.stack((tensor.permute(*range(tensor.ndim)[::-1]),) * 2, -1)
 
     def back(tensor):
@@ -74,7 +74,7 @@ def test_results_have_the_types_of_the_inputs(path, dtype):
     assert [grad.dtype for grad in result.grads] == [a.dtype for a in arguments]
 
 
-def test_the_inputs_are_left_alone(path):
+def test_the_inputs_do_not_change(path):
     arguments = make_arguments(path[0], 67)
     copies = [argument.clone() for argument in arguments]
     leaves = [argument.requires_grad_() for argument in arguments]

@@ -6,8 +6,8 @@ from scans import assert_exact, make_arguments
 
 pytestmark = pytest.mark.medium
 
-# Where a state is the sum of 10,000 tokens and more, each addition is rounded, and a float32 decay
-# next to 1 holds only the first digits of what is lost: no form comes within 2e-6.
+# A state that sums 10,000 tokens or more is rounded at each addition, and a float32 decay near 1
+# has few digits of its distance to 1: no form is within 2e-6.
 SLACK = 3
 
 

@@ -1,4 +1,4 @@
-"""What holds for any scan: the same result for the same scan said otherwise."""
+"""Properties of any scan: linearity, permutations, reversal, and splits of the batch."""
 
 import pytest
 import torch

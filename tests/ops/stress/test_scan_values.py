@@ -1,4 +1,4 @@
-"""Scans of zeros, constants and huge numbers, and of tokens that are not there."""
+"""Scans of zeros, constants and huge numbers, and of padding tokens."""
 
 import pytest
 import torch
@@ -47,8 +47,8 @@ def test_huge_numbers(path, huge, reverse):
     assert_exact(path, arguments, grad_output, reverse)
 
 
-def test_huge_tokens_that_are_forgotten(path, reverse):
-    """Nothing of them is left in the tokens after, and nothing of those' gradients before."""
+def test_huge_tokens_before_the_state_is_cleared(path, reverse):
+    """They affect neither later tokens nor the gradients of these."""
     x, dt, A, B, C, D = make_arguments(path[0], 131)
     cut = 40  # in the order of the scan
     order = torch.arange(131).flip(0) if reverse else torch.arange(131)
@@ -85,9 +85,9 @@ def test_tokens_of_no_duration_change_nothing(path, where, reverse):
     grad_output = torch.zeros_like(x)
     grad_output[:, places] = random_grad_output(arguments[0])
     padded = both_ways(path, (x, dt, A, B, C, D), grad_output, reverse).named()
-    kept = {name: t[:, places] if name in PER_TOKEN else t for name, t in padded.items()}
+    results = {name: t[:, places] if name in PER_TOKEN else t for name, t in padded.items()}
     exact = by_loop(path, arguments, reverse=reverse).named()
-    for name, value in kept.items():
+    for name, value in results.items():
         assert relative_error(value, exact[name]) <= ERROR[torch.float32], name
 
 

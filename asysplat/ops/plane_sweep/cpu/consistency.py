@@ -58,10 +58,12 @@ def consistency(
         others=others.flatten(0, 1).contiguous().numpy(),
         projections=projections.flatten(0, 1).contiguous().numpy(),
     )
-    found = reference.Consistency(*(torch.empty(B, V, h, w) for _ in reference.Consistency._fields))
-    arrays = reference.Consistency(*(each.flatten(0, 1).numpy() for each in found))
+    result = reference.Consistency(
+        *(torch.empty(B, V, h, w) for _ in reference.Consistency._fields)
+    )
+    arrays = reference.Consistency(*(each.flatten(0, 1).numpy() for each in result))
     run_blocks(count_views, even_bounds(B * V), inputs, V, arrays)
-    return found
+    return result
 
 
 @kernel

@@ -1,8 +1,8 @@
-"""The costs: a task takes a vector of planes through a view, two rows at a time.
+"""The cost volume on CPUs: a task takes a vector of planes through a view, two rows at a time.
 
-Of each neighbor it warps one row after the other, where the neighbor may see something, and keeps
-as many as two rows of patches have; the sums over patches are taken along columns first, then along
-the row.
+It warps the rows of each neighbor one by one, where the neighbor's image may contain the points,
+and keeps the rows that two rows of patches need; it sums over patches along columns first, then
+along the row.
 """
 
 import numpy as np
@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.cpu.patches import AROUND, describe_row, variance
 from asysplat.ops.plane_sweep.inputs import CostInputs, prepare
 from asysplat.ops.plane_sweep.reference import BEST, WINDOW
 from asysplat.ops.simd.gathers import gather_squares
@@ -25,6 +24,7 @@ from asysplat.ops.simd.vectors import (
     least,
     less,
     load,
+    load_some,
     rsqrt,
     store,
     store_some,
@@ -33,7 +33,10 @@ from asysplat.ops.simd.vectors import (
 )
 
 assert BEST == 2 and WINDOW == 5  # the least cost and the one after; sums of five columns
-KEPT = WINDOW + 1  # rows that two rows of patches take
+AROUND = WINDOW // 2
+COUNT = np.float32(WINDOW**2)  # pixels of a patch
+NOISE = np.float32(reference.NOISE * WINDOW**4)  # in the variance of sums
+BUFFER = WINDOW + 1  # rows that two rows of patches need
 HALF = np.float32(0.5)
 FRONT = np.float32(reference.FRONT)
 UNSEEN = np.float32(reference.UNSEEN)
@@ -76,8 +79,8 @@ def cost_planes(start, stop, inputs, stride, costs):
     vectors = inputs.inverse.shape[1] // LANES
     share = np.float32(0.5 / (stride * stride))
     # A place for each of the last rows of each neighbor.
-    warped = np.empty((K, KEPT, W, LANES), np.float32)
-    seen = np.empty((K, KEPT, W), np.uint16)
+    warped = np.empty((K, BUFFER, W, LANES), np.float32)
+    visible = np.empty((K, BUFFER, W), np.uint16)
     spans = np.empty((K, H, 2), np.int64)
     # The least cost of each pixel of two rows, and the one after.
     first, second = np.empty((2, W, LANES), np.float32), np.empty((2, W, LANES), np.float32)
@@ -96,9 +99,9 @@ def cost_planes(start, stop, inputs, stride, costs):
                 for y in range(H):
                     _find_span(spans[k, y], inputs.projections[view, k], y, depth, H, W)
         for y in range(0, H, 2):
-            # What fewer neighbors than two leave open is unseen.
+            # With fewer than two neighbors the others count as unseen.
             for row in range(2):
-                describe_row(offsets[row], scales[row], image, min(y + row, H - 1), along)
+                _describe_row(offsets[row], scales[row], image, min(y + row, H - 1), along)
                 for x in range(W):
                     store(first[row], x, zeros() + (UNSEEN if number < 2 else INFINITY))
                     store(second[row], x, zeros() + (UNSEEN if number < 1 else INFINITY))
@@ -108,14 +111,16 @@ def cost_planes(start, stop, inputs, stride, costs):
                 other = inputs.padded[inputs.neighbors[view, k]]
                 matrix = inputs.projections[view, k]
                 for row in range(0 if y == 0 else y + AROUND, min(y + AROUND + 2, H)):
-                    begin, end = W, 0  # of what patches take from this row
+                    begin, end = W, 0  # the columns of this row that patches need
                     for near in range(max(row - AROUND, 0), min(row + AROUND + 1, H)):
                         begin, end = min(begin, spans[k, near, 0]), max(end, spans[k, near, 1])
                     columns = range(max(begin - AROUND, 0), min(end + AROUND, W))
-                    place = row % KEPT
-                    _warp_row(warped[k, place], seen[k, place], other, matrix, row, depth, columns)
+                    place = row % BUFFER
+                    _warp_row(
+                        warped[k, place], visible[k, place], other, matrix, row, depth, columns
+                    )
                 patches = (image, offsets, scales)
-                _compare_rows(first, second, patches, y, warped[k], seen[k], spans[k])
+                _compare_rows(first, second, patches, y, warped[k], visible[k], spans[k])
             for row in range(y, min(y + 2, H)):
                 if row % stride == 0:
                     sums[:] = ZERO
@@ -133,13 +138,13 @@ def cost_planes(start, stop, inputs, stride, costs):
 
 @inline
 def _find_span(span, matrix, y, depth, H, W):
-    """Write the first column of row y that a neighbor sees at some plane, and one past the last.
+    """Write the range of columns of row y inside a neighbor's image at any of the planes.
 
-    A pixel around its image counts as within, so that rounding leaves none out.
+    The image has a margin of a pixel, so that rounding excludes none.
     """
     low, high = ZERO + zeros(), np.float32(W) + zeros()
     for side in range(4):
-        # What is on the inner side has slope x column + rest > 0.
+        # On the inner side, slope x column + rest > 0.
         axis, sign = side // 2, ONE - np.float32(2 * (side % 2))
         shift = ONE if side % 2 == 0 else np.float32(1 + (W if axis == 0 else H))
         slope = sign * matrix[axis, 0] + shift * matrix[2, 0]
@@ -159,8 +164,8 @@ def _find_span(span, matrix, y, depth, H, W):
 
 
 @inline
-def _warp_row(warped, seen, other, matrix, y, depth, columns):
-    """Write what a neighbor shows at pixels of a row, [W, LANES] and whether it sees them."""
+def _warp_row(warped, visible, other, matrix, y, depth, columns):
+    """Write a neighbor's warped pixels of a row, [W, LANES], and which are inside its image."""
     bottom, right = np.float32(other.shape[0] - 1), np.float32(other.shape[1] - 1)
     row = np.float32(y) + HALF
     x_row = fma(depth, matrix[0, 3], fma(matrix[0, 1], row, matrix[0, 2]))
@@ -173,7 +178,7 @@ def _warp_row(warped, seen, other, matrix, y, depth, columns):
         u = fma(column, matrix[0, 0], x_row) * scale
         v = fma(column, matrix[1, 0], y_row) * scale
         inside = less(ZERO, u) & less(u, right) & less(ZERO, v) & less(v, bottom)
-        seen[x] = inside & less(FRONT, z)
+        visible[x] = inside & less(FRONT, z)
         u = min(max(u - HALF, ZERO), right - ONE)
         v = min(max(v - HALF, ZERO), bottom - ONE)
         a, b, c, d, v, u = gather_squares(other, v, u)
@@ -182,10 +187,10 @@ def _warp_row(warped, seen, other, matrix, y, depth, columns):
 
 
 @inline
-def _compare_rows(first, second, patches, y, warped, seen, spans):
-    """Put the costs of a neighbor among the two least of each pixel of the rows y and y + 1.
+def _compare_rows(first, second, patches, y, warped, visible, spans):
+    """Merge a neighbor's costs into the two least of each pixel of the rows y and y + 1.
 
-    Both rows' patches have four rows in common. Past the last row, y stands in for y + 1.
+    Both rows' patches share four rows. Below the last row, y replaces y + 1.
     """
     image, offsets, scales = patches
     H, W = image.shape
@@ -194,31 +199,31 @@ def _compare_rows(first, second, patches, y, warped, seen, spans):
     end = max(begin, spans[y, 1], spans[below, 1])
     for row in range(2):
         for x in range(begin):
-            _put(first[row], second[row], x, UNSEEN + zeros())
+            _merge(first[row], second[row], x, UNSEEN + zeros())
         for x in range(end, W):
-            _put(first[row], second[row], x, UNSEEN + zeros())
+            _merge(first[row], second[row], x, UNSEEN + zeros())
     top, bottom = max(y - AROUND, 0), min(y + AROUND + 1, H - 1)
-    # The sums along the last columns: of the neighbor, its square, its product with the view.
+    # Sums along the last columns: of the neighbor, its square, its product with the view.
     nothing = (zeros(), zeros(), zeros(), zeros())
     a, b, c, d, e, f = nothing, nothing, nothing, nothing, nothing, nothing
     for right in range(begin - AROUND, end + AROUND):
-        column = min(max(right, 0), W - 1)  # beyond the border its pixels go on
+        column = min(max(right, 0), W - 1)  # the border's pixels continue beyond it
         common = (zeros(), zeros(), zeros())
         for k in range(1, WINDOW):
             row = min(max(y - AROUND + k, 0), H - 1)
-            common = _add(common, load(warped[row % KEPT], column), image[row, column])
-        upper = _add(common, load(warped[top % KEPT], column), image[top, column])
-        lower = _add(common, load(warped[bottom % KEPT], column), image[bottom, column])
+            common = _add(common, load(warped[row % BUFFER], column), image[row, column])
+        upper = _add(common, load(warped[top % BUFFER], column), image[top, column])
+        lower = _add(common, load(warped[bottom % BUFFER], column), image[bottom, column])
         x = right - AROUND
         if x >= begin:
             sums = (_sum(a, upper[0]), _sum(b, upper[1]), _sum(c, upper[2]))
-            cost = where(seen[y % KEPT, x], _cost(sums, offsets[0, x], scales[0, x]), UNSEEN)
-            _put(first[0], second[0], x, cost)
+            cost = where(visible[y % BUFFER, x], _cost(sums, offsets[0, x], scales[0, x]), UNSEEN)
+            _merge(first[0], second[0], x, cost)
             sums = (_sum(d, lower[0]), _sum(e, lower[1]), _sum(f, lower[2]))
             cost = _cost(sums, offsets[1, x], scales[1, x])
-            _put(first[1], second[1], x, where(seen[below % KEPT, x], cost, UNSEEN))
-        a, b, c = _go_on(a, upper[0]), _go_on(b, upper[1]), _go_on(c, upper[2])
-        d, e, f = _go_on(d, lower[0]), _go_on(e, lower[1]), _go_on(f, lower[2])
+            _merge(first[1], second[1], x, where(visible[below % BUFFER, x], cost, UNSEEN))
+        a, b, c = _advance(a, upper[0]), _advance(b, upper[1]), _advance(c, upper[2])
+        d, e, f = _advance(d, lower[0]), _advance(e, lower[1]), _advance(f, lower[2])
 
 
 @inline
@@ -228,8 +233,8 @@ def _add(sums, value, pixel):
 
 
 @inline
-def _go_on(last, new):
-    """Return the last column, and the sums of the last two, of the two that end before, ..."""
+def _advance(last, new):
+    """Return the last column, and the sums of the last two columns and of earlier pairs."""
     return new, last[0] + new, last[1], last[2]
 
 
@@ -241,14 +246,53 @@ def _sum(last, new):
 
 @inline
 def _cost(sums, offset, scale):
-    """Return 1 - the correlation, from the sums over a patch; see `describe_row`."""
+    """Return 1 - the correlation, from the sums over a patch; see `_describe_row`."""
     total, square, both = sums
-    return fma(fma(total, offset, both * -scale), rsqrt(variance(total, square)), ONE)
+    return fma(fma(total, offset, both * -scale), rsqrt(_variance(total, square)), ONE)
 
 
 @inline
-def _put(first, second, x, cost):
-    """Put a cost among the two least of a pixel."""
+def _merge(first, second, x, cost):
+    """Merge a cost into the two least of a pixel."""
     before = load(first, x)
     store(second, x, min(load(second, x), max(before, cost)))
     store(first, x, min(before, cost))
+
+
+@inline
+def _describe_row(offsets, scales, image, y, sums):
+    """Write the terms that turn sums over patches into correlations, for the pixels of row y.
+
+    Args:
+        offsets, scales: [W], the sum over a patch and COUNT, divided by the deviation of such sums.
+        image: [H, W].
+        sums: [2, W + WINDOW - 1], written: along columns, of pixels and of squares.
+    """
+    H, W = image.shape
+    for x in range(0, W, LANES):
+        count = min(W - x, LANES)
+        total, square = zeros(), zeros()
+        for k in range(WINDOW):
+            value = load_some(image[min(max(y - AROUND + k, 0), H - 1)], x, count)
+            total, square = total + value, fma(value, value, square)
+        store_some(sums[0], AROUND + x, count, total)
+        store_some(sums[1], AROUND + x, count, square)
+    for kind in range(2):
+        for k in range(AROUND):  # the border's pixels continue beyond it
+            sums[kind, k] = sums[kind, AROUND]
+            sums[kind, AROUND + W + k] = sums[kind, AROUND + W - 1]
+    for x in range(0, W, LANES):
+        count = min(W - x, LANES)
+        total, square = zeros(), zeros()
+        for k in range(WINDOW):
+            total = total + load_some(sums[0], x + k, count)
+            square = square + load_some(sums[1], x + k, count)
+        scale = rsqrt(_variance(total, square))
+        store_some(offsets, x, count, total * scale)
+        store_some(scales, x, count, scale * COUNT)
+
+
+@inline
+def _variance(total, square):
+    """Return COUNT^2 variances of patches and their noise, from sums of pixels and of squares."""
+    return max(fma(square, COUNT, ZERO - total * total), ZERO) + NOISE

@@ -58,7 +58,7 @@ def aggregate_views(start, stop, costs, weights, penalties, plane, contrast):
     vectors = -(-planes // LANES)
     weighted = np.empty((h, w, vectors * LANES), np.float32)
     sums = np.empty((h, w, vectors * LANES), np.float32)
-    # Costs of the paths to the last two pixels of each line: infinite on both sides of the planes.
+    # Costs of the paths to the last two pixels of each line, infinite beyond the planes.
     paths = np.full((2, max(h, w), vectors * LANES + 2), INFINITY, np.float32)
     lows = np.empty(max(h, w), np.float32)  # the least of each path
     numbers = np.arange(vectors * LANES).astype(np.float32)
@@ -69,18 +69,18 @@ def aggregate_views(start, stop, costs, weights, penalties, plane, contrast):
         for direction in range(4):
             along, back = direction % 2 == 0, direction // 2
             lines, length = (h, w) if along else (w, h)
-            for line in range(lines):  # a path begins where all planes cost nothing
+            for line in range(lines):  # a path starts with cost 0 at all planes
                 lows[line] = ZERO
                 for v in range(vectors):
                     store_some(paths[0, line], 1 + v * LANES, LANES, zeros())
             for k in range(length):
                 position = length - 1 - k if back else k
-                entry = min(position + back, length - 1)  # whose penalty lies on the way here
+                entry = min(position + back, length - 1)  # whose penalty applies to this step
                 for line in range(lines):
                     y, x = (line, position) if along else (position, line)
                     penalty = penalties[n, 0, y, entry] if along else penalties[n, 1, entry, x]
                     old, new = paths[k % 2, line], paths[(k + 1) % 2, line]
-                    lows[line] = _go_on(
+                    lows[line] = _extend(
                         old, new, lows[line], lows[line] + penalty, weighted[y, x], sums[y, x]
                     )
         for y in range(h):
@@ -90,7 +90,7 @@ def aggregate_views(start, stop, costs, weights, penalties, plane, contrast):
 
 @inline
 def _begin(weighted, sums, costs, weight):
-    """Write the weighted costs of a pixel, infinite beyond its planes, and sums of nothing."""
+    """Write the weighted costs of a pixel, infinite beyond its planes, and clear its sums."""
     for d in range(0, len(weighted), LANES):
         count = min(len(costs) - d, LANES)
         store_some(weighted, d, LANES, INFINITY + zeros())
@@ -99,15 +99,15 @@ def _begin(weighted, sums, costs, weight):
 
 
 @inline
-def _go_on(old, new, low, far, cost, sums):
-    """Write what the paths to a pixel cost, from those to the one before; return the least.
+def _extend(old, new, low, far, cost, sums):
+    """Extend the paths by a pixel; write their costs and return the least.
 
     Args:
-        old, new: a place more at both ends than there are planes.
+        old, new: one element more at both ends than there are planes.
         low: the least of `old`.
         far: that and the penalty for several planes more or less.
         cost: of the pixel's planes.
-        sums: of the costs of all paths to the pixel, to which these are added.
+        sums: of the costs of all paths to the pixel, added to.
     """
     lowest = INFINITY + zeros()
     for d in range(0, len(cost), LANES):
@@ -122,9 +122,9 @@ def _go_on(old, new, low, far, cost, sums):
 
 @inline
 def _find_lowest(costs, numbers, planes):
-    """Return the place of the lowest cost, and how much less it is than the mean.
+    """Return the plane of the lowest cost, and how far the cost is below the mean.
 
-    It is moved to the minimum of the parabola through three.
+    The plane is refined by the parabola through three.
     """
     lowest, everything = INFINITY + zeros(), zeros()
     for d in range(0, planes, LANES):

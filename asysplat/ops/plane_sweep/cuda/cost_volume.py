@@ -1,6 +1,6 @@
-"""The costs: a program takes some columns and planes down a band of a view's rows.
+"""The cost volume on GPUs: a program takes some columns and planes down a band of a view's rows.
 
-The sums along a patch's last rows stay in registers, of every neighbor.
+The sums along a patch's last rows stay in registers, for every neighbor.
 """
 
 import torch
@@ -14,7 +14,7 @@ from asysplat.ops.plane_sweep.inputs import prepare
 from asysplat.ops.triton_utils import FUSED, INTERPRETED, kernel
 
 AROUND = tl.constexpr(reference.WINDOW // 2)
-KEPT = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch
+EARLIER = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch
 SHARE = tl.constexpr(1 / reference.WINDOW**2)  # of a pixel in a patch
 FRONT, NOISE = tl.constexpr(reference.FRONT), tl.constexpr(reference.NOISE)
 UNSEEN, INFINITY = tl.constexpr(reference.UNSEEN), tl.constexpr(float("inf"))
@@ -99,19 +99,19 @@ def cost_band(
     for part in range(stride):
         x = tl.minimum(block * stride + part, width - 1)
         sums = ()
-        for _ in tl.static_range(K * KEPT):
+        for _ in tl.static_range(K * EARLIER):
             sums = sums + ((nothing, nothing, nothing),)
         total = nothing
         for step in range(rows + 2 * AROUND):
-            y = begin + step - 2 * AROUND  # all rows of its patch are there now
+            y = begin + step - 2 * AROUND  # all rows of its patch are summed now
             row = tl.minimum(tl.maximum(y + AROUND, 0), height - 1)
             middle = tl.minimum(tl.maximum(y, 0), height - 1)
             pixel = (view * height + middle) * width + x
             mean, scale = tl.load(means + pixel)[:, None], tl.load(scales + pixel)[:, None]
-            # What fewer neighbors than two leave open is unseen.
+            # With fewer than two neighbors the others count as unseen.
             first = nothing + tl.where(number < 2, UNSEEN, INFINITY)
             second = nothing + tl.where(number < 1, UNSEEN, INFINITY)
-            kept = ()
+            buffered = ()
             for k in tl.static_range(K):
                 neighbor = tl.load(neighbors + view * K + k).to(tl.int64)
                 other = padded + tl.maximum(neighbor, 0) * (height + 1) * (width + 1)
@@ -119,24 +119,24 @@ def cost_band(
                 line = images + (view * height + row) * width
                 a, b, c = add_row(line, other, matrix, x, row, depth, height, width)
                 total_a, total_b, total_c = a, b, c
-                for j in tl.static_range(KEPT):
-                    earlier = sums[k * KEPT + j]
+                for j in tl.static_range(EARLIER):
+                    earlier = sums[k * EARLIER + j]
                     total_a += earlier[0]
                     total_b += earlier[1]
                     total_c += earlier[2]
                     if j > 0:
-                        kept = kept + (earlier,)
-                kept = kept + ((a, b, c),)
+                        buffered = buffered + (earlier,)
+                buffered = buffered + ((a, b, c),)
                 u, v, z = project(factors_at(matrix, middle), x, depth)
-                seen = (z > FRONT) & (u > 0) & (u < width) & (v > 0) & (v < height)
+                visible = (z > FRONT) & (u > 0) & (u < width) & (v > 0) & (v < height)
                 other_mean = total_a * SHARE
                 both = total_c * SHARE - mean * other_mean
                 variance = tl.maximum(total_b * SHARE - other_mean * other_mean, 0.0) + NOISE
-                cost = tl.where(seen, 1 - both * scale / tl.sqrt(variance), UNSEEN)
+                cost = tl.where(visible, 1 - both * scale / tl.sqrt(variance), UNSEEN)
                 cost = tl.where(neighbor >= 0, cost, INFINITY)
                 second = tl.minimum(second, tl.maximum(first, cost))
                 first = tl.minimum(first, cost)
-            sums = kept
+            sums = buffered
             total = tl.where(y % stride == 0, 0.0, total) + 0.5 * (first + second)
             limit = tl.where((y >= begin) & (y % stride == stride - 1), width, 0)
             done = (block * stride < limit)[:, None] & (plane < planes)[None, :]
@@ -150,9 +150,9 @@ def cost_band(
 
 @kernel
 def add_row(line, other, matrix, x, row, depth, height, width):
-    """Return the sums of a neighbor along a patch's row, of its square, its product with `line`.
+    """Return the sums of a neighbor, its square, and its product with `line` along a patch's row.
 
-    Beyond the border, its pixels go on.
+    The border's pixels continue beyond it.
     """
     factors = factors_at(matrix, row)
     a, b, c = 0.0, 0.0, 0.0
@@ -176,9 +176,9 @@ def add_row(line, other, matrix, x, row, depth, height, width):
 
 @kernel
 def factors_at(matrix, y):
-    """Return by what x, 1 and the inverse depth are multiplied for the pixels of a row.
+    """Return the factors of x, 1 and the inverse depth for the pixels of a row.
 
-    Three numbers for each of a neighbor's homogeneous coordinates.
+    Three numbers for each homogeneous coordinate in a neighbor.
     """
     y += 0.5
     factors = ()
@@ -191,7 +191,7 @@ def factors_at(matrix, y):
 
 @kernel
 def project(factors, x, depth):
-    """Return where a neighbor has the pixels, [columns, planes], and at which depth."""
+    """Project pixels into a neighbor: coordinates and depths, [columns, planes]."""
     x = x[:, None] + 0.5
     u = factors[0] * x + factors[1] + factors[2] * depth
     v = factors[3] * x + factors[4] + factors[5] * depth

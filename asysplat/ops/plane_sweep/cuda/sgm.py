@@ -74,22 +74,22 @@ def add_paths(
     view = tl.program_id(1).to(tl.int64)
     line = tl.program_id(0) * LINES + tl.arange(0, LINES)
     plane = tl.broadcast_to(tl.arange(0, PLANES)[None, :], (LINES, PLANES))
-    there = line < lines
-    path = tl.zeros((LINES, PLANES), tl.float32)  # it begins where all planes cost nothing
+    exists = line < lines
+    path = tl.zeros((LINES, PLANES), tl.float32)  # it starts with cost 0 at all planes
     low = tl.zeros((LINES,), tl.float32)
     for k in range(length):
         position = length - 1 - k if REVERSE else k
         pixel = view * lines * length + line * apart + position * step
-        # A path's first pixel has no step before it, and any will do.
+        # A path's first pixel has no step before it: any penalty gives the same.
         entry = pixel + tl.where(k > 0, step, 0) if REVERSE else pixel
-        far = low + tl.load(penalties + entry, mask=there, other=0.0)
-        weight = tl.load(weights + pixel, mask=there, other=0.0)[:, None]
+        far = low + tl.load(penalties + entry, mask=exists, other=0.0)
+        weight = tl.load(weights + pixel, mask=exists, other=0.0)[:, None]
         place = pixel[:, None] * planes + plane
-        inside = there[:, None] & (plane < planes)
+        inside = exists[:, None] & (plane < planes)
         cost = tl.load(costs + place, mask=inside, other=0.0) * weight
         nearer = tl.gather(path, tl.minimum(plane + 1, PLANES - 1), 1)
         farther = tl.gather(path, tl.maximum(plane - 1, 0), 1)
-        near = tl.minimum(nearer, farther) + SMALL_STEP  # at both ends that of the plane itself
+        near = tl.minimum(nearer, farther) + SMALL_STEP  # at both ends the plane itself
         path = tl.minimum(tl.minimum(path, near), far[:, None]) - low[:, None]
         path = tl.where(plane < planes, cost + path, INFINITY)
         low = tl.min(path, 1)

@@ -1,9 +1,9 @@
-"""The selective scan for CPUs (Numba): a state of 16 channels at a time.
+"""The selective scan for CPUs (Numba): the states of 16 channels at a time.
 
-A task walks through a sequence by chunks of tokens, and through a chunk by blocks of 16 channels,
-one vector wide, one of the N states after the other: it stays in a register meanwhile. Nothing is
-stored between the passes but the state at the beginning of each chunk; the backward pass walks
-through a chunk once more before it walks back.
+A task goes through a sequence in chunks of tokens, through a chunk in blocks of 16 channels, one
+vector wide, and through a block one of the N states at a time, which stays in a register. Only the
+state at the start of each chunk is stored between the passes; the backward pass computes each
+chunk's states again.
 """
 
 from asysplat.ops.selective_scan.cpu.scan import backward, forward, saved_state_shape

@@ -1,4 +1,4 @@
-"""The gradients: a task takes its blocks of channels back through a sequence, chunk by chunk."""
+"""The backward pass: a task takes its blocks of channels through a sequence, last chunk first."""
 
 import math
 
@@ -28,7 +28,7 @@ def backward_blocks(start, stop, inputs, saved_state, grad_output, grads):
 
     Args:
         inputs, grads: see `BlockedInputs` and `BlockedGradients`.
-        saved_state: what `forward_blocks` wrote.
+        saved_state: written by `forward_blocks`.
         grad_output: [B, L, D].
     """
     x, dt, A, B, C, D, reverse = inputs
@@ -40,12 +40,12 @@ def backward_blocks(start, stop, inputs, saved_state, grad_output, grads):
     decays = np.empty(ROWS, np.float32)
     states = np.empty((CACHE_CHUNK + 1, LANES), np.float32)
     g_steps, g_added = np.empty(ROWS, np.float32), np.empty(ROWS, np.float32)
-    behind = np.empty((blocks, state_size, LANES), np.float32)
+    passed = np.empty((blocks, state_size, LANES), np.float32)
     while start < stop:
         batch, first_block = start // blocks, start % blocks
         last_block = min(blocks, first_block + stop - start)
         start += last_block - first_block
-        behind[:] = ZERO
+        passed[:] = ZERO
         grad_A[batch, first_block:last_block] = ZERO
         grad_D[batch, first_block:last_block] = ZERO
         for chunk in range(chunks - 1, -1, -1):
@@ -74,7 +74,7 @@ def backward_blocks(start, stop, inputs, saved_state, grad_output, grads):
                         store(states, k, value)
                         value = fma(decay, value, load(added, k) * B[batch, t, n])
                     store(states, count, value)
-                    later, g_rate = load(behind[block], n), zeros()
+                    later, g_rate = load(passed[block], n), zeros()
                     for k in range(count - 1, -1, -1):
                         t = length - 1 - begin - k if reverse else begin + k
                         g_state = fma(C[batch, t, n], load(outs, k), later)
@@ -82,11 +82,11 @@ def backward_blocks(start, stop, inputs, saved_state, grad_output, grads):
                         grad_C[block, batch, t, n] = total(load(outs, k) * load(states, k + 1))
                         store(g_added, k, fma(g_state, B[batch, t, n], load(g_added, k)))
                         later = g_state * load(decays, k)
-                        # The exponent is one of 2: A holds a factor log2(e).
+                        # The base of the exponent is 2: A has the factor log2(e).
                         g_log = later * load(states, k)
                         store(g_steps, k, fma(g_log, rate, load(g_steps, k)))
                         g_rate = fma(g_log, load(steps, k), g_rate)
-                    store(behind[block], n, later)
+                    store(passed[block], n, later)
                     store(g_rates, n, load(g_rates, n) + g_rate)
                 skip, g_skip = load(D[block], 0), zeros()
                 for k in range(count):

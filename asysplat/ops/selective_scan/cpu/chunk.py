@@ -1,4 +1,4 @@
-"""What a task works on: chunks of a sequence, and blocks of as many channels as a vector has."""
+"""The arrays of a task: chunks of a sequence, and blocks of LANES channels."""
 
 from typing import NamedTuple
 
@@ -8,12 +8,12 @@ from torch import Tensor
 
 from asysplat.ops.simd.vectors import LANES
 
-CACHE_CHUNK = 32  # tokens: what is kept of each, CACHE_CHUNK x LANES, fits a core's nearest cache
+CACHE_CHUNK = 32  # tokens: arrays of CACHE_CHUNK x LANES fit a core's first cache
 ROWS = (CACHE_CHUNK, LANES)
 
 
 class BlockedInputs(NamedTuple):
-    """The inputs of a scan in float32, with zeros where the last block has no channel.
+    """The inputs of a scan in float32; zeros fill up the last block of channels.
 
     Args:
         x, dt: [B, L, D].
@@ -33,7 +33,7 @@ class BlockedInputs(NamedTuple):
 
 
 class BlockedGradients(NamedTuple):
-    """Their gradients, those of B and C for each block and those of A and D for each sequence.
+    """The gradients: of B and C for each block, of A and D for each sequence.
 
     Args:
         x, dt: [B, L, D].
@@ -51,11 +51,11 @@ class BlockedGradients(NamedTuple):
 
 
 def by_block(per_channel: Tensor) -> Tensor:
-    """Rearrange [D, n] to [blocks of channels, n, LANES], zeros where there is no channel."""
+    """Rearrange [D, n] to [blocks of channels, n, LANES], filled up with zeros."""
     padded = F.pad(per_channel, (0, 0, 0, -len(per_channel) % LANES))
     return padded.unflatten(0, (-1, LANES)).mT.contiguous()
 
 
 def by_channel(per_block: Tensor) -> Tensor:
-    """Rearrange [blocks of channels, n, LANES] to [D, n], and rows where there is no channel."""
+    """Rearrange [blocks of channels, n, LANES] to [D, n], with the last block's padding."""
     return per_block.mT.flatten(0, 1)

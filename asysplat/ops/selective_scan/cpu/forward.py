@@ -1,4 +1,4 @@
-"""The output: a task takes its blocks of channels through a sequence, chunk by chunk."""
+"""The forward pass: a task takes its blocks of channels through a sequence, chunk by chunk."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Both passes over all sequences: the arrays of the kernels, and what becomes of them."""
+"""Both passes: the arrays of the kernels."""
 
 import math
 
@@ -23,7 +23,7 @@ LOG2_E = 1 / math.log(2)
 
 
 def saved_state_shape(x: Float[Tensor, "B L D"], B: Float[Tensor, "B L N"]) -> tuple:
-    """Return that of the states at the beginning of chunks, [B, blocks, chunks, N, LANES]."""
+    """Return the shape of the states at the start of chunks, [B, blocks, chunks, N, LANES]."""
     batch, length, channels = x.shape
     return batch, -(-channels // LANES), -(-length // CACHE_CHUNK), B.shape[-1], LANES
 
@@ -31,7 +31,7 @@ def saved_state_shape(x: Float[Tensor, "B L D"], B: Float[Tensor, "B L N"]) -> t
 def forward(
     inputs: ScanInputs, reverse: bool, keep: bool
 ) -> tuple[Float[Tensor, "B L D"], Float[Tensor, "_ _ _ _ _"]]:
-    """Return y and the states at the beginning of chunks; see `asysplat.ops.scan.Kernels`."""
+    """Return y and the states at the start of chunks; see `asysplat.ops.scan.Kernels`."""
     x = inputs.x
     y = torch.empty(x.shape, dtype=torch.float32)
     shape = saved_state_shape(x, inputs.B)
@@ -54,7 +54,7 @@ def backward(
     batch, length, channels = x.shape
     blocks, state_size = saved_state.shape[1], B.shape[-1]
     grad_x, grad_dt = (torch.empty(x.shape, dtype=torch.float32) for _ in range(2))
-    # Each block of channels has a place of its own for what is summed over channels.
+    # Sums over channels: each block of channels has its own part.
     part_B, part_C = (torch.empty(blocks, batch, length, state_size) for _ in range(2))
     grad_A = torch.empty(batch, blocks, state_size, LANES)
     grad_D = torch.empty(batch, blocks, 1, LANES)

@@ -1,4 +1,4 @@
-"""The gradients of each chunk, from the state before it and the gradient of that after it."""
+"""The gradients of each chunk, from the state before it and the gradient of the state after it."""
 
 import triton.language as tl
 
@@ -32,21 +32,21 @@ def backward_chunk(
 ):
     """Write the gradients for a chunk and a block of channels.
 
-    Sums over chunks, or over blocks, are left to be finished by the caller.
+    The caller sums over chunks and blocks.
 
     Args:
         grad_output, x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
         states: [B, chunks, D, N] before each chunk.
-        grad_states: [B, chunks, D, N], the gradients of those after each chunk.
+        grad_states: [B, chunks, D, N], the gradients of the states after each chunk.
         grad_x, grad_dt: [B, L, D].
         grad_A, grad_D: [B, chunks, D, N] and [B, chunks, D].
         grad_B, grad_C: [B, L, blocks, N].
     """
-    batch, chunk, channel, there, entry = place(channels, STATE, BLOCK)
-    rate = tl.load(A + entry, mask=there[:, None], other=0.0)
-    skip = tl.load(D + channel, mask=there, other=0.0)
+    batch, chunk, channel, exists, entry = place(channels, STATE, BLOCK)
+    rate = tl.load(A + entry, mask=exists[:, None], other=0.0)
+    skip = tl.load(D + channel, mask=exists, other=0.0)
     row = (batch * tl.num_programs(0) + chunk) * channels
-    state = tl.load(states + row * STATE + entry, mask=there[:, None], other=0.0)
+    state = tl.load(states + row * STATE + entry, mask=exists[:, None], other=0.0)
     before = (state,)
     for k in tl.static_range(CHUNK - 1):
         position = chunk * CHUNK + k
@@ -57,7 +57,7 @@ def backward_chunk(
         state = tl.exp(step[:, None] * rate) * state + (step * value)[:, None] * projection
         before = before + (state,)
 
-    grad_state = tl.load(grad_states + row * STATE + entry, mask=there[:, None], other=0.0)
+    grad_state = tl.load(grad_states + row * STATE + entry, mask=exists[:, None], other=0.0)
     total_A = tl.zeros_like(rate)
     total_D = tl.zeros_like(skip)
     for k in tl.static_range(CHUNK):
@@ -88,5 +88,5 @@ def backward_chunk(
         projection = tl.sum(state * out[:, None], 0)
         tl.store(grad_C + part + entries, projection, mask=entries < limit)
         grad_state *= decay
-    tl.store(grad_A + row * STATE + entry, total_A, mask=there[:, None])
-    tl.store(grad_D + row + channel, total_D, mask=there)
+    tl.store(grad_A + row * STATE + entry, total_A, mask=exists[:, None])
+    tl.store(grad_D + row + channel, total_D, mask=exists)

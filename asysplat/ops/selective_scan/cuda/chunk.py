@@ -1,4 +1,4 @@
-"""What a program works on: a chunk of a sequence, and a block of its channels."""
+"""The indices of a program: a chunk of a sequence, and a block of its channels."""
 
 import triton.language as tl
 
@@ -7,7 +7,7 @@ from asysplat.ops.triton_utils import kernel, tokens_at
 
 @kernel
 def place(channels, STATE: tl.constexpr, BLOCK: tl.constexpr):
-    """Return batch entry, chunk, channels, which of them exist, and where [D, N] has them."""
+    """Return batch entry, chunk, channels, which of them exist, and their places in [D, N]."""
     chunk = tl.program_id(0)
     channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     batch = tl.program_id(2).to(tl.int64)
@@ -17,9 +17,9 @@ def place(channels, STATE: tl.constexpr, BLOCK: tl.constexpr):
 
 @kernel
 def row_at(batch, position, length, size, REVERSE: tl.constexpr):
-    """Return where [B, L, size] has a token's row, and its length, 0 where there is no token."""
-    token, there = tokens_at(position, length, REVERSE)
-    return (batch * length + token) * size, tl.where(there, size, 0)
+    """Return the place of a token's row in [B, L, size], and its length, 0 if there is no token."""
+    token, exists = tokens_at(position, length, REVERSE)
+    return (batch * length + token) * size, tl.where(exists, size, 0)
 
 
 @kernel
@@ -30,6 +30,6 @@ def load_channels(array, row, limit, channel):
 
 @kernel
 def load_projection(array, batch, position, length, STATE: tl.constexpr, REVERSE: tl.constexpr):
-    """Return fp32 [1, STATE] of an array [B, L, N], 0 where there is no token."""
+    """Return fp32 [1, STATE] of an array [B, L, N], 0 if there is no token."""
     row, limit = row_at(batch, position, length, STATE, REVERSE)
     return load_channels(array, row, limit, tl.arange(0, STATE))[None, :]

@@ -1,7 +1,7 @@
-"""The state before each chunk, and the output of each from its own tokens and that state.
+"""The state before each chunk, and the output of each chunk from its tokens and that state.
 
-With GRADIENT a chunk is gone through from its end, and what is passed on is the gradient of the
-state before a token.
+With GRADIENT the kernels go through each chunk from its end, and pass on the gradient of the state
+before a token.
 """
 
 import triton.language as tl
@@ -28,15 +28,15 @@ def sum_chunk(
     BLOCK: tl.constexpr,
     CHUNK: tl.constexpr,
 ):
-    """Write what a chunk's own tokens leave in the state, and how far they make it decay.
+    """Write what a chunk's tokens add to the state, and the sum of their steps.
 
     Args:
         values, projections: x [B, L, D] and B [B, L, N]; with GRADIENT, grad_output and C.
-        states: [B, chunks, D, N], what the tokens leave.
+        states: [B, chunks, D, N], what the tokens add.
         steps: [B, chunks, D], the sum of dt.
     """
-    batch, chunk, channel, there, entry = place(channels, STATE, BLOCK)
-    rate = tl.load(A + entry, mask=there[:, None], other=0.0)
+    batch, chunk, channel, exists, entry = place(channels, STATE, BLOCK)
+    rate = tl.load(A + entry, mask=exists[:, None], other=0.0)
     state = tl.zeros_like(rate)
     total = tl.zeros((BLOCK,), tl.float32)
     for k in tl.static_range(CHUNK):
@@ -52,8 +52,8 @@ def sum_chunk(
             state = decay * state + (step * value)[:, None] * projection
         total += step
     row = (batch * tl.num_programs(0) + chunk) * channels
-    tl.store(states + row * STATE + entry, state, mask=there[:, None])
-    tl.store(steps + row + channel, total, mask=there)
+    tl.store(states + row * STATE + entry, state, mask=exists[:, None])
+    tl.store(steps + row + channel, total, mask=exists)
 
 
 @kernel
@@ -67,7 +67,7 @@ def pass_states(
     STATE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Replace what each chunk adds by the state before it; see `sum_chunk`.
+    """Replace each chunk's addition by the state before the chunk; see `sum_chunk`.
 
     With GRADIENT, replace it by the gradient of the state after the chunk.
     """
@@ -77,7 +77,7 @@ def pass_states(
     rate = tl.load(A + entry, mask=entry < size, other=0.0)
     state = tl.zeros((BLOCK,), tl.float32)
     for start in range(0, chunks, AHEAD):
-        # All loads first: they do not wait for each other.
+        # All loads come first, so that they overlap.
         added, totals = (), ()
         for k in tl.static_range(AHEAD):
             row, limit = row_at(batch, start + k, chunks, size, GRADIENT)
@@ -113,11 +113,11 @@ def forward_chunk(
         x, dt, A, B, C, D: see `asysplat.ops.selective_scan`.
         states: [B, chunks, D, N] before each chunk.
     """
-    batch, chunk, channel, there, entry = place(channels, STATE, BLOCK)
-    rate = tl.load(A + entry, mask=there[:, None], other=0.0)
-    skip = tl.load(D + channel, mask=there, other=0.0)
+    batch, chunk, channel, exists, entry = place(channels, STATE, BLOCK)
+    rate = tl.load(A + entry, mask=exists[:, None], other=0.0)
+    skip = tl.load(D + channel, mask=exists, other=0.0)
     row = (batch * tl.num_programs(0) + chunk) * channels
-    state = tl.load(states + row * STATE + entry, mask=there[:, None], other=0.0)
+    state = tl.load(states + row * STATE + entry, mask=exists[:, None], other=0.0)
     for k in tl.static_range(CHUNK):
         position = chunk * CHUNK + k
         token, limit = row_at(batch, position, length, channels, REVERSE)

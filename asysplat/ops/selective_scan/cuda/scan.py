@@ -1,4 +1,4 @@
-"""Both passes: which kernels run, one after the other, and on what."""
+"""Both passes: the arrays and launches of the kernels."""
 
 import torch
 from jaxtyping import Float
@@ -11,9 +11,9 @@ from asysplat.ops.triton_utils import FUSED, INTERPRETED, check_size
 
 # Tokens of a chunk; the backward pass keeps all their states in registers.
 FORWARD_CHUNK, BACKWARD_CHUNK = (4, 4) if INTERPRETED else (16, 8)
-TILE = 256  # numbers of the state in a program
-PASSED = 128  # of it, where it goes from chunk to chunk
-WARP = {"num_warps": 1, **FUSED}  # no sum leaves it
+TILE = 256  # numbers of the state in a program,
+PASSED = 128  # and in one that passes states from chunk to chunk
+WARP = {"num_warps": 1, **FUSED}  # no sum leaves a warp
 
 
 def saved_state_shape(x: Float[Tensor, "B L D"], B: Float[Tensor, "B L N"]) -> tuple[int]:
@@ -34,14 +34,9 @@ def forward(
     y = torch.empty_like(x)
     with torch.cuda.device_of(x):
         states = _states(x, dt, A, B, FORWARD_CHUNK, reverse, gradient=False)
+        arrays = (x, dt, A, B, C, D, states, y)
         forward_chunk[_grid(states)](
-            *(x, dt, A, B, C, D),
-            states=states,
-            y=y,
-            length=x.shape[1],
-            channels=x.shape[2],
-            CHUNK=FORWARD_CHUNK,
-            **_tile(states, reverse),
+            *arrays, *x.shape[1:], CHUNK=FORWARD_CHUNK, **_tile(states, reverse)
         )
     return y, dt.new_empty(saved_state_shape(x, B))
 
@@ -64,17 +59,9 @@ def backward(
         parts = (*x.shape[:2], grid[1], B.shape[2])
         grad_B, grad_C = states.new_empty(parts), states.new_empty(parts)
         backward_chunk[grid](
-            *(grad_output, x, dt, A, B, C, D),
-            states=states,
-            grad_states=grad_states,
-            grad_x=grad_x,
-            grad_dt=grad_dt,
-            grad_A=grad_A,
-            grad_B=grad_B,
-            grad_C=grad_C,
-            grad_D=grad_D,
-            length=x.shape[1],
-            channels=x.shape[2],
+            *(grad_output, x, dt, A, B, C, D, states, grad_states),
+            *(grad_x, grad_dt, grad_A, grad_B, grad_C, grad_D),
+            *x.shape[1:],
             CHUNK=BACKWARD_CHUNK,
             **_tile(states, reverse),
         )
@@ -97,7 +84,7 @@ def _states(
     reverse: bool,
     gradient: bool,
 ) -> Float[Tensor, "B chunks D N"]:
-    """Return the state before each chunk, or with `gradient` the gradient of that after it."""
+    """Return the state before each chunk, or with `gradient` the gradient of the state after it."""
     (batch, length, channels), state = values.shape, A.shape[1]
     chunks = -(-length // chunk)
     states = dt.new_empty(batch, chunks, channels, state)

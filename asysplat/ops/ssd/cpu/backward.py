@@ -1,4 +1,4 @@
-"""The gradients of a segment: one head after the other goes through its chunks, last chunk first.
+"""The gradients of a segment: each head goes through its chunks, last chunk first.
 
 `width` is the head_dim in whole vectors of LANES, as in the forward pass.
 """
@@ -20,7 +20,7 @@ from asysplat.ops.ssd.cpu.chunk import (
 
 
 class HeadGradients(NamedTuple):
-    """The gradients of what each head has of its own.
+    """The gradients of the inputs of each head.
 
     Args:
         x, dt: [l, h, p] and [l, h] float32, written.
@@ -34,10 +34,10 @@ class HeadGradients(NamedTuple):
 
 
 class GroupGradients(NamedTuple):
-    """The gradients of what the heads share, summed over each group of heads; float32, written.
+    """The gradients of the shared inputs, summed over each group of heads; float32, written.
 
     Args:
-        B, C: [c, groups, q, N in whole vectors], without what comes by way of the scores.
+        B, C: [c, groups, q, N in whole vectors], without the part through the scores.
         scores: [c, groups, q, q].
     """
 
@@ -56,8 +56,8 @@ def backward_heads(
         segment: see `Segment`.
         saved_state: [h, N, width] states before the segment.
         grad_output: [l, h, p].
-        grad_states: [h, N, width] of the states after the segment, overwritten by those of the
-            states before it.
+        grad_states: [h, N, width] of the states after the segment, overwritten by the gradients of
+            the states before it.
         head_grads, group_grads: see `HeadGradients` and `GroupGradients`.
     """
     x, dt, A, B, C, D = segment.x, segment.dt, segment.A, segment.B, segment.C, segment.D
@@ -74,7 +74,7 @@ def backward_heads(
     weights, grad_weights = np.zeros((size, size), np.float32), np.zeros((size, size), np.float32)
     states = np.empty((chunks, state_size, width), np.float32)
     state_T = np.zeros((width, part_B.shape[3]), np.float32)
-    grad_logs, before, behind = np.empty(size), np.empty(size), np.empty(size)
+    grad_logs, before, after = np.empty(size), np.empty(size), np.empty(size)
     for group in range(start, stop):
         part_scores[:, group] = ZERO
         first, last = group * heads // groups, (group + 1) * heads // groups
@@ -82,7 +82,7 @@ def backward_heads(
             grad_state = grad_states[head]
             part_of_others = ZERO if head == first else ONE
 
-            # Compute the state before each chunk once more.
+            # Compute the state before each chunk again.
             states[chunks - 1 if reverse else 0] = saved_state[head]
             for k in range(1, chunks):
                 chunk, done = (chunks - 1 - k, chunks - k) if reverse else (k, k - 1)
@@ -103,7 +103,7 @@ def backward_heads(
                 inputs[:] = values
                 scale_rows(inputs, dt[begin : begin + size, head])
 
-                # What the tokens see of one another.
+                # Through the scores, within the chunk.
                 transpose(inputs, inputs_T)
                 add_product(grad_weights, grads, inputs_T, ZERO)
                 grad_scores = part_scores[chunk, group]
@@ -112,7 +112,7 @@ def backward_heads(
                 )
                 weigh_scores(scores[chunk], high, low, reverse, weights)
 
-                # What they add to the state after the chunk.
+                # Through the state after the chunk.
                 scale_rows(inputs, to_end)
                 add_product(grad_inputs, B[chunk], grad_state, ZERO)
                 for t in range(size):
@@ -122,13 +122,13 @@ def backward_heads(
                 transpose(grad_state, state_T)
                 add_product(part_B[chunk, group], inputs, state_T, part_of_others)
 
-                # What is left of the state before it, and what they read of that.
+                # Through the state before the chunk: what remains of it, and what the tokens read.
                 left = 0.0
                 for n in range(state_size):
                     left += dot_rows(states[chunk], grad_state, n)
                 add_product(read, C[chunk], states[chunk], ZERO)
                 for t in range(size):
-                    behind[t] = dot_rows(read, grads, t) * from_start[t]
+                    after[t] = dot_rows(read, grads, t) * from_start[t]
                 read[:] = grads
                 scale_rows(read, from_start)
                 transpose(states[chunk], state_T)
@@ -136,7 +136,7 @@ def backward_heads(
                 add_product(grad_state, C[chunk].T, read, across)
 
                 grad_logs += left * across
-                add_sums(before, behind, reverse, grad_logs)
+                add_sums(before, after, reverse, grad_logs)
                 for t in range(size):
                     step = dt[begin + t, head]
                     from_inputs = dot_rows(grad_inputs, values, t)
@@ -150,12 +150,11 @@ def backward_heads(
 
 
 @inline
-def add_sums(before, behind, reverse, grad_logs):
-    """Add to the gradient of each token's log decay what passes by way of the states.
+def add_sums(before, after, reverse, grad_logs):
+    """Add the part through the states to the gradient of each token's log decay.
 
-    A token's decay acts on what was written before it and is read at it or behind it. Both are
-    sums of the tokens before and behind; differences of sums would keep the rounding of the
-    largest.
+    A token's decay acts on what earlier tokens wrote and what it and later tokens read. Both are
+    summed directly: differences of sums would keep the rounding error of the largest.
     """
     size = len(grad_logs)
     written = read = 0.0
@@ -164,5 +163,5 @@ def add_sums(before, behind, reverse, grad_logs):
         grad_logs[t] += written
         written += before[t]
         t = size - 1 - t
-        read += behind[t]
+        read += after[t]
         grad_logs[t] += read

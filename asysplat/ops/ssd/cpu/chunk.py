@@ -1,6 +1,6 @@
-"""What the kernels know of a chunk: its inputs, the rows of a head's tokens, and their decays.
+"""The arrays of a chunk: its inputs, the rows of a head's tokens, and the decays between them.
 
-Decays between the tokens of a chunk turn scores into weights.
+The decays turn scores into weights.
 """
 
 import math
@@ -18,10 +18,10 @@ class Decays(NamedTuple):
     """The decays of c chunks of q tokens, for h heads; float32.
 
     Args:
-        high, low: [c, h, q] log2 of the decay since the scan entered the chunk, in two numbers: a
-            token that forgets everything leaves no rounding in the decays behind it.
-        from_start: [c, h, q] from where the scan enters the chunk to a token.
-        to_end: [c, h, q] from a token to where the scan leaves the chunk.
+        high, low: [c, h, q] log2 of the decay since the start of the chunk, as the sum of two
+            numbers: a huge step leaves no rounding error in later decays.
+        from_start: [c, h, q] from the start of the chunk, in scan order, to a token.
+        to_end: [c, h, q] from a token to the end of the chunk.
         across: [c, h] of the whole chunk.
     """
 
@@ -66,7 +66,7 @@ def take_rows(tensor, begin, head, rows):
 
 @inline
 def scale_rows(rows, factors):
-    """Multiply each row by a factor of its own."""
+    """Multiply each row by its factor."""
     for t in range(len(rows)):
         for i in range(rows.shape[1]):
             rows[t, i] *= factors[t]
@@ -74,7 +74,7 @@ def scale_rows(rows, factors):
 
 @inline
 def dot_rows(a, b, t):
-    """Return the product of row t of both, which are contiguous and in whole vectors."""
+    """Return the dot product of row t of both, which are contiguous and in whole vectors."""
     vectors = a.shape[1] // LANES
     value = zeros()
     for i in range(t * vectors, (t + 1) * vectors):
@@ -101,8 +101,8 @@ def decay_between(high, low, t, s, reverse):
 
 
 @inline
-def seen_from(t, size, reverse):
-    """Return the range of tokens that token t sees, widened to whole vectors."""
+def range_before(t, size, reverse):
+    """Return the range of tokens before t in scan order, with t, widened to whole vectors."""
     if reverse:
         return t // LANES * LANES, size
     return 0, (t // LANES + 1) * LANES
@@ -110,16 +110,16 @@ def seen_from(t, size, reverse):
 
 @inline
 def weigh_scores(scores, high, low, reverse, weights):
-    """Write `weights`, scores times decays, where a token sees another (`seen_from`).
+    """Write `weights`, the scores times the decays, in the `range_before` each token.
 
     Args:
         scores, weights: [q, q] of token t (row) and s.
         high, low: [q], see `Decays`.
-        reverse: tokens see those after them.
+        reverse: the scan goes from the last token to the first.
     """
     size = len(scores)
     for t in range(size):
-        first, last = seen_from(t, size, reverse)
+        first, last = range_before(t, size, reverse)
         for base in range(first, last, LANES):
             for i in range(LANES):
                 decay = decay_between(high, low, t, base + i, reverse)
@@ -139,8 +139,8 @@ def weigh_scores_backward(grad_weights, scores, high, low, reverse, grad_scores,
     grads = np.empty(LANES, np.float32)
     column = np.zeros(size)
     for k in range(size):
-        t = k if reverse else size - 1 - k  # from the last that the scan comes to
-        first, last = seen_from(t, size, reverse)
+        t = k if reverse else size - 1 - k  # from the last in scan order
+        first, last = range_before(t, size, reverse)
         for base in range(first, last, LANES):
             for i in range(LANES):
                 decay = decay_between(high, low, t, base + i, reverse)
@@ -148,7 +148,7 @@ def weigh_scores_backward(grad_weights, scores, high, low, reverse, grad_scores,
                 grad_scores[t, base + i] += grads[i]
             for i in range(LANES):
                 column[base + i] += float(grads[i] * scores[t, base + i])
-        # The decay of t lies between all tokens before it and itself or those behind it.
+        # The decay of t is part of every decay from a token before it to itself or a later token.
         total = 0.0
         for s in range(t + 1 if reverse else 0, size if reverse else t):
             total += column[s]

@@ -1,7 +1,7 @@
-"""The output of a segment: one head after the other goes through its chunks.
+"""The output of a segment: each head goes through its chunks.
 
-A state is [N, width], where `width` is the head_dim in whole vectors of LANES; so is everything
-that has a row for each token. The columns beyond the head_dim stay 0.
+A state is [N, width], where `width` is the head_dim in whole vectors of LANES; arrays with a row
+for each token have the same width. The columns beyond the head_dim stay 0.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from asysplat.ops.ssd.cpu.chunk import scale_rows, take_rows, weigh_scores
 
 @kernel
 def forward_heads(start, stop, segment, states, y):
-    """Write y of the heads start to stop, and take their states through the segment.
+    """Write y of the heads start to stop, and update their states.
 
     Args:
         segment: see `Segment`.

@@ -1,4 +1,4 @@
-"""Both passes over a sequence: one segment of chunks after the other, its heads in parallel."""
+"""Both passes over a sequence: segment by segment of chunks, the heads in parallel."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,11 +18,11 @@ from asysplat.ops.ssd.cpu.chunk import Segment, sum_decays
 from asysplat.ops.ssd.cpu.forward import forward_heads
 
 SEGMENT = 16 * CHUNK  # tokens; a head's states before these chunks are 1 MB at paper scale
-GROUP = 2  # heads whose gradients of B and C are summed before they leave a core
+GROUP = 2  # heads whose gradients of B and C one core sums
 
 
 def saved_state_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) -> tuple:
-    """Return that of the states before each segment, [B, segments, H, N, P in whole vectors]."""
+    """Return the shape of the states before segments, [B, segments, H, N, P in whole vectors]."""
     batch, length, heads, head_dim = x.shape
     return batch, -(-length // SEGMENT), heads, B.shape[-1], _whole_vectors(head_dim)
 
@@ -92,16 +92,16 @@ def backward(
 
 
 def _segments(length: int, reverse: bool) -> Iterator[tuple[int, slice]]:
-    """Yield each segment's index and tokens, in the direction of the scan."""
+    """Yield each segment's index and tokens, in scan order."""
     indices = range(-(-length // SEGMENT))
     for index in reversed(indices) if reverse else indices:
         yield index, slice(index * SEGMENT, min((index + 1) * SEGMENT, length))
 
 
 def _segment(inputs: ScanInputs, batch: int, tokens: slice, reverse: bool) -> Segment:
-    """Cut a segment out of one sequence, in whole chunks.
+    """Return a segment of one sequence, padded to whole chunks.
 
-    Tokens that fill the last chunk have dt = 0: they neither decay the state nor add to it.
+    Padding has dt = 0: it neither decays the state nor adds to it.
     """
     x, dt, B, C = (
         _whole_chunks(tensor[batch, tokens]) for tensor in (inputs.x, inputs.dt, inputs.B, inputs.C)
@@ -113,7 +113,7 @@ def _segment(inputs: ScanInputs, batch: int, tokens: slice, reverse: bool) -> Se
         A=inputs.A.numpy(),
         B=B.numpy(),
         C=C.numpy(),
-        D=inputs.D.clone().numpy(),  # a weight, whose own storage FSDP could then not free
+        D=inputs.D.clone().numpy(),  # a view would keep FSDP from freeing the parameter
         scores=(C @ B.mT).numpy(),
         decays=sum_decays(dt.unflatten(0, (-1, CHUNK)), inputs.A, reverse),
         reverse=reverse,
@@ -121,7 +121,7 @@ def _segment(inputs: ScanInputs, batch: int, tokens: slice, reverse: bool) -> Se
 
 
 def _whole_chunks(tokens: Tensor) -> Tensor:
-    """Return [l ...] in fp32, filled with zeros to whole chunks."""
+    """Return [l ...] in fp32, padded with zeros to whole chunks."""
     missing = -len(tokens) % CHUNK
     if missing:
         tokens = F.pad(tokens, (0, 0) * (tokens.ndim - 1) + (0, missing))
@@ -135,7 +135,7 @@ def _whole_vectors(count: int | torch.SymInt) -> int | torch.SymInt:
 
 @contextmanager
 def _whole_target(target: Tensor, length: int) -> Iterator[np.ndarray]:
-    """Give an fp32 array of `length` tokens, and copy to `target` what is written there."""
+    """Yield an fp32 array of `length` tokens, whose content is copied to `target`."""
     if len(target) == length and target.dtype == torch.float32:
         yield target.numpy()
         return
@@ -145,10 +145,10 @@ def _whole_target(target: Tensor, length: int) -> Iterator[np.ndarray]:
 
 
 def _write(target: Tensor, chunks: Tensor) -> None:
-    """Copy the tokens of [c, q, N] to `target`, without those that fill the last chunk."""
+    """Copy the tokens of [c, q, N] to `target`, without the padding."""
     target.copy_(chunks.flatten(0, 1)[: len(target)])
 
 
 def _one_each(count: int) -> np.ndarray:
-    """Return bounds that give each task one head or group: it takes long enough."""
+    """Return bounds with one head or group for each task."""
     return np.arange(count + 1)

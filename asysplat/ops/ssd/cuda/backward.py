@@ -1,4 +1,4 @@
-"""The gradients of what each head has of its own, x, dt, A and D, then of what the heads share."""
+"""The gradients of x, dt, A and D, which each head has of its own, then of the shared B and C."""
 
 import triton.language as tl
 
@@ -46,15 +46,15 @@ def head_gradients(
 ):
     """Write the gradients of x, dt, A and D for a chunk and a head.
 
-    The gradient of a token's log decay is the sum over all pairs of an input before it and an
-    output not before it. They are summed themselves, never as a difference of larger sums.
+    The gradient of a token's log decay is the sum over all pairs of an earlier input and an output
+    at or after it, summed directly, never as a difference of larger sums.
 
     Args:
         grad_output, x, A, B, C, D: see `asysplat.ops.ssd`.
         decays: see `sum_decays`.
         scores: see `score_chunk`.
         states: [B, chunks, H, P, N] before each chunk.
-        grad_states: [B, chunks, H, P, N], the gradients of those after each chunk.
+        grad_states: [B, chunks, H, P, N], the gradients of the states after each chunk.
         grad_x, grad_dt: [B, L, H, P] and [B, L, H], written.
         grad_A, grad_D: [B, chunks, H], written, to be summed over sequences and chunks.
     """
@@ -65,7 +65,7 @@ def head_gradients(
     step = tl.load(row + STEP * positions + lane)
     part = (batch * chunks + chunk) * heads + head
 
-    # From the states: what flows in from before the chunk, out behind it, and through.
+    # Through the states: into the chunk, out of it, and across it.
     grad_input = tl.zeros((CHUNK, HEAD_DIM), tl.float32)
     read = tl.zeros((CHUNK, HEAD_DIM), tl.float32)
     through = tl.zeros((HEAD_DIM,), tl.float32)
@@ -85,7 +85,7 @@ def head_gradients(
     flows_in *= tl.sum(read * out.to(tl.float32), 1)
     grad_input *= tl.exp(tl.load(row + TO_END * positions + lane))[:, None]
     flows_out = step * tl.sum(grad_input * value.to(tl.float32), 1)
-    flows_through = tl.exp(tl.load(row + SINCE * positions + CHUNK - 1)) * tl.sum(through, 0)
+    flows_across = tl.exp(tl.load(row + SINCE * positions + CHUNK - 1)) * tl.sum(through, 0)
 
     # Within the chunk, from position s to position t.
     weight = tl.load(scores + square_at(batch, chunk, chunks, CHUNK))
@@ -94,7 +94,7 @@ def head_gradients(
     flows = weight * product(out, tl.trans(value), DOT, PRECISION) * step[None, :]
     flows = tl.cumsum(flows, 0, reverse=True) + flows_out[None, :]
     flows = tl.where(lane[:, None] > lane[None, :], flows, 0.0)
-    grad_exponent = tl.sum(flows, 1) + tl.cumsum(flows_in, 0, reverse=True) + flows_through
+    grad_exponent = tl.sum(flows, 1) + tl.cumsum(flows_in, 0, reverse=True) + flows_across
 
     value = value.to(tl.float32)
     out = out.to(tl.float32)
@@ -163,7 +163,7 @@ def projection_gradients(
 ):
     """Write BLOCK columns of the gradient of B or C, [B, L, N], for a chunk's tokens.
 
-    It is summed over the heads in their order.
+    The sum over the heads is in their order.
 
     Args:
         values, projections, states: with OF_B, x, C and the gradients of the states after the
@@ -174,8 +174,8 @@ def projection_gradients(
     first, chunk = tl.program_id(0) * BLOCK, tl.program_id(1)
     batch = tl.program_id(2).to(tl.int64)
     lane = tl.arange(0, CHUNK)
-    to, there = rows_of_state(batch, chunk, first, length, STATE, BLOCK, REVERSE, CHUNK)
-    projection = tl.load(projections + to, mask=there, other=0.0)
+    to, exists = rows_of_state(batch, chunk, first, length, STATE, BLOCK, REVERSE, CHUNK)
+    projection = tl.load(projections + to, mask=exists, other=0.0)
     square = tl.load(grad_scores + square_at(batch, chunk, chunks, CHUNK))
     if OF_B:
         square = tl.trans(square)
@@ -192,4 +192,4 @@ def projection_gradients(
         part = (batch * chunks + chunk) * heads + head
         at = state_at(part, first, HEAD_DIM, STATE, BLOCK)
         total += product(value, tl.load(states + at), DOT, PRECISION)
-    tl.store(grad_projections + to, total.to(grad_projections.dtype.element_ty), mask=there)
+    tl.store(grad_projections + to, total.to(grad_projections.dtype.element_ty), mask=exists)

@@ -1,21 +1,21 @@
-"""What the kernels know of a chunk: where arrays have its tokens, their decays, and products."""
+"""The indices of a chunk's tokens in the arrays, their decays, and products."""
 
 import triton.language as tl
 
 from asysplat.ops.triton_utils import INTERPRETED, kernel, tokens_at
 
 IN_INTERPRETER = tl.constexpr(INTERPRETED)
-# What a token needs, rows of [B, H, ROWS, positions], fp32: log decay since the chunk's start,
-# with the token's own (<= 0), and what float32 leaves of it; log decay to the chunk's end; dt.
+# The rows of [B, H, ROWS, positions], fp32: log decay since the chunk's start, with the token's own
+# (<= 0), and its rounding error in float32; log decay to the chunk's end; dt.
 SINCE, REST, TO_END, STEP = (tl.constexpr(row) for row in range(4))
 ROWS = tl.constexpr(4)
-# exp of it is 0 in float32: a token that forgets more does not make the sums after it coarser.
-LEAST = tl.constexpr(-128.0)
+# Its exp is 0 in float32; a larger step would make later sums less precise.
+MIN_EXPONENT = tl.constexpr(-128.0)
 
 
 @kernel
 def rows_of_head(batch, chunk, head, length, heads, HEAD_DIM, REVERSE, CHUNK):
-    """Return where [B, L, H, P] has a chunk's tokens, [CHUNK, P], and which of them exist."""
+    """Return the places [CHUNK, P] of a chunk's tokens in [B, L, H, P], and which exist."""
     token, inside = tokens_at(chunk * CHUNK + tl.arange(0, CHUNK), length, REVERSE)
     row = (batch * length + token) * heads + head
     return row[:, None] * HEAD_DIM + tl.arange(0, HEAD_DIM)[None, :], inside[:, None]
@@ -23,7 +23,7 @@ def rows_of_head(batch, chunk, head, length, heads, HEAD_DIM, REVERSE, CHUNK):
 
 @kernel
 def rows_of_state(batch, chunk, first, length, STATE, BLOCK, REVERSE, CHUNK):
-    """Return where [B, L, N] has BLOCK columns of a chunk's tokens, and which of them exist."""
+    """Return the places of a chunk's tokens in BLOCK columns of [B, L, N], and which exist."""
     token, inside = tokens_at(chunk * CHUNK + tl.arange(0, CHUNK), length, REVERSE)
     row = (batch * length + token)[:, None] * STATE
     return row + first + tl.arange(0, BLOCK)[None, :], inside[:, None]
@@ -31,7 +31,7 @@ def rows_of_state(batch, chunk, first, length, STATE, BLOCK, REVERSE, CHUNK):
 
 @kernel
 def state_at(part, first, HEAD_DIM, STATE, BLOCK):
-    """Return where states [B, chunks, H, P, N] have BLOCK columns of the state `part`, [P, BLOCK].
+    """Return the places [P, BLOCK] of the state `part` in [B, chunks, H, P, N].
 
     `part` counts all [B, chunks, H].
     """
@@ -41,7 +41,7 @@ def state_at(part, first, HEAD_DIM, STATE, BLOCK):
 
 @kernel
 def square_at(batch, chunk, chunks, CHUNK):
-    """Return where an array [B, chunks, CHUNK, CHUNK] has a chunk's square."""
+    """Return the places of a chunk's square in [B, chunks, CHUNK, CHUNK]."""
     lane = tl.arange(0, CHUNK)
     return ((batch * chunks + chunk) * CHUNK + lane)[:, None] * CHUNK + lane[None, :]
 
@@ -68,27 +68,27 @@ def sum_decays(
     batch = tl.program_id(2).to(tl.int64)
     position = chunk * CHUNK + tl.arange(0, CHUNK)
     token, inside = tokens_at(position, length, REVERSE)
-    there = (head < heads)[:, None]
-    mask = there & inside[None, :]
+    exists = (head < heads)[:, None]
+    mask = exists & inside[None, :]
     step = tl.load(
         dt + (batch * length + token)[None, :] * heads + head[:, None], mask=mask, other=0.0
     )
     rate = tl.load(A + head, mask=head < heads, other=0.0)
-    exponent = tl.maximum(step.to(tl.float64) * rate.to(tl.float64)[:, None], LEAST)
+    exponent = tl.maximum(step.to(tl.float64) * rate.to(tl.float64)[:, None], MIN_EXPONENT)
     total = tl.cumsum(exponent, 1)
     since = total.to(tl.float32)
     positions = tl.num_programs(0) * CHUNK
     to = decays + (batch * heads + head)[:, None] * ROWS * positions + position[None, :]
-    tl.store(to + SINCE * positions, since, mask=there)
-    tl.store(to + REST * positions, (total - since.to(tl.float64)).to(tl.float32), mask=there)
+    tl.store(to + SINCE * positions, since, mask=exists)
+    tl.store(to + REST * positions, (total - since.to(tl.float64)).to(tl.float32), mask=exists)
     to_end = tl.sum(exponent, 1)[:, None] - total
-    tl.store(to + TO_END * positions, tl.minimum(to_end, 0.0).to(tl.float32), mask=there)
-    tl.store(to + STEP * positions, step, mask=there)
+    tl.store(to + TO_END * positions, tl.minimum(to_end, 0.0).to(tl.float32), mask=exists)
+    tl.store(to + STEP * positions, step, mask=exists)
 
 
 @kernel
 def decays_of(decays, batch, head, heads, chunk, chunks, CHUNK: tl.constexpr):
-    """Return where a head's rows have a chunk's first position, and the length of a row."""
+    """Return the place of a chunk's first position in a head's rows, and the length of a row."""
     positions = tl.cast(chunks, tl.int64) * CHUNK
     return decays + (batch * heads + head) * ROWS * positions + chunk * CHUNK, positions
 
@@ -106,8 +106,8 @@ def decay_between(row, positions, CHUNK: tl.constexpr):
 
 @kernel
 def product(a, b, DOT: tl.constexpr, PRECISION: tl.constexpr):
-    """Return a @ b, the factors as DOT, summed in fp32."""
+    """Return a @ b, the factors converted to DOT, summed in fp32."""
     a, b = a.to(DOT), b.to(DOT)
-    if IN_INTERPRETER:  # whose products take bfloat16 for integers
+    if IN_INTERPRETER:  # whose products read bfloat16 as integers
         a, b = a.to(tl.float32), b.to(tl.float32)
     return tl.dot(a, b, input_precision=PRECISION)

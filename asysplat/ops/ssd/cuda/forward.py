@@ -1,4 +1,4 @@
-"""The state before each chunk, and the output of each from its own tokens and that state."""
+"""The state before each chunk, and the output of each chunk from its tokens and that state."""
 
 import triton.language as tl
 
@@ -79,7 +79,7 @@ def score_chunk(
     DOT: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """Write the scores C_t . B_s, [B, chunks, t, s] fp32, which all heads share."""
+    """Write the scores C_t . B_s, [B, chunks, t, s] fp32, shared by all heads."""
     chunk, batch = tl.program_id(0), tl.program_id(1).to(tl.int64)
     total = tl.zeros((CHUNK, CHUNK), tl.float32)
     for first in range(0, STATE, BLOCK):

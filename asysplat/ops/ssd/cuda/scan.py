@@ -1,4 +1,4 @@
-"""Both passes: which kernels run, one after the other, and on what."""
+"""Both passes: the arrays and launches of the kernels."""
 
 from typing import Any, NamedTuple
 
@@ -14,13 +14,12 @@ from asysplat.ops.ssd.cuda.chunk import ROWS, sum_decays
 from asysplat.ops.ssd.cuda.forward import forward_chunk, pass_states, score_chunk
 from asysplat.ops.triton_utils import FUSED, INTERPRETED, check_size
 
-INTERPRETED_CHUNK = 16  # tokens: tests see several chunks, although the interpreter is slow
-TOKENS = INTERPRETED_CHUNK if INTERPRETED else CHUNK  # of a chunk
+TOKENS = 16 if INTERPRETED else CHUNK  # of a chunk; the slow interpreter, too, runs several
 BLOCK = 64  # columns of a state in a program
-HEADS = 8  # in a program that sums decays
+HEADS = 8  # of a program that sums decays
 LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}  # with fewer warps, fp32 products spill
 MAX_HEAD_DIM, MAX_STATE = 128, 256
-# As what a product's factors are rounded: fp16 has not the range of a state, TF32 has all its bits.
+# The type of a product's factors: fp16 lacks the range of a state, TF32 has all of its bits.
 PRODUCTS = {
     torch.float32: {"DOT": tl.float32, "PRECISION": "ieee"},
     torch.bfloat16: {"DOT": tl.bfloat16, "PRECISION": "ieee"},
@@ -39,14 +38,14 @@ def forward(
     """Return y and an empty saved state; see `asysplat.ops.scan.Kernels`.
 
     Raises:
-        InputError: a head_dim or a state size that is no power of two from 16 to 128 or 256.
+        InputError: a head_dim or state size that is no power of two from 16 to 128 or 256.
     """
     check_size("ssd", "head_dim", inputs.x.shape[-1], MAX_HEAD_DIM)
     check_size("ssd", "state size", inputs.B.shape[-1], MAX_STATE)
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     y = torch.empty_like(x)
     with torch.cuda.device_of(x):
-        sizes = _Sizes.of(x, B, reverse)
+        sizes = _Sizes(*x.shape, B.shape[-1], x.dtype, reverse)
         decays = _decays(sizes, dt, A)
         scores = _scores(sizes, B, C)
         states = _states(sizes, x, B, decays, gradient=False)
@@ -66,7 +65,7 @@ def backward(
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     grad_output = grad_output.contiguous()
     with torch.cuda.device_of(x):
-        sizes = _Sizes.of(x, B, reverse)
+        sizes = _Sizes(*x.shape, B.shape[-1], x.dtype, reverse)
         parts = (sizes.batch, sizes.chunks, sizes.heads)
         grads = ScanInputs(
             x=torch.empty_like(x),
@@ -76,31 +75,22 @@ def backward(
             C=torch.empty_like(C),
             D=dt.new_empty(parts),
         )
-        decays = _decays(sizes, dt, A)
+        decays, scores = _decays(sizes, dt, A), _scores(sizes, B, C)
         states = _states(sizes, x, B, decays, gradient=False)
         grad_states = _states(sizes, grad_output, C, decays, gradient=True)
         head_gradients[(sizes.chunks * sizes.heads, sizes.batch)](
-            *(grad_output, x, A, B, C, D),
-            decays=decays,
-            scores=_scores(sizes, B, C),
-            states=states,
-            grad_states=grad_states,
-            grad_x=grads.x,
-            grad_dt=grads.dt,
-            grad_A=grads.A,
-            grad_D=grads.D,
+            *(grad_output, x, A, B, C, D, decays, scores, states, grad_states),
+            *(grads.x, grads.dt, grads.A, grads.D),
             **sizes.launch_kwargs(head_gradients),
         )
-        grad_scores = dt.new_empty(sizes.squares)
+        grad_scores = torch.empty_like(scores)
         score_gradients[(sizes.chunks, sizes.batch)](
             grad_output, x, decays, grad_scores, **sizes.launch_kwargs(score_gradients)
         )
         gradients_of = projection_gradients[(sizes.blocks, sizes.chunks, sizes.batch)]
-        launch_kwargs = sizes.launch_kwargs(projection_gradients)
-        gradients_of(x, C, decays, grad_scores, grad_states, grads.B, OF_B=True, **launch_kwargs)
-        gradients_of(
-            grad_output, B, decays, grad_scores, states, grads.C, OF_B=False, **launch_kwargs
-        )
+        options = sizes.launch_kwargs(projection_gradients)
+        gradients_of(x, C, decays, grad_scores, grad_states, grads.B, OF_B=True, **options)
+        gradients_of(grad_output, B, decays, grad_scores, states, grads.C, OF_B=False, **options)
     return grads._replace(A=grads.A.sum((0, 1)), D=grads.D.sum((0, 1)))
 
 
@@ -115,17 +105,9 @@ class _Sizes(NamedTuple):
     dtype: torch.dtype
     reverse: bool
 
-    @classmethod
-    def of(cls, x: Tensor, B: Tensor, reverse: bool) -> "_Sizes":
-        return cls(*x.shape, B.shape[-1], x.dtype, reverse)
-
     @property
     def chunks(self) -> int:
         return -(-self.length // TOKENS)
-
-    @property
-    def squares(self) -> tuple[int, int, int, int]:
-        return self.batch, self.chunks, TOKENS, TOKENS
 
     @property
     def block(self) -> int:
@@ -152,7 +134,7 @@ class _Sizes(NamedTuple):
 
 
 def _decays(sizes: _Sizes, dt: Tensor, A: Tensor) -> Float[Tensor, "B H rows positions"]:
-    """Return what `sum_decays` writes."""
+    """Run `sum_decays`."""
     decays = dt.new_empty(sizes.batch, sizes.heads, ROWS.value, sizes.chunks * TOKENS)
     sum_decays[(sizes.chunks, -(-sizes.heads // HEADS), sizes.batch)](
         *(dt, A, decays, sizes.length, sizes.heads),
@@ -167,7 +149,7 @@ def _decays(sizes: _Sizes, dt: Tensor, A: Tensor) -> Float[Tensor, "B H rows pos
 def _states(
     sizes: _Sizes, values: Tensor, projections: Tensor, decays: Tensor, gradient: bool
 ) -> Float[Tensor, "B chunks H P N"]:
-    """Return the state before each chunk, or with `gradient` the gradient of that after it."""
+    """Return the state before each chunk, or with `gradient` the gradient of the state after it."""
     shape = (sizes.batch, sizes.chunks, sizes.heads, sizes.head_dim, sizes.state)
     states = decays.new_empty(shape)
     pass_states[(sizes.blocks, sizes.heads, sizes.batch)](
@@ -177,7 +159,8 @@ def _states(
 
 
 def _scores(sizes: _Sizes, B: Tensor, C: Tensor) -> Float[Tensor, "B chunks t s"]:
-    """Return what `score_chunk` writes."""
-    scores = torch.empty(sizes.squares, dtype=torch.float32, device=B.device)
+    """Run `score_chunk`."""
+    shape = (sizes.batch, sizes.chunks, TOKENS, TOKENS)
+    scores = torch.empty(shape, dtype=torch.float32, device=B.device)
     score_chunk[(sizes.chunks, sizes.batch)](B, C, scores, **sizes.launch_kwargs(score_chunk))
     return scores

@@ -1,0 +1,140 @@
+"""Early exit: exact when off, skips what its thresholds name, and reports the shares."""
+
+import math
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from test_prior import wall
+from tiny import NETWORK
+
+from asysplat.errors import InputError, input_error_behind
+from asysplat.models import BiMamba2, EarlyExit
+from asysplat.models.early_exit import EXACT
+from asysplat.rendering import render
+from asysplat.scene import Views
+
+ALWAYS = 1e-6  # a confidence that every scene with a known depth exceeds
+NEVER = 1.0  # a confidence that no scene reaches
+
+
+@pytest.fixture
+def net(build):
+    """A network of three stages with two layers each, whose head corrects the prior visibly."""
+    net = build(*NETWORK).eval()
+    torch.nn.init.normal_(net.head.decode.weight, std=0.05)
+    return net
+
+
+def preset(repository, name):
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        return instantiate(compose("train", [f"speed={name}"]).speed)
+
+
+@torch.no_grad()
+def predict(net, views, **thresholds):
+    net.early_exit = EarlyExit(**thresholds)
+    return net(views)
+
+
+def same_bits(one, other):
+    pairs = [(getattr(one, f.name), getattr(other, f.name)) for f in fields(one)]
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_off_is_exact_and_reports_nothing(net, repository):
+    exact = predict(net, wall())
+    assert preset(repository, "exact") == EXACT == net.early_exit
+    assert net.early_exit_shares == {}
+    assert same_bits(exact, net.predict(wall()))
+
+
+@pytest.mark.parametrize("threshold", ["skip_layers_above", "skip_network_above"])
+def test_a_threshold_that_no_scene_reaches_changes_no_bit(net, threshold):
+    exact = predict(net, wall())
+    assert same_bits(exact, predict(net, wall(), **{threshold: NEVER}))
+    assert set(net.early_exit_shares.values()) == {0.0}
+
+
+def test_training_skips_nothing(net):
+    net.early_exit = EarlyExit(skip_network_above=ALWAYS)
+    torch.manual_seed(0)
+    assert net.train()(wall()).sh.shape[-2] == net.head.sh_bands
+    assert net.early_exit_shares == {}
+
+
+def test_skipped_layers_are_scans_and_middle_stages(net):
+    called = []
+    for module in net.modules():
+        if module in net.skippable_layers or isinstance(module, BiMamba2):
+            module.register_forward_hook(lambda module, *_: called.append(module))
+    exact = predict(net, wall())
+    assert set(called) == set(net.skippable_layers)
+    called.clear()
+    found = predict(net, wall(), skip_layers_above=ALWAYS)
+    assert called == []
+    # Of 3 stages with a scan, an attention and two layers of MambaVision: all but 2 attentions.
+    assert math.isclose(net.early_exit_shares["layers"], 10 / 12)
+    assert net.early_exit_shares["network"] == 0
+    assert not torch.equal(found.means, exact.means)
+
+
+def test_without_the_network_gaussians_are_those_of_the_prior(net):
+    views = wall()
+    found = predict(net, views, skip_network_above=ALWAYS)
+    prior = net.run_prior(views)
+    torch.testing.assert_close(found.opacities, prior.opacity.flatten(1))
+    origins = views.cameras.centers[:, :, None, None]
+    distance = (found.means.unflatten(1, prior.distance.shape[1:]) - origins).norm(dim=-1)
+    torch.testing.assert_close(distance, prior.distance, rtol=1e-4, atol=1e-4)
+    assert found.sh.shape[-2] == 1
+    assert net.early_exit_shares == {"network": 1, "layers": 1}
+    # The omitted SH bands are 0: the images are those of all bands.
+    net.head.decode.weight.data.zero_()
+    images = [
+        render(gaussians, views.cameras, depth=False).image
+        for gaussians in (found, predict(net, views))
+    ]
+    torch.testing.assert_close(*images)
+
+
+def test_presets_skip_where_the_prior_is_confident(net, repository):
+    textured = wall()
+    flat = replace(textured, images=torch.full_like(textured.images, 0.4))
+    shares = {}
+    for name in ("balanced", "fast"):
+        net.early_exit = preset(repository, name)
+        for scene, views in (("flat", flat), ("textured", textured)):
+            with torch.no_grad():
+                net(Views(views.cameras, views.images))
+            shares[name, scene] = net.early_exit_shares["layers"]
+    assert shares["balanced", "flat"] == shares["fast", "flat"] == 0
+    assert shares["balanced", "textured"] > 0.3
+    assert shares["fast", "textured"] == 1
+
+
+@pytest.mark.parametrize("value", [0.0, -0.1, 1.5, float("nan")], ids=str)
+@pytest.mark.parametrize("name", [field.name for field in fields(EarlyExit)])
+def test_bad_thresholds_are_refused(name, value):
+    with pytest.raises(InputError, match=rf"speed\.{name}=.*above 0 and up to 1"):
+        EarlyExit(**{name: value})
+
+
+def test_a_bad_override_is_one_sentence(repository):
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        config = compose("train", ["speed=fast", "speed.skip_network_above=2.0"])
+    with pytest.raises(Exception, match=r"speed\.skip_network_above=2\.0") as caught:
+        instantiate(config.speed)
+    assert isinstance(input_error_behind(caught.value), InputError)
+
+
+def test_early_exit_needs_a_prior_and_one_scene(build, net):
+    blind = build(*NETWORK, "model=asysplat_4m4s").eval()
+    blind.check_early_exit(EXACT)
+    with pytest.raises(InputError, match="has no prior"):
+        predict(blind, wall(), skip_layers_above=ALWAYS)
+    with pytest.raises(InputError, match="2 scenes at a time"):
+        scenes = Views.stack([wall()] * 2).map(lambda tensor: tensor[:, 0])
+        predict(net, scenes, skip_layers_above=ALWAYS)
