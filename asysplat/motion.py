@@ -1,4 +1,4 @@
-"""Gaussians, moved from one coordinate frame to another."""
+"""Rigid motions of Gaussians."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from asysplat.scene import Gaussians
 
 
 def transform(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
-    """Apply a rigid motion to Gaussians: cameras moved alike render the same images.
+    """Apply a rigid motion to Gaussians; cameras that move along render the same images.
 
     Computed in float64; the fields keep their types.
 
@@ -36,7 +36,7 @@ def transform(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
 def _quaternion_product(
     first: Float[Tensor, "4"], second: Float[Tensor, "*batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
-    """Multiply quaternions wxyz: the rotation by `second`, then by `first`."""
+    """Multiply quaternions wxyz: first the rotation by `second`, then by `first`."""
     w, x, y, z = first.tolist()
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     return second @ second.new_tensor(rows).mT

@@ -1,7 +1,7 @@
-"""What data, models and rendering give to each other: Cameras, Views and Gaussians.
+"""The values that data, models and rendering exchange: Cameras, Views and Gaussians.
 
-Shapes are checked when a value is made; `validate()` also looks at the numbers (finite, in range,
-rotations orthonormal) and is called once, where data enters.
+Constructors check shapes; `validate()` also checks the numbers (finite, in range, rotations
+orthonormal) and is called once, where data enters.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ Record = TypeVar("Record", bound="TensorRecord")
 
 
 class TensorRecord:
-    """A frozen dataclass of tensors (and of other such records) that moves and stacks as one."""
+    """A frozen dataclass of tensors, and of other such records, that moves and stacks as one."""
 
     def map(self: Record, function: Callable[[Tensor], Tensor]) -> Record:
         """Apply `function` to every tensor; None and plain numbers stay as they are."""
@@ -48,7 +48,7 @@ class TensorRecord:
             elif all(isinstance(value, Tensor) for value in values):
                 stacked[field.name] = torch.stack(values)
             elif any(value is None for value in values):
-                # A field that some scenes lack is dropped for the whole batch.
+                # The batch lacks a field that any scene lacks.
                 stacked[field.name] = None
             elif all(value == values[0] for value in values):
                 stacked[field.name] = values[0]
@@ -100,7 +100,7 @@ class Cameras(TensorRecord):
         return self.cam_to_world[..., :3, 3]
 
     def select(self, views: Sequence[int] | Tensor) -> "Cameras":
-        """Return the named views, in the given order."""
+        """Return the views with these indices, in the given order."""
         index = torch.as_tensor(views, device=self.intrinsics.device)
         return replace(
             self,
@@ -109,14 +109,14 @@ class Cameras(TensorRecord):
         )
 
     def resized(self, height: int, width: int) -> "Cameras":
-        """Return the same cameras with `height` x `width` pixels over the same field of view."""
+        """Return cameras of `height` x `width` pixels with the same field of view."""
         factors = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
         return replace(
             self, intrinsics=factors[:, None] * self.intrinsics, height=height, width=width
         )
 
     def pixel_directions(self) -> Float[Tensor, "*batch V H W 3"]:
-        """Return the camera-space directions through every pixel center, with z = 1."""
+        """Compute the camera-space directions through every pixel center, with z = 1."""
         options = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
         y, x = torch.meshgrid(
             torch.arange(self.height, **options) + 0.5,
@@ -129,19 +129,38 @@ class Cameras(TensorRecord):
         return torch.stack((x, y, z), dim=-1)
 
     def rays(self) -> tuple[Float[Tensor, "*batch V H W 3"], Float[Tensor, "*batch V H W 3"]]:
-        """Return the world-space origins and unit directions of every pixel center's ray."""
-        # Not a matrix product: autocast would round those to half precision.
+        """Compute the world-space origin and unit direction of every pixel center's ray."""
+        # Not a matrix product, which autocast would round to half precision.
         rotation = self.cam_to_world[..., None, None, :3, :3]
         directions = (rotation * self.pixel_directions()[..., None, :]).sum(-1)
         directions = torch.nn.functional.normalize(directions, dim=-1)
         return self.centers[..., None, None, :].expand_as(directions), directions
 
+    def project(
+        self, points: Float[Tensor, "*batch N 3"]
+    ) -> tuple[
+        Float[Tensor, "*batch V N 2"], Float[Tensor, "*batch V N"], Bool[Tensor, "*batch V N"]
+    ]:
+        """Project world points into every view.
+
+        Returns:
+            Positions (x, y) in pixels; depths along the camera's z axis; whether a point is in
+            front of the camera and inside the image.
+        """
+        # The offset comes first: it is exact for scenes far from the origin.
+        offsets = points[..., None, :, :] - self.centers[..., None, :]
+        local = offsets @ self.cam_to_world[..., :3, :3]
+        depth = local[..., 2]
+        pixels = (local @ self.intrinsics.mT)[..., :2] / depth.clamp_min(1e-12)[..., None]
+        size = pixels.new_tensor([self.width, self.height])
+        return pixels, depth, (depth > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
+
     def validate(self, name: str = "Cameras") -> "Cameras":
-        """Return self if every number can be used.
+        """Return self if all numbers are usable.
 
         Raises:
-            InputError: NaN or infinity, a focal length <= 0, a rotation that is not orthonormal
-                or a last row other than 0 0 0 1; it names the field and the view.
+            InputError: NaN or infinity, a focal length <= 0, a rotation that is not orthonormal, or
+                a last row other than 0 0 0 1; it names the field and the view.
         """
         _check_finite(f"{name}.intrinsics", self.intrinsics, 2)
         _check_finite(f"{name}.cam_to_world", self.cam_to_world, 2)
@@ -177,12 +196,11 @@ class Views(TensorRecord):
     Args:
         cameras: V cameras.
         images: [..., V, 3, H, W] RGB in [0, 1].
-        depths: [..., V, H, W] along the camera's z axis, in scene units; 0 where unknown.
-        masks: [..., V, H, W], True where the pixel counts.
-        point_depths: [..., V, H, W], as depths, of the scene's sparse points; 0 where there is
-            none.
+        depths: [..., V, H, W] along the camera's z axis, in scene units; 0 if unknown.
+        masks: [..., V, H, W], True where a pixel counts.
+        point_depths: [..., V, H, W] depths of the scene's sparse points; 0 in pixels without one.
         disparities: [..., V, H, W] estimated inverse depths, up to a scale and a shift of each
-            view; 0 where unknown.
+            view; 0 if unknown.
     """
 
     cameras: Cameras
@@ -205,7 +223,7 @@ class Views(TensorRecord):
         return self.cameras.num_views
 
     def select(self, views: Sequence[int] | Tensor) -> "Views":
-        """Return the named views, in the given order."""
+        """Return the views with these indices, in the given order."""
         index = torch.as_tensor(views, device=self.images.device)
 
         def pick(tensor: Tensor | None, dim: int) -> Tensor | None:
@@ -222,13 +240,13 @@ class Views(TensorRecord):
         )
 
     def masked(self, rendered: Float[Tensor, "*batch V 3 H W"]) -> Float[Tensor, "*batch V 3 H W"]:
-        """Copy the photographs into masked-out pixels, so that these add no error or gradient."""
+        """Copy the photographs into masked pixels, where they add no error or gradient."""
         if self.masks is None:
             return rendered
         return torch.where(self.masks[..., None, :, :], rendered, self.images)
 
     def validate(self, name: str = "Views") -> "Views":
-        """Return self if every number can be used.
+        """Return self if all numbers are usable.
 
         Raises:
             InputError: as for `Cameras.validate`; also images outside [0, 1] or depths below 0.
@@ -241,26 +259,26 @@ class Views(TensorRecord):
             "has values outside [0, 1]: divide 8-bit images by 255",
         )
         distances = "distances along the camera's z axis"
-        meant = {"depths": distances, "point_depths": distances, "disparities": "inverse depths"}
-        for field, what in meant.items():
+        units = {"depths": distances, "point_depths": distances, "disparities": "inverse depths"}
+        for field, unit in units.items():
             values = getattr(self, field)
             if values is not None:
                 _check_finite(f"{name}.{field}", values, 2)
                 _check_all(
                     f"{name}.{field}",
                     (values >= 0).all(-1).all(-1),
-                    f"has negative values: give {what}, 0 where unknown",
+                    f"has negative values: give {unit}, 0 if unknown",
                 )
         return self
 
 
 @dataclass(frozen=True)
 class Gaussians(TensorRecord):
-    """3D Gaussians, ready to render: every activation is already applied.
+    """3D Gaussians, ready to render: all activations are applied.
 
     Args:
         means: [..., N, 3] in scene units.
-        quats: [..., N, 4] rotations, wxyz; normalized by the renderer.
+        quats: [..., N, 4] rotations, wxyz; the renderer normalizes them.
         scales: [..., N, 3] standard deviations > 0, in scene units.
         opacities: [..., N] in (0, 1).
         sh: [..., N, K, 3] spherical harmonics, K = 1, 4, 9 or 16; color = 0.5 + sum_k sh_k Y_k.
@@ -289,19 +307,15 @@ class Gaussians(TensorRecord):
         return self.opacities.shape[-1]
 
     def scale_by(self, factor: float) -> "Gaussians":
-        """Return the same scene in units that are `factor` times smaller."""
+        """Scale means and sizes: the same scene in units that are `factor` times smaller."""
         return replace(self, means=self.means * factor, scales=self.scales * factor)
 
     def keep(self, mask: Bool[Tensor, "N"]) -> "Gaussians":
         """Return the Gaussians where `mask` is True; for one scene, without batch dimensions."""
         return self.map(lambda tensor: tensor[mask])
 
-    def crop(self, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> "Gaussians":
-        """Return the Gaussians whose mean lies in the closed box from `lower` to `upper`."""
-        return self.keep(((self.means >= lower) & (self.means <= upper)).all(-1))
-
     def validate(self, name: str = "Gaussians") -> "Gaussians":
-        """Return self if every number can be rendered.
+        """Return self if all numbers can be rendered.
 
         Raises:
             InputError: NaN or infinity, a scale <= 0, an opacity outside (0, 1].
@@ -330,7 +344,7 @@ def _check_exact(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
 
 
 def _check_all(name: str, good: Tensor, complaint: str) -> None:
-    """Raise for the first False of `good`, naming its index."""
+    """Raise InputError with the index of the first False of `good`."""
     if not bool(good.all()):
         index = tuple(torch.nonzero(~good)[0].tolist())
         raise InputError(f"{name}[{', '.join(map(str, index))}] {complaint}.")

@@ -66,12 +66,32 @@ def test_scenes_of_different_sizes_do_not_stack():
         Cameras.stack([cameras(height=4), cameras(height=8)])
 
 
-def test_gaussians_keep_crop_scale():
+def test_project():
+    intrinsics = torch.tensor([[5.0, 0, 5.0], [0, 5.0, 4.0], [0, 0, 1]]).repeat(2, 1, 1)
+    poses = torch.eye(4).repeat(2, 1, 1)
+    poses[1, 0, 3] = 1
+    points = torch.tensor([[0.0, 0, 2], [1.0, -1, 4], [0.0, 0, -2], [-3.0, 0, 2], [0.0, 0, 0]])
+    pixels, depth, inside = Cameras(intrinsics, poses, 8, 10).project(points)
+    # x = 5 X / Z + 5, y = 5 Y / Z + 4
+    torch.testing.assert_close(pixels[0, :2], torch.tensor([[5.0, 4], [6.25, 2.75]]))
+    torch.testing.assert_close(pixels[1, :2], torch.tensor([[2.5, 4], [5.0, 2.75]]))
+    assert depth.tolist() == [[2, 4, -2, 2, 0]] * 2
+    assert inside.tolist() == [[True, True, False, False, False]] * 2
+
+
+def test_project_inverts_rays(make_scene):
+    _, views = make_scene(views=3)
+    origins, directions = views.rays()
+    pixels, _, inside = views.project((origins + 2 * directions)[1].flatten(0, 1))
+    y, x = torch.meshgrid(torch.arange(13) + 0.5, torch.arange(17) + 0.5, indexing="ij")
+    torch.testing.assert_close(pixels[1], torch.stack((x, y), -1).flatten(0, 1).double())
+    assert inside[1].all()
+
+
+def test_gaussians_keep_and_scale():
     scene = gaussians()
     right = scene.means[:, 0] > 0
     assert torch.equal(scene.keep(right).sh, scene.sh[right])
-    box = scene.crop(torch.full((3,), -0.5), torch.full((3,), 0.5))
-    assert box.num_gaussians == int((scene.means.abs() <= 0.5).all(-1).sum())
     doubled = scene.scale_by(2.0)
     torch.testing.assert_close(doubled.means, 2 * scene.means)
     torch.testing.assert_close(doubled.scales, 2 * scene.scales)
