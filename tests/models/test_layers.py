@@ -2,20 +2,11 @@
 
 import pytest
 import torch
+from test_asysplat import make_views
 
 from asysplat.evaluation.static_cost import activation_gb
-from asysplat.scene import Cameras, Views
 
 SMALL = ["width=0.125", "model.blocks.m.state_size=16", "model.layers=2m2s"]
-
-
-def make_views(views=3, height=32, width=48):
-    generator = torch.Generator().manual_seed(0)
-    poses = torch.eye(4).repeat(1, views, 1, 1)
-    poses[0, :, 0, 3] = torch.linspace(-0.5, 0.5, views)
-    intrinsics = torch.tensor([[50.0, 0, width / 2], [0, 50, height / 2], [0, 0, 1]])
-    images = torch.rand(1, views, 3, height, width, generator=generator)
-    return Views(Cameras(intrinsics.repeat(1, views, 1, 1), poses, height, width), images)
 
 
 def step(net, views):
@@ -29,14 +20,14 @@ def step(net, views):
 
 def test_checkpointing_changes_nothing_but_memory(build):
     torch.manual_seed(0)
-    net = build(*SMALL)
+    net, views = build(*SMALL), make_views(batch=(1,), width=48)
     start = {name: value.clone() for name, value in net.state_dict().items()}
-    plain = [tensor.clone() for tensor in step(net, make_views())]
+    plain = [tensor.clone() for tensor in step(net, views)]
     memory = activation_gb(net.to("meta"), 3, 32, 48)
     again = build(*SMALL)
     again.load_state_dict(start)
     again.checkpoint_layers(True)
-    assert all(map(torch.equal, step(again, make_views()), plain))
+    assert all(map(torch.equal, step(again, views), plain))
     less = activation_gb(again.to("meta"), 3, 32, 48)
     print(
         f"\nsaved for the backward pass: {1e3 * memory:.1f} MB, with checkpointing {1e3 * less:.1f}"
@@ -48,9 +39,10 @@ def test_checkpointing_changes_nothing_but_memory(build):
 def test_float32_gives_the_gaussians_of_float64(build, model):
     torch.manual_seed(0)
     net = build("width=0.125", f"model={model}").eval()
+    views = make_views(batch=(1,), views=4, height=64, width=64)
     with torch.no_grad():
-        single = net(make_views(views=4, height=64, width=64))
-        exact = net.double()(make_views(views=4, height=64, width=64).to(torch.float64))
+        single = net(views)
+        exact = net.double()(views.to(torch.float64))
     for name in ("means", "quats", "scales", "opacities", "sh"):
         value, truth = getattr(single, name).double(), getattr(exact, name)
         assert truth.dtype == torch.float64

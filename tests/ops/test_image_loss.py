@@ -15,14 +15,6 @@ SMALL = [(1, 1), (1, 40), (10, 10), (3, 17), (10, 30), (70, 9)]
 VALUE, GRADIENT = 1e-6, 1e-5  # of the kernel against float64, the latter relative in L2
 
 
-@pytest.fixture
-def threads():
-    """Set the number of threads until the test's end."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
 def images(kind, *shape):
     """A rendering and its target [*shape]: noise, alike, or bright, alike and nearly flat."""
     target = torch.rand(shape)

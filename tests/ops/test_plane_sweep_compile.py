@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from compiler import compiled
+from compiler import collect_kernels
 
 triton = pytest.importorskip("triton")
 
@@ -11,19 +11,9 @@ pytestmark = pytest.mark.medium
 
 @pytest.mark.parametrize("architecture", [80, 90], ids="sm_{}".format)
 def test_all_kernels_compile(monkeypatch, architecture):
-    from triton.runtime.jit import JITFunction
-
     from asysplat.ops.plane_sweep import cuda
 
-    kernels = {}
-
-    def run(kernel, *arguments, grid, warmup, **others):
-        arguments = dict(zip(kernel.arg_names, arguments, strict=False)) | others
-        name = kernel.fn.__name__, arguments.get("REVERSE")
-        if name not in kernels:
-            kernels[name] = compiled(kernel, arguments, architecture)
-
-    monkeypatch.setattr(JITFunction, "run", run)
+    kernels = collect_kernels(monkeypatch, architecture, ["REVERSE"])
     neighbors = torch.tensor([[[1, -1, -1, -1], [0, -1, -1, -1]]])
     costs = cuda.cost_volume(
         *(torch.zeros(1, 2, 8, 12), neighbors, torch.zeros(1, 2, 4, 3, 4), torch.zeros(1, 2, 2)),

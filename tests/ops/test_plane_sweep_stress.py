@@ -112,20 +112,16 @@ def test_noise_has_less_confidence_than_texture(backend):
     assert noise < 0.75 * sweep(cameras, backend, slanted_plane(cameras)[0]).confidence.mean()
 
 
-def test_any_number_of_threads_gives_the_same_bits():
+def test_any_number_of_threads_gives_the_same_bits(threads):
     cameras = four_cameras()
     images = torch.rand(1, 4, 3, cameras.height, cameras.width)
-    before = torch.get_num_threads()
-    try:
-        found = []
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            found.append(sweep(cameras, "cpu", images))
-    finally:
-        torch.set_num_threads(before)
-    for other in found[1:]:
-        assert torch.equal(other.inverse_depth, found[0].inverse_depth)
-        assert torch.equal(other.confidence, found[0].confidence)
+    results = []
+    for count in (1, 2, 3):
+        threads(count)
+        results.append(sweep(cameras, "cpu", images))
+    for other in results[1:]:
+        assert torch.equal(other.inverse_depth, results[0].inverse_depth)
+        assert torch.equal(other.confidence, results[0].confidence)
 
 
 def test_shapes_on_the_meta_device():
@@ -138,14 +134,8 @@ def test_shapes_on_the_meta_device():
 @pytest.mark.parametrize(
     "change, message",
     [
-        (
-            {"images": torch.zeros(1, 3, 3, 24, 32)},
-            r"images have shape .* expected \(1, 4, 3, 24, 32\)",
-        ),
-        (
-            {"images": torch.zeros(4, 3, 24, 32)},
-            r"images have shape .* expected \(1, 4, 3, 24, 32\)",
-        ),
+        ({"images": torch.zeros(1, 3, 3, 24, 32)}, r"have shape .* expected \(1, 4, 3, 24, 32\)"),
+        ({"images": torch.zeros(4, 3, 24, 32)}, r"have shape .* expected \(1, 4, 3, 24, 32\)"),
         ({"stride": 5}, "stride=5 for images of 24x32: give a number that divides both"),
         ({"stride": 0}, "stride=0"),
         ({"planes": 3}, "planes=3 .* at least 4 planes"),

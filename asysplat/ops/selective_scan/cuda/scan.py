@@ -59,9 +59,17 @@ def backward(
         parts = (*x.shape[:2], grid[1], B.shape[2])
         grad_B, grad_C = states.new_empty(parts), states.new_empty(parts)
         backward_chunk[grid](
-            *(grad_output, x, dt, A, B, C, D, states, grad_states),
-            *(grad_x, grad_dt, grad_A, grad_B, grad_C, grad_D),
-            *x.shape[1:],
+            *(grad_output, x, dt, A, B, C, D),
+            states=states,
+            grad_states=grad_states,
+            grad_x=grad_x,
+            grad_dt=grad_dt,
+            grad_A=grad_A,
+            grad_B=grad_B,
+            grad_C=grad_C,
+            grad_D=grad_D,
+            length=x.shape[1],
+            channels=x.shape[2],
             CHUNK=BACKWARD_CHUNK,
             **_tile(states, reverse),
         )

@@ -79,8 +79,15 @@ def backward(
         states = _states(sizes, x, B, decays, gradient=False)
         grad_states = _states(sizes, grad_output, C, decays, gradient=True)
         head_gradients[(sizes.chunks * sizes.heads, sizes.batch)](
-            *(grad_output, x, A, B, C, D, decays, scores, states, grad_states),
-            *(grads.x, grads.dt, grads.A, grads.D),
+            *(grad_output, x, A, B, C, D),
+            decays=decays,
+            scores=scores,
+            states=states,
+            grad_states=grad_states,
+            grad_x=grads.x,
+            grad_dt=grads.dt,
+            grad_A=grads.A,
+            grad_D=grads.D,
             **sizes.launch_kwargs(head_gradients),
         )
         grad_scores = torch.empty_like(scores)

@@ -1,0 +1,64 @@
+"""Triton without a GPU: its compiler for other machines, and its interpreter."""
+
+import os
+import subprocess
+import sys
+
+import torch
+
+TYPES = {torch.bfloat16: "bf16", torch.float32: "fp32", torch.float64: "fp64"}
+TYPES |= {torch.int16: "i16", torch.int32: "i32", torch.int64: "i64", torch.bool: "i1"}
+
+
+def compiled(kernel, arguments, architecture):
+    """Compile a kernel for the arguments, constants and options of a launch, all by name."""
+    from triton import compile
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    signature, constants = {}, {}
+    for parameter in kernel.params:
+        name, value = parameter.name, arguments.pop(parameter.name)
+        if parameter.is_constexpr or value is None:
+            signature[name], constants[name] = "constexpr", value
+        elif isinstance(value, torch.Tensor):
+            signature[name] = "*" + TYPES[value.dtype]
+        else:
+            signature[name] = "fp32" if isinstance(value, float) else "i32"
+    source = ASTSource(kernel, signature, constants)
+    options = arguments
+    return compile(source, GPUTarget("cuda", architecture, 32), options)
+
+
+def collect_kernels(monkeypatch, architecture, variant):
+    """Compile each kernel at its launch instead of running it.
+
+    Args:
+        variant: the constants that distinguish variants of a kernel.
+
+    Returns:
+        The compiled kernels by name and variant, filled by later launches.
+    """
+    from triton.runtime.jit import JITFunction
+
+    kernels = {}
+
+    def run(kernel, *arguments, grid, warmup, **others):
+        arguments = dict(zip(kernel.arg_names, arguments, strict=False)) | others
+        name = kernel.fn.__name__, *(arguments.get(constant) for constant in variant)
+        if name not in kernels:
+            kernels[name] = compiled(kernel, arguments, architecture)
+
+    monkeypatch.setattr(JITFunction, "run", run)
+    return kernels
+
+
+def run_interpreted(*arguments):
+    """Run test files again in a process in which Triton interprets its kernels on a CPU."""
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments],
+        env={**os.environ, "TRITON_INTERPRET": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
