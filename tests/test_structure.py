@@ -1,11 +1,26 @@
-"""What makes code quick to read: how much a file pulls in, how many arguments a call lines up."""
+"""The structure of the code: import order, size of import closures, arguments of calls."""
 
 import ast
+from graphlib import TopologicalSorter
 
 import pytest
 
-MOST_FILES = 15  # of which the renderer for CPUs consists
-MOST_ARGUMENTS = 8  # without their names
+MAX_FILES = 15  # of the CPU renderer
+MAX_ARGUMENTS = 8  # passed by position
+# Packages and modules of asysplat: each imports only from layers before its own.
+LAYERS = (
+    ("errors", "interrupts"),
+    ("files", "overrides", "scene"),
+    ("ops",),
+    ("rendering",),
+    ("motion",),
+    ("models", "data"),
+    ("refinement",),
+    ("evaluation",),
+    ("training", "export"),
+    ("load", "report"),
+    ("reconstruct", "benchmark"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -20,12 +35,14 @@ def sources(repository):
 
 
 def imported(tree, sources):
-    """The modules of this project that a file names in its import statements."""
+    """The modules that a file imports; a package if it imports a name from the package itself."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module:
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
                 yield inner if inner in sources else node.module
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
 
 
 def closure(module, sources):
@@ -38,13 +55,41 @@ def closure(module, sources):
     return found
 
 
-def test_the_renderer_for_cpus_is_few_files(sources):
+def unit(module):
+    """The package or module directly inside asysplat; None for asysplat itself and scripts."""
+    first, *inner = module.split(".")
+    return inner[0] if first == "asysplat" and inner else None
+
+
+def test_imports_go_to_lower_layers(sources):
+    layer = {name: place for place, names in enumerate(LAYERS) for name in names}
+    units = {unit(module) for module in sources} - {None}
+    assert units == set(layer)
+    upward = [
+        (module, name)
+        for module, tree in sources.items()
+        for name in imported(tree, sources)
+        if unit(module) and name in sources and unit(name) != unit(module)
+        if unit(name) is None or layer[unit(name)] >= layer[unit(module)]
+    ]
+    assert upward == []
+
+
+def test_imports_have_no_cycle(sources):
+    graph = {
+        module: {name for name in imported(tree, sources) if name in sources and name != module}
+        for module, tree in sources.items()
+    }
+    assert len(list(TopologicalSorter(graph).static_order())) == len(sources)
+
+
+def test_the_cpu_renderer_has_few_files(sources):
     files = closure("asysplat.rendering.cpu.draw", sources)
     assert "asysplat.scene" in files  # the closure is not empty by mistake
-    assert len(files) <= MOST_FILES, sorted(files)
+    assert len(files) <= MAX_FILES, sorted(files)
 
 
-def test_no_call_lines_up_many_arguments(sources):
+def test_calls_have_few_positional_arguments(sources):
     def count(call):
         parts = [arg.value if isinstance(arg, ast.Starred) else arg for arg in call.args]
         starred = [isinstance(arg, ast.Starred) for arg in call.args]
@@ -60,4 +105,4 @@ def test_no_call_lines_up_many_arguments(sources):
         if isinstance(node, ast.Call)
     ]
     assert len(calls) > 5000
-    assert [call for call in calls if call[2] > MOST_ARGUMENTS] == []
+    assert [call for call in calls if call[2] > MAX_ARGUMENTS] == []
