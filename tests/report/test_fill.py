@@ -29,7 +29,7 @@ def compose(repository):
 
 
 def compose_train(overrides):
-    """A configuration of one's own; composing takes ten times as long as copying."""
+    """A copy of a configuration, which is ten times as fast as composing."""
     return deepcopy(composed(tuple(overrides)))
 
 
@@ -48,14 +48,14 @@ def write_run(folder: Path, config, numbers: dict, seed: int) -> None:
 @pytest.mark.medium
 @pytest.mark.parametrize("table", load_paper())
 def test_costs_of_every_row_are_the_papers_or_flagged(compose, table, monkeypatch):
-    # The paper prints none, and they take longer than all else.
+    # The paper prints no activations, and counting them is slow.
     monkeypatch.setattr(static_cost, "count_activations", lambda *_: Activations(0.0, 0.0))
     filled = with_costs(fill_table(load_paper()[table], [], compose, {}), compose)
     for row in filled.rows:
         if row.paper.quoted or row.paper.post_optimization:
             continue
         if row.paper.unverified:
-            # Both readings are there, and one of them has the paper's costs.
+            # One of the readings has the paper's costs.
             assert len(row.reading_costs) == len(row.paper.readings) > 0
             assert check_costs(row).startswith("unverified")
             assert any(fits(row.paper, costs) for costs in (row.costs, *row.reading_costs))
@@ -88,7 +88,7 @@ def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
     assert filled.notes["Command"] == "python train.py sweeps=layers steps=7"
 
 
-def test_one_run_serves_every_table_that_names_its_configuration(compose, logs, tmp_path):
+def test_one_run_fills_every_table_with_its_configuration(compose, logs, tmp_path):
     config = compose(["sweeps=layers", "model=asysplat_4m4s"])
     numbers = {"test/procedural/psnr": 20.0, "test/outdoors/psnr": 19.0}
     write_run(tmp_path / "c", config, numbers, 0)
@@ -104,7 +104,7 @@ DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
 
 
 def test_runs_on_the_papers_data(compose, tmp_path):
-    """Found though the report is given no path; a test set without one has no numbers."""
+    """They are found without their paths; a test set without a path has no numbers."""
     config = compose(
         ["sweeps=geometry_ratio", "model=asysplat_4m4s", *DL3DV, "paths.mipnerf360=/a/360_v2"]
     )
@@ -217,7 +217,7 @@ def test_post_optimization_is_not_run_until_evaluation_adds_it(compose, tmp_path
 @pytest.mark.parametrize(
     "text", ["", '{"run/config_hash": "1', "[]", '{"test/procedural/psnr": 1}']
 )
-def test_half_written_results_are_no_results(compose, tmp_path, text):
+def test_broken_results_are_ignored(compose, tmp_path, text):
     config = compose(["sweeps=layers", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, {"test/procedural/psnr": 20.0}, 0)
     config.seed = 0

@@ -1,4 +1,4 @@
-"""The front is drawn as a line, and names stand beside each other."""
+"""The front is drawn as a line, and names do not overlap."""
 
 from itertools import combinations
 
@@ -28,7 +28,7 @@ def test_the_front_is_a_line_and_the_rest_is_faded():
     assert faces == {3.0: "blue", 1.0: "blue", 2.0: "none", 2.5: "none"}
 
 
-def test_names_do_not_overlap_and_those_of_the_front_are_all_there():
+def test_names_do_not_overlap_and_the_front_has_all_of_its_names():
     texts = draw(POINTS + CROWD).texts
     names = {text.get_text() for text in texts}
     assert {"slow", "quick", "base", "worse", "crowded_0"} <= names

@@ -142,6 +142,12 @@ class Page(HTMLParser):
             self.cells[-1] += data
 
 
+def on_terminal(table: FilledTable, width: int) -> str:
+    console = Console(width=width, file=StringIO())
+    render_terminal([table], console)
+    return console.file.getvalue()
+
+
 def line(markdown: str, start: str, nth: int = 0) -> list[str]:
     """Cells of the nth line of a Markdown table that begins with `start`."""
     found = [text for text in markdown.splitlines() if text.startswith(f"| {start} |")]
@@ -191,16 +197,14 @@ def test_notes_under_a_table(table):
         assert note in text
 
 
-def test_a_number_of_ours_stands_under_the_name_of_our_test_set(table, ratios):
-    """In every writer: ours under my_rooms, the paper's under DL3DV-140."""
+def test_our_numbers_have_the_name_of_our_test_set(table, ratios):
+    """In every renderer: ours under my_rooms, the paper's under DL3DV-140."""
     ratios = replace(ratios, sets=table.sets)
     markdown = render_markdown([table])
     assert (
         "| DL3DV-140 PSNR ↑ paper | my\\_rooms PSNR ↑ ours |".replace(" ↑", "\u00a0↑") in markdown
     )
-    terminal = Console(width=300, file=StringIO())
-    render_terminal([table], terminal)
-    texts = [markdown, terminal.file.getvalue(), *Page(render_html([table])).cells]
+    texts = [markdown, on_terminal(table, 300), *Page(render_html([table])).cells]
     assert not any(re.search(r"DL3DV-140 (PSNR|LPIPS)[^|]{0,4}ours", text) for text in texts)
     headings = [text for text in texts if re.fullmatch(r"\S+ (PSNR|LPIPS).*", text)]
     assert headings == [
@@ -240,10 +244,8 @@ def test_a_set_of_the_papers_has_one_heading(table):
 
 
 def test_the_protocol_is_above_the_numbers(table):
-    console = Console(width=200, file=StringIO())
-    render_terminal([table], console)
     page = Page(render_html([table]))
-    for text in (render_markdown([table]), console.file.getvalue(), " ".join(page.cells)):
+    for text in (render_markdown([table]), on_terminal(table, 200), " ".join(page.cells)):
         text = text.replace("\\", "")
         assert text.index("protocol longlrm. PSNR: mean of *all* images") < text.index("Measured")
 
@@ -271,7 +273,7 @@ def test_overview_has_a_line_a_table(table, ratios):
     assert "All tables" not in render_markdown([table])
 
 
-def test_html_says_what_markdown_says(table, ratios):
+def test_html_has_the_texts_of_markdown(table, ratios):
     markdown = render_markdown([table, ratios])
     page = Page(render_html([table, ratios]))
     plots = [caption for table in (table, ratios) for caption, _ in make_plots(table)]
@@ -292,15 +294,12 @@ def test_html_needs_nothing_else(table, ratios):
 
 
 def test_terminal_breaks_a_wide_table_into_blocks(table):
-    wide, narrow = Console(width=200, file=StringIO()), Console(width=80, file=StringIO())
-    render_terminal([table], wide)
-    render_terminal([table], narrow)
-    assert "22.00 ± 1.00" in wide.file.getvalue()
-    assert "unverified, no fit" in narrow.file.getvalue()
-    tables = narrow.file.getvalue().split("Paper: 32")[0]
+    wide, narrow = (on_terminal(table, width) for width in (200, 80))
+    assert "22.00 ± 1.00" in wide and "unverified, no fit" in narrow
+    tables = narrow.split("Paper: 32")[0]
     assert max(map(len, tables.splitlines())) <= 80
     assert "…" not in tables
-    assert tables.count("Later") > wide.file.getvalue().split("Paper: 32")[0].count("Later")
+    assert tables.count("Later") > wide.split("Paper: 32")[0].count("Later")
 
 
 def test_pareto_front():
@@ -326,7 +325,7 @@ def test_plots_show_every_seed_and_the_paper(table, ratios):
     assert list(mean.get_ydata()) == [21.5, 20.5, 19.5]
 
 
-def test_no_plot_of_what_was_not_run(table):
+def test_no_plot_of_rows_that_did_not_run(table):
     assert make_plots(replace(table, rows=table.rows[-1:])) == []
 
 
