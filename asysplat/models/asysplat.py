@@ -1,4 +1,4 @@
-"""AsySplat: posed photographs to Gaussians through two asymmetric branches (paper, Sec. 3.2)."""
+"""AsySplat: posed images to Gaussians through two asymmetric branches (paper, Sec. 3.2)."""
 
 from collections.abc import Collection, Mapping, Sequence
 

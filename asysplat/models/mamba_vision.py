@@ -29,8 +29,8 @@ class MambaVision(nn.Module):
         self.mlp = MLP(shape.width, shape.mlp_ratio, bias=True)
 
     def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
-        frames = self.norm(tokens).flatten(2, 3).flatten(0, 1)
-        tokens = tokens + self.mixer(frames).view_as(tokens)
+        sequences = self.norm(tokens).flatten(2, 3).flatten(0, 1)
+        tokens = tokens + self.mixer(sequences).view_as(tokens)
         return tokens + self.mlp(self.mlp_norm(tokens))
 
 
@@ -60,8 +60,8 @@ class MambaVisionMixer(nn.Module):
     def _conv(channels: int) -> nn.Conv1d:
         return nn.Conv1d(channels, channels, CONV_KERNEL, groups=channels, bias=False)
 
-    def forward(self, frames: Float[Tensor, "F L d"]) -> Float[Tensor, "F L d"]:
-        x, gate = self.project(frames).chunk(2, dim=-1)
+    def forward(self, sequences: Float[Tensor, "F L d"]) -> Float[Tensor, "F L d"]:
+        x, gate = self.project(sequences).chunk(2, dim=-1)
         x = F.silu(depthwise_conv(x, self.conv_scan.weight, None, before=CONV_KERNEL // 2))
         gate = F.silu(depthwise_conv(gate, self.conv_gate.weight, None, before=CONV_KERNEL // 2))
         dt, B, C = self.x_proj(x).split(self.splits, dim=-1)

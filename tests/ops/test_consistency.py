@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from swept import cameras_at, depth_of_plane, four_cameras, slanted_plane
+from surfaces import cameras_at, depth_of_plane, four_cameras, slanted_plane
 
 from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.models.prior.prior import other_views

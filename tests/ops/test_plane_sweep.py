@@ -10,7 +10,7 @@ from importlib import import_module
 import pytest
 import torch
 from compiler import run_interpreted
-from swept import cameras_at, depth_of_plane, four_cameras, slanted_plane, texture
+from surfaces import cameras_at, depth_of_plane, four_cameras, slanted_plane, texture
 
 from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.models.prior.projections import (
@@ -124,7 +124,7 @@ def relative_error(found, depth):
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-def test_a_textured_plane_is_found(stride):
+def test_depth_of_a_textured_plane(stride):
     cameras = four_cameras()
     images, depth = slanted_plane(cameras)
     depth = torch.nn.functional.avg_pool2d(depth, stride)

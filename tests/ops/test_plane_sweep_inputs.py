@@ -3,7 +3,7 @@
 import pytest
 import torch
 import torch.nn.functional as F
-from swept import four_cameras, turned
+from surfaces import four_cameras, turned
 
 from asysplat.models.prior.plane_sweep import edges, shrink
 from asysplat.models.prior.projections import Projections

@@ -108,12 +108,12 @@ def plane_sweep(
     images = images if images.dtype == torch.float64 else images.float()
     poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
     return DepthEstimate(
-        *_sweep(images, intrinsics, poses, stride, planes, neighbors, backend, ranges)
+        *_plane_sweep(images, intrinsics, poses, stride, planes, neighbors, backend, ranges)
     )
 
 
 @torch.library.custom_op("asysplat::plane_sweep", mutates_args=())
-def _sweep(
+def _plane_sweep(
     images: Tensor,
     intrinsics: Tensor,
     cam_to_world: Tensor,
@@ -132,11 +132,11 @@ def _sweep(
         ranges = visible
     ranges = torch.where(ranges[..., 1:] > 0, ranges.to(visible), visible)
     kernels = load_backend(backend, images)
-    sweep = _Sweep(projections, chosen, smallest_step(cameras, chosen), planes, stride, kernels)
+    run = _PlaneSweep(projections, chosen, smallest_step(cameras, chosen), planes, stride, kernels)
     half = (max(1, side // (2 * stride)) * stride for side in images.shape[-2:])
-    inverse, steps, agreement = sweep.depths(shrink(images, *half), ranges, aggregations=1)
-    ranges = _narrowed(ranges, inverse, steps, agreement, planes * sweep.smallest_step)
-    inverse, steps, agreement = sweep.depths(images, ranges, aggregations=2)
+    inverse, steps, agreement = run.depths(shrink(images, *half), ranges, aggregations=1)
+    ranges = _narrowed(ranges, inverse, steps, agreement, planes * run.smallest_step)
+    inverse, steps, agreement = run.depths(images, ranges, aggregations=2)
     others = other_views(images.shape[1], images.shape[0], images.device)
     small = projections.into(others, *inverse.shape[-2:])
     found = kernels.consistency(inverse, steps, agreement, others, small)
@@ -147,15 +147,15 @@ def _sweep(
     return inverse, agreement * (1 + precision) / 2, found.agreeing, found.containing
 
 
-@_sweep.register_fake
+@_plane_sweep.register_fake
 def _(images, intrinsics, cam_to_world, stride, planes, neighbors, backend, ranges):
     shape = (*images.shape[:2], images.shape[-2] // stride, images.shape[-1] // stride)
     return tuple(images.new_empty(shape) for _ in range(4))
 
 
 @dataclass(frozen=True)
-class _Sweep:
-    """What both sweeps share."""
+class _PlaneSweep:
+    """What both plane sweeps share."""
 
     projections: Projections
     chosen: Int[Tensor, "B V K"]
