@@ -1,4 +1,4 @@
-"""What a test leaves out is logged for each of its sets, and makes another run of it."""
+"""Early-exit shares are logged for each test set, and `speed` changes a run's hash."""
 
 import json
 from types import SimpleNamespace
@@ -20,16 +20,16 @@ def composed(repository):
 
 
 def logged(shares_of_sets):
-    """Results and log of the callback after a test that left out these shares of its scenes."""
+    """Results and log of the callback after a test with these shares of its scenes."""
     log = {}
-    module = SimpleNamespace(net=SimpleNamespace(skipped={}), log_dict=log.update)
+    module = SimpleNamespace(net=SimpleNamespace(early_exit_shares={}), log_dict=log.update)
     data = SimpleNamespace(tests=shares_of_sets)
     trainer = Mock(lightning.Trainer, datamodule=data, world_size=1)
     callback = EarlyExitShares()
     callback.on_test_epoch_start(trainer, module)
     for index, shares in enumerate(shares_of_sets.values()):
         for number, share in enumerate(shares):
-            module.net.skipped = share
+            module.net.early_exit_shares = share
             batch = {"scene": [f"scene {number}"]}
             callback.on_test_batch_end(trainer, module, None, batch, number, index)
     callback.on_test_epoch_end(trainer, module)
@@ -38,21 +38,21 @@ def logged(shares_of_sets):
 
 def test_means_over_the_scenes_of_each_set():
     results, log = logged({"rooms": [{"layers": 0.5}, {"layers": 1.0}], "fern": [{"layers": 0.25}]})
-    assert results == log == {"skip/rooms/layers": 0.75, "skip/fern/layers": 0.25}
+    assert results == log == {"early_exit/rooms/layers": 0.75, "early_exit/fern/layers": 0.25}
 
 
 def test_exact_logs_nothing():
     assert logged({"rooms": [{}, {}]}) == ({}, {})
 
 
-def test_exact_is_the_run_that_it_was_before_there_was_a_choice(composed):
+def test_exact_has_the_hash_of_a_run_without_speed(composed):
     before = composed()
     with open_dict(before):
         del before["speed"]
     assert config_hash(composed()) == config_hash(before)
     hashes = {config_hash(composed(f"speed={name}")) for name in ("exact", "balanced", "fast")}
     assert len(hashes) == 3
-    assert config_hash(composed("speed.faint=0.1")) not in hashes
+    assert config_hash(composed("speed.skip_network_above=0.2")) not in hashes
 
 
 def test_presets_name_the_same_thresholds(repository):
@@ -62,17 +62,17 @@ def test_presets_name_the_same_thresholds(repository):
 
 
 @pytest.mark.medium
-def test_a_run_writes_what_its_test_left_out(train):
-    result = train("speed.faint=0.95", "data.test_sets=null", "~callbacks.figures")
+def test_a_run_writes_its_shares(train):
+    result = train("speed.skip_layers_above=1e-6", "data.test_sets=null", "~callbacks.figures")
     assert result.returncode == 0, result.stderr
     (path,) = train.logs.rglob("metrics.json")
     results = json.loads(path.read_text())
-    assert 0 < results["skip/procedural/gaussians"] < 1
-    assert results["skip/procedural/views"] == 0
+    assert 0 < results["early_exit/procedural/layers"] < 1
+    assert results["early_exit/procedural/network"] == 0
 
 
 @pytest.mark.medium
-def test_a_model_without_a_prior_is_refused_before_it_trains(train):
+def test_a_model_without_a_prior_is_refused_before_training(train):
     result = train("speed=fast", "model=asysplat_4m4s")
     assert result.returncode != 0
     assert "no prior" in result.stderr

@@ -1,4 +1,4 @@
-"""What TrainingMonitor makes of a step: shares, speed, norms; and of Gaussians: histograms."""
+"""TrainingMonitor: shares, rates and norms of a step, histograms of Gaussians."""
 
 from types import SimpleNamespace
 
@@ -31,10 +31,10 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch):
-    made = Clock()
+    clock = Clock()
     for module in (monitor, parts):
-        monkeypatch.setattr(module, "time", made)
-    return made
+        monkeypatch.setattr(module, "time", clock)
+    return clock
 
 
 class Run:
@@ -73,9 +73,9 @@ class Run:
             self.monitor.on_train_batch_end(*hooks, None, self.batch, batch)
 
 
-def test_shares_and_speed_of_every_so_many_steps(clock):
+def test_shares_and_rates_of_measured_steps(clock):
     run = Run(clock, every=3)
-    run.step(network=100)  # the first, which compiles, counts nowhere
+    run.step(network=100)  # the first, which compiles, is not counted
     run.step()
     run.step(network=14)
     clock.wait(1000)  # a validation
@@ -97,7 +97,7 @@ def test_shares_and_speed_of_every_so_many_steps(clock):
     assert "MFU not measured" in text
 
 
-def test_a_step_of_several_batches(clock):
+def test_a_step_of_several_micro_batches(clock):
     run = Run(clock, every=2, accumulate=2)
     run.monitor.peak = 12e9
     for _ in range(4):
@@ -132,7 +132,7 @@ def test_histograms_count_scene_by_scene():
     assert spread.median() == pytest.approx(numbers.median().item(), abs=0.01)
 
 
-def test_the_peak_of_known_gpus_alone(monkeypatch):
+def test_the_peak_is_known_for_listed_gpus(monkeypatch):
     gpu = torch.device("cuda")
     assert peak_flops(CPU, "32-true") is None
     monkeypatch.setattr(peak.torch.cuda, "get_device_name", lambda _: "NVIDIA H200")
@@ -144,7 +144,7 @@ def test_the_peak_of_known_gpus_alone(monkeypatch):
     assert peak_flops(gpu, "bf16-mixed") is None
 
 
-def test_without_wandb_it_says_what_to_install(monkeypatch, tmp_path):
+def test_error_without_wandb(monkeypatch, tmp_path):
     monkeypatch.setattr(loggers, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install 'asysplat\[wandb\]', or take logger="):
+    with pytest.raises(InputError, match=r"pip install 'asysplat\[wandb\]', or use logger="):
         make_wandb_logger(tmp_path, "asysplat", "run", offline=True)

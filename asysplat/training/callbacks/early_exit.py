@@ -9,7 +9,7 @@ from asysplat.training.callbacks.metrics import gather
 
 
 class EarlyExitShares(lightning.Callback):
-    """Logs skip/<set>/<what>: shares that were left out, averaged over the scenes of a test set.
+    """Logs early_exit/<set>/<what>: the skipped shares, averaged over the scenes of a test set.
 
     `results` has the same numbers; it is empty with speed=exact. See `asysplat.models.early_exit`.
     """
@@ -18,23 +18,18 @@ class EarlyExitShares(lightning.Callback):
         self.rows: list[ImageRow] = []
 
     def on_test_batch_end(
-        self,
-        trainer: Any,
-        module: Any,
-        outputs: Any,
-        batch: dict[str, Any],
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Any, module: Any, outputs: Any, batch: Any, index: int, set_index: int = 0
     ) -> None:
-        if module.net.skipped:
-            test_set = list(trainer.datamodule.tests)[dataloader_idx]
+        if module.net.early_exit_shares:
+            test_set = list(trainer.datamodule.tests)[set_index]
             (scene,) = batch["scene"]
-            self.rows.append({"set": test_set, "scene": scene, "view": 0, **module.net.skipped})
+            row = {"set": test_set, "scene": scene, "view": 0}
+            self.rows.append(row | module.net.early_exit_shares)
 
     def on_test_epoch_end(self, trainer: Any, module: Any) -> None:
         rows = gather(trainer, self.rows)
         self.results = {
-            f"skip/{test_set}/{name}": share
+            f"early_exit/{test_set}/{name}": share
             for test_set in trainer.datamodule.tests
             for name, share in average([r for r in rows if r["set"] == test_set], "images").items()
         }
