@@ -24,7 +24,7 @@ HOW = (
     "seconds and gb are those of the prediction and the steps together"
 )
 Predict = Callable[[Views], Gaussians]
-Watch = Callable[[int, Rendering | None], None]
+StepCallback = Callable[[int, Rendering | None], None]
 
 
 @dataclass
@@ -90,7 +90,7 @@ class PostOptimization:
         predict: Predict,
         inputs: Views,
         targets: Views,
-        watch: Watch = lambda step, rendering: None,
+        watch: StepCallback = lambda step, rendering: None,
     ) -> SceneResult:
         """Measure one scene; the costs do not include the metrics.
 

@@ -37,10 +37,10 @@ def smoothed_path(cameras: Cameras, frames: int) -> Cameras:
     if not moves.any():
         return with_poses(cameras, poses[:1].repeat(frames, 0))
     positions = np.append(0.0, steps[moves].cumsum())
-    smooth = _smoothed(poses[np.append(True, moves)], positions)
-    positions = np.append(0.0, lengths(np.diff(pose_vectors(_rigid(smooth)), axis=0)).cumsum())
+    smoothed = _smoothed(poses[np.append(True, moves)], positions)
+    positions = np.append(0.0, lengths(np.diff(pose_vectors(_rigid(smoothed)), axis=0)).cumsum())
     times = np.linspace(0, positions[-1], frames)
-    evenly = np.stack([np.interp(times, positions, column) for column in smooth.T], 1)
+    evenly = np.stack([np.interp(times, positions, column) for column in smoothed.T], 1)
     return with_poses(cameras, _rigid(evenly))
 
 

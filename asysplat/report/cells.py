@@ -101,10 +101,10 @@ def _paper_cells(rows: Sequence[FilledRow], column: Column) -> list[Cell]:
 
 
 def _our_cells(rows: Sequence[FilledRow], column: Column) -> list[Cell]:
-    measured = [row.values.get(column.key) for row in rows]
-    means = [mean_and_spread(values)[0] if values else None for values in measured]
+    all_values = [row.values.get(column.key) for row in rows]
+    means = [mean_and_spread(values)[0] if values else None for values in all_values]
     cells = []
-    for row, values, best in zip(rows, measured, _best(means, column), strict=True):
+    for row, values, best in zip(rows, all_values, _best(means, column), strict=True):
         if values:
             cells.append(Cell(_mean_text(values, column), "best" * best))
         else:

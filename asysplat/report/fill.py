@@ -262,10 +262,10 @@ def _folders(runs: Sequence[Run]) -> str:
 
 def _untested(sets: dict[str, str], config: DictConfig, rows: Sequence[FilledRow]) -> str:
     """List the paper's test sets that the sweep names without a path, and no row has numbers of."""
-    measured = {key.partition("/")[0] for row in rows for key in row.values}
+    tested = {key.partition("/")[0] for row in rows for key in row.values}
     data = OmegaConf.to_container(config.data, resolve=True)
     if "root" not in data:  # synthetic data has no test sets on disk
         return ""
     no_path = [name for name, how in data["test_sets"].items() if how.get("root", "") is None]
-    untested = [key for key, ours in sets.items() if ours in no_path and key not in measured]
+    untested = [key for key, ours in sets.items() if ours in no_path and key not in tested]
     return "; ".join(f"{set_titles()[key]}, without paths.{key}=..." for key in untested)

@@ -193,8 +193,8 @@ def _perturb(
         for layer in layers
     ]
     try:
-        moved = {name: move(tensor) for name, tensor in inputs.items()}
-        return forward_backward(exact, moved, leaves)
+        perturbed = {name: move(tensor) for name, tensor in inputs.items()}
+        return forward_backward(exact, perturbed, leaves)
     finally:
         for hook in hooks:
             hook.remove()

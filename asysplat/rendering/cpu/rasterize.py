@@ -138,10 +138,10 @@ def draw_row(state, row, rank, splat, settings, blended, median):
         u = fma(splat.a, np.float32(i) - MIDDLE, row.middle)
         opacity = alpha_at(u, row.exponent, settings)
         before = state[base + i]
-        behind = fma(-opacity, before, before)
-        keep = ONE if behind >= settings.transmittance_min else ZERO
+        transmitted = fma(-opacity, before, before)
+        keep = ONE if transmitted >= settings.transmittance_min else ZERO
         weight = opacity * before * keep
-        state[base + i] = behind * keep
+        state[base + i] = transmitted * keep
         stops = (ONE - keep) if before > ZERO else ZERO
         state[STOP + base + i] = fma(stops, rank + ONE, state[STOP + base + i])
         state[STOPPED + base + i] = fma(stops, before, state[STOPPED + base + i])
@@ -157,7 +157,7 @@ def draw_row(state, row, rank, splat, settings, blended, median):
             dz = (splat.z - origin) + splat.z_rest
             state[DEPTH + base + i] = fma(weight, dz, state[DEPTH + base + i])
         if median is not None:
-            crosses_half = ONE if before > HALF and weight > ZERO and behind <= HALF else ZERO
+            crosses_half = ONE if before > HALF and weight > ZERO and transmitted <= HALF else ZERO
             state[MEDIAN + base + i] = fma(crosses_half, splat.z, state[MEDIAN + base + i])
             state[MEDIAN_RANK + base + i] = fma(
                 crosses_half, rank + ONE, state[MEDIAN_RANK + base + i]
@@ -258,10 +258,10 @@ def draw_row_backward(state, row, rank, splat, settings, blended, median):
         if blended is not None:
             dz = (splat.z - state[G_ORIGIN + base + i]) + splat.z_rest
             value = fma(dz, state[G_DEPTH + base + i], value)
-        behind = state[G_BEHIND + base + i]
-        state[G_BEHIND + base + i] = fma(weight, value, behind)
+        light_behind = state[G_BEHIND + base + i]
+        state[G_BEHIND + base + i] = fma(weight, value, light_behind)
         unclamped = ONE if opacity < settings.alpha_max else ZERO  # a clamped alpha is constant
-        e = unclamped * fma(weight, value, -opacity * inverse * behind)
+        e = unclamped * fma(weight, value, -opacity * inverse * light_behind)
         eu, ey = e * u, e * row.dy
         state[SUM_E + i] += e
         state[SUM_EU + i] += eu

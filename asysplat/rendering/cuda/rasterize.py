@@ -116,10 +116,10 @@ def rasterize(
             v = c * ((y + lane_y) + rest_y)
             u = tl.fma(a, lane_x, tl.fma(b, lane_y, u))
             opacity = tl.where(live, alpha_at(u, v, log_opacity, alpha_min, alpha_max), 0.0)
-            behind = tl.fma(-opacity, remaining, remaining)
-            drops = live & (behind < transmittance_min)
+            transmitted = tl.fma(-opacity, remaining, remaining)
+            drops = live & (transmitted < transmittance_min)
             stop = tl.where(drops, rank, stop)
-            live = live & (behind >= transmittance_min)
+            live = live & (transmitted >= transmittance_min)
             opacity = tl.where(drops, 0.0, opacity)
             weight = opacity * remaining
             total_alpha += weight
@@ -133,10 +133,10 @@ def rasterize(
                 total_depth = tl.fma(weight, (z - origin) + rest_z, total_depth)
             if MEDIAN:
                 z, _ = load_depth(splats, d, valid)
-                crosses_half = (remaining > 0.5) & (weight > 0) & (behind <= 0.5)
+                crosses_half = (remaining > 0.5) & (weight > 0) & (transmitted <= 0.5)
                 total_depth = tl.where(crosses_half, z, total_depth)
                 median_rank = tl.where(crosses_half, rank, median_rank)
-            remaining = tl.where(drops, remaining, behind)
+            remaining = tl.where(drops, remaining, transmitted)
         position += STEP
         drawing = position < end
         if CULL_OPAQUE:
@@ -201,7 +201,7 @@ def rasterize_backward(
     g_blue = tl.load(grad_image + blue_pixel, mask=inside, other=0.0)
     remaining = tl.load(transmittance + pixel, mask=inside, other=1.0)
     # The light from behind, the background included, times its gradient.
-    behind = remaining * tl.load(grad_transmittance + pixel, mask=inside, other=0.0)
+    light_behind = remaining * tl.load(grad_transmittance + pixel, mask=inside, other=0.0)
     stop = tl.load(stop_ranks + pixel, mask=inside, other=0)
     if DEPTH or MEDIAN:
         g_depth = tl.load(grad_depth + pixel, mask=inside, other=0.0)
@@ -242,9 +242,9 @@ def rasterize_backward(
                     grad + 9, tl.sum(tl.where(rank == median_rank, g_depth, 0.0), 0), mask=valid
                 )
             # alpha dL/dalpha; a clamped alpha is constant.
-            e = tl.fma(weight, value, -opacity * inverse * behind)
+            e = tl.fma(weight, value, -opacity * inverse * light_behind)
             e = tl.where(opacity < alpha_max, e, 0.0)
-            behind = tl.fma(weight, value, behind)
+            light_behind = tl.fma(weight, value, light_behind)
             # The exponent is log_opacity - u^2 - v^2; u = a x + b y, v = c y, x and y of the pixel
             # relative to the center.
             eu, ey = e * u, e * dy

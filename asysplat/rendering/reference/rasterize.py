@@ -158,9 +158,9 @@ class _Block:
             grad_values[..., -1:] = self.median_weights() @ grad_output[:, -1:].mT
             values, grad_output = values[..., :-1], grad_output[:, :-1]
         share = weights * (values @ grad_output)  # of each splat in grad_output . output
-        behind = share.sum(1, keepdim=True) - share.cumsum(1)
+        light_behind = share.sum(1, keepdim=True) - share.cumsum(1)
         # alpha dL/dalpha; 0 where alpha is clamped.
-        grad = share.addcmul_(behind, self.alpha / self.passing, value=-1)
+        grad = share.addcmul_(light_behind, self.alpha / self.passing, value=-1)
         if bool((self.opacity >= self.convention.alpha_max).any()):
             grad.mul_(self.alpha < self.convention.alpha_max)
         u0, a, b = -(self.u.mul_(grad) @ self.basis.T).movedim(-1, 0)
