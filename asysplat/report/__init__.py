@@ -1,1 +1,1 @@
-"""The paper's numbers, what finished runs measured, and both side by side."""
+"""Compare finished runs with the tables of the paper."""
