@@ -1,11 +1,11 @@
-"""A model or a file of Gaussians, before and after the paper's post-optimization.
+"""Measure a model or a file of Gaussians, before and after the paper's post-optimization.
 
 python evaluate.py run=last
 """
 
 import os
-import sys
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import hydra
@@ -18,7 +18,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import nn
 
 from asysplat.data import SceneDataModule
-from asysplat.errors import InputError, input_error_behind
+from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.post_optimization import HOW, PostOptimization, Predict
 from asysplat.evaluation.rows import write_csv
@@ -27,35 +27,27 @@ from asysplat.evaluation.scenes import measure_scenes
 from asysplat.export import read_gaussians
 from asysplat.interrupts import keep_interrupts
 from asysplat.models.early_exit import EXACT
-from asysplat.models.network import Network
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 from asysplat.training.checkpoints import load_weights
-from asysplat.training.quiet import quiet_lightning
+from asysplat.training.evaluation_target import find_target
+from asysplat.training.messages import exit_with_message, quiet_lightning
 from asysplat.training.runs import EVALUATION
-from asysplat.training.subject import find_subject
 from asysplat.training.summary import print_evaluation, write_json
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
 def main(options: DictConfig) -> None:
-    try:
+    with exit_with_message("stopped; the same command resumes with the scenes that are missing."):
         evaluate(options)
-    except KeyboardInterrupt:
-        sys.exit("stopped; the same command goes on with the scenes that are missing.")
-    except Exception as error:
-        mistake = input_error_behind(error)
-        if mistake is None:
-            raise
-        sys.exit(f"error: {mistake}")
 
 
 def evaluate(options: DictConfig) -> None:
-    """Measure every scene that was not measured yet; write and print what all give together."""
+    """Measure every scene that was not measured yet; write and print the results of all."""
     quiet_lightning()
-    subject = find_subject(options, HydraConfig.get().overrides.task)
-    config = subject.config
+    target = find_target(options, HydraConfig.get().overrides.task)
+    config = target.config
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     fabric = make_fabric(config.trainer)
     measure = make_measure(config, options, fabric.device)
@@ -63,27 +55,27 @@ def evaluate(options: DictConfig) -> None:
     data.setup()
     data.check_sizes(measure.protocol.check_size)
     if options.scene is None:
-        net = network(config, data, fabric)
-        predict, skipped = predictions(net, fabric), net.skipped
+        (predict, early_exit), tests = open_network(config, data, fabric), data.tests
     else:
-        predict, skipped = gaussians_of_file(options.scene, data, fabric.device), {}
+        predict, early_exit = open_gaussians(options.scene, data, fabric.device), {}
+        tests = {data.name: data.tests[data.name]}
 
-    tests = data.tests if options.scene is None else {data.name: data.tests[data.name]}
-    folders = subject.folder, subject.kept
-    scenes = measure_scenes(tests, predict, measure, fabric.device, *folders, skipped)
-    sentences = {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
-    how = {"evaluation/post_optimization": HOW}
-    if options.run is None:  # which has one
-        OmegaConf.save(options, subject.folder / "config.yaml", resolve=True)
-    results = subject.described | sentences | how | set_results(scenes, measure.protocol.mean_over)
-    write_csv(subject.folder / "evaluation.csv", image_rows(scenes))
-    write_csv(subject.folder / "evaluation_scenes.csv", scene_rows(scenes))
-    write_json(subject.folder / EVALUATION, results)
-    print_evaluation(results, list(scenes), subject.folder)
+    folders = target.folder, target.scene_folder
+    scenes = measure_scenes(tests, predict, measure, fabric.device, *folders, early_exit)
+
+    if options.run is None:  # a run has one
+        OmegaConf.save(options, target.folder / "config.yaml", resolve=True)
+    results = target.described | {"evaluation/post_optimization": HOW}
+    results |= {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
+    results |= set_results(scenes, measure.protocol.mean_over)
+    write_csv(target.folder / "evaluation.csv", image_rows(scenes))
+    write_csv(target.folder / "evaluation_scenes.csv", scene_rows(scenes))
+    write_json(target.folder / EVALUATION, results)
+    print_evaluation(results, list(scenes), target.folder)
 
 
 def make_fabric(trainer: DictConfig) -> lightning.Fabric:
-    """Choose the device and the precision of a prediction, as train.py's test does.
+    """Choose the device and the precision of a prediction, as in the test of train.py.
 
     Raises:
         InputError: there is no such device or precision.
@@ -97,10 +89,9 @@ def make_fabric(trainer: DictConfig) -> lightning.Fabric:
 
 
 def make_measure(config: DictConfig, options: DictConfig, device: torch.device) -> PostOptimization:
-    """Build what measures a scene; without LPIPS, and a warning, where its backbone is missing."""
+    """Build what measures a scene; without LPIPS, and a warning, if its backbone is missing."""
     protocol = instantiate(config.metrics)
-    paths = options.paths
-    lpips = load_lpips(protocol.lpips_net, Path(paths.weights), paths.download)
+    lpips = load_lpips(protocol.lpips_net, Path(options.paths.weights), options.paths.download)
     if lpips is None:
         warnings.warn(protocol.without_lpips(), stacklevel=1)
     else:
@@ -111,34 +102,36 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
     return PostOptimization(steps, protocol, lpips, background)
 
 
-def network(config: DictConfig, data: SceneDataModule, fabric: lightning.Fabric) -> Network:
-    """Build the model and load its weights."""
+def open_network(
+    config: DictConfig, data: SceneDataModule, fabric: lightning.Fabric
+) -> tuple[Predict, Mapping[str, float]]:
+    """Build the model and load its weights.
+
+    Returns:
+        The function that predicts the Gaussians of a scene, and the shares that the early exit of
+        its last call left out.
+    """
     net = instantiate(config.model)
     data.check_sizes(net.check_size)
-    load_weights(config.init_path, nn.ModuleDict({"net": net}))  # as a checkpoint names them
+    load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
     net.to(fabric.device).eval()
-    net.early_exit = instantiate(config.get("speed")) or EXACT  # runs of before have no speed
+    net.early_exit = instantiate(config.get("speed")) or EXACT  # absent in the oldest runs
     net.check_early_exit(net.early_exit)
     print(f"model: {net.describe()}")
-    return net
-
-
-def predictions(net: Network, fabric: lightning.Fabric) -> Predict:
-    """Return what predicts the Gaussians of one scene, as train.py's test does."""
 
     def predict(inputs: Views) -> Gaussians:
         with torch.no_grad(), fabric.autocast():
             return net(Views.stack([inputs])).map(lambda tensor: tensor[0].float())
 
-    return predict
+    return predict, net.early_exit_shares
 
 
-def gaussians_of_file(path: str, data: SceneDataModule, device: torch.device) -> Predict:
+def open_gaussians(path: str, data: SceneDataModule, device: torch.device) -> Predict:
     """Read the Gaussians of the data's one scene.
 
     Raises:
-        InputError: the file cannot be used, there are several scenes, or none of the Gaussians is
-            seen in them.
+        InputError: the file cannot be used, the data has several scenes, or the input views show
+            none of the Gaussians.
     """
     scenes = data.tests[data.name]
     if len(scenes) != 1:
@@ -150,9 +143,9 @@ def gaussians_of_file(path: str, data: SceneDataModule, device: torch.device) ->
     gaussians = sample["frame"].to_network(read_gaussians(path)).to(device)
     if not render(gaussians, sample["inputs"].cameras.to(device), depth=False).alpha.any():
         raise InputError(
-            f"scene={path} has {gaussians.num_gaussians} Gaussians, and the input views of "
-            f"{sample['scene']} see none of them: name the file of that scene, in the world and "
-            "the units of its cameras."
+            f"scene={path} has {gaussians.num_gaussians} Gaussians, and none is visible in the "
+            f"input views of {sample['scene']}: name the file of that scene, in the world and the "
+            "units of its cameras."
         )
     return lambda inputs: gaussians
 

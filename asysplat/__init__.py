@@ -26,7 +26,7 @@ from asysplat.scene import Cameras, Gaussians, Views
 
 # Imported when first asked for: they bring Hydra, image readers and plots along.
 LATER = {
-    "load": "asysplat.training.load",
+    "load": "asysplat.load",
     "mean_color": "asysplat.refinement",
     "open_photographs": "asysplat.refinement.photographs",
     "refine": "asysplat.refinement",
@@ -50,4 +50,6 @@ def __getattr__(name: str) -> object:
     """Import what LATER names."""
     if name not in LATER:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(LATER[name]), name)
+    # Stored, since the import of asysplat.load leaves the module under the name of its function.
+    globals()[name] = getattr(import_module(LATER[name]), name)
+    return globals()[name]

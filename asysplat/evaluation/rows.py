@@ -1,4 +1,4 @@
-"""Numbers of images: a row for each, their means, and a table as a file."""
+"""Rows of metrics, one for each image: averages and CSV files."""
 
 import csv
 from collections.abc import Sequence
@@ -9,8 +9,8 @@ import torch
 
 from asysplat.files import atomic_write
 
-ImageRow = dict[str, str | float]
-# What a row is of: its other columns are numbers that have a mean.
+ImageRow = dict[str, str | float | int]
+# Columns that name the image of a row; the others are numbers.
 LABELS = ("set", "scene", "images", "view", "source")
 
 
@@ -19,7 +19,7 @@ def average(rows: Sequence[ImageRow], over: Literal["images", "scenes"]) -> dict
 
     Args:
         rows: of one test set.
-        over: "images": all alike, or "scenes": each scene's images first, then the scenes.
+        over: "images": all at once, or "scenes": the images of each scene first, then the scenes.
     """
     if over == "scenes":
         scenes: dict[str | float, list[ImageRow]] = {}
@@ -35,10 +35,7 @@ def average(rows: Sequence[ImageRow], over: Literal["images", "scenes"]) -> dict
 
 
 def write_csv(path: Path, rows: Sequence[ImageRow]) -> None:
-    """Write a line for each row; what a row lacks, as depths of a scene without, is left empty.
-
-    The file appears complete or not at all.
-    """
+    """Write a CSV file atomically; columns that a row lacks are left empty."""
     with atomic_write(path) as partial, partial.open("w", newline="") as file:
         columns = dict.fromkeys(name for row in rows for name in row)
         writer = csv.DictWriter(file, fieldnames=list(columns))

@@ -1,4 +1,4 @@
-"""How well Gaussians show photographs, one view after the other."""
+"""Measure how well Gaussians show the images of a scene, view by view."""
 
 import torch
 from jaxtyping import Float
@@ -22,17 +22,17 @@ def measure_scene(
 
     Args:
         gaussians: [N].
-        views: the photographs, [V].
+        views: the images, [V].
         background: RGB.
         protocol: of the metrics.
         lpips: see `load_lpips`; None for no LPIPS.
     """
-    found: dict[str, list[float]] = {}
+    metrics: dict[str, list[float]] = {}
     for view in range(views.num_views):
         target = views.select([view])
         out = render(gaussians, target.cameras, background)
         values = protocol.image_metrics(out.image, target, lpips)
         values |= protocol.depth_metrics(out.depth, target)
         for name, value in values.items():
-            found.setdefault(name, []).append(value.item())
-    return found
+            metrics.setdefault(name, []).append(value.item())
+    return metrics

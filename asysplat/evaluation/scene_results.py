@@ -1,4 +1,4 @@
-"""Results of scenes: kept as they come, then put together."""
+"""Save the results of single scenes and collect them."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -15,18 +15,18 @@ Scenes = Mapping[str, Sequence[SceneResult]]  # by test set, the data set's own 
 
 
 def save_result(path: Path, result: SceneResult) -> None:
-    """Write what was measured of a scene, whole or not at all."""
+    """Write the result of a scene atomically."""
     with atomic_write(path) as partial:
         partial.write_text(json.dumps(asdict(result)))
 
 
 def load_result(path: Path) -> SceneResult | None:
-    """Read what `save_result` has written; None if there is no such file."""
+    """Read the result of a scene; None if there is no such file."""
     return SceneResult(**json.loads(path.read_text())) if path.exists() else None
 
 
 def image_rows(scenes: Scenes) -> list[ImageRow]:
-    """List the rows of all images."""
+    """Return the rows of all images."""
     return [
         {"set": test_set, "scene": result.scene, **row}
         for test_set, results in scenes.items()
@@ -36,7 +36,7 @@ def image_rows(scenes: Scenes) -> list[ImageRow]:
 
 
 def scene_rows(scenes: Scenes) -> list[ImageRow]:
-    """List a row for each scene and source: costs, PSNR of the inputs, means over its targets."""
+    """Return a row for each scene and source: costs, input PSNR, means over its targets."""
     rows: list[ImageRow] = []
     for test_set, results in scenes.items():
         for result in results:
@@ -60,29 +60,29 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
     Returns:
         test/<set>/post<steps>/<metric>, of the input views inputs/<set>/post<steps>/psnr,
         baseline/<set>/<baseline>/<metric>, and cost/gaussians, cost/post<steps>/seconds (the
-        `mean_but_longest`) and /gb (the largest); of further sets under cost/<set>/. Where
-        something was left out, skip/<set>/<what>.
+        `mean_but_longest`) and /gb (the largest); of further sets under cost/<set>/. With an early
+        exit also early_exit/<set>/<what>.
     """
-    found: dict[str, float] = {}
+    averages: dict[str, float] = {}
     main = next(iter(scenes))
     for test_set, results in scenes.items():
         rows = image_rows({test_set: results})
         costs = "cost" if test_set == main else f"cost/{test_set}"
-        found[f"{costs}/gaussians"] = sum(r.gaussians for r in results) / len(results)
+        averages[f"{costs}/gaussians"] = sum(r.gaussians for r in results) / len(results)
         for name, share in average([dict(r.early_exit) for r in results], "images").items():
-            found[f"skip/{test_set}/{name}"] = share
+            averages[f"early_exit/{test_set}/{name}"] = share
         for source in dict.fromkeys(row["source"] for row in rows):
             kind = "test" if source in results[0].costs else "baseline"
             for name, value in _means(rows, "targets", source, over).items():
-                found[f"{kind}/{test_set}/{source}/{name}"] = value
+                averages[f"{kind}/{test_set}/{source}/{name}"] = value
             for name, value in _means(rows, "inputs", source, over).items():
-                found[f"inputs/{test_set}/{source}/{name}"] = value
+                averages[f"inputs/{test_set}/{source}/{name}"] = value
         for source in results[0].costs:
             every = [result.costs[source] for result in results]
-            found[f"{costs}/{source}/seconds"] = mean_but_longest([c["seconds"] for c in every])
+            averages[f"{costs}/{source}/seconds"] = mean_but_longest([c["seconds"] for c in every])
             if all("gb" in each for each in every):
-                found[f"{costs}/{source}/gb"] = max(each["gb"] for each in every)
-    return found
+                averages[f"{costs}/{source}/gb"] = max(each["gb"] for each in every)
+    return averages
 
 
 def _means(

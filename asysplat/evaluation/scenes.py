@@ -1,4 +1,4 @@
-"""Measure all scenes of all test sets, going on where an earlier process was."""
+"""Measure all scenes of all test sets; an interrupted evaluation resumes with the next scene."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,60 +20,59 @@ def measure_scenes(
     measure: PostOptimization,
     device: torch.device,
     folder: Path,
-    kept: Path,
-    skipped: Mapping[str, float],
+    scene_folder: Path,
+    early_exit: Mapping[str, float],
 ) -> dict[str, list[SceneResult]]:
-    """Measure every scene that has no result yet, under a progress bar, and draw the first.
+    """Measure every scene that has no result yet, with a progress bar, and draw the first.
 
     Args:
-        tests: by test set, that of the data itself first, its scenes: their name, `scene`, and
-            `inputs` and `targets`.
+        tests: by test set, the data set's own first, its scenes: their name, `scene`, and `inputs`
+            and `targets`.
         predict, measure: see `PostOptimization`.
-        device: where to work.
+        device: that computes.
         folder: for figures/evaluation-post<steps>.png: the first scene at the first and the last
             of the steps.
-        kept: the folder that has the results of scenes, and to which more are added.
-        skipped: the shares that the last prediction left out, see `Network`.
+        scene_folder: the results of single scenes are read from it and written to it.
+        early_exit: the shares that the last prediction left out, see `Network`.
     """
-    kept.mkdir(parents=True, exist_ok=True)
+    scene_folder.mkdir(parents=True, exist_ok=True)
     (folder / "figures").mkdir(exist_ok=True)
-    drawn = {step: folder / "figures" / f"evaluation-post{step}.png" for step in measure.steps}
     main, last = next(iter(tests)), measure.steps[-1]
     columns = (TextColumn("{task.description:8}"), BarColumn(bar_width=20), MofNCompleteColumn())
     with Progress(*columns, TimeElapsedColumn()) as bars:
         scenes = bars.add_task("scenes", total=sum(map(len, tests.values())))
         steps = bars.add_task("steps", total=last)
 
-        def measured(name: str, index: int) -> SceneResult:
+        def measure_scene(name: str, index: int) -> SceneResult:
             sample = tests[name][index]
             inputs, targets = (sample[views].to(device) for views in ("inputs", "targets"))
 
-            def watch(step: int, rendering: Rendering | None) -> None:
+            def show(step: int, rendering: Rendering | None) -> None:
                 bars.update(steps, completed=step)
                 if (name, index) == (main, 0) and step in (measure.steps[0], last):
-                    with atomic_write(drawn[step]) as partial:
+                    path = folder / "figures" / f"evaluation-post{step}.png"
+                    with atomic_write(path) as partial:
                         comparison_figure(inputs, targets, rendering).savefig(partial, dpi=100)
 
-            result = measure(sample["scene"], predict, inputs, targets, watch)
-            result.early_exit.update(skipped)
-            bars.console.print(_told(name, result), soft_wrap=True, highlight=False)
+            result = measure(sample["scene"], predict, inputs, targets, show)
+            result.early_exit.update(early_exit)
+            bars.console.print(_sentence(name, result), soft_wrap=True, highlight=False)
             return result
 
-        found: dict[str, list[SceneResult]] = {}
+        results: dict[str, list[SceneResult]] = {name: [] for name in tests}
         for name, samples in tests.items():
-            found[name] = []
             for index in range(len(samples)):
-                path = kept / f"{name}-{index}.json"
+                path = scene_folder / f"{name}-{index}.json"
                 result = load_result(path)
                 if result is None:
-                    result = measured(name, index)
+                    result = measure_scene(name, index)
                     save_result(path, result)
-                found[name].append(result)
+                results[name].append(result)
                 bars.advance(scenes)
-    return found
+    return results
 
 
-def _told(name: str, result: SceneResult) -> str:
+def _sentence(name: str, result: SceneResult) -> str:
     rows = [row for row in scene_rows({name: [result]}) if row["source"] in result.costs]
     steps = ", ".join(f"{row['source'].removeprefix('post')}: {row['psnr']:.2f}" for row in rows)
     return f"{name} {result.scene}, PSNR after steps of post-optimization: {steps}"

@@ -10,20 +10,20 @@ from torch import Tensor, nn
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import ssim
 from asysplat.training.disparity import InputDisparity, RenderedDisparity
-from asysplat.training.outcome import Outcome
 from asysplat.training.perceptual import PerceptualDistance, vgg16
+from asysplat.training.prediction import Prediction
 
 
 class SplattingLoss(nn.Module):
-    """MSE + lambda_p perceptual + lambda_d normalized-disparity SmoothL1, and two more.
+    """MSE + lambda_p perceptual + lambda_d normalized-disparity SmoothL1, and two more terms.
 
-    Ours is 1 - SSIM, which wants edges as the perceptual term does, at little cost and without
-    weights to fetch; Long-LRM's the mean opacity, which wants Gaussians that do nothing gone.
+    Ours is 1 - SSIM, which sharpens edges like the perceptual term, at little cost and without a
+    network; Long-LRM's is the mean opacity, which removes useless Gaussians.
 
     Args:
-        mse, perceptual, depth, ssim, opacity: weights of the terms; 0 turns a term off. The
-            perceptual term is also off if its network is not on this machine, the depth term if
-            the data has neither disparities nor depths; a warning says so once.
+        mse, perceptual, depth, ssim, opacity: weights of the terms; 0 turns a term off. With a
+            warning, the perceptual term is also off if its network is not on this machine, and the
+            depth term if the data has neither disparities nor depths.
         perceptual_term, depth_term: constructors, called if the term's weight is not 0.
 
     Raises:
@@ -57,18 +57,18 @@ class SplattingLoss(nn.Module):
 
     @property
     def needs_depth(self) -> bool:
-        """Whether depth has to be rendered at the targets."""
+        """Whether the loss needs rendered depth."""
         return self._depth_term is not None and self._depth_term.renders_depth
 
-    def forward(self, outcome: Outcome, batch: dict[str, Any]) -> dict[str, Tensor]:
+    def forward(self, prediction: Prediction, batch: dict[str, Any]) -> dict[str, Tensor]:
         """Compute the weighted sum, as "loss", and each term that is on, unweighted.
 
         Args:
-            outcome: with rendered depth if `needs_depth`.
+            prediction: with rendered depth if `needs_depth`.
             batch: inputs and targets, both Views.
         """
         targets = batch["targets"]
-        terms, image = {}, targets.masked(outcome.rendering.image)
+        terms, image = {}, targets.masked(prediction.rendering.image)
         if self.mse:
             terms["mse"] = F.mse_loss(image, targets.images)
         if self.ssim:
@@ -76,9 +76,9 @@ class SplattingLoss(nn.Module):
         for distance in self._perceptual_term:
             terms["perceptual"] = distance.to(image.device)(image, targets.images)
         if self.opacity:
-            terms["opacity"] = outcome.gaussians.opacities.mean()
+            terms["opacity"] = prediction.gaussians.opacities.mean()
         if self._depth_term is not None:
-            depth = self._depth_term(outcome, batch)
+            depth = self._depth_term(prediction, batch)
             if depth is not None:
                 terms["depth"] = depth
             elif not self._warned_of_depth:

@@ -1,4 +1,4 @@
-"""The LightningModule: it wires a network, the renderer and the losses, and nothing else."""
+"""The LightningModule that trains a network through the renderer."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -17,24 +17,24 @@ from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.rendering import render
 from asysplat.training.losses import SplattingLoss
-from asysplat.training.outcome import Outcome
 from asysplat.training.parts import Parts
-from asysplat.training.side_by_side import SideBySide
+from asysplat.training.prediction import Prediction
+from asysplat.training.side_by_side import Batch, SideBySide
 from asysplat.training.step_means import StepMeans
 
 
 class SplattingModule(lightning.LightningModule):
-    """Predict Gaussians from the input views, render the targets, compare.
+    """Predict Gaussians from the input views, render the target views, compute the loss.
 
     Args:
         net: views -> Gaussians; see `freeze_unused`.
-        loss: of an outcome against its batch.
+        loss: of an prediction against its batch.
         optimizer: parameter groups -> optimizer; weight decay applies to those of `decaying`
             alone.
         schedule: optimizer -> its learning rates, one for each step.
         background: RGB in [0, 1] behind the Gaussians, or "inputs": the mean color of the input
-            views; while it trains black or white, whichever is less like it, so that being
-            transparent never pays.
+            views; in training black or white, whichever is less like that mean, so that
+            transparent Gaussians never lower the loss.
         checkpoint_layers: compute each layer again in the backward pass, to save memory.
         views_at_once: render this many targets of each scene at a time, and again in the backward
             pass, to save memory; None: all at once. See `render`.
@@ -56,33 +56,32 @@ class SplattingModule(lightning.LightningModule):
         self.net, self.loss = net, loss
         self.optimizer, self.schedule = optimizer, schedule
         self.views_at_once = views_at_once
-        self.parts = Parts()  # of a step, which a callback measures
-        self._side_by_side = SideBySide(net, self._terms, self.parts)
+        self.parts = Parts()  # of a step, timed by a callback
+        self._side_by_side = SideBySide(net, self.compute_terms, self.parts)
         self._step_means = StepMeans(net)
         fixed = None if background == "inputs" else torch.tensor(background)
         self.register_buffer("background", fixed, persistent=False)
 
     def configure_model(self) -> None:
-        """Divide the parameters among the processes, layer by layer, if the strategy is FSDP's."""
+        """Shard the parameters among the processes, layer by layer, if the strategy is FSDP's."""
         if self.device_mesh is None or isinstance(self.net, FSDPModule):
             return
         groups = [module for module in self.net.modules() if isinstance(module, Layers)]
         for block in (*(layer for layers in groups for layer in layers), self.net):
             fully_shard(block, mesh=self.device_mesh["data_parallel"])
 
-    def reconstruct(self, batch: dict[str, Any], depth: bool) -> Outcome:
+    def forward(self, batch: Batch, depth: bool, net: nn.Module | None = None) -> Prediction:
         """Predict the Gaussians of the inputs and render them at the target cameras.
 
         Args:
             batch: `inputs` and `targets`, both Views.
             depth: whether to render depth too.
+            net: a copy of the network to use instead.
         """
-        return self._reconstruct(self.net, batch, depth)
-
-    def _reconstruct(self, net: nn.Module, batch: dict[str, Any], depth: bool) -> Outcome:
+        net = self.net if net is None else net
         with self.parts("network"), self.parts.of("prior", net.prior):
             gaussians = net(batch["inputs"])
-        targets, background = batch["targets"], self.behind(batch)
+        targets, background = batch["targets"], self.background_for(batch)
         with self.parts("rendering"):
             rendering = render(
                 gaussians,
@@ -92,18 +91,18 @@ class SplattingModule(lightning.LightningModule):
                 masks=targets.masks,
                 views_at_once=self.views_at_once,
             )
-        return Outcome(gaussians, rendering)
+        return Prediction(gaussians, rendering)
 
-    def behind(self, batch: dict[str, Any]) -> Tensor:
-        """Return the background of the targets: [3], or [B, V, 3] where it follows the inputs."""
+    def background_for(self, batch: Batch) -> Tensor:
+        """Return the background of the targets: [3], or [B, V, 3] if it depends on the inputs."""
         if self.background is not None:
             return self.background
         mean = batch["inputs"].images.mean((1, 3, 4))[:, None]
         color = (mean < 0.5).to(mean) if self.training else mean
         return color.expand(-1, batch["targets"].cameras.num_views, -1)
 
-    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
-        """Compute the loss of a micro-batch; log the means of a step at its last."""
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Compute the loss of a micro-batch; log the means of a step at its last micro-batch."""
         accumulated = self.trainer.accumulate_grad_batches
         if batch_idx % accumulated == 0:
             self._step_means.start()
@@ -116,30 +115,29 @@ class SplattingModule(lightning.LightningModule):
             self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])
         return terms["loss"]
 
-    def compute_terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Compute "loss", which has gradients, its terms and "psnr": means over the scenes."""
-        # The copies of a network whose parameters are divided (FSDP) could not gather them.
-        if self.device.type == "cpu" and len(batch["scene"]) > 1 and self.device_mesh is None:
+    def compute_terms(self, batch: Batch, net: nn.Module | None = None) -> dict[str, Tensor]:
+        """Compute "loss", which has gradients, its terms and "psnr": means over the scenes.
+
+        Args:
+            batch: `scene`, and `inputs` and `targets`, both Views.
+            net: computes the whole batch at once; None: this module's network, whose copies
+                compute the scenes side by side on a CPU.
+        """
+        # The copies of a network whose parameters are sharded (FSDP) could not gather them.
+        on_cpu = self.device.type == "cpu" and self.device_mesh is None
+        if net is None and on_cpu and len(batch["scene"]) > 1:
             return self._side_by_side(batch)
-        return self.terms(batch)
-
-    def terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Do what `compute_terms` does, always in the network itself, whose hooks see it all."""
-        return self._terms(self.net, batch)
-
-    def _terms(self, net: nn.Module, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Compute the loss, its terms and the PSNR: means over the scenes of the batch."""
-        outcome = self._reconstruct(net, batch, depth=self.loss.needs_depth)
+        prediction = self(batch, depth=self.loss.needs_depth, net=net)
         targets = batch["targets"]
-        image = targets.masked(outcome.rendering.image.detach())
+        image = targets.masked(prediction.rendering.image.detach())
         with self.parts("loss"):
-            return {**self.loss(outcome, batch), "psnr": psnr(image, targets.images).mean()}
+            return {**self.loss(prediction, batch), "psnr": psnr(image, targets.images).mean()}
 
-    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> Outcome:
-        return self.reconstruct(batch, depth=True)
+    def validation_step(self, batch: Batch, batch_idx: int) -> Prediction:
+        return self(batch, depth=True)
 
-    def test_step(self, batch: dict[str, Any], batch_idx: int, dataloader_idx: int = 0) -> Outcome:
-        return self.reconstruct(batch, depth=True)
+    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> Prediction:
+        return self(batch, depth=True)
 
     def configure_optimizers(self) -> dict[str, Any]:
         decay = set(decaying(self.net))
@@ -163,8 +161,8 @@ class SplattingModule(lightning.LightningModule):
     ) -> None:
         """Clip by the norm of all gradients, or by value.
 
-        Lightning's own refuses a fused optimizer under autocast, for the sake of fp16's loss
-        scaling, which bf16 does without.
+        Lightning refuses a fused optimizer under autocast, because of fp16's loss scaling, which
+        bf16 does not need.
         """
         if not gradient_clip_val:
             return
@@ -180,20 +178,20 @@ WEIGHTED = (nn.Linear, nn.Conv1d, nn.Conv2d)
 def decaying(net: nn.Module) -> list[nn.Parameter]:
     """List the parameters that weight decay applies to: weights of Linear and Conv layers.
 
-    All others have a meaning away from zero: norms, biases, learned tokens, and A, dt and D of the
-    scans, whatever their shape.
+    Zero is no neutral value of the others: norms, biases, learned tokens, and A, dt and D of the
+    scans.
     """
     return [module.weight for module in net.modules() if isinstance(module, WEIGHTED)]
 
 
 def freeze_unused(net: Network) -> None:
-    """Turn off the gradients of parameters on which no Gaussian depends.
+    """Turn off the gradients of parameters that no Gaussian depends on.
 
-    Processes that train together would wait for those gradients forever. The parameters exist
-    because the paper counts them, as a link into a branch from which nothing is predicted.
+    Distributed processes would wait for those gradients forever. The parameters exist because the
+    paper counts them, such as a link into a branch from which nothing is predicted.
     """
     with torch.device("meta"):
-        views = blank_views(2, net.size_multiple, net.size_multiple)
+        views = blank_views(2, net.patch, net.patch)
         state = {n: torch.empty(t.shape, dtype=t.dtype) for n, t in net.named_buffers()}
         leaves = {
             n: torch.empty(p.shape, dtype=p.dtype, requires_grad=True)

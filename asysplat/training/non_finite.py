@@ -1,4 +1,4 @@
-"""Find the first tensor that is not finite, by a step's second run; keep the step in a file.
+"""Repeat a step to find its first non-finite tensor; save the step to a file.
 
 python -m asysplat.training.non_finite logs/asysplat/2026-01-31_12-00-00/non_finite/step-000012-0.pt
 """
@@ -18,7 +18,8 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
-from asysplat.training.checkpoints import write_whole
+from asysplat.training.checkpoints import atomic_save
+from asysplat.training.old_names import upgrade_config
 from asysplat.training.random_states import RandomStates, set_random_states
 
 Batch = dict[str, Any]
@@ -27,39 +28,38 @@ Batch = dict[str, Any]
 def first_non_finite(module: LightningModule, batch: Batch) -> str | None:
     """Compute a batch's loss and gradients; name the first tensor that is NaN or infinite.
 
-    Inputs come first, then the outputs of modules in the order in which they end, inner ones before
-    those that they are part of, terms of the loss, gradients at those outputs from the last to the
-    first, and gradients of parameters.
+    The order is: inputs, outputs of modules (inner before outer ones), terms of the loss, gradients
+    at those outputs from the last to the first, gradients of parameters.
 
     Args:
-        module: has `terms(batch)`, of which "loss" is minimized. It is left as it was.
+        module: has `compute_terms(batch, net)`, whose "loss" is minimized. It is left as it was.
         batch: inputs and targets, both Views.
     """
-    found: list[str] = []
+    names: list[str] = []
 
-    def see(name: str, value: Any) -> None:
+    def check(name: str, value: Any) -> None:
         bad = (part for part, tensor in tensors(value) if not tensor.isfinite().all())
-        found.extend(f"{name}{part}" for part in bad)
+        names.extend(f"{name}{part}" for part in bad)
 
-    def see_output(name: str, _: Any, __: Any, output: Any) -> None:
-        see(f"the output of {name}", output)
+    def check_output(name: str, _: Any, __: Any, output: Any) -> None:
+        check(f"the output of {name}", output)
         for part, tensor in tensors(output):
             if tensor.requires_grad:
-                tensor.register_hook(partial(see, f"the gradient at the output of {name}{part}"))
+                tensor.register_hook(partial(check, f"the gradient at the output of {name}{part}"))
 
     for name in ("inputs", "targets"):
-        see(f"the batch's {name}", batch[name])
+        check(f"the batch's {name}", batch[name])
     hooks = [
-        part.register_forward_hook(partial(see_output, name))
+        part.register_forward_hook(partial(check_output, name))
         for name, part in module.named_modules()
         if name
     ]
     buffers = [buffer.clone() for buffer in module.buffers()]
     try:
         with torch.enable_grad():
-            terms = module.terms(batch)
+            terms = module.compute_terms(batch, module.net)
             for name, term in terms.items():
-                see(f"the term {name} of the loss", term)
+                check(f"the term {name} of the loss", term)
             trained = {name: p for name, p in module.named_parameters() if p.requires_grad}
             grads = torch.autograd.grad(terms["loss"], list(trained.values()), allow_unused=True)
     finally:
@@ -68,15 +68,12 @@ def first_non_finite(module: LightningModule, batch: Batch) -> str | None:
         for buffer, before in zip(module.buffers(), buffers, strict=True):
             buffer.copy_(before)
     for name, grad in reversed(list(zip(trained, grads, strict=True))):
-        see(f"the gradient of {name}", grad)
-    return found[0] if found else None
+        check(f"the gradient of {name}", grad)
+    return names[0] if names else None
 
 
 def tensors(value: Any, part: str = "") -> Iterator[tuple[str, Tensor]]:
-    """Yield the floating-point tensors in nested records, lists and dictionaries, and their place.
-
-    A place is such as ".cameras.intrinsics" or "[0]".
-    """
+    """Yield the path, as ".cameras.intrinsics" or "[0]", and value of each nested float tensor."""
     if isinstance(value, Tensor):
         if value.is_floating_point():
             yield part, value
@@ -92,10 +89,10 @@ def tensors(value: Any, part: str = "") -> Iterator[tuple[str, Tensor]]:
 
 
 def save_step(path: Path, module: LightningModule, batch: Batch, states: RandomStates) -> None:
-    """Write all that a step starts from, to be read with weights_only=True.
+    """Write everything that a step depends on, to be read with weights_only=True.
 
     Args:
-        path: the file; its folder is made.
+        path: the file; its folder is created.
         module: its `hparams` are the configuration of the run.
         batch: inputs and targets, both Views.
         states: of the random generators, before the step.
@@ -111,18 +108,18 @@ def save_step(path: Path, module: LightningModule, batch: Batch, states: RandomS
         "scene": batch["scene"],
         **{name: asdict(batch[name]) for name in ("inputs", "targets")},
     }
-    write_whole(step, path)
+    atomic_save(step, path)
 
 
 def replay(path: Path) -> str | None:
-    """Take a saved step again; name the first tensor that is not finite, see `first_non_finite`.
+    """Repeat a saved step; name the first non-finite tensor, see `first_non_finite`.
 
     Raises:
-        InputError: the file is none of `save_step`.
+        InputError: the file was not written by `save_step`.
     """
     try:
         step = torch.load(path, map_location="cpu", weights_only=True)
-        config = OmegaConf.create(step["configuration"])
+        config = OmegaConf.create(upgrade_config(step["configuration"]))
     except Exception as error:
         raise InputError(f"{path} cannot be read as a step: name a file of non_finite/.") from error
     module = instantiate(config.training, net=instantiate(config.model))
@@ -143,7 +140,7 @@ def main() -> None:
     if len(sys.argv) != 2:
         sys.exit("usage: python -m asysplat.training.non_finite FILE")
     try:
-        print(replay(Path(sys.argv[1])) or "all is finite here")
+        print(replay(Path(sys.argv[1])) or "all tensors are finite")
     except InputError as error:
         sys.exit(f"error: {error}")
 

@@ -1,4 +1,4 @@
-"""Perceptual distances of images, by frozen networks found on this machine."""
+"""Perceptual distances of images, by frozen networks."""
 
 import warnings
 from collections.abc import Sequence
@@ -32,9 +32,9 @@ class PerceptualDistance(nn.Module):
         with without_autocast(rendered):
             with torch.no_grad():
                 expected = self.features(target.flatten(0, -4))
-            found = self.features(rendered.flatten(0, -4))
+            activations = self.features(rendered.flatten(0, -4))
             distance = self.image_weight * F.l1_loss(rendered, target)
-            for weight, a, b in zip(self.weights, found, expected, strict=True):
+            for weight, a, b in zip(self.weights, activations, expected, strict=True):
                 distance = distance + weight * F.l1_loss(a, b)
             return distance
 
@@ -42,11 +42,11 @@ class PerceptualDistance(nn.Module):
 def vgg16(backbone_dir: str | None = None, download: bool = False) -> PerceptualDistance | None:
     """Build the mean over VGG16's ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016).
 
-    Images are normalized as ImageNet's are.
+    Images are normalized with ImageNet's mean and standard deviation.
 
     Args:
         backbone_dir: folder that may hold the network's weights.
-        download: whether to fetch the weights if they are missing.
+        download: whether to download missing weights.
 
     Returns:
         None, with a warning, if the weights are not on this machine.
@@ -69,13 +69,13 @@ def longlrm(backbone_dir: str | None = None, download: bool = False) -> Perceptu
     5_2, with mean pooling in place of maximum pooling. Images, less ImageNet's mean, are scaled to
     [0, 255], and distances divided by 255.
 
-    Long-LRM publishes weights converted from MatConvNet, made for these units. Like its code's
-    default, this takes torchvision's in their place. The published ones are read if they are
-    vgg19_features_fp16.pth in `backbone_dir` and torch's hub cache has no VGG19.
+    Long-LRM publishes weights converted from MatConvNet for these units; its code uses
+    torchvision's by default, as does this function. The published weights are read from
+    vgg19_features_fp16.pth in `backbone_dir` if torch's hub cache has no VGG19.
 
     Args:
         backbone_dir: folder that may hold the network's weights.
-        download: whether to fetch the weights if they are missing.
+        download: whether to download missing weights.
 
     Returns:
         None, with a warning, if the weights are not on this machine.

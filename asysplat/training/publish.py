@@ -1,4 +1,4 @@
-"""Turn a run into a model to ship: its weights in half precision, and a card that says what it is.
+"""Publish the model of a run: its weights in half precision and a model card.
 
 python -m asysplat.training.publish logs/asysplat/2026-01-31_12-00-00 checkpoints/my_model
 """
@@ -14,16 +14,18 @@ from omegaconf import OmegaConf
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
 from asysplat.training.checkpoints import save_weights
-from asysplat.training.summary import METRICS
+from asysplat.training.old_names import read_config, upgrade_results
+from asysplat.training.runs import RESULTS
+from asysplat.training.summary import METRICS, Results
 
 LIMITS = "\n## Limits\n"
-LARGEST = 16e6  # bytes: more does not belong into a repository
+LARGEST = 16e6  # bytes
 
 
 def publish(run: Path, target: Path) -> None:
-    """Write `target`.safetensors, and `target`.md with where it comes from and what it measured.
+    """Write `target`.safetensors and the card `target`.md with its origin and test results.
 
-    What stands below "## Limits" in a card that is there already is kept: it is written by hand.
+    The section "## Limits" of an existing card is kept, since it is written by hand.
 
     Args:
         run: the folder of a finished run.
@@ -33,7 +35,7 @@ def publish(run: Path, target: Path) -> None:
         InputError: the run has not finished, or its weights are too large to ship.
     """
     try:
-        results = json.loads((run / "metrics.json").read_text())
+        results = upgrade_results(json.loads((run / RESULTS).read_text()))
         saved = torch.load(run / "checkpoints" / "last.ckpt", "cpu", weights_only=True)
     except OSError as error:
         raise InputError(
@@ -57,11 +59,9 @@ def publish(run: Path, target: Path) -> None:
         partial.write_text(text)
 
 
-def _card(
-    name: str, run: Path, results: dict[str, float | int | str], steps: int, size: int
-) -> str:
-    """Write the card: command, data, time, numbers and learning curve."""
-    config = OmegaConf.load(run / "config.yaml")
+def _card(name: str, run: Path, results: Results, steps: int, size: int) -> str:
+    """Write the card: command, data, time, test results and learning curve."""
+    config = read_config(run / "config.yaml")
     overrides = OmegaConf.load(run / ".hydra" / "overrides.yaml")
     data = config.data.name
     hours = steps * results["cost/seconds_per_step"] / 3600
@@ -107,10 +107,7 @@ def _card(
 
 
 def _number(value: str | float | None) -> str:
-    """Write a number shortly, nothing for none."""
-    if value in (None, ""):
-        return ""
-    return f"{float(value):.4g}"
+    return "" if value in (None, "") else f"{float(value):.4g}"
 
 
 def main() -> None:

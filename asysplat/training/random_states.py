@@ -1,4 +1,4 @@
-"""The states of all random generators that training may draw from."""
+"""Save and restore the states of all random generators."""
 
 import random
 from typing import Any
@@ -21,7 +21,7 @@ def random_states() -> RandomStates:
 
 
 def set_random_states(states: RandomStates) -> None:
-    """Put the generators back; those of GPUs only where there are as many."""
+    """Restore the generators; those of GPUs only if their number is the same."""
     random.setstate(states["python"])
     name, keys, *rest = states["numpy"]
     np.random.set_state((name, keys.numpy().astype(np.uint32), *rest))

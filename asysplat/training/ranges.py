@@ -1,4 +1,4 @@
-"""Check the values of the options that are set most, before any work starts."""
+"""Check the values of the most used options, before any work starts."""
 
 import math
 from collections.abc import Callable
@@ -22,7 +22,7 @@ def is_window(value: object) -> bool:
     return isinstance(value, ListConfig) and list(map(is_whole, value)) == [True, True]
 
 
-# What a value has to be, the test of that, and the options it holds for.
+# The expected value, its check, and the options.
 RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
     (
         "a whole number of at least 1",
@@ -72,9 +72,9 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
         ("geometry_ratio",),
     ),
     (
-        "a number above 0 and up to 1, or null to leave nothing out",
+        "a number above 0 and up to 1, or null to skip nothing",
         lambda value: value is None or (is_number(value) and 0 < value <= 1),
-        ("speed.coverage", "speed.sure", "speed.known", "speed.faint"),
+        ("speed.skip_layers_above", "speed.skip_network_above"),
     ),
     (
         "a number of at least 0, or null",
@@ -92,15 +92,14 @@ RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
 
 
 def check_ranges(config: DictConfig) -> None:
-    """Check those options of `RANGES` that the configuration has.
+    """Check the options of `RANGES` that the configuration has.
 
     Raises:
-        InputError: a value has another type or is out of range; names the first of them.
+        InputError: a value has the wrong type or is out of range.
     """
     absent = object()
     for expected, fits, keys in RANGES:
         for key in keys:
             value = OmegaConf.select(config, key, default=absent)
             if value is not absent and not fits(value):
-                found = "null" if value is None else value
-                raise InputError(f"{key}={found}: give {expected}.")
+                raise InputError(f"{key}={'null' if value is None else value}: give {expected}.")

@@ -1,4 +1,4 @@
-"""The revision of the code that a run was made with."""
+"""The revision of the code."""
 
 import hashlib
 import subprocess

@@ -1,4 +1,4 @@
-"""The folder of a run: which one it is, and that no other process writes there."""
+"""Choose the folder of a run and lock it."""
 
 import fcntl
 from collections.abc import Iterator
@@ -14,31 +14,33 @@ from asysplat.training.runs import RESULTS
 LOCK = ".lock"  # in the folder of each run
 
 
-def run_folder(asked: str | None, runs: str, fresh: str) -> str:
+def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
     """Choose the folder of a run, for `hydra.run.dir` of conf/train.yaml.
 
-    A run that was cut off goes on in its own folder. Whatever else starts from a checkpoint, as
-    more steps of a run that has its results, leaves that one as it is.
+    An interrupted run resumes in its own folder. Other runs that start from a checkpoint, such as
+    more steps of a finished run, get a new folder.
 
     Args:
-        asked: the option `ckpt_path`.
+        ckpt_path: the option.
         runs: the folder of all runs of one name.
-        fresh: the folder of a new run.
+        new: the folder of a new run.
     """
-    try:
-        last = newest_folder(Path(runs)) / "checkpoints" / LAST if asked == "last" else asked
-    except InputError:  # which find_checkpoint tells the user
-        return fresh
-    if last is None or Path(last).name != LAST:
-        return fresh
-    folder = Path(last).parents[1]
+    if ckpt_path == "last":
+        try:
+            folder = newest_folder(Path(runs))
+        except InputError:  # raised again by find_checkpoint
+            return new
+    elif ckpt_path is not None and Path(ckpt_path).name == LAST:
+        folder = Path(ckpt_path).parents[1]
+    else:
+        return new
     run = folder.parent if (folder.parent / LOCK).exists() else folder  # of an earlier stage
-    return fresh if not has_checkpoints(folder) or (run / RESULTS).exists() else str(run)
+    return new if not has_checkpoints(folder) or (run / RESULTS).exists() else str(run)
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep a run's folder to this process, and those that it trains with, until the end.
+    """Lock a run's folder for this process and those that it trains with.
 
     Raises:
         InputError: another run trains there.
@@ -49,12 +51,12 @@ def locked(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / LOCK, "w") as file:
         try:
-            # Not flock, which a killed run's loaders would still hold for seconds.
+            # Not flock: the loaders of a killed run would hold it for seconds.
             fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except (BlockingIOError, PermissionError):
             raise InputError(
                 f"{folder} is a run that another process still trains: wait for it, or stop it."
             ) from None
         except OSError:
-            pass  # a network disk that cannot lock
+            pass  # a network disk without locks
         yield

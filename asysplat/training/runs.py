@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import getitem
@@ -16,13 +16,14 @@ from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
 from asysplat.data.build import tested_sets
 from asysplat.training.checkpoints import weights_file
+from asysplat.training.old_names import FORMAT, read_config, upgrade_results
 from asysplat.training.revision import revision
 from asysplat.training.stages import stage_configs
 
 RESULTS = "metrics.json"
 EVALUATION = "evaluation.json"  # added to a run by evaluate.py
-# Names, places on disk, callbacks, keys that only other keys take their values from, and how a
-# global batch is divided.
+# Names, paths, callbacks, keys that only other keys take their values from, and how a global batch
+# is divided.
 NOT_HASHED = (
     *("name", "ckpt_path", "rerun", "paths", "callbacks", "logger"),
     *("stage", "stages", "earlier_stages", "selections", "more_inputs", "replica_size"),
@@ -38,7 +39,7 @@ class Run:
     """A finished run.
 
     Args:
-        folder: where its files are.
+        folder: of its files.
         config_hash: see the function `config_hash`.
         seed: of its random numbers.
         revision: of the code that made it, see `revision`.
@@ -52,29 +53,36 @@ class Run:
     results: dict[str, Any]
 
     def agrees(self, data: Mapping[str, str]) -> bool:
-        """Return whether it read `data` (see `data_of`), as far as both name what they read."""
+        """Return whether the run and `data` (see `data_of`) contradict each other nowhere."""
         return all(self.results.get(key, value) == value for key, value in data.items())
 
     def covers(self, data: Mapping[str, str]) -> bool:
-        """Return whether it read all of `data` (see `data_of`), and perhaps more test sets."""
+        """Return whether the run read all of `data` (see `data_of`), and perhaps more test sets."""
         return all(self.results.get(key) == value for key, value in data.items())
 
 
-def config_hash(config: DictConfig) -> str:
+def config_hash(config: DictConfig, earlier: Sequence[DictConfig] | None = None) -> str:
     """Hash the resolved configuration, without the keys that change no number.
 
-    The stages of a run before its last count as well. Left out are:
+    These are left out:
 
     - the seed, callbacks, the logger, the number of loader processes and the cache;
     - how many devices share a step, how many scenes and views each holds at a time;
-    - places on disk: for the test root, disparities and a checkpoint to start from, only whether
-      they are given counts; `data_of` names the first and the last;
+    - paths: of the test root, disparities and a checkpoint to start from, only whether they are
+      given is hashed; `data_of` names the first and the last;
     - further test sets, which do not change the numbers of the others; `data_of` names them too.
 
     Runs of one hash, seed and data have the same numbers. Missing values (`???`) are allowed.
+
+    Args:
+        config: of a run.
+        earlier: of its stages before the last, which are hashed too; None: `stage_configs`.
     """
+    earlier = stage_configs(config)[:-1] if earlier is None else earlier
     config = config.copy()
     with open_dict(config):
+        if config.data.get("seed") == config.seed:
+            config.data.seed = None
         config.paths = dict.fromkeys(config.paths, "")
         config.seed = config.data.num_workers = config.data.test_sets = None
     resolved = OmegaConf.to_container(config, resolve=True)
@@ -83,11 +91,12 @@ def config_hash(config: DictConfig) -> str:
         resolved["data"][key] = resolved["data"].get(key) is not None
     speed = resolved.get("speed") or {}
     if not any(value for key, value in speed.items() if key != "_target_"):
-        resolved.pop("speed", None)  # exact, as every run was before there was a choice
+        resolved.pop("speed", None)  # exact, as every run was before the option existed
     for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)
-    resolved["stages"] = [config_hash(stage) for stage in stage_configs(config)[:-1]]
+    stages = enumerate(earlier)
+    resolved["stages"] = [config_hash(stage, earlier[:index]) for index, stage in stages]
     return hash_of(resolved)
 
 
@@ -99,18 +108,18 @@ def data_of(config: DictConfig) -> dict[str, str]:
     test set's options, with its root by name and its index by content. Absent options are left out.
     """
     data = OmegaConf.to_container(config.data, resolve=True)
-    places = {
+    described = {
         "run/data/root": _name(data.get("root")),
         "run/data/test_root": _name(data.get("test_root")),
         "run/data/index": content_of(data.get("index")),
         "run/init_path": content_of(config.init_path and weights_file(config.init_path)),
     }
-    tested = tested_sets(data["test_sets"], data["name"], on_disk="root" in data)
-    for name, options in tested.items():
-        how = dict(options or {})
-        how |= {"root": _name(how.get("root")), "index": content_of(how.get("index"))}
-        places[f"run/test_sets/{name}"] = hash_of(how)
-    return {key: value for key, value in places.items() if value is not None}
+    test_sets = tested_sets(data["test_sets"], data["name"], on_disk="root" in data)
+    for name, options in test_sets.items():
+        options = dict(options or {})
+        options |= {"root": _name(options.get("root")), "index": content_of(options.get("index"))}
+        described[f"run/test_sets/{name}"] = hash_of(options)
+    return {key: value for key, value in described.items() if value is not None}
 
 
 def _name(path: str | Path | None) -> str | None:
@@ -138,7 +147,8 @@ def describe_run(config: DictConfig) -> dict[str, str | int]:
     """Describe a run for metrics.json.
 
     Returns:
-        run/config_hash, run/seed, run/revision (see `revision`), run/machine, and `data_of`.
+        run/config_hash, run/seed, run/revision (see `revision`), run/machine, run/format (see
+        `asysplat.training.old_names`) and `data_of`.
     """
     gpus = torch.cuda.device_count()
     machine = f"{gpus} x {torch.cuda.get_device_name()}" if gpus else f"{os.cpu_count()} CPU cores"
@@ -147,6 +157,7 @@ def describe_run(config: DictConfig) -> dict[str, str | int]:
         "run/seed": config.seed,
         "run/revision": revision(),
         "run/machine": f"{machine}, torch {torch.__version__}",
+        "run/format": FORMAT,
         **data_of(config),
     }
 
@@ -154,15 +165,14 @@ def describe_run(config: DictConfig) -> dict[str, str | int]:
 def find_runs(logs: Path) -> Iterator[Run]:
     """Yield every finished run below `logs`, oldest first.
 
-    A results file that cannot be read, as a run that was cut off may leave, is skipped with a
-    warning.
+    A results file that cannot be read, as an interrupted run may leave, is left out with a warning.
     """
-    found = sorted(logs.rglob(RESULTS), key=lambda path: (path.stat().st_mtime, path))
-    for path in found:
+    paths = sorted(logs.rglob(RESULTS), key=lambda path: (path.stat().st_mtime, path))
+    for path in paths:
         try:
             results = json.loads(path.read_text())
-            keys = ("run/config_hash", "run/seed", "run/revision")
-            run = Run(path.parent, *(results[key] for key in keys), results)
+            hash_now = _config_hash_now(path.parent, results)
+            seed, commit = results["run/seed"], results["run/revision"]
             extra = path.with_name(EVALUATION)
             if extra.exists():
                 results.update(json.loads(extra.read_text()))
@@ -171,7 +181,20 @@ def find_runs(logs: Path) -> Iterator[Run]:
                 f"{path} is not the results of a finished run: it is left out.", stacklevel=2
             )
             continue
-        yield run
+        yield Run(path.parent, hash_now, seed, commit, upgrade_results(results))
+
+
+def _config_hash_now(folder: Path, results: Mapping[str, Any]) -> str:
+    """Return the hash that today's code computes for the configuration of a run."""
+    stored = results["run/config_hash"]
+    if results.get("run/format") == FORMAT:
+        return stored
+    try:
+        config = read_config(folder / "config.yaml")
+        stages = config.get("earlier_stages") or ()
+        return config_hash(config, [read_config(folder / s / "config.yaml") for s in stages])
+    except (OSError, ValueError, KeyError, AttributeError):  # no or another configuration
+        return stored
 
 
 def find_run(logs: Path, config: DictConfig) -> Run | None:
@@ -179,7 +202,7 @@ def find_run(logs: Path, config: DictConfig) -> Run | None:
 
     Runs of this revision of the code come before runs of others.
     """
-    wanted, data = (config_hash(config), config.seed), data_of(config)
-    same = [run for run in find_runs(logs) if (run.config_hash, run.seed) == wanted]
+    key, data = (config_hash(config), config.seed), data_of(config)
+    same = [run for run in find_runs(logs) if (run.config_hash, run.seed) == key]
     same = [run for run in same if run.covers(data)]
     return max(reversed(same), key=lambda run: run.revision == revision(), default=None)

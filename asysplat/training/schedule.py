@@ -1,4 +1,4 @@
-"""How the learning rate changes over the steps of a training."""
+"""The learning rate of each training step."""
 
 import math
 
@@ -10,7 +10,7 @@ def cosine(optimizer: Optimizer, warmup_steps: int, total_steps: int) -> LambdaL
     """Return the schedule of a linear warm-up to the optimizer's rate, then a cosine to 0.
 
     Args:
-        optimizer: its own learning rate is the highest.
+        optimizer: with the highest learning rate.
         warmup_steps, total_steps: in optimizer steps; the warm-up is part of the total.
     """
 

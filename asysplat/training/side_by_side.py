@@ -1,8 +1,8 @@
-"""The scenes of a batch side by side on a CPU, each in a thread of its own.
+"""Compute the scenes of a batch side by side on a CPU, each in a thread.
 
-A scene at small resolution leaves most cores idle: its operators are too short to be divided. Whole
-scenes divide well. Each gives its gradients, which are averaged in the order of the scenes: the
-number of threads that take turns at them changes no bit.
+The operators of a scene of low resolution are too short to be divided among the cores.
+The gradients of the scenes are averaged in the order of the scenes, so that the number of threads
+changes no bit.
 """
 
 import copy
@@ -25,19 +25,19 @@ Terms = dict[str, Tensor]
 class SideBySide:
     """Computes means over the scenes of a batch, and their gradients.
 
-    Batch norms see one scene at a time, as if each scene had a process of its own; their running
-    means move by the mean of what they saw.
+    Batch norms normalize each scene by itself, as if it had its own process; their running means
+    change by the mean over the scenes.
 
     Args:
         net: whose parameters are trained.
-        compute: network, batch -> terms, "loss" among them.
+        compute: batch, network -> terms, "loss" among them.
         parts: measures the backward pass of each scene.
     """
 
     def __init__(
         self,
         net: nn.Module,
-        compute: Callable[[nn.Module, Batch], Terms],
+        compute: Callable[[Batch, nn.Module], Terms],
         parts: Parts | None = None,
     ):
         self.net, self.compute, self.parts = net, compute, parts or Parts()
@@ -48,7 +48,7 @@ class SideBySide:
         scenes = split(batch)
         copies = self._copies(len(scenes))
         parameters = [p for p in self.net.parameters() if p.requires_grad]
-        # Autocast is a setting of this thread alone.
+        # Autocast is a setting of the calling thread alone.
         autocast = partial(
             torch.autocast,
             "cpu",
@@ -57,21 +57,21 @@ class SideBySide:
             cache_enabled=False,  # it would be shared by all threads
         )
 
-        def differentiate(net: nn.Module, scene: Batch) -> tuple[Terms, tuple[Tensor, ...]]:
+        def differentiate(scene: Batch, net: nn.Module) -> tuple[Terms, tuple[Tensor, ...]]:
             with autocast():
-                terms = self.compute(net, scene)
+                terms = self.compute(scene, net)
             with self.parts("backward"):
                 grads = torch.autograd.grad(terms["loss"], parameters, materialize_grads=True)
             return {name: term.detach() for name, term in terms.items()}, grads
 
         cores = torch.get_num_threads()
         workers = min(len(scenes), cores)
-        found = list(_pool(workers, cores // workers).map(differentiate, copies, scenes))
-        self._count_scenes(copies)
-        terms, grads = zip(*found, strict=True)
+        results = list(_pool(workers, cores // workers).map(differentiate, scenes, copies))
+        self._update_buffers(copies)
+        terms, grads = zip(*results, strict=True)
         means = {name: torch.stack([each[name] for each in terms]).mean() for name in terms[0]}
         sums = [reduce(torch.add, each) for each in zip(*grads, strict=True)]
-        means["loss"] = _Known.apply(means["loss"], sums, len(scenes), *parameters)
+        means["loss"] = _WithGradients.apply(means["loss"], sums, len(scenes), *parameters)
         return means
 
     def _copies(self, count: int) -> list[nn.Module]:
@@ -87,8 +87,8 @@ class SideBySide:
                 buffer.copy_(original)
         return copies
 
-    def _count_scenes(self, copies: list[nn.Module]) -> None:
-        """Move the buffers by the mean of the copies' changes; counters by that of one."""
+    def _update_buffers(self, copies: list[nn.Module]) -> None:
+        """Change the buffers by the mean of the copies' changes, counters as one copy did."""
         buffers = zip(self.net.buffers(), *(net.buffers() for net in copies), strict=True)
         for buffer, *changed in buffers:
             if buffer.is_floating_point():
@@ -98,7 +98,7 @@ class SideBySide:
 
 
 def split(batch: Batch) -> list[Batch]:
-    """Return a batch of one scene for each of the scenes."""
+    """Split a batch into batches of one scene."""
     return [
         {
             "scene": [scene],
@@ -109,8 +109,8 @@ def split(batch: Batch) -> list[Batch]:
     ]
 
 
-class _Known(torch.autograd.Function):
-    """A number whose gradients are known: `sums` / `count`."""
+class _WithGradients(torch.autograd.Function):
+    """Return a number unchanged; its gradients are `sums` / `count`."""
 
     @staticmethod
     def forward(ctx, number, sums, count, *parameters):
@@ -126,7 +126,7 @@ class _Known(torch.autograd.Function):
 
 @cache
 def _pool(workers: int, threads: int) -> ThreadPoolExecutor:
-    """Return threads that compute, each with `threads` for its operators."""
+    """Return a pool of worker threads, each with `threads` for its operators."""
     return ThreadPoolExecutor(
         workers, "asysplat-scene", initializer=torch.set_num_threads, initargs=(threads,)
     )

@@ -1,4 +1,4 @@
-"""Stages of one run: each starts from the weights of the one before, and all are tested alike."""
+"""The stages of a run: each starts from the weights of the one before."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from asysplat.errors import InputError
-from asysplat.training.checkpoints import read_callbacks
+from asysplat.training.checkpoints import read_notes
 from asysplat.training.ranges import check_ranges
 from asysplat.training.summary import Results
 
@@ -18,13 +18,13 @@ from asysplat.training.summary import Results
 def stage_configs(config: DictConfig) -> list[DictConfig]:
     """List the configurations of a run's stages, in their order; the last is the run's own.
 
-    Optimizer, schedule and random numbers start anew in each. Those before the last are tested at
-    its size, so that their numbers can be compared.
+    Optimizer, schedule and random numbers start anew in each stage. All are tested at the size of
+    the last, so that their numbers can be compared.
 
     Raises:
-        InputError: `earlier_stages` names one that the scale does not have, or one twice.
+        InputError: `earlier_stages` has a stage that the scale does not have, or a stage twice.
     """
-    names = [*(config.get("earlier_stages") or ()), config.stage]  # older runs have none
+    names = [*(config.get("earlier_stages") or ()), config.stage]
     for index, name in enumerate(names):
         if name not in config.stages:
             raise InputError(
@@ -47,11 +47,11 @@ def stage_configs(config: DictConfig) -> list[DictConfig]:
 
 
 def check_stages(stages: Sequence[DictConfig]) -> None:
-    """Check the options of every stage, so that none is refused after days of the one before.
+    """Check the options of every stage, so that none is refused after days of training.
 
     Raises:
         InputError: a value out of range, a size that the model does not take, or several stages
-            without the checkpoints by which they pass their weights on.
+            without checkpoints.
     """
     if len(stages) == 1:
         check_ranges(stages[0])
@@ -66,8 +66,8 @@ def check_stages(stages: Sequence[DictConfig]) -> None:
             raise InputError(f"{stage.stage}: {error}") from error
     if (stages[-1].get("callbacks") or {}).get("checkpoints") is None:
         raise InputError(
-            "callbacks.checkpoints is left out, by which a stage hands its weights to the next: "
-            "leave it in, or train one stage alone with earlier_stages=[]."
+            "callbacks.checkpoints is left out, and each stage starts from the checkpoint of the "
+            "one before: leave it in, or train one stage alone with earlier_stages=[]."
         )
 
 
@@ -78,10 +78,10 @@ def describe_stage(config: DictConfig) -> str:
 
 
 class StageRecord(lightning.Callback):
-    """Has every checkpoint say which stage it is of, and what the stages before it measured.
+    """Saves the name of the stage and the results of the stages before it in each checkpoint.
 
-    A later stage writes its first checkpoint before its first step: what the stage before measured
-    is kept from then on.
+    A later stage writes its first checkpoint before its first step, which saves the results of the
+    stage before it.
 
     Args:
         stage: its name.
@@ -100,9 +100,9 @@ class StageRecord(lightning.Callback):
 
 
 def resume_point(checkpoint: Path | None, stages: Sequence[DictConfig]) -> tuple[int, Results]:
-    """Find where a run goes on: the index of the checkpoint's stage, and the results before it.
+    """Find where a run resumes: the index of the checkpoint's stage, and the results before it.
 
-    A checkpoint that says nothing of a stage counts as one of the first.
+    A checkpoint without the name of a stage counts as one of the first.
 
     Raises:
         InputError: the file cannot be read, or is of a stage that the run does not have.
@@ -110,17 +110,17 @@ def resume_point(checkpoint: Path | None, stages: Sequence[DictConfig]) -> tuple
     if checkpoint is None:
         return 0, {}
     names = [stage.stage for stage in stages]
-    record = read_callbacks(checkpoint).get(StageRecord.__qualname__, {})
+    record = read_notes(checkpoint)["callbacks"].get(StageRecord.__qualname__, {})
     stage = record.get("stage", names[0])
     if stage not in names:
         raise InputError(
             f"ckpt_path={checkpoint} is of {stage}, and this run trains {', '.join(names)}: give "
-            "the options of its run to go on with it, or init_path in its place to start from it."
+            "the options of its run to resume it, or init_path= instead to start from it."
         )
     return names.index(stage), record.get("earlier", {})
 
 
 def results_of_stage(name: str, results: Results) -> Results:
-    """Name a stage's tests and costs after it: `stage1/test/...`, as in the run's metrics.json."""
+    """Prefix a stage's tests and costs with its name, `stage1/test/...`, as in metrics.json."""
     kinds = ("test/", "cost/")
     return {f"{name}/{key}": value for key, value in results.items() if key.startswith(kinds)}

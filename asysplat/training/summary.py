@@ -1,8 +1,8 @@
-"""The results of a run or an evaluation: a file, and tables on the terminal."""
+"""Write the results of a run or an evaluation to a file and print them as tables."""
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -23,10 +23,7 @@ SOURCES = {"trained": "test/{}"} | BASELINES
 
 
 def write_json(path: Path, results: Results) -> None:
-    """Write results sorted, NaN as null, with a sentence on how seconds are measured.
-
-    The file appears complete or not at all.
-    """
+    """Write results atomically: sorted, NaN as null, with the protocol of the seconds."""
     finite = {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in results.items()
@@ -36,62 +33,57 @@ def write_json(path: Path, results: Results) -> None:
         partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
 
 
-def test_sets(results: Results) -> list[str]:
-    """List the test sets that were measured, in order."""
-    keys = (key.split("/") for key in results)
-    return [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
-
-
 def quality_table(results: Results, data: str) -> Table:
     """Make the table of one test set: a column for each metric, a row for each image source.
 
-    The stages of a training before the last have rows of their own, as metrics.json has them.
+    Each earlier stage of the training has a row.
     """
-    shown = [name for name in METRICS if f"test/{data}/{name}" in results]
+    columns = [name for name in METRICS if f"test/{data}/{name}" in results]
     title = f"test scenes: {data}, metrics: {results['protocol/name']}"
-    table = Table("", *(METRICS[name] for name in shown), title=title)
+    table = Table("", *(METRICS[name] for name in columns), title=title)
     ending = f"/test/{data}/psnr"
-    earlier = [key.removesuffix(ending) for key in results if key.endswith(ending)]
-    sources = {f"after {stage}": f"{stage}/test/{{}}" for stage in earlier} | SOURCES
+    stages = [key.removesuffix(ending) for key in results if key.endswith(ending)]
+    sources = {f"after {stage}": f"{stage}/test/{{}}" for stage in stages} | SOURCES
     for label, prefix in sources.items():
-        values = [results.get(f"{prefix.format(data)}/{name}") for name in shown]
-        table.add_row(label, *("" if v is None else f"{v:.3f}" for v in values))
+        table.add_row(label, *_cells(results.get(f"{prefix.format(data)}/{n}") for n in columns))
     return table
 
 
-def psnr_table(results: Results, names: list[str]) -> Table:
+def psnr_table(results: Results, names: Sequence[str]) -> Table:
     """Make the table of several test sets: a row for each, PSNR of each image source."""
     table = Table("", *SOURCES, title="other test sets, PSNR (dB)")
     for name in names:
-        values = [results[f"{prefix.format(name)}/psnr"] for prefix in SOURCES.values()]
-        table.add_row(name, *(f"{value:.3f}" for value in values))
+        table.add_row(name, *_cells(results[f"{p.format(name)}/psnr"] for p in SOURCES.values()))
     return table
 
 
 def post_optimization_table(results: Results, name: str, costs: str) -> Table:
-    """Make the table of one test set after steps of post-optimization, and of its inputs' PSNR.
+    """Make the table of one test set after steps of post-optimization.
 
     Args:
         results: as in evaluation.json.
         name: of the test set.
-        costs: the beginning of the keys of its costs.
+        costs: prefix of the keys of its costs.
     """
     keys = [key.split("/") for key in results if key.startswith(f"test/{name}/post")]
     steps = sorted({int(key[2].removeprefix("post")) for key in keys})
-    shown = [metric for metric in METRICS if [metric] in [key[3:] for key in keys]]
+    metrics = [metric for metric in METRICS if [metric] in [key[3:] for key in keys]]
     title = f"test scenes: {name}, metrics: {results['protocol/name']}, "
     title += f"{results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
-    titles = ("seconds", "GB", "inputs (dB)", *(METRICS[metric] for metric in shown))
+    titles = ("seconds", "GB", "inputs (dB)", *(METRICS[metric] for metric in metrics))
     table = Table(Column("steps", min_width=12), *titles, title=title)
     rows = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
     rows |= {label: (prefix.format(name), "") for label, prefix in BASELINES.items()}
     for label, (prefix, source) in rows.items():
-        seconds, gb = (results.get(f"{costs}/{source}/{unit}") for unit in ("seconds", "gb"))
+        spent = _cells((results.get(f"{costs}/{source}/{u}") for u in ("seconds", "gb")), digits=2)
         inputs = results.get(f"inputs/{name}/{source}/psnr")
-        values = [inputs, *(results.get(f"{prefix}/{metric}") for metric in shown)]
-        cells = ["" if each is None else f"{each:.2f}" for each in (seconds, gb)]
-        table.add_row(label, *cells, *("" if v is None else f"{v:.3f}" for v in values))
+        values = [inputs, *(results.get(f"{prefix}/{metric}") for metric in metrics)]
+        table.add_row(label, *spent, *_cells(values))
     return table
+
+
+def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
+    return ["" if value is None else f"{value:.{digits}f}" for value in values]
 
 
 def cost_sentence(results: Results) -> str:
@@ -113,39 +105,40 @@ def cost_sentence(results: Results) -> str:
 
 
 def print_summary(results: Results, data: str, folder: Path) -> None:
-    """Print the test and its baselines, the costs, the pictures and, last, the run's folder.
+    """Print the test and its baselines, the costs, the figures and, last, the run's folder.
 
     Args:
         results: of a run; what was not measured is left out.
-        data: the test set to show in full; for others only PSNR is shown.
+        data: the test set to print in full; of others only PSNR is printed.
         folder: of the run.
     """
-    console = Console()
-    measured = test_sets(results)
-    if data in measured:
-        console.print(quality_table(results, data))
-    others = [name for name in measured if name != data]
-    if others:
-        console.print(psnr_table(results, others))
-    if costs := cost_sentence(results):
-        console.print(costs, soft_wrap=True)
-    for picture in sorted((folder / "figures").glob("test-*.png")):
-        console.print(f"picture: {picture}", soft_wrap=True)
-    console.print(f"run: {folder}", soft_wrap=True)
+    keys = [key.split("/") for key in results]
+    test_sets = [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
+    others = [name for name in test_sets if name != data]
+    tables = [quality_table(results, data)] if data in test_sets else []
+    tables += [psnr_table(results, others)] if others else []
+    _print([*tables, cost_sentence(results)], folder, "test")
+    print(f"run: {folder}")
 
 
 def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> None:
-    """Print what evaluate.py found: a table for each test set, pictures and, last, the folder.
+    """Print a table for each test set, the figures and, last, the folder.
 
     Args:
         results: as in evaluation.json.
-        sets: the test sets, that of the data itself first.
-        folder: where the results are.
+        sets: the test sets, the data set's own first.
+        folder: of the results.
     """
+    costs = ["cost" if name == sets[0] else f"cost/{name}" for name in sets]
+    tables = [post_optimization_table(results, *each) for each in zip(sets, costs, strict=True)]
+    _print(tables, folder, "evaluation")
+    print(f"evaluation: {folder}")
+
+
+def _print(parts: Sequence[Table | str], folder: Path, figures: str) -> None:
     console = Console()
-    for name in sets:
-        costs = "cost" if name == sets[0] else f"cost/{name}"
-        console.print(post_optimization_table(results, name, costs))
-    for picture in sorted((folder / "figures").glob("evaluation-*.png")):
-        console.print(f"picture: {picture}", soft_wrap=True)
-    console.print(f"evaluation: {folder}", soft_wrap=True)
+    for part in parts:
+        if part:
+            console.print(part, soft_wrap=isinstance(part, str))
+    for path in sorted((folder / "figures").glob(f"{figures}-*.png")):
+        print(f"figure: {path}")

@@ -1,4 +1,4 @@
-"""TensorBoard: a first page of quality, training and time, and the hparams tab."""
+"""TensorBoard: custom scalars of quality, training and time, and the hparams tab."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -9,24 +9,10 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 CHOICES = (
-    "name",
-    "seed",
-    "width",
-    "state_size",
-    "geometry_ratio",
-    "steps",
-    "learning_rate",
-    "model.layers",
-    "data.name",
-    "data.inputs",
-    "data.height",
-    "data.width",
-    "data.batch_size",
-    "metrics.name",
-    "training.loss.ssim",
-    "training.loss.perceptual",
-    "training.loss.depth",
-    "training.loss.opacity",
+    *("name", "seed", "width", "state_size", "geometry_ratio", "steps", "learning_rate"),
+    *("model.layers", "metrics.name"),
+    *(f"data.{key}" for key in ("name", "inputs", "height", "width", "batch_size")),
+    *(f"training.loss.{key}" for key in ("ssim", "perceptual", "depth", "opacity")),
 )
 TERMS = ("mse", "ssim", "perceptual", "depth", "opacity")
 EVENTS = "events.out.tfevents.*"
@@ -57,21 +43,21 @@ def make_logger(folder: Path | str) -> TensorBoardLogger:
 
 
 def event_files(loggers: Sequence[Logger]) -> dict[str, int]:
-    """Write all that was logged to disk; return the name and bytes of each file of events."""
+    """Flush all events to disk; return the name and bytes of each file of events."""
     sizes = {}
     for logger in loggers:
         if isinstance(logger, TensorBoardLogger):
             logger.experiment.flush()
-            found = Path(logger.log_dir).glob(EVENTS)
-            sizes |= {path.name: path.stat().st_size for path in found}
+            paths = Path(logger.log_dir).glob(EVENTS)
+            sizes |= {path.name: path.stat().st_size for path in paths}
     return sizes
 
 
 @rank_zero_only
 def cut_events(folder: Path, sizes: Mapping[str, int]) -> None:
-    """Drop what a run logged after a checkpoint, from which it logs it again.
+    """Drop the events that a run logged after a checkpoint, since it will log them again.
 
-    `purge_step` would not do: the last validation before and the first step after the checkpoint
+    `purge_step` cannot do this: the last validation before and the first step after the checkpoint
     have the same step.
 
     Args:
@@ -86,9 +72,9 @@ def cut_events(folder: Path, sizes: Mapping[str, int]) -> None:
 
 
 def log_choices(logger: Logger, config: DictConfig) -> None:
-    """Write what a run logs once: a "custom scalars" page that shows quality first, and options.
+    """Log the layout of the "custom scalars" page, and the options for the hparams tab.
 
-    The hparams tab has the options; its metrics must be named before they are known.
+    The metrics of the hparams tab must be named before they are measured.
     """
     choices = {key: OmegaConf.select(config, key) for key in CHOICES}
     if isinstance(logger, TensorBoardLogger):
@@ -98,8 +84,8 @@ def log_choices(logger: Logger, config: DictConfig) -> None:
         logger.log_hyperparams(choices)
 
 
-def log_outcome(logger: Logger, results: Mapping[str, str | int | float], data: str) -> None:
-    """Log the test's numbers, for the hparams tab."""
-    found = {f"hp/{name}": results.get(f"test/{data}/{name}") for name in HPARAMS_METRICS}
-    logger.log_metrics({name: value for name, value in found.items() if value is not None})
+def log_results(logger: Logger, results: Mapping[str, str | int | float], data: str) -> None:
+    """Log the metrics of the test, for the hparams tab."""
+    values = {f"hp/{name}": results.get(f"test/{data}/{name}") for name in HPARAMS_METRICS}
+    logger.log_metrics({name: value for name, value in values.items() if value is not None})
     logger.save()

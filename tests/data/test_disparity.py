@@ -1,4 +1,4 @@
-"""`python -m asysplat.data.disparity`: what it writes and keeps, and that training reads it."""
+"""`python -m asysplat.data.disparity`: its maps, and the training that reads them."""
 
 import sys
 
@@ -7,29 +7,29 @@ import pytest
 import torch
 from PIL import Image
 
-from asysplat.data import ProceduralScene, files_data, open_scene
+from asysplat.data import ProceduralScene, SceneOptions, files_data, open_scene
 from asysplat.data.datamodule import TrainingTasks, collate
-from asysplat.data.disparity.__main__ import main, shrunk
+from asysplat.data.disparity.__main__ import main, shrink
 from asysplat.data.disparity.maps import LEVELS, map_folder, map_name
 from asysplat.data.disparity.network import DepthAnything, network_size
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.rendering import Rendering
 from asysplat.scene import Gaussians
-from asysplat.training import Outcome, RenderedDisparity
-from asysplat.training.disparity import disparity_distance, known_disparities
+from asysplat.training import Prediction, RenderedDisparity
+from asysplat.training.disparity import disparity_distance, reference_disparities
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 12
 
 
 def red(photograph):
-    """A stand-in for the network: red is near, at twice the photograph's size."""
+    """Replaces the network: red is near, at twice the image's size."""
     return photograph[..., 0].repeat(2, 0).repeat(2, 1).astype(np.float32) / 100 - 1
 
 
 @pytest.fixture(scope="module")
 def views():
-    return ProceduralScene(1, HEIGHT, WIDTH, num_frames=40, places="rooms").views(range(FRAMES))
+    return ProceduralScene(1, HEIGHT, WIDTH, num_images=40, places="rooms").views(range(FRAMES))
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def scene(views, tmp_path):
 
 @pytest.fixture
 def command(tmp_path, capsys):
-    """Runs the command with a stand-in; maps go to tmp_path/maps unless told otherwise."""
+    """Runs the command without a network; maps go to tmp_path/maps by default."""
 
     def run(scene, *options, estimate=red):
         place = [] if "--beside" in options else ["--folder", str(tmp_path / "maps")]
@@ -51,19 +51,20 @@ def command(tmp_path, capsys):
     return run
 
 
-def stand_of(folder):
+def snapshot(folder):
     return {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in folder.rglob("*") if p.is_file()}
 
 
-def test_maps_are_kept_outside_of_the_data_and_read(command, scene, views, tmp_path):
-    before = stand_of(scene)
+def test_maps_are_written_outside_of_the_data_and_read(command, scene, views, tmp_path):
+    before = snapshot(scene)
     code, out, _ = command(scene)
     folder = map_folder(scene, tmp_path / "maps")
     assert code == 0 and f"{FRAMES} maps written, 0 were there: {folder}" in out
-    assert len(list(folder.iterdir())) == FRAMES and stand_of(scene) == before
+    assert len(list(folder.iterdir())) == FRAMES and snapshot(scene) == before
 
-    assert open_scene(scene, HEIGHT, WIDTH).views([0]).disparities is None
-    found = open_scene(scene, HEIGHT, WIDTH, disparities=tmp_path / "maps").views([3, 0])
+    assert open_scene(scene, SceneOptions(HEIGHT, WIDTH)).views([0]).disparities is None
+    options = SceneOptions(HEIGHT, WIDTH, disparities=tmp_path / "maps")
+    found = open_scene(scene, options).views([3, 0])
     for disparity, image in zip(found.disparities, found.images[:, 0], strict=True):
         assert (disparity.min(), disparity.max()) == (1, LEVELS)
         near = (image - image.min()) / (image.max() - image.min())
@@ -71,7 +72,7 @@ def test_maps_are_kept_outside_of_the_data_and_read(command, scene, views, tmp_p
     torch.testing.assert_close(found.depths, views.depths[[3, 0]], atol=1e-3, rtol=0)
 
 
-def test_it_goes_on_where_it_was_stopped(command, scene, tmp_path):
+def test_a_second_call_continues(command, scene, tmp_path):
     def stops(photograph, calls=[]):  # noqa: B006
         calls.append(photograph)
         if len(calls) > 5:
@@ -81,43 +82,43 @@ def test_it_goes_on_where_it_was_stopped(command, scene, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         command(scene, estimate=stops)
     folder = map_folder(scene, tmp_path / "maps")
-    first = stand_of(folder)
+    first = snapshot(folder)
     assert len(first) == 5  # each whole, and nothing else
-    some = open_scene(scene, HEIGHT, WIDTH, disparities=tmp_path / "maps")
+    some = open_scene(scene, SceneOptions(HEIGHT, WIDTH, disparities=tmp_path / "maps"))
     known = some.views(range(FRAMES)).disparities.flatten(1).any(1)
     assert known.sum() == 5  # 0 where unknown
 
     _, out, _ = command(scene)
     assert f"{FRAMES - 5} maps written, 5 were there" in out
-    assert first.items() <= stand_of(folder).items() and len(stand_of(folder)) == FRAMES
+    assert first.items() <= snapshot(folder).items() and len(snapshot(folder)) == FRAMES
     assert "0 maps written, 12 were there" in command(scene, estimate=stops)[1]
 
 
-def test_maps_lie_in_the_data_only_if_told_so(command, scene, tmp_path):
+def test_maps_are_inside_the_data_only_with_beside(command, scene, tmp_path):
     code, _, said = command(scene, "--folder", str(scene / "maps"))  # the last one counts
     assert code == 2 and "lies in the data set" in said and not (scene / "maps").exists()
     code, out, _ = command(scene.parent, "--beside")
     assert code == 0 and str(scene / "disparities") in out
     assert len(list((scene / "disparities").iterdir())) == FRAMES
-    read = open_scene(scene, HEIGHT, WIDTH, disparities=tmp_path / "none").views([1])
+    read = open_scene(scene, SceneOptions(HEIGHT, WIDTH, disparities=tmp_path / "none")).views([1])
     assert read.disparities.max() == LEVELS
 
 
-def test_a_photograph_that_cannot_be_read(command, scene, tmp_path):
+def test_a_damaged_image(command, scene, tmp_path):
     image = sorted((scene / "images").iterdir())[4]
     data = image.read_bytes()
     image.write_bytes(data[:300] + bytes(200) + data[500:])
     code, _, said = command(scene)
-    assert code == 2 and "1 of 12 frames cannot be used" in said and image.name in said
+    assert code == 2 and "1 of 12 images cannot be used" in said and image.name in said
     assert len(list(map_folder(scene, tmp_path / "maps").iterdir())) == FRAMES - 1
     with pytest.warns(UserWarning, match="left out 1 of 12"):
-        assert command(scene, "--on-bad-frame", "skip")[0] == 0
+        assert command(scene, "--on-bad-image", "skip")[0] == 0
 
 
-def test_a_map_of_another_photograph_is_refused(command, scene, tmp_path):
+def test_a_map_of_another_image_is_an_error(command, scene, tmp_path):
     command(scene)
-    sequence = open_scene(scene, HEIGHT, WIDTH, disparities=tmp_path / "maps")
-    image = sequence.scene.photographs[2].image
+    sequence = open_scene(scene, SceneOptions(HEIGHT, WIDTH, disparities=tmp_path / "maps"))
+    image = sequence.scene.images[2].file
     path = map_folder(scene, tmp_path / "maps") / map_name(image, scene)
     Image.fromarray(np.ones((20, 40), np.uint16)).save(path)
     with pytest.raises(InputError, match=r"is 40 x 20 and .* 32 x 24: delete it, and estimate"):
@@ -125,13 +126,13 @@ def test_a_map_of_another_photograph_is_refused(command, scene, tmp_path):
     assert sequence.views([1]).disparities is not None
 
 
-def test_an_estimate_that_is_not_finite(command, scene, tmp_path):
+def test_a_non_finite_estimate_is_an_error(command, scene, tmp_path):
     code, _, said = command(scene, estimate=lambda photograph: red(photograph) * np.nan)
     assert code == 2 and "would hold NaN or infinity" in said
     assert not list(map_folder(scene, tmp_path / "maps").iterdir())
 
 
-def test_training_compares_with_them(command, scene, tmp_path):
+def test_training_reads_the_maps(command, scene, tmp_path):
     """Cropped with the images, in batches, and before the data's own depths."""
     command(scene)
     sizes = {"height": 16, "width": 16, "window": (6, 12), "inputs": 2, "targets": 2}
@@ -142,7 +143,7 @@ def test_training_compares_with_them(command, scene, tmp_path):
     batch = collate([TrainingTasks(data)[0]] * 2)
     targets = batch["targets"]
     assert targets.depths is not None and targets.disparities.shape == (2, 2, 16, 16)
-    assert torch.equal(known_disparities(targets), targets.disparities)
+    assert torch.equal(reference_disparities(targets), targets.disparities)
 
     depth = 1 + torch.rand(2, 2, 16, 16)
     rendering = Rendering(targets.images, torch.ones_like(depth), depth, {})
@@ -151,17 +152,19 @@ def test_training_compares_with_them(command, scene, tmp_path):
     distance = disparity_distance(found, expected, torch.ones_like(found, dtype=torch.bool))
     ones = torch.ones(1, 4)
     gaussians = Gaussians(ones[:, :3], ones, ones[:, :3], ones[:, 0], ones[:, None, :3])
-    torch.testing.assert_close(RenderedDisparity()(Outcome(gaussians, rendering), batch), distance)
+    torch.testing.assert_close(
+        RenderedDisparity()(Prediction(gaussians, rendering), batch), distance
+    )
     assert distance > 0.1
 
 
-def test_maps_have_the_photographs_proportions():
-    assert shrunk(np.zeros((518, 924), np.float32), 540, 960).shape == (272, 484)
-    assert shrunk(np.zeros((518, 700), np.float32), 20, 27).shape == (20, 27)
+def test_maps_keep_the_proportions():
+    assert shrink(np.zeros((518, 924), np.float32), 540, 960).shape == (272, 484)
+    assert shrink(np.zeros((518, 700), np.float32), 20, 27).shape == (20, 27)
     assert network_size(540, 960, 14) == (518, 924) and network_size(960, 540, 14) == (924, 518)
 
 
-def test_without_transformers_it_says_what_to_install(command, scene, monkeypatch):
+def test_missing_transformers_is_an_error(command, scene, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
     code, _, said = command(scene, estimate=None)
     assert code == 2 and "pip install 'asysplat[disparity]'" in said
@@ -188,18 +191,18 @@ def tiny_model(tmp_path_factory):
 def test_depth_anything_by_way_of_transformers(command, scene, tiny_model, tmp_path):
     code, out, said = command(scene, "--model", str(tiny_model), estimate=None)
     assert code == 0 and f"{FRAMES} maps written" in out, said
-    read = open_scene(scene, HEIGHT, WIDTH, disparities=tmp_path / "maps").views([0])
+    read = open_scene(scene, SceneOptions(HEIGHT, WIDTH, disparities=tmp_path / "maps")).views([0])
     assert read.disparities.unique().numel() > 100
 
 
-def test_a_model_that_is_not_there(command, scene, tmp_path):
+def test_a_missing_model_is_an_error(command, scene, tmp_path):
     pytest.importorskip("transformers", reason="needs transformers")
     code, _, said = command(scene, "--model", str(tmp_path), estimate=None)
     assert code == 2 and f"--model {tmp_path} cannot be loaded" in said
 
 
 class Network(torch.nn.Module):
-    """Returns red as it is given it."""
+    """Returns its red input."""
 
     class config:
         patch_size = 14
@@ -209,7 +212,7 @@ class Network(torch.nn.Module):
         return type("Found", (), {"predicted_depth": pixel_values[:, 0]})
 
 
-def test_what_the_network_is_given():
+def test_the_network_gets_normalized_patches():
     """Whole patches, normalized as ImageNet's, and its answer as it is."""
     network = Network()
     photograph = np.full((100, 150, 3), (255, 0, 128), np.uint8)

@@ -11,14 +11,14 @@ import pytest
 from tiny import NETWORK, SCENES, STEPS, VIEWS
 
 COSTS = "callbacks.costs={_target_: asysplat.training.callbacks.Costs}"
-# Costs and plan take longer than the steps of most tests: who needs them asks with COSTS.
+# Costs and plan take longer than the steps of most tests: COSTS turns them on.
 TINY = [*NETWORK, *STEPS, *VIEWS, "callbacks.costs=null"]
 TINY_SCENES = [*SCENES, "data.test_scenes=2"]
 
 
 @pytest.fixture
 def train(tmp_path, run_script, repository):
-    """Runs train.py with overrides; logs go below tmp_path."""
+    """A function that runs train.py with overrides and logs below tmp_path."""
     return make_train(tmp_path, run_script, repository)
 
 
@@ -32,7 +32,7 @@ def make_train(logs, run_script, repository):
         return [*overrides, f"paths.logs={logs}", *tiny]
 
     def run(*overrides):
-        """In this process, which has all imports behind it."""
+        """In this process, which has imported everything."""
         return run_script("train.py", *complete(*overrides))
 
     def run_alone(*overrides):
@@ -44,10 +44,9 @@ def make_train(logs, run_script, repository):
 
     @contextmanager
     def start(*overrides, until, cwd=repository, env=environment):
-        """A process, when the folder of logs has a file of the name `until`; ends with the test.
+        """Yield a process when the logs have a file named `until`; kill it at the end.
 
-        It takes SIGINT, also where the shell that started the tests ignores it, as it does for what
-        runs in its background.
+        It handles SIGINT, even if the shell ignores it for background jobs.
         """
         process = subprocess.Popen(
             [sys.executable, repository / "train.py", *complete(*overrides)],

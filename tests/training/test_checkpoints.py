@@ -1,12 +1,12 @@
-"""What is kept of a run, and that a run goes on from it as if nothing had happened."""
+"""The checkpoints of a run; a resumed run takes the same steps as an uninterrupted one."""
 
 import os
 import signal
 import struct
 import zipfile
 
+import events
 import lightning
-import logged
 import pytest
 import torch
 from full_disk import largest_file
@@ -46,7 +46,7 @@ class Numbers(lightning.LightningDataModule):
 
 
 class Module(lightning.LightningModule):
-    """One weight, worse with every validation; what befalls it in each step is `kill`."""
+    """One weight, worse with every validation; `kill` is called in each step."""
 
     def __init__(self, kill=None, measured=True):
         super().__init__()
@@ -103,37 +103,32 @@ def steps_kept(folder) -> dict[str, int]:
     return {path.stem: read_notes(path)["global_step"] for path in folder.rglob("*.ckpt")}
 
 
-def test_the_last_two_are_kept_though_an_earlier_one_is_the_best(tmp_path):
-    fit(tmp_path, Module(), steps=9)
-    assert steps_kept(tmp_path) == {"best": 3, "previous": 6, "last": 9}
+KEPT = {
+    "last_two_and_an_earlier_best": (9, None, True, {"best": 3, "previous": 6, "last": 9}),
+    "end_within_an_epoch": (7, None, True, {"best": 3, "previous": 6, "last": 7}),
+    "between_validations": (5, 0, True, {"best": 3, "previous": 4, "last": 5}),
+    "no_best_without_metrics": (4, None, False, {"previous": 3, "last": 4}),
+}
 
 
-def test_the_end_is_kept_though_it_is_within_an_epoch(tmp_path):
-    fit(tmp_path, Module(), steps=7)
-    assert steps_kept(tmp_path) == {"best": 3, "previous": 6, "last": 7}
-
-
-def test_between_validations_too(tmp_path):
-    fit(tmp_path, Module(), steps=5, minutes=0)
-    assert steps_kept(tmp_path) == {"best": 3, "previous": 4, "last": 5}
-
-
-def test_nothing_is_the_best_where_nothing_measures(tmp_path):
-    fit(tmp_path, Module(measured=False), steps=4)
-    assert steps_kept(tmp_path) == {"previous": 3, "last": 4}
+@pytest.mark.parametrize("case", KEPT)
+def test_checkpoints_of_a_run(tmp_path, case):
+    steps, minutes, measured, expected = KEPT[case]
+    fit(tmp_path, Module(measured=measured), steps=steps, minutes=minutes)
+    assert steps_kept(tmp_path) == expected
 
 
 @pytest.mark.parametrize("minutes", [None, 0])
-def test_killed_in_every_step_it_takes_the_same_steps_with_the_same_logs(tmp_path, minutes):
+def test_a_run_killed_in_every_step_has_the_same_steps_and_logs(tmp_path, minutes):
     torch.manual_seed(0)
     whole = Module()
     fit(tmp_path / "whole", whole)
-    assert logged.scalars(tmp_path / "whole")["task"] == [(i, i) for i in range(7)]
+    assert events.scalars(tmp_path / "whole")["task"] == [(i, i) for i in range(7)]
 
     folder = tmp_path / "killed"
     torch.manual_seed(0)
     last = None
-    for at in range(1, 7):  # the lives of a run, each killed a step later
+    for at in range(1, 7):  # each process is killed a step later
 
         def kill(step, at=at):
             if step == at:
@@ -147,21 +142,21 @@ def test_killed_in_every_step_it_takes_the_same_steps_with_the_same_logs(tmp_pat
     killed = Module()
     fit(folder, killed, checkpoint=last, minutes=minutes)
     assert torch.equal(killed.layer.weight, whole.layer.weight)
-    assert logged.scalars(folder) == logged.scalars(tmp_path / "whole")
+    assert events.scalars(folder) == events.scalars(tmp_path / "whole")
 
 
-def test_more_steps_go_on_where_the_end_was(tmp_path):
+def test_more_steps_resume_at_the_end(tmp_path):
     fit(tmp_path, Module(), steps=6)
     last = tmp_path / "checkpoints" / "last.ckpt"
     fit(tmp_path, Module(), steps=9, checkpoint=last)
-    found = logged.scalars(tmp_path)
+    found = events.scalars(tmp_path)
     assert found["task"] == [(i, i) for i in range(9)]
     assert found["ended"] == [(2, 0), (5, 1), (8, 2)]
     assert [step for step, _ in found["val/psnr"]] == [2, 5, 8]
 
 
 @pytest.mark.parametrize("at", [1, 2, 4])
-def test_a_notice_saves_the_step_at_hand_and_ends_the_run(tmp_path, capsys, at):
+def test_a_signal_saves_the_step_and_ends_the_run(tmp_path, capsys, at):
     """Within an epoch and in its last step, after which it is validated first."""
 
     def notice(step):
@@ -174,19 +169,19 @@ def test_a_notice_saves_the_step_at_hand_and_ends_the_run(tmp_path, capsys, at):
     assert end.value.code == 128 + signal.SIGTERM
     assert signal.getsignal(signal.SIGTERM) is before
     assert steps_kept(tmp_path)["last"] == at + 1
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     last = tmp_path / "checkpoints" / "last.ckpt"
-    assert f"SIGTERM: saved at step {at + 1}\nstopped; to go on, add ckpt_path={last}" in said
+    assert f"SIGTERM: saved at step {at + 1}\nstopped; to go on, add ckpt_path={last}" in output
     fit(tmp_path, Module(), checkpoint=last)
-    assert logged.scalars(tmp_path)["task"] == [(i, i) for i in range(7)]
+    assert events.scalars(tmp_path)["task"] == [(i, i) for i in range(7)]
 
 
-def test_a_notice_that_another_handles_is_handed_on_with_the_step_saved(tmp_path):
+def test_a_signal_of_another_handler_is_passed_on_after_saving(tmp_path):
     """As submitit's, which asks for the job once more."""
-    told = []
+    calls = []
 
     def handler(number, _):
-        told.append((number, steps_kept(tmp_path)["last"]))
+        calls.append((number, steps_kept(tmp_path)["last"]))
 
     def notice(step):
         if step == 4:
@@ -197,11 +192,11 @@ def test_a_notice_that_another_handles_is_handed_on_with_the_step_saved(tmp_path
         fit(tmp_path, Module(notice))
     finally:
         signal.signal(signal.SIGUSR2, before)
-    assert told == [(signal.SIGUSR2, 5)]
+    assert calls == [(signal.SIGUSR2, 5)]
     assert steps_kept(tmp_path)["last"] == 7
 
 
-def test_a_full_disk_leaves_the_checkpoints_before(tmp_path, capsys):
+def test_a_full_disk_keeps_the_earlier_checkpoints(tmp_path, capsys):
     fit(tmp_path, Module(), steps=6)
     kept = steps_kept(tmp_path)
     last = tmp_path / "checkpoints" / "last.ckpt"
@@ -213,7 +208,7 @@ def test_a_full_disk_leaves_the_checkpoints_before(tmp_path, capsys):
     assert steps_kept(tmp_path) == kept
     assert "stopped; to go on, add ckpt_path=" in capsys.readouterr().out
     fit(tmp_path, Module(), steps=9, checkpoint=last)
-    assert logged.scalars(tmp_path)["task"] == [(i, i) for i in range(9)]
+    assert events.scalars(tmp_path)["task"] == [(i, i) for i in range(9)]
 
 
 @pytest.fixture
@@ -223,7 +218,7 @@ def run(tmp_path):
 
 
 def damage(path):
-    """Change one bit of the weights, which torch would not notice."""
+    """Change one bit of the weights, which torch does not detect."""
     content = bytearray(path.read_bytes())
     with zipfile.ZipFile(path) as parts:
         (part,) = (each for each in parts.infolist() if each.filename.endswith("/data/0"))
@@ -232,7 +227,7 @@ def damage(path):
     path.write_bytes(content)
 
 
-def test_of_a_damaged_checkpoint_the_one_before_is_taken(tmp_path, run, capsys):
+def test_a_damaged_checkpoint_is_replaced_by_the_one_before(tmp_path, run, capsys):
     last, previous = (run / "checkpoints" / f"{name}.ckpt" for name in ("last", "previous"))
     assert find_checkpoint("last", tmp_path / "new", tmp_path) == last
     assert find_checkpoint(None, tmp_path / "new", tmp_path) is None
@@ -242,8 +237,8 @@ def test_of_a_damaged_checkpoint_the_one_before_is_taken(tmp_path, run, capsys):
     for asked in ("last", str(last)):
         capsys.readouterr()
         assert find_checkpoint(asked, tmp_path / "new", tmp_path) == previous
-        said = f"{last} cannot be read as a checkpoint: going on from the one before it\n"
-        assert capsys.readouterr().out == f"{said}going on from {previous}\n"
+        output = f"{last} cannot be read as a checkpoint: resuming from the one before it\n"
+        assert capsys.readouterr().out == f"{output}resuming from {previous}\n"
     last.unlink()
     assert find_checkpoint("last", tmp_path / "new", tmp_path) == previous
     previous.write_bytes(whole[:100])
@@ -251,7 +246,7 @@ def test_of_a_damaged_checkpoint_the_one_before_is_taken(tmp_path, run, capsys):
         find_checkpoint("last", tmp_path / "new", tmp_path)
 
 
-def test_a_bit_that_changed_on_the_disk_is_noticed(tmp_path, run, capsys):
+def test_a_changed_bit_is_detected(tmp_path, run, capsys):
     damage(run / "checkpoints" / "last.ckpt")
     found = find_checkpoint("last", tmp_path / "new", tmp_path)
     assert found == run / "checkpoints" / "previous.ckpt"
@@ -261,7 +256,7 @@ def test_a_bit_that_changed_on_the_disk_is_noticed(tmp_path, run, capsys):
         find_checkpoint("last", tmp_path / "new", tmp_path)
 
 
-def test_what_differs_from_the_run_before():
+def test_config_diff():
     notes = {"revision": "a", "hyper_parameters": {"steps": 6, "data": {"seed": 1, "root": "x"}}}
     assert config_diff(notes, notes["hyper_parameters"] | {"ckpt_path": "last"}, "a") == []
     options = {"steps": 9, "data": {"seed": 2, "root": "x"}, "paths": {"logs": "y"}}
@@ -272,14 +267,14 @@ def test_what_differs_from_the_run_before():
     ]
 
 
-def test_a_file_that_is_none_is_one_sentence(tmp_path):
+def test_a_text_as_a_checkpoint_is_one_sentence(tmp_path):
     path = tmp_path / "notes.ckpt"
     path.write_text("a text")
     with pytest.raises(InputError, match=r"notes\.ckpt cannot be read as a checkpoint: [^\n]*$"):
         check_checkpoint(path, torch.nn.Linear(1, 1))
 
 
-def test_weights_alone_are_read_as_they_were_written(tmp_path):
+def test_weights_are_saved_and_loaded(tmp_path):
     net = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))
     save_weights(net.state_dict(), tmp_path / "net.safetensors")
     again = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))

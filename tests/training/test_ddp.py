@@ -42,8 +42,8 @@ class Loss(nn.Module):
         self.module = module
 
     def forward(self, batch):
-        outcome = self.module.reconstruct(batch, depth=self.module.loss.needs_depth)
-        return self.module.loss(outcome, batch)["loss"]
+        prediction = self.module(batch, depth=self.module.loss.needs_depth)
+        return self.module.loss(prediction, batch)["loss"]
 
 
 def make_loss(model):

@@ -16,8 +16,8 @@ FEW = [
 TWO = "trainer.devices=2"
 
 
-class Outcome:
-    """What a run left: its curves, its test, its weights."""
+class RunFiles:
+    """The curves, the test results and the weights of a run."""
 
     def __init__(self, printed: str):
         (line,) = [line for line in printed.splitlines() if line.startswith("run: ")]
@@ -40,17 +40,17 @@ def train(tmp_path_factory, run_script, repository):
     return make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
 
 
-def outcome(result) -> Outcome:
+def read_run(result) -> RunFiles:
     assert result.returncode == 0, result.stderr
-    return Outcome(result.stdout)
+    return RunFiles(result.stdout)
 
 
 @pytest.fixture(scope="module")
 def one(train):
-    return outcome(train("name=one", "trainer.devices=1", "data.micro_batch=4", *FEW))
+    return read_run(train("name=one", "trainer.devices=1", "data.micro_batch=4", *FEW))
 
 
-def check_the_same(found: Outcome, expected: Outcome) -> None:
+def check_the_same(found: RunFiles, expected: RunFiles) -> None:
     """The norm of all gradients is summed in fp32, and by process."""
     assert found.curves.keys() == expected.curves.keys()
     assert {"train/loss", "train/psnr", "train/grad_norm", "val/psnr"} <= found.curves.keys()
@@ -66,7 +66,7 @@ def check_the_same(found: Outcome, expected: Outcome) -> None:
 def test_accumulated(train, one):
     result = train("name=accumulated", "trainer.devices=1", "data.micro_batch=1", *FEW)
     assert "global batch 4 = 1 process x 1 scene x 4 accumulated" in result.stdout
-    check_the_same(outcome(result), one)
+    check_the_same(read_run(result), one)
 
 
 @pytest.mark.medium
@@ -74,7 +74,7 @@ def test_two_processes(train, one):
     """Each accumulates, and validates and tests a share of three scenes."""
     result = train.alone("name=two", "trainer=ddp", TWO, "data.micro_batch=1", *FEW)
     assert "global batch 4 = 2 processes x 1 scene x 2 accumulated" in result.stdout
-    check_the_same(outcome(result), one)
+    check_the_same(read_run(result), one)
 
 
 @pytest.mark.slow
@@ -82,11 +82,11 @@ def test_divided_weights(train, one):
     """FSDP takes the same steps, and one process goes on from its checkpoint."""
     saving = ["training.checkpoint_layers=true", "training.views_at_once=1"]
     result = train.alone("name=fsdp", "trainer=fsdp", TWO, "data.micro_batch=1", *saving, *FEW)
-    fsdp = outcome(result)
+    fsdp = read_run(result)
     check_the_same(fsdp, one)
     more = ["steps=3", "trainer.devices=1", "data.micro_batch=4", *FEW[2:]]
     again = [
-        outcome(train(f"ckpt_path={run.checkpoint}", "trainer.accelerator=cpu", *more))
+        read_run(train(f"ckpt_path={run.checkpoint}", "trainer.accelerator=cpu", *more))
         for run in (fsdp, one)
     ]
     assert again[0].curves["train/loss"] == pytest.approx(again[1].curves["train/loss"], rel=1e-5)

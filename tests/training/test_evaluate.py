@@ -1,4 +1,4 @@
-"""The script evaluate.py: a run, a checkpoint, a file; going on; the report; what it refuses."""
+"""evaluate.py of a run, a checkpoint and a file: results, resumption, the report, refusals."""
 
 import csv
 import json
@@ -45,7 +45,7 @@ def evaluate(tmp_path, run_script):
     return lambda *overrides: run_script("evaluate.py", *overrides, f"paths.logs={tmp_path}")
 
 
-def outcome(result) -> tuple[Path, dict]:
+def read_evaluation(result) -> tuple[Path, dict]:
     """The folder that the script prints last, and its evaluation.json."""
     assert result.returncode == 0, result.stderr
     label, folder = result.stdout.strip().splitlines()[-1].split(": ", 1)
@@ -60,7 +60,7 @@ def qualities(results: dict) -> dict:
 @pytest.fixture(scope="module")
 def evaluated(whole, run_script) -> dict:
     """The run's evaluation."""
-    folder, results = outcome(run_script("evaluate.py", f"run={whole}", STEPS))
+    folder, results = read_evaluation(run_script("evaluate.py", f"run={whole}", STEPS))
     assert folder == whole
     return results
 
@@ -122,12 +122,12 @@ def test_the_report_has_rows_with_post_optimization(whole, evaluated, repository
 def test_a_checkpoint_by_path_has_the_numbers_of_its_run(whole, evaluated, evaluate, tmp_path):
     weights = whole / "checkpoints" / "last.ckpt"
     options = [*MODEL, *VIEWS, *TINY_SCENES, STEPS]
-    folder, results = outcome(evaluate(f"init_path={weights}", *options))
+    folder, results = read_evaluation(evaluate(f"init_path={weights}", *options))
     assert folder.parent == tmp_path / "evaluate" and (folder / "config.yaml").is_file()
     assert qualities(results) == qualities(evaluated)
 
 
-def test_interrupted_it_goes_on_where_it_was(whole, evaluated, evaluate, tmp_path, monkeypatch):
+def test_an_interrupted_evaluation_resumes(whole, evaluated, evaluate, tmp_path, monkeypatch):
     weights = f"init_path={whole}/checkpoints/last.ckpt"
     command = [weights, *MODEL, *VIEWS, *TINY_SCENES]
     keep = scenes.save_result
@@ -146,17 +146,17 @@ def test_interrupted_it_goes_on_where_it_was(whole, evaluated, evaluate, tmp_pat
     assert len(kept) == 2
     measured = []
     monkeypatch.setattr(scenes, "save_result", lambda p, r: (measured.append(p.stem), keep(p, r)))
-    _, results = outcome(evaluate(*command, STEPS))
+    _, results = read_evaluation(evaluate(*command, STEPS))
     assert measured == ["rooms-0", "rooms-1", "outdoors-0", "outdoors-1"]
     assert {path: path.read_bytes() for path in kept} == kept
     assert qualities(results) == qualities(evaluated)
 
     # What is finished is read; another set of steps is another evaluation.
     measured.clear()
-    outcome(evaluate(*command, STEPS))
+    read_evaluation(evaluate(*command, STEPS))
     assert measured == []
     alone = "data.test_sets=null"
-    outcome(evaluate(*command, "steps=[0,2]", alone))
+    read_evaluation(evaluate(*command, "steps=[0,2]", alone))
     assert measured == ["procedural-0", "procedural-1"]
 
 
@@ -176,7 +176,7 @@ def test_a_file_of_gaussians_in_the_worlds_units(whole, photographs, evaluate, t
     """What a network predicts, brought to the world and written, measures as the network does."""
     data = [*ON_DISK, f"data.root={photographs}", *VIEWS, "steps=[0,2]"]
     weights = whole / "checkpoints" / "last.ckpt"
-    folder, expected = outcome(evaluate(f"init_path={weights}", *MODEL, *data))
+    folder, expected = read_evaluation(evaluate(f"init_path={weights}", *MODEL, *data))
     config = OmegaConf.load(folder / "config.yaml")
     module = torch.nn.ModuleDict({"net": instantiate(config.model)})
     load_weights(str(weights), module)
@@ -187,7 +187,7 @@ def test_a_file_of_gaussians_in_the_worlds_units(whole, photographs, evaluate, t
         gaussians = module.net.eval()(Views.stack([sample["inputs"]])).map(lambda t: t[0])
     path = tmp_path / "scene.ply"
     write_gaussians(path, sample["frame"].to_world(gaussians))
-    _, found = outcome(evaluate(f"scene={path}", "metrics=longlrm", *data))
+    _, found = read_evaluation(evaluate(f"scene={path}", "metrics=longlrm", *data))
     assert qualities(found) == pytest.approx(qualities(expected), abs=0.01)
 
     behind = replace(gaussians, means=gaussians.means - torch.tensor([0.0, 0.0, 1000.0]))

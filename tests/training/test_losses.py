@@ -13,12 +13,12 @@ from torchvision.models import vgg19 as torchvision_vgg19
 from asysplat.errors import InputError
 from asysplat.rendering import Rendering
 from asysplat.scene import Cameras, Gaussians, Views
-from asysplat.training import InputDisparity, Outcome, SplattingLoss
+from asysplat.training import InputDisparity, Prediction, SplattingLoss
 from asysplat.training.disparity import (
     disparity_distance,
-    known_disparities,
     normalized_disparity,
     own_depths,
+    reference_disparities,
 )
 from asysplat.training.perceptual import longlrm, vgg16
 
@@ -48,14 +48,14 @@ def pair(size=32, depths=True):
         depth=(1 + torch.rand(2, size, size)).requires_grad_(),
         stats={},
     )
-    outcome = Outcome(gaussians_at(torch.ones(2 * size * size, 3)), rendering)
-    return outcome, {"inputs": targets, "targets": targets}
+    prediction = Prediction(gaussians_at(torch.ones(2 * size * size, 3)), rendering)
+    return prediction, {"inputs": targets, "targets": targets}
 
 
 def test_mean_squared_error():
-    outcome, batch = pair()
-    terms = SplattingLoss(mse=2.0, perceptual=0.0, depth=0.0)(outcome, batch)
-    expected = (outcome.rendering.image - batch["targets"].images).square().mean()
+    prediction, batch = pair()
+    terms = SplattingLoss(mse=2.0, perceptual=0.0, depth=0.0)(prediction, batch)
+    expected = (prediction.rendering.image - batch["targets"].images).square().mean()
     torch.testing.assert_close(terms["loss"], 2 * expected)
     assert set(terms) == {"loss", "mse"}
 
@@ -80,23 +80,23 @@ def test_normalized_disparity_by_hand():
 def test_disparities_come_before_depths():
     views = pair()[1]["targets"]
     views.depths[0, 0, 0] = 0
-    known = known_disparities(views)
+    known = reference_disparities(views)
     assert known[0, 0, 0] == 0
     torch.testing.assert_close(known[1], 1 / views.depths[1])
     estimated = replace(views, disparities=torch.rand(2, 32, 32))
-    assert torch.equal(known_disparities(estimated), estimated.disparities)
-    assert known_disparities(replace(views, depths=None)) is None
+    assert torch.equal(reference_disparities(estimated), estimated.disparities)
+    assert reference_disparities(replace(views, depths=None)) is None
 
 
 def test_opacity_is_a_term_and_off_by_default():
-    outcome, batch = pair()
-    gaussians = replace(outcome.gaussians, opacities=torch.rand(2048).requires_grad_())
-    outcome = Outcome(gaussians, outcome.rendering)
+    prediction, batch = pair()
+    gaussians = replace(prediction.gaussians, opacities=torch.rand(2048).requires_grad_())
+    prediction = Prediction(gaussians, prediction.rendering)
     options = {"mse": 1.0, "perceptual": 0.0, "depth": 0.0}
-    terms = SplattingLoss(**options, opacity=0.1)(outcome, batch)
+    terms = SplattingLoss(**options, opacity=0.1)(prediction, batch)
     torch.testing.assert_close(terms["opacity"], gaussians.opacities.mean())
     torch.testing.assert_close(terms["loss"], terms["mse"] + 0.1 * terms["opacity"])
-    assert "opacity" not in SplattingLoss(**options)(outcome, batch)
+    assert "opacity" not in SplattingLoss(**options)(prediction, batch)
 
 
 # Disparities (1, 2, 4) against (1, 2, 3), normalized: (-1, 0, 2) against (-1.5, 0, 1.5), whose
@@ -113,10 +113,10 @@ def test_rendered_disparity_by_hand():
     depth.requires_grad_()
     views = Views(cameras(4, views=1), torch.rand(1, 3, 4, 4), target)
     rendering = Rendering(torch.rand(1, 3, 4, 4), torch.ones(1, 4, 4), depth, {})
-    outcome = Outcome(gaussians_at(torch.ones(4, 3)), rendering)
+    prediction = Prediction(gaussians_at(torch.ones(4, 3)), rendering)
     loss = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0)
     assert loss.needs_depth
-    terms = loss(outcome, {"inputs": None, "targets": views})
+    terms = loss(prediction, {"inputs": None, "targets": views})
     torch.testing.assert_close(terms["depth"].item(), BY_HAND)
     terms["loss"].backward()
     assert depth.grad[:, ::2, ::2].abs().sum() > 0 and (depth.grad[:, 1::2] == 0).all()
@@ -149,7 +149,7 @@ def test_input_disparity_by_hand():
     assert not loss.needs_depth
     rendering = Rendering(torch.rand(1, 3, 4, 4), torch.ones(1, 4, 4), None, {})
     targets = Views(cameras(4, views=1), torch.rand(1, 3, 4, 4))
-    terms = loss(Outcome(gaussians, rendering), {"inputs": inputs, "targets": targets})
+    terms = loss(Prediction(gaussians, rendering), {"inputs": inputs, "targets": targets})
     # Three pixels of the first view and four of the second.
     torch.testing.assert_close(terms["depth"].item(), BY_HAND * 3 / 7)
     terms["loss"].backward()
@@ -169,45 +169,45 @@ def test_input_disparity_of_a_network(build):
     depths = own_depths(gaussians, inputs)
     assert depths.shape == (2, 2, 16, 16)
     torch.testing.assert_close(depths.flatten(1), gaussians.means[..., 2])
-    term = InputDisparity()(Outcome(gaussians, pair()[0].rendering), {"inputs": inputs})
+    term = InputDisparity()(Prediction(gaussians, pair()[0].rendering), {"inputs": inputs})
     term.backward()
     assert term > 0 and net.head.decode.weight.grad.abs().sum() > 0
 
 
 def test_gaussians_that_are_no_map_of_the_views():
     inputs = Views(cameras(4), torch.rand(2, 3, 4, 4), torch.ones(2, 4, 4))
-    outcome = Outcome(gaussians_at(torch.ones(9, 3)), pair()[0].rendering)
+    prediction = Prediction(gaussians_at(torch.ones(9, 3)), pair()[0].rendering)
     with pytest.raises(InputError, match=r"gave 9 for 2 views of 4x4.*training/depth=rendered"):
-        InputDisparity()(outcome, {"inputs": inputs})
+        InputDisparity()(prediction, {"inputs": inputs})
 
 
 def test_pixels_without_depth_do_not_count():
-    outcome, batch = pair()
+    prediction, batch = pair()
     batch["targets"].depths[:, :8] = 0
-    terms = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0)(outcome, batch)
+    terms = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0)(prediction, batch)
     terms["loss"].backward()
-    grad = outcome.rendering.depth.grad
+    grad = prediction.rendering.depth.grad
     assert (grad[:, :8] == 0).all()
     assert grad.isfinite().all() and grad.abs().sum() > 0
 
 
 def test_no_known_depth_at_all_gives_zero_and_no_nan():
-    outcome, batch = pair()
+    prediction, batch = pair()
     batch["targets"].depths.zero_()
-    terms = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0)(outcome, batch)
+    terms = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0)(prediction, batch)
     terms["loss"].backward()
     assert terms["loss"] == 0
-    assert (outcome.rendering.depth.grad == 0).all()
+    assert (prediction.rendering.depth.grad == 0).all()
 
 
 @pytest.mark.parametrize("reading", [{}, {"depth_term": InputDisparity}])
 def test_data_without_depth_turns_the_term_off_and_is_said_once(reading):
-    outcome, batch = pair(depths=False)
+    prediction, batch = pair(depths=False)
     loss = SplattingLoss(mse=1.0, perceptual=0.0, depth=1.0, **reading)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         for _ in range(3):
-            assert "depth" not in loss(outcome, batch)
+            assert "depth" not in loss(prediction, batch)
     assert ["no depths" in str(warning.message) for warning in said] == [True]
 
 
@@ -295,17 +295,17 @@ def test_perceptual_term_has_the_same_bits_under_autocast(distances, name):
 def test_perceptual_term(distances, name):
     distance, _ = distances[name]
     loss = SplattingLoss(mse=0.0, perceptual=1.0, depth=0.0, perceptual_term=lambda: distance)
-    outcome, batch = pair()
-    terms = loss(outcome, batch)
+    prediction, batch = pair()
+    terms = loss(prediction, batch)
     terms["loss"].backward()
-    assert terms["perceptual"] > 0 and outcome.rendering.image.grad.abs().sum() > 0
+    assert terms["perceptual"] > 0 and prediction.rendering.image.grad.abs().sum() > 0
     assert not any(p.requires_grad for p in distance.parameters())
-    same = Rendering(batch["targets"].images, outcome.rendering.alpha, None, {})
-    assert loss(Outcome(outcome.gaussians, same), batch)["perceptual"] == 0
+    same = Rendering(batch["targets"].images, prediction.rendering.alpha, None, {})
+    assert loss(Prediction(prediction.gaussians, same), batch)["perceptual"] == 0
     assert not loss.state_dict() and not list(loss.parameters())
 
 
 def test_with_the_weights_of_imagenet(shared):
     distance = vgg16(str(shared / "weights"))
-    outcome, batch = pair()
-    assert 0 < distance(outcome.rendering.image, batch["targets"].images) < 10
+    prediction, batch = pair()
+    assert 0 < distance(prediction.rendering.image, batch["targets"].images) < 10

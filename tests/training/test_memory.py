@@ -1,4 +1,4 @@
-"""What saves memory changes no gradient, and what needs too much is told what would do."""
+"""Options that save memory change no gradient."""
 
 import pytest
 import torch
@@ -6,10 +6,8 @@ from test_module import make_module
 from test_side_by_side import make_batch
 
 from asysplat.evaluation.cost import memory_before_gb, peak_memory_gb, reset_peak_memory
-from asysplat.evaluation.static_cost import Activations
 from asysplat.rendering import render
 from asysplat.training import SplattingLoss
-from asysplat.training.memory import Held, Sizes
 
 
 @pytest.fixture
@@ -32,7 +30,7 @@ def step(module):
 
     module.zero_grad()
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        loss = module._terms(module.net, batch)["loss"]
+        loss = module.compute_terms(batch, module.net)["loss"]
     loss.backward()
     grads = torch.cat([p.grad.flatten() for p in module.parameters() if p.requires_grad])
     return grads, sum(storage.nbytes() for storage in kept.values())
@@ -60,44 +58,3 @@ def test_views_at_once_bound_the_memory_of_rendering(make_scene):
         risen[views_at_once] = peak_memory_gb("cpu") - before
     print(f"\nGB to render 8 views: {risen[None]:.3f}, one at a time {risen[1]:.3f}")
     assert risen[1] < 0.6 * risen[None]
-
-
-# The paper's first stage, in bf16.
-SIZES = Sizes(
-    parameters=98_111_472,
-    activations=Activations(kept=13.5, checkpointed=4.4),
-    gaussians=524_288,
-    fields_gb=0.05,
-    targets=8,
-    pixels=256**2,
-    pixel_bytes=3000,
-    side_by_side=None,
-)
-ALL = Held(micro_batch=8, checkpoint_layers=False, views_at_once=None)
-
-
-@pytest.mark.parametrize(
-    ("capacity", "said"),
-    [
-        (60.0, "set training.checkpoint_layers=true (about"),
-        (54.0, "set training.checkpoint_layers=true training.views_at_once=1 (about"),
-        (40.0, "set data.micro_batch=4 training.checkpoint_layers=true training.views_at_once=1 ("),
-        (1.0, "take fewer data.inputs"),
-    ],
-)
-def test_what_would_fit_costs_least_time(capacity, said):
-    assert SIZES.gb(ALL) > 2 * capacity
-    assert SIZES.that_fits(ALL, 256, capacity).startswith(said)
-
-
-def test_micro_batches_that_are_suggested_divide_a_process_share():
-    held = Held(micro_batch=12, checkpoint_layers=True, views_at_once=1)
-    sizes = [each.micro_batch for each in held.smaller(24)]
-    assert sizes == [12, 12, 8, 6, 4, 3, 2, 1]
-
-
-def test_a_cpu_holds_as_many_scenes_as_it_computes_side_by_side():
-    apart = Sizes(**(vars(SIZES) | {"side_by_side": 2}))
-    four, eight = (apart.parts(Held(count, True, 1)) for count in (4, 8))
-    assert four["activations"] == eight["activations"] == 2 * SIZES.activations.checkpointed
-    assert eight["weights"] - four["weights"] == pytest.approx(4 * 4 * SIZES.parameters / 1e9)

@@ -91,8 +91,8 @@ def test_the_background_follows_the_inputs(build):
     targets = Views(Cameras(intrinsics[:, :1], away, 32, 32), torch.rand(2, 1, 3, 32, 32))
     batch = {"inputs": inputs, "targets": targets}
     inputs.images[1] = 0.4 * inputs.images[1]
-    trained = module.train().reconstruct(batch, depth=False).rendering.image
+    trained = module.train()(batch, depth=False).rendering.image
     assert set(trained[0].unique().tolist()) <= {0, 1} and (trained[1] == 1).all()
-    outcome = module.eval().reconstruct(batch, depth=False)
+    prediction = module.eval()(batch, depth=False)
     expected = inputs.images.mean((1, 3, 4))[:, None, :, None, None].expand(2, 1, 3, 32, 32)
-    torch.testing.assert_close(outcome.rendering.image, expected)
+    torch.testing.assert_close(prediction.rendering.image, expected)

@@ -7,7 +7,7 @@ import torch
 
 from asysplat.data.datamodule import collate, load
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection import uniform_selection
+from asysplat.data.selection.views import uniform_selection
 from asysplat.data.sources import Task
 from asysplat.evaluation.metrics import psnr
 from asysplat.training import SplattingLoss, SplattingModule
@@ -32,14 +32,14 @@ def test_one_scene_overfitted_passes_30_db(build):
     options = module.configure_optimizers()
     optimizer, schedule = options["optimizer"], options["lr_scheduler"]["scheduler"]
     for step in range(STEPS):
-        outcome = module.reconstruct(batch, depth=False)
+        prediction = module(batch, depth=False)
         optimizer.zero_grad()
-        module.loss(outcome, batch)["loss"].backward()
+        module.loss(prediction, batch)["loss"].backward()
         optimizer.step()
         schedule.step()
         if step % 25 == 24:
             with torch.no_grad():
-                rendering = module.eval().reconstruct(batch, depth=False).rendering
+                rendering = module.eval()(batch, depth=False).rendering
             module.train()
             quality = psnr(rendering.image, batch["targets"].images).mean()
             if quality >= 30:

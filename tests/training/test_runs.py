@@ -1,4 +1,4 @@
-"""Which finished run a configuration is: what makes another of it, and what does not."""
+"""Which options and data make two runs different."""
 
 import json
 import subprocess
@@ -31,6 +31,7 @@ def write_run(tmp_path):
 
 
 SAME = {
+    "the default by name": ["metrics=default"],
     "moved data": ["data.root=/b/DL3DV", "data.test_root=/b/c/Benchmark/"],
     "another cache": ["data.cache.folder=/b/cache", "data.cache.memory_gb=2"],
     "moved disparities": ["data.disparities=/b/disparities"],
@@ -51,6 +52,7 @@ OTHER = {
     "model": ["model=asysplat_7m1t"],
     "steps": ["steps=241"],
     "metrics": ["metrics=longlrm"],
+    "depth alignment": ["metrics.depth_alignment=median"],
     "weights to start from": ["init_path=/b/last.ckpt"],
     "without disparities": ["data.disparities=null"],
     "frames instead of scenes": ["data.test_root=null"],
@@ -58,15 +60,15 @@ OTHER = {
 
 
 @pytest.mark.parametrize("case", SAME)
-def test_what_changes_no_number_makes_no_other_run(composed, case):
+def test_options_that_change_no_number_keep_the_hash(composed, case):
     plain, changed = composed(*DL3DV), composed(*DL3DV, *SAME[case])
     assert config_hash(changed) == config_hash(plain)
-    places = {key: value for key, value in data_of(changed).items() if "test_sets" not in key}
-    assert places == data_of(plain)
+    described = {key: value for key, value in data_of(changed).items() if "test_sets" not in key}
+    assert described == data_of(plain)
 
 
 @pytest.mark.parametrize("case", OTHER)
-def test_what_changes_numbers_makes_another_run(composed, case):
+def test_options_that_change_numbers_change_the_hash(composed, case):
     assert config_hash(composed(*DL3DV, *OTHER[case])) != config_hash(composed(*DL3DV))
 
 
@@ -79,7 +81,7 @@ def test_paths_may_be_left_out(composed):
     }
 
 
-def test_other_data_makes_another_run(composed, write_run, tmp_path):
+def test_runs_of_other_data_differ(composed, write_run, tmp_path):
     overrides = ["data=files", "data.root=/a/garden"]
     folder = write_run("one", composed(*overrides))
     assert find_run(tmp_path, composed(*overrides)).folder == folder
@@ -88,7 +90,7 @@ def test_other_data_makes_another_run(composed, write_run, tmp_path):
 
 
 @pytest.mark.parametrize("option", ["data.index", "init_path"])
-def test_a_file_is_what_it_holds(composed, write_run, tmp_path, option):
+def test_files_are_compared_by_content(composed, write_run, tmp_path, option):
     paths = [tmp_path / f"{number}.json" for number in range(3)]
     for path, text in zip(paths, ("[1]", "[1]", "[2]"), strict=True):
         path.write_text(text)
@@ -100,7 +102,7 @@ def test_a_file_is_what_it_holds(composed, write_run, tmp_path, option):
     assert find_run(tmp_path, other) is None
 
 
-def test_a_run_that_was_tested_on_more_serves_less(composed, write_run, tmp_path):
+def test_a_run_with_more_test_sets_is_found_for_fewer(composed, write_run, tmp_path):
     tested = [*DL3DV, "test_sets=[mipnerf360,replica]", "paths.replica=/a/Replica"]
     folder = write_run("run", composed(*tested))
     assert find_run(tmp_path, composed(*DL3DV)).folder == folder
@@ -142,9 +144,9 @@ def checkout(tmp_path, monkeypatch):
 
 def fresh() -> str:
     revisions.revision.cache_clear()
-    found = revisions.revision()
+    value = revisions.revision()
     revisions.revision.cache_clear()
-    return found
+    return value
 
 
 def test_a_revision_is_a_commit_and_its_changes(checkout):

@@ -10,8 +10,8 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from asysplat.data import FilesSource, SceneOptions
 from asysplat.data.datamodule import collate, load
-from asysplat.data.sources import FilesSource
 from asysplat.evaluation.baselines import mean_color_images, nearest_view_images
 from asysplat.evaluation.lpips import load_lpips, lpips_distance
 from asysplat.evaluation.metrics import psnr
@@ -41,7 +41,7 @@ def measure(module, lpips, batch):
     """PSNR and LPIPS of the model, of the nearest view and of the mean color."""
     inputs, targets = batch["inputs"], batch["targets"]
     with torch.no_grad():
-        image = module.reconstruct(batch, depth=False).rendering.image.clamp(0, 1)
+        image = module(batch, depth=False).rendering.image.clamp(0, 1)
     drawn = (image, nearest_view_images(inputs, targets), mean_color_images(inputs, targets))
     return [
         (
@@ -66,7 +66,7 @@ def test_real_photographs(module, shared, most):
             pytest.skip(f"{folder} is absent")
         distances = []
         for size, views in itertools.product((128, 256), (n for n in numbers if n <= most)):
-            source = FilesSource(str(folder), size, size, window=(24, 96))
+            source = FilesSource(str(folder), SceneOptions(size, size), window=(24, 96))
             batch = collate([load(task) for task in source.evaluation("test", views, TARGETS)])
             model, nearest, mean = measure(module, lpips, batch)
             cells = " | ".join(f"{p:.2f} / {d:.3f}" for p, d in (model, nearest, mean))

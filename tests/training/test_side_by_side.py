@@ -55,7 +55,7 @@ def one_by_one(module, batch):
     for scene in split(batch):
         module.zero_grad()
         module.net.load_state_dict(start, strict=False)
-        terms = module._terms(module.net, scene)
+        terms = module.compute_terms(scene, module.net)
         terms["loss"].backward()
         losses.append(terms["loss"].item())
         states.append(state(module))
@@ -82,8 +82,8 @@ def test_the_mean_over_scenes(module):
 def test_the_terms_of_a_batch_are_means_over_its_scenes(module):
     batch, net = make_batch(), module.net.eval()
     with torch.no_grad():
-        whole = module._terms(net, batch)
-        scenes = [module._terms(net, scene) for scene in split(batch)]
+        whole = module.compute_terms(batch, net)
+        scenes = [module.compute_terms(scene, net) for scene in split(batch)]
     assert whole.keys() == {"loss", "mse", "depth", "psnr"} and whole["depth"] > 0
     for name, term in whole.items():
         mean = torch.stack([each[name] for each in scenes]).mean()
@@ -113,7 +113,7 @@ def test_any_number_of_workers_gives_the_same_bits(module, threads, monkeypatch)
 def test_it_computes_under_autocast_where_its_caller_does(module):
     types = []
 
-    def compute(net, batch):
+    def compute(batch, net):
         types.append((torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu")))
         return {"loss": sum(p.sum() for p in net.parameters() if p.requires_grad)}
 
@@ -127,7 +127,7 @@ def test_it_computes_under_autocast_where_its_caller_does(module):
 
 def test_a_parameter_that_a_loss_does_not_see():
     net = nn.ModuleDict({"seen": nn.Linear(1, 1), "unseen": nn.Linear(1, 1)})
-    scenes = SideBySide(net, lambda net, batch: {"loss": net["seen"].weight.sum()})
+    scenes = SideBySide(net, lambda batch, net: {"loss": net["seen"].weight.sum()})
     scenes(make_batch())["loss"].backward()
     assert net["seen"].weight.grad == 1 and net["unseen"].weight.grad == 0
 
@@ -141,7 +141,7 @@ def test_copies_hold_no_parameters_of_their_own(module):
 
 
 def test_an_error_in_a_scene_is_the_steps():
-    def fail(net, batch):
+    def fail(batch, net):
         raise ValueError(batch["scene"][0])
 
     with pytest.raises(ValueError, match="scene 0"):

@@ -1,4 +1,4 @@
-"""Several stages in one run: what each is, what passes on, and where a stopped run goes on."""
+"""Several stages in one run: their options, their weights, and how a stopped run resumes."""
 
 import csv
 import json
@@ -65,7 +65,7 @@ def test_one_stage_is_the_run_itself(composed):
     assert stage_configs(config) == [config]
 
 
-def test_a_run_is_that_of_all_its_stages(composed):
+def test_the_hash_covers_all_stages(composed):
     runs = [[], ["stages.stage1.steps=7"], ["+stages.stage2.crop=0.5"], ["earlier_stages=[stage2]"]]
     runs += [["earlier_stages=[stage2,stage1]"], ["earlier_stages=[]"], ["stage=ablation"]]
     hashes = [config_hash(composed("scale=paper", *overrides)) for overrides in runs]
@@ -78,18 +78,18 @@ REFUSED = {
     "a stage twice": (["stage=stage1"], "stage1 is twice among the stages of the run, stage1, "),
     "no steps": (["stages.stage2.steps=0"], "stage2: steps=0: give a whole number of at least 1"),
     "a size between patches": (["stages.stage3.height=40"], r"stage3: .* 40x\d+, .* set 48x"),
-    "nothing to hand over": (["callbacks.checkpoints=null"], "leave it in, or train one stage"),
+    "no checkpoints": (["callbacks.checkpoints=null"], "leave it in, or train one stage"),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_a_mistake_in_any_stage_is_told_at_once(composed, case):
+def test_a_mistake_in_any_stage_is_refused_at_once(composed, case):
     overrides, message = REFUSED[case]
     with pytest.raises(InputError, match=message):
         check_stages(stage_configs(composed(*overrides)))
 
 
-def test_a_checkpoint_says_where_to_go_on(composed, tmp_path):
+def test_resume_point(composed, tmp_path):
     stages, path = stage_configs(composed()), tmp_path / "last.ckpt"
 
     def saved(**record):
@@ -107,7 +107,7 @@ def test_a_checkpoint_says_where_to_go_on(composed, tmp_path):
         resume_point(path, stages)
 
 
-def test_tests_and_costs_of_a_stage_are_named_after_it():
+def test_results_of_a_stage_have_its_prefix():
     results = {"test/rooms/psnr": 2.0, "cost/peak_gb": 1.0, "baseline/rooms/mean_color/psnr": 0.0}
     found = results_of_stage("stage1", results | {"protocol/name": "default"})
     assert found == {"stage1/test/rooms/psnr": 2.0, "stage1/cost/peak_gb": 1.0}
@@ -169,7 +169,7 @@ def test_a_run_of_three_stages_is_one_run(whole, logs, composed):
 
 
 @pytest.mark.medium
-def test_weights_pass_on_and_the_optimizer_starts_anew(whole):
+def test_stages_share_weights_but_not_the_optimizer(whole):
     first, second, third = (saved_in(whole / name) for name in ("stage1", "stage2", "."))
     for stage in (first, second, third):
         steps = {int(state["step"]) for state in stage["optimizer_states"][0]["state"].values()}
@@ -184,9 +184,7 @@ def test_weights_pass_on_and_the_optimizer_starts_anew(whole):
 
 
 @pytest.mark.medium
-def test_stopped_twice_in_the_second_stage_and_resumed_it_has_the_same_bits(
-    train, whole, monkeypatch
-):
+def test_a_run_stopped_twice_in_its_second_stage_has_the_same_bits(train, whole, monkeypatch):
     """First before its first step, then between its two."""
     step = SplattingModule.training_step
 

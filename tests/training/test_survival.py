@@ -1,4 +1,4 @@
-"""What a run survives: it goes on with the same bits, or stops with a clear word."""
+"""Killed or stopped runs resume with the same bits; other ends are one sentence."""
 
 import csv
 import os
@@ -8,8 +8,8 @@ import signal
 import time
 from pathlib import Path
 
-import lives
-import logged
+import events
+import processes
 import pytest
 import torch
 from full_disk import largest_file
@@ -20,7 +20,7 @@ OPTIONS = ["callbacks.checkpoints.minutes=0", "data.num_workers=1", "data.batch_
 
 
 def folder_of(train, name) -> Path:
-    """The one folder of all lives of a run."""
+    """The one folder of all processes of a run."""
     (folder,) = (train.logs / name).iterdir()
     return folder
 
@@ -33,15 +33,15 @@ def wait_for(found, process, seconds=300):
         time.sleep(0.005)
 
 
-def live(train, name, *overrides):
-    """Begin a life of a run: a new run, or where the last life ended."""
-    known = list(train.logs.glob(f"{name}/*/checkpoints/*.ckpt"))
-    asked = ["ckpt_path=last"] if known else []
-    said = train.logs / f"{name}.txt"
-    if not known:  # a life before was too short to leave something
+def start_or_resume(train, name, *overrides):
+    """Start a run, or resume it if an earlier process has left a checkpoint."""
+    checkpoints = list(train.logs.glob(f"{name}/*/checkpoints/*.ckpt"))
+    resume = ["ckpt_path=last"] if checkpoints else []
+    output = train.logs / f"{name}.txt"
+    if not checkpoints:  # the earlier process was too short to write one
         for folder in train.logs.glob(f"{name}/*"):
             folder.rename(train.logs / f"{name}-{folder.name}")
-    return lives.begin(said, *train.complete(f"name={name}", *overrides, *asked)), said
+    return processes.start(output, *train.complete(f"name={name}", *overrides, *resume)), output
 
 
 def kill_at_random_moments(train, kills, longest, *overrides):
@@ -49,17 +49,17 @@ def kill_at_random_moments(train, kills, longest, *overrides):
     moments = random.Random(0)
     killed = 0
     for _ in range(kills):
-        said = train.logs / "killed.txt"
-        before = said.read_text().count("model: ") if said.exists() else 0
-        process, said = live(train, "killed", *overrides)
-        wait_for(lambda: said.exists() and said.read_text().count("model: ") > before, process)  # noqa: B023
+        output = train.logs / "killed.txt"
+        before = output.read_text().count("model: ") if output.exists() else 0
+        process, output = start_or_resume(train, "killed", *overrides)
+        wait_for(lambda: output.exists() and output.read_text().count("model: ") > before, process)  # noqa: B023
         time.sleep(moments.uniform(0, longest))
         killed += process.is_alive()
         process.kill()
         process.join()
-    process, said = live(train, "killed", *overrides)
+    process, output = start_or_resume(train, "killed", *overrides)
     process.join()
-    assert process.exitcode == 0, said.read_text()
+    assert process.exitcode == 0, output.read_text()
     return killed
 
 
@@ -82,9 +82,9 @@ def check_same(whole, killed):
     assert [name for name in weights if not torch.equal(weights[name], survived[name])] == []
     for name in ("curve.csv", "metrics.csv"):
         assert rows(whole / name) == rows(killed / name) != []
-    assert logged.scalars(whole) == logged.scalars(killed) != {}
+    assert events.scalars(whole) == events.scalars(killed) != {}
     for kind in ("scalars", "images", "tensors"):
-        assert logged.steps(whole, kind) == logged.steps(killed, kind) != {}
+        assert events.steps(whole, kind) == events.steps(killed, kind) != {}
     assert (killed / "checkpoints" / "previous.ckpt").exists()
 
 
@@ -97,11 +97,11 @@ def test_killed_twice_it_ends_with_the_same_bits_and_logs(train):
     whole = folder_of(train, "whole")
     check_same(whole, folder_of(train, "killed"))
 
-    before = logged.scalars(whole)
+    before = events.scalars(whole)
     (whole / "metrics.json").unlink()  # as if killed after its training, while it is measured
     result = train("name=whole", *options, "ckpt_path=last")
     assert result.returncode == 0, result.stderr
-    assert logged.scalars(whole) == before
+    assert events.scalars(whole) == before
     check_same(whole, folder_of(train, "killed"))
 
 
@@ -118,13 +118,13 @@ def test_killed_twenty_times_it_ends_with_the_same_bits_and_logs(train):
 
 
 @pytest.mark.medium
-def test_a_notice_to_all_processes_and_then_a_lost_loader(train):
+def test_a_signal_to_all_processes_and_then_a_lost_loader(train):
     options = [*OPTIONS, "steps=1000", "validate_every=1000"]
-    process, said = live(train, "noticed", *options)
+    process, output = start_or_resume(train, "noticed", *options)
     wait_for(lambda: list(train.logs.glob("noticed/*/checkpoints/previous.ckpt")), process)
     os.killpg(process.pid, signal.SIGTERM)
     process.join()
-    text = said.read_text()
+    text = output.read_text()
     assert process.exitcode == 128 + signal.SIGTERM, text
     saved = int(re.search(r"SIGTERM: saved at step (\d+)", text)[1])
     last = folder_of(train, "noticed") / "checkpoints" / "last.ckpt"
@@ -132,13 +132,13 @@ def test_a_notice_to_all_processes_and_then_a_lost_loader(train):
     assert f"stopped; to go on, add ckpt_path={last} to the same command" in text
 
     before = last.stat().st_mtime
-    process, said = live(train, "noticed", *options)
+    process, output = start_or_resume(train, "noticed", *options)
     wait_for(lambda: last.exists() and last.stat().st_mtime > before, process)
     kill_workers(process)
     process.join()
-    text = said.read_text()
+    text = output.read_text()
     assert process.exitcode == 1, text
-    assert f"going on from {last}" in text and text.count("stopped; to go on") == 2
+    assert f"resuming from {last}" in text and text.count("stopped; to go on") == 2
     assert "error: a process that loads data was lost (DataLoader worker (pid" in text
     assert "Traceback" not in text
 

@@ -1,4 +1,4 @@
-"""Sweeps: what is finished is not run again, a failure stops nothing else, launchers work."""
+"""Sweeps: finished runs are not repeated, failures do not stop other jobs, launchers work."""
 
 import json
 import signal
@@ -50,13 +50,13 @@ def test_an_interrupted_sweep_runs_only_what_is_missing(train, tmp_path):
     assert finished_seeds(tmp_path) == [0, 1, 2, 2]
 
 
-def test_what_another_revision_finished_is_told_and_run_again_where_asked(train, finish, tmp_path):
+def test_a_run_of_another_revision_is_named_and_repeated_with_rerun(train, finish, tmp_path):
     finish(0, revision="0123456789ab")
     finish(1)
     result = train(*SWEEP, "seed=0,1")
-    told = [line for line in result.stdout.splitlines() if "finished already" in line]
-    assert told[0].startswith("job 0: finished already by 0123456789ab, while this is")
-    assert told[1:] == ["job 1: finished already"]
+    lines = [line for line in result.stdout.splitlines() if "finished already" in line]
+    assert lines[0].startswith("job 0: finished already by 0123456789ab, while this is")
+    assert lines[1:] == ["job 1: finished already"]
     assert f"run: {tmp_path / '0'}" in result.stdout
     assert finished_seeds(tmp_path) == [0, 1]
 

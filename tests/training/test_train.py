@@ -1,4 +1,4 @@
-"""The script: fit, resume, measure, and what it refuses, on tiny synthetic scenes."""
+"""train.py on tiny synthetic scenes: what a run leaves, and which mistakes it refuses."""
 
 import contextlib
 import csv
@@ -34,7 +34,7 @@ def whole(tmp_path_factory, run_script, repository) -> Path:
     return run_folder(train("name=whole", "steps=6", "callbacks.monitor.every=2", COSTS))
 
 
-def test_a_run_leaves_what_is_promised(whole):
+def test_the_files_of_a_run(whole):
     folder = whole
     numbers = metrics(folder)
     for name in ("psnr", "ssim", "absrel", "delta1"):
@@ -75,14 +75,8 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     events.Reload()
     tags = events.Tags()
     scalars = set(tags["scalars"])
-    for name in (
-        "train/psnr",
-        "train/learning_rate",
-        "val/psnr",
-        "test/procedural/psnr",
-        "cost/parameters",
-    ):
-        assert name in scalars
+    names = {"train/psnr", "train/learning_rate", "val/psnr", "test/procedural/psnr"}
+    assert names | {"cost/parameters"} <= scalars
     for name in ("time/share_prior", "gradient/geometry", "gradient/head", "memory/peak_gb"):
         assert [event.step for event in events.Scalars(name)] == [1, 3, 5]
     shares = [tag for tag in scalars if tag.startswith("time/share_")]
@@ -102,9 +96,9 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     last = events.Scalars("hp/psnr")[-1].value
     assert abs(last - numbers["test/procedural/psnr"]) < 1e-3
     assert any(tag.startswith("val/") for tag in tags["images"])
-    plugins = events.summary_metadata
-    assert "custom_scalars__config__" in plugins
-    assert "_hparams_/session_start_info" in plugins
+    assert {"custom_scalars__config__", "_hparams_/session_start_info"} <= set(
+        events.summary_metadata
+    )
 
 
 @pytest.mark.medium
@@ -133,7 +127,7 @@ def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, mo
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setenv("ASYSPLAT_SHARED", str(tmp_path))
     names = [key.partition(".")[2].removesuffix("=null") for key in overrides]
-    logged = "watch" not in names
+    logged = "monitor" not in names
     costs = [] if "costs" in names else [COSTS]
     result = train(*overrides, *costs, "callbacks.monitor.every=2" if logged else "logger=none")
     folder = run_folder(result)
@@ -150,13 +144,15 @@ def test_without_some_callbacks_the_rest_is_there(train, overrides, tmp_path, mo
             (folder / "checkpoints" / "best.ckpt").exists() or "metrics" in names,
         ),
         "progress": ("step 2 of 4" in result.stdout,),
-        "watch": ("a step took" in result.stdout,),
+        "monitor": ("a step took" in result.stdout,),
     }
     assert {name: set(there) for name, there in left.items()} == {
         name: {name not in names} for name in left
     }
-    said = "warning: AlexNet is neither in torch's hub cache nor in paths.weights: the run goes on "
-    assert (said in result.stderr) == ("metrics" not in names)
+    warning = (
+        "warning: AlexNet is neither in torch's hub cache nor in paths.weights: the run goes on "
+    )
+    assert (warning in result.stderr) == ("metrics" not in names)
     assert not list(folder.glob("tensorboard/**/*.ckpt"))
     assert "Epoch" not in result.stdout + result.stderr
 
@@ -174,7 +170,7 @@ def test_bfloat16_with_the_perceptual_term(train, shared):
 
 
 @pytest.mark.medium
-def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repository, tmp_path):
+def test_an_interrupted_run_prints_how_to_resume(train, repository, tmp_path):
     environment = {k: v for k, v in train.environment.items() if k != "ASYSPLAT_SHARED"}
     environment["PYTHONFAULTHANDLER"] = "1"
     run = train.start("steps=1000", until="last.ckpt", cwd=tmp_path, env=environment)
@@ -182,14 +178,14 @@ def test_started_elsewhere_and_interrupted_it_says_how_to_go_on(train, repositor
         for _ in range(4):  # Python drops an interrupt where it cannot raise it, as in a destructor
             process.send_signal(signal.SIGINT)
             with contextlib.suppress(subprocess.TimeoutExpired):
-                said, errors = process.communicate(timeout=20)
+                output, errors = process.communicate(timeout=20)
                 break
         else:
             process.send_signal(signal.SIGABRT)  # shows where every thread stands
             pytest.fail(f"it does not stop:\n{process.communicate()[1]}")
     assert process.returncode != 0 and "Traceback" not in errors
     checkpoint = next(tmp_path.rglob("last.ckpt"))
-    assert f"add ckpt_path={checkpoint} to the same command" in said
+    assert f"add ckpt_path={checkpoint} to the same command" in output
     paths = yaml.safe_load((checkpoint.parents[1] / "config.yaml").read_text())["paths"]
     assert paths["shared"] == str(repository.parent / "shared")
 
@@ -227,10 +223,7 @@ REFUSED = {
     "one of a sweep": (["-m", "seed=-1,x"], "seed=x: give a whole number from 0"),
     "an unknown setting of a protocol": (["metrics.depth_alignment=mean"], "choose none or median"),
     "a trainer that cannot be": (["trainer.precision=bf17"], "error: trainer: Precision 'bf17' is"),
-    "no checkpoint, but a text": (
-        ["ckpt_path=README.md"],
-        "README.md cannot be read as a checkpoint",
-    ),
+    "a text as a checkpoint": (["ckpt_path=README.md"], "README.md cannot be read as a checkpoint"),
     "no weights to start from": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
     "a size that the patches do not take": (["data.height=40"], "set 48x32"),
     "images too small to measure": (
@@ -254,19 +247,19 @@ REFUSED = {
 }
 
 
-# Tests check these types before the script does.
+# The tests' type checks refuse these before the script does.
 ALONE = ("an unknown setting of a protocol", "a loss of nothing")
 
 
 @pytest.mark.parametrize("case", sorted(REFUSED.keys() - set(ALONE)))
-def test_mistakes_are_one_clear_sentence(train, case, tmp_path):
+def test_a_mistake_is_one_sentence(train, case, tmp_path):
     overrides, message = REFUSED[case]
     check_refusal(train(*overrides), message, tmp_path)
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize("case", ALONE)
-def test_mistakes_are_one_clear_sentence_to_a_user(train, case, tmp_path):
+def test_a_mistake_is_one_sentence_without_type_checks(train, case, tmp_path):
     overrides, message = REFUSED[case]
     check_refusal(train.alone(*overrides), message, tmp_path)
 

@@ -10,7 +10,8 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from asysplat.training.checkpoints import LAST, PREVIOUS, write_whole
+from asysplat.training.checkpoints import LAST, PREVIOUS, atomic_save
+from asysplat.training.old_names import upgrade_checkpoint
 from asysplat.training.random_states import RandomStates, random_states, set_random_states
 from asysplat.training.revision import revision
 from asysplat.training.tensorboard import event_files
@@ -152,7 +153,7 @@ def _begin_at_next_batch(loop: dict[str, Any]) -> None:
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints atomically.
+    """Writes checkpoints atomically, reads those of earlier versions under today's names.
 
     Raises:
         InputError: the disk is full or the folder is not writable.
@@ -162,4 +163,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        write_whole(checkpoint, Path(path))
+        atomic_save(checkpoint, Path(path))
+
+    def load_checkpoint(self, *args: Any, **options: Any) -> dict[str, Any]:
+        return upgrade_checkpoint(super().load_checkpoint(*args, **options))

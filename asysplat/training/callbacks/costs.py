@@ -45,7 +45,7 @@ class Costs(lightning.Callback):
         self.batch_tokens = self.split.micro_batch * scene.num_views * height * width
         self.batch_tokens //= module.net.patch**2
         costs = static_costs(module.net, scene.num_views, height, width)
-        plan = make_plan(trainer, module, costs, self.gb_before)
+        plan = make_plan(trainer, module)
         if trainer.is_global_zero:
             print(plan, flush=True)
         self.values = {f"cost/{name}": value for name, value in costs.items()}
@@ -102,14 +102,9 @@ class Costs(lightning.Callback):
         ]
 
     def on_test_batch_start(
-        self,
-        trainer: Any,
-        module: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Any, module: Any, batch: Any, index: int, set_index: int = 0
     ) -> None:
-        self.work = self.tests[dataloader_idx]
+        self.work = self.tests[set_index]
 
     def _predict(self, *_: Any) -> None:
         self.work["inference"].start()

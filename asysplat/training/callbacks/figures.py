@@ -7,7 +7,7 @@ import lightning
 
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.training.loggers import log_figure
-from asysplat.training.outcome import Outcome
+from asysplat.training.prediction import Prediction
 
 
 class Figures(lightning.Callback):
@@ -22,22 +22,30 @@ class Figures(lightning.Callback):
         self.folder, self.scenes = Path(folder) / "figures", scenes
 
     def on_validation_batch_end(
-        self, trainer: Any, module: Any, outputs: Outcome, batch: Any, index: int, *_: Any
+        self, trainer: Any, module: Any, outputs: Prediction, batch: Any, index: int, *_: Any
     ) -> None:
         self._draw(trainer, "val", outputs, batch, index)
 
     def on_test_batch_end(
-        self, trainer: Any, module: Any, outputs: Outcome, batch: Any, index: int, test_set: int = 0
+        self,
+        trainer: Any,
+        module: Any,
+        outputs: Prediction,
+        batch: Any,
+        index: int,
+        test_set: int = 0,
     ) -> None:
         if test_set == 0:
             self._draw(trainer, "test", outputs, batch, index)
 
-    def _draw(self, trainer: Any, split: str, outcome: Outcome, batch: Any, index: int) -> None:
+    def _draw(
+        self, trainer: Any, split: str, prediction: Prediction, batch: Any, index: int
+    ) -> None:
         if index >= self.scenes or not trainer.is_global_zero:
             return
         first = (
             record.map(lambda tensor: tensor[0].detach())
-            for record in (batch["inputs"], batch["targets"], outcome.rendering)
+            for record in (batch["inputs"], batch["targets"], prediction.rendering)
         )
         figure = comparison_figure(*first)
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.rows import ImageRow, average, write_csv
 from asysplat.scene import Views
-from asysplat.training.outcome import Outcome
+from asysplat.training.prediction import Prediction
 
 IMAGE = ("set", "scene", "view")  # the columns that identify a row
 Measure = Callable[[Tensor, Views], dict[str, Tensor]]
@@ -54,11 +54,15 @@ class Metrics(lightning.Callback):
         return self.protocol.image_metrics(rendered, targets, network)
 
     def _add(
-        self, test_set: str, batch: dict[str, Any], outcome: Outcome, measure_baseline: Measure
+        self,
+        test_set: str,
+        batch: dict[str, Any],
+        prediction: Prediction,
+        measure_baseline: Measure,
     ) -> None:
         inputs, targets = batch["inputs"], batch["targets"]
-        values = self.measure(outcome.rendering.image, targets)
-        values |= self.protocol.depth_metrics(outcome.rendering.depth, targets)
+        values = self.measure(prediction.rendering.image, targets)
+        values |= self.protocol.depth_metrics(prediction.rendering.depth, targets)
         for name, baseline in BASELINES.items():
             metrics = measure_baseline(baseline(inputs, targets), targets)
             values |= {f"{name}/{metric}": value for metric, value in metrics.items()}
@@ -75,7 +79,7 @@ class Metrics(lightning.Callback):
         self.work = CostMeter(module.device)
 
     def on_validation_batch_end(
-        self, trainer: Any, module: Any, outputs: Outcome, batch: Any, *_: Any
+        self, trainer: Any, module: Any, outputs: Prediction, batch: Any, *_: Any
     ) -> None:
         def measure_baseline(image: Tensor, targets: Views) -> dict[str, Tensor]:
             return {"psnr": self.protocol.psnr(image, targets)}  # the learning curve has no other
@@ -86,12 +90,12 @@ class Metrics(lightning.Callback):
         self,
         trainer: Any,
         module: Any,
-        outputs: Outcome,
+        outputs: Prediction,
         batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        index: int,
+        set_index: int = 0,
     ) -> None:
-        test_set = list(trainer.datamodule.tests)[dataloader_idx]
+        test_set = list(trainer.datamodule.tests)[set_index]
         self.work.start()
         self._add(test_set, batch, outputs, self.measure)
         self.work.stop()

@@ -14,8 +14,8 @@ from asysplat.evaluation.peak import peak_flops
 from asysplat.evaluation.static_cost import forward_flops
 from asysplat.training.histogram import Histogram
 from asysplat.training.loggers import log_histogram
-from asysplat.training.outcome import Outcome
 from asysplat.training.parts import PARTS
+from asysplat.training.prediction import Prediction
 
 GIGA = 1e9
 PASSES = 3  # forward, and a backward of about twice its products; recomputation does not count
@@ -105,7 +105,9 @@ class TrainingMonitor(Callback):
     def on_validation_epoch_start(self, trainer: Any, module: Any) -> None:
         self.histograms = {n: Histogram.empty(*b, module.device) for n, b in BOUNDS.items()}
 
-    def on_validation_batch_end(self, trainer: Any, module: Any, outputs: Outcome, *_: Any) -> None:
+    def on_validation_batch_end(
+        self, trainer: Any, module: Any, outputs: Prediction, *_: Any
+    ) -> None:
         gaussians, rendering = outputs.gaussians, outputs.rendering
         self.histograms["opacity"].add(gaussians.opacities)
         self.histograms["log10_scale"].add(gaussians.scales.log10().mean(-1))

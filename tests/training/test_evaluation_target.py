@@ -1,22 +1,22 @@
-"""What an evaluation is of: the same command is the same one, other files and options are not."""
+"""Which options and files make another evaluation."""
 
 import pytest
 from hydra import compose, initialize_config_dir
 
-from asysplat.training.subject import find_subject
+from asysplat.training.evaluation_target import find_target
 
 DATA = ["data=files", "data.root=/a/garden"]
 
 
 @pytest.fixture
-def kept(repository, tmp_path):
-    """The folder that keeps the scenes of a command."""
+def scene_folder(repository, tmp_path):
+    """A function that returns the folder of the scenes' results of a command."""
 
     def find(*overrides):
         with initialize_config_dir(str(repository / "conf"), version_base=None):
             paths = [f"paths.logs={tmp_path}", "paths.run=unused"]
             options = compose("evaluate", [*overrides, *paths])
-        return find_subject(options, overrides).kept
+        return find_target(options, overrides).scene_folder
 
     return find
 
@@ -31,8 +31,8 @@ def files(tmp_path):
 
 
 @pytest.mark.parametrize("option", ["init_path", "scene"])
-def test_weights_and_scenes_are_what_they_hold(kept, files, option):
-    same, moved, other = (kept(f"{option}={path}", *DATA) for path in files)
+def test_files_are_compared_by_content(scene_folder, files, option):
+    same, moved, other = (scene_folder(f"{option}={path}", *DATA) for path in files)
     assert moved.name == same.name and other.name != same.name
     assert same.parents[1].name == f"a-{same.name[:8]}"
 
@@ -48,15 +48,15 @@ OTHER = {
 
 
 @pytest.mark.parametrize("case", OTHER)
-def test_other_options_are_another_evaluation(kept, files, case):
+def test_other_options_are_another_evaluation(scene_folder, files, case):
     weights = f"init_path={files[0]}"
-    first = kept(weights, *DATA)
-    assert kept(weights, *DATA, "data.cache.folder=null", "paths.weights=/b") == first
-    assert kept(weights, *OTHER[case]) != first
+    first = scene_folder(weights, *DATA)
+    assert scene_folder(weights, *DATA, "data.cache.folder=null", "paths.weights=/b") == first
+    assert scene_folder(weights, *OTHER[case]) != first
 
 
-def test_another_revision_of_the_code_is_another_evaluation(kept, files, monkeypatch):
+def test_another_revision_of_the_code_is_another_evaluation(scene_folder, files, monkeypatch):
     command = (f"init_path={files[0]}", *DATA)
-    first = kept(*command)
+    first = scene_folder(*command)
     monkeypatch.setattr("asysplat.training.runs.revision", lambda: "other")
-    assert kept(*command) != first
+    assert scene_folder(*command) != first

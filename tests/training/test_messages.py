@@ -6,7 +6,7 @@ import os
 import pytest
 
 from asysplat.errors import InputError
-from asysplat.training.failures import sentence_of
+from asysplat.training.messages import error_sentence
 
 
 def raised_from(error, cause):
@@ -20,12 +20,12 @@ FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "logs/events")
 LOST = RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. ")
 SENTENCES = {
     "a mistake": (InputError("steps=0: give more."), "steps=0: give more."),
-    "a full disk": (FULL, "there is no room on the disk for logs/events (No space left on device)"),
+    "a full disk": (FULL, "no space on the disk for logs/events (No space left on device)"),
     "a full disk behind": (
         raised_from(RuntimeError("write"), FULL),
-        "no room on the disk",
+        "no space on the disk",
     ),
-    "a quota": (OSError(errno.EDQUOT, "Disk quota exceeded"), "no room on the disk (Disk quota"),
+    "a quota": (OSError(errno.EDQUOT, "Disk quota exceeded"), "no space on the disk (Disk quota"),
     "a lost loader": (LOST, "a process that loads data was lost (DataLoader worker (pid 12) is ki"),
 }
 
@@ -33,9 +33,9 @@ SENTENCES = {
 @pytest.mark.parametrize("case", SENTENCES)
 def test_a_sentence(case):
     error, sentence = SENTENCES[case]
-    assert sentence in sentence_of(error)
+    assert sentence in error_sentence(error)
 
 
 @pytest.mark.parametrize("error", [RuntimeError("shapes"), OSError(errno.EIO, "I/O"), KeyError(1)])
 def test_none(error):
-    assert sentence_of(error) is None
+    assert error_sentence(error) is None

@@ -1,4 +1,4 @@
-"""Training in processes that start in a moment, to be killed at any."""
+"""Run train.py in processes that start at once, to be killed at any time."""
 
 import multiprocessing
 import os
@@ -8,23 +8,22 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 REPO = Path(__file__).resolve().parents[2]
-# Forked from a process that has imported what takes long, and computed nothing.
+# Forked from a process that has imported the slow modules and computed nothing.
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(["asysplat.training.callbacks", "asysplat.data", "hydra.main"])
 
 
-def begin(said: Path, *overrides: str, environment: dict[str, str] | None = None) -> BaseProcess:
-    """Start train.py in a process of its own; what it says goes to the end of a file."""
-    process = CONTEXT.Process(target=_train, args=(said, overrides, environment or {}))
+def start(output: Path, *overrides: str) -> BaseProcess:
+    """Start train.py in a process; append what it prints to a file."""
+    process = CONTEXT.Process(target=_train, args=(output, overrides))
     process.start()
     return process
 
 
-def _train(said: Path, overrides: tuple[str, ...], environment: dict[str, str]) -> None:
+def _train(output: Path, overrides: tuple[str, ...]) -> None:
     os.setsid()  # for signals to all of its processes
     os.chdir(REPO)
-    os.environ.update(environment)
-    descriptor = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for stream in (sys.stdout, sys.stderr):
         os.dup2(descriptor, stream.fileno())
         stream.reconfigure(line_buffering=True)

@@ -1,4 +1,4 @@
-"""The outcome of a batch, for the losses to compare and the callbacks to measure and draw."""
+"""What the network and the renderer predict for a batch."""
 
 from dataclasses import dataclass
 
@@ -7,12 +7,12 @@ from asysplat.scene import Gaussians
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What the network and the renderer made of a batch.
+class Prediction:
+    """The prediction for a batch.
 
     Args:
         gaussians: predicted from the input views.
-        rendering: of these Gaussians, at the target cameras.
+        rendering: of these Gaussians at the target cameras.
     """
 
     gaussians: Gaussians

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from asysplat import load
 from asysplat.errors import InputError
-from asysplat.training.load import load
 
 TINY = ["width=0.125", "state_size=8", "model.layers=1m1s"]
 

@@ -1,0 +1,58 @@
+"""Load a trained network by the name of its file: `asysplat.load("shipped")`.
+
+Import it from the package, `from asysplat import load`: the module has the name of the function.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from torch import nn
+
+from asysplat.errors import InputError
+from asysplat.models.network import Network
+from asysplat.overrides import CONF, check_overrides
+from asysplat.training.checkpoints import load_weights
+from asysplat.training.old_names import read_config
+
+
+def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> Network:
+    """Load a network in evaluation mode: `load("shipped")(views)`.
+
+    Args:
+        checkpoint: "shipped" for the model that comes with the project; a .ckpt file in the folder
+            of its run, whose config.yaml describes the model; a .safetensors file with the layout
+            of the shipped model; None: without training.
+        overrides: of train.py, which change its default model and its early exit (`speed=fast`);
+            a run's model ignores them.
+
+    Raises:
+        InputError: no such file, the weights of another model, or an unknown override.
+    """
+    path = Path(checkpoint or "")
+    if path.suffix == ".ckpt" and path.is_file():
+        config_path = path.parent.parent / "config.yaml"
+        if not config_path.is_file():
+            raise InputError(
+                f"{checkpoint} has no {config_path}, which describes its model: leave it in the "
+                "folder of its run."
+            )
+        net = instantiate(read_config(config_path).model)
+    else:
+        config = _default_config(overrides)
+        net = instantiate(config.model)
+        net.early_exit = instantiate(config.speed)
+        net.check_early_exit(net.early_exit)
+    load_weights(checkpoint, nn.ModuleDict({"net": net}))  # named as in a checkpoint
+    return net.eval()
+
+
+def _default_config(overrides: Sequence[str]) -> DictConfig:
+    check_overrides(overrides)
+    if GlobalHydra.instance().is_initialized():
+        return compose("train", list(overrides))
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("train", list(overrides))

@@ -1,0 +1,64 @@
+"""The messages of a script: errors as one sentence, warnings without their line of code."""
+
+import errno
+import logging
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from asysplat.errors import input_error_behind
+
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def quiet_lightning() -> None:
+    """Hide Lightning's tips and deprecations; print other warnings without their line of code."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="lightning")
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
+
+
+@contextmanager
+def exit_with_message(stopped: str) -> Iterator[None]:
+    """End the process with one sentence at an error of `error_sentence` or an interrupt.
+
+    Args:
+        stopped: the sentence for Ctrl-C.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.exit(stopped)
+    except Exception as error:
+        sentence = error_sentence(error)
+        if sentence is None:
+            raise
+        sys.exit(f"error: {sentence}")
+
+
+def error_sentence(error: BaseException) -> str | None:
+    """Return the sentence of an InputError, a full disk or a lost loader; None for other errors.
+
+    `error` may also have been raised from one of them.
+    """
+    mistake = input_error_behind(error)
+    if mistake is not None:
+        return str(mistake)
+    for each in _causes(error):
+        if isinstance(each, OSError) and each.errno in NO_SPACE:
+            place = f" for {each.filename}" if each.filename else ""
+            return f"there is no space on the disk{place} ({each.strerror}): free some."
+        if isinstance(each, RuntimeError) and str(each).startswith("DataLoader worker"):
+            return (
+                f"a process that loads data was lost ({each}); if memory was short, set "
+                "data.num_workers lower."
+            )
+    return None
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and the errors that it was raised from."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__

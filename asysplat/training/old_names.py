@@ -1,0 +1,106 @@
+"""Names in the files of runs that an earlier version of the code wrote, and today's names.
+
+Whoever renames a class of conf/, a configuration key or a key of metrics.json adds a line here.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+FORMAT = 2  # of the files of a run; raise it with every line that is added below
+
+CLASSES = {
+    "asysplat.models.SceneSkips": "asysplat.models.EarlyExit",
+    "asysplat.models.SweepPrior": "asysplat.models.PlaneSweepPrior",
+    "asysplat.reconstruction.Rates": "asysplat.refinement.Rates",
+    "asysplat.reconstruction.Settings": "asysplat.refinement.RefinementSettings",
+    "asysplat.training.Reconstruction": "asysplat.training.SplattingModule",
+    "asysplat.training.ReconstructionLoss": "asysplat.training.SplattingLoss",
+    "asysplat.training.callbacks.Pictures": "asysplat.training.callbacks.Figures",
+    "asysplat.training.callbacks.Progress": "asysplat.training.callbacks.TrainingProgressBar",
+    "asysplat.training.callbacks.SkipNonFiniteSteps": "asysplat.training.callbacks.NonFiniteSteps",
+    "asysplat.training.callbacks.Skipped": "asysplat.training.callbacks.EarlyExitShares",
+    "asysplat.training.callbacks.SkippedScenes": "asysplat.training.callbacks.BadScenes",
+    "asysplat.training.callbacks.Watch": "asysplat.training.callbacks.TrainingMonitor",
+}
+KEYS = {  # of the configuration; a new name has the same parent
+    "callbacks.guard": "non_finite_steps",
+    "callbacks.pictures": "figures",
+    "callbacks.skipped": "early_exit",
+    "callbacks.skips": "bad_scenes",
+    "callbacks.watch": "monitor",
+    "data.num_frames": "num_images",
+    "data.on_bad_frame": "on_bad_image",
+    "model.prior.neighbours": "neighbors",
+    "speed.known": "skip_network_above",
+    "speed.sure": "skip_layers_above",
+}
+REMOVED = {"speed.coverage": None, "speed.faint": None}  # with the value that had no effect
+RESULTS = {  # parts of the keys of metrics.json, as regular expressions
+    r"/mean_colour/": "/mean_color/",
+    r"^mean_colour/": "mean_color/",
+    r"^skip/(.+)/views$": r"early_exit/\1/network",
+    r"^skip/": "early_exit/",
+    r"/post_optimisation$": "/post_optimization",
+    r"^skipped$": "count",  # in the state of BadScenes and NonFiniteSteps
+    r"^troubles$": "errors",  # in the state of BadScenes
+}
+CALLBACKS = {old.rpartition(".")[2]: new.rpartition(".")[2] for old, new in CLASSES.items()}
+
+
+def read_config(path: Path) -> DictConfig:
+    """Read the config.yaml of a run, under today's names."""
+    return OmegaConf.create(upgrade_config(OmegaConf.to_container(OmegaConf.load(path))))
+
+
+def upgrade_config(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return a resolved configuration under today's names.
+
+    Args:
+        config: of plain values.
+        prefix: dotted path of `config` within the whole, with a dot at its end.
+    """
+    upgraded = {}
+    for key, value in config.items():
+        path = f"{prefix}{key}"
+        if path in REMOVED and value == REMOVED[path]:
+            continue
+        if isinstance(value, Mapping):
+            value = upgrade_config(value, f"{path}.")
+        elif key == "_target_":
+            value = CLASSES.get(value, value)
+        upgraded[KEYS.get(path, key)] = value
+    return upgraded
+
+
+def upgrade_results(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what metrics.json or evaluation.json holds, under today's names."""
+    return {_upgrade_key(key): value for key, value in results.items()}
+
+
+def upgrade_checkpoint(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a checkpoint under today's names; its weights are as they were."""
+    upgraded = dict(checkpoint)
+    if "hyper_parameters" in upgraded:
+        upgraded["hyper_parameters"] = upgrade_config(upgraded["hyper_parameters"])
+    if "callbacks" in upgraded:
+        states = upgraded["callbacks"].items()
+        upgraded["callbacks"] = {CALLBACKS.get(key, key): _upgrade(state) for key, state in states}
+    return upgraded
+
+
+def _upgrade(state: Any) -> Any:
+    """Rename the keys of results in the nested state of a callback."""
+    if isinstance(state, Mapping):
+        return {_upgrade_key(key): _upgrade(value) for key, value in state.items()}
+    return [_upgrade(each) for each in state] if isinstance(state, list) else state
+
+
+def _upgrade_key(key: Any) -> Any:
+    if isinstance(key, str):
+        for old, new in RESULTS.items():
+            key = re.sub(old, new, key)
+    return key

@@ -1,0 +1,193 @@
+"""Prepare a run and its stages: checks, folder, resumption, results.
+
+train.py instantiates what the configuration names, fits and tests; the rest of a run is here.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import lightning
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from lightning.pytorch.loggers import Logger
+from omegaconf import DictConfig, OmegaConf
+
+from asysplat.data.datamodule import SceneDataModule
+from asysplat.errors import InputError
+from asysplat.models.early_exit import EarlyExit
+from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
+from asysplat.training.checkpoints import (
+    check_checkpoint,
+    config_diff,
+    find_checkpoint,
+    has_checkpoints,
+    load_weights,
+    read_notes,
+)
+from asysplat.training.messages import quiet_lightning
+from asysplat.training.module import SplattingModule
+from asysplat.training.revision import revision
+from asysplat.training.run_folder import locked
+from asysplat.training.runs import RESULTS, describe_run
+from asysplat.training.stages import (
+    StageRecord,
+    check_stages,
+    describe_stage,
+    results_of_stage,
+    resume_point,
+    stage_configs,
+)
+from asysplat.training.summary import Results, print_summary, write_json
+from asysplat.training.tensorboard import cut_events, log_choices, log_results
+
+Callbacks = Mapping[str, lightning.Callback]
+
+
+@dataclass
+class Stage:
+    """A stage of a run.
+
+    Args:
+        config: of the stage.
+        weights: to start from, as `init_path` names them.
+        checkpoint: to resume from.
+        earlier: results of the stages before it.
+    """
+
+    config: DictConfig
+    weights: str | None
+    checkpoint: Path | None
+    earlier: Results
+
+    def prepare(
+        self, data: SceneDataModule, module: SplattingModule, early_exit: EarlyExit | None
+    ) -> Logger | None:
+        """Check the parts, load the weights, write config.yaml and build the logger.
+
+        A stage that is resumed drops the events that it logged after the checkpoint, since it will
+        log them again.
+
+        Raises:
+            InputError: sizes or weights that do not fit the model.
+        """
+        config, net, folder = self.config, module.net, Path(self.config.paths.run)
+        net.check_early_exit(early_exit)
+        data.check_sizes(net.check_size)
+        data.check_sizes(instantiate(config.metrics).check_size)
+        check_checkpoint(self.checkpoint, module)
+        load_weights(self.weights, module)
+        print(f"{config.stage}: {describe_stage(config)}")
+        print(f"model: {net.describe()}")
+
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(config, folder / "config.yaml", resolve=True)
+        options = OmegaConf.to_container(config, resolve=True)
+        module.save_hyperparameters(options, logger=False)
+        notes = {} if self.checkpoint is None else read_notes(self.checkpoint)
+        for difference in config_diff(notes, options, revision()):
+            print(f"not as before: {difference}")
+        resumes = has_checkpoints(folder)
+        cut_events(folder, notes["event_files"] if resumes else {})
+        logger = instantiate(config.logger)
+        if logger is not None and not resumes:
+            log_choices(logger, config)
+        return logger
+
+    def make_trainer(
+        self, data: SceneDataModule, callbacks: Callbacks, logger: Logger | None
+    ) -> lightning.Trainer:
+        """Build Lightning's trainer, which accumulates the micro-batches of each process.
+
+        Raises:
+            InputError: it refuses an option, or a device does not exist.
+        """
+        record = StageRecord(self.config.stage, self.earlier)
+        try:
+            trainer = instantiate(
+                self.config.trainer,
+                callbacks=[*callbacks.values(), record],
+                logger=logger or False,
+                # Otherwise Lightning adds its own callbacks.
+                enable_checkpointing="checkpoints" in callbacks,
+                plugins=[AtomicCheckpointIO()],
+                enable_progress_bar="progress" in callbacks,
+            )
+        except InstantiationException as error:
+            raise InputError(f"trainer: {error.__cause__}") from error
+        split = data.split(trainer.world_size)
+        trainer.accumulate_grad_batches = split.accumulated
+        if trainer.is_global_zero:
+            print(split)
+        return trainer
+
+
+@dataclass
+class PreparedRun:
+    """A run that has its folder to itself.
+
+    Args:
+        config: of the run.
+        described: see `describe_run`.
+        stages: that are still to be trained.
+        results: of the stages that are finished.
+    """
+
+    config: DictConfig
+    described: Results
+    stages: Sequence[Stage]
+    results: Results = field(default_factory=dict)
+
+    def record(self, stage: Stage, trainer: lightning.Trainer, callbacks: Callbacks) -> None:
+        """Collect what a tested stage measured; write metrics.json after the last; print it."""
+        new_results = dict(callbacks["costs"].values) if "costs" in callbacks else {}
+        for name in ("metrics", "early_exit"):
+            if name in callbacks:
+                new_results |= callbacks[name].results
+        data, folder = self.config.data.name, Path(stage.config.paths.run)
+        shown = self.results | new_results
+        if stage is self.stages[-1]:
+            self.results = shown = self.described | shown
+        else:
+            self.results |= results_of_stage(stage.config.stage, new_results)
+        if trainer.is_global_zero:
+            if trainer.logger is not None:
+                log_results(trainer.logger, new_results, data)
+            if stage is self.stages[-1]:
+                write_json(folder / RESULTS, shown)
+            print_summary(shown, data, folder)
+
+    @property
+    def psnr(self) -> float | None:
+        """The test PSNR of the data's own test set."""
+        return self.results.get(f"test/{self.config.data.name}/psnr")
+
+
+@contextmanager
+def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
+    """Check a configuration, lock the run's folder and find the stages that are to be trained.
+
+    Raises:
+        InputError: an option is missing or out of range, another process trains in the folder, or a
+            checkpoint cannot be used.
+    """
+    for key in OmegaConf.missing_keys(config):
+        raise InputError(f"{key} is not set: add {key}=... to the command.")
+    configs = stage_configs(config)
+    check_stages(configs)
+    folder = Path(config.paths.run)
+    with locked(folder):
+        quiet_lightning()
+        described = describe_run(config)  # now, since files may be edited during the training
+        runs = Path(config.paths.logs) / config.name
+        checkpoint = find_checkpoint(config.ckpt_path, folder, runs)
+        first, results = resume_point(checkpoint, configs)
+        weights = config.init_path if checkpoint is None else None
+        stages = []
+        for stage in configs[first:]:
+            if stage is not config:
+                stage.paths.run = str(folder / stage.stage)
+            stages.append(Stage(stage, weights, checkpoint, results))
+            weights, checkpoint = f"{stage.paths.run}/checkpoints/last.ckpt", None
+        yield PreparedRun(config, described, stages, results)

@@ -1,0 +1,98 @@
+"""A run that an earlier version of the code wrote is read as one of today's.
+
+old_run/ is a finished run of two stages and its evaluation, less what nobody reads; its command is
+in .hydra/overrides.yaml, and targets.txt lists the classes of conf/ of that version.
+"""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_object
+from omegaconf import OmegaConf
+
+from asysplat import load
+from asysplat.training.old_names import CLASSES, KEYS, read_config
+from asysplat.training.runs import find_run
+
+OLD_RUN = Path(__file__).parent / "old_run"
+
+
+def overrides_of_today() -> list[str]:
+    """The command of the old run, under today's names."""
+    renamed = {old: f"{old.rpartition('.')[0]}.{new}" for old, new in KEYS.items()}
+    pairs = [o.split("=", 1) for o in OmegaConf.load(OLD_RUN / ".hydra" / "overrides.yaml")]
+    return [f"{renamed.get(key, key)}={value}" for key, value in pairs]
+
+
+@pytest.fixture
+def old_run(tmp_path) -> Path:
+    return shutil.copytree(OLD_RUN, tmp_path / "old_run")
+
+
+@pytest.fixture
+def config(repository):
+    with initialize_config_dir(str(repository / "conf"), version_base=None):
+        return compose("train", [*overrides_of_today(), "paths.run=unused"])
+
+
+def test_a_sweep_finds_it(old_run, config):
+    run = find_run(old_run.parent, config)
+    assert run.folder == old_run
+    assert run.results["test/procedural/psnr"] == pytest.approx(13.95, abs=0.01)
+    assert run.results["stage1/test/procedural/psnr"] == pytest.approx(13.95, abs=0.01)
+    for key in (
+        "baseline/procedural/mean_color/psnr",
+        "early_exit/outdoors/layers",
+        "test/rooms/post1/psnr",
+    ):
+        assert key in run.results
+    other = config.copy()
+    other.stages.stage1.steps = 7
+    assert find_run(old_run.parent, other) is not None  # steps=2 is the same for all stages
+    other.earlier_stages = []
+    assert find_run(old_run.parent, other) is None
+
+
+def test_its_checkpoint_loads(old_run):
+    net = load(str(old_run / "checkpoints" / "last.ckpt"))
+    saved = torch.load(old_run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    for name, tensor in net.state_dict().items():
+        assert torch.equal(tensor, saved[f"net.{name}"])
+
+
+@pytest.mark.parametrize("target", (OLD_RUN / "targets.txt").read_text().split())
+def test_every_class_of_the_old_configuration_is_there(target):
+    assert get_object(CLASSES.get(target, target))
+
+
+def test_its_configuration_has_the_keys_of_today(old_run, config):
+    def paths(node, prefix=""):
+        for key in node:
+            yield f"{prefix}{key}"
+            if OmegaConf.is_dict(node[key]):
+                yield from paths(node[key], f"{prefix}{key}.")
+
+    assert set(paths(read_config(old_run / "config.yaml"))) == set(paths(config))
+
+
+@pytest.mark.medium
+def test_it_is_evaluated_resumed_and_started_from(old_run, run_script, train):
+    stored = json.loads((old_run / "metrics.json").read_text())
+    result = run_script("evaluate.py", f"run={old_run}", "steps=[0]")
+    assert result.returncode == 0, result.stderr
+    found = json.loads((old_run / "evaluation.json").read_text())
+    for key in ("test/procedural/{}psnr", "test/outdoors/{}absrel"):
+        expected = stored[key.format("")]
+        assert found[key.format("post0/")] == pytest.approx(expected, rel=1e-4)
+    last = old_run / "checkpoints" / "last.ckpt"
+    options = [*overrides_of_today(), "logger=none", "data.test_sets=null", "callbacks.costs=null"]
+    result = train(*options, f"init_path={last}", "earlier_stages=[]")
+    assert result.returncode == 0, result.stderr
+    (old_run / "metrics.json").unlink()
+    result = train(*options, f"ckpt_path={last}", "steps=3")
+    assert result.returncode == 0, result.stderr
+    assert "step 3 of 3" in result.stdout and f"run: {old_run}" in result.stdout
