@@ -1,4 +1,4 @@
-"""Posed photographs, synthetic or from files, as batches of reconstruction tasks."""
+"""Posed images, synthetic or from files, as batches of training and evaluation tasks."""
 
 from asysplat.data.augment import Augmentation
 from asysplat.data.build import files_data, procedural_data

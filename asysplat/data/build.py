@@ -2,7 +2,7 @@
 
 import inspect
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -62,7 +62,7 @@ def _data_module(
     changeable: tuple[str, ...],
     test_sets: Mapping[str, Any],
     of_tests: Mapping[str, Any],
-    test_size: tuple[int, int] | None = None,
+    test_size: Sequence[int] | None = None,
     **options: Any,
 ) -> SceneDataModule:
     """Build a data module; `of_tests` replaces options of the sources of tests."""

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import get_all_start_methods
 from typing import Any
@@ -18,8 +18,7 @@ from asysplat.data.batches import BatchSplit, split_batch
 from asysplat.data.loader import EpochLoader, batches_done, ignore_first_sigterm
 from asysplat.data.normalize import normalize
 from asysplat.data.points import depths_of_points
-from asysplat.data.selection.views import Selection, Split
-from asysplat.data.sequence import ImageSequence
+from asysplat.data.selection.views import Selection
 from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
@@ -29,13 +28,13 @@ MAX_LOADED_BYTES = 2**30  # of images that a set of fixed tasks keeps in memory
 Sample = dict[str, Any]  # scene: name, inputs: Views, targets: Views; a batch has lists of names
 
 
+@dataclass(eq=False, repr=False)
 class SceneDataModule(lightning.LightningDataModule):
     """Lightning's data module of tasks: random for training, fixed for evaluation.
 
     An epoch is the steps between two validations. Task i of a run depends only on the seed and i,
-    and an epoch continues where the previous one ended. Processes that train together take turns at
-    the tasks of each step, and at the scenes of each evaluation: Lightning must add no samplers of
-    its own (use_distributed_sampler=False).
+    and an epoch continues where the previous one ended. Processes take turns at the tasks of each
+    step and the scenes of each evaluation: Lightning needs use_distributed_sampler=False.
 
     Args:
         name: the data set's name in metrics.
@@ -59,35 +58,25 @@ class SceneDataModule(lightning.LightningDataModule):
             fixed ones that are kept in memory.
     """
 
-    def __init__(
-        self,
-        name: str,
-        source: Source,
-        inputs: int,
-        targets: int,
-        height: int,
-        width: int,
-        batch_size: int,
-        num_workers: int,
-        seed: int,
-        steps_per_epoch: int,
-        test_sets: Mapping[str, Callable[[], list[Task]]] | None = None,
-        augmentation: Augmentation | None = None,
-        points: bool = False,
-        on_bad_scene: Policy = "fail",
-        micro_batch: int | None = None,
-    ):
+    name: str = field()  # without the default of Lightning
+    source: Source
+    inputs: int
+    targets: int
+    height: int
+    width: int
+    batch_size: int
+    num_workers: int
+    seed: int
+    steps_per_epoch: int
+    test_sets: Mapping[str, Callable[[], list[Task]]] = field(default_factory=dict)
+    augmentation: Augmentation | None = None
+    points: bool = False
+    on_bad_scene: Policy = "fail"
+    micro_batch: int | None = None
+
+    def __post_init__(self):
         super().__init__()
-        self.on_bad_scene = on_bad_scene
-        self.name, self.source = name, source
-        self.inputs, self.targets = inputs, targets
-        self.height, self.width = height, width
-        self.batch_size, self.micro_batch = batch_size, micro_batch
-        self.num_workers, self.seed = num_workers, seed
-        self.steps_per_epoch = steps_per_epoch
-        self.test_sets = test_sets or {}
-        self.augmentation = augmentation or Augmentation()
-        self.points = points
+        self.augmentation = self.augmentation or Augmentation()
         self.evaluation: dict[str, FixedTasks] = {}  # val and test of this data set
         self.tests: dict[str, FixedTasks] = {}  # by test set, this data set first
 
@@ -95,8 +84,9 @@ class SceneDataModule(lightning.LightningDataModule):
         """Load the validation and test tasks, and try one training task."""
         if not self.evaluation:
             samples = {"training": TrainingTasks(self)[0]}
-            self.evaluation["val"] = FixedTasks(self._own_tasks("val"), self.points)
-            own = {self.name: partial(self._own_tasks, "test")}
+            counts = (self.inputs, self.targets)
+            self.evaluation["val"] = FixedTasks(self.source.evaluation("val", *counts), self.points)
+            own = {self.name: partial(self.source.evaluation, "test", *counts)}
             for name, make_tasks in (own | self.test_sets).items():
                 try:
                     self.tests[name] = FixedTasks(make_tasks(), self.points)
@@ -108,9 +98,6 @@ class SceneDataModule(lightning.LightningDataModule):
             samples |= {name: tasks[0] for name, tasks in self.tests.items()}
             if self.points:
                 _warn_of_no_points(samples)
-
-    def _own_tasks(self, split: Split) -> list[Task]:
-        return self.source.evaluation(split, self.inputs, self.targets)
 
     def check_sizes(self, check: Callable[[int, int], None]) -> None:
         """Call `check(height, width)` for every set; its InputError names the set."""
@@ -251,18 +238,11 @@ def load(task: Task, share: float = 1.0, points: bool = False) -> Sample:
     inputs, targets = (
         views.select([indices.index(index) for index in chosen]) for chosen in (inputs, targets)
     )
-    if points:
-        inputs = with_points(inputs, task.sequence)
+    sparse = getattr(task.sequence, "points", None) if points else None  # none of synthetic scenes
+    if sparse is not None:
+        inputs = replace(inputs, point_depths=depths_of_points(sparse, inputs.cameras))
     inputs, targets, frame = normalize(inputs, targets)
     return {"scene": task.sequence.name, "inputs": inputs, "targets": targets, "frame": frame}
-
-
-def with_points(views: Views, sequence: ImageSequence) -> Views:
-    """Return the views with the depths of their sequence's sparse points, if it has any."""
-    points = getattr(sequence, "points", None)  # synthetic scenes have none
-    if points is None:
-        return views
-    return replace(views, point_depths=depths_of_points(points, views.cameras))
 
 
 def _warn_of_no_points(samples: Mapping[str, Sample]) -> None:

@@ -1,7 +1,8 @@
 """Read images, depth maps and masks from files, undistort them and resize them.
 
 Pixel positions count from the image's corner: the first pixel's center is at +0.5. Nothing is ever
-written. The exif orientation is not applied, since calibrations are for the pixels as stored.
+written. The exif orientation is not applied, since calibrations are for the pixels as stored. All
+functions that read raise an InputError for a file that is missing, empty, damaged or cut short.
 """
 
 import hashlib
@@ -65,11 +66,7 @@ class Lens:
 
 
 def image_size(path: ImageFile) -> tuple[int, int]:
-    """Read (width, height) from the header.
-
-    Raises:
-        InputError: the file is missing, empty, not an image or cut short.
-    """
+    """Read (width, height) from the header."""
     return _read(path, _checked_size)
 
 
@@ -82,7 +79,7 @@ def load_image(path: ImageFile) -> UInt8[ndarray, "h w 3"]:
     """Read RGB in 0..255, on a white background where the image is transparent.
 
     Raises:
-        InputError: the file is damaged, or holds more than 8 bits of gray (a depth map).
+        InputError: the file holds more than 8 bits of gray (a depth map).
     """
     return _read(path, _to_rgb)
 
@@ -91,7 +88,7 @@ def load_depth(path: ImageFile) -> Float32[ndarray, "h w"]:
     """Read the stored integers of a one-channel (16-bit) image; 0 where unknown.
 
     Raises:
-        InputError: the file is damaged or has several channels.
+        InputError: the file has several channels.
     """
     stored = _read(path, np.asarray)
     if stored.ndim != 2:
@@ -102,11 +99,7 @@ def load_depth(path: ImageFile) -> Float32[ndarray, "h w"]:
 
 
 def load_mask(path: ImageFile) -> Bool[ndarray, "h w"]:
-    """Read a mask: True where the stored value is not 0.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """Read a mask: True where the stored value is not 0."""
     return _read(path, lambda image: np.asarray(image.convert("L")) > 0)
 
 
@@ -181,11 +174,7 @@ def _to_rgb(image: Image.Image) -> UInt8[ndarray, "h w 3"]:
 
 
 def content_hash(file: ImageFile) -> str:
-    """Hash the stored bytes; a file is read again only if it changes.
-
-    Raises:
-        InputError: the file is missing or empty.
-    """
+    """Hash the stored bytes; a file is read again only if it changes."""
     if isinstance(file, EncodedImage):
         return hashlib.blake2b(file.data.tobytes(), digest_size=16).hexdigest()
     _check_exists(file)

@@ -31,33 +31,27 @@ from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 
 Points = Float[ndarray, "P 3"]
+Load = Callable[[ImageFile], ndarray]
 
 
 @runtime_checkable
 class ImageSequence(Protocol):
-    """Images along a walk through one static place, in the order they were taken.
-
-    The cameras are known from the start; pixels are read when `views` is called.
-    """
+    """Images of one static place, in the order they were taken; `views` reads their pixels."""
 
     @property
     def name(self) -> str:
         """The name, unique within the data set."""
-        ...
 
     @property
     def num_images(self) -> int:
         """The number of images."""
-        ...
 
     @property
     def cameras(self) -> Cameras:
         """The cameras of all images, [num_images, ...]."""
-        ...
 
     def views(self, indices: Sequence[int]) -> Views:
         """Return the images at `indices`, in that order: pixels in [0, 1], depths where known."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -191,13 +185,9 @@ class FileSequence:
         return pixels.permute(2, 0, 1).float() / 255
 
     def _depth(self, image: PosedImage) -> Float[Tensor, "H W"]:
-        if image.depth is None:
-            return torch.zeros(self.options.height, self.options.width)
-        return self._pixels(image.depth, load_depth, image.lens, nearest=True) * image.depth_unit
+        return self._map(image.depth, load_depth, image.lens) * image.depth_unit
 
     def _disparity(self, image: PosedImage) -> Float[Tensor, "H W"]:
-        if image.disparity is None:
-            return torch.zeros(self.options.height, self.options.width)
         lens = image.lens
 
         def load_disparity(file: ImageFile) -> ndarray:
@@ -212,22 +202,22 @@ class FileSequence:
                 )
             return disparity
 
-        return self._pixels(image.disparity, load_disparity, lens, nearest=True)
+        return self._map(image.disparity, load_disparity, lens)
 
     def _mask(self, image: PosedImage) -> Bool[Tensor, "H W"]:
         lens = image.lens
         if image.mask is None:
-            everywhere = np.ones((lens.height, lens.width), dtype=np.uint8)
-            return torch.tensor(self._fit(everywhere, lens, nearest=True)) > 0
+            ones = np.ones((lens.height, lens.width), dtype=np.uint8)
+            return torch.tensor(self._fit(ones, lens, nearest=True)) > 0
         return self._pixels(image.mask, load_mask, lens, nearest=True) > 0
 
-    def _pixels(
-        self,
-        file: ImageFile,
-        load: Callable[[ImageFile], ndarray],
-        lens: Lens,
-        nearest: bool = False,
-    ) -> Tensor:
+    def _map(self, file: ImageFile | None, load: Load, lens: Lens) -> Float[Tensor, "H W"]:
+        """Return unmixed values at this sequence's size; 0 without a file."""
+        if file is None:
+            return torch.zeros(self.options.height, self.options.width)
+        return self._pixels(file, load, lens, nearest=True)
+
+    def _pixels(self, file: ImageFile, load: Load, lens: Lens, nearest: bool = False) -> Tensor:
         """Return a file's pixels at this sequence's size, from the cache if they are there."""
 
         def make() -> ndarray:

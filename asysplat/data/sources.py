@@ -1,14 +1,16 @@
 """Sources of tasks: which sequences train, validate and test, and which of their images."""
 
+from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from asysplat.data.procedural import ProceduralScene, split_seed
-from asysplat.data.scene_folder import SceneFolder
+from asysplat.data.readers import find_scenes, open_scene
 from asysplat.data.selection import named_selection
 from asysplat.data.selection.index import read_index
 from asysplat.data.selection.views import (
@@ -21,6 +23,8 @@ from asysplat.data.selection.views import (
 )
 from asysplat.data.sequence import FileSequence, ImageSequence, SceneOptions
 from asysplat.errors import InputError
+
+MAX_OPEN = 64  # scenes of a folder
 
 
 @dataclass(frozen=True)
@@ -37,13 +41,12 @@ class Source(Protocol):
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         """Draw a random training task; the same state of `rng` gives the same task."""
-        ...
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
         """Return the fixed tasks of a split; no task trains on any of their targets."""
-        ...
 
 
+@dataclass(frozen=True)
 class ProceduralSource:
     """Synthetic scenes: unlimited ones to train, and fixed ones to validate and test.
 
@@ -58,29 +61,24 @@ class ProceduralSource:
         varied: whether training scenes are varied; see ProceduralScene.
     """
 
-    def __init__(
-        self,
-        height: int,
-        width: int,
-        num_images: int,
-        window: Sequence[int],
-        val_scenes: int,
-        test_scenes: int,
-        places: str = "both",
-        varied: bool = False,
-    ):
-        self.height, self.width, self.num_images = height, width, num_images
-        self.places, self.varied = places, varied
-        self.window = (window[0], window[1])
-        self.counts = {"val": val_scenes, "test": test_scenes}
+    height: int
+    width: int
+    num_images: int
+    window: Sequence[int]
+    val_scenes: int
+    test_scenes: int
+    places: str = "both"
+    varied: bool = False
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         scene = self._scene("train", int(rng.integers(2**31)))
-        return Task(scene, training_selection(self.num_images, inputs, targets, self.window, rng))
+        window = tuple(self.window)
+        return Task(scene, training_selection(self.num_images, inputs, targets, window, rng))
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
         selection = uniform_selection(self.num_images, inputs, targets)
-        return [Task(self._scene(split, index), selection) for index in range(self.counts[split])]
+        count = self.val_scenes if split == "val" else self.test_scenes
+        return [Task(self._scene(split, index), selection) for index in range(count)]
 
     def _scene(self, split: Literal["train", "val", "test"], index: int) -> ProceduralScene:
         return ProceduralScene(
@@ -93,19 +91,50 @@ class ProceduralSource:
         )
 
 
+class SceneFolder(Sequence):
+    """The scenes that a folder is or holds, each opened at its first use.
+
+    The MAX_OPEN last used stay open.
+
+    Raises:
+        InputError: no scene; and, when a scene is opened, files that cannot be used.
+    """
+
+    def __init__(self, root: str, options: SceneOptions):
+        self.root = Path(root).absolute()
+        layout, self.paths = find_scenes(root, options.layout)
+        self._options = replace(options, layout=layout)
+        self._open: OrderedDict[int, FileSequence] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, index: int) -> FileSequence:
+        if index not in self._open:
+            self._open[index] = open_scene(self.paths[index], self._options)
+        self._open.move_to_end(index)
+        while len(self._open) > MAX_OPEN:
+            self._open.popitem(last=False)
+        return self._open[index]
+
+    def folders(self, index: int) -> set[str]:
+        """Return the folder names between the root and a scene, and its own, without opening it."""
+        path = self.paths[index]
+        return {*path.parts} - {*self.root.parts} | {path.name}
+
+
+@dataclass(eq=False)
 class FilesSource:
     """Scenes on disk.
 
-    With a `test_root`, scenes are split: those of `test_root` test, some scenes of `root` validate,
-    and the others train with all their images. A scene that tests is never trained on, even if
-    `root` holds it as well. Without a `test_root`, images are split: in every scene of `root`, the
-    first of every 8 images tests, the fifth validates, the others train.
+    With a `test_root`, its scenes test, some scenes of `root` validate, and the others train with
+    all their images; test scenes are never trained on, even if `root` holds them as well. Without a
+    `test_root`, in every scene of `root` the first of every 8 images tests, the fifth validates,
+    and the others train.
 
     Args:
-        root: one scene, or a folder of scenes.
-        options: how scenes are opened.
+        root, test_root: one scene, or a folder of scenes.
         window: least and greatest number of consecutive images that a training task is drawn from.
-        test_root: one scene, or a folder of scenes.
         selection: how the images of a test are chosen: every_8th, kmeans (the paper's tests),
             first_96 (its ablations), uniform, or index.
         index: with selection=index, the file that names the images; scenes that it does not name
@@ -118,46 +147,43 @@ class FilesSource:
             and, when a scene is first used, files that cannot be used.
     """
 
-    def __init__(
-        self,
-        root: str,
-        options: SceneOptions,
-        window: Sequence[int],
-        test_root: str | None = None,
-        selection: str = "every_8th",
-        index: str | None = None,
-        val_scenes: int = 8,
-        targets_may_be_inputs: bool = False,
-    ):
-        def scenes(key: str, folder: str) -> SceneFolder:
-            try:
-                return SceneFolder(folder, options)
-            except InputError as error:
-                raise InputError(f"data.{key}={folder}: {error}") from error
+    root: str
+    options: SceneOptions
+    window: Sequence[int]
+    test_root: str | None = None
+    selection: str = "every_8th"
+    index: str | None = None
+    val_scenes: int = 8
+    targets_may_be_inputs: bool = False
 
-        self.window = (window[0], window[1])
-        self.selection, self.index = selection, index
-        self.val_scenes, self.targets_may_be_inputs = val_scenes, targets_may_be_inputs
-        self.scenes = scenes("root", root)
-        self.split_by_scenes = test_root is not None
-        self.test_scenes = scenes("test_root", test_root) if self.split_by_scenes else self.scenes
-        if (selection == "index") != (index is not None):
+    def __post_init__(self):
+        self.scenes = self._folder("root")
+        self.split_by_scenes = self.test_root is not None
+        self.test_scenes = self._folder("test_root") if self.split_by_scenes else self.scenes
+        if (self.selection == "index") != (self.index is not None):
             raise InputError(
-                f"data.selection is {selection} and data.index is {index}: give both "
+                f"data.selection is {self.selection} and data.index is {self.index}: give both "
                 "data.selection=index and data.index=path, or neither."
             )
-        if selection == "index" and options.on_bad_image == "skip":
+        if self.selection == "index" and self.options.on_bad_image == "skip":
             raise InputError(
                 "data.on_bad_image=skip changes the numbers of the images that data.index names: "
                 "set it to fail, and fix the images."
             )
+
+    def _folder(self, key: str) -> SceneFolder:
+        root = getattr(self, key)
+        try:
+            return SceneFolder(root, self.options)
+        except InputError as error:
+            raise InputError(f"data.{key}={root}: {error}") from error
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         sequence = self.scenes[self._training[rng.integers(len(self._training))]]
         count = sequence.num_images
         images = range(count) if self.split_by_scenes else training_images(count)
         drawn = training_selection(
-            len(images), inputs, targets, self.window, rng, self.targets_may_be_inputs
+            len(images), inputs, targets, tuple(self.window), rng, self.targets_may_be_inputs
         )
         chosen = Selection([images[i] for i in drawn.inputs], [images[i] for i in drawn.targets])
         return Task(sequence, chosen)

@@ -1,4 +1,4 @@
-"""A global batch is divided whole, and what does not divide is refused."""
+"""A global batch divides evenly among processes, or is refused."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from asysplat.errors import InputError
 
 
 @pytest.mark.parametrize(
-    ("batch", "most", "processes", "expected"),
+    ("batch", "micro_batch", "processes", "expected"),
     [
         (256, 8, 8, "global batch 256 = 8 processes x 8 scenes x 4 accumulated"),
         (64, 2, 1, "global batch 64 = 1 process x 2 scenes x 32 accumulated"),
@@ -16,14 +16,14 @@ from asysplat.errors import InputError
         (7, 3, 1, "global batch 7 = 1 process x 1 scene x 7 accumulated"),
     ],
 )
-def test_what_a_batch_comes_to(batch, most, processes, expected):
-    split = split_batch(batch, most, processes)
+def test_a_batch_is_divided(batch, micro_batch, processes, expected):
+    split = split_batch(batch, micro_batch, processes)
     assert str(split) == expected
     assert split.processes * split.micro_batch * split.accumulated == batch
 
 
-def test_processes_that_do_not_divide_it():
-    with pytest.raises(InputError, match=r"batch_size=24 .* among 5 processes .*: take 4 of them"):
+def test_processes_that_do_not_divide_a_batch_are_refused():
+    with pytest.raises(InputError, match=r"batch_size=24 .* among 5 processes .*: use 4 processes"):
         split_batch(24, 8, 5)
     with pytest.raises(InputError, match=r"or set data\.batch_size=8\."):
         split_batch(4, None, 8)

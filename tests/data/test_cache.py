@@ -1,4 +1,4 @@
-"""What is kept of photographs: the same pixels, within bounds, and never of another file."""
+"""The cache returns the same pixels, within bounds, and never those of another file."""
 
 import numpy as np
 import pytest
@@ -25,12 +25,12 @@ def scene(tmp_path):
     return tmp_path / "s"
 
 
-def test_what_was_made_is_not_made_again(tmp_path):
+def test_arrays_are_made_once(tmp_path):
     array = numbers(100)
     cache = ImageCache(tmp_path / "cache")
     assert np.array_equal(cache.get("ab", lambda: array, to_disk=True), array)
     assert np.array_equal(cache.get("ab", never, to_disk=True), array)
-    # Another process finds it on disk; what was for memory alone it does not.
+    # Another process reads it from disk, but not an array of memory alone.
     other = ImageCache(tmp_path / "cache")
     assert np.array_equal(other.get("ab", never, to_disk=True), array)
     cache.get("cd", lambda: array, to_disk=False)
@@ -38,7 +38,7 @@ def test_what_was_made_is_not_made_again(tmp_path):
         other.get("cd", never, to_disk=True)
 
 
-def test_memory_is_bounded_and_the_longest_unused_goes_first(tmp_path):
+def test_memory_is_bounded_and_the_least_recently_used_goes_first(tmp_path):
     cache = ImageCache(None, memory_gb=2.5 * KILOBYTE)
     for key in ("a", "b"):
         cache.get(key, lambda: numbers(1000), to_disk=True)
@@ -71,7 +71,7 @@ def test_a_file_that_is_cut_short_is_made_again(tmp_path):
 
 @pytest.mark.parametrize("height, width, files", [(24, 32, 0), (12, 16, 6)])
 def test_views_are_the_same_with_a_cache(scene, tmp_path, height, width, files):
-    """Images and depths; those that are used as they are stored are not stored twice."""
+    """Images and depths; those at their stored size are not stored twice."""
     plain = open_scene(scene, SceneOptions(height, width)).views(range(3))
     for _ in range(2):
         cache = ImageCache(tmp_path / "cache")
@@ -81,7 +81,7 @@ def test_views_are_the_same_with_a_cache(scene, tmp_path, height, width, files):
         assert len(list((tmp_path / "cache").rglob("*.npy"))) == files
 
 
-def test_a_photograph_that_changes_is_read_anew(scene, tmp_path):
+def test_an_image_that_changes_is_read_again(scene, tmp_path):
     cache = ImageCache(tmp_path / "cache")
     before = open_scene(scene, SceneOptions(12, 16, cache=cache)).views([0, 1])
     first, second = (scene / f"images/0000{index}.png" for index in (0, 1))

@@ -1,4 +1,4 @@
-"""Tasks: reproducible, disjoint between stages, normalized, and batched."""
+"""Tasks: reproducible, disjoint between splits, normalized, and batched."""
 
 import lightning
 import numpy as np
@@ -15,7 +15,7 @@ from asysplat.data import (
 )
 from asysplat.data.datamodule import FixedTasks, TrainingTasks, collate, load
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection.views import Selection, every_8th_selection
+from asysplat.data.selection.views import Selection
 from asysplat.data.sources import Task
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
@@ -31,7 +31,7 @@ def procedural(**changes):
     return SceneDataModule(**(options | changes))
 
 
-READ_WITH = {
+OPTIONS = {
     **{"inputs": 3, "targets": 2, "height": 16, "width": 16, "window": (12, 24)},
     **{"batch_size": 2, "num_workers": 0, "seed": 5, "steps_per_epoch": 3},
 }
@@ -39,12 +39,31 @@ READ_WITH = {
 
 def with_test_sets(test_sets, **changes):
     scenes = {"num_images": 24, "val_scenes": 1, "test_scenes": 2, "places": "both"}
-    options = {"name": "procedural", **READ_WITH, **scenes}
+    options = {"name": "procedural", **OPTIONS, **scenes}
     return procedural_data(test_sets=test_sets, **(options | changes))
 
 
+def write_scenes(folder, *seeds):
+    for seed in seeds:
+        scene = ProceduralScene(seed, 16, 16, num_images=24)
+        write_transforms(scene.views(range(24)), folder / str(seed))
+    return str(folder)
+
+
+def set_up(data):
+    data.setup()
+    return data
+
+
+def assert_same_cameras(sample, expected):
+    assert sample["scene"] == expected["scene"]
+    for views in ("inputs", "targets"):
+        poses = (each[views].cameras.cam_to_world for each in (sample, expected))
+        assert torch.equal(*poses)
+
+
 def epoch_of_scenes(data, epoch, done=0):
-    """The scenes of an epoch, of which `done` batches were trained on before a checkpoint."""
+    """The scenes of an epoch that is resumed after `done` batches."""
     trainer = lightning.Trainer(logger=False, accelerator="cpu", enable_checkpointing=False)
     loop = trainer.fit_loop
     loop.epoch_progress.current.processed = epoch
@@ -62,22 +81,22 @@ class Trainer:
         self.current_epoch, self.global_rank, self.world_size = epoch, global_rank, world_size
 
 
-def test_an_epoch_is_the_same_however_one_gets_there():
-    whole = [epoch_of_scenes(procedural(), epoch) for epoch in range(2)]
-    assert epoch_of_scenes(procedural(), 1) == whole[1]
-    assert len({name for epoch in whole for names in epoch for name in names}) == 12
-    assert epoch_of_scenes(procedural(), 1, done=2) == whole[1][2:]
+def test_a_resumed_epoch_has_the_same_scenes():
+    epochs = [epoch_of_scenes(procedural(), epoch) for epoch in range(2)]
+    assert epoch_of_scenes(procedural(), 1) == epochs[1]
+    assert len({name for epoch in epochs for names in epoch for name in names}) == 12
+    assert epoch_of_scenes(procedural(), 1, done=2) == epochs[1][2:]
 
 
 def test_the_steps_of_several_processes_are_those_of_one(monkeypatch):
-    """Whatever a process holds at a time: two steps of 4 scenes, in the second epoch."""
+    """For any micro-batch: two steps of 4 scenes, in the second epoch."""
     monkeypatch.setattr(datamodule, "batches_done", lambda trainer: 0)
-    (whole,) = scenes_of_steps(processes=1, micro_batch=4)
-    assert len({name for step in whole for name in step}) == 8
+    (alone,) = scenes_of_steps(processes=1, micro_batch=4)
+    assert len({name for step in alone for name in step}) == 8
     for processes, micro_batch in ((2, 2), (2, 1)):
         shares = scenes_of_steps(processes, micro_batch)
         together = [sorted(name for share in shares for name in share[step]) for step in range(2)]
-        assert together == [sorted(step) for step in whole]
+        assert together == [sorted(step) for step in alone]
 
 
 def scenes_of_steps(processes, micro_batch):
@@ -95,7 +114,7 @@ def scenes_of_steps(processes, micro_batch):
 
 @pytest.mark.parametrize(("scenes", "processes"), [(3, 1), (3, 2), (5, 4), (2, 3)])
 def test_no_scene_is_evaluated_by_two_processes(scenes, processes):
-    """All take equally many turns; who has fewer scenes repeats one of its own, if it has any."""
+    """All have equally many batches; a process with fewer scenes repeats one of its own."""
     source = ProceduralSource(16, 16, 24, (12, 24), val_scenes=scenes, test_scenes=1)
     data, turns = procedural(source=source), []
     data.setup()
@@ -140,15 +159,15 @@ def test_augmented_tasks_are_repeated_by_their_seed():
 
 
 class Counting:
-    """A sequence that remembers which frames were decoded."""
+    """A sequence that lists the images that were decoded."""
 
     def __init__(self, scene):
         self.scene, self.name, self.num_images = scene, scene.name, scene.num_images
         self.cameras, self.decoded = scene.cameras, []
 
-    def views(self, frames):
-        self.decoded += frames
-        return self.scene.views(frames)
+    def views(self, indices):
+        self.decoded += indices
+        return self.scene.views(indices)
 
 
 def test_an_input_that_is_a_target_is_decoded_once():
@@ -160,7 +179,7 @@ def test_an_input_that_is_a_target_is_decoded_once():
     assert torch.equal(sample["targets"].images, images[[2, 3, 0]])
 
 
-def test_fixed_tasks_stay_loaded_as_long_as_there_is_room(monkeypatch):
+def test_fixed_tasks_stay_loaded_up_to_a_limit(monkeypatch):
     sequences = [Counting(ProceduralScene(seed, 16, 16, num_images=24)) for seed in range(3)]
     tasks = [Task(sequence, Selection([0, 1], [2])) for sequence in sequences]
     monkeypatch.setattr(datamodule, "MAX_LOADED_BYTES", 1.5 * 3 * 3 * 16 * 16 * 4)
@@ -172,8 +191,7 @@ def test_fixed_tasks_stay_loaded_as_long_as_there_is_room(monkeypatch):
 
 
 def test_evaluation_scenes_are_never_trained_on():
-    data = procedural()
-    data.setup()
+    data = set_up(procedural())
     evaluated = {sample["scene"] for split in data.evaluation.values() for sample in split}
     trained_on = {TrainingTasks(data)[i]["scene"] for i in range(5)}
     assert len(evaluated) == 2 and not evaluated & trained_on
@@ -188,14 +206,8 @@ def test_inputs_are_normalized_and_batches_stack():
     torch.testing.assert_close(centers.mean(1), torch.zeros(2, 3), atol=1e-5, rtol=0)
 
 
-def test_too_short_a_folder():
-    with pytest.raises(InputError, match=r"data\.inputs"):
-        every_8th_selection(6, 8, 4, "test")
-
-
-def test_a_test_set_differs_in_its_options_alone():
-    data = with_test_sets({"rooms": {"places": "rooms"}, "more_views": {"inputs": 5}})
-    data.setup()
+def test_a_test_set_differs_only_in_its_options():
+    data = set_up(with_test_sets({"rooms": {"places": "rooms"}, "more_views": {"inputs": 5}}))
     assert list(data.tests) == ["procedural", "rooms", "more_views"]
     for scenes, loader in zip(data.tests.values(), data.test_dataloader(), strict=True):
         batches = [batch["scene"] for batch in loader]
@@ -218,167 +230,137 @@ def test_a_set_of_one_kind_of_place(places):
 
 
 REFUSED = {
-    "an unknown option": ({"far": {"palces": "rooms"}}, r"data\.test_sets\.far\.palces is no"),
-    "an option of training": ({"far": {"window": [4, 8]}}, r"data\.test_sets\.far\.window is no"),
-    "no options": ({"far": 16}, r"data\.test_sets\.far is 16: give the options"),
-    "the main set's name": ({"procedural": {}}, r"data\.test_sets\.procedural has the name"),
-    "unknown places": ({"far": {"places": "caves"}}, r"data\.test_sets\.far: data\.places is"),
-    "too many views": ({"far": {"inputs": 30}}, r"data\.test_sets\.far: .* 24 frames"),
+    "an unknown option": ({"far": {"palces": "rooms"}}, r"\.far\.palces is no"),
+    "an option of training": ({"far": {"window": [4, 8]}}, r"\.far\.window is no"),
+    "no options": ({"far": 16}, r"\.far is 16: give the options"),
+    "the main set's name": ({"procedural": {}}, r"\.procedural has the name"),
+    "unknown places": ({"far": {"places": "caves"}}, r"\.far: data\.places is"),
+    "too many views": ({"far": {"inputs": 30}}, r"\.far: .* 24 images"),
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_an_unusable_test_set_is_named(case):
-    test_sets, message = REFUSED[case]
-    with pytest.raises(InputError, match=message):
+@pytest.mark.parametrize("test_sets, message", REFUSED.values(), ids=REFUSED.keys())
+def test_an_unusable_test_set_is_named(test_sets, message):
+    with pytest.raises(InputError, match=rf"data\.test_sets{message}"):
         with_test_sets(test_sets).setup()
 
 
 def test_a_test_set_has_a_size_of_its_own():
-    data = with_test_sets({"wide": {"height": 24, "width": 40}})
-    data.setup()
+    data = set_up(with_test_sets({"wide": {"height": 24, "width": 40}}))
     images = {name: scenes[0]["inputs"].images for name, scenes in data.tests.items()}
     assert images["procedural"].shape[-2:] == (16, 16)
     assert images["wide"].shape[-2:] == (24, 40)
     checked = []
     data.check_sizes(lambda *size: checked.append(size))
     assert set(checked) == {(16, 16), (24, 40)}
-
-    def check(height, width):
-        if width == 40:
-            raise InputError("40 is too wide.")
-
     with pytest.raises(InputError, match=r"^data\.test_sets\.wide: 40 is too wide\.$"):
-        data.check_sizes(check)
+        data.check_sizes(refuse(40))
 
 
-def test_tests_may_have_a_size_that_is_not_trained(tmp_path):
-    """The same scenes and frames, larger; a test set keeps a size of its own."""
+def refuse(refused):
+    def check(height, width):
+        if width == refused:
+            raise InputError(f"{width} is too wide.")
+
+    return check
+
+
+def test_tests_may_have_another_size_than_training():
+    """The same scenes and images, larger; a test set keeps a size of its own."""
     sets = {"rooms": {"places": "rooms"}, "wide": {"height": 16, "width": 32}}
-    data, small = with_test_sets(sets, test_size=[32, 48]), with_test_sets(sets)
-    data.setup()
-    small.setup()
+    data = set_up(with_test_sets(sets, test_size=[32, 48]))
+    small = set_up(with_test_sets(sets))
     sizes = {name: tasks[0]["inputs"].images.shape[-2:] for name, tasks in data.tests.items()}
     assert sizes == {"procedural": (32, 48), "rooms": (32, 48), "wide": (16, 32)}
     for sample in (TrainingTasks(data)[0], data.evaluation["val"][0]):
         assert sample["inputs"].images.shape[-2:] == (16, 16)
     for sample, expected in zip(data.tests["procedural"], small.tests["procedural"], strict=True):
-        assert sample["scene"] == expected["scene"]
-        for views in ("inputs", "targets"):
-            poses = (each[views].cameras.cam_to_world for each in (sample, expected))
-            assert torch.equal(*poses)
-
-    def refuse(height, width):
-        if width == 48:
-            raise InputError("too wide")
-
-    with pytest.raises(InputError, match=r"^data\.test_size: too wide"):
-        data.check_sizes(refuse)
+        assert_same_cameras(sample, expected)
+    with pytest.raises(InputError, match=r"^data\.test_size: 48 is too wide"):
+        data.check_sizes(refuse(48))
 
 
 def test_which_test_sets_are_tested(tmp_path):
-    scene = ProceduralScene(3, 16, 16, num_images=24)
-    write_transforms(scene.views(range(24)), tmp_path)
-    sets = {"here": {"root": str(tmp_path), "selection": "kmeans"}, "nowhere": {"root": None}}
+    root = f"{write_scenes(tmp_path, 3)}/3"
+    sets = {"here": {"root": root, "selection": "kmeans"}, "nowhere": {"root": None}}
     assert not with_test_sets(sets).test_sets
-    own = {"root": str(tmp_path), "name": "own", "on_bad_image": "fail"} | READ_WITH
+    own = {"root": root, "name": "own", "on_bad_image": "fail"} | OPTIONS
     same = {"own": {"root": "elsewhere"}, "more": {"inputs": 5}}
     with pytest.warns(UserWarning, match=r"their paths are not set: nowhere\. .* paths\.no"):
         data = files_data(test_sets=sets | same, **own)
     assert list(data.test_sets) == ["here", "more"]
     with pytest.raises(InputError, match=r"data\.test_sets\.own has the name of the data"):
         files_data(test_sets={"own": {"inputs": 5}}, **own)
+    with pytest.raises(InputError, match=r"data\.test_sets\.lost: data\.root=.*nowhere"):
+        files_data(test_sets={"lost": {"root": f"{root}/nowhere"}}, **own).setup()
 
 
-def test_a_test_set_beside_scenes_that_are_tested(tmp_path):
+def test_a_test_set_beside_a_test_root(tmp_path):
     """Its root is what it tests, as test_root is of the data set; options are its own."""
-    for name, seeds in {"train": (3, 4, 5), "test": (6,), "other": (7,)}.items():
-        for seed in seeds:
-            scene = ProceduralScene(seed, 16, 16, num_images=24)
-            write_transforms(scene.views(range(24)), tmp_path / name / str(seed))
-    data = files_data(
-        **{"name": "files", "root": f"{tmp_path}/train", "test_root": f"{tmp_path}/test"},
-        **{"test_sets": {"far": {"root": f"{tmp_path}/other", "selection": "kmeans"}, "more": {}}},
-        **{"val_scenes": 1, **READ_WITH},
+    far = {"root": write_scenes(tmp_path / "other", 7), "selection": "kmeans"}
+    options = {
+        "root": write_scenes(tmp_path / "train", 3, 4, 5),
+        "test_root": write_scenes(tmp_path / "test", 6),
+        "val_scenes": 1,
+    }
+    data = set_up(
+        files_data(name="files", test_sets={"far": far, "more": {}}, **options, **OPTIONS)
     )
-    data.setup()
     scenes = {name: [sample["scene"] for sample in tasks] for name, tasks in data.tests.items()}
     assert scenes == {"files": ["6"], "far": ["7"], "more": ["6"]}
-    # Every 8th of 24 frames, where the data set itself takes two of them.
+    # Every 8th of 24 images, where the data set itself takes two of them.
     targets = {name: tasks[0]["targets"].num_views for name, tasks in data.tests.items()}
     assert targets == {"files": 2, "far": 3, "more": 2}
+    alone = set_up(files_data(name="far", **far, **OPTIONS))
+    (scene,), (expected,) = data.tests["far"], alone.evaluation["test"]
+    assert torch.equal(scene["targets"].images, expected["targets"].images)
     drawn = {TrainingTasks(data)[index]["scene"] for index in range(20)}
     (validated,) = (sample["scene"] for sample in data.evaluation["val"])
     assert drawn | {validated} == {"3", "4", "5"} and validated not in drawn
 
 
-@pytest.mark.parametrize("test_root", [None, "3"], ids=["frames", "scenes"])
-def test_photographs_are_tested_on_the_same_frames_at_another_size(tmp_path, test_root):
-    for seed in (3, 4, 5):
-        scene = ProceduralScene(seed, 16, 16, num_images=24)
-        write_transforms(scene.views(range(24)), tmp_path / str(seed))
-    options = {"name": "files", "root": str(tmp_path), "val_scenes": 1, **READ_WITH}
+@pytest.mark.parametrize("test_root", [None, "3"], ids=["images", "scenes"])
+def test_files_are_tested_on_the_same_images_at_another_size(tmp_path, test_root):
+    options = {"name": "files", "root": write_scenes(tmp_path, 3, 4, 5), "val_scenes": 1, **OPTIONS}
     options["test_root"] = test_root and str(tmp_path / test_root)
-    data, plain = files_data(**options, test_size=[8, 8]), files_data(**options)
-    data.setup()
-    plain.setup()
+    data, plain = set_up(files_data(**options, test_size=[8, 8])), set_up(files_data(**options))
     assert len(data.tests["files"]) == (3 if test_root is None else 1)
     for sample, expected in zip(data.tests["files"], plain.tests["files"], strict=True):
         assert sample["targets"].images.shape[-2:] == (8, 8)
-        for views in ("inputs", "targets"):
-            poses = (each[views].cameras.cam_to_world for each in (sample, expected))
-            assert torch.equal(*poses)
-
-
-def test_a_test_set_in_another_folder(tmp_path):
-    for seed in (3, 4):
-        scene = ProceduralScene(seed, 16, 16, num_images=24)
-        write_transforms(scene.views(range(24)), tmp_path / str(seed))
-    options = {"name": "transforms", "root": str(tmp_path / "3"), **READ_WITH}
-    data = files_data(test_sets={"other": {"root": str(tmp_path / "4")}}, **options)
-    data.setup()
-    alone = files_data(**(options | {"root": str(tmp_path / "4")}))
-    alone.setup()
-    (scene,), (expected,) = data.tests["other"], alone.evaluation["test"]
-    assert torch.equal(scene["targets"].images, expected["targets"].images)
-    with pytest.raises(InputError, match=r"data\.test_sets\.lost: data\.root=.*nowhere"):
-        files_data(test_sets={"lost": {"root": f"{tmp_path}/nowhere"}}, **options).setup()
+        assert_same_cameras(sample, expected)
 
 
 @pytest.fixture
 def folders(tmp_path):
-    """Scenes to train on, 3, 4 and 5, of which 4 has a photograph that is cut short, and a test."""
-    for name, seeds in {"train": (3, 4, 5), "test": (6,)}.items():
-        for seed in seeds:
-            scene = ProceduralScene(seed, 16, 16, num_images=24)
-            write_transforms(scene.views(range(24)), tmp_path / name / str(seed))
+    """Scenes 3, 4 and 5 to train on, and a test; every image of scene 4 is cut short."""
+    roots = {"root": write_scenes(tmp_path / "train", 3, 4, 5)}
     for image in (tmp_path / "train" / "4" / "images").iterdir():
         image.write_bytes(image.read_bytes()[:100])
-    return {"name": "files", "root": f"{tmp_path}/train", "test_root": f"{tmp_path}/test"}
+    return {"name": "files", **roots, "test_root": write_scenes(tmp_path / "test", 6)}
 
 
-def test_another_scene_is_drawn_in_place_of_one_that_cannot_be_read(folders):
-    options = {"val_scenes": 1, **folders, **READ_WITH}
+def test_another_scene_is_drawn_where_one_cannot_be_read(folders):
+    options = {"val_scenes": 1, **folders, **OPTIONS}
     with pytest.raises(InputError, match=r"train/4/images/\S+ cannot be read as an image"):
         for index in range(20):
             TrainingTasks(files_data(**options))[index]
 
     tasks = TrainingTasks(files_data(**options, on_bad_scene="skip"))
     samples = [tasks[index] for index in range(20)]
-    skipped = [len(sample["bad_scenes"]) for sample in samples]
+    counts = [len(sample["bad_scenes"]) for sample in samples]
     assert {"4"}.isdisjoint(sample["scene"] for sample in samples)
-    assert 0 in skipped and sum(skipped) >= 5
+    assert 0 in counts and sum(counts) >= 5
     assert all("train/4: 24 of 24" in each for sample in samples for each in sample["bad_scenes"])
     batch = collate(samples)
-    assert len(batch["bad_scenes"]) == sum(skipped)
+    assert len(batch["bad_scenes"]) == sum(counts)
     again = files_data(**options, on_bad_scene="skip")
     for index, sample in enumerate(samples):
         assert torch.equal(TrainingTasks(again)[index]["inputs"].images, sample["inputs"].images)
 
 
-def test_no_scene_that_can_be_read(folders, tmp_path):
+def test_no_scene_can_be_read(folders, tmp_path):
     for image in (tmp_path / "train").rglob("images/*"):
         image.unlink()
-    data = files_data(val_scenes=1, **folders, **READ_WITH, on_bad_scene="skip")
+    data = files_data(val_scenes=1, **folders, **OPTIONS, on_bad_scene="skip")
     with pytest.raises(InputError, match=r"^10 training scenes in a row cannot be used, .*/train/"):
         TrainingTasks(data)[0]

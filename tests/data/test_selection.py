@@ -22,7 +22,7 @@ from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
 
-# Inputs that k-means finds, on every machine.
+# Inputs by k-means, the same on every machine.
 CIRCLE = [1, 15, 33, 47, 62, 75, 89, 103]
 LINE = [6, 19, 34, 49, 62, 74, 85, 95]
 MYDESK = [
@@ -44,32 +44,21 @@ def cameras_at(centers, forwards=None) -> Cameras:
     return Cameras(torch.eye(3, dtype=torch.float64).repeat(len(centers), 1, 1), poses, 4, 4)
 
 
-def test_evaluation_inputs_are_even_and_targets_midway():
-    selected = uniform_selection(num_images=17, num_inputs=5, num_targets=4)
-    assert selected.inputs == [0, 4, 8, 12, 16]
-    assert selected.targets == [2, 6, 10, 14]
-
-
-def test_evaluation_targets_are_spread_over_the_gaps():
-    selected = uniform_selection(num_images=81, num_inputs=9, num_targets=2)
-    assert selected.targets == [25, 65]
-
-
-def test_evaluation_uses_every_frame_of_the_shortest_sequence():
-    selected = uniform_selection(num_images=7, num_inputs=4, num_targets=3)
-    assert selected.inputs == [0, 2, 4, 6]
-    assert selected.targets == [1, 3, 5]
+def test_uniform_inputs_are_even_and_targets_midway():
+    assert uniform_selection(17, 5, 4) == Selection([0, 4, 8, 12, 16], [2, 6, 10, 14])
+    assert uniform_selection(81, 9, 2).targets == [25, 65]  # spread over the gaps
+    assert uniform_selection(7, 4, 3) == Selection([0, 2, 4, 6], [1, 3, 5])  # every image
 
 
 @pytest.mark.parametrize("num_images", range(8, 60))
-def test_evaluation_never_shares_or_repeats_a_frame(num_images):
+def test_uniform_never_shares_or_repeats_an_image(num_images):
     selected = uniform_selection(num_images, num_inputs=3, num_targets=5)
     chosen = selected.inputs + selected.targets
     assert len(set(chosen)) == 8 and min(chosen) >= 0 and max(chosen) < num_images
     assert selected.targets == sorted(selected.targets)
 
 
-def test_training_stays_in_its_window_and_never_shares_a_frame():
+def test_training_stays_in_its_window_and_never_shares_an_image():
     rng = np.random.default_rng(0)
     starts = set()
     for _ in range(200):
@@ -84,34 +73,29 @@ def test_training_stays_in_its_window_and_never_shares_a_frame():
     assert min(starts) <= 1 and max(starts) >= 36 and len(starts) > 30
 
 
-def test_training_is_repeated_by_its_seed():
-    drawn = [
+def test_training_is_repeated_by_its_seed_and_its_window_is_clipped():
+    first, again, other = (
         training_selection(50, 4, 3, (10, 20), np.random.default_rng(seed)) for seed in (1, 1, 2)
-    ]
-    assert drawn[0] == drawn[1] != drawn[2]
-
-
-def test_window_is_clipped_to_a_short_sequence():
+    )
+    assert first == again != other
     selected = training_selection(9, 4, 3, (64, 128), np.random.default_rng(0))
     assert selected.inputs == [0, 3, 5, 8]
 
 
-def test_too_short_a_sequence_says_what_to_set():
+def test_too_short_a_sequence_is_refused():
     with pytest.raises(InputError, match=r"has 6 images.*data\.inputs and data\.targets.*6"):
         uniform_selection(6, num_inputs=4, num_targets=3)
     with pytest.raises(InputError, match="has 6 images"):
         training_selection(6, 4, 3, (8, 9), np.random.default_rng(0))
+
+    with pytest.raises(InputError, match=r"data\.inputs is 0"):
+        uniform_selection(9, num_inputs=0, num_targets=3)
 
 
 @pytest.mark.parametrize("window", [(6, 20), (20, 10)])
 def test_unusable_window_is_named(window):
     with pytest.raises(InputError, match=r"data\.window"):
         training_selection(50, 4, 3, window, np.random.default_rng(0))
-
-
-def test_zero_inputs_are_refused():
-    with pytest.raises(InputError, match=r"data\.inputs is 0"):
-        uniform_selection(9, num_inputs=0, num_targets=3)
 
 
 def test_targets_of_training_may_be_inputs():
@@ -121,11 +105,11 @@ def test_targets_of_training_may_be_inputs():
         selected = training_selection(50, 4, 3, (8, 8), rng, targets_may_be_inputs=True)
         assert len(set(selected.targets)) == 3 and min(selected.inputs) <= min(selected.targets)
         shared.append(len(set(selected.inputs) & set(selected.targets)))
-    # 3 of 8 frames, of which 4 are inputs.
+    # 3 of 8 images; 4 of the 8 are inputs.
     assert 1.2 < np.mean(shared) < 1.8
 
 
-def test_frames_of_a_folder_are_tested_or_validated_or_trained():
+def test_every_image_tests_or_validates_or_trains():
     sets = [set(held_out(50, "test")), set(held_out(50, "val")), set(training_images(50))]
     assert set.union(*sets) == set(range(50))
     assert sum(map(len, sets)) == 50
@@ -134,7 +118,7 @@ def test_frames_of_a_folder_are_tested_or_validated_or_trained():
     assert len(selected.inputs) == 8 and len(selected.targets) == 4
 
 
-def test_first_96_frames():
+def test_first_96_images():
     selected = first_96_selection(300, 32, 8, "test")
     assert selected.targets == [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88]
     # Every 2.68th of the 84 others, which begin with 1 and end with 95.
@@ -147,7 +131,7 @@ def test_first_96_frames():
 
 
 @pytest.mark.parametrize("selection", ["every_8th", "kmeans", "first_96"])
-def test_validation_sees_no_frame_of_the_test(selection):
+def test_validation_shares_no_image_with_the_test(selection):
     cameras = cameras_at(np.random.default_rng(0).normal(size=(70, 3)))
     selected = named_selection(selection, cameras, 8, 4, "val")
     assert len(selected.inputs) == 8 and len(selected.targets) == 4
@@ -157,13 +141,9 @@ def test_validation_sees_no_frame_of_the_test(selection):
     assert not set(tested.targets) & set(training_images(70))
 
 
-def test_uniform_is_the_evaluation_of_made_up_scenes():
-    found = named_selection("uniform", cameras_at(torch.rand(17, 3)), 5, 4, "test")
-    assert found == uniform_selection(17, 5, 4)
-
-
 def test_unknown_selections_and_short_sequences_are_named():
     cameras = cameras_at(torch.rand(20, 3))
+    assert named_selection("uniform", cameras, 5, 4, "test") == uniform_selection(20, 5, 4)
     with pytest.raises(InputError, match=r"data\.selection is 'k_means': expected one of every_8"):
         named_selection("k_means", cameras, 4, 4, "test")
     for selection in ("every_8th", "kmeans", "first_96"):
@@ -190,8 +170,8 @@ def test_kmeans_finds_the_middle_of_planted_clusters():
     assert selected == Selection(MIDDLES, [0, 8, 16, 24, 32])
 
 
-def test_kmeans_tells_directions_apart_as_well():
-    """Two places, and at each cameras that look left and right, whatever the unit of length."""
+def test_kmeans_separates_directions_too():
+    """Two places, and at each cameras that look left and right, in any unit of length."""
     place = np.arange(40) % 10 // 5
     look = np.arange(40) // 20
     rng = np.random.default_rng(0)
@@ -237,8 +217,8 @@ def test_kmeans_of_a_circle_and_of_a_walk():
 
 
 @pytest.mark.parametrize("count", [1, 7, 30, 31])
-def test_no_frame_is_chosen_twice(count):
-    """Four places, at each of which eight cameras stand and look alike."""
+def test_no_image_is_chosen_twice(count):
+    """Four places with eight equal cameras each."""
     features = np.repeat(np.eye(4, 6), 8, axis=0)
     rows = nearest_to_centers(features, count)
     assert len(set(rows)) == len(rows) == count
@@ -246,7 +226,7 @@ def test_no_frame_is_chosen_twice(count):
         assert {row // 8 for row in rows} == set(range(4))
 
 
-def test_positions_and_directions_weigh_alike():
+def test_positions_and_directions_have_equal_weight():
     features = pose_features(planted())
     lengths = np.linalg.norm(features.reshape(36, 2, 3), axis=-1)
     assert abs((lengths[:, 0] ** 2).mean() - 1) < 1e-3 and np.allclose(lengths[:, 1], 1)
@@ -267,7 +247,7 @@ def test_kmeans_of_a_real_walk(shared):
     assert selected.targets == list(range(0, 498, 8))
     published = read_index(file, 32).selection("mydesk", cameras, 32)
     assert published.targets == selected.targets and len(published.inputs) == 32
-    # They cover the walk about as well: the farthest frame from an input is about as far.
+    # They cover the walk about as well: the farthest image from an input is about as far.
     features = pose_features(cameras)
     distance = [
         np.linalg.norm(features[:, None] - features[inputs], axis=-1).min(1).max()
@@ -301,7 +281,7 @@ def test_long_lrm_s_lists(tmp_path):
         read_index(tmp_path, 4)
 
 
-def test_our_index_is_of_these_cameras_and_unchanged(tmp_path):
+def test_our_index_detects_other_cameras_and_changes(tmp_path):
     file = tmp_path / "index.json"
     selected = kmeans_selection(line(), 4, 4, "test")
     write_index(file, "kmeans", {"walk": Entry(selected, camera_hash(line()))})
@@ -315,7 +295,7 @@ def test_our_index_is_of_these_cameras_and_unchanged(tmp_path):
         read_index(file, 4)
 
 
-def test_the_hash_is_of_the_cameras_alone():
+def test_the_hash_depends_only_on_the_cameras():
     walk = line(10)
     far = Cameras(walk.intrinsics, walk.cam_to_world.clone(), 4, 4)
     far.cam_to_world[:, :3, 3] = 7 * far.cam_to_world[:, :3, 3] + 3
@@ -334,9 +314,8 @@ UNUSABLE = {
 }
 
 
-@pytest.mark.parametrize("case", UNUSABLE)
-def test_an_unusable_index_is_named(case, tmp_path):
-    text, message = UNUSABLE[case]
+@pytest.mark.parametrize("text, message", UNUSABLE.values(), ids=UNUSABLE.keys())
+def test_an_unusable_index_is_named(text, message, tmp_path):
     (tmp_path / "index.json").write_text(text)
     with pytest.raises(InputError, match=rf"index\.json.*{message}"):
         read_index(tmp_path / "index.json", 2)

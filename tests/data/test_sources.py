@@ -1,4 +1,4 @@
-"""Scenes on disk: what trains and what is tested, opened when needed."""
+"""Scenes on disk: which train and which test, opened when needed."""
 
 import json
 import shutil
@@ -6,19 +6,19 @@ import shutil
 import numpy as np
 import pytest
 
-from asysplat.data import FilesSource, SceneOptions, scene_folder
+from asysplat.data import FilesSource, SceneOptions, sources
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.selection.kmeans import kmeans_selection
 from asysplat.data.selection.views import Selection, held_out
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 
-FRAMES = 24
+IMAGES = 24
 SIZE = SceneOptions(8, 8)
 
 
-def made(seed: int) -> ProceduralScene:
-    return ProceduralScene(seed, SIZE.height, SIZE.width, num_images=FRAMES)
+def procedural(seed: int) -> ProceduralScene:
+    return ProceduralScene(seed, SIZE.height, SIZE.width, num_images=IMAGES)
 
 
 @pytest.fixture(scope="module")
@@ -26,13 +26,13 @@ def written(tmp_path_factory):
     """A folder with the scenes s0 to s7."""
     root = tmp_path_factory.mktemp("scenes")
     for seed in range(8):
-        write_transforms(made(seed).views(range(FRAMES)), root / f"s{seed}")
+        write_transforms(procedural(seed).views(range(IMAGES)), root / f"s{seed}")
     return root
 
 
 @pytest.fixture
 def folder(written, tmp_path):
-    """Makes a folder with copies of some of the scenes."""
+    """Make a folder with copies of some of the scenes."""
 
     def copy(name, *seeds):
         for seed in seeds:
@@ -51,8 +51,8 @@ def opened(monkeypatch):
         names.append(path.name)
         return real(path, *arguments, **options)
 
-    real = scene_folder.open_scene
-    monkeypatch.setattr(scene_folder, "open_scene", open_scene)
+    real = sources.open_scene
+    monkeypatch.setattr(sources, "open_scene", open_scene)
     return names
 
 
@@ -65,21 +65,21 @@ def names(tasks):
     return {task.sequence.name for task in tasks}
 
 
-def frames(tasks):
-    return {frame for task in tasks for frame in task.selection.inputs + task.selection.targets}
+def images(tasks):
+    return {index for task in tasks for index in task.selection.inputs + task.selection.targets}
 
 
 def test_a_written_scene_trains_like_the_scene_itself(folder):
     source = FilesSource(folder("one", 3), SIZE, (12, 24))
     (task,) = source.evaluation("test", 4, 2)
     read = task.sequence.views(task.selection.targets)
-    views = made(3).views(task.selection.targets)
+    views = procedural(3).views(task.selection.targets)
     assert (read.images - views.images).abs().max() < 1 / 255
     assert (read.depths - views.depths).abs().max() < 1e-3
     assert (read.cameras.cam_to_world - views.cameras.cam_to_world).abs().max() < 1e-5
     assert (read.cameras.intrinsics - views.cameras.intrinsics).abs().max() < 1e-5
-    held = set(held_out(FRAMES, "test") + held_out(FRAMES, "val"))
-    assert frames(drawn(source)) == set(range(FRAMES)) - held
+    held = set(held_out(IMAGES, "test") + held_out(IMAGES, "val"))
+    assert images(drawn(source)) == set(range(IMAGES)) - held
 
 
 def test_a_folder_without_scenes(tmp_path, written):
@@ -98,9 +98,9 @@ def test_scenes_are_opened_when_they_are_drawn(folder, opened):
     assert sorted(opened) == [f"s{seed}" for seed in range(6)]
 
 
-def test_scenes_that_were_long_unused_are_closed(folder, opened, monkeypatch):
-    monkeypatch.setattr(scene_folder, "MAX_OPEN", 2)
-    folder = scene_folder.SceneFolder(folder("many", 0, 1, 2), SIZE)
+def test_the_least_recently_used_scenes_are_closed(folder, opened, monkeypatch):
+    monkeypatch.setattr(sources, "MAX_OPEN", 2)
+    folder = sources.SceneFolder(folder("many", 0, 1, 2), SIZE)
     assert len(folder) == 3
     first = folder[0]
     assert folder[0] is first and folder[1].name == "s1" and folder[0] is first
@@ -110,7 +110,7 @@ def test_scenes_that_were_long_unused_are_closed(folder, opened, monkeypatch):
 
 
 def test_tested_scenes_are_not_trained_on(folder):
-    """Though the root holds them, deeper down, too."""
+    """Although the root holds them too, in subfolders."""
     root, tested = folder("all/1K", *range(8)), folder("tested", 2, 5)
     source = FilesSource(root, SIZE, (12, 24), test_root=tested, val_scenes=2)
     validated = names(source.evaluation("val", 4, 2))
@@ -118,7 +118,7 @@ def test_tested_scenes_are_not_trained_on(folder):
     trained = names(drawn(source))
     assert len(validated) == 2 and len(trained) == 4
     assert trained | validated == {f"s{seed}" for seed in range(8)} - {"s2", "s5"}
-    assert frames(drawn(source)) == set(range(FRAMES))
+    assert images(drawn(source)) == set(range(IMAGES))
 
 
 def test_a_test_root_leaves_scenes_to_train_on(folder):
@@ -128,33 +128,33 @@ def test_a_test_root_leaves_scenes_to_train_on(folder):
         drawn(source)
 
 
-def test_a_damaged_scene_is_never_another_scene(folder):
+def test_a_damaged_scene_is_never_replaced(folder):
     root = folder("broken", 0, 1, 2)
     source = FilesSource(root, SIZE, (12, 24))
     image = source.scenes.paths[1] / "images/00003.png"
     image.write_bytes(image.read_bytes()[:50])
-    whole = FilesSource(folder("whole", 0, 1, 2), SIZE, (12, 24))
-    found = set()
+    intact = FilesSource(folder("intact", 0, 1, 2), SIZE, (12, 24))
+    drawn_scenes = set()
     for seed in range(20):
         rngs = [np.random.default_rng(seed) for _ in range(2)]
-        expected = whole.training(4, 2, rngs[0])
-        found.add(expected.sequence.name)
+        expected = intact.training(4, 2, rngs[0])
+        drawn_scenes.add(expected.sequence.name)
         if expected.sequence.name == "s1":
             with pytest.raises(InputError, match=r"s1/images/00003\.png cannot be read"):
                 source.training(4, 2, rngs[1])
         else:
             assert source.training(4, 2, rngs[1]).sequence.name == expected.sequence.name
-    assert found == {"s0", "s1", "s2"}
+    assert drawn_scenes == {"s0", "s1", "s2"}
 
 
-def test_targets_may_be_inputs_where_asked(folder):
+def test_targets_may_be_inputs(folder):
     root = folder("one", 3)
     shared = [
         any(
             set(task.selection.inputs) & set(task.selection.targets)
-            for task in drawn(FilesSource(root, SIZE, (12, 24), targets_may_be_inputs=asked))
+            for task in drawn(FilesSource(root, SIZE, (12, 24), targets_may_be_inputs=allowed))
         )
-        for asked in (False, True)
+        for allowed in (False, True)
     ]
     assert shared == [False, True]
 
@@ -163,17 +163,17 @@ def test_the_selection_is_that_of_the_test(folder):
     root = folder("two", 3, 4)
     source = FilesSource(root, SIZE, (12, 24), selection="kmeans")
     for task in source.evaluation("test", 4, 2):
-        cameras = made(int(task.sequence.name[1:])).cameras
+        cameras = procedural(int(task.sequence.name[1:])).cameras
         assert task.selection == kmeans_selection(cameras, 4, 2, "test")
         assert task.selection.targets == [0, 8, 16]
-    assert not frames(drawn(source)) & {0, 8, 16}
+    assert not images(drawn(source)) & {0, 8, 16}
     with pytest.raises(InputError, match=r"data\.selection is 'k-means'"):
         FilesSource(root, SIZE, (12, 24), selection="k-means").evaluation("test", 4, 2)
 
 
 @pytest.fixture
 def index(tmp_path):
-    """Writes an index of pixelSplat's form and gives its path."""
+    """Write an index of pixelSplat's form and return its path."""
 
     def write(**scenes):
         file = tmp_path / "index.json"
@@ -201,9 +201,9 @@ def test_an_index_that_does_not_fit(folder, index):
     entry = {"context": [3, 20], "target": [9]}
     options = {"selection": "index", "index": index(s2=entry, s7=entry, s9=entry)}
     source = FilesSource(root, SIZE, (12, 24), **options)
-    with pytest.raises(InputError, match=r"names 2 scenes that are not there, such as s7"):
+    with pytest.raises(InputError, match=r"names 2 scenes that do not exist, such as s7"):
         source.evaluation("test", 2, 2)
-    with pytest.raises(InputError, match=r"data\.selection=index would test frames that are"):
+    with pytest.raises(InputError, match=r"data\.selection=index would test images that are"):
         drawn(source)
     with pytest.raises(InputError, match=r"data\.selection is kmeans and data\.index is"):
         FilesSource(root, SIZE, (12, 24), **(options | {"selection": "kmeans"}))

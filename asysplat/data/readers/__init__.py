@@ -4,7 +4,8 @@ A layout is the arrangement of a data set's files in its folder. Its reader is a
 functions:
 
 find_scenes(root) -> list[Path]         the scenes of this layout that `root` is or holds
-read_scene(scene, bad) -> PosedScene    one of them; errors of single images are collected in `bad`
+read_scene(scene, bad) -> PosedScene    one of them; errors of single images are collected in `bad`,
+                                        and an InputError is raised for a scene that is not usable
 
 To add a layout: write such a module (`llff` is a short one, `common` has shared functions), add it
 to READERS, write conf/data/NAME.yaml and a section of data/README.md, and add a writer of it in

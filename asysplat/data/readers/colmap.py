@@ -54,14 +54,9 @@ def find_scenes(root: Path) -> list[Path]:
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     """Read a folder with a model and the images that it names.
 
-    The names are relative to `images`, `images_undistort`, `images_2`, `images_4`, `images_8` or
-    the folder itself: the first of those that holds the most of them. Reads the registered images,
-    ordered by the numbers in their names (2 before 10); a warning lists images that are not
+    The names are relative to the first of FOLDERS that holds the most of them. Reads the registered
+    images, ordered by the numbers in their names (2 before 10); a warning lists images that are not
     registered. Where images are smaller than their cameras' size, the intrinsics are scaled.
-
-    Raises:
-        InputError: a model that is cut short, a camera model that is not in PARAMETERS, or no
-            image that the model names.
     """
     model = _find_model(scene)
     if model is None:
@@ -115,15 +110,12 @@ def _same_world(pairs: Float[ndarray, "N 2 4 4"]) -> bool:
 
 def _find_model(scene: Path) -> Path | None:
     models = (scene / name for name in MODELS)
-    return next((m for m in models if _is_binary(m) or (m / "cameras.txt").is_file()), None)
-
-
-def _is_binary(model: Path) -> bool:
-    return (model / "cameras.bin").is_file()
+    kinds = ("cameras.bin", "cameras.txt")
+    return next((m for m in models if any((m / kind).is_file() for kind in kinds)), None)
 
 
 def _read(model: Path) -> pycolmap.Reconstruction:
-    colmap, binary = pycolmap.Reconstruction(), _is_binary(model)
+    colmap, binary = pycolmap.Reconstruction(), (model / "cameras.bin").is_file()
     for file in model.glob("*.bin"):
         _check_lengths(file)
     try:

@@ -1,6 +1,7 @@
 """Functions that several readers share: folders, JSON, intrinsics and poses, each checked.
 
-`size` is always (width, height) of an image, `where` the file and the image, for messages.
+`size` is always (width, height) of an image, `where` the file and the image, for messages. Whatever
+does not pass a check raises an InputError.
 """
 
 import json
@@ -54,11 +55,7 @@ def read_text(file: Path) -> str:
 
 
 def read_json(file: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        InputError: the file is missing, empty or not JSON.
-    """
+    """Read a JSON file."""
     if not file.is_file():
         raise InputError(f"{file} does not exist: put it there, or name another file.")
     text = read_text(file)
@@ -71,11 +68,7 @@ def read_json(file: Path) -> Any:
 
 
 def read_frames(file: Path) -> dict[str, Any]:
-    """Read a JSON object with a list "frames".
-
-    Raises:
-        InputError: it has none.
-    """
+    """Read a JSON object with a list "frames"."""
     content = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise InputError(f'{file} has no list "frames": give one entry for each image.')
@@ -88,22 +81,14 @@ def has_path(entry: Any) -> bool:
 
 
 def frame_label(file: Path, index: int, entry: Any) -> str:
-    """Return the name of an entry of "frames" for messages.
-
-    Raises:
-        InputError: the entry names no image file.
-    """
+    """Return the name of an entry of "frames" for messages."""
     if not has_path(entry):
         raise InputError(f"{file}, frame {index} has no file_path: name its image.")
     return f"{file}, frame {index} ({entry['file_path']})"
 
 
 def number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """Return the number under `key`, or `default` where there is none.
-
-    Raises:
-        InputError: it is not a finite number.
-    """
+    """Return the number under `key`, or `default` where there is none."""
     value = settings.get(key, default)
     if not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{where}: {key} is {value!r}: give a finite number.")
@@ -143,11 +128,7 @@ def scaled(lens: Lens, size: tuple[int, int], where: str) -> Lens:
 
 
 def beside(path: Path, size: tuple[int, int], where: str) -> Path:
-    """Return the path of a depth map or mask, after checking that it shows the whole image.
-
-    Raises:
-        InputError: it is missing, damaged or of other proportions than `size`.
-    """
+    """Return the path of a depth map or mask, after checking that it shows the whole image."""
     width, height = image_size(path)
     if not same_proportions((width, height), size):
         raise InputError(
@@ -166,11 +147,7 @@ def array_of(stored: Any) -> Float[ndarray, "..."]:
 
 
 def rigid(stored: Any, where: str) -> Float[ndarray, "4 4"]:
-    """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal.
-
-    Raises:
-        InputError: it is not a rotation and a translation.
-    """
+    """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal."""
     matrix = array_of(stored)
     if matrix.shape != (4, 4):
         raise InputError(f"{where} is not 4x4: give four rows of four numbers.")

@@ -35,9 +35,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     height, width and focal length of the full-size image, then the nearest and farthest depth. The
     principal point is the center. Images are taken from the first of `images`, `images_2`,
     `images_4` and `images_8` that holds one image per row.
-
-    Raises:
-        InputError: an array that cannot be used, or no folder with one image per row.
     """
     file = scene / POSES
     rows = _read_rows(file)

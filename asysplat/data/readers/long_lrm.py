@@ -45,9 +45,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
     Every entry has `w2c` (world-to-camera, OpenCV axes), `fx fy cx cy` in pixels of an image of
     `w` x `h`, and `file_path`, relative to the json file. Images are in the file's order.
-
-    Raises:
-        InputError: a file that cannot be used, or intrinsics for images of other proportions.
     """
     file = scene if scene.suffix == ".json" else scene / CAMERAS
 

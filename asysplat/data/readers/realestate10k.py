@@ -36,7 +36,7 @@ def find_scenes(root: Path) -> list[Path]:
     if any(parent.suffix == CHUNK for parent in root.parents):
         return [root]
     if root.suffix == CHUNK:
-        return _in_chunk(root)
+        return [root / key for key in _load(root)]
     if not root.is_dir():
         return []
     folders = [root, *sorted(child for child in root.iterdir() if child.is_dir())]
@@ -44,11 +44,7 @@ def find_scenes(root: Path) -> list[Path]:
 
 
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:
-    """Read one scene, named chunk.torch/key; its images stay in the file until they are decoded.
-
-    Raises:
-        InputError: a chunk that cannot be used, or without this scene.
-    """
+    """Read one scene, named chunk.torch/key; its images stay in the file until they are decoded."""
     chunk = next((parent for parent in scene.parents if parent.suffix == CHUNK), None)
     if chunk is None:
         raise InputError(f"{scene} is no scene in a chunk: name one as 000000{CHUNK}/key.")
@@ -68,7 +64,7 @@ def _in_folder(folder: Path) -> list[Path]:
     chunks = sorted(folder.glob(f"*{CHUNK}"))
     index = folder / "index.json"
     if not chunks or not index.is_file():
-        return [scene for chunk in chunks for scene in _in_chunk(chunk)]
+        return [chunk / key for chunk in chunks for key in _load(chunk)]
     content = read_json(index)
     if not isinstance(content, dict):
         raise InputError(f"{index} is no object of key: chunk: write it again.")
@@ -80,10 +76,6 @@ def _in_folder(folder: Path) -> list[Path]:
                 "name single chunks."
             )
     return [folder / name / key for key, name in content.items()]
-
-
-def _in_chunk(chunk: Path) -> list[Path]:
-    return [chunk / key for key in _load(chunk)]
 
 
 def _load(chunk: Path) -> dict[str, dict[str, Any]]:

@@ -44,16 +44,12 @@ from asysplat.errors import InputError
 
 @dataclass(frozen=True)
 class Part:
-    """The folders that belong to a file of poses, within its camera's folder.
-
-    Args:
-        get: how to get the images, for messages.
-    """
+    """The folders that belong to a file of poses, within its camera's folder."""
 
     images: str
     masks: str
     depths: str | None
-    get: str
+    get: str  # how to get the images, for messages
 
 
 EXTRACT = (
@@ -63,16 +59,11 @@ EXTRACT = (
 ARKIT = "iphone/pose_intrinsic_imu.json"
 PARTS = {
     "dslr/nerfstudio/transforms_undistorted.json": Part(
-        images="resized_undistorted_images",
-        masks="resized_undistorted_masks",
-        depths=None,
-        get="download it, or run the toolkit's dslr.undistort",
+        *("resized_undistorted_images", "resized_undistorted_masks", None),
+        "download it, or run the toolkit's dslr.undistort",
     ),
     "dslr/nerfstudio/transforms.json": Part(
-        images="resized_images",
-        masks="resized_anon_masks",
-        depths="render_depth",
-        get="download it",
+        *("resized_images", "resized_anon_masks", "render_depth"), "download it"
     ),
     "iphone/nerfstudio/transforms.json": Part("rgb", "rgb_masks", "depth", EXTRACT),
     ARKIT: Part("rgb", "rgb_masks", "depth", EXTRACT),
@@ -103,9 +94,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
     Args:
         scene: a file of poses, or a folder that stands for one.
-
-    Raises:
-        InputError: images or masks that were not downloaded or extracted, or an unusable file.
     """
     files = find_scenes(scene)
     if len(files) != 1:

@@ -41,9 +41,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
     Reads only the headers of images. Images are ordered by the numbers in their names (2 before
     10), or, if a name has no number, as in the file. Paths are relative to the file's folder.
-
-    Raises:
-        InputError: anything in the file that cannot be used.
     """
     file = scene if scene.suffix == ".json" else scene / "transforms.json"
     images = read_images(read_frames(file), file, bad)

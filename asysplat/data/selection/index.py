@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from asysplat.data.readers.common import folders_with, read_json
+from asysplat.data.readers.common import folders_with, read_frames, read_json
 from asysplat.data.selection.kmeans import DECIMALS, pose_features
 from asysplat.data.selection.views import Selection
 from asysplat.errors import InputError
@@ -86,14 +86,19 @@ def read_index(path: Path | str, num_inputs: int) -> ViewIndex:
                 f"data.index={path} is a folder without {LONG_LRM_FILE}: name an index file, or "
                 "scenes in the layout of Long-LRM."
             )
-        entries = [_long_lrm_entry(file, read_json(file), num_inputs) for file in files]
+        entries = [_long_lrm_entry(file, read_frames(file), num_inputs) for file in files]
         return ViewIndex(path, dict(entries))
     content = read_json(path)
     if not isinstance(content, dict):
         raise InputError(f'{path} is no index: give {{"scene": {{"context": [], "target": []}}}}.')
     if isinstance(content.get("frames"), list):
         return ViewIndex(path, dict([_long_lrm_entry(path, content, num_inputs)]))
-    scenes = _checked_scenes(path, content) if "hash" in content else content
+    scenes = content
+    if "hash" in content:
+        stored = {name: value for name, value in content.items() if name != "hash"}
+        if content["hash"] != _hash_of(stored) or not isinstance(content.get("scenes"), dict):
+            raise InputError(f"{path} was changed after it was written: write it again.")
+        scenes = content["scenes"]
     entries = {
         name: _entry(f"{path}, scene {name}", entry)
         for name, entry in scenes.items()
@@ -110,14 +115,10 @@ def write_index(path: Path, selection: str, entries: Mapping[str, Entry]) -> Non
     """
     if path.exists():
         raise InputError(f"{path} exists: name a new file, nothing is overwritten.")
-    scenes = {
-        name: {
-            "context": entry.selection.inputs,
-            "target": entry.selection.targets,
-            "cameras": entry.cameras,
-        }
-        for name, entry in entries.items()
-    }
+    scenes = {}
+    for name, entry in entries.items():
+        lists = {"context": entry.selection.inputs, "target": entry.selection.targets}
+        scenes[name] = lists | {"cameras": entry.cameras}
     content = {"selection": selection, "scenes": scenes}
     path.write_text(json.dumps(content | {"hash": _hash_of(content)}, indent=1))
 
@@ -126,13 +127,6 @@ def camera_hash(cameras: Cameras) -> str:
     """Hash the cameras' positions and viewing directions, for any origin and unit."""
     steps = (pose_features(cameras) * 10**DECIMALS).round().astype("<i8")
     return _digest(np.ascontiguousarray(steps).tobytes())
-
-
-def _checked_scenes(path: Path, content: dict[str, Any]) -> dict[str, Any]:
-    stored = {name: value for name, value in content.items() if name != "hash"}
-    if content["hash"] != _hash_of(stored) or not isinstance(content.get("scenes"), dict):
-        raise InputError(f"{path} was changed after it was written: write it again.")
-    return content["scenes"]
 
 
 def _hash_of(content: dict[str, Any]) -> str:
@@ -149,16 +143,13 @@ def _entry(where: str, stored: Any) -> Entry:
     return Entry(Selection(*lists), entry.get("cameras"))
 
 
-def _long_lrm_entry(file: Path, content: Any, num_inputs: int) -> tuple[str, Entry]:
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list):
-        raise InputError(f'{file} has no list "frames": give a file of Long-LRM\'s layout.')
-    lists = {name: match for name in content if (match := LONG_LRM_LIST.fullmatch(name))}
-    for name, match in lists.items():
-        fold, count = map(int, match.groups())
+def _long_lrm_entry(file: Path, content: dict[str, Any], num_inputs: int) -> tuple[str, Entry]:
+    lists = {name: matched for name in content if (matched := LONG_LRM_LIST.fullmatch(name))}
+    for name, matched in lists.items():
+        fold, count = map(int, matched.groups())
         if count == num_inputs and fold > 0:
             inputs = _indices(f"{file}, {name}", content[name])
-            selection = Selection(inputs, list(range(0, len(frames), fold)))
+            selection = Selection(inputs, list(range(0, len(content["frames"]), fold)))
             return str(content.get("scene_name", file.parent.name)), Entry(selection)
     raise InputError(
         f"{file} has no list fold_8_kmeans_{num_inputs}_input (its lists: "

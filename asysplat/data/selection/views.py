@@ -1,4 +1,8 @@
-"""Selections that need only the number of images."""
+"""Selections that need only the number of images.
+
+All functions are deterministic but for `training_selection`, and raise an InputError if a sequence
+is too short for the number of inputs and targets.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,11 +31,7 @@ class Selection:
 def uniform_selection(num_images: int, num_inputs: int, num_targets: int) -> Selection:
     """Select inputs evenly over the whole sequence, targets midway between neighboring inputs.
 
-    Deterministic. If there are fewer gaps than targets, the targets are spread over all images that
-    are not inputs.
-
-    Raises:
-        InputError: the sequence is too short.
+    If there are fewer gaps than targets, the targets are spread over all images but the inputs.
     """
     _check_length(num_images, num_inputs, num_targets)
     inputs = spread(range(num_images), num_inputs)
@@ -55,8 +55,7 @@ def training_selection(
     """Select inputs evenly over a random window, and random targets within it.
 
     Args:
-        window: the least and the greatest number of images to draw from, both included; clipped
-            to the sequence.
+        window: least and greatest number of images to draw from; clipped to the sequence.
         targets_may_be_inputs: whether targets are drawn from all images of the window.
 
     Raises:
@@ -91,28 +90,18 @@ def training_images(num_images: int) -> list[int]:
 def every_8th_selection(
     num_images: int, num_inputs: int, num_targets: int, split: Split
 ) -> Selection:
-    """Select inputs evenly over the training images, targets evenly over the held-out images.
-
-    Deterministic; there are at most `num_targets` targets.
-
-    Raises:
-        InputError: the sequence is too short.
-    """
-    inputs, targets = training_images(num_images), held_out(num_images, split)
+    """Select inputs evenly over the training images, at most `num_targets` held-out targets."""
+    inputs, targets = _training_split(num_images, num_targets, split)
     check_held_out(num_images, len(inputs), num_inputs, split)
-    return Selection(spread(inputs, num_inputs), spread(targets, min(num_targets, len(targets))))
+    return Selection(spread(inputs, num_inputs), targets)
 
 
 def first_96_selection(
     num_images: int, num_inputs: int, num_targets: int, split: Split
 ) -> Selection:
-    """Select as the paper's ablations do (Suppl. A).
+    """Select as the paper's ablations (Suppl. A): inputs evenly over the first 96 images.
 
-    Of the first 96 images every 8th is a target, and inputs lie evenly over the others.
-    Deterministic.
-
-    Raises:
-        InputError: the sequence is too short.
+    Every 8th of them is a target, and no input.
     """
     inputs, targets = paper_split(min(num_images, ABLATION_IMAGES), num_targets, split)
     check_held_out(num_images, len(inputs), num_inputs, split)
@@ -122,14 +111,18 @@ def first_96_selection(
 def paper_split(num_images: int, num_targets: int, split: Split) -> tuple[list[int], list[int]]:
     """Return the images that inputs are chosen from, and the targets.
 
-    For test, every 8th image is a target, and inputs are chosen from all others. For val, no target
-    of the test is used: there are at most `num_targets` targets, and inputs are chosen from the
-    training images.
+    For test, every 8th image is a target, and inputs are chosen from all others. For val, at most
+    `num_targets` images are targets, and inputs are chosen from the training images.
     """
-    targets = held_out(num_images, split)
     if split == "val":
-        return training_images(num_images), spread(targets, min(num_targets, len(targets)))
+        return _training_split(num_images, num_targets, split)
+    targets = held_out(num_images, split)
     return sorted(set(range(num_images)) - set(targets)), targets
+
+
+def _training_split(n: int, num_targets: int, split: Split) -> tuple[list[int], list[int]]:
+    targets = held_out(n, split)
+    return training_images(n), spread(targets, min(num_targets, len(targets)))
 
 
 def spread(images: Sequence[int], count: int) -> list[int]:
@@ -139,11 +132,7 @@ def spread(images: Sequence[int], count: int) -> list[int]:
 
 
 def check_held_out(num_images: int, left: int, num_inputs: int, split: Split) -> None:
-    """Check that there are targets, and enough images `left` to choose the inputs from.
-
-    Raises:
-        InputError: there are not.
-    """
+    """Check that there are targets, and enough images `left` to choose the inputs from."""
     if left < num_inputs or not held_out(num_images, split):
         raise InputError(
             f"The sequence has {num_images} images, of which {left} are not held out for "

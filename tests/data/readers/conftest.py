@@ -1,4 +1,4 @@
-"""Small posed photographs with exact depths, to be written in any layout and read back."""
+"""Small posed images with exact depths, to be written in any layout and read back."""
 
 from dataclasses import replace
 
@@ -12,9 +12,11 @@ HEIGHT, WIDTH = 24, 32
 
 
 @pytest.fixture(scope="session")
-def centerd_views() -> Views:
-    """Twelve views of a room, 24 x 32, as 8-bit images and depths of whole millimeters can hold
-    them; one focal length, and the principal point at the center."""
+def centered_views() -> Views:
+    """Twelve views of a room with one focal length and the principal point at the center.
+
+    Images are rounded to 8 bits and depths to whole millimeters.
+    """
     scene = ProceduralScene(1, HEIGHT, WIDTH, num_images=40, places="rooms")
     views = scene.views(range(12))
     return replace(
@@ -25,9 +27,14 @@ def centerd_views() -> Views:
 
 
 @pytest.fixture(scope="session")
-def views(centerd_views) -> Views:
+def views(centered_views) -> Views:
     """The same with two focal lengths and the principal point off the center."""
-    cameras = centerd_views.cameras
+    cameras = centered_views.cameras
     change = torch.tensor([[0.0, 0.0, 1.25], [0.0, 1.5, -2.5], [0.0, 0.0, 0.0]])
-    cameras = replace(cameras, intrinsics=cameras.intrinsics + change)
-    return replace(centerd_views, cameras=cameras)
+    return replace(centered_views, cameras=replace(cameras, intrinsics=cameras.intrinsics + change))
+
+
+@pytest.fixture
+def few(views) -> Views:
+    """Four of the views."""
+    return views.select(range(4))

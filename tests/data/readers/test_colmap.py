@@ -1,20 +1,20 @@
 import shutil
 import warnings
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pycolmap
 import pytest
+from layouts import assert_listed, cut, opener, save_image
 from layouts import colmap as layout
-from layouts import save_image
 
-from asysplat.data import SceneOptions, open_scene
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens
 from asysplat.data.readers import colmap
 from asysplat.errors import InputError
 
-HEIGHT, WIDTH = 24, 32
+opened = opener("colmap")
 
 
 @pytest.fixture
@@ -25,17 +25,17 @@ def scene(views, tmp_path):
 
 def read(folder):
     bad = BadImages()
-    found = colmap.read_scene(folder, bad)
-    bad.report(str(folder), len(found.images))
-    return found
+    posed = colmap.read_scene(folder, bad)
+    bad.report(str(folder), len(posed.images))
+    return posed
 
 
-def cameras_of(found):
-    return np.array([photograph.cam_to_world for photograph in found.images])
+def cameras_of(posed):
+    return np.array([image.cam_to_world for image in posed.images])
 
 
-def names_of(found):
-    return [photograph.file.name for photograph in found.images]
+def names_of(posed):
+    return [image.file.name for image in posed.images]
 
 
 def edit(file, change):
@@ -43,10 +43,9 @@ def edit(file, change):
 
 
 def with_camera(folder, line):
-    """Gives every image the camera `line`: model, width, height and parameters."""
-    (folder / "sparse/0/cameras.txt").write_text(
-        "".join(f"{index + 1} {line}\n" for index in range(12))
-    )
+    """Give every image the camera `line`: model, width, height and parameters."""
+    lines = (f"{index + 1} {line}\n" for index in range(12))
+    (folder / "sparse/0/cameras.txt").write_text("".join(lines))
     return folder
 
 
@@ -62,12 +61,9 @@ def as_binary(folder, old=False):
     return folder
 
 
-def test_points_are_the_model_s(scene, views):
-    np.testing.assert_allclose(read(scene).points, layout.points_of(views), atol=1e-9)
-
-
-def test_frames_follow_their_numbers(scene):
+def test_images_follow_their_numbers_and_have_the_model_s_points(scene, views):
     assert names_of(read(scene)) == [f"{index}.png" for index in range(12)]
+    np.testing.assert_allclose(read(scene).points, layout.points_of(views), atol=1e-9)
 
 
 @pytest.mark.parametrize("old", [True, False])
@@ -104,18 +100,17 @@ LENSES = {
 @pytest.mark.parametrize("line", LENSES, ids=lambda line: line.split()[0])
 def test_camera_models(scene, line):
     fx, fy, distortion = LENSES[line]
-    found = read(with_camera(scene, line)).images[0].lens
-    assert found == Lens(32, 24, fx, fy, 15.0, 11.0, distortion, line.startswith("OPENCV_FISHEYE"))
-    # The same pixels as COLMAP itself would find.
+    lens = read(with_camera(scene, line)).images[0].lens
+    assert lens == Lens(32, 24, fx, fy, 15.0, 11.0, distortion, line.startswith("OPENCV_FISHEYE"))
+    # COLMAP itself projects to the same pixels.
     in_camera = np.random.default_rng(0).uniform((-0.5, -0.4, 1), (0.5, 0.4, 1), (20, 3))
     camera = pycolmap.Reconstruction(scene / "sparse/0").cameras[1]
-    matrix = np.array([[found.fx, 0, found.cx], [0, found.fy, found.cy], [0, 0, 1.0]])
-    still, project = np.zeros(3), cv2.fisheye if found.fisheye else cv2
-    pixels, _ = project.projectPoints(
-        in_camera[:, None], still, still, matrix, np.array(found.distortion)
-    )
+    matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]])
+    still, project = np.zeros(3), cv2.fisheye if lens.fisheye else cv2
+    distortion = np.array(lens.distortion)
+    pixels, _ = project.projectPoints(in_camera[:, None], still, still, matrix, distortion)
     np.testing.assert_allclose(pixels[:, 0], camera.img_from_cam(in_camera), atol=1e-9)
-    open_scene(scene, SceneOptions(HEIGHT, WIDTH, layout="colmap")).views([0]).validate()
+    opened(scene).views([0]).validate()
 
 
 @pytest.mark.parametrize(
@@ -137,7 +132,7 @@ def test_every_image_has_its_own_camera(scene, views):
         scene / "sparse/0/cameras.txt",
         lambda text: text.replace("\n3 PINHOLE", "\n3 SIMPLE_PINHOLE 32 24 50 16 12 #"),
     )
-    focals = [photograph.lens.fx for photograph in read(scene).images]
+    focals = [image.lens.fx for image in read(scene).images]
     assert focals[2] == 50 and focals[1] == pytest.approx(views.cameras.intrinsics[1, 0, 0].item())
 
 
@@ -157,7 +152,7 @@ def test_the_full_size_wins(scene, views):
     assert read(scene).images[0].file == scene / "images_2/0.png"
 
 
-def test_images_of_other_proportions_are_bad_frames(scene):
+def test_images_of_other_proportions_are_bad(scene):
     with_camera(scene, "PINHOLE 64 40 60 60 32 20")
     with pytest.raises(InputError, match=r"12 of 12 .*\n.*0\.png is 32 x 24 and .* for 64 x 40"):
         read(scene)
@@ -167,39 +162,31 @@ def test_names_may_have_folders_and_any_letters(scene, views):
     (scene / "images/左cam").mkdir()
     (scene / "images/3.png").rename(scene / "images/左cam/ä3.png")
     edit(scene / "sparse/0/images.txt", lambda text: text.replace("3.png", "左cam/ä3.png", 1))
-    found = read(scene)
+    posed = read(scene)
     expected = views.cameras.cam_to_world[3].double().numpy()
-    (photograph,) = (p for p in found.images if p.file.name == "ä3.png")
-    np.testing.assert_allclose(photograph.cam_to_world, expected, atol=1e-6)
-    binary = read(as_binary(scene))
-    assert names_of(binary) == names_of(found)
+    (image,) = (image for image in posed.images if image.file.name == "ä3.png")
+    np.testing.assert_allclose(image.cam_to_world, expected, atol=1e-6)
+    assert names_of(read(as_binary(scene))) == names_of(posed)
 
 
-def test_images_that_are_not_registered_are_told(scene, views):
+def test_a_warning_lists_images_that_are_not_registered(scene, views):
     for index in range(50, 57):
         save_image(scene / f"images/{index}.png", views.images[0])
     with pytest.warns(UserWarning) as caught:
-        found = read(scene)
+        posed = read(scene)
     message = str(caught.list[0].message)
     assert len(caught) == 1 and "not registered 7 of 19" in message
     assert message.endswith("50.png, 51.png, 52.png, 53.png, 54.png, ...")
-    assert len(found.images) == 12
+    assert len(posed.images) == 12
 
 
-def test_bad_images_are_listed_together_or_skipped(scene):
+def test_all_bad_images_are_listed_or_left_out(scene):
     (scene / "images/4.png").unlink()
-    cut = scene / "images/7.png"
-    cut.write_bytes(cut.read_bytes()[:200])
+    cut(scene / "images/7.png")
     edit(scene / "sparse/0/images.txt", lambda text: text.replace(" 10.png", " gone/10.png"))
+    messages = ("gone/10.png does not exist", "4.png does not exist", "7.png cannot be read")
     (scene / "images/10.png").unlink()
-    with pytest.raises(InputError) as error:
-        open_scene(scene, SceneOptions(HEIGHT, WIDTH, layout="colmap"))
-    message = str(error.value)
-    assert "3 of 12" in message and "4.png does not exist" in message
-    assert "7.png cannot be read" in message and "gone/10.png does not exist" in message
-    with pytest.warns(UserWarning, match="left out 3 of 12"):
-        sequence = open_scene(scene, SceneOptions(HEIGHT, WIDTH, "colmap", "skip"))
-    assert sequence.num_images == 9
+    assert_listed(opened, scene, *messages[1:], messages[0], total=12)
 
 
 @pytest.mark.parametrize("binary", [False, True])
@@ -209,8 +196,7 @@ def test_a_model_cut_short_is_refused(scene, binary, name, part):
     if binary:
         as_binary(scene, old=True)
     file = scene / "sparse/0" / f"{name}.{'bin' if binary else 'txt'}"
-    stored = file.read_bytes()
-    file.write_bytes(stored[: int(part * len(stored))])
+    cut(file, int(part * file.stat().st_size))
     with pytest.raises(InputError, match=r"sparse/0.*copy (it|its .* files) again"):
         read(scene)
 
@@ -225,11 +211,11 @@ def test_damaged_files_are_refused(scene, name, content):
 
 def test_a_missing_file_is_refused(scene):
     (scene / "sparse/0/points3D.txt").unlink()
-    with pytest.raises(InputError, match=r"not a whole COLMAP model.*points3D"):
+    with pytest.raises(InputError, match=r"not a complete COLMAP model.*points3D"):
         read(scene)
 
 
-def test_a_pose_of_nan_is_a_bad_frame(scene):
+def test_a_pose_of_nan_is_a_bad_image(scene):
     file = as_binary(scene, old=True) / "sparse/0/images.bin"
     stored = bytearray(file.read_bytes())
     stored[8 + 36 : 8 + 44] = np.array(np.nan).tobytes()  # the first image's translation
@@ -246,43 +232,37 @@ def test_a_model_without_its_images_is_refused(scene):
         read(scene)
 
 
-def test_a_model_of_no_image_is_refused(scene):
-    (scene / "sparse/0/images.txt").write_text("")
+def test_a_model_without_points_or_images(scene):
     (scene / "sparse/0/points3D.txt").write_text("")
+    posed = read(scene)
+    assert posed.points is None and len(posed.images) == 12
+    (scene / "sparse/0/images.txt").write_text("")
     with pytest.raises(InputError, match="registers no image"):
         read(scene)
 
 
-def test_a_model_without_points_has_none(scene):
-    (scene / "sparse/0/points3D.txt").write_text("")
-    found = read(scene)
-    assert found.points is None and len(found.images) == 12
-
-
-def test_points_beside_photographs_of_the_same_world(scene, views):
-    photographs = read(scene).images
-    points = colmap.points_beside(scene, photographs[3:8])
+def test_points_beside_images_of_the_same_world(scene, views):
+    images = read(scene).images
+    points = colmap.points_beside(scene, images[3:8])
     np.testing.assert_allclose(points, layout.points_of(views), atol=1e-9)
-    assert colmap.points_beside(scene / "images", photographs) is None
+    assert colmap.points_beside(scene / "images", images) is None
 
 
 @pytest.mark.parametrize("change", ["moved", "scaled", "turned", "other images"])
-def test_points_of_another_world_are_not_taken(scene, change):
-    found = read(scene)
+def test_points_of_another_world_are_ignored(scene, change):
+    posed = read(scene)
     transform = np.eye(4)
     if change == "turned":
         transform[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     if change == "moved":
         transform[0, 3] = 0.05
-    poses = transform @ cameras_of(found)
+    poses = transform @ cameras_of(posed)
     if change == "scaled":
         poses[:, :3, 3] *= 1.05
-    photographs = [
-        type(photograph)(photograph.file, photograph.lens, pose)
-        for photograph, pose in zip(found.images, poses, strict=True)
-    ]
+    pairs = zip(posed.images, poses, strict=True)
+    images = [replace(image, cam_to_world=pose) for image, pose in pairs]
     if change == "other images":
         edit(scene / "sparse/0/images.txt", lambda text: text.replace(".png", ".jpg"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert colmap.points_beside(scene, photographs) is None
+        assert colmap.points_beside(scene, images) is None

@@ -1,21 +1,17 @@
 import numpy as np
 import pytest
+from layouts import assert_listed, cut, opener, save_depth
 from layouts import posed as layout
 from PIL import Image
 
-from asysplat.data import SceneOptions, open_scene
 from asysplat.errors import InputError
 
-HEIGHT, WIDTH = 24, 32
+open_posed = opener("posed")
 
 
 @pytest.fixture
 def scene(views, tmp_path):
     return layout.write(views, tmp_path)
-
-
-def open_posed(scene, **options):
-    return open_scene(scene, SceneOptions(HEIGHT, WIDTH, layout="posed", **options))
 
 
 def test_refined_poses_are_preferred(scene):
@@ -27,9 +23,7 @@ def test_refined_poses_are_preferred(scene):
 
 
 def test_depth_may_be_smaller_or_absent(scene, views):
-    for file in (scene / "depth").iterdir():
-        small = np.asarray(Image.open(file))[::2, ::2]
-        Image.fromarray(np.ascontiguousarray(small)).save(file)
+    save_depth(scene / "depth/00001.png", views.depths[1, ::2, ::2])
     depths = open_posed(scene).views([1]).depths
     expected = views.depths[1, ::2, ::2].repeat_interleave(2, 0).repeat_interleave(2, 1)
     np.testing.assert_allclose(depths[0], expected, atol=1e-5)
@@ -37,36 +31,24 @@ def test_depth_may_be_smaller_or_absent(scene, views):
     assert open_posed(scene).views([1]).depths is None
 
 
-def test_all_bad_frames_are_listed_or_skipped(scene):
-    cut = scene / "images/00001.png"
-    cut.write_bytes(cut.read_bytes()[:200])
+def test_all_bad_images_are_listed_or_left_out(scene):
+    cut(scene / "images/00001.png")
     (scene / "depth/00002.png").unlink()
     Image.new("I;16", (24, 24)).save(scene / "depth/00003.png")
     poses = np.loadtxt(scene / "poses.txt")
     poses[4, 0] = np.nan
     poses[5] *= 2
     np.savetxt(scene / "poses.txt", poses)
-    with pytest.raises(InputError) as error:
-        open_posed(scene)
-    summary, *sentences = str(error.value).splitlines()
-    assert "5 of 12 images" in summary
-    expected = [
+    assert_listed(
+        open_posed,
+        scene,
         "00001.png cannot be read",
         "depth/00002.png does not exist",
         "depth/00003.png is 24 x 24 and the image 32 x 24",
         "pose 4 (00004.png) holds NaN",
         "pose 5 (00005.png) has last row",
-    ]
-    for sentence, part in zip(sentences, expected, strict=True):
-        assert part in sentence
-    with pytest.warns(UserWarning, match="left out 5 of 12"):
-        assert open_posed(scene, on_bad_image="skip").num_images == 7
-
-
-def test_poses_and_images_that_differ_in_number_are_refused(scene):
-    (scene / "images/00003.png").unlink()
-    with pytest.raises(InputError, match=r"poses\.txt has 12 poses and .*images 11 images"):
-        open_posed(scene)
+        total=12,
+    )
 
 
 TEXTS = {
@@ -89,7 +71,10 @@ def test_text_that_cannot_be_used_is_refused(scene, name, edit, message):
         open_posed(scene)
 
 
-def test_a_missing_file_of_poses_is_refused(scene):
+def test_missing_images_and_poses_are_refused(scene):
+    (scene / "images/00003.png").unlink()
+    with pytest.raises(InputError, match=r"poses\.txt has 12 poses and .*images 11 images"):
+        open_posed(scene)
     (scene / "poses.txt").unlink()
     with pytest.raises(InputError, match=r"poses\.txt cannot be read"):
         open_posed(scene)

@@ -4,23 +4,19 @@ from pathlib import Path
 
 import pytest
 import torch
+from layouts import assert_listed, assert_same, opener, table
 from layouts.realestate10k import KEY, cameras, encoded, scene, write
 
-from asysplat.data import SceneOptions, open_scene
 from asysplat.data.readers import realestate10k
 from asysplat.errors import InputError
 
 MAPS = Path("/proc/self/maps")
-
-
-@pytest.fixture
-def few(views):
-    return views.select(range(4))
+opened = opener("realestate10k")
 
 
 @pytest.fixture
 def chunk(few, tmp_path):
-    """Writes a chunk of one scene after `change(scene)`; gives its path."""
+    """Write a chunk of one scene after `change(scene)`; return its path."""
 
     def save(change=lambda scene: None):
         content = scene(few)
@@ -31,10 +27,6 @@ def chunk(few, tmp_path):
         return file
 
     return save
-
-
-def opened(path, height=24, width=32, **options):
-    return open_scene(path, SceneOptions(height, width, layout="realestate10k", **options))
 
 
 def test_scenes_are_found_by_the_index_by_chunk_and_by_address(few, tmp_path):
@@ -49,16 +41,10 @@ def test_chunks_without_an_index_are_opened(few, tmp_path):
     torch.save([scene(few, "b"), scene(few, "a")], tmp_path / "000001.torch")
     torch.save([scene(few, "c")], tmp_path / "000000.torch")
     found = realestate10k.find_scenes(tmp_path)
-    assert [(path.parent.name, path.name) for path in found] == [
-        ("000000.torch", "c"),
-        ("000001.torch", "b"),
-        ("000001.torch", "a"),
-    ]
-
-
-def test_other_folders_hold_no_scene(tmp_path):
+    names = ["000000.torch/c", "000001.torch/b", "000001.torch/a"]
+    assert found == [tmp_path / name for name in names]
     (tmp_path / "images").mkdir()
-    assert realestate10k.find_scenes(tmp_path) == []
+    assert realestate10k.find_scenes(tmp_path / "images") == []
 
 
 def test_an_index_that_names_an_absent_chunk_is_refused(few, tmp_path):
@@ -73,81 +59,66 @@ def test_intrinsics_hold_for_any_size_of_image(few, chunk):
     def half(content):
         content["images"] = [encoded(image[:, ::2, ::2]) for image in few.images]
 
-    intrinsics = opened(chunk(half) / KEY).cameras.intrinsics
-    torch.testing.assert_close(intrinsics, few.cameras.intrinsics, rtol=0, atol=1e-5)
+    assert_same(opened(chunk(half) / KEY).cameras.intrinsics, few.cameras.intrinsics)
 
 
-def test_the_form_before_zips_is_read(few, tmp_path):
+def test_the_format_before_zip_files_is_read(few, tmp_path):
     file = tmp_path / "000000.torch"
     torch.save([scene(few)], file, _use_new_zipfile_serialization=False)
-    read = opened(file / KEY).views(range(4))
-    torch.testing.assert_close(read.images, few.images, rtol=0, atol=1e-5)
+    assert_same(opened(file / KEY).views(range(4)).images, few.images)
 
 
-def test_a_chunk_that_was_written_anew_is_read_anew(few, chunk):
+def test_a_chunk_that_changes_is_read_again(few, chunk):
     file = chunk()
     assert opened(file / KEY).num_images == 4
     torch.save([scene(few.select([0, 1]))], file)
     assert opened(file / KEY).num_images == 2
 
 
-def set_camera(index, column, value):
-    def change(content):
-        content["cameras"][index, column] = value
-
-    return change
+def set_camera(column, value):
+    return lambda content: content["cameras"][2].__setitem__(column, value)
 
 
-def set_image(index, value):
-    def change(content):
-        content["images"][index] = value
-
-    return change
+def set_image(value):
+    return lambda content: content["images"].__setitem__(2, value)
 
 
-def cut(content):
-    content["images"][2] = content["images"][2][:300].clone()
+@table(
+    {
+        "nan": (set_camera(9, float("nan")), "frame 2: its world-to-camera holds NaN"),
+        "no rotation": (set_camera(6, 2.0), "frame 2: its world-to-camera is not a rotation"),
+        "focal length": (set_camera(0, 0.0), "frame 2: its intrinsics are"),
+        "infinite": (set_camera(3, float("inf")), "frame 2: its intrinsics are"),
+        "distortion": (set_camera(4, 0.1), "frame 2: numbers 5 and 6"),
+        "cut short": (
+            lambda content: set_image(content["images"][2][:300].clone())(content),
+            "frame 2 cannot be read as an image",
+        ),
+        "empty": (set_image(torch.zeros(0, dtype=torch.uint8)), "frame 2 cannot be read"),
+        "no bytes": (set_image(torch.zeros(4)), "frame 2: its image is no uint8 tensor"),
+        "no tensor": (set_image("frame.jpg"), "frame 2: its image is no uint8 tensor"),
+    }
+)
+def test_a_bad_image_is_named_or_left_out(chunk, damage, message):
+    assert_listed(opened, chunk(damage) / KEY, message)
 
 
-FRAMES = {
-    "nan": (set_camera(2, 9, float("nan")), "frame 2: its world-to-camera holds NaN"),
-    "no rotation": (set_camera(2, 6, 2.0), "frame 2: its world-to-camera is not a rotation"),
-    "focal length": (set_camera(2, 0, 0.0), "frame 2: its intrinsics are"),
-    "infinite": (set_camera(2, 3, float("inf")), "frame 2: its intrinsics are"),
-    "distortion": (set_camera(2, 4, 0.1), "frame 2: numbers 5 and 6"),
-    "cut short": (cut, "frame 2 cannot be read as an image"),
-    "empty": (set_image(2, torch.zeros(0, dtype=torch.uint8)), "frame 2 cannot be read"),
-    "no bytes": (set_image(2, torch.zeros(4)), r"frame 2: its image is no uint8 tensor"),
-    "no tensor": (set_image(2, "frame.jpg"), r"frame 2: its image is no uint8 tensor"),
-}
-
-
-@pytest.mark.parametrize("change, message", FRAMES.values(), ids=FRAMES.keys())
-def test_a_bad_frame_is_named_or_left_out(chunk, change, message):
-    address = chunk(change) / KEY
-    with pytest.raises(InputError, match=f"1 of 4 images cannot be used(.|\n)*{message}"):
-        opened(address)
-    with pytest.warns(UserWarning, match=f"left out 1 of 4 images(.|\n)*{message}"):
-        assert opened(address, on_bad_image="skip").num_images == 3
-
-
-SCENES = {
-    "17 numbers": (
-        lambda content: content.update(cameras=content["cameras"][:, :17]),
-        r"cameras is \(4, 17\): give a tensor \[V, 18\]",
-    ),
-    "no cameras": (lambda content: content.pop("cameras"), "cameras is NoneType"),
-    "fewer images": (lambda content: content["images"].pop(), "has 4 cameras and images is 3"),
-    "images": (lambda content: content.update(images=None), "images is NoneType"),
-    "no key": (lambda content: content.pop("key"), "000000.torch is no list of scenes"),
-    "another key": (lambda content: content.update(key="a"), f"has no scene {KEY}"),
-}
-
-
-@pytest.mark.parametrize("change, message", SCENES.values(), ids=SCENES.keys())
-def test_a_broken_scene_is_refused(chunk, change, message):
+@table(
+    {
+        "17 numbers": (
+            lambda content: content.update(cameras=content["cameras"][:, :17]),
+            r"cameras is \(4, 17\): give a tensor \[V, 18\]",
+        ),
+        "no cameras": (lambda content: content.pop("cameras"), "cameras is NoneType"),
+        "fewer images": (lambda content: content["images"].pop(), "has 4 cameras and images is 3"),
+        "images": (lambda content: content.update(images=None), "images is NoneType"),
+        "no key": (lambda content: content.pop("key"), "000000.torch is no list of scenes"),
+        "another key": (lambda content: content.update(key="a"), f"has no scene {KEY}"),
+    }
+)
+def test_a_broken_scene_is_refused(chunk, damage, message):
     with pytest.raises(InputError, match=message):
-        opened(chunk(change) / KEY, on_bad_image="skip")
+        opened(chunk(damage) / KEY, on_bad_image="skip")
 
 
 @pytest.mark.parametrize("left", [0, 10, 5000, -100])
@@ -166,7 +137,7 @@ def test_an_absent_chunk_and_an_address_without_one_are_named(tmp_path):
 
 
 class Code:
-    """Pickled, it asks whoever loads it to make a folder."""
+    """Unpickling it makes a folder."""
 
     def __init__(self, folder):
         self.folder = folder

@@ -2,13 +2,10 @@
 
 import json
 
-import numpy as np
-
-from layouts import pinholes, poses, save_image
+from layouts import AXES, pinholes, poses, save_image
 
 HAS_DEPTHS = False
 HASH = "07d9f9724ca854fae07cb4c57d7ea22bf667d5decd4058f547728922f909956b"
-AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's from OpenCV's
 LENS = {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
 
 

@@ -4,10 +4,9 @@ import json
 
 import numpy as np
 
-from layouts import pinholes, poses, save_depth, save_image
+from layouts import AXES, pinholes, poses, save_depth, save_image
 
 SCENE = "036bce3393"
-AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's from OpenCV's
 # As the toolkit turns COLMAP's world, which is the scan's.
 WORLD = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 

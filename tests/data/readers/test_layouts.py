@@ -1,0 +1,74 @@
+"""One scene, written in every layout: read back, and with damaged files."""
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+import layouts
+import pytest
+import torch
+from layouts import assert_listed, assert_same, cut, opener, save_depth
+
+from asysplat.data import find_scenes
+
+NAMES = [module.name for module in iter_modules(layouts.__path__)]
+FILES = [name for name in NAMES if name != "realestate10k"]  # which has images inside a file
+DEPTHS = [name for name in NAMES if getattr(import_module(f"layouts.{name}"), "HAS_DEPTHS", True)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_layout_gives_the_same_views(name, views, centered_views, tmp_path):
+    layout = import_module(f"layouts.{name}")
+    expected = views if getattr(layout, "FREE_INTRINSICS", True) else centered_views
+    root = layout.write(expected, tmp_path / "scène 1")
+    detected, scenes = find_scenes(root)
+    assert detected == name and len(scenes) == 1
+    sequence = opener(name)(scenes[0])
+    assert sequence.num_images == expected.num_views
+    read = sequence.views(range(sequence.num_images)).validate()
+    assert_same(read.images, expected.images)
+    assert_same(read.cameras.intrinsics, expected.cameras.intrinsics)
+    assert_same(read.cameras.cam_to_world, expected.cameras.cam_to_world)
+    if name in DEPTHS:
+        assert_same(read.depths, expected.depths)
+    else:
+        assert read.depths is None
+    assert read.masks is None or bool(read.masks.all())
+
+
+DAMAGES = {
+    "missing": (lambda file: file.unlink(), "does not exist"),
+    "cut": (cut, "cannot be read as an image"),
+    "empty": (lambda file: file.write_bytes(b""), "is empty (0 bytes)"),
+}
+SQUARE = (lambda file: save_depth(file, torch.ones(8, 8)), "is 8 x 8 and the image 32 x 24")
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("name", FILES)
+def test_a_damaged_image_is_named_or_left_out(name, damage, few, tmp_path):
+    if damage == "missing" and name in ("llff", "posed"):
+        pytest.skip("the number of images is checked first")
+    damage, message = DAMAGES[damage]
+    check_damage(name, few, tmp_path, "file", damage, message)
+
+
+@pytest.mark.parametrize("damage", [*DAMAGES, "square"])
+@pytest.mark.parametrize("name", DEPTHS)
+def test_a_damaged_depth_map_is_named_or_left_out(name, damage, few, tmp_path):
+    damage, message = (DAMAGES | {"square": SQUARE})[damage]
+    check_damage(name, few, tmp_path, "depth", damage, message)
+
+
+def check_damage(name, views, folder, field, damage, message):
+    _, (scene,) = find_scenes(import_module(f"layouts.{name}").write(views, folder))
+    file = getattr(opener(name)(scene).scene.images[2], field)
+    damage(file)
+    assert_listed(opener(name), scene, f"{file} {message}")
+
+
+@pytest.mark.parametrize("name", DEPTHS)
+def test_depths_may_be_smaller(name, few, tmp_path):
+    _, (scene,) = find_scenes(import_module(f"layouts.{name}").write(few, tmp_path))
+    for image in opener(name)(scene).scene.images:
+        save_depth(image.depth, torch.full((12, 16), 2.125))
+    assert opener(name)(scene).views([0]).depths.unique().tolist() == [2.125]
