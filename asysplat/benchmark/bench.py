@@ -30,13 +30,13 @@ from asysplat.scene import Views
 
 BEST_OF = 3  # runs in a round: interruptions only make a run slower
 WATCHED = Watched(names=("workload", "over"), alike=(), kinds={"ratio": RATIO})
-SWEEP = {"batch": 1, "views": 4, "height": 32, "width": 32, "stride": 2}
+PLANE_SWEEP = {"batch": 1, "views": 4, "height": 32, "width": 32, "stride": 2}
 CASES = {
     "chunked": (
         OpCase("ssd", {"batch": 1, "length": 512, "heads": 4, "head_dim": 64, "state": 64}),
         OpCase("selective_scan", {"batch": 8, "length": 128, "channels": 64, "state": 16}),
     ),
-    "reference": (PlaneSweepCase("plane_sweep", SWEEP | {"planes": 48, "neighbors": 3}),),
+    "reference": (PlaneSweepCase("plane_sweep", PLANE_SWEEP | {"planes": 48, "neighbors": 3}),),
 }
 GAUSSIANS, SIDE = 5000, 96  # of the renderer's scene
 ROWS = 20_000  # of which Adam updates half

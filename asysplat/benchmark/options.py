@@ -23,7 +23,7 @@ SUITES["stability"] += ".report"
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
 CPU = torch.device("cpu")
 CPU_INFO = Path("/proc/cpuinfo")  # Linux alone
-PACKAGES = ("torch", "numba", "triton", "gsplat")
+PACKAGES = ("torch", "numba", "triton")
 
 
 def find_suite(name: str) -> ModuleType:

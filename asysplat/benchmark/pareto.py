@@ -356,7 +356,7 @@ def select_inputs(scene: Photographs, views: int | None, side: int | None) -> Ph
         images = F.interpolate(inputs.images, (side, side), mode="area")
         inputs = Views(inputs.cameras.resized(side, side), images)
     inputs, targets, _ = normalize(inputs, _without_depths(scene.held_out))
-    return replace(scene, inputs=inputs, held_out=targets)
+    return replace(scene, inputs=inputs, held_out=targets, points=None)
 
 
 @dataclass(frozen=True)
@@ -410,7 +410,7 @@ class Meter:
                 absent[name] = str(error)
         if not once:
             time_in_rounds(list(measurements.values()), self.repeats)
-        exact = self._exact_images(scene, settings, images)
+        exact_images = {repr(base): images[BASE]}
         rows = []
         for name, setting in settings.items():
             row = {"setting": name, "values": asdict(setting), "not_measured": absent.get(name)}
@@ -421,28 +421,18 @@ class Meter:
                 own, of_base = (m.seconds["seconds"] for m in (timed, measurements[BASE]))
                 ratios = [a / b for a, b in zip(own, of_base, strict=True)]
                 row |= {"seconds": summary(own), "over_base": summary(ratios)} | timed.row
-                if name in exact:
-                    row["error"] = image_error(image, exact[name])
+                exact = setting.exact(base)
+                if exact != setting:
+                    key = repr(exact)
+                    if key not in exact_images:
+                        render_exact = exact.prepare(self.refinement, self.device)
+                        exact_images[key] = render_exact(scene)
+                    row["error"] = image_error(image, exact_images[key])
                 if setting.trained:
                     metrics = self.protocol.image_metrics(image, scene.held_out, self.lpips)
                     row |= {metric: values.mean().item() for metric, values in metrics.items()}
             rows.append(row | ({"noise": NOISE_OF_SECONDS} if once else {}))
         return rows
-
-    def _exact_images(
-        self, scene: Photographs, settings: Mapping[str, Setting], images: Mapping[str, Tensor]
-    ) -> dict[str, Tensor]:
-        """Render what each setting's images are compared with; an exact setting has none."""
-        rendered: list[tuple[Setting, Tensor]] = [(settings[BASE], images[BASE])]
-        exact_images = {}
-        for name in images:
-            exact = settings[name].exact(settings[BASE])
-            if exact == settings[name]:
-                continue
-            if exact not in [setting for setting, _ in rendered]:
-                rendered.append((exact, exact.prepare(self.refinement, self.device)(scene)))
-            exact_images[name] = next(image for setting, image in rendered if setting == exact)
-        return exact_images
 
 
 def image_error(image: Tensor, exact: Tensor) -> Result:
@@ -535,22 +525,22 @@ def summarize(rows: Sequence[Result]) -> list[Result]:
 
 
 def _means(group: Sequence[Result], bases: Mapping[tuple[str, str], Result]) -> Result:
-    measured = [row for row in group if row["seconds"]]
+    timed_rows = [row for row in group if row["seconds"]]
 
     def values(path: str) -> list[float]:
-        return [value for row in measured if (value := at(row, path)) is not None]
+        return [value for row in timed_rows if (value := at(row, path)) is not None]
 
     def mean(numbers: Sequence[float]) -> float | None:
         return fmean(numbers) if numbers else None
 
     lost = [
         bases[row["family"], row["scene"]]["psnr"] - row["psnr"]
-        for row in measured
+        for row in timed_rows
         if row["psnr"] is not None
     ]
     ratios = values("over_base.median")
     return {
-        "scenes": len(measured),
+        "scenes": len(timed_rows),
         "seconds": mean(values("seconds.median")),
         "over_base": math.exp(fmean(map(math.log, ratios))) if ratios else None,
         "psnr": mean(values("psnr")),
@@ -560,17 +550,15 @@ def _means(group: Sequence[Result], bases: Mapping[tuple[str, str], Result]) -> 
         "error_decibels": mean(values("error.decibels")),
         "error_max": max(values("error.max"), default=None),
         "peak_gb": max(values("peak_gb"), default=None),
-        "busy": any(row["seconds"]["busy"] for row in measured),
+        "busy": any(row["seconds"]["busy"] for row in timed_rows),
     }
 
 
 def points(rows: Sequence[Result], quality: str | None) -> list[tuple[str, float, float]]:
     """Return name, seconds and quality of the settings that have both."""
-    return [
-        (row["setting"], row["seconds"], row[quality])
-        for row in rows
-        if quality and row["seconds"] is not None and row[quality] is not None
-    ]
+    names = ("setting", "seconds", quality)
+    found = [tuple(row.get(name) for name in names) for row in rows]
+    return [point for point in found if None not in point]
 
 
 def _grouped(rows: Sequence[Result], *names: str) -> dict[tuple[str, ...], list[Result]]:

@@ -14,7 +14,7 @@ from asysplat.benchmark.timing import Result
 from asysplat.report.style import FAINT, INK, OURS, PAPER, STYLE
 
 COLORS = {"cpu": OURS, "cuda": INK, "reference": FAINT, "loop": FAINT}
-COLORS |= dict.fromkeys(("chunked", "sdpa", "gsplat"), PAPER)
+COLORS |= dict.fromkeys(("chunked", "sdpa"), PAPER)
 MARKS = "osD^vPX*"
 
 

@@ -1,4 +1,4 @@
-"""Matrix products and convolutions by themselves: the least that a computation made of them takes.
+"""Matrix products and convolutions by themselves: a lower bound of a computation made of them.
 
 Matrices are contiguous, whatever their strides in the computation they stand for; images keep
 channels innermost where they had them so.

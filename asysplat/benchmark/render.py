@@ -1,7 +1,5 @@
 """Every backend of the renderer, and every culling switched off: seconds, memory, error."""
 
-import importlib.util
-import math
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
@@ -31,7 +29,7 @@ from asysplat.benchmark.timing import (
     time_in_rounds,
 )
 from asysplat.ops.simd.threads import time_kernels
-from asysplat.rendering import GSPLAT_1_5, INRIA, Convention, Culling, render
+from asysplat.rendering import Culling, render
 from asysplat.scene import Cameras, Gaussians
 
 WATCHED = Watched(
@@ -53,7 +51,6 @@ class Backend(NamedTuple):
     name: str
     device: torch.device = CPU  # of its tensors
     culling: tuple[str, ...] = ()  # names of the culling that can be switched off
-    convention: Convention = INRIA
 
 
 class Inputs(NamedTuple):
@@ -78,32 +75,8 @@ def find_backends() -> list[Backend]:
     """List the reference, then the fast backends that can run here."""
     backends = [Backend("reference"), Backend("cpu", culling=CULLING)]
     if torch.cuda.is_available():
-        cuda = torch.device("cuda")
-        backends.append(Backend("cuda", cuda, CUDA_CULLING))
-        if importlib.util.find_spec("gsplat"):
-            backends.append(Backend("gsplat", cuda, convention=GSPLAT_1_5))
+        backends.append(Backend("cuda", torch.device("cuda"), CUDA_CULLING))
     return backends
-
-
-def _render_by_gsplat(gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, dict[str, int]]:
-    """Render with gsplat 1.5, not packed, which is faster."""
-    from gsplat import rasterization
-
-    images, _, meta = rasterization(
-        means=gaussians.means,
-        quats=gaussians.quats,
-        scales=gaussians.scales,
-        opacities=gaussians.opacities,
-        colors=gaussians.sh,
-        viewmats=torch.linalg.inv(cameras.cam_to_world),
-        Ks=cameras.intrinsics,
-        width=cameras.width,
-        height=cameras.height,
-        sh_degree=math.isqrt(gaussians.sh.shape[-2]) - 1,
-        packed=False,
-    )
-    stats = {"pairs": len(meta["flatten_ids"]), "tile_size": meta["tile_size"]}
-    return images.movedim(-1, -3), stats
 
 
 def prepare(scene: Scene, device: torch.device = CPU, ignored: Tensor | None = None) -> Inputs:
@@ -126,23 +99,17 @@ def run(backend: Backend, culling: Culling, inputs: Inputs) -> Outputs:
     leaves = [getattr(gaussians, name) for name in FIELDS]
     with time_kernels() as kernels:
         start = now(backend.device)
-        if backend.name == "gsplat":
-            image, stats = _render_by_gsplat(gaussians, cameras)
-        else:
-            choices = {"backend": backend.name, "convention": backend.convention}
-            out = render(gaussians, cameras, depth=False, culling=culling, **choices)
-            image, stats = out.image, out.stats
+        out = render(gaussians, cameras, backend=backend.name, culling=culling, depth=False)
         middle = now(backend.device)
-        gradients = torch.autograd.grad(image, leaves, weights)
+        gradients = torch.autograd.grad(out.image, leaves, weights)
         seconds = {"forward": middle - start, "backward": now(backend.device) - middle}
-    return Outputs(image.detach(), gradients, seconds, kernels, stats)
+    return Outputs(out.image.detach(), gradients, seconds, kernels, out.stats)
 
 
-def run_exact(scene: Scene, convention: Convention, ignored: Tensor | None = None) -> Outputs:
+def run_exact(scene: Scene, ignored: Tensor | None = None) -> Outputs:
     """Render the scene by the reference in float64."""
     exact = tuple(part.to(torch.float64) for part in scene)
-    backend = Backend("reference", convention=convention)
-    return run(backend, Culling(), prepare(exact, ignored=ignored))
+    return run(Backend("reference"), Culling(), prepare(exact, ignored=ignored))
 
 
 def flips(outputs: Outputs, exact: Outputs) -> Tensor:
@@ -187,15 +154,12 @@ def _measure_scene(name: str, repeats: int) -> list[Result]:
     scene = SCENES[name]()
     small = SMALLER[name]() if name in SMALLER else scene
     # Where the rounding of any backend decides about a cut-off, more than rounding differs.
-    ignored = torch.stack(
-        [
-            flips(run(b, Culling(), prepare(small, b.device)), run_exact(small, b.convention))
-            for b in backends
-        ]
-    ).any(0)
+    exact = run_exact(small)
+    fast = [run(b, Culling(), prepare(small, b.device)) for b in backends]
+    ignored = torch.stack([flips(outputs, exact) for outputs in fast]).any(0)
+    exact = run_exact(small, ignored)
     measurements = []
     for backend in backends:
-        exact = run_exact(small, backend.convention, ignored)
         inputs = prepare(scene, backend.device)
         small_inputs = prepare(small, backend.device, ignored)
         for off in (None, *backend.culling):

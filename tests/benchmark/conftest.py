@@ -23,12 +23,13 @@ def make_options(repository):
 
 @pytest.fixture(scope="module")
 def run_suite(repository, make_options, tmp_path_factory):
-    """Run a suite with changed options; return the numbers that it writes."""
+    """Run a suite with changed options, or with all of its options; return what it writes."""
     script = runpy.run_path(str(repository / "benchmark.py"))
 
     def run(suite, changes):
         folder = tmp_path_factory.mktemp("benchmark")
-        options = make_options(suite, changes | {"output": str(folder)})
+        options = make_options(suite, changes) if isinstance(changes, dict) else changes
+        options.output = str(folder)
         with initialize_config_dir(str(repository / "conf"), version_base=None):
             script["benchmark"](options)
         assert (folder / f"{suite}.png").stat().st_size > 0

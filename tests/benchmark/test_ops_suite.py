@@ -35,24 +35,10 @@ LENGTH, LOOP_TOKENS = 150, 50
 TINY = {
     "ssd": {"batch": 1, "length": LENGTH, "heads": 8, "head_dim": 16, "state": 8},
     "selective_scan": {"batch": 2, "length": LENGTH, "channels": 16, "state": 4},
-    "grid_attention": {
-        "batch": 1,
-        "views": 2,
-        "height": 4,
-        "width": 6,
-        "heads": 2,
-        "head_dim": 8,
-        "grids": [1, 2],
-    },
-    "plane_sweep": {
-        "batch": 1,
-        "views": 4,
-        "height": 24,
-        "width": 32,
-        "stride": 2,
-        "planes": 20,
-        "neighbors": 2,
-    },
+    "grid_attention": {"batch": 1, "views": 2, "height": 4, "width": 6, "heads": 2, "head_dim": 8}
+    | {"grids": [1, 2]},
+    "plane_sweep": {"batch": 1, "views": 4, "height": 24, "width": 32, "stride": 2}
+    | {"planes": 20, "neighbors": 2},
     "loop_tokens": LOOP_TOKENS,
     "exact": {
         "ssd": {"length": 140},  # all heads: few numbers would make an error of A's gradient chance
@@ -67,19 +53,19 @@ ATTENTION = ("grid_attention/1", "grid_attention/2")
 @pytest.fixture(scope="module")
 def rows(run_suite):
     """The rows by operator, precision and path."""
-    found = run_suite("ops", {"ops": TINY})["rows"]
-    return {(row["operator"], row["precision"], row["path"]): row for row in found}
+    results = run_suite("ops", {"ops": TINY})
+    return {(row["operator"], row["precision"], row["path"]): row for row in results["rows"]}
 
 
-def test_every_operator_has_a_path_and_what_it_is_compared_with(rows):
+def test_every_operator_has_all_paths(rows):
     for operator in (*SCANS, *ATTENTION):
         for precision in BOUNDS:
             paths = {path for name, p, path in rows if (name, p) == (operator, precision)}
             assert paths - {"loop", "matmuls"}
             assert ("matmuls" in paths) == (operator != "selective_scan")
             assert ("loop" in paths) == (operator in SCANS and precision == "fp32")
-    sweeps = {(precision, path) for name, precision, path in rows if name == "plane_sweep"}
-    assert sweeps == {("fp32", path) for path in ("reference", "cpu")}
+    paths = {(precision, path) for name, precision, path in rows if name == "plane_sweep"}
+    assert paths == {("fp32", path) for path in ("reference", "cpu")}
 
 
 def test_errors_are_below_their_bounds(rows):
@@ -121,14 +107,14 @@ def test_ratios_are_those_of_the_times(rows):
             assert row["loop_tokens"] == LOOP_TOKENS
 
 
-def test_an_error_is_seen():
+def test_errors_are_relative():
     case = OpCase("selective_scan", {"batch": 1, "length": 5, "channels": 3, "state": 2})
     path = make_path(case, "reference", torch.float32, CPU)
     output, gradients = path.exact()
     wrong = 2 * output, {name: 4 * grad for name, grad in gradients.items()}
-    found = path.errors(wrong)
-    assert found["forward"] == pytest.approx(1 / 2, abs=1e-5)
-    assert found["gradients"] == pytest.approx(
+    errors = path.errors(wrong)
+    assert errors["forward"] == pytest.approx(1 / 2, abs=1e-5)
+    assert errors["gradients"] == pytest.approx(
         dict.fromkeys(["x", "dt", "A", "B", "C", "D"], 3 / 4), abs=1e-5
     )
 
@@ -155,7 +141,7 @@ def test_products_are_those_of_the_operator(case, path):
     assert counts <= both
 
 
-def test_large_products_are_done_in_parts_that_add_up():
+def test_large_products_are_split():
     batch, m, k, n = 6, 1000, 64, 30_000
     counts = products([(batch, m, k, n)], torch.bfloat16, CPU)
     assert flops_of(counts) == 2 * batch * m * k * n
@@ -200,19 +186,19 @@ def test_unknown_options_are_named():
     assert find_device("cpu") == CPU
 
 
-def test_a_wrong_size_is_not_taken_for_a_path_that_is_not_there():
+def test_a_wrong_size_is_an_error():
     case = OpCase("grid_attention", MAPS | {"grid": 0})
     with pytest.raises(InputError, match="grid=0"):
         make_rows(case, PRECISIONS, LOOP_TOKENS, CPU)
 
 
-def test_a_sweep_is_of_a_wall_that_can_be_found():
+def test_the_plane_sweep_finds_the_wall():
     sizes = {"batch": 2, "views": 4, "height": 24, "width": 32}
     case = PlaneSweepCase("plane_sweep", sizes | {"stride": 2, "planes": 24, "neighbors": 3})
     tensors = case.tensors()
     assert tensors["images"].min() >= 0 and tensors["images"].max() <= 1
-    found = case.run({name: tensor.float() for name, tensor in tensors.items()}, "cpu")
-    assert torch.equal(found[0], found[1])
+    inverse_depths = case.run({name: tensor.float() for name, tensor in tensors.items()}, "cpu")
+    assert torch.equal(inverse_depths[0], inverse_depths[1])
     cameras = Cameras(tensors["intrinsics"], tensors["cam_to_world"], 24, 32).resized(12, 16)
     # Along rays of z = 1: the wall is at z = DISTANCE + SLANT x.
     rays = (cameras.cam_to_world[..., None, None, :3, :3] @ cameras.pixel_directions()[..., None])[
@@ -221,4 +207,4 @@ def test_a_sweep_is_of_a_wall_that_can_be_found():
     x, _, z = cameras.centers.unbind(-1)
     missing = (DISTANCE + SLANT * x - z)[..., None, None]
     depth = missing / (rays[..., 2] - SLANT * rays[..., 0])
-    assert (found * depth - 1).abs().median() < 0.03
+    assert (inverse_depths * depth - 1).abs().median() < 0.03

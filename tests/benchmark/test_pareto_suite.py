@@ -82,7 +82,7 @@ def make_pareto(make_options, shared_folder):
 @pytest.fixture(scope="module")
 def measured(make_pareto, run_suite):
     options = make_pareto()
-    return options, run_suite("pareto", OmegaConf.to_container(options))
+    return options, run_suite("pareto", options)
 
 
 @pytest.fixture(scope="module")

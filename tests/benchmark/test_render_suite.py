@@ -1,6 +1,5 @@
 """The suite on a tiny scene, and what benchmark.py says to a user."""
 
-import math
 import os
 import subprocess
 import sys
@@ -31,7 +30,7 @@ from asysplat.benchmark.scenes import (
 from asysplat.benchmark.timing import rise_gb
 from asysplat.errors import InputError
 from asysplat.evaluation.cost import CLEAR_PEAK
-from asysplat.rendering import INRIA, Culling
+from asysplat.rendering import Culling
 
 
 @pytest.fixture(scope="module")
@@ -43,18 +42,9 @@ def results(run_suite):
         return run_suite("render", {"scenes": ["tiny", "twin"]})
 
 
-def numbers(value):
-    """All numbers of nested dictionaries and lists."""
-    if isinstance(value, dict | list):
-        inner = value.values() if isinstance(value, dict) else value
-        return [number for part in inner for number in numbers(part)]
-    return [value] if isinstance(value, int | float) else []
-
-
 @pytest.mark.medium
 def test_json_has_every_backend_and_culling(results):
     assert {"cpu", "cores", "threads", "torch", "numba"} <= results["machine"].keys()
-    assert all(math.isfinite(number) for number in numbers(results))
     rows = {(row["scene"], row["backend"], row["without"]): row for row in results["rows"]}
     assert len(rows) == len(results["rows"])
     for scene in ("tiny", "twin"):
@@ -67,7 +57,7 @@ def test_json_has_every_backend_and_culling(results):
         assert row["error"]["measured_on"]["gaussians"] == {"tiny": 500, "twin": 128}[scene]
         assert row["error"]["gradients"].keys() == set(FIELDS)
         assert 0 <= row["error"]["image_p99"] <= row["error"]["image_max"]
-        assert {"visible", "pairs", "tile_size"} <= row["stats"].keys() or backend == "gsplat"
+        assert {"visible", "pairs", "tile_size"} <= row["stats"].keys()
         assert row["forward"].keys() == row["backward"].keys() == {"median", "iqr", "busy"}
         assert row["faster_than_reference"].keys() == {"forward", "backward"}
         if backend == "cpu":
@@ -87,7 +77,7 @@ def test_culling_leaves_the_error_unchanged(results):
 
 def test_errors_are_those_of_image_and_gradients():
     scene = random_scene(200, 20, 20)
-    exact = run_exact(scene, INRIA)
+    exact = run_exact(scene)
     outputs = run(find_backends()[0], Culling(), prepare(scene))
     none = flips(exact, exact)
     close = errors(outputs, exact, none)
