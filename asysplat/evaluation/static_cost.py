@@ -1,8 +1,8 @@
-"""Costs of a forward pass, counted without data and without running it."""
+"""Count the costs of a forward pass without data, on tensors without content."""
 
 import copy
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, UntypedStorage, nn
@@ -16,7 +16,7 @@ GIGA = 1e9
 
 
 def blank_views(num_views: int, height: int, width: int) -> Views:
-    """Make one scene's views with uninitialized content, on torch's default device."""
+    """Create one scene's views with uninitialized content, on torch's default device."""
     intrinsics, poses = torch.empty(1, num_views, 3, 3), torch.empty(1, num_views, 4, 4)
     images = torch.empty(1, num_views, 3, height, width)
     return Views(Cameras(intrinsics, poses, height, width), images)
@@ -26,13 +26,13 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
     """Count the costs of the forward pass of one scene.
 
     Args:
-        net: on any device; a copy on the meta device is measured.
+        net: on any device; its costs are counted on a copy on the meta device.
         num_views, height, width: of the input.
 
     Returns:
         parameters; geometry_share, of 1; gflops as the paper counts them (`module_flops`) and
-        gflops_true (`true_flops`), in 1e9; gaussians, their number, and gaussians_gb, their fields;
-        activation_gb and checkpointed_gb (`Activations`).
+        gflops_true (`true_flops`), in 1e9; gaussians, their number; activation_gb, see
+        `Activations`, without checkpointing.
     """
     on_meta = copy.deepcopy(net).to("meta")
     with torch.device("meta"):
@@ -49,16 +49,13 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
 
     with torch.no_grad():
         everything = true_flops(counted_forward)
-    activations = count_activations(on_meta, num_views, height, width)
     return {
         "parameters": count_parameters(net),
         "geometry_share": net.geometry_share(),
         "gflops": modules / GIGA,
         "gflops_true": everything / GIGA,
         "gaussians": gaussians.num_gaussians,
-        "gaussians_gb": sum(getattr(gaussians, f.name).nbytes for f in fields(gaussians)) / GB,
-        "activation_gb": activations.kept,
-        "checkpointed_gb": activations.checkpointed,
+        "activation_gb": count_activations(on_meta, num_views, height, width).saved,
     }
 
 
@@ -71,53 +68,54 @@ def forward_flops(net: nn.Module, num_views: int, height: int, width: int) -> in
 
 @dataclass(frozen=True)
 class Activations:
-    """The memory that one scene's forward pass keeps for its backward pass, in 1e9 bytes.
+    """Memory of one scene's activations, saved for the backward pass, in 1e9 bytes.
 
     Args:
-        kept: of everything.
-        checkpointed: with every layer computed again in the backward pass: what is kept outside the
-            layers and between them, and within the largest layer.
+        saved: all of them.
+        checkpointed: with layer checkpointing: outside the layers, between them, and within the
+            largest layer.
     """
 
-    kept: float
+    saved: float
     checkpointed: float
 
 
 def activation_gb(net: nn.Module, num_views: int, height: int, width: int) -> float:
-    """Count one scene's activations as the network is set, with or without checkpointing."""
-    found = count_activations(net, num_views, height, width)
+    """Count one scene's activations, with checkpointing if the network's layers have it."""
+    activations = count_activations(net, num_views, height, width)
     checkpointing = any(isinstance(m, Layers) and m.checkpointing for m in net.modules())
-    return found.checkpointed if checkpointing else found.kept
+    return activations.checkpointed if checkpointing else activations.saved
 
 
 def count_activations(net: nn.Module, num_views: int, height: int, width: int) -> Activations:
-    """Count one scene's activations, on fake tensors of the CPU, which have no content.
+    """Count one scene's activations, on fake CPU tensors, which have no content.
 
-    In fp32, or in the caller's autocast; without the parameters, with attention that keeps no
-    scores.
+    They are in fp32, or in the caller's autocast; parameters are not counted, and attention saves
+    no scores.
     """
-    kept: dict[int, tuple[int, nn.Module | None]] = {}  # storage -> its bytes, the layer it is of
+    saved: dict[int, tuple[int, nn.Module | None]] = {}  # storage -> its bytes and its layer
     inputs: dict[int, int] = {}  # storage -> bytes, of the layers' inputs
-    storages: list[UntypedStorage] = []  # as long as they live, none has the address of another
-    within: list[nn.Module] = []  # the layer that computes now
+    storages: list[UntypedStorage] = []  # kept alive, so that no two share an address
+    current: list[nn.Module] = []  # the layer that computes now
 
     def enter(layer: nn.Module, arguments: tuple[Tensor]) -> None:
         storage = arguments[0].untyped_storage()
         storages.append(storage)
         inputs[storage._cdata] = storage.nbytes()
-        within.append(layer)
+        current.append(layer)
 
-    def keep(tensor: Tensor) -> Tensor:
+    def save(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
         if storage._cdata not in own:
             storages.append(storage)
-            kept.setdefault(storage._cdata, (storage.nbytes(), within[-1] if within else None))
+            layer = current[-1] if current else None
+            saved.setdefault(storage._cdata, (storage.nbytes(), layer))
         return tensor
 
     groups = [module for module in net.modules() if isinstance(module, Layers)]
     layers = [layer for group in groups for layer in group]
     hooks = [layer.register_forward_pre_hook(enter) for layer in layers]
-    hooks += [layer.register_forward_hook(lambda *_: within.pop() and None) for layer in layers]
+    hooks += [layer.register_forward_hook(lambda *_: current.pop() and None) for layer in layers]
     checkpointing = [group.checkpointing for group in groups]
     try:
         for group in groups:
@@ -129,7 +127,7 @@ def count_activations(net: nn.Module, num_views: int, height: int, width: int) -
                 state[name].requires_grad_()
             own = {tensor.untyped_storage()._cdata for tensor in state.values()}
             views = blank_views(num_views, height, width)
-            with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            with torch.autograd.graph.saved_tensors_hooks(save, lambda tensor: tensor):
                 torch.func.functional_call(net, state, (views,))
     finally:
         for hook in hooks:
@@ -137,9 +135,9 @@ def count_activations(net: nn.Module, num_views: int, height: int, width: int) -
         for group, was in zip(groups, checkpointing, strict=True):
             group.checkpointing = was
     by_layer = Counter()
-    for size, layer in kept.values():
+    for size, layer in saved.values():
         by_layer[layer] += size
     outside = by_layer.pop(None, 0)
-    between = sum(size for at, size in inputs.items() if kept.get(at, (0, at))[1] is not None)
-    again = outside + between + max(by_layer.values(), default=0)
-    return Activations((outside + by_layer.total()) / GB, again / GB)
+    between = sum(size for at, size in inputs.items() if saved.get(at, (0, at))[1] is not None)
+    checkpointed = outside + between + max(by_layer.values(), default=0)
+    return Activations((outside + by_layer.total()) / GB, checkpointed / GB)
