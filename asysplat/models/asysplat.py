@@ -62,16 +62,8 @@ class AsySplat(Network):
                 f"model.patch_coarse={patch_coarse} is not a multiple of "
                 f"model.patch_fine={patch_fine}: the paper uses 16 and 8."
             )
-        if len(stage_ratios) != len(widths.stages):
-            raise InputError(
-                f"model.stage_ratios has {len(stage_ratios)} entries for {len(widths.stages)} "
-                "stages: give one MLP ratio for each stage."
-            )
         self.appearance_layers = appearance_layers
-        shapes = [
-            StageShape(width, widths.head_dim, ratio)
-            for width, ratio in zip(widths.stages, stage_ratios, strict=True)
-        ]
+        shapes = widths.stage_shapes(stage_ratios)
         fine = StageShape(widths.fine, widths.head_dim, APPEARANCE_MLP_RATIO)
         self.geometry = nn.ModuleDict(
             {

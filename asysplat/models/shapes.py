@@ -1,6 +1,9 @@
 """The sizes of a model: the widths of its network stages."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from asysplat.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -37,3 +40,26 @@ class Widths:
         head_dim = max(4, round(self.head_dim * factor / 4) * 4)
         stages = tuple(width // self.head_dim * head_dim for width in self.stages)
         return Widths(stages, self.fine // self.head_dim * head_dim, head_dim)
+
+    def stage_shapes(
+        self, stage_ratios: Sequence[int], **per_stage: Sequence[object]
+    ) -> list[StageShape]:
+        """Return the shape of each stage.
+
+        Args:
+            stage_ratios: MLP ratio of each stage.
+            per_stage: other options with one entry for each stage.
+
+        Raises:
+            InputError: an option has another number of entries.
+        """
+        for name, values in {"stage_ratios": stage_ratios, **per_stage}.items():
+            if len(values) != len(self.stages):
+                raise InputError(
+                    f"model.{name} has {len(values)} entries for {len(self.stages)} stages of "
+                    "model.stage_widths: give one for each stage."
+                )
+        return [
+            StageShape(width, self.head_dim, ratio)
+            for width, ratio in zip(self.stages, stage_ratios, strict=True)
+        ]

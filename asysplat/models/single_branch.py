@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from asysplat.errors import InputError
 from asysplat.models.attention import SparseAttention
 from asysplat.models.network import Network
-from asysplat.models.shapes import StageShape, Widths
+from asysplat.models.shapes import Widths
 from asysplat.models.stage import Component, Stage
 from asysplat.models.tokenizer import Tokenizer
 
@@ -46,18 +46,8 @@ class SingleBranch(Network):
         prior: nn.Module | None = None,
     ):
         super().__init__(widths, patch * 2 ** sum(merges), prior)
-        lists = {"stage_ratios": stage_ratios, "stage_layers": stage_layers, "merges": merges}
-        for name, values in lists.items():
-            if len(values) != len(widths.stages):
-                raise InputError(
-                    f"model.{name} has {len(values)} entries for {len(widths.stages)} stages of "
-                    "model.stage_widths: give one a stage."
-                )
         self.tokenizer = Tokenizer(patch, widths.stages[0], self.pixel_channels)
-        shapes = [
-            StageShape(width, widths.head_dim, ratio)
-            for width, ratio in zip(widths.stages, stage_ratios, strict=True)
-        ]
+        shapes = widths.stage_shapes(stage_ratios, stage_layers=stage_layers, merges=merges)
         self.stages = nn.ModuleList(
             Stage(previous.width, shape, layers, blocks, merge, global_tokens > 0)
             for previous, shape, layers, merge in zip(

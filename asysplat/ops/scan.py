@@ -1,13 +1,17 @@
-"""The frame of both scans: checks, the choice of a backend, and their operators in torch.
+"""The common parts of both scans: checks, the choice of a backend, and their operators in torch.
 
-"reference" and "chunked" are functions in torch; "cpu" and "cuda" are modules of kernels, which
-torch sees as one operator, so that autograd, torch.compile, autocast, the meta device and the FLOP
-counter take a scan as a whole.
+"reference" and "chunked" are functions in torch. "cpu" and "cuda" are modules of kernels, in which
+x, B and C have the same float type; torch sees them as one operator, so that autograd,
+torch.compile, autocast, the meta device and the FLOP counter take a scan as a whole:
+
+    forward(inputs, reverse, keep) -> y and the saved state, whose sides are 0 unless `keep`
+    backward(grad_output, inputs, saved_state, reverse) -> the gradients, as ScanInputs
+    saved_state_shape(x, B) -> the shape of what the backward pass needs besides the inputs, in fp32
 """
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,21 +42,6 @@ class ScanInputs(NamedTuple):
     B: Tensor
     C: Tensor
     D: Tensor
-
-
-class Kernels(Protocol):
-    """The functions of a scan's modules cpu and cuda; x, B and C have the same float type."""
-
-    def saved_state_shape(self, x: Tensor, B: Tensor) -> tuple[int, ...]:
-        """Return the shape of what the backward pass needs besides the inputs, in fp32."""
-
-    def forward(self, inputs: ScanInputs, reverse: bool, keep: bool) -> tuple[Tensor, Tensor]:
-        """Return y and the saved state, whose sides are 0 unless `keep`."""
-
-    def backward(
-        self, grad_output: Tensor, inputs: ScanInputs, saved_state: Tensor, reverse: bool
-    ) -> ScanInputs:
-        """Return the gradients of the inputs."""
 
 
 class Scan:
@@ -132,7 +121,7 @@ def _register_operator(name: str, count_flops: CountFlops) -> Callable[..., tupl
         (backend, x, dt, A, B, C, D, reverse, keep) -> (y, saved state).
     """
     tensors = "Tensor x, Tensor dt, Tensor A, Tensor B, Tensor C, Tensor D"
-    kernels = partial(load_kernels, name)  # a module as `Kernels` describes
+    kernels = partial(load_kernels, name)
 
     @torch.library.custom_op(
         f"asysplat::{name}",

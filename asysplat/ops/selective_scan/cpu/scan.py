@@ -31,7 +31,7 @@ def saved_state_shape(x: Float[Tensor, "B L D"], B: Float[Tensor, "B L N"]) -> t
 def forward(
     inputs: ScanInputs, reverse: bool, keep: bool
 ) -> tuple[Float[Tensor, "B L D"], Float[Tensor, "_ _ _ _ _"]]:
-    """Return y and the states at the start of chunks; see `asysplat.ops.scan.Kernels`."""
+    """Return y and the states at the start of chunks; see `asysplat.ops.scan`."""
     x = inputs.x
     y = torch.empty(x.shape, dtype=torch.float32)
     shape = saved_state_shape(x, inputs.B)
@@ -49,7 +49,7 @@ def forward(
 def backward(
     grad_output: Float[Tensor, "B L D"], inputs: ScanInputs, saved_state: Tensor, reverse: bool
 ) -> ScanInputs:
-    """Return the gradients of the inputs; see `asysplat.ops.scan.Kernels`."""
+    """Return the gradients of the inputs; see `asysplat.ops.scan`."""
     x, _, _, B, C, _ = inputs
     batch, length, channels = x.shape
     blocks, state_size = saved_state.shape[1], B.shape[-1]

@@ -24,7 +24,7 @@ def saved_state_shape(x: Float[Tensor, "B L D"], B: Float[Tensor, "B L N"]) -> t
 def forward(
     inputs: ScanInputs, reverse: bool, keep: bool
 ) -> tuple[Float[Tensor, "B L D"], Float[Tensor, "0"]]:
-    """Return y and an empty saved state; see `asysplat.ops.scan.Kernels`.
+    """Return y and an empty saved state; see `asysplat.ops.scan`.
 
     Raises:
         InputError: a state size that is no power of two from 16 to 256.
@@ -47,7 +47,7 @@ def backward(
     saved_state: Float[Tensor, "0"],
     reverse: bool,
 ) -> ScanInputs:
-    """Return the gradients of the inputs; see `asysplat.ops.scan.Kernels`."""
+    """Return the gradients of the inputs; see `asysplat.ops.scan`."""
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     grad_output = grad_output.contiguous()
     grad_x, grad_dt = torch.empty_like(x), torch.empty_like(dt)

@@ -30,7 +30,7 @@ def saved_state_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) ->
 def forward(
     inputs: ScanInputs, reverse: bool, keep: bool
 ) -> tuple[Float[Tensor, "B L H P"], Float[Tensor, "_ _ _ _ _"]]:
-    """Return y and the states before each segment; see `asysplat.ops.scan.Kernels`."""
+    """Return y and the states before each segment; see `asysplat.ops.scan`."""
     y = torch.empty_like(inputs.x)
     shape = saved_state_shape(inputs.x, inputs.B)
     saved_state = torch.empty(shape if keep else (0,) * len(shape))
@@ -48,7 +48,7 @@ def forward(
 def backward(
     grad_output: Float[Tensor, "B L H P"], inputs: ScanInputs, saved_state: Tensor, reverse: bool
 ) -> ScanInputs:
-    """Return the gradients of the inputs; see `asysplat.ops.scan.Kernels`."""
+    """Return the gradients of the inputs; see `asysplat.ops.scan`."""
     x, dt, A, B, C, D = inputs
     state_size = B.shape[-1]
     grads = ScanInputs(

@@ -35,7 +35,7 @@ def saved_state_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) ->
 def forward(
     inputs: ScanInputs, reverse: bool, keep: bool
 ) -> tuple[Float[Tensor, "B L H P"], Float[Tensor, "0"]]:
-    """Return y and an empty saved state; see `asysplat.ops.scan.Kernels`.
+    """Return y and an empty saved state; see `asysplat.ops.scan`.
 
     Raises:
         InputError: a head_dim or state size that is no power of two from 16 to 128 or 256.
@@ -61,7 +61,7 @@ def backward(
     saved_state: Float[Tensor, "0"],
     reverse: bool,
 ) -> ScanInputs:
-    """Return the gradients of the inputs; see `asysplat.ops.scan.Kernels`."""
+    """Return the gradients of the inputs; see `asysplat.ops.scan`."""
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     grad_output = grad_output.contiguous()
     with torch.cuda.device_of(x):
