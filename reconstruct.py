@@ -16,6 +16,7 @@ import hydra
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from asysplat import load
 from asysplat.errors import InputError, input_error_behind
 from asysplat.export import read_gaussians
 from asysplat.interrupts import keep_interrupts
@@ -26,7 +27,6 @@ from asysplat.refinement import mean_color, refine
 from asysplat.refinement.init import INITS, best_init, initial_gaussians
 from asysplat.refinement.photographs import Photographs, open_photographs
 from asysplat.scene import Gaussians
-from asysplat import load
 from asysplat.training.ranges import check_ranges
 
 
