@@ -1,6 +1,6 @@
-"""Predict Gaussians with a network and render views that it was not given, without Lightning.
+"""Predict Gaussians with a network and render target views, without Lightning.
 
-python examples/predict_scene.py [logs/demo/.../checkpoints/best.ckpt] [picture.png]
+python examples/predict_scene.py [logs/demo/.../checkpoints/best.ckpt] [figure.png]
 """
 
 import sys
@@ -24,7 +24,7 @@ def build(*overrides: str) -> torch.nn.Module:
 
 
 @torch.no_grad()
-def main(checkpoint: Path | None, picture: Path) -> None:
+def main(checkpoint: Path | None, figure: Path) -> None:
     net = build("model=asysplat_4m4s", "scale=laptop").eval()
     if checkpoint is not None:
         state = torch.load(checkpoint, weights_only=True)["state_dict"]
@@ -33,8 +33,8 @@ def main(checkpoint: Path | None, picture: Path) -> None:
     inputs, targets = scene.views(range(0, 48, 6)), scene.views([9, 21, 33])
     gaussians = net(inputs)
     rendering = render(gaussians, targets.cameras, background=torch.full((3,), 0.5))
-    comparison_figure(inputs, targets, rendering).savefig(picture, dpi=120)
-    print(f"{gaussians.num_gaussians:,} Gaussians; picture: {picture}")
+    comparison_figure(inputs, targets, rendering).savefig(figure, dpi=120)
+    print(f"{gaussians.num_gaussians:,} Gaussians; figure: {figure}")
 
 
 if __name__ == "__main__":

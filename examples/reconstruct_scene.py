@@ -1,4 +1,4 @@
-"""Photographs in, Gaussians out, from Python: load, predict, refine, render, write.
+"""From photographs to Gaussians in Python: load, predict, refine, render, write.
 
 python examples/reconstruct_scene.py [my_scene]
 """
@@ -15,7 +15,7 @@ from asysplat.data.write import write_transforms
 from asysplat.evaluation.figures import comparison_figure
 
 
-def reconstruct(folder: Path, scene: Path, picture: Path) -> None:
+def reconstruct(folder: Path, scene: Path, figure: Path) -> None:
     photographs = open_photographs(folder, height=128, width=128, views=8)
     with torch.no_grad():
         start = load("shipped")(photographs.inputs)
@@ -24,11 +24,11 @@ def reconstruct(folder: Path, scene: Path, picture: Path) -> None:
 
     background = mean_color(photographs.inputs)
     rendering = render(gaussians, photographs.held_out.cameras, background)
-    comparison_figure(photographs.inputs, photographs.held_out, rendering).savefig(picture, dpi=110)
-    print(f"{gaussians.num_gaussians:,} Gaussians; scene: {scene}; picture: {picture}")
+    comparison_figure(photographs.inputs, photographs.held_out, rendering).savefig(figure, dpi=110)
+    print(f"{gaussians.num_gaussians:,} Gaussians; scene: {scene}; figure: {figure}")
 
 
-def made_up(folder: Path) -> Path:
+def write_synthetic(folder: Path) -> Path:
     """Write a synthetic scene in place of photographs."""
     scene = ProceduralScene(seed=7, height=128, width=128, num_images=24)
     write_transforms(scene.views(range(scene.num_images)), folder)
@@ -37,5 +37,5 @@ def made_up(folder: Path) -> Path:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as empty:
-        given = Path(sys.argv[1]) if len(sys.argv) > 1 else made_up(Path(empty) / "made_up")
-        reconstruct(given, Path("reconstructed.ply"), Path("reconstructed.png"))
+        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else write_synthetic(Path(empty) / "scene")
+        reconstruct(folder, Path("reconstructed.ply"), Path("reconstructed.png"))

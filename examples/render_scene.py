@@ -1,6 +1,6 @@
-"""Put a Gaussian on every pixel of three photographs and look at them from between.
+"""Place a Gaussian at every pixel of three images and render views between them.
 
-python examples/render_scene.py [picture.png]
+python examples/render_scene.py [figure.png]
 """
 
 import sys
@@ -14,13 +14,13 @@ from asysplat.evaluation.figures import comparison_figure
 from asysplat.rendering.sh import SH_C0
 
 
-def gaussians_of(views: Views) -> Gaussians:
-    """Make round Gaussians, as wide as a pixel, where the depths say that its surface is."""
+def gaussians_from_depths(views: Views) -> Gaussians:
+    """Build isotropic Gaussians of a pixel's size at the depth of each pixel."""
     cameras = views.cameras
     rotations = cameras.cam_to_world[:, None, None, :3, :3]
     directions = (rotations @ cameras.pixel_directions()[..., None]).squeeze(-1)
     means = cameras.centers[:, None, None] + views.depths[..., None] * directions
-    pixel = views.depths / cameras.intrinsics[:, 0, 0, None, None]  # its side there, scene units
+    pixel = views.depths / cameras.intrinsics[:, 0, 0, None, None]
     colors = views.images.movedim(1, -1)
     num = pixel.numel()
     return Gaussians(
@@ -32,12 +32,12 @@ def gaussians_of(views: Views) -> Gaussians:
     )
 
 
-def main(picture: Path) -> None:
+def main(figure: Path) -> None:
     scene = ProceduralScene(seed=5, height=128, width=128)
     inputs, targets = scene.views([0, 12, 24]), scene.views([6, 18])
-    rendering = render(gaussians_of(inputs), targets.cameras)
-    comparison_figure(inputs, targets, rendering).savefig(picture, dpi=120)
-    print(f"{rendering.stats['visible']:,} Gaussians seen; picture: {picture}")
+    rendering = render(gaussians_from_depths(inputs), targets.cameras)
+    comparison_figure(inputs, targets, rendering).savefig(figure, dpi=120)
+    print(f"{rendering.stats['visible']:,} visible Gaussians; figure: {figure}")
 
 
 if __name__ == "__main__":

@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# From a folder of posed photographs to a trained model:
+# Train a model on a folder of posed photographs:
 #   bash examples/train_on_photographs.sh my_scene [steps=1500 ...]
-# COLMAP's, nerfstudio's and seven more layouts are read as they are: data/README.md.
+# It reads COLMAP, nerfstudio and seven more layouts: data/README.md.
 set -euo pipefail
 scene=$1
 shift
 
-# Do the cameras fit the images? A verdict and a picture; it ends here if they do not.
+# Check the cameras, with a figure; exit if they do not fit the images.
 python -m asysplat.data.check "$scene"
 
-# Every eighth photograph is kept for the test. Options of yours come last and win.
+# Every eighth photograph is held out for the test. Your options come last.
 python "$(dirname "$0")/../train.py" name=photographs data=files data.root="$scene" "$@"
 
-# The same training, looked at: tensorboard --logdir logs/photographs
+# Curves: tensorboard --logdir logs/photographs

@@ -1,4 +1,4 @@
-"""Write a synthetic scene to disk, as a stand-in for photographs of one's own.
+"""Write a synthetic scene to disk, in place of your photographs.
 
 python examples/write_scene.py my_scene
 """

@@ -18,12 +18,12 @@ from asysplat.data import SceneOptions, open_scene
 
 
 @pytest.mark.parametrize("name", ["render_scene", "predict_scene"])
-def test_it_draws_a_picture(repository, tmp_path, monkeypatch, capsys, name):
-    picture = tmp_path / f"{name}.png"
-    monkeypatch.setattr("sys.argv", [name, str(picture)])
+def test_it_draws_a_figure(repository, tmp_path, monkeypatch, capsys, name):
+    figure = tmp_path / f"{name}.png"
+    monkeypatch.setattr("sys.argv", [name, str(figure)])
     runpy.run_path(str(repository / "examples" / f"{name}.py"), run_name="__main__")
-    assert cv2.imread(str(picture)).std() > 20
-    assert str(picture) in capsys.readouterr().out
+    assert cv2.imread(str(figure)).std() > 20
+    assert str(figure) in capsys.readouterr().out
 
 
 @pytest.mark.slow  # the notebook does the same

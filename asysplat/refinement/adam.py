@@ -17,13 +17,13 @@ class VisibleAdam:
     seldom visible, or a tensor whose learning rate was 0, starts as on the first step.
 
     Args:
-        parameters: tensors by name, contiguous, all with N rows, one for each Gaussian.
+        parameters: tensors by name, without gradients, contiguous, all with N rows, one for each
+            Gaussian.
         betas: decay of the running averages of a gradient and of its square, in [0, 1).
         eps: > 0, added to the root of the latter.
 
     Attributes:
-        parameters: the tensors. A step changes them in place; `keep` and `append` replace them by
-            leaves that need a gradient if the old ones did.
+        parameters: the tensors. A step changes them in place; `keep` and `append` replace them.
         non_finite: number of visible rows that were not updated so far, because a gradient was NaN
             or infinite.
     """
@@ -72,7 +72,7 @@ class VisibleAdam:
             if row_rates.any():
                 _expect(f"gradient of {name}", gradients.get(name), parameter.shape)
                 gradient = gradients[name].to(parameter).contiguous()
-                numbers = (parameter.detach(), gradient, state["mean"], state["square"])
+                numbers = (parameter, gradient, state["mean"], state["square"])
                 flat = (tensor.view(self.num_rows, len(row_rates)) for tensor in numbers)
                 tensors.append(Rows(*flat, state["steps"], row_rates))
         if tensors:
@@ -82,7 +82,7 @@ class VisibleAdam:
     def keep(self, index: Int[Tensor, "M"]) -> None:
         """Keep the rows of `index`, in its order; a row may be repeated."""
         for name, tensor in self.parameters.items():
-            self.parameters[name] = _leaf(tensor[index], tensor)
+            self.parameters[name] = tensor[index]
             self._state[name] = {part: value[index] for part, value in self._state[name].items()}
 
     @torch.no_grad()
@@ -95,8 +95,9 @@ class VisibleAdam:
         count = len(next(iter(parameters.values())))
         for name, tensor in self.parameters.items():
             _expect(f"append of {name}", parameters.get(name), (count, *tensor.shape[1:]))
+        for name, tensor in self.parameters.items():
             added = parameters[name].to(tensor)
-            self.parameters[name] = _leaf(torch.cat((tensor, added)), tensor)
+            self.parameters[name] = torch.cat((tensor, added))
             self._state[name] = {
                 part: torch.cat((self._state[name][part], value))
                 for part, value in _zero_state(added).items()
@@ -112,11 +113,7 @@ def _expect(name: str, tensor: Tensor | None, shape: tuple[int, ...]) -> None:
 
 def _zero_state(parameter: Tensor) -> dict[str, Tensor]:
     return {
-        "mean": torch.zeros_like(parameter, requires_grad=False),
-        "square": torch.zeros_like(parameter, requires_grad=False),
+        "mean": torch.zeros_like(parameter),
+        "square": torch.zeros_like(parameter),
         "steps": torch.zeros(len(parameter), dtype=torch.int32, device=parameter.device),
     }
-
-
-def _leaf(tensor: Tensor, like: Tensor) -> Tensor:
-    return tensor.detach().requires_grad_(like.requires_grad)

@@ -30,7 +30,7 @@ def chromium():
 def viewer(repository):
     views = ProceduralScene(seed=5, height=96, width=128).views([0, 8, 16, 24])
     example = runpy.run_path(str(repository / "examples" / "render_scene.py"))
-    with Viewer(views, example["gaussians_of"](views), port=0) as viewer:
+    with Viewer(views, example["gaussians_from_depths"](views), port=0) as viewer:
         yield viewer
 
 

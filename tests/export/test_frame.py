@@ -1,4 +1,4 @@
-"""The frame that suits scenes of any size, and what pages do with cameras."""
+"""The frame of the viewer's pages, and their cameras."""
 
 import math
 from dataclasses import replace
@@ -21,7 +21,7 @@ from asysplat.export.frame import (
 )
 
 
-def moved(cameras, factor, offset):
+def scaled_cameras(cameras, factor, offset):
     poses = cameras.cam_to_world.clone()
     poses[:, :3, 3] = factor * poses[:, :3, 3] + offset
     return replace(cameras, cam_to_world=poses)
@@ -38,7 +38,7 @@ def test_a_scene_of_any_size_looks_the_same(make_scene, factor):
     offset = factor * torch.tensor([30.0, -20, 10])
     scaled = gaussians.scale_by(factor)
     scaled = replace(scaled, means=scaled.means + offset)
-    placed = moved(cameras, factor, offset)
+    placed = scaled_cameras(cameras, factor, offset)
     frame = page_frame(placed, scaled)
     inside = in_frame(frame, placed)
     assert inside.centers.mean(0).norm() < 1e-4
@@ -64,7 +64,7 @@ def test_up_is_the_mean_of_the_cameras(make_scene):
     torch.testing.assert_close(mean_up(opposed), -poses[0, :3, 1])
 
 
-def test_frustums_are_half_as_long_as_cameras_are_apart(make_scene):
+def test_frustums_are_half_the_distance_of_cameras(make_scene):
     _, cameras = make_scene(views=3, dtype=torch.float32)
     poses = cameras.cam_to_world.clone()
     for apart, length in ((0.2, 0.1), (1e-3, FRUSTUM_LENGTHS[0]), (5.0, FRUSTUM_LENGTHS[1])):
@@ -73,7 +73,7 @@ def test_frustums_are_half_as_long_as_cameras_are_apart(make_scene):
     assert frustum_length(cameras.select([0])) == FRUSTUM_LENGTHS[1]
 
 
-def test_the_look_at_is_where_the_gaussians_are(make_scene):
+def test_distance_along(make_scene):
     gaussians, _ = make_scene(count=61, dtype=torch.float32)
     forward, origin = torch.tensor([0.0, 0, 1]), torch.zeros(3)
     assert distance_along(gaussians, origin, forward) == pytest.approx(3.5, abs=0.1)
@@ -81,7 +81,7 @@ def test_the_look_at_is_where_the_gaussians_are(make_scene):
 
 
 def page_of(cameras, view):
-    """What viser says of a page that stands in a camera, whose pixels are square."""
+    """viser's camera of a page at an input camera."""
     return SimpleNamespace(
         wxyz=quaternion(cameras, view),
         position=cameras.centers[view].numpy(),
@@ -91,7 +91,7 @@ def page_of(cameras, view):
     )
 
 
-def test_a_page_that_stands_in_a_camera_has_it(make_scene):
+def test_a_page_at_an_input_camera(make_scene):
     _, cameras = make_scene(views=3, height=60, width=80, dtype=torch.float32)
     focal = torch.tensor([[70.0, 0, 40], [0, 70, 30], [0, 0, 1]])
     cameras = replace(cameras, intrinsics=focal.repeat(3, 1, 1))
@@ -103,7 +103,7 @@ def test_a_page_that_stands_in_a_camera_has_it(make_scene):
     assert field_of_view(cameras, 0)[1] == pytest.approx(80 / 60)
 
 
-def test_fewer_pixels_see_as_much(make_scene):
+def test_fewer_pixels_keep_the_field_of_view(make_scene):
     _, cameras = make_scene(height=600, width=800, dtype=torch.float32)
     camera, in_full = page_camera(page_of(cameras, 0), 30_000)
     assert not in_full and (camera.height, camera.width) == (150, 200)
@@ -111,7 +111,7 @@ def test_fewer_pixels_see_as_much(make_scene):
     assert expected == pytest.approx(field_of_view(cameras, 0)[0])
 
 
-def test_a_ray_meets_the_first_photograph_that_is_drawn(make_scene):
+def test_a_click_hits_the_first_visible_image(make_scene):
     _, cameras = make_scene(views=3, height=60, width=80, dtype=torch.float32)
     poses = torch.eye(4).repeat(3, 1, 1)
     poses[:, 2, 3] = torch.tensor([0.0, 1, 2])  # one behind the other, looking ahead

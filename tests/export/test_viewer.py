@@ -1,4 +1,4 @@
-"""The viewer: what pages are sent, and what it does when scenes change and pages come and go."""
+"""The viewer: images for its pages, changes of the scene, pages that come and go."""
 
 import sys
 import time
@@ -47,11 +47,11 @@ def inside(viewer, gaussians):
 def until(condition):
     end = time.monotonic() + 60
     while not condition():
-        assert time.monotonic() < end, "it never came to that"
+        assert time.monotonic() < end, "timed out"
         time.sleep(0.01)
 
 
-def test_without_viser_it_says_what_to_install(scene, monkeypatch):
+def test_without_viser(scene, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match=r"needs viser: pip install 'viser>=1\.1'"):
         Viewer(scene[1])
@@ -100,7 +100,7 @@ def test_ctrl_c_ends_waiting_and_closes(viewer, monkeypatch):
         urlopen(viewer.url)
 
 
-def test_pages_are_sent_what_render_gives_for_their_cameras(scene, viewer):
+def test_pages_show_the_rendering_of_their_cameras(scene, viewer):
     gaussians, views = scene
     shown, cameras = inside(viewer, gaussians)
     with open_page(viewer) as first, open_page(viewer) as second:
@@ -111,7 +111,7 @@ def test_pages_are_sent_what_render_gives_for_their_cameras(scene, viewer):
         first.picture_like(draw_layer(gaussians, views.cameras.select([2])))
 
 
-def test_the_panel_changes_what_is_sent(scene, viewer):
+def test_the_panel_changes_the_rendering(scene, viewer):
     gaussians, cameras = inside(viewer, scene[0])
     camera = cameras.select([1])
     target = image_at(viewer._views, camera, SAME_POSITION)
@@ -128,7 +128,7 @@ def test_the_panel_changes_what_is_sent(scene, viewer):
             page.picture_like(image)
 
 
-def test_error_asks_for_a_place_where_a_photograph_was_taken(scene, viewer):
+def test_error_needs_an_input_camera(scene, viewer):
     _, cameras = inside(viewer, scene[0])
     viewer._layer.value = "error"
     poses = cameras.cam_to_world.clone()
@@ -141,7 +141,7 @@ def test_error_asks_for_a_place_where_a_photograph_was_taken(scene, viewer):
         until(lambda: NO_IMAGE not in viewer._text.content)
 
 
-def test_the_newest_scene_wins_and_nobody_waits_for_a_picture(scene, monkeypatch):
+def test_the_newest_scene_wins_and_show_does_not_block(scene, monkeypatch):
     """While a picture takes its time, `show` returns; of what it was given the last is drawn."""
     gaussians, views = scene
     drawn, started, turn = [], Event(), Event()
@@ -167,7 +167,7 @@ def test_the_newest_scene_wins_and_nobody_waits_for_a_picture(scene, monkeypatch
         assert "49 Gaussians, 120 x 90 pixels" in viewer._text.content
 
 
-def test_a_scene_that_changes_in_place_is_shown_as_it_was(scene, viewer):
+def test_the_scene_is_copied(scene, viewer):
     gaussians, _ = scene
     before, cameras = inside(viewer, gaussians)
     gaussians.sh.zero_()
@@ -197,7 +197,7 @@ def test_many_scenes_from_another_thread(scene, viewer):
         until(lambda: "29/29" in viewer._text.content)
 
 
-def test_the_degrees_of_sh_follow_the_scene(scene, viewer):
+def test_the_sh_degree_follows_the_scene(scene, viewer):
     gaussians, _ = scene
     assert (viewer._sh_degree.max, viewer._sh_degree.value) == (1, 1)
     for degree in (3, 0, 2):
@@ -262,7 +262,7 @@ def test_pages_come_and_go(scene):
             assert not viewer._thread.is_alive()
 
 
-def test_a_click_on_a_camera_leads_there(scene, viewer):
+def test_a_click_on_a_camera_moves_there(scene, viewer):
     gaussians, cameras = inside(viewer, scene[0])
     with open_page(viewer) as page:
         page.stand(cameras, 0)

@@ -1,4 +1,4 @@
-"""Layers: what they show is what `render` gives, and where no photograph tells, nothing is said."""
+"""Layers show what `render` returns; the error is unknown where no image was taken."""
 
 from dataclasses import replace
 
@@ -29,13 +29,13 @@ def test_color_and_alpha_are_those_of_the_renderer(scene):
 
 
 @pytest.mark.parametrize("layer", LAYERS)
-def test_every_layer_is_a_picture_for_the_browser(scene, layer):
-    picture = draw_layer(*scene, layer=layer, target=torch.rand(3, 24, 32))
-    assert picture.shape == (24, 32, 3) and picture.dtype == np.uint8
-    assert np.ptp(picture) > 50
+def test_every_layer_is_an_rgb_image(scene, layer):
+    image = draw_layer(*scene, layer=layer, target=torch.rand(3, 24, 32))
+    assert image.shape == (24, 32, 3) and image.dtype == np.uint8
+    assert np.ptp(image) > 50
 
 
-def test_the_nearest_is_the_brightest():
+def test_near_is_bright():
     camera = Cameras(
         torch.tensor([[[20.0, 0, 16], [0, 20, 8], [0, 0, 1]]]), torch.eye(4)[None], 16, 32
     )
@@ -46,18 +46,18 @@ def test_the_nearest_is_the_brightest():
         opacities=torch.full((2,), 0.99),
         sh=torch.zeros(2, 1, 3),
     )
-    picture = draw_layer(gaussians, camera, layer="depth").astype(int)
-    near, far, nothing = (picture[8, column].sum() for column in (6, 26, 16))
+    image = draw_layer(gaussians, camera, layer="depth").astype(int)
+    near, far, nothing = (image[8, column].sum() for column in (6, 26, 16))
     assert near > far > nothing
 
 
-def test_an_empty_picture_has_no_depth(scene):
+def test_the_depth_of_an_empty_image(scene):
     gaussians, camera = scene
     behind = replace(gaussians, means=gaussians.means * torch.tensor([1, 1, -1.0]))
     assert np.ptp(draw_layer(behind, camera, layer="depth"), axis=(0, 1)).max() == 0
 
 
-def test_what_is_hidden_is_not_there(scene):
+def test_minimum_opacity(scene):
     gaussians, camera = scene
     least = gaussians.opacities.median().item()
     kept = gaussians.keep(gaussians.opacities >= least)
@@ -66,7 +66,7 @@ def test_what_is_hidden_is_not_there(scene):
     assert 0 < kept.num_gaussians < gaussians.num_gaussians
 
 
-def test_sh_of_higher_degrees_are_left_out(scene):
+def test_sh_degree(scene):
     gaussians, camera = scene
     constant = replace(gaussians, sh=gaussians.sh[:, :1])
     drawn = draw_layer(gaussians, camera, sh_degree=0)
@@ -74,7 +74,7 @@ def test_sh_of_higher_degrees_are_left_out(scene):
     assert (drawn != draw_layer(gaussians, camera, sh_degree=1)).any()
 
 
-def test_smaller_gaussians_cover_less(scene):
+def test_size(scene):
     gaussians, camera = scene
     half = draw_layer(gaussians, camera, layer="alpha", size=0.5)
     smaller = replace(gaussians, scales=gaussians.scales / 2)
@@ -82,7 +82,7 @@ def test_smaller_gaussians_cover_less(scene):
     assert half.mean() < 0.8 * draw_layer(gaussians, camera, layer="alpha").mean()
 
 
-def test_error_is_dark_where_right_and_where_nothing_is_known(scene):
+def test_error_is_black_where_correct_or_unknown(scene):
     rendered = render(*scene).image[0].clamp(0, 1)
     black = draw_layer(*scene, layer="error", target=rendered)
     assert np.ptp(black, axis=(0, 1)).max() == 0
@@ -95,7 +95,7 @@ def test_error_is_dark_where_right_and_where_nothing_is_known(scene):
     np.testing.assert_array_equal(error[12:], black[12:])
 
 
-def test_without_a_photograph_error_shows_the_color(scene):
+def test_error_without_a_target_is_the_color(scene):
     np.testing.assert_array_equal(draw_layer(*scene, layer="error"), draw_layer(*scene))
 
 
@@ -105,58 +105,58 @@ def sky(cameras):
 
 
 @pytest.fixture
-def photographs(make_scene):
+def views(make_scene):
     _, cameras = make_scene(views=3, height=48, width=64, dtype=torch.float32)
     return Views(cameras, sky(cameras))
 
 
-def test_from_its_own_camera_the_photograph_comes_back(photographs):
+def test_image_at_its_own_camera(views):
     for view in range(3):
-        seen = image_at(photographs, photographs.cameras.select([view]), 1e-3)
-        torch.testing.assert_close(seen, photographs.images[view], atol=1e-4, rtol=0)
+        seen = image_at(views, views.cameras.select([view]), 1e-3)
+        torch.testing.assert_close(seen, views.images[view], atol=1e-4, rtol=0)
 
 
-def test_another_camera_in_its_place_sees_the_same_directions(photographs):
+def test_image_at_another_camera_at_the_same_position(views):
     """Of other size, field of view and rotation."""
-    own = photographs.cameras.select([1])
+    own = views.cameras.select([1])
     turn = torch.eye(4)
     turn[:3, :3] = torch.linalg.matrix_exp(
         torch.tensor([[0, -0.1, 0.2], [0.1, 0, -0.1], [-0.2, 0.1, 0]])
     )
     intrinsics = torch.tensor([[[30.0, 0, 20], [0, 30, 15], [0, 0, 1]]])
     camera = Cameras(intrinsics, own.cam_to_world @ turn, 30, 40)
-    seen = image_at(photographs, camera, 1e-3)
+    seen = image_at(views, camera, 1e-3)
     known = seen.isfinite().all(0)
     assert 0.3 < known.float().mean() < 1
     torch.testing.assert_close(seen[:, known], sky(camera)[0][:, known], atol=0.01, rtol=0)
 
 
-def test_behind_a_camera_there_is_no_photograph(photographs):
+def test_no_image_behind_a_camera(views):
     around = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
-    camera = photographs.cameras.select([0])
+    camera = views.cameras.select([0])
     camera = replace(camera, cam_to_world=camera.cam_to_world @ around)
-    assert image_at(photographs, camera, 1e-3).isnan().all()
+    assert image_at(views, camera, 1e-3).isnan().all()
 
 
-def test_masked_pixels_are_not_known(photographs):
+def test_masked_pixels_are_unknown(views):
     masks = torch.ones(3, 48, 64, dtype=torch.bool)
     masks[:, 10:20] = False
-    masked = replace(photographs, masks=masks)
-    seen = image_at(masked, photographs.cameras.select([2]), 1e-3)
+    masked = replace(views, masks=masks)
+    seen = image_at(masked, views.cameras.select([2]), 1e-3)
     torch.testing.assert_close(seen.isfinite().all(0), masks[2])
 
 
-def test_where_no_one_stood_there_is_none(photographs):
-    camera = photographs.cameras.select([0])
+def test_no_image_at_other_positions(views):
+    camera = views.cameras.select([0])
     poses = camera.cam_to_world.clone()
     poses[:, 0, 3] += 0.01
-    assert image_at(photographs, replace(camera, cam_to_world=poses), 1e-3) is None
+    assert image_at(views, replace(camera, cam_to_world=poses), 1e-3) is None
 
 
-def test_of_several_in_one_place_the_one_that_looks_that_way(photographs):
-    poses = photographs.cameras.cam_to_world[:1].repeat(2, 1, 1)
+def test_the_image_with_the_nearest_direction(views):
+    poses = views.cameras.cam_to_world[:1].repeat(2, 1, 1)
     poses[0] = poses[0] @ torch.diag(torch.tensor([-1.0, 1, -1, 1]))
-    cameras = replace(photographs.cameras.select([0, 0]), cam_to_world=poses)
+    cameras = replace(views.cameras.select([0, 0]), cam_to_world=poses)
     views = Views(cameras, sky(cameras))
     for view in range(2):
         seen = image_at(views, cameras.select([view]), 1e-3)

@@ -1,4 +1,4 @@
-"""What several tests of reconstruction share."""
+"""Fixtures of several tests of the refinement."""
 
 import pytest
 import torch

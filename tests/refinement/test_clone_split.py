@@ -1,4 +1,4 @@
-"""Gaussians whose images are pulled become two."""
+"""Densification of 3DGS: clone and split by screen-space gradients."""
 
 from dataclasses import replace
 
@@ -39,18 +39,18 @@ def fields_of(start):
     return Fields(start, torch.linspace(0.5, 2, start.num_gaussians))
 
 
-def pulled(fields, *rows):
-    """Return pulls of which those of `rows` are enough, the first the strongest."""
-    pulls = ScreenGradients(fields)
+def with_gradients(fields, *rows):
+    """Return gradients above the threshold for `rows`, the first the largest."""
+    screen = ScreenGradients(fields)
     # At distance 2 to 2.5 and focal length 40 this is 2.4 or more of half an image.
     gradients = torch.zeros(len(fields), 3)
     for rank, row in enumerate(rows):
         gradients[row, 0] = fields.units[row] * DENSIFY_GRAD_THRESHOLD * (len(rows) - rank)
-    pulls.add(gradients, camera())
-    return pulls
+    screen.add(gradients, camera())
+    return screen
 
 
-def test_a_pull_is_the_gradient_of_the_place_in_the_image():
+def test_screen_gradients_are_those_of_the_position_in_the_image():
     """With one Gaussian, that of the principal point, times half the image's sides."""
     start = gaussians(size=0.1, count=1)
     fields, cameras = fields_of(start), camera()
@@ -60,26 +60,26 @@ def test_a_pull_is_the_gradient_of_the_place_in_the_image():
     image = render(fields.gaussians(leaves), cameras, depth=False).image
     error = (image - target).abs().mean()
     of_pixels, of_offsets = torch.autograd.grad(error, (intrinsics, leaves["offsets"]))
-    pulls = ScreenGradients(fields)
-    pulls.add(of_offsets, camera())
+    screen = ScreenGradients(fields)
+    screen.add(of_offsets, camera())
     expected = (of_pixels[0, :2, 2] * torch.tensor([24.0, 16.0])).norm()
     assert expected > 1e-5
-    torch.testing.assert_close(pulls.mean, expected[None], rtol=1e-3, atol=0)
+    torch.testing.assert_close(screen.mean, expected[None], rtol=1e-3, atol=0)
 
 
-def test_the_mean_is_over_the_photographs_that_see_it():
+def test_the_mean_is_over_views_that_show_it():
     fields = fields_of(gaussians())
-    pulls = pulled(fields, 1)
-    once = pulls.mean.clone()
-    pulls.add(torch.zeros(COUNT, 3), camera())
-    torch.testing.assert_close(pulls.mean, once)
+    screen = with_gradients(fields, 1)
+    once = screen.mean.clone()
+    screen.add(torch.zeros(COUNT, 3), camera())
+    torch.testing.assert_close(screen.mean, once)
     assert once[1] > DENSIFY_GRAD_THRESHOLD and once.count_nonzero() == 1
 
 
-def test_a_small_one_is_cloned_where_it_is():
+def test_small_gaussians_are_cloned_in_place():
     fields = fields_of(gaussians())
     before = fields.gaussians()
-    pulled(fields, 3).clone_and_split(100, generator())
+    with_gradients(fields, 3).clone_and_split(100, generator())
     after = fields.gaussians()
     assert len(fields) == COUNT + 1
     for name in ("means", "scales", "opacities", "sh"):
@@ -87,10 +87,10 @@ def test_a_small_one_is_cloned_where_it_is():
         torch.testing.assert_close(getattr(after, name)[COUNT], getattr(before, name)[3])
 
 
-def test_a_large_one_is_split_in_two_smaller_ones_around_it():
+def test_large_gaussians_are_split_in_two_smaller_ones():
     fields = fields_of(gaussians(size=2 * SPLIT_SCALE, count=200))
     before = fields.gaussians()
-    pulled(fields, *range(100)).clone_and_split(1000, generator())
+    with_gradients(fields, *range(100)).clone_and_split(1000, generator())
     after = fields.gaussians()
     assert len(fields) == 300
     torch.testing.assert_close(after.means[:100], before.means[100:])
@@ -101,15 +101,15 @@ def test_a_large_one_is_split_in_two_smaller_ones_around_it():
     assert 0.8 < away.std() / (2 * SPLIT_SCALE) < 1.2
 
 
-def test_no_more_than_there_is_room_for_and_the_most_pulled_first():
+def test_the_limit_and_the_largest_gradients_first():
     fields = fields_of(gaussians())
     before = fields.gaussians()
-    pulled(fields, 4, 2, 0).clone_and_split(COUNT + 1, generator())
+    with_gradients(fields, 4, 2, 0).clone_and_split(COUNT + 1, generator())
     assert len(fields) == COUNT + 1
     torch.testing.assert_close(fields.gaussians().means[-1], before.means[4])
 
 
-def test_transparent_ones_are_dropped_but_one_is_left():
+def test_transparent_gaussians_are_pruned_but_one():
     start = gaussians()
     faint = torch.full((COUNT,), MIN_OPACITY / 2)
     some = faint.clone()
@@ -121,8 +121,8 @@ def test_transparent_ones_are_dropped_but_one_is_left():
 
 
 @pytest.mark.parametrize("rows", [(), (1,)])
-def test_pulls_are_forgotten_after_a_round(rows):
+def test_gradients_are_reset_after_a_round(rows):
     fields = fields_of(gaussians())
-    pulls = pulled(fields, *rows)
-    pulls.clone_and_split(100, generator())
-    assert pulls.mean.shape == (len(fields),) and not pulls.mean.any()
+    screen = with_gradients(fields, *rows)
+    screen.clone_and_split(100, generator())
+    assert screen.mean.shape == (len(fields),) and not screen.mean.any()

@@ -1,4 +1,4 @@
-"""Gaussians as numbers that move, and back."""
+"""Gaussians as unconstrained parameters, and back."""
 
 from dataclasses import fields as fields_of
 from dataclasses import replace
@@ -33,7 +33,7 @@ def gradients_of(fields, fill=1.0):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gaussians_come_back(gaussians, dtype):
+def test_round_trip(gaussians, dtype):
     gaussians.opacities[:3] = torch.tensor([1.0, 1 - 1e-6, 1e-6])
     gaussians.scales[3:5] = torch.tensor([1e-30, 1e30])[:, None]
     fields = Fields(gaussians.to(dtype), units(gaussians).to(dtype))
@@ -42,7 +42,7 @@ def test_gaussians_come_back(gaussians, dtype):
     fields.gaussians().validate()
 
 
-def test_any_layout_and_half_precision_will_do(gaussians):
+def test_any_layout_and_half_precision(gaussians):
     gaussians = replace(gaussians, sh=gaussians.sh.mT.contiguous().mT)
     assert not gaussians.sh.is_contiguous()
     assert_close(Fields(gaussians, units(gaussians)).gaussians(), gaussians)
@@ -62,7 +62,7 @@ def test_sh_are_cut_or_filled_with_0(gaussians, degree):
     assert (found[:, both:] == 0).all()
 
 
-def test_what_one_starts_from_is_not_changed(gaussians):
+def test_the_input_is_copied(gaussians):
     before = gaussians.map(torch.clone)
     fields = Fields(gaussians, units(gaussians))
     fields.step(gradients_of(fields), Rates(), 1.0)
@@ -87,7 +87,7 @@ def test_the_first_step_is_as_long_as_the_rates(gaussians):
     torch.testing.assert_close(fields.gaussians().means, means, rtol=1e-4, atol=1e-6)
 
 
-def test_what_was_not_seen_or_has_no_rate_stays(gaussians):
+def test_invisible_rows_and_fields_without_a_rate_stay(gaussians):
     fields = Fields(gaussians, units(gaussians))
     gradients = gradients_of(fields)
     for gradient in gradients.values():
@@ -107,7 +107,7 @@ def test_what_was_not_seen_or_has_no_rate_stays(gaussians):
             assert torch.equal(~stays, seen & (torch.arange(12) != 1))
 
 
-def test_leaves_have_a_gradient_and_the_numbers_none(gaussians):
+def test_leaves_have_gradients_and_parameters_none(gaussians):
     fields = Fields(gaussians, units(gaussians))
     leaves = fields.leaves()
     found = fields.gaussians(leaves)
@@ -147,7 +147,7 @@ def test_rows_are_added_with_a_unit_of_their_own(gaussians):
     torch.testing.assert_close(moved, torch.full_like(moved, 7.0), rtol=1e-3, atol=0)
 
 
-def test_no_rows_may_be_added(gaussians):
+def test_append_of_no_rows(gaussians):
     fields = Fields(gaussians, units(gaussians))
     fields.append(gaussians.keep(torch.zeros(12, dtype=torch.bool)), torch.zeros(0))
     assert_close(fields.gaussians(), gaussians)

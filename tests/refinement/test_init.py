@@ -1,4 +1,4 @@
-"""Where Gaussians start: on the prior's surfaces and at points, as large as what they stand for."""
+"""Initial Gaussians: from a prior's depth maps and from sparse points."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def true_prior(views, opacity=0.5):
     return Prior(distance, torch.ones_like(distance), torch.full_like(distance, opacity))
 
 
-def test_a_prior_puts_a_gaussian_where_each_pixel_sees_its_surface(room):
+def test_gaussians_of_a_prior_are_at_the_surface_points(room):
     gaussians = gaussians_from_prior(room, true_prior(room)).validate()
     assert gaussians.num_gaussians == room.depths.numel()
     for view in range(room.num_views):
@@ -70,7 +70,7 @@ def test_a_gaussian_of_a_prior_covers_its_pixel():
 
 
 @pytest.mark.parametrize("size", [(4, 5), (3, 7), (8, 10), (20, 11), (1, 1)], ids=str)
-def test_a_prior_has_a_grid_of_its_own(size):
+def test_a_prior_of_any_size(size):
     """Of fewer pixels than the photographs, of more, and of such as do not divide them."""
     views = front_views(height=8, width=10)
     distance = torch.full((1, 1, *size), 2.0)
@@ -101,7 +101,7 @@ def test_masked_pixels_get_no_gaussian():
     assert torch.equal(none.means, every.means)
 
 
-def test_footprints_are_those_of_the_finest_camera_that_sees_a_point():
+def test_footprints_are_the_smallest_over_visible_views():
     views = front_views(places=[(0.0, 0, 0), (0.0, 0, 1), (9.0, 0, 0)])
     cameras = replace(views.cameras, intrinsics=views.cameras.intrinsics.clone())
     cameras.intrinsics[2, :2, :2] *= 100  # the third is fine, and sees nothing of this
@@ -117,14 +117,14 @@ def test_footprints_are_those_of_the_finest_camera_that_sees_a_point():
     torch.testing.assert_close(footprints(points, cameras), expected)
 
 
-def test_footprints_of_points_at_a_camera_are_above_0():
+def test_footprints_at_a_camera_are_above_0():
     views = front_views()
     found = footprints(torch.zeros(2, 3), views.cameras)
     assert (found > 0).all() and (found < 1e-30).all()
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_the_unit_of_the_world_changes_nothing_else(scale):
+def test_invariance_to_the_scene_unit(scale):
     places = [(0.0, 0, 0), (0.5, 0.1, 0)]
     torch.manual_seed(3)
     views, plain = front_views(places, scale=scale), front_views(places)
@@ -138,7 +138,7 @@ def test_the_unit_of_the_world_changes_nothing_else(scale):
     torch.testing.assert_close(sizes, footprints(points, plain.cameras))
 
 
-def test_points_are_as_large_as_their_neighbors_are_far():
+def test_points_have_the_mean_distance_of_neighbors_as_size():
     points = torch.tensor([[0.0, 0, 5], [3.0, 0, 5], [0.0, 4, 5], [0.0, 0, 6], [100.0, 0, 5]])
     gaussians = gaussians_from_points(points, front_views(focal=50.0)).validate()
     torch.testing.assert_close(gaussians.scales[0], torch.full((3,), (3 + 4 + 1) / 3))
@@ -153,7 +153,7 @@ def test_few_points_are_enough(count):
     torch.testing.assert_close(gaussians.scales[0], torch.full((3,), size))
 
 
-def test_points_at_one_place_are_as_large_as_a_pixel():
+def test_coincident_points_have_the_size_of_a_pixel():
     for place in ([0.0, 0.0, 2.0], [0.0, 0.0, 0.0]):  # before a camera, and at it
         points = torch.tensor(place).repeat(6, 1)
         gaussians = gaussians_from_points(points, front_views()).validate()
@@ -161,7 +161,7 @@ def test_points_at_one_place_are_as_large_as_a_pixel():
         assert torch.equal(gaussians.scales, expected[:, None].repeat(1, 3))
 
 
-def test_what_cannot_be_a_point_is_named():
+def test_invalid_points_are_refused():
     for points, found in (
         (torch.zeros(0, 3), "got 0 points"),
         (torch.tensor([[0.0, 0, 1], [torch.nan, torch.inf, 1]]), "2 points with 2 coordinates"),
@@ -170,7 +170,7 @@ def test_what_cannot_be_a_point_is_named():
             gaussians_from_points(points, front_views())
 
 
-def test_colors_are_the_mean_of_the_pixels_that_count():
+def test_colors_are_the_mean_of_unmasked_pixels():
     views = front_views(places=[(0.0, 0, 0), (1.0, 0, 0)])
     points = torch.tensor([[0.5, 0.1, 2.0], [-1.9, -1.5, 2.0], [0.0, 0, -1]])
     # In the first view (6.25, 4.25) and (0.25, 0.25); in the second (3.75, 4.25) and outside.
@@ -184,7 +184,7 @@ def test_colors_are_the_mean_of_the_pixels_that_count():
     torch.testing.assert_close(found, torch.stack((one, gray, gray)))
 
 
-def test_cameras_all_in_one_place_are_cameras(room):
+def test_cameras_at_one_position(room):
     poses = room.cameras.cam_to_world.clone()
     poses[:, :3, 3] = poses[0, :3, 3]
     views = replace(room, cameras=replace(room.cameras, cam_to_world=poses))

@@ -1,4 +1,4 @@
-"""Gaussians of a cell become one: weighted means, what they hid together, and never too many."""
+"""Merging: weighted means, opacity of all together, and the limit."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from asysplat.errors import InputError
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import MAX_OPACITY, MIN_OPACITY, SPREAD, merge_cells, merge_to_limit
 from asysplat.rendering import render
-from asysplat.scene import Cameras, Gaussians
+from asysplat.scene import Cameras
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -40,7 +40,7 @@ def everything(gaussians):
     )
 
 
-def test_two_alike_become_one_that_hides_what_both_did():
+def test_equal_gaussians_merge_to_the_opacity_of_both():
     one = some(1)
     two = merge_cells(repeated(one, 2), torch.full((2,), 0.01))
     assert two.num_gaussians == 1
@@ -49,7 +49,7 @@ def test_two_alike_become_one_that_hides_what_both_did():
     torch.testing.assert_close(two.opacities, 1 - (1 - one.opacities) ** 2)
 
 
-def test_the_picture_of_twice_the_same_stays():
+def test_the_image_of_doubled_gaussians_stays():
     gaussians = some(60)
     gaussians.opacities.mul_(0.3)
     twice, cells = repeated(gaussians, 2), torch.full((120,), 1e-4)
@@ -60,7 +60,7 @@ def test_the_picture_of_twice_the_same_stays():
     assert (once - twice).abs().mean() <= 0.2 * (half - twice).abs().mean()
 
 
-def test_a_cell_has_the_means_weighted_by_opacity():
+def test_means_are_weighted_by_opacity():
     means = torch.tensor([[0.0, 0, 0], [0.1, 0.2, 0.3]])
     both = isotropic_gaussians(
         means, torch.tensor([2.0, 8.0]), torch.tensor([0.6, 0.2]), torch.eye(3)[:2]
@@ -72,7 +72,7 @@ def test_a_cell_has_the_means_weighted_by_opacity():
     torch.testing.assert_close(one.opacities, torch.tensor([1 - 0.4 * 0.8]))
 
 
-def test_what_is_left_covers_its_cell():
+def test_merged_gaussians_cover_their_cell():
     both = isotropic_gaussians(
         torch.zeros(2, 3), torch.full((2,), 1e-3), torch.full((2,), 0.5), torch.zeros(2, 3)
     )
@@ -91,7 +91,7 @@ def test_opacities_keep_a_gradient(opacity):
     torch.testing.assert_close(one.means, few.means[:1])
 
 
-def test_one_that_is_hardly_there_changes_nothing():
+def test_a_transparent_gaussian_changes_nothing():
     both = some(2)
     both.means[:] = 0
     both.opacities[1] = 1e-7
@@ -101,7 +101,7 @@ def test_one_that_is_hardly_there_changes_nothing():
 
 
 @pytest.mark.parametrize("angle", [0.0, 3.1415, 3.1416, 3.2, 6.28], ids=str)
-def test_turns_that_differ_little_have_a_mean(angle):
+def test_the_mean_of_similar_rotations(angle):
     """Half a turn has w = 0, on both sides of which w changes its sign; q and -q are one turn."""
     angles = torch.tensor([angle - 0.01, angle, angle + 0.01])
     both = repeated(some(1), 3)
@@ -124,7 +124,7 @@ def test_cells_are_powers_of_2_and_tile_the_space():
     assert sorted(mixed.means[:, 0].tolist()) == [1, 2.5, 3.5, 5, 6.5, 7.5]
 
 
-def test_where_the_world_begins_changes_nothing():
+def test_invariance_to_translation():
     gaussians, cells = some(300), torch.rand(300) + 0.1
     shift = torch.tensor([1024.0, -512, 64])
     moved = gaussians.map(lambda tensor: tensor)
@@ -136,14 +136,14 @@ def test_where_the_world_begins_changes_nothing():
     torch.testing.assert_close(found.means - shift, expected.means, rtol=0, atol=1e-3)
 
 
-def test_the_order_changes_nothing_but_the_bits():
+def test_invariance_to_order():
     gaussians, cells = some(200), torch.rand(200) + 0.1
     order = torch.randperm(200)
     found = merge_cells(gaussians.map(lambda tensor: tensor[order]), cells[order])
     torch.testing.assert_close(found.means, merge_cells(gaussians, cells).means)
 
 
-def test_ranks_do_not_collide_where_places_do_not_fit_an_integer():
+def test_cell_ids_do_not_overflow():
     """A point at a camera has a cell of next to nothing, and its place a number beyond 2^63."""
     means = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1, 0], [1.0, 1, 1e-30]])
     few = isotropic_gaussians(means, torch.ones(4), torch.full((4,), 0.5), torch.zeros(4, 3))
@@ -153,7 +153,7 @@ def test_ranks_do_not_collide_where_places_do_not_fit_an_integer():
 
 @pytest.mark.parametrize("most", [1, 2, 7, 50, 199, 200, 1000])
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_there_are_never_more_than_most(most, scale):
+def test_the_limit(most, scale):
     gaussians = some(200, scale)
     few = merge_to_limit(gaussians, camera(), 1e-3, most).validate()
     assert few.num_gaussians <= most
@@ -163,7 +163,7 @@ def test_there_are_never_more_than_most(most, scale):
     assert ((few.means >= low - 1e-5 * scale) & (few.means <= high + 1e-5 * scale)).all()
 
 
-def test_pixels_decide_where_there_is_room():
+def test_the_size_of_cells_below_the_limit():
     gaussians = some(400)
     counts = [
         merge_to_limit(gaussians, camera(), pixels, 400).num_gaussians
@@ -178,7 +178,7 @@ def test_pixels_decide_where_there_is_room():
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
-def test_few_and_those_at_one_place_become_one(count):
+def test_equal_positions_merge_to_one(count):
     alike = repeated(some(1), count)
     assert merge_to_limit(alike, camera(), 1.0, 1).validate().num_gaussians == 1
     alike.means[:] = 0  # at the camera
@@ -194,9 +194,8 @@ def test_the_same_bits_again(threads):
     assert torch.equal(found[0], found[1]) and torch.equal(found[1], found[2])
 
 
-def test_nan_is_named():
+def test_nan_is_refused():
     gaussians = some(5)
     gaussians.means[3, 1] = torch.nan
     with pytest.raises(InputError, match=r"merge_to_limit's gaussians.means\[3\] holds NaN"):
         merge_to_limit(gaussians, camera(), 1.0, 5)
-    assert isinstance(gaussians, Gaussians)

@@ -1,4 +1,4 @@
-"""Dead Gaussians move to live ones, which look as before; faint ones are shaken."""
+"""3DGS-MCMC: dead Gaussians are relocated to live ones; faint ones get position noise."""
 
 import math
 from dataclasses import replace
@@ -36,7 +36,7 @@ def fields_of(gaussians):
     return Fields(gaussians, torch.linspace(0.5, 2, gaussians.num_gaussians))
 
 
-def picture(gaussians, cameras):
+def draw(gaussians, cameras):
     return render(gaussians, cameras, torch.full((3,), 0.5), depth=False).image
 
 
@@ -51,19 +51,8 @@ def double_sum(opacity, count):
     return opacity / total
 
 
-def test_two_in_the_place_of_one_are_as_in_equation_9():
-    opacities = torch.tensor([0.05, 0.3, 0.75, 0.99])
-    scales = torch.rand(4, 3)
-    found, sizes = split_opacity_and_scale(opacities, scales, torch.full((4,), 2))
-    half = 1 - (1 - opacities).sqrt()
-    torch.testing.assert_close(found, half)
-    factor = opacities / (2 * half - half**2 / math.sqrt(2))
-    torch.testing.assert_close(sizes, scales * factor[:, None])
-    assert (factor < 1).all()
-
-
 @pytest.mark.parametrize("count", [1, 2, 3, 10, MAX_COPIES])
-def test_any_number_are_as_in_equation_9(count):
+def test_any_number_of_copies_as_in_equation_9(count):
     opacities, scales = torch.linspace(0.3, 0.99, 7), torch.rand(7, 3)
     found, sizes = split_opacity_and_scale(opacities, scales, torch.full((7,), count))
     exact = (1 - (1 - opacities.double()) ** (1 / count)).float().clamp_min(MIN_OPACITY)
@@ -74,7 +63,7 @@ def test_any_number_are_as_in_equation_9(count):
         torch.testing.assert_close((found, sizes), (opacities, scales))
 
 
-def test_more_than_the_most_count_as_that_many():
+def test_more_than_max_copies_count_as_max_copies():
     one = torch.tensor([0.9, 1.0]), torch.ones(2, 3)
     most, more = (
         split_opacity_and_scale(*one, torch.full((2,), count)) for count in (MAX_COPIES, 1000)
@@ -84,38 +73,38 @@ def test_more_than_the_most_count_as_that_many():
 
 
 @pytest.mark.parametrize("dead", [1, 40])
-def test_the_picture_stays_when_dead_ones_move(scene, dead):
+def test_the_image_stays_when_dead_gaussians_move(scene, dead):
     gaussians, cameras = scene
     gaussians.opacities[:dead] = MIN_OPACITY / 2
     fields = fields_of(gaussians)
-    before = picture(gaussians, cameras)
+    before = draw(gaussians, cameras)
     relocate(fields, 80, 0.0, generator())
     found = fields.gaussians().validate()
     assert found.num_gaussians == 80
     assert (found.opacities > MIN_OPACITY).all()
     assert not torch.equal(found.opacities, gaussians.opacities)
-    assert (picture(found, cameras) - before).abs().mean() <= 1e-2
+    assert (draw(found, cameras) - before).abs().mean() <= 1e-2
     uncorrected = gaussians.map(lambda field: torch.cat((field[40:], field[40:])))
-    assert dead < 40 or (picture(uncorrected, cameras) - before).abs().mean() > 2e-2
+    assert dead < 40 or (draw(uncorrected, cameras) - before).abs().mean() > 2e-2
 
 
-def test_the_picture_stays_when_copies_are_added(scene):
+def test_the_image_stays_when_copies_are_added(scene):
     gaussians, cameras = scene
     fields = fields_of(gaussians)
     relocate(fields, 1000, 0.5, generator())
     assert len(fields) == 120
-    difference = picture(fields.gaussians(), cameras) - picture(gaussians, cameras)
+    difference = draw(fields.gaussians(), cameras) - draw(gaussians, cameras)
     assert difference.abs().mean() <= 1e-2
 
 
-def test_no_more_than_most_and_none_is_lost(scene):
+def test_the_limit_adds_no_more_and_removes_none(scene):
     for most, growth, expected in ((100, 0.5, 100), (80, 1.0, 80), (20, 1.0, 80), (200, 0.05, 84)):
         fields = fields_of(scene[0])
         relocate(fields, most, growth, generator())
         assert len(fields) == expected
 
 
-def test_those_that_are_alone_stay_and_copies_begin_anew(scene):
+def test_copies_have_the_fields_of_their_original(scene):
     gaussians = scene[0]
     gaussians.opacities[:30] = MIN_OPACITY / 2
     fields = fields_of(gaussians)
@@ -137,7 +126,7 @@ def test_those_that_are_alone_stay_and_copies_begin_anew(scene):
     assert counts.max() > 2 and counts.min() == 1
 
 
-def test_what_was_copied_takes_its_first_step_again(scene):
+def test_copies_have_a_new_optimizer_state(scene):
     fields = fields_of(scene[0])
     up = {name: torch.ones_like(tensor) for name, tensor in fields.parameters.items()}
     for _ in range(5):
@@ -153,7 +142,7 @@ def test_what_was_copied_takes_its_first_step_again(scene):
     assert (moved[~several] < 0).all() and several.any() and (~several).any()
 
 
-def test_live_ones_are_drawn_by_opacity():
+def test_live_gaussians_are_sampled_by_opacity():
     opacities = torch.cat(
         (torch.full((2000,), 1e-3), torch.full((50,), 0.2), torch.full((50,), 0.6))
     )
@@ -167,7 +156,7 @@ def test_live_ones_are_drawn_by_opacity():
     assert abs(share - (0.75 * 2000 + 50) / 2100) <= 0.03
 
 
-def test_where_none_is_alive_they_stay():
+def test_without_live_gaussians_all_stay():
     start = isotropic_gaussians(
         torch.rand(6, 3), torch.ones(6), torch.full((6,), 1e-6), torch.rand(6, 3)
     )
@@ -190,7 +179,7 @@ def test_the_same_generator_relocates_the_same(scene):
     assert not torch.equal(found[0].scales, found[2].scales)
 
 
-def test_faint_ones_are_shaken_along_their_covariance():
+def test_noise_has_the_shape_of_the_covariance():
     """Noise of the deviation NOISE * sigmoid(100 (0.005 - o)) * factor, times the covariance."""
     count = 4000
     quats, scales = torch.tensor([[0.8, 0.1, -0.5, 0.3]]), torch.tensor([[0.1, 0.02, 0.3]])
@@ -210,7 +199,7 @@ def test_faint_ones_are_shaken_along_their_covariance():
     assert (along.mean(0).abs() <= 4 * expected / count**0.5).all()
 
 
-def test_opaque_ones_keep_still_and_nothing_else_moves(scene):
+def test_noise_moves_only_means_of_faint_gaussians(scene):
     gaussians = scene[0]
     gaussians.opacities[:10] = 0.006
     fields = fields_of(gaussians)

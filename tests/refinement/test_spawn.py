@@ -1,4 +1,4 @@
-"""New Gaussians: at wrong pixels, on the surface, with the photograph's color."""
+"""Densification by errors: new Gaussians at wrong pixels, with position, color and size."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def wrong_in(views, view, rows, columns):
     return rendered
 
 
-def test_they_are_at_wrong_pixels_on_the_surface_in_its_color(room):
+def test_position_color_and_size(room):
     rows, columns = slice(10, 14), slice(20, 28)
     rendered = wrong_in(room, 2, rows, columns)
     found = spawn_at_errors(room, rendered, room.depths, 40, generator()).validate()
@@ -56,7 +56,7 @@ def test_they_are_at_wrong_pixels_on_the_surface_in_its_color(room):
     assert len(torch.unique(row * 32 + column)) == 40  # each pixel once
 
 
-def test_they_are_drawn_as_often_as_pixels_are_wrong(room):
+def test_samples_are_proportional_to_errors(room):
     rendered = room.images.clone()
     rendered[0, :, :, :16] += 0.3
     rendered[0, :, :, 16:] += 0.1
@@ -73,7 +73,7 @@ def test_they_are_drawn_as_often_as_pixels_are_wrong(room):
     assert abs(left.float().mean().item() - 3 / 7) <= 0.06
 
 
-def test_no_more_than_wrong_pixels_and_none_where_nothing_is_seen(room):
+def test_none_without_an_error_or_at_the_background(room):
     rendered = wrong_in(room, 1, slice(4, 6), slice(4, 6))
     assert spawn_at_errors(room, rendered, room.depths, 500, generator()).num_gaussians == 16
     depth = room.depths.clone()
@@ -84,7 +84,7 @@ def test_no_more_than_wrong_pixels_and_none_where_nothing_is_seen(room):
         assert found.num_gaussians == 0 and found.sh.shape == (0, 1, 3)
 
 
-def test_masked_pixels_get_none(room):
+def test_masked_pixels_are_not_sampled(room):
     masks = torch.ones_like(room.depths, dtype=torch.bool)
     masks[:, :, 8:] = False
     views = replace(room, masks=masks)
@@ -107,14 +107,14 @@ def test_the_same_generator_draws_the_same(room, threads):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 2)], ids=str)
-def test_tiny_pictures_will_do(room, size):
+def test_tiny_images(room, size):
     cameras = room.cameras.resized(*size)
     views = Views(cameras, torch.rand(4, 3, *size))
     found = spawn_at_errors(views, torch.zeros(4, 3, *size), torch.ones(4, *size), 3, generator())
     assert found.validate().num_gaussians == 3
 
 
-def test_one_looks_at_each_view_and_where_half_of_a_ray_is_hidden(room):
+def test_render_views(room):
     """A wall of opaque Gaussians before the second camera alone."""
     x = torch.linspace(-0.5, 0.5, 21)
     plane = torch.stack((*torch.meshgrid(x, x, indexing="ij"), 2 + torch.zeros(21, 21)), -1)
