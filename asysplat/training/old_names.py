@@ -38,7 +38,12 @@ KEYS = {  # of the configuration; a new name has the same parent
     "speed.known": "skip_network_above",
     "speed.sure": "skip_layers_above",
 }
-REMOVED = {"speed.coverage": None, "speed.faint": None}  # with the value that had no effect
+ANY = object()
+REMOVED = {  # with the value that had no effect
+    "callbacks.guard.folder": ANY,
+    "speed.coverage": None,
+    "speed.faint": None,
+}
 RESULTS = {  # parts of the keys of metrics.json, as regular expressions
     r"/mean_colour/": "/mean_color/",
     r"^mean_colour/": "mean_color/",
@@ -66,7 +71,7 @@ def upgrade_config(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any
     upgraded = {}
     for key, value in config.items():
         path = f"{prefix}{key}"
-        if path in REMOVED and value == REMOVED[path]:
+        if path in REMOVED and REMOVED[path] in (ANY, value):
             continue
         if isinstance(value, Mapping):
             value = upgrade_config(value, f"{path}.")

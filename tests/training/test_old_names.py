@@ -1,7 +1,7 @@
-"""A run that an earlier version of the code wrote is read as one of today's.
+"""A run that an earlier version of the code wrote is read under today's names.
 
-old_run/ is a finished run of two stages and its evaluation, less what nobody reads; its command is
-in .hydra/overrides.yaml, and targets.txt lists the classes of conf/ of that version.
+old_run/ has the files of a finished run of two stages and of its evaluation; .hydra/overrides.yaml
+is its command, and targets.txt lists the classes that the conf/ of that version named.
 """
 
 import json
@@ -15,8 +15,9 @@ from hydra.utils import get_object
 from omegaconf import OmegaConf
 
 from asysplat import load
+from asysplat.report.fill import finished_runs
 from asysplat.training.old_names import CLASSES, KEYS, read_config
-from asysplat.training.runs import find_run
+from asysplat.training.runs import config_hash, find_run
 
 OLD_RUN = Path(__file__).parent / "old_run"
 
@@ -39,7 +40,7 @@ def config(repository):
         return compose("train", [*overrides_of_today(), "paths.run=unused"])
 
 
-def test_a_sweep_finds_it(old_run, config):
+def test_a_sweep_and_the_report_find_it(old_run, config):
     run = find_run(old_run.parent, config)
     assert run.folder == old_run
     assert run.results["test/procedural/psnr"] == pytest.approx(13.95, abs=0.01)
@@ -50,6 +51,8 @@ def test_a_sweep_finds_it(old_run, config):
         "test/rooms/post1/psnr",
     ):
         assert key in run.results
+    (reported,) = finished_runs(old_run.parent)[config_hash(config)]
+    assert reported == run
     other = config.copy()
     other.stages.stage1.steps = 7
     assert find_run(old_run.parent, other) is not None  # steps=2 is the same for all stages
