@@ -1,4 +1,4 @@
-"""Augmentation of training tasks: order of the inputs, crop, exposure, noise; never in evaluation.
+"""Augmentation of training tasks (never of evaluation): order of inputs, crop, exposure, noise.
 
 Order and crop as in Long-LRM (arXiv 2410.12781).
 """
@@ -14,20 +14,20 @@ from torch.nn.functional import interpolate
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
-GAMMA = 2.2  # of photographs, about that of sRGB
+GAMMA = 2.2  # of images, about that of sRGB
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How much training tasks vary.
+    """Strength of the augmentations of training tasks.
 
     Args:
-        reverse, shuffle: how likely the inputs are given backwards, and in random order.
-        crop: the least share of the sides that a crop keeps; 1 crops nothing.
-        exposure: the most stops by which a task, inputs and targets alike, is brighter or darker.
-        white_balance: the most stops by which its red and its blue are, beside its green.
-        flicker: the most stops by which one input is, beside the other views.
-        noise: the greatest standard deviation of the noise of a task's inputs.
+        reverse, shuffle: probability of inputs in reverse order, and in random order.
+        crop: least share of the sides that a crop keeps; 1 crops nothing.
+        exposure: greatest change in stops of a whole task, inputs and targets alike.
+        white_balance: greatest change in stops of a task's red and blue, relative to its green.
+        flicker: greatest change in stops of one input, relative to the other views.
+        noise: greatest standard deviation of the noise in a task's inputs.
 
     Raises:
         InputError: a number outside [0, 1], or a share of 0.
@@ -50,7 +50,7 @@ class Augmentation:
                 )
 
     def order(self, inputs: Sequence[int], rng: np.random.Generator) -> list[int]:
-        """Return the same frames, maybe in another order."""
+        """Reverse and shuffle the inputs at random."""
         ordered = list(inputs)
         if rng.random() < self.reverse:
             ordered.reverse()
@@ -59,7 +59,7 @@ class Augmentation:
         return ordered
 
     def share(self, rng: np.random.Generator) -> float:
-        """Draw the share of the sides that a crop keeps; one for all views of a task."""
+        """Draw the share of the sides that a crop keeps, the same for all views of a task."""
         return float(rng.uniform(self.crop, 1.0))
 
     def expose(
@@ -74,7 +74,7 @@ class Augmentation:
         stops = rng.uniform(-self.exposure, self.exposure) + np.array([red, 0.0, blue])
         flicker = rng.uniform(-self.flicker, self.flicker, (inputs.cameras.num_views, 1))
         noise = rng.uniform(0, self.noise)
-        inputs, targets = brightened(inputs, stops + flicker), brightened(targets, stops[None])
+        inputs, targets = brighten(inputs, stops + flicker), brighten(targets, stops[None])
         if noise:
             grain = torch.from_numpy(rng.standard_normal(inputs.images.shape, np.float32))
             noisy = inputs.images + noise * grain.to(inputs.images)
@@ -82,20 +82,20 @@ class Augmentation:
         return inputs, targets
 
 
-def brightened(views: Views, stops: Float[np.ndarray, "#V 3"]) -> Views:
-    """Multiply the light of every view by 2^stops, for red, green and blue; 1 is the brightest.
+def brighten(views: Views, stops: Float[np.ndarray, "#V 3"]) -> Views:
+    """Multiply the light of every view by 2^stops, for red, green and blue, and clip at 1.
 
-    Images are taken to hold light to the power of 1 / GAMMA.
+    Images store light to the power of 1 / GAMMA.
     """
     gains = torch.from_numpy(2 ** (stops / GAMMA)).to(views.images)
     return replace(views, images=(views.images * gains[..., None, None]).clamp(max=1))
 
 
-def cropped(views: Views, share: float) -> Views:
-    """Crop every view to its middle, enlarged to the size that the views had.
+def center_crop(views: Views, share: float) -> Views:
+    """Crop every view around its center at whole pixels, and enlarge it to the original size.
 
-    Cut out at whole pixels and enlarged: images bilinearly, depths and masks without mixing. The
-    intrinsics follow exactly; poses stay as they are.
+    Images are resampled bilinearly, depths and masks by nearest neighbor. The intrinsics change
+    accordingly; the poses stay.
 
     Args:
         views: [V, ...].
@@ -108,7 +108,7 @@ def cropped(views: Views, share: float) -> Views:
     top, left = (height - rows) // 2, (width - columns) // 2
 
     images = views.images[..., top : top + rows, left : left + columns]
-    # The pixel under each new center.
+    # The pixel under each new pixel center.
     y = top + (torch.arange(height) + 0.5) * rows // height
     x = left + (torch.arange(width) + 0.5) * columns // width
     nearest = (..., y.long()[:, None], x.long())
@@ -116,10 +116,9 @@ def cropped(views: Views, share: float) -> Views:
     intrinsics[:, 0, 2] -= left
     intrinsics[:, 1, 2] -= top
     cameras = replace(views.cameras, intrinsics=intrinsics, height=rows, width=columns)
+    maps = {name: getattr(views, name) for name in ("depths", "masks", "disparities")}
     return Views(
         cameras=cameras.resized(height, width),
         images=interpolate(images, (height, width), mode="bilinear"),
-        depths=None if views.depths is None else views.depths[nearest],
-        masks=None if views.masks is None else views.masks[nearest],
-        disparities=None if views.disparities is None else views.disparities[nearest],
+        **{name: None if values is None else values[nearest] for name, values in maps.items()},
     )

@@ -1,4 +1,4 @@
-"""Bring every scene into the same world frame and scale before a network sees it."""
+"""Normalize the world frame and scale of scenes for networks."""
 
 from dataclasses import dataclass, replace
 
@@ -12,18 +12,18 @@ from asysplat.scene import Gaussians, TensorRecord, Views
 
 @dataclass(frozen=True)
 class Normalization(TensorRecord):
-    """How a scene was brought into the network's frame, and the way back.
+    """The transform from the data set's world to the network's frame, and its inverse.
 
     Args:
         world_to_mean: rigid, float64, from the data set's world to the mean input camera.
-        scale: factor of all lengths, applied after that.
+        scale: factor of all lengths, applied afterwards.
     """
 
     world_to_mean: Float[Tensor, "4 4"]
     scale: float
 
     def apply(self, views: Views) -> Views:
-        """Bring views from the data set's world into the network's frame, depths included."""
+        """Transform views, with their depths, from the data set's world to the network's frame."""
         poses = self.world_to_mean @ views.cameras.cam_to_world.double()
         poses[:, :3, 3] *= self.scale
         cameras = replace(views.cameras, cam_to_world=poses.to(views.cameras.cam_to_world))
@@ -34,23 +34,23 @@ class Normalization(TensorRecord):
         return replace(views, cameras=cameras, depths=depths, point_depths=point_depths)
 
     def to_network(self, gaussians: Gaussians) -> Gaussians:
-        """Bring Gaussians from the data set's world into the network's frame."""
+        """Transform Gaussians from the data set's world to the network's frame."""
         return transform(gaussians, self.world_to_mean).scale_by(self.scale)
 
     def to_world(self, gaussians: Gaussians) -> Gaussians:
-        """Bring Gaussians back to the data set's world, where its own cameras see the same."""
+        """Transform Gaussians from the network's frame to the data set's world."""
         return transform(gaussians.scale_by(1 / self.scale), torch.linalg.inv(self.world_to_mean))
 
 
 def normalize(inputs: Views, targets: Views) -> tuple[Views, Views, Normalization]:
-    """Put the world's origin at the mean input camera and the farthest input at distance 1.
+    """Move the world's origin to the mean input camera and scale the farthest input to distance 1.
 
     The mean pose has the mean of the centers and the mean of the forward and down axes, made
     orthonormal by Gram-Schmidt (as Long-LRM, arXiv 2410.12781). One scene, without batch dimension.
 
     Returns:
-        inputs and targets in the new frame, and how to undo it; the scale is 1 where all inputs
-        stand in one place.
+        inputs and targets in the network's frame, and the transform; its scale is 1 if all inputs
+        have the same position.
     """
     poses = inputs.cameras.cam_to_world.double()
     centers = poses[:, :3, 3]
@@ -59,15 +59,15 @@ def normalize(inputs: Views, targets: Views) -> tuple[Views, Views, Normalizatio
     mean_pose[:3, 3] = centers.mean(0)
     radius = (centers - centers.mean(0)).norm(dim=-1).max()
     # Smaller differences between the centers are rounding.
-    apart = radius > 1e-6 * centers.abs().max()
-    frame = Normalization(torch.linalg.inv(mean_pose), 1 / radius.item() if apart else 1.0)
+    distinct = radius > 1e-6 * centers.abs().max()
+    frame = Normalization(torch.linalg.inv(mean_pose), 1 / radius.item() if distinct else 1.0)
     return frame.apply(inputs), frame.apply(targets), frame
 
 
 def _mean_rotation(rotations: Float[Tensor, "V 3 3"]) -> Float[Tensor, "3 3"]:
     forward, down = rotations[:, :, 2].mean(0), rotations[:, :, 1].mean(0)
     right = torch.linalg.cross(down, forward)
-    # On a full circle the forward axes cancel: then take the first camera's axes.
+    # On a full circle the forward axes cancel: use the first camera's axes.
     if right.norm() < 1e-3:
         return rotations[0]
     forward, right = forward / forward.norm(), right / right.norm()

@@ -1,4 +1,4 @@
-"""Sparse points of a scene, as its cameras see them."""
+"""Depth maps of sparse points."""
 
 import torch
 import torch.nn.functional as F
@@ -8,44 +8,42 @@ from torch import Tensor
 from asysplat.data.sequence import Points
 from asysplat.scene import Cameras
 
-IN_A_WINDOW = 4  # points, on average: enough to meet the surface that hides a point
-BEHIND = 0.2  # of the nearest depth in its window: a point that is farther is hidden
+POINTS_PER_WINDOW = 4  # on average: enough to include a surface that occludes a point
+OCCLUSION_MARGIN = 0.2  # a point so much deeper than its window's nearest point is occluded
 
 
 def depths_of_points(points: Points, cameras: Cameras) -> Float[Tensor, "V H W"]:
-    """Return the depth along z of the nearest point in every pixel; 0 where there is none.
+    """Render the depth along z of the nearest point in every pixel; 0 without a visible point.
 
-    Between the points of a surface one sees those behind it. A point that is much farther than
-    another in a window around it is therefore left out; the sparser the points, the larger the
-    window.
+    A point counts as occluded if it is much deeper than another point in a window around it, since
+    sparse points of a surface leave gaps. The sparser the points, the larger the window.
 
     Args:
         points: in the world of the cameras.
         cameras: of one scene, [V].
     """
-    homogeneous = F.pad(torch.as_tensor(points, dtype=torch.float64), (0, 1), value=1.0)
-    world_to_cam = torch.linalg.inv(cameras.cam_to_world.double())
-    projections = cameras.intrinsics.double() @ world_to_cam[:, :3]
-    size = (cameras.height, cameras.width)
-    inverse = torch.stack([_nearest(homogeneous @ p.mT, *size) for p in projections])
-    seen = (inverse > 0) & (inverse * (1 + BEHIND) >= torch.stack([_around(i) for i in inverse]))
-    return torch.where(seen, 1 / inverse, 0).to(cameras.intrinsics)
+    points = torch.as_tensor(points, dtype=torch.float64)
+    exact = cameras.to(torch.float64)
+    views = [exact.select([view]) for view in range(cameras.num_views)]
+    inverse = torch.stack([_nearest(points, view) for view in views])
+    nearest = torch.stack([_window_maximum(view) for view in inverse])
+    visible = (inverse > 0) & (inverse * (1 + OCCLUSION_MARGIN) >= nearest)
+    return torch.where(visible, 1 / inverse, 0).to(cameras.intrinsics)
 
 
-def _nearest(projected: Float[Tensor, "P 3"], height: int, width: int) -> Float[Tensor, "H W"]:
-    """Return the greatest inverse depth in every pixel, from homogeneous image positions."""
-    z = projected[:, 2]
-    x, y = (projected[:, :2] / z[:, None]).floor().unbind(-1)
-    inside = (z > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    pixel = (y[inside] * width + x[inside]).long()
-    inverse = torch.zeros(height * width)
-    return inverse.scatter_reduce(0, pixel, (1 / z[inside]).float(), "amax").view(height, width)
+def _nearest(points: Float[Tensor, "P 3"], camera: Cameras) -> Float[Tensor, "H W"]:
+    """Compute the greatest inverse depth in every pixel of one view."""
+    (pixels,), (depth,), (inside,) = camera.project(points)
+    x, y = pixels[inside].long().unbind(-1)
+    inverse = torch.zeros(camera.height * camera.width)
+    inverse = inverse.scatter_reduce(0, y * camera.width + x, (1 / depth[inside]).float(), "amax")
+    return inverse.view(camera.height, camera.width)
 
 
-def _around(inverse: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+def _window_maximum(inverse: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
     """Return the greatest inverse depth in the window of 3 x 3 cells around every pixel's cell."""
     known = (inverse > 0).sum().clamp_min(1).item()
-    cell = max(1, round((IN_A_WINDOW * inverse.numel() / known) ** 0.5 / 3))
+    cell = max(1, round((POINTS_PER_WINDOW * inverse.numel() / known) ** 0.5 / 3))
     cells = F.max_pool2d(inverse[None], cell, ceil_mode=True)
     windows = F.max_pool2d(cells, 3, stride=1, padding=1)[0]
     row, column = (torch.arange(length) // cell for length in inverse.shape)

@@ -12,8 +12,8 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
-STEPS_PER_UNIT = 1000  # of stored depths
-FARTHEST = 2**16 - 1  # the largest depth step that a 16-bit image holds
+STEPS_PER_UNIT = 1000  # stored depths of one scene unit
+MAX_STEP = 2**16 - 1  # largest depth in a 16-bit image
 
 
 def write_transforms(views: Views, folder: Path) -> None:
@@ -25,11 +25,11 @@ def write_transforms(views: Views, folder: Path) -> None:
     https://docs.nerf.studio/quickstart/data_conventions.html
 
     Raises:
-        InputError: views with a batch dimension, or a folder that holds a transforms.json already.
+        InputError: views with a batch dimension, or a folder that contains a transforms.json.
     """
     if views.images.ndim != 4:
         raise InputError(
-            f"Views.images has shape {tuple(views.images.shape)}: expected [V, 3, H, W], so write "
+            f"Views.images has shape {tuple(views.images.shape)}: expected [V, 3, H, W]; write "
             "the scenes of a batch one by one."
         )
     target = folder / "transforms.json"
@@ -38,31 +38,35 @@ def write_transforms(views: Views, folder: Path) -> None:
     views = views.to("cpu")
     (folder / "images").mkdir(parents=True, exist_ok=True)
     frames = []
-    poses = _opengl(views.cameras.cam_to_world)
+    poses = views.cameras.cam_to_world * torch.tensor([1.0, -1.0, -1.0, 1.0])
     for index, (pose, matrix) in enumerate(zip(poses, views.cameras.intrinsics, strict=True)):
         name = f"{index:05d}.png"
+        (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
         frame = {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
         _write_image(folder / "images" / name, views.images[index])
         if views.depths is not None:
             (folder / "depth").mkdir(exist_ok=True)
             frame["depth_file_path"] = f"depth/{name}"
             _write_depth(folder / "depth" / name, views.depths[index])
-        frames.append(frame | _pinhole(matrix))
+        frames.append(frame | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
     target.write_text(json.dumps(_with_shared_intrinsics(views, frames), indent=1))
 
 
-def _opengl(cam_to_world: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
-    """Convert OpenCV axes to OpenGL's: y up, z backward."""
-    return cam_to_world * cam_to_world.new_tensor([1.0, -1.0, -1.0, 1.0])
+def refuse_inside(folder: Path, data: Path, advice: str) -> None:
+    """Check that `folder` is outside of a data set (its folder, or a file in it).
 
-
-def _pinhole(matrix: Float[Tensor, "3 3"]) -> dict[str, float]:
-    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
-    return {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    Raises:
+        InputError: it is inside; ends with `advice`.
+    """
+    data = (data if data.is_dir() else data.parent).resolve()
+    if folder.expanduser().resolve().is_relative_to(data):
+        raise InputError(
+            f"{folder.absolute()} lies in the data set {data}, which is never changed: {advice}."
+        )
 
 
 def _with_shared_intrinsics(views: Views, frames: list[dict]) -> dict:
-    """Return the file's content; intrinsics that all frames share are given once, at the top."""
+    """Return the file's content; intrinsics shared by all frames are written once, at the top."""
     top = {"camera_model": "PINHOLE", "w": views.cameras.width, "h": views.cameras.height}
     if views.depths is not None:
         top["depth_unit_scale_factor"] = 1 / STEPS_PER_UNIT
@@ -80,6 +84,6 @@ def _write_image(path: Path, image: Float[Tensor, "3 H W"]) -> None:
 
 
 def _write_depth(path: Path, depth: Float[Tensor, "H W"]) -> None:
-    """Write a depth map; depths beyond what 16 bits hold become 0, unknown."""
+    """Write a depth map; depths beyond 16 bits become 0, unknown."""
     steps = (depth.double() * STEPS_PER_UNIT).round().numpy()
-    Image.fromarray(np.where(steps > FARTHEST, 0, steps).astype(np.uint16)).save(path)
+    Image.fromarray(np.where(steps > MAX_STEP, 0, steps).astype(np.uint16)).save(path)

@@ -1,4 +1,4 @@
-"""Crops move content and cameras together; orders hold the same frames; targets have no noise."""
+"""Augmentation: crops with their cameras, orders, exposure, noise of inputs."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from asysplat.data.augment import Augmentation, cropped
+from asysplat.data.augment import Augmentation, center_crop
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 
@@ -31,10 +31,10 @@ def make_views(count=3) -> Views:
 
 
 @pytest.mark.parametrize("share", [0.77, 0.8, 0.93, 0.995])
-def test_the_same_point_meets_the_same_content(share):
+def test_a_crop_keeps_directions_and_content(share):
     """The direction through each pixel of the crop is that of the position it shows."""
     views = make_views()
-    crop = cropped(views, share)
+    crop = center_crop(views, share)
     assert crop.images.shape == views.images.shape
     old = views.cameras.intrinsics[:, None, None]
     x, y = crop.images[:, 0] * WIDTH, crop.images[:, 1] * HEIGHT
@@ -48,32 +48,32 @@ def test_the_same_point_meets_the_same_content(share):
 
 
 @pytest.mark.parametrize("share", [0.6, 0.77])  # no center on a border between pixels
-def test_depths_and_masks_are_those_under_each_pixel(share):
+def test_a_crop_takes_the_nearest_depths_and_masks(share):
     views = make_views()
-    crop = cropped(views, share)
+    crop = center_crop(views, share)
     x = (crop.images[0, 0, 20] * WIDTH).floor().long()
     y = (crop.images[0, 1, :, 40] * HEIGHT).floor().long()
     inner = (slice(None), slice(1, -1), slice(1, -1))
     for name in ("depths", "masks", "disparities"):
         maps, found = getattr(views, name), getattr(crop, name)
         assert torch.equal(found[inner], maps[:, y[:, None], x][inner])
-    bare = cropped(replace(views, depths=None, masks=None, disparities=None), share)
+    bare = center_crop(replace(views, depths=None, masks=None, disparities=None), share)
     assert bare.depths is None and bare.masks is None and bare.disparities is None
     assert torch.equal(bare.images, crop.images)
 
 
 def test_a_crop_keeps_the_middle_and_the_poses():
     views = make_views()
-    crop = cropped(views, 0.6)
+    crop = center_crop(views, 0.6)
     middle = (slice(None), slice(None), HEIGHT // 2, slice(WIDTH // 2 - 1, WIDTH // 2 + 1))
     torch.testing.assert_close(crop.images[middle].mean(-1), views.images[middle].mean(-1))
     assert torch.equal(crop.cameras.cam_to_world, views.cameras.cam_to_world)
     focal = crop.cameras.intrinsics[:, 0, 0] / views.cameras.intrinsics[:, 0, 0]
     torch.testing.assert_close(focal, torch.full_like(focal, 1 / 0.6))
-    assert cropped(views, 1.0) is views
+    assert center_crop(views, 1.0) is views
 
 
-def test_orders_are_backwards_and_shuffled_as_often_as_asked():
+def test_orders_follow_their_probabilities():
     inputs = [3, 5, 8, 13, 21, 34]
     rng = np.random.default_rng(0)
     both = Augmentation(reverse=0.5, shuffle=0.5)
@@ -86,7 +86,7 @@ def test_orders_are_backwards_and_shuffled_as_often_as_asked():
     assert Augmentation(reverse=1.0).order(inputs, rng) == inputs[::-1]
 
 
-def test_shares_fill_their_range_and_the_seed_repeats_them():
+def test_shares_fill_their_range_and_follow_the_seed():
     crops = Augmentation(crop=0.77)
     rng = np.random.default_rng(0)
     shares = [crops.share(rng) for _ in range(200)]
@@ -111,7 +111,7 @@ def test_a_task_has_one_exposure():
     assert torch.equal(inputs.depths, views.depths)
 
 
-def test_flicker_and_noise_are_of_inputs_alone():
+def test_flicker_and_noise_change_inputs_only():
     views = make_views(12)
     views = replace(views, images=0.1 + 0.3 * views.images)
     for option in ({"flicker": 0.3}, {"noise": 0.02}):
@@ -132,7 +132,7 @@ def test_flicker_and_noise_are_of_inputs_alone():
     assert 0 < min(noises) < 0.005 and 0.015 < max(noises) < 0.0205
 
 
-def test_images_stay_within_their_range_and_without_options_as_they_are():
+def test_images_stay_in_range_and_are_unchanged_by_default():
     views = make_views()
     strong = Augmentation(exposure=1.0, white_balance=1.0, flicker=1.0, noise=1.0)
     for seed in range(5):
@@ -145,7 +145,7 @@ def test_images_stay_within_their_range_and_without_options_as_they_are():
 @pytest.mark.parametrize(
     "option", [{"reverse": 1.5}, {"shuffle": -0.1}, {"crop": 0.0}, {"noise": 2.0}]
 )
-def test_unusable_options_are_named(option):
+def test_invalid_options_are_errors(option):
     (name,) = option
     with pytest.raises(InputError, match=rf"data\.augmentation\.{name} is"):
         Augmentation(**option)

@@ -42,23 +42,7 @@ def relative(views: Views, to: Views) -> torch.Tensor:
     return torch.linalg.inv(to.cameras.cam_to_world[:1]) @ views.cameras.cam_to_world
 
 
-def project_depth(source: Views, target: Views) -> torch.Tensor:
-    """Where the first source view's depth pixels land in every target view."""
-    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
-    pixels = torch.stack((x, y, torch.ones_like(x)), -1).reshape(-1, 3)
-    camera = pixels @ torch.linalg.inv(source.cameras.intrinsics[0]).T
-    camera = camera * source.depths[0].reshape(-1, 1)
-    pose = source.cameras.cam_to_world[0]
-    world = camera @ pose[:3, :3].T + pose[:3, 3]
-    world_to_cam = torch.linalg.inv(target.cameras.cam_to_world)
-    seen = (
-        torch.einsum("vij,nj->vni", world_to_cam[:, :3, :3], world) + world_to_cam[:, None, :3, 3]
-    )
-    image = torch.einsum("vij,vnj->vni", target.cameras.intrinsics, seen)
-    return image[..., :2] / image[..., 2:]
-
-
-def test_mean_pose_becomes_the_world_and_the_farthest_input_is_at_one(pair):
+def test_the_mean_pose_is_the_world_frame_and_the_farthest_input_at_one(pair):
     inputs, _, frame = normalize(*pair)
     centers = inputs.cameras.centers
     torch.testing.assert_close(centers.mean(0), torch.zeros(3), atol=1e-5, rtol=0)
@@ -73,26 +57,19 @@ def test_mean_pose_becomes_the_world_and_the_farthest_input_is_at_one(pair):
     assert forward[2] > 0 and down[1] > 0 and abs(down[0].item()) < 1e-5
 
 
-def test_relative_poses_change_in_scale_alone(pair):
+def test_lengths_are_scaled_and_nothing_else_changes(pair):
     inputs, targets, frame = normalize(*pair)
     for before, after in ((pair[0], inputs), (pair[1], targets)):
         expected = relative(before, pair[0])
         expected[:, :3, 3] *= frame.scale
         torch.testing.assert_close(relative(after, inputs), expected, atol=1e-5, rtol=0)
+        torch.testing.assert_close(after.depths, before.depths * frame.scale)
+        torch.testing.assert_close(after.point_depths, before.point_depths * frame.scale)
+        assert torch.equal(after.images, before.images)
+        assert torch.equal(after.cameras.intrinsics, before.cameras.intrinsics)
 
 
-def test_depth_reprojection_is_unchanged(pair):
-    inputs, targets, frame = normalize(*pair)
-    torch.testing.assert_close(
-        project_depth(inputs, targets), project_depth(*pair), atol=2e-3, rtol=1e-3
-    )
-    for name in ("depths", "point_depths"):
-        before, after = (getattr(views, name) for views in (pair[1], targets))
-        torch.testing.assert_close(after, before * frame.scale)
-    assert torch.equal(inputs.images, pair[0].images)
-
-
-def test_pure_rotation_keeps_its_scale():
+def test_cameras_in_one_place_keep_their_scale():
     views = make_views(random_rotations(4), torch.tensor([7.0, -3, 2]).expand(4, 3))
     inputs, _, frame = normalize(views, views)
     assert frame.scale == 1
@@ -118,7 +95,7 @@ def test_views_without_depths_stay_without(pair):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_is_undone_looks_the_same_from_the_data_set_s_cameras(make_scene, degree):
+def test_to_world_keeps_the_renderings(make_scene, degree):
     """The data set's world lies far from the frame of networks, turned and in other units."""
     gaussians, _ = make_scene(count=40, degree=degree)
     _, cameras = make_scene(views=3, height=16, width=16)
@@ -136,7 +113,7 @@ def test_what_is_undone_looks_the_same_from_the_data_set_s_cameras(make_scene, d
     torch.testing.assert_close(after.depth * frame.scale, before.depth, atol=1e-8, rtol=1e-8)
 
 
-def test_what_is_brought_back_is_where_it_was(make_scene, pair):
+def test_to_network_inverts_to_world(make_scene, pair):
     gaussians, _ = make_scene(count=40, dtype=torch.float64)
     frame = normalize(*pair)[2]
     back = frame.to_network(frame.to_world(gaussians))
@@ -148,8 +125,8 @@ def test_what_is_brought_back_is_where_it_was(make_scene, pair):
     torch.testing.assert_close(*turns)
 
 
-def test_undone_gaussians_keep_their_type(make_scene, pair):
+def test_to_world_keeps_the_type(make_scene, pair):
     gaussians, _ = make_scene(dtype=torch.float32)
-    undone = normalize(*pair)[2].to_world(gaussians).validate()
-    assert undone.means.dtype == undone.sh.dtype == undone.quats.dtype == torch.float32
-    assert torch.equal(undone.opacities, gaussians.opacities)
+    world = normalize(*pair)[2].to_world(gaussians).validate()
+    assert world.means.dtype == world.sh.dtype == world.quats.dtype == torch.float32
+    assert torch.equal(world.opacities, gaussians.opacities)

@@ -1,4 +1,4 @@
-"""Sparse points: where they fall, what hides them, and how they come with a task's inputs."""
+"""Depths of sparse points: projection, occlusion, and point depths of a task's inputs."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import torch
 from asysplat.data.datamodule import SceneDataModule, TrainingTasks, collate, load
 from asysplat.data.points import depths_of_points
 from asysplat.data.procedural import ProceduralScene
-from asysplat.data.selection import Selection
+from asysplat.data.selection.views import Selection
 from asysplat.data.sources import Task
 from asysplat.scene import Cameras
 
@@ -29,8 +29,8 @@ class SequenceWithPoints:
     """A synthetic scene and sparse points of the surfaces that one of its frames sees."""
 
     def __init__(self, frame: int):
-        self.scene = ProceduralScene(3, SIZE, SIZE, num_frames=24)
-        self.name, self.cameras, self.num_frames = "scene", self.scene.cameras, 24
+        self.scene = ProceduralScene(3, SIZE, SIZE, num_images=24)
+        self.name, self.cameras, self.num_images = "scene", self.scene.cameras, 24
         views = self.scene.views([frame])
         y, x = torch.meshgrid(torch.arange(2, SIZE, 4), torch.arange(2, SIZE, 4), indexing="ij")
         depth = views.depths[0, y, x][..., None]
@@ -43,7 +43,7 @@ class SequenceWithPoints:
         return self.scene.views(frames)
 
 
-def test_points_fall_into_their_pixels_and_the_nearest_counts():
+def test_a_pixel_has_the_depth_of_its_nearest_point():
     cameras = camera_at_origin(2)
     cameras.cam_to_world[1, 0, 3] = 0.5
     seen, farther, beside, behind = (0.1, 0.1, 2), (0.12, 0.12, 2.2), (9, 0, 1), (0, 0, -1)
@@ -55,7 +55,7 @@ def test_points_fall_into_their_pixels_and_the_nearest_counts():
     assert none.shape == (2, SIZE, SIZE) and not none.any()
 
 
-def test_a_sparse_wall_hides_the_points_behind_it():
+def test_a_sparse_wall_occludes_points():
     """A wall at depth 2 in the left half, and behind it one at 5 in the whole image."""
     front, back = wall(2, 16, first=0), wall(5, SIZE, first=2)
     alone = depths_of_points(back, camera_at_origin())[0]
@@ -78,7 +78,7 @@ def test_a_slanted_surface_keeps_its_points():
     assert (seen > 0).sum() > 0.85 * len(pixels)
 
 
-def test_inputs_come_with_the_points_in_their_own_frame():
+def test_inputs_have_point_depths_in_their_own_frame():
     sequence = SequenceWithPoints(frame=5)
     task = Task(sequence, Selection([9, 5, 1], [7]))
     plain = load(task, share=0.8)
@@ -116,7 +116,7 @@ def make_data(sequence, points: bool) -> SceneDataModule:
     return SceneDataModule("data", OneTask(sequence), **size, **options)
 
 
-def test_only_data_that_is_asked_for_points_gives_them():
+def test_points_are_optional():
     for asked in (True, False):
         data = make_data(SequenceWithPoints(5), points=asked)
         data.setup()
@@ -125,8 +125,8 @@ def test_only_data_that_is_asked_for_points_gives_them():
         assert given == [asked, asked]
 
 
-def test_a_scene_without_points_is_named_and_has_none():
-    data = make_data(ProceduralScene(3, SIZE, SIZE, num_frames=24), points=True)
+def test_a_scene_without_points_is_reported():
+    data = make_data(ProceduralScene(3, SIZE, SIZE, num_images=24), points=True)
     with pytest.warns(UserWarning, match="no sparse points of"):
         data.setup()
     assert data.evaluation["test"][0]["inputs"].point_depths is None

@@ -1,6 +1,4 @@
-"""What scenes that train have beyond the others: smooth edges, gloss, paths, focal lengths."""
-
-from itertools import pairwise
+"""Varied scenes, used in training: antialiased edges, gloss, paths, focal lengths."""
 
 import numpy as np
 import pytest
@@ -9,25 +7,17 @@ from torch.nn.functional import max_pool2d
 
 from asysplat.data import ProceduralSource
 from asysplat.data.procedural import ProceduralScene, split_seed
-from asysplat.data.procedural.edges import SAMPLES, edge_pixels, mixed, samples
+from asysplat.data.procedural.edges import SAMPLES, average_samples, edge_pixels, sample_directions
 from asysplat.data.procedural.floor_plan import FloorPlan
 from asysplat.data.procedural.path import circle, forward, hand_held_path, pan
 from asysplat.data.procedural.textures import Material
 from asysplat.data.procedural.world import World
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 SEEDS = range(6)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Images this small gain nothing from threads, and lose much where other tests run too."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-def test_only_scenes_that_train_are_varied():
+def test_only_training_scenes_are_varied():
     source = ProceduralSource(16, 16, 24, (12, 24), val_scenes=1, test_scenes=1, varied=True)
     rng = np.random.default_rng(0)
     focals = [
@@ -45,7 +35,7 @@ def test_only_scenes_that_train_are_varied():
 def test_a_pixel_at_an_edge_lies_between_its_neighbors(seed):
     scene = ProceduralScene(seed, 48, 48, varied=True)
     smooth = scene.views([0, 60])
-    scene._smooth_edges = False
+    scene._antialiased = False
     sharp = scene.views([0, 60])
     assert torch.equal(smooth.depths, sharp.depths)
     changed = (smooth.images != sharp.images).any(1)
@@ -55,7 +45,7 @@ def test_a_pixel_at_an_edge_lies_between_its_neighbors(seed):
     assert (smooth.images < brightest + 1e-5).all() and (smooth.images > darkest - 1e-5).all()
 
 
-def test_a_pixel_is_as_bright_as_it_is_covered():
+def test_edge_pixels_match_their_coverage():
     """A white surface right of a slanted edge on black, where the exact coverage is known."""
     size, pixel = 32, 2 / 32
 
@@ -67,8 +57,8 @@ def test_a_pixel_is_as_bright_as_it_is_covered():
     surfaces = surface(directions).view(size, size)
     light = surfaces.float().flatten().repeat(3, 1)
     edges = edge_pixels(surfaces)
-    seen = surface(samples(directions[:, edges], pixel))
-    found = mixed(light, surfaces, edges, seen)[0]
+    seen = surface(sample_directions(directions[:, edges], pixel))
+    found = average_samples(light, surfaces, edges, seen)[0]
     fine = (torch.arange(40) + 0.5) / 40 - 0.5
     offsets = torch.cartesian_prod(fine, fine).T * pixel
     around = directions[:2, edges, None] + offsets[:, None]
@@ -79,13 +69,13 @@ def test_a_pixel_is_as_bright_as_it_is_covered():
 
 
 @pytest.mark.parametrize("gloss", [0.0, 1.0])
-def test_gloss_is_brightest_where_the_light_is_mirrored(gloss):
+def test_gloss_is_brightest_in_the_mirror_direction(gloss):
     """The floor of a room right between eye and lamp, which are equally high."""
     gray = Material((0.5, 0.5, 0.5), (0.5, 0.5, 0.5), gloss=gloss, shininess=30.0)
     plan = FloorPlan(
         walk=np.zeros((1, 2)),
         light=np.array([2.0, 0.0, 2.0]),
-        light_color=np.ones(3),
+        irradiance=np.ones(3),
         falloff=3.0,
         ambient=0.1 * np.ones(3),
         shell=[gray] * 6,
@@ -115,7 +105,7 @@ def test_a_circle_goes_around_and_looks_inward(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_walk_leads_forward(seed):
+def test_a_forward_path_advances(seed):
     poses = hand_held_path(np.random.default_rng(seed), 96, 2.0, forward)
     way = poses[-1, :3, 3] - poses[0, :3, 3]
     assert 1.4 < np.linalg.norm(way) < 4.2
@@ -127,15 +117,3 @@ def test_a_pan_turns_nearly_on_the_spot(seed):
     poses = hand_held_path(np.random.default_rng(seed), 96, 2.0, pan)
     assert 45 < turn(np.arctan2(*poses[:, :2, 2].T)) < 130
     assert np.ptp(poses[:, :3, 3], axis=0).max() < 1.1
-
-
-@pytest.mark.parametrize("seed", range(16))
-def test_cameras_move_smoothly_and_keep_clear(seed):
-    scene = ProceduralScene(seed, 16, 16, varied=True)
-    poses = scene.cameras.cam_to_world
-    steps = [(after - before)[:3, 3].norm() for before, after in pairwise(poses)]
-    assert 0.002 < max(steps) < 0.25
-    cosines = ((poses[1:, :3, :3] * poses[:-1, :3, :3]).sum((1, 2)) - 1) / 2
-    assert torch.rad2deg(cosines.clamp(max=1).arccos()).max() < 6
-    views = scene.views(range(0, 96, 6)).validate()
-    assert views.depths.min() > 0.3

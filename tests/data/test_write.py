@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from asysplat.data import open_scene
+from asysplat.data import SceneOptions, open_scene
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
@@ -17,48 +17,44 @@ def views() -> Views:
     return ProceduralScene(2, 12, 16).views([0, 40, 80])
 
 
-def test_matrices_and_intrinsics_round_trip(views, tmp_path):
+def test_files_follow_the_format(views, tmp_path):
     write_transforms(views, tmp_path)
-    settings = json.loads((tmp_path / "transforms.json").read_text())
-    assert (settings["w"], settings["h"]) == (16, 12)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    assert (content["w"], content["h"]) == (16, 12)
     intrinsics = torch.eye(3)
-    intrinsics[0, 0], intrinsics[1, 1] = settings["fl_x"], settings["fl_y"]
-    intrinsics[0, 2], intrinsics[1, 2] = settings["cx"], settings["cy"]
+    intrinsics[0, 0], intrinsics[1, 1] = content["fl_x"], content["fl_y"]
+    intrinsics[0, 2], intrinsics[1, 2] = content["cx"], content["cy"]
     assert torch.equal(intrinsics.expand(3, 3, 3), views.cameras.intrinsics)
-    opengl = torch.tensor([frame["transform_matrix"] for frame in settings["frames"]])
+    opengl = torch.tensor([frame["transform_matrix"] for frame in content["frames"]])
     assert torch.equal(opengl[:, :, (0, 3)], views.cameras.cam_to_world[:, :, (0, 3)])
     assert torch.equal(opengl[:, :, 1:3], -views.cameras.cam_to_world[:, :, 1:3])
 
-
-def test_images_and_depths_round_trip(views, tmp_path):
-    write_transforms(views, tmp_path)
-    settings = json.loads((tmp_path / "transforms.json").read_text())
-    frame = settings["frames"][1]
+    frame = content["frames"][1]
     image = np.asarray(Image.open(tmp_path / frame["file_path"])) / 255
     assert np.abs(image - views.images[1].permute(1, 2, 0).numpy()).max() <= 0.5 / 255 + 1e-6
     steps = np.asarray(Image.open(tmp_path / frame["depth_file_path"]))
     assert steps.dtype == np.uint16
-    depth = steps * settings["depth_unit_scale_factor"]
+    depth = steps * content["depth_unit_scale_factor"]
     assert np.abs(depth - views.depths[1].numpy()).max() <= 0.5e-3 + 1e-5
 
 
-def test_the_reader_reads_it_back(views, tmp_path):
+def test_the_reader_round_trips(views, tmp_path):
     write_transforms(views, tmp_path)
-    read = open_scene(tmp_path, 12, 16).views([0, 1, 2])
+    read = open_scene(tmp_path, SceneOptions(12, 16)).views([0, 1, 2])
     torch.testing.assert_close(read.cameras.cam_to_world, views.cameras.cam_to_world)
     torch.testing.assert_close(read.cameras.intrinsics, views.cameras.intrinsics)
     torch.testing.assert_close(read.images, views.images, atol=0.51 / 255, rtol=0)
     torch.testing.assert_close(read.depths, views.depths, atol=0.51e-3, rtol=0)
 
 
-def test_intrinsics_that_differ_stand_in_each_frame(views, tmp_path):
+def test_different_intrinsics_are_written_per_frame(views, tmp_path):
     intrinsics = views.cameras.intrinsics.clone()
     intrinsics[1, 0, 0] += 1
     cameras = Cameras(intrinsics, views.cameras.cam_to_world, 12, 16)
     write_transforms(Views(cameras, views.images), tmp_path / "new")
-    settings = json.loads((tmp_path / "new" / "transforms.json").read_text())
-    assert [frame["fl_x"] for frame in settings["frames"]] == intrinsics[:, 0, 0].tolist()
-    assert "fl_x" not in settings and "fl_y" in settings
+    content = json.loads((tmp_path / "new" / "transforms.json").read_text())
+    assert [frame["fl_x"] for frame in content["frames"]] == intrinsics[:, 0, 0].tolist()
+    assert "fl_x" not in content and "fl_y" in content
     assert not (tmp_path / "new" / "depth").exists()
 
 

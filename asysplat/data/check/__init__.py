@@ -1,8 +1,4 @@
-"""Check what a reader sees in a scene, and whether its cameras fit its images.
+"""Check a scene's files, and whether its cameras fit its images.
 
 python -m asysplat.data.check PATH
 """
-
-from asysplat.data.check.report import Report, Verdict, check_scene
-
-__all__ = ["Report", "Verdict", "check_scene"]

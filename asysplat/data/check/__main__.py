@@ -1,9 +1,9 @@
-"""Show what a reader sees in a scene, on one screen and as a picture.
+"""Check a scene: print its measurements on one screen, and draw them as a figure.
 
 python -m asysplat.data.check path/to/scene
 
-Ends with 0 where the cameras fit the images, with 1 where they do not, with 2 where the scene
-cannot be read.
+Exits with 0 if the cameras fit the images, with 1 if they do not, and with 2 if the scene cannot be
+read.
 """
 
 import sys
@@ -13,17 +13,16 @@ from itertools import chain, count
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import Progress
 
-from asysplat.data.bad_images import BadFrames, Policy
-from asysplat.data.check.matches import PLACES
+from asysplat.data.bad_images import BadImages, Policy
 from asysplat.data.check.report import Report, check_scene
 from asysplat.data.check.show import draw_report, print_report
 from asysplat.data.readers import LAYOUTS, find_scenes
+from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
 
-FIRST_SCENES = 3  # so many are checked of a folder of more
-RESOLUTION = 110  # pixels an inch of the picture
+MAX_SCENES = 3  # checked of a folder of more
+RESOLUTION = 110  # pixels an inch of the figure
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -40,53 +39,49 @@ def parse(arguments: list[str] | None) -> Namespace:
     parser.add_argument("path", type=Path, help="a scene, or a folder of scenes")
     parser.add_argument("--layout", default="auto", choices=("auto", *LAYOUTS))
     parser.add_argument(
-        "--scene", help=f"the name of one of many; without it the first {FIRST_SCENES} are checked"
+        "--scene", help=f"check this scene of a folder; default: the first {MAX_SCENES}"
     )
-    parser.add_argument("--on-bad-frame", default="fail", choices=("fail", "skip"))
+    parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
     parser.add_argument(
         "--out",
         type=Path,
         default=Path("check"),
-        help="where SCENE/check.png is put, outside the data set; nothing is overwritten",
+        help="folder of SCENE/check.png, outside the data set; existing files are kept",
     )
     return parser.parse_args(arguments)
 
 
 def check(options: Namespace, console: Console) -> int:
-    """Check every chosen scene: 0 if the cameras of all fit, else 1."""
+    """Check the selected scenes, and return 0 if the cameras of all fit, else 1."""
     layout, scenes = find_scenes(options.path, options.layout)
-    _check_outside(options.out, options.path)
-    chosen = _chosen(scenes, options.scene)
+    refuse_inside(options.out, options.path, "name a folder elsewhere with --out")
+    selected = _select(scenes, options.scene)
     if len(scenes) > 1:
-        more = "" if len(chosen) == len(scenes) else "; --scene NAME checks another"
-        console.print(f"checking {len(chosen)} of {len(scenes)} scenes{more}", highlight=False)
+        more = "" if len(selected) == len(scenes) else "; --scene NAME checks another"
+        console.print(f"checking {len(selected)} of {len(scenes)} scenes{more}", highlight=False)
     all_fit = True
-    for path in chosen:
+    for path in selected:
         report = check_one(layout, path, options.on_bad_image, console)
         title = f"{report.sequence.name}, layout {layout}"
-        picture = save_picture(report, title, options.out)
+        figure = save_figure(report, title, options.out)
         print_report(report, title, console)
-        console.print(f"picture: {picture}\n", soft_wrap=True, highlight=False)
+        console.print(f"figure: {figure}\n", soft_wrap=True, highlight=False)
         all_fit &= report.verdict.fits
     return 0 if all_fit else 1
 
 
 def check_one(layout: str, path: Path, on_bad_image: Policy, console: Console) -> Report:
-    """Make the report of one scene, under progress bars."""
-    bad = BadFrames(on_bad_image)
+    """Create the report of one scene, with progress bars."""
+    bad = BadImages(on_bad_image)
     scene = LAYOUTS[layout].read_scene(path, bad)
-    with Progress(console=console, transient=True) as progress, warnings.catch_warnings():
-        # The report lists the frames that are left out.
+    with warnings.catch_warnings():
+        # The report lists the skipped images.
         warnings.simplefilter("ignore")
-        bars = {
-            "decode": progress.add_task(f"{scene.name}: decoding", total=len(scene.photographs)),
-            "match": progress.add_task(f"{scene.name}: matching", total=PLACES),
-        }
-        return check_scene(scene, bad, lambda bar: progress.advance(bars[bar]))
+        return check_scene(scene, bad, console)
 
 
-def save_picture(report: Report, title: str, out: Path) -> Path:
-    """Save the report's picture under the first free name: check.png, check-2.png, ..."""
+def save_figure(report: Report, title: str, out: Path) -> Path:
+    """Save the report's figure under the first free name: check.png, check-2.png, ..."""
     folder = out / report.sequence.name.replace("/", "-")
     folder.mkdir(parents=True, exist_ok=True)
     names = chain(["check.png"], (f"check-{number}.png" for number in count(2)))
@@ -96,25 +91,16 @@ def save_picture(report: Report, title: str, out: Path) -> Path:
     return file
 
 
-def _chosen(scenes: list[Path], name: str | None) -> list[Path]:
+def _select(scenes: list[Path], name: str | None) -> list[Path]:
     if name is None:
-        return scenes[:FIRST_SCENES]
-    named = [scene for scene in scenes if name in scene.parts]
-    if not named:
+        return scenes[:MAX_SCENES]
+    selected = [scene for scene in scenes if name in scene.parts]
+    if not selected:
         raise InputError(
             f"--scene {name} is none of the {len(scenes)} scenes: name one, such as "
             f"{scenes[0].name}."
         )
-    return named
-
-
-def _check_outside(out: Path, data: Path) -> None:
-    data = (data if data.is_dir() else data.parent).resolve()
-    if out.resolve().is_relative_to(data):
-        raise InputError(
-            f"{out.absolute()} lies in the data set {data}, where nothing is written: name a "
-            "folder elsewhere with --out."
-        )
+    return selected
 
 
 if __name__ == "__main__":

@@ -1,83 +1,82 @@
-"""What is measured of a scene: its pixels, its camera path, its sparse points, its depth maps."""
+"""Measure a scene's pixels, camera path, sparse points and depth maps."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
+from rich.console import Console
+from rich.progress import track
 from torch import Tensor
 
-from asysplat.data.bad_images import BadFrames
-from asysplat.data.sequence import ImageSequence, FileSequence
+from asysplat.data.bad_images import BadImages
 from asysplat.data.check.matches import Matches, epipolar_distances, triangulate
+from asysplat.data.sequence import FileSequence, ImageSequence
 from asysplat.scene import Cameras
 
-SAMPLED = 97  # one depth in so many is looked at; a prime, so that no pixel column is favored
-SAME = 1e-6  # poses differ by less: as a share of the path's extent, and in a rotation's entries
-PRECISE = 1.0  # pixels: greatest distance to the epipolar line of a match that is triangulated
-WIDE = 1.5  # degrees: least angle between its rays
+DEPTH_STRIDE = 97  # one depth in so many is sampled; a prime, so that no pixel column is favored
+POSE_TOLERANCE = 1e-6  # of equal poses: share of the path's extent, and entries of the rotation
+MAX_EPIPOLAR_ERROR = 1.0  # pixels, of a match whose depth is compared
+MIN_RAY_ANGLE = 1.5  # degrees between the rays of such a match
 
 Quartiles = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Pixels:
-    """What the pixels of all frames that can be decoded show.
+class PixelStats:
+    """Statistics of all images that can be decoded.
 
     Args:
         brightness: mean colors, in [0, 1], of the darkest and of the brightest image.
         depth_known: share of the pixels whose depth is known; None without depth maps.
         depths: quartiles of those depths, in scene units.
-        counted: share of the pixels that count; None without masks.
+        unmasked: share of the pixels that masks keep; None without masks.
     """
 
     brightness: tuple[float, float]
     depth_known: float | None
     depths: Quartiles | None
-    counted: float | None
+    unmasked: float | None
 
 
 def read_pixels(
-    sequence: FileSequence, bad: BadFrames, step: Callable[[], None] = lambda: None
-) -> tuple[FileSequence, Pixels]:
-    """Decode every frame once.
+    sequence: FileSequence, bad: BadImages, console: Console | None
+) -> tuple[FileSequence, PixelStats]:
+    """Decode every image once, and return the sequence without the damaged images.
 
     Args:
-        bad: notes the frames that cannot be decoded; the sequence that is returned lacks them.
-        step: called after each frame.
+        bad: collects the images that cannot be decoded.
+        console: where to show a progress bar; None shows none.
 
     Raises:
-        InputError: too few frames can be used, or some cannot and must not be skipped.
+        InputError: too few usable images, or damaged images that must not be skipped.
     """
-    whole, brightness, known, counted, depths = [], [], [], [], []
-    for frame, photograph in enumerate(sequence.scene.photographs):
-        with bad.caught():
-            views = sequence.views([frame])
-            whole.append(photograph)
+    intact, brightness, known, unmasked, depths = [], [], [], [], []
+    bar = {"console": console, "transient": True, "disable": console is None}
+    for index, image in enumerate(track(sequence.scene.images, "decoding", **bar)):
+        with bad.collect():
+            views = sequence.views([index])
+            intact.append(image)
             brightness.append(float(views.images.mean()))
             if views.depths is not None:
                 known.append(float((views.depths > 0).double().mean()))
-                depths.append(views.depths.flatten()[::SAMPLED])
+                depths.append(views.depths.flatten()[::DEPTH_STRIDE])
             if views.masks is not None:
-                counted.append(float(views.masks.double().mean()))
-        step()
-    bad.settle(sequence.name, len(whole))
-    scene = replace(sequence.scene, photographs=whole)
+                unmasked.append(float(views.masks.double().mean()))
+    bad.report(sequence.name, len(intact))
     sampled = torch.cat(depths) if depths else torch.empty(0)
-    return FileSequence(scene, sequence.cameras.height, sequence.cameras.width), Pixels(
+    return sequence.with_images(intact), PixelStats(
         brightness=(min(brightness), max(brightness)),
         depth_known=_mean(known),
         depths=quartiles(sampled[sampled > 0]),
-        counted=_mean(counted),
+        unmasked=_mean(unmasked),
     )
 
 
 def quartiles(values: Float[Tensor, " N"]) -> Quartiles | None:
-    """Return the quartiles; None of no values."""
+    """Return the quartiles; None without values."""
     if not len(values):
         return None
-    low, middle, high = values.double().quantile(values.new_tensor([0.25, 0.5, 0.75]).double())
-    return float(low), float(middle), float(high)
+    return tuple(values.double().quantile(torch.tensor([0.25, 0.5, 0.75]).double()).tolist())
 
 
 def _mean(shares: list[float]) -> float | None:
@@ -86,14 +85,14 @@ def _mean(shares: list[float]) -> float | None:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """The camera path: lengths in scene units, angles in degrees; steps are frame to frame.
+    """Lengths in scene units and angles in degrees; steps are from image to image.
 
     Args:
         length: of the whole path.
-        extent: the longest side of the box around all cameras.
-        step, longest_step: distance from a frame to the next, median and greatest.
-        turn, widest_turn: rotation from a frame to the next, median and greatest.
-        repeated: frames whose pose is that of an earlier frame.
+        extent: longest side of the box around all cameras.
+        step, longest_step: median and greatest distance.
+        turn, widest_turn: median and greatest rotation.
+        repeated: number of images with the pose of an earlier image.
     """
 
     length: float
@@ -105,23 +104,8 @@ class CameraPath:
     repeated: int
 
 
-@dataclass(frozen=True)
-class PointsSeen:
-    """How many sparse points there are, and how many views should show them.
-
-    Args:
-        count: how many there are.
-        seen: share that lies in front of two cameras or more and inside their images.
-        views: number of images in which a point lies, in the median.
-    """
-
-    count: int
-    seen: float
-    views: float
-
-
 def measure_path(cameras: Cameras) -> CameraPath:
-    """Measure the path of the cameras of all frames, in order."""
+    """Measure the path of the cameras, in the order of the images."""
     centers = cameras.centers.double()
     rotations = cameras.cam_to_world[:, :3, :3].double()
     steps = (centers[1:] - centers[:-1]).norm(dim=-1)
@@ -130,7 +114,7 @@ def measure_path(cameras: Cameras) -> CameraPath:
     turns = torch.rad2deg(2 * torch.arcsin((chords / 8**0.5).clamp(max=1)))
     extent = (centers.amax(0) - centers.amin(0)).max()
     poses = torch.cat((centers / extent.clamp(min=1e-12), rotations.flatten(1)), 1)
-    same = torch.cdist(poses, poses, compute_mode="donot_use_mm_for_euclid_dist") < SAME
+    equal = torch.cdist(poses, poses, compute_mode="donot_use_mm_for_euclid_dist") < POSE_TOLERANCE
     return CameraPath(
         length=float(steps.sum()),
         extent=float(extent),
@@ -138,24 +122,33 @@ def measure_path(cameras: Cameras) -> CameraPath:
         longest_step=float(steps.max()),
         turn=float(turns.median()),
         widest_turn=float(turns.max()),
-        repeated=int(same.tril(-1).any(1).sum()),
+        repeated=int(equal.tril(-1).any(1).sum()),
     )
 
 
-def count_points(cameras: Cameras, points: Float[Tensor, "P 3"]) -> PointsSeen:
-    """Count in how many images each point (float64) lies."""
+@dataclass(frozen=True)
+class PointVisibility:
+    """The number of sparse points, and how many cameras have them in view.
+
+    Args:
+        count: number of points.
+        shared: share of the points inside the images of two cameras or more.
+        views: median number of images that a point lies in.
+    """
+
+    count: int
+    shared: float
+    views: float
+
+
+def count_points(cameras: Cameras, points: Float[Tensor, "P 3"]) -> PointVisibility:
+    """Count the images that each point (float64) lies in, in front of the camera."""
     views = torch.zeros(len(points), dtype=torch.int64)
-    size = torch.tensor([cameras.width, cameras.height])
-    poses, lenses = cameras.cam_to_world.double(), cameras.intrinsics.double()
-    for pose, lens in zip(poses, lenses, strict=True):
-        in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
-        pixels = in_camera @ lens[:2].T / in_camera[:, 2:]
-        views += ((pixels >= 0) & (pixels <= size)).all(-1) & (in_camera[:, 2] > 0)
-    return PointsSeen(
-        count=len(points),
-        seen=float((views >= 2).double().mean()),
-        views=float(views.double().median()),
-    )
+    for view in range(cameras.num_views):
+        _, _, inside = cameras.select([view]).to(torch.float64).project(points)
+        views += inside[0]
+    shared = (views >= 2).double().mean()
+    return PointVisibility(len(points), float(shared), float(views.double().median()))
 
 
 @dataclass(frozen=True)
@@ -167,22 +160,20 @@ class DepthScale:
 
 
 def compare_depths(sequence: ImageSequence, matches: Matches) -> DepthScale | None:
-    """Compare depth maps with the depths of matches that are triangulated precisely.
-
-    None if no depth is known at any of these.
-    """
+    """Compare depth maps with precisely triangulated matches; None if they share no pixel."""
     cameras = sequence.cameras.to(torch.float64)
     depths, angles = triangulate(cameras, matches)
-    sure = (angles > WIDE) & (epipolar_distances(cameras, matches) < PRECISE) & (depths > 0).all(-1)
-    ratios = [torch.empty(0, dtype=torch.float64)]
-    frames, points, depths = (
-        x[sure].flatten(0, 1) for x in (matches.frames, matches.points, depths)
+    precise = (angles > MIN_RAY_ANGLE) & (depths > 0).all(-1)
+    precise &= epipolar_distances(cameras, matches) < MAX_EPIPOLAR_ERROR
+    indices, points, depths = (
+        values[precise].flatten(0, 1) for values in (matches.indices, matches.points, depths)
     )
-    for frame in frames.unique().tolist():
-        here = frames == frame
-        stored = sequence.views([frame]).depths[0].double()
-        column, row = points[here].long().unbind(-1)
-        ratios.append(stored[row, column] / depths[here])
-    ratios = torch.cat(ratios)
-    known = ratios[ratios > 0]
+    ratios = [torch.empty(0, dtype=torch.float64)]
+    for index in indices.unique().tolist():
+        in_image = indices == index
+        stored = sequence.views([index]).depths[0].double()
+        column, row = points[in_image].long().unbind(-1)
+        ratios.append(stored[row, column] / depths[in_image])
+    known = torch.cat(ratios)
+    known = known[known > 0]
     return DepthScale(quartiles(known), len(known)) if len(known) else None

@@ -1,4 +1,4 @@
-"""The usual mistakes in poses and intrinsics, each with what undoes it and how to fix it."""
+"""Common mistakes in poses and intrinsics: a correction of the cameras, and advice for each."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,12 +23,10 @@ CONVENTIONS = {
     ("right", "up", "forward"): "Unity",
 }
 RESOLUTIONS = (0.5, 2.0, 0.25, 4.0, 0.125, 8.0)
-OFFSETS = (1, -1, 2, -2, 3, -3)  # frames
+OFFSETS = (1, -1, 2, -2, 3, -3)  # images
 
-# From the rotations and positions of all cameras as read to what they should be.
-PoseChange = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-# The same for (fx, fy) and (cx, cy).
-LensChange = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+# Corrects the rotations and positions of all cameras, or their (fx, fy) and (cx, cy).
+Change = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -36,179 +34,172 @@ class Mistake:
     """One way in which cameras may be wrong.
 
     Args:
-        name: what was done, as a sentence without its end.
+        name: the mistake, as a sentence without its period.
         fix: what to do about it.
-        undo: turns the cameras as read into what they should be.
+        correct: computes the correct cameras from the cameras as read.
     """
 
     name: str
     fix: str
-    undo: Callable[[Cameras], Cameras]
+    correct: Callable[[Cameras], Cameras]
 
 
-def usual_mistakes(names: Sequence[str]) -> list[Mistake]:
-    """List the usual mistakes, the likelier first.
+def common_mistakes(names: Sequence[str]) -> list[Mistake]:
+    """List the common mistakes, the most likely first.
 
-    Those with a number to be fitted are not among them: `other_resolution` and `other_focal` make
-    them.
+    Mistakes with a factor to fit are not listed: see `other_resolution` and `other_focal`.
 
     Args:
-        names: image files, in the order of the frames.
+        names: image files, in the order of the sequence.
     """
     resolutions = [other_resolution(factor) for factor in RESOLUTIONS]
     axes = _swapped_axes()
     inverses = [_inverse(), *(_inverse(mistake) for mistake in axes)]
-    return [*resolutions, *_swapped_intrinsics(), *axes, *inverses, *_halves(), *_orders(names)]
+    return [*resolutions, *_swapped_intrinsics(), *axes, *inverses, *_partial(), *_orders(names)]
 
 
 def other_resolution(factor: float) -> Mistake:
-    """Suppose that the intrinsics belong to images `factor` times as large."""
+    """Return the mistake that the intrinsics belong to images `factor` times as large."""
     times = f"{factor:.4g} times" if factor >= 1 else f"1/{1 / factor:.4g}"
-    return Mistake(
+    return _of_lenses(
         f"the intrinsics are those of images {times} the size",
         f"divide fx, fy, cx and cy by {factor:.4g}, or give the images they were made for",
-        partial(_with_lens, change=lambda focal, middle: (focal / factor, middle / factor)),
+        lambda focal, center: (focal / factor, center / factor),
     )
 
 
 def other_focal(factor: float) -> Mistake:
-    """Suppose that the focal lengths alone are `factor` times what they should be."""
-    return Mistake(
+    """Return the mistake that the focal lengths are `factor` times too large."""
+    return _of_lenses(
         f"the focal lengths are {factor:.4g} times what the images show",
         f"divide fx and fy by {factor:.4g}",
-        partial(_with_lens, change=lambda focal, middle: (focal / factor, middle)),
+        lambda focal, center: (focal / factor, center),
     )
 
 
 def _swapped_intrinsics() -> list[Mistake]:
     changes = {
-        "cx and cy": lambda focal, middle: (focal, middle.flip(-1)),
-        "fx and fy": lambda focal, middle: (focal.flip(-1), middle),
-        "fx and fy, cx and cy": lambda focal, middle: (focal.flip(-1), middle.flip(-1)),
+        "cx and cy": lambda focal, center: (focal, center.flip(-1)),
+        "fx and fy": lambda focal, center: (focal.flip(-1), center),
+        "fx and fy, cx and cy": lambda focal, center: (focal.flip(-1), center.flip(-1)),
     }
-    fix = "exchange them, and look whether the photographs were turned to stand upright"
-    return [
-        Mistake(f"{name} are exchanged", fix, partial(_with_lens, change=change))
-        for name, change in changes.items()
-    ]
+    fix = "exchange them, and check whether the photographs were turned to stand upright"
+    return [_of_lenses(f"{name} are exchanged", fix, change) for name, change in changes.items()]
 
 
 def _swapped_axes() -> list[Mistake]:
     """List all other orders and signs of the three axes.
 
-    Those that mirror the axes mirror the world too: else the matrix would be no rotation, and the
-    reader would have refused it.
+    A change that mirrors the axes mirrors the world too: otherwise the matrix would not be a
+    rotation, and the reader would have refused it.
     """
     mistakes = []
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
-        named = zip(order, signs, strict=True)
-        columns = tuple((EXPECTED if sign > 0 else OPPOSITES)[axis] for axis, sign in named)
-        # All three signs changed is the same mistake as negated positions.
+        axes = zip(order, signs, strict=True)
+        columns = tuple((EXPECTED if sign > 0 else OPPOSITES)[axis] for axis, sign in axes)
+        # Changing all three signs is the same mistake as negating the positions.
         if columns not in (EXPECTED, OPPOSITES):
             mistakes.append(_axes(order, signs, columns))
     return mistakes
 
 
 def _axes(order: tuple[int, ...], signs: tuple[int, ...], columns: tuple[str, ...]) -> Mistake:
-    # Column j as read should be column order[j], with the sign signs[j].
+    # Column j as read is the correct column order[j], times signs[j].
     turn = torch.zeros(3, 3, dtype=torch.float64)
     turn[range(3), order] = torch.tensor(signs, dtype=turn.dtype)
     mirror = torch.linalg.det(turn).round()
-    elsewhere = [axis for place, axis in enumerate(order) if place != axis]
+    exchanged = [axis for column, axis in enumerate(order) if column != axis]
     if columns in CONVENTIONS:
         name = f"{CONVENTIONS[columns]} axes were taken for OpenCV's, or the reverse"
-    elif elsewhere:
-        name = (
-            f"the cameras' axes {' and '.join('xyz'[i] for i in sorted(elsewhere))} are exchanged"
-        )
+    elif exchanged:
+        letters = " and ".join("xyz"[axis] for axis in sorted(exchanged))
+        name = f"the cameras' axes {letters} are exchanged"
     else:
-        turned = [axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0]
-        name = f"the cameras' {' and '.join(turned)} point the wrong way"
-    fix = (
-        f"the columns of cam_to_world as read point {', '.join(columns)}; make them "
-        f"{', '.join(EXPECTED)}"
-    )
+        letters = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
+        name = f"the cameras' {letters} point the wrong way"
+    fix = f"the columns of cam_to_world as read point {', '.join(columns)}; make them "
+    fix += ", ".join(EXPECTED)
     if mirror < 0:
         fix += ", and mirror the positions as well, since the world is left-handed"
-    return Mistake(
-        name, fix, partial(_with_poses, change=lambda r, c: (mirror * r @ turn, mirror * c))
-    )
+    return _of_poses(name, fix, lambda r, c: (mirror * r @ turn, mirror * c))
 
 
 def _inverse(axes: Mistake | None = None) -> Mistake:
-    name = "world-to-camera matrices were taken for camera-to-world"
-    invert = partial(_with_poses, change=lambda r, c: (r.mT, -(r.mT @ c[..., None])[..., 0]))
+    inverse = _of_poses(
+        "world-to-camera matrices were taken for camera-to-world",
+        "invert them",
+        lambda r, c: (r.mT, -(r.mT @ c[..., None])[..., 0]),
+    )
     if axes is None:
-        return Mistake(name, "invert them", invert)
+        return inverse
     return Mistake(
-        f"{name}, and {axes.name}",
-        f"invert them; then {axes.fix}",
-        lambda cameras: axes.undo(invert(cameras)),
+        f"{inverse.name}, and {axes.name}",
+        f"{inverse.fix}; then {axes.fix}",
+        lambda cameras: axes.correct(inverse.correct(cameras)),
     )
 
 
-def _halves() -> list[Mistake]:
+def _partial() -> list[Mistake]:
     """List mistakes in the rotations alone or in the positions alone."""
     return [
-        Mistake(
+        _of_poses(
             "the rotations are transposed, the positions are not",
             "transpose the 3x3 rotations alone",
-            partial(_with_poses, change=lambda r, c: (r.mT, c)),
+            lambda r, c: (r.mT, c),
         ),
-        Mistake(
+        _of_poses(
             "the translations of world-to-camera were taken for positions",
             "with R of camera-to-world, positions are -R t",
-            partial(_with_poses, change=lambda r, c: (r, -(r @ c[..., None])[..., 0])),
+            lambda r, c: (r, -(r @ c[..., None])[..., 0]),
         ),
-        Mistake(
-            "the positions are negated",
-            "negate them",
-            partial(_with_poses, change=lambda r, c: (r, -c)),
-        ),
+        _of_poses("the positions are negated", "negate them", lambda r, c: (r, -c)),
     ]
 
 
 def _orders(names: Sequence[str]) -> list[Mistake]:
-    """List the ways in which poses belong to other images of the sequence."""
-    frames = range(len(names))
-    paths = [Path(name) for name in names]
+    """List the orders in which poses may belong to other images of the sequence."""
+    indices = range(len(names))
+    as_string = sorted(indices, key=lambda index: Path(names[index]).as_posix())
+    by_number = sorted(indices, key=lambda index: natural_order(Path(names[index])))
+    sort = "the images were sorted {}, the poses {}".format
+    strings, numbers = "as strings", "by their numbers"
     orders = {
-        "the images were sorted by their numbers, the poses as strings (10 before 2)": sorted(
-            frames, key=lambda frame: paths[frame].as_posix()
-        ),
-        "the images were sorted as strings (10 before 2), the poses by their numbers": sorted(
-            frames, key=lambda frame: natural_order(paths[frame])
-        ),
-        "the poses run backwards": list(reversed(frames)),
+        sort(numbers, f"{strings} (10 before 2)"): as_string,
+        sort(f"{strings} (10 before 2)", numbers): by_number,
+        "the poses run backwards": list(reversed(indices)),
     }
     for offset in OFFSETS:
-        place = "later" if offset > 0 else "earlier"
-        frames_away = f"{abs(offset)} frame{'s' if abs(offset) > 1 else ''}"
-        name = f"every pose belongs to the image {frames_away} {place}"
-        orders[name] = [(frame + offset) % len(frames) for frame in frames]
-    # The k-th pose as read belongs to frame order[k].
+        distance = f"{abs(offset)} place{'s' if abs(offset) > 1 else ''}"
+        name = f"every pose belongs to the image {distance} {'later' if offset > 0 else 'earlier'}"
+        orders[name] = [(index + offset) % len(indices) for index in indices]
+
+    def reorder(cameras: Cameras, order: list[int]) -> Cameras:
+        # Pose k as read belongs to image order[k].
+        return cameras.select(torch.tensor(order).argsort())
+
     return [
-        Mistake(
-            name,
-            "give every image its own pose",
-            lambda cameras, order=order: cameras.select(torch.tensor(order).argsort()),
-        )
+        Mistake(name, "give every image its own pose", partial(reorder, order=order))
         for name, order in orders.items()
-        if order != list(frames)
+        if order != list(indices)
     ]
 
 
-def _with_lens(cameras: Cameras, change: LensChange) -> Cameras:
-    intrinsics = cameras.intrinsics.clone()
-    diagonal = (slice(None), (0, 1), (0, 1))
-    focal, middle = change(intrinsics[diagonal], intrinsics[:, :2, 2].clone())
-    intrinsics[diagonal], intrinsics[:, :2, 2] = focal, middle
-    return replace(cameras, intrinsics=intrinsics)
+def _of_lenses(name: str, fix: str, change: Change) -> Mistake:
+    def correct(cameras: Cameras) -> Cameras:
+        intrinsics = cameras.intrinsics.clone()
+        diagonal = (slice(None), (0, 1), (0, 1))
+        focal, center = change(intrinsics[diagonal], intrinsics[:, :2, 2].clone())
+        intrinsics[diagonal], intrinsics[:, :2, 2] = focal, center
+        return replace(cameras, intrinsics=intrinsics)
+
+    return Mistake(name, fix, correct)
 
 
-def _with_poses(cameras: Cameras, change: PoseChange) -> Cameras:
-    poses = cameras.cam_to_world.clone()
-    poses[:, :3, :3], poses[:, :3, 3] = change(
-        cameras.cam_to_world[:, :3, :3], cameras.cam_to_world[:, :3, 3]
-    )
-    return replace(cameras, cam_to_world=poses)
+def _of_poses(name: str, fix: str, change: Change) -> Mistake:
+    def correct(cameras: Cameras) -> Cameras:
+        poses = cameras.cam_to_world.clone()
+        rotations, positions = change(poses[:, :3, :3], poses[:, :3, 3])
+        poses[:, :3, :3], poses[:, :3, 3] = rotations.clone(), positions.clone()
+        return replace(cameras, cam_to_world=poses)
+
+    return Mistake(name, fix, correct)

@@ -1,228 +1,224 @@
-"""What is concluded of a scene: all that was measured, whether the cameras fit, and if not, why."""
+"""Diagnose the cameras of a scene, and collect all measurements in a report."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
+from rich.console import Console
 
-from asysplat.data.bad_images import BadFrames
-from asysplat.data.sequence import FileSequence, PosedScene
+from asysplat.data.bad_images import BadImages
 from asysplat.data.check.matches import Matches, epipolar_distances, find_matches, triangulate
 from asysplat.data.check.measurements import (
     CameraPath,
     DepthScale,
-    Pixels,
-    PointsSeen,
+    PixelStats,
+    PointVisibility,
     compare_depths,
     count_points,
     measure_path,
     read_pixels,
 )
-from asysplat.data.check.mistakes import Mistake, other_focal, other_resolution, usual_mistakes
+from asysplat.data.check.mistakes import Mistake, common_mistakes, other_focal, other_resolution
 from asysplat.data.images import Lens, content_hash
+from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.scene import Cameras
 
-LONGEST = 960  # pixels: longer side, at most, of the images in which points are matched
-LIMIT = 1.5  # pixels: cameras that fit are below it in the median
-NEARLY = 5.0  # pixels: poses that are right but for their precision
-NOISE = 0.5  # pixels: precision of the matches; smaller errors are not compared
-CLEARLY = 2.0  # times smaller error: with a mistake undone, to blame that mistake
-ALIKE = 1.1  # times the least error: the likeliest mistake with at most that counts
-FEWEST = 100  # matches, to judge by
-TELLING = 1.0  # degrees between two rays; below it, noise decides on which side they meet
-WIDEST = 10.0  # fitted factors lie between 1 / WIDEST and WIDEST
+MAX_SIDE = 960  # pixels: longer side of the images in which points are matched
+MAX_ERROR = 1.5  # pixels: median error of cameras that fit
+ROUGH_ERROR = 5.0  # pixels: median error of cameras that only lack precision
+MATCH_PRECISION = 0.5  # pixels; smaller errors are not compared
+MIN_IMPROVEMENT = 2.0  # times less error after a correction, to blame its mistake
+TIE = 1.1  # times the least error: the most likely mistake up to there is reported
+MIN_MATCHES = 100
+MIN_RAY_ANGLE = 1.0  # degrees; below it, noise decides on which side two rays meet
+MAX_FACTOR = 10.0  # fitted factors lie between 1 / MAX_FACTOR and MAX_FACTOR
 TRIALS = 41  # factors tried, coarsely and then finely
-FITTED = 3  # one match in so many is used to fit them
+FIT_STRIDE = 3  # one match in so many is used to fit them
+
+NO_MISTAKE_FOUND = (
+    "the cameras do not fit the images, and no usual mistake explains it: check in check.png "
+    "whether the path is the real one, and whether each pose has its own image"
+)
+ROUGH_FIT = (
+    "the cameras fit the images only roughly, and no usual mistake explains it: refine "
+    "them by bundle adjustment, and check for lens distortion or a rolling shutter"
+)
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How well cameras explain matches.
+    """Agreement of cameras with matches.
 
     Args:
         error: median distance to the epipolar lines, in pixels.
-        under_1px: share of the matches that are nearer than that.
-        behind: share of the triangulated points that lie behind a camera.
+        under_1px: share of the matches with a distance below 1 pixel.
+        behind_camera: share of the triangulated points behind a camera.
     """
 
     error: float
     under_1px: float
-    behind: float
+    behind_camera: float
 
     @property
-    def badness(self) -> float:
+    def penalty(self) -> float:
         """The error; infinite if most points lie behind the cameras."""
-        return self.error if self.behind < 0.5 else float("inf")
+        return self.error if self.behind_camera < 0.5 else float("inf")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the matches say of the cameras.
+    """The diagnosis of a scene's cameras.
 
     Args:
         fits: whether the cameras as read fit the images.
-        sentence: the same in words; where they do not fit, why, and what to do.
-        read: how well the cameras as read fit; None without enough matches.
-        mistake, undone: the mistake that explains the matches best, and how well the cameras fit
-            with it undone.
+        sentence: the same in words; if they do not fit, the reason and what to do.
+        fit: of the cameras as read; None with too few matches.
+        mistake, corrected: the mistake that explains the matches best, and the fit of the cameras
+            after its correction.
     """
 
     fits: bool
     sentence: str
-    read: Fit | None = None
+    fit: Fit | None = None
     mistake: Mistake | None = None
-    undone: Fit | None = None
+    corrected: Fit | None = None
 
 
-def judge(cameras: Cameras, matches: Matches, names: Sequence[str]) -> Verdict:
-    """Compare the cameras as read with every usual mistake undone.
+def diagnose_cameras(cameras: Cameras, matches: Matches, names: Sequence[str]) -> Verdict:
+    """Compare the cameras as read with the correction of every common mistake.
 
     Args:
-        cameras: one a frame, in order.
-        names: the frames' image files.
+        cameras: of all images, in order.
+        names: the image files.
     """
-    if len(matches) < FEWEST:
+    if len(matches) < MIN_MATCHES:
         return Verdict(
             False,
-            f"only {len(matches)} points were found again in other frames, too few to tell: look "
-            "whether the images are sharp, in the order they were taken, and show one place",
+            f"only {len(matches)} points were matched between images, too few for a diagnosis: "
+            "check that the images are sharp, in the order they were taken, and show one place",
         )
     cameras = cameras.to(torch.float64)
-    read = measure_fit(cameras, matches)
+    fit = measure_fit(cameras, matches)
     tried = []
-    for mistake in usual_mistakes(names) + _fitted_mistakes(cameras, matches):
-        undone = mistake.undo(cameras)
-        if _differ(cameras, undone):
-            tried.append((mistake, measure_fit(undone, matches)))
-    least = min(fit.badness for _, fit in tried)
-    mistake, undone = next((m, fit) for m, fit in tried if fit.badness <= ALIKE * least)
-    if read.badness > max(CLEARLY * undone.badness, NOISE) and undone.badness < LIMIT:
-        return Verdict(False, _explained(mistake, undone), read, mistake, undone)
-    if read.badness >= LIMIT:
-        return Verdict(False, _unexplained(read), read, mistake, undone)
-    return Verdict(True, "the cameras fit the images", read, mistake, undone)
+    for mistake in common_mistakes(names) + _fitted_mistakes(cameras, matches):
+        corrected = mistake.correct(cameras)
+        if _differ(cameras, corrected):
+            tried.append((mistake, measure_fit(corrected, matches)))
+    least = min(corrected.penalty for _, corrected in tried)
+    mistake, corrected = next(pair for pair in tried if pair[1].penalty <= TIE * least)
+    improved = fit.penalty > max(MIN_IMPROVEMENT * corrected.penalty, MATCH_PRECISION)
+    if improved and corrected.penalty < MAX_ERROR:
+        error = f"{corrected.error:.2f} px"
+        sentence = f"{mistake.name} (corrected, the error is {error}): {mistake.fix}"
+    elif fit.penalty < MAX_ERROR:
+        return Verdict(True, "the cameras fit the images", fit, mistake, corrected)
+    elif fit.error < MAX_ERROR:
+        sentence = "the points that the images share lie behind the cameras: see check.png"
+    else:
+        sentence = ROUGH_FIT if fit.penalty < ROUGH_ERROR else NO_MISTAKE_FOUND
+    return Verdict(False, sentence, fit, mistake, corrected)
 
 
 def measure_fit(cameras: Cameras, matches: Matches) -> Fit:
-    """Measure how well cameras (float64) explain the matches."""
+    """Compute the epipolar error of cameras (float64), and how many points lie behind them."""
     distances = epipolar_distances(cameras, matches)
     depths, angles = triangulate(cameras, matches)
-    telling = (angles > TELLING) & (distances < LIMIT)
-    behind = (depths[telling] < 0).any(-1).double()
+    precise = (angles > MIN_RAY_ANGLE) & (distances < MAX_ERROR)
+    negative = (depths[precise] < 0).any(-1).double()
     return Fit(
         error=float(distances.median()),
         under_1px=float((distances < 1).double().mean()),
-        behind=float(behind.mean()) if len(behind) else 0.0,
+        behind_camera=float(negative.mean()) if len(negative) else 0.0,
     )
 
 
 def _fitted_mistakes(cameras: Cameras, matches: Matches) -> list[Mistake]:
-    few = matches.select(slice(None, None, FITTED))
-    return [_fitted(make, cameras, few) for make in (other_resolution, other_focal)]
+    sample = matches.select(slice(None, None, FIT_STRIDE))
+    return [_fit_factor(create, cameras, sample) for create in (other_resolution, other_focal)]
 
 
-def _fitted(make: Callable[[float], Mistake], cameras: Cameras, matches: Matches) -> Mistake:
-    """Make the mistake with the factor that leaves the least error, to about 0.3 %."""
+def _fit_factor(create: Callable[[float], Mistake], cameras: Cameras, matches: Matches) -> Mistake:
+    """Create the mistake with the factor of least error, to about 0.3 %."""
 
     def error(factor: float) -> float:
-        return float(epipolar_distances(make(factor).undo(cameras), matches).median())
+        return float(epipolar_distances(create(factor).correct(cameras), matches).median())
 
-    coarse = min(np.geomspace(1 / WIDEST, WIDEST, TRIALS).tolist(), key=error)
-    step = WIDEST ** (2 / (TRIALS - 1))
-    return make(min(np.geomspace(coarse / step, coarse * step, TRIALS).tolist(), key=error))
+    coarse = min(np.geomspace(1 / MAX_FACTOR, MAX_FACTOR, TRIALS).tolist(), key=error)
+    step = MAX_FACTOR ** (2 / (TRIALS - 1))
+    return create(min(np.geomspace(coarse / step, coarse * step, TRIALS).tolist(), key=error))
 
 
 def _differ(one: Cameras, other: Cameras) -> bool:
-    """Tell whether undoing a mistake changed anything; exchanging equal fx and fy does not."""
+    """Return whether a correction changed the cameras; exchanging equal fx and fy does not."""
     same_poses = torch.equal(one.cam_to_world, other.cam_to_world)
     return not (same_poses and torch.allclose(one.intrinsics, other.intrinsics, rtol=0.02))
 
 
-def _explained(mistake: Mistake, undone: Fit) -> str:
-    return f"{mistake.name} (undone, the error is {undone.error:.2f} px): {mistake.fix}"
-
-
-def _unexplained(read: Fit) -> str:
-    if read.error < LIMIT:
-        return "the points that the images share lie behind the cameras: look at check.png"
-    if read.badness < NEARLY:
-        return (
-            "the cameras fit the images only roughly, and no usual mistake explains it: refine "
-            "them by bundle adjustment, and look for lens distortion or a rolling shutter"
-        )
-    return (
-        "the cameras do not fit the images, and no usual mistake explains it: look in check.png "
-        "whether the path is the one that was walked, and whether each pose has its own image"
-    )
-
-
 @dataclass(frozen=True)
 class Report:
-    """All that was found out about a scene; lengths are in scene units.
+    """All measurements of a scene; lengths are in scene units.
 
     Args:
-        sequence: the frames that can be used, at the size at which they were compared.
-        damaged: a sentence for each frame that cannot be used.
-        lenses: every kind of lens and the number of photographs that it took.
-        identical: number of photographs whose file equals an earlier one.
-        depth_scale: None without depth maps, or where they show none of the matches.
+        sequence: the usable images, at the size at which they were matched.
+        damaged: an error for each image that cannot be used.
+        lenses: every kind of lens and the number of images that it took.
+        identical: number of images whose file equals an earlier one.
+        depth_scale: None without depth maps, or if no match has a known depth.
         points: None without sparse points.
-        matches: the points by which the cameras are judged.
+        matches: the points that the cameras are compared with.
     """
 
     sequence: FileSequence
     damaged: list[str]
     lenses: list[tuple[Lens, int]]
     identical: int
-    pixels: Pixels
+    pixels: PixelStats
     path: CameraPath
-    points: PointsSeen | None
+    points: PointVisibility | None
     matches: Matches
     depth_scale: DepthScale | None
     verdict: Verdict
 
 
-def check_scene(
-    scene: PosedScene, bad: BadFrames, step: Callable[[str], None] = lambda name: None
-) -> Report:
-    """Decode every frame, match some of them, and judge the cameras.
+def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = None) -> Report:
+    """Decode every image, match some of them, and diagnose the cameras.
 
     Args:
-        scene: what a reader returned.
-        bad: the frames that the reader noted; damaged ones are added.
-        step: called with "decode" or "match" whenever one of those is done.
+        scene: returned by a reader.
+        bad: the damaged images that the reader found; those found here are added.
+        console: where to show progress bars; None shows none.
 
     Raises:
-        InputError: too few frames can be used, or some cannot and must not be skipped.
+        InputError: too few usable images, or damaged images that must not be skipped.
     """
-    sequence = FileSequence(scene, *_size(scene, bad))
-    sequence, pixels = read_pixels(sequence, bad, partial(step, "decode"))
-    photographs, cameras = sequence.scene.photographs, sequence.cameras
-    matches = find_matches(sequence, partial(step, "match"))
+    sequence = FileSequence(scene, SceneOptions(*_size(scene, bad)))
+    sequence, pixels = read_pixels(sequence, bad, console)
+    images, cameras = sequence.scene.images, sequence.cameras
+    matches = find_matches(sequence, console)
     points = sequence.scene.points
-    files = {content_hash(photograph.image) for photograph in photographs}
+    files = {content_hash(image.file) for image in images}
     has_depths = pixels.depth_known is not None
+    names = [str(image.file) for image in images]
     return Report(
         sequence=sequence,
-        damaged=list(bad.sentences),
-        lenses=Counter(photograph.lens for photograph in photographs).most_common(),
-        identical=len(photographs) - len(files),
+        damaged=list(bad.errors),
+        lenses=Counter(image.lens for image in images).most_common(),
+        identical=len(images) - len(files),
         pixels=pixels,
         path=measure_path(cameras),
         points=None if points is None else count_points(cameras, torch.tensor(points).double()),
         matches=matches,
         depth_scale=compare_depths(sequence, matches) if has_depths else None,
-        verdict=judge(cameras, matches, [str(photograph.image) for photograph in photographs]),
+        verdict=diagnose_cameras(cameras, matches, names),
     )
 
 
-def _size(scene: PosedScene, bad: BadFrames) -> tuple[int, int]:
-    """Return height and width: the first photograph's, or LONGEST with its proportions."""
-    if not scene.photographs:
-        bad.settle(scene.name, 0)
-    lens = scene.photographs[0].lens
-    scale = min(1.0, LONGEST / max(lens.height, lens.width))
+def _size(scene: PosedScene, bad: BadImages) -> tuple[int, int]:
+    """Return height and width: the first image's, shrunk to a longer side of MAX_SIDE."""
+    if not scene.images:
+        bad.report(scene.name, 0)
+    lens = scene.images[0].lens
+    scale = min(1.0, MAX_SIDE / max(lens.height, lens.width))
     return round(lens.height * scale), round(lens.width * scale)

@@ -1,4 +1,4 @@
-"""Show a report on one screen, and as a picture."""
+"""Print a report on one screen, and draw it as a figure."""
 
 from collections.abc import Iterator, Sequence
 from math import atan, degrees, isfinite
@@ -15,29 +15,29 @@ from rich.table import Table
 from rich.text import Text
 
 from asysplat.data.check.matches import epipolar_lines
-from asysplat.data.check.report import Fit, Report
+from asysplat.data.check.report import Report
 from asysplat.data.images import Lens
 from asysplat.scene import Cameras
 
-# The screen.
-MOST_LENSES = 3  # printed one by one; of more, the number
-MOST_DAMAGED = 10  # printed one by one
-AGREES = (0.8, 1.25)  # median of depth maps over triangulated depths without a complaint
+# On the screen.
+MAX_LENSES = 3  # printed one by one; of more, the number
+MAX_DAMAGED = 10  # printed one by one
+DEPTH_AGREEMENT = (0.8, 1.25)  # median of depth maps over triangulated depths without advice
 
-# The picture.
-WIDTH, PATH, TALLEST, TITLE = 12.0, 5.0, 4.5, 0.3  # inches: in all, and down the page
-PAIRS = 3  # of frames, at most
-LINES = 10  # in a pair
-ARROWS = 60  # along the path
-POINTS = 5000  # sparse points, about
-NEAR = (0.05, 0.95)  # quantiles of the sparse points that the picture has room for
+# In the figure.
+WIDTH, PATH_HEIGHT, MAX_IMAGE_HEIGHT, TITLE_HEIGHT = 12.0, 5.0, 4.5, 0.3  # inches
+MAX_PAIRS = 3  # of images
+MAX_LINES = 10  # in a pair
+MAX_ARROWS = 60  # along the path
+MAX_POINTS = 5000  # sparse points, about
+POINT_QUANTILES = (0.05, 0.95)  # of the sparse points that the axes include
 MARGIN = 0.1  # around the path and the points, of their size
 
 Item = TypeVar("Item")
 
 
 def print_report(report: Report, title: str, console: Console) -> None:
-    """Print what was read, line by line, and the verdict last, where it is seen."""
+    """Print the measurements line by line, and the verdict last."""
     table = Table(title=Text(title, "bold"), title_justify="left", box=None, show_header=False)
     table.add_column(style="cyan", no_wrap=True)
     table.add_column()
@@ -52,39 +52,34 @@ def print_report(report: Report, title: str, console: Console) -> None:
 def _lines(report: Report) -> Iterator[tuple[str, str]]:
     sequence, pixels, path = report.sequence, report.pixels, report.path
     same = f", {report.identical} with the same file as another" if report.identical else ""
-    yield "frames", f"{sequence.num_frames}{same}"
-    for lens, count in report.lenses[:MOST_LENSES]:
-        yield "images", f"{count} of {_lens(lens)}"
-    if len(report.lenses) > MOST_LENSES:
-        yield "", f"and {len(report.lenses) - MOST_LENSES} other lenses"
+    yield "images", f"{sequence.num_images}{same}"
+    for lens, count in report.lenses[:MAX_LENSES]:
+        yield "lens", f"{count} of {_lens(lens)}"
+    if len(report.lenses) > MAX_LENSES:
+        yield "", f"and {len(report.lenses) - MAX_LENSES} other lenses"
     yield "brightness", "{:.2f} to {:.2f}, means of images in [0, 1]".format(*pixels.brightness)
     yield "path", f"{path.length:.4g} long, {path.extent:.4g} wide"
-    yield (
-        "a frame",
-        (
-            f"{path.step:.3g} in the median, {path.longest_step:.3g} at most; "
-            f"{path.turn:.2g}° in the median, {path.widest_turn:.3g}° at most"
-        ),
-    )
+    step = f"{path.step:.3g} in the median, {path.longest_step:.3g} at most"
+    turn = f"{path.turn:.2g}° in the median, {path.widest_turn:.3g}° at most"
+    yield "a step", f"{step}; {turn}"
     if path.repeated:
-        yield "", f"{path.repeated} frames with the pose of an earlier frame"
+        yield "", f"{path.repeated} images with the pose of an earlier image"
     yield "points", _points(report)
     yield "depth maps", _depths(report)
-    counted = "none" if pixels.counted is None else f"{pixels.counted:.1%} of the pixels count"
-    yield "masks", counted
-    for sentence in report.damaged[:MOST_DAMAGED]:
+    masked = pixels.unmasked is not None
+    yield "masks", f"{pixels.unmasked:.1%} of the pixels are kept" if masked else "none"
+    for sentence in report.damaged[:MAX_DAMAGED]:
         yield "left out", sentence
-    if len(report.damaged) > MOST_DAMAGED:
-        yield "", f"and {len(report.damaged) - MOST_DAMAGED} more"
+    if len(report.damaged) > MAX_DAMAGED:
+        yield "", f"and {len(report.damaged) - MAX_DAMAGED} more"
     yield from _fits(report)
 
 
 def _lens(lens: Lens) -> str:
     across, down = (
         degrees(atan(center / focal) + atan((size - center) / focal))
-        for center, focal, size in (
-            (lens.cx, lens.fx, lens.width),
-            (lens.cy, lens.fy, lens.height),
+        for center, focal, size in zip(
+            (lens.cx, lens.cy), (lens.fx, lens.fy), (lens.width, lens.height), strict=True
         )
     )
     kind = " fisheye" if lens.fisheye else " distorted" if lens.is_distorted else ""
@@ -99,7 +94,7 @@ def _points(report: Report) -> str:
     if points is None:
         return "none"
     return (
-        f"{points.count}, {points.seen:.1%} in front of and inside two views or more; "
+        f"{points.count}, {points.shared:.1%} in front of and inside two views or more; "
         f"{points.views:g} views a point"
     )
 
@@ -115,7 +110,7 @@ def _depths(report: Report) -> str:
         return text
     text += "; over triangulated depths {:.3f} {:.3f} {:.3f}".format(*scale.ratios)
     text += f" ({scale.points} points)"
-    if report.verdict.fits and not AGREES[0] < scale.ratios[1] < AGREES[1]:
+    if report.verdict.fits and not DEPTH_AGREEMENT[0] < scale.ratios[1] < DEPTH_AGREEMENT[1]:
         text += f": divide the unit of depth by {scale.ratios[1]:.4g}"
     return text
 
@@ -127,42 +122,34 @@ def _fits(report: Report) -> Iterator[tuple[str, str]]:
         yield "matches", "none"
         return
     gaps = sorted(abs(first - second) for first, second in pairs)
-    yield (
-        "matches",
-        (
-            f"{len(matches)} of {len(pairs)} pairs, {gaps[0]} to {gaps[-1]} frames apart, at "
-            f"{cameras.width} x {cameras.height}"
-        ),
-    )
-    if verdict.read is not None:
-        yield "epipolar error", _fit(verdict.read)
-    if verdict.undone is not None and isfinite(verdict.undone.badness):
+    pairs_apart = f"{len(pairs)} pairs, {gaps[0]} to {gaps[-1]} images apart"
+    yield "matches", f"{len(matches)} of {pairs_apart}, at {cameras.width} x {cameras.height}"
+    if fit := verdict.fit:
+        text = f"{fit.error:.2f} px in the median, {fit.under_1px:.0%} under 1 px"
+        suffix = f"; {fit.behind_camera:.0%} lie behind a camera"
+        yield "epipolar error", text + (suffix if fit.behind_camera >= 0.01 else "")
+    if verdict.corrected is not None and isfinite(verdict.corrected.penalty):
         name = "next best" if verdict.fits else "nearest"
-        yield name, f"{verdict.undone.error:.2f} px, if {verdict.mistake.name}"
-
-
-def _fit(fit: Fit) -> str:
-    text = f"{fit.error:.2f} px in the median, {fit.under_1px:.0%} under 1 px"
-    return text + (f"; {fit.behind:.0%} lie behind a camera" if fit.behind >= 0.01 else "")
+        yield name, f"{verdict.corrected.error:.2f} px, if {verdict.mistake.name}"
 
 
 def draw_report(report: Report, title: str) -> Figure:
-    """Draw the path from above and from the side, and a few pairs of frames below.
+    """Draw the path from above and from the side, and a few pairs of images below.
 
-    A pair's frames are one above the other, with matched points and their epipolar lines: where
-    the cameras put each point, given its place in the other frame.
+    The images of a pair are drawn one above the other, with matched points and the epipolar lines
+    that the cameras predict for them.
     """
     cameras = report.sequence.cameras
-    tall = min(WIDTH / PAIRS * cameras.height / cameras.width, TALLEST) + TITLE
-    figure = Figure(figsize=(WIDTH, PATH + 2 * tall), layout="constrained")
+    image_height = min(WIDTH / MAX_PAIRS * cameras.height / cameras.width, MAX_IMAGE_HEIGHT)
+    pair_height = 2 * (image_height + TITLE_HEIGHT)
+    figure = Figure(figsize=(WIDTH, PATH_HEIGHT + pair_height), layout="constrained")
     figure.suptitle(f"{title}: {report.verdict.sentence}", wrap=True)
-    paths, images = figure.subfigures(2, 1, height_ratios=(PATH, 2 * tall))
+    paths, images = figure.subfigures(2, 1, height_ratios=(PATH_HEIGHT, pair_height))
     _draw_path(report, *paths.subplots(1, 2))
-    pairs = _spread(report.matches.pairs, PAIRS)
+    pairs = _spread(report.matches.pairs, MAX_PAIRS)
     if pairs:
-        for plots, pair in zip(
-            images.subplots(2, len(pairs), squeeze=False).T.tolist(), pairs, strict=True
-        ):
+        columns = images.subplots(2, len(pairs), squeeze=False).T.tolist()
+        for plots, pair in zip(columns, pairs, strict=True):
             _draw_pair(report, pair, plots)
     return figure
 
@@ -173,10 +160,10 @@ def _draw_path(report: Report, above: Axes, side: Axes) -> None:
     centers = cameras.centers.double().numpy() @ axes
     ahead = cameras.cam_to_world[:, :3, 2].double().numpy() @ axes
     sparse = np.empty((0, 3)) if points is None else points @ axes
-    drawn = sparse[:: max(1, len(sparse) // POINTS)]
-    arrows = _spread(range(len(centers)), ARROWS)
-    for plot, x, y, where in ((above, 0, 1, "above"), (side, 1, 2, "the side")):
-        plot.set_title(f"path from {where}, dark to light; scene units")
+    drawn = sparse[:: max(1, len(sparse) // MAX_POINTS)]
+    arrows = _spread(range(len(centers)), MAX_ARROWS)
+    for plot, x, y, direction in ((above, 0, 1, "above"), (side, 1, 2, "the side")):
+        plot.set_title(f"path from {direction}, dark to light; scene units")
         plot.scatter(drawn[:, x], drawn[:, y], s=1, c="0.7", linewidths=0)
         plot.plot(centers[:, x], centers[:, y], c="0.4", lw=0.8)
         plot.quiver(
@@ -184,23 +171,22 @@ def _draw_path(report: Report, above: Axes, side: Axes) -> None:
             **{"cmap": "viridis", "angles": "xy", "scale": 16, "width": 0.004},
         )
         plot.set_aspect("equal")
-        plot.set_xlim(*_room(centers[:, x], sparse[:, x]))
-        plot.set_ylim(*_room(centers[:, y], sparse[:, y]))
+        plot.set_xlim(*_limits(centers[:, x], sparse[:, x]))
+        plot.set_ylim(*_limits(centers[:, y], sparse[:, y]))
 
 
 def _draw_pair(report: Report, pair: tuple[int, int], plots: Sequence[Axes]) -> None:
     sequence = report.sequence
     height, width = sequence.cameras.height, sequence.cameras.width
     matches = report.matches.of(pair)
-    matches = matches.select(
-        torch.tensor(_spread(matches.points[:, 0, 0].argsort().tolist(), LINES))
-    )
+    left_to_right = matches.points[:, 0, 0].argsort().tolist()
+    matches = matches.select(torch.tensor(_spread(left_to_right, MAX_LINES)))
     lines = epipolar_lines(sequence.cameras.to(torch.float64), matches)
     images = sequence.views(pair).images.permute(0, 2, 3, 1).numpy()
     for view, plot in enumerate(plots):
         # The first pixel's center is at +0.5.
         plot.imshow(images[view], extent=(0, width, height, 0))
-        plot.set_title(f"frame {pair[view]}")
+        plot.set_title(f"image {pair[view]}")
         plot.set_axis_off()
         for number in range(len(matches)):
             a, b, c = lines[number, view].tolist()
@@ -216,9 +202,9 @@ def _draw_pair(report: Report, pair: tuple[int, int], plots: Sequence[Axes]) -> 
 
 
 def _upright(cameras: Cameras) -> Float[ndarray, "3 3"]:
-    """Return right, ahead and up in the world as columns.
+    """Return right, ahead and up in the world as columns, from the first camera's right axis.
 
-    Up is the mean direction of the cameras' tops, right the first camera's right.
+    Up is the mean of the cameras' up directions.
     """
     rotations = cameras.cam_to_world[:, :3, :3].double().numpy()
     up, right = -rotations[:, :, 1].mean(0), rotations[0, :, 0]
@@ -227,14 +213,14 @@ def _upright(cameras: Cameras) -> Float[ndarray, "3 3"]:
     return np.stack([axis / max(np.linalg.norm(axis), 1e-9) for axis in axes], 1)
 
 
-def _room(centers: Float[ndarray, " N"], points: Float[ndarray, " P"]) -> tuple[float, float]:
-    """Return the ends of an axis that shows all cameras and most points."""
-    ends = [*centers, *(np.quantile(points, NEAR) if len(points) else ())]
-    margin = MARGIN * max(max(ends) - min(ends), 1e-6)
-    return min(ends) - margin, max(ends) + margin
+def _limits(centers: Float[ndarray, " N"], points: Float[ndarray, " P"]) -> tuple[float, float]:
+    """Return the limits of an axis that includes all cameras and most points."""
+    values = [*centers, *(np.quantile(points, POINT_QUANTILES) if len(points) else ())]
+    margin = MARGIN * max(max(values) - min(values), 1e-6)
+    return min(values) - margin, max(values) + margin
 
 
 def _spread(items: Sequence[Item], count: int) -> list[Item]:
-    """Choose at most `count` items, evenly."""
-    places = np.linspace(0, len(items) - 1, min(count, len(items)))
-    return [items[round(place)] for place in places]
+    """Select at most `count` evenly spaced items."""
+    positions = np.linspace(0, len(items) - 1, min(count, len(items)))
+    return [items[round(position)] for position in positions]

@@ -1,4 +1,4 @@
-"""Monocular disparities of photographs: estimated once, kept on disk, read when present.
+"""Monocular disparities of images: estimated once, kept on disk, read when present.
 
 python -m asysplat.data.disparity path/to/scenes
 """

@@ -1,4 +1,4 @@
-"""Files of disparities: where they lie, how they are written, whose photograph each belongs to."""
+"""Files of disparities: their folders, names and format."""
 
 import os
 from dataclasses import replace
@@ -15,46 +15,46 @@ from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
 
-BESIDE = "disparities"  # the folder in a scene's own, where a user wants them there
-LEVELS = 4095  # of a map: finer than any network is right, and PNG packs 12 bits well
+BESIDE = "disparities"  # the folder inside a scene's own folder, if a user puts maps there
+LEVELS = 4095  # of a map: finer than any network's precision, and PNG packs 12 bits well
 
 
 def map_folder(scene: Path, cache: Path) -> Path:
-    """Return the folder of a scene's maps in the cache, which knows scenes by their path."""
+    """Return the folder of a scene's maps in the cache, named after the scene's path."""
     return cache.expanduser() / f"{scene.name}-{_digest(str(scene.absolute()))}"
 
 
 def map_name(image: ImageFile, scene: Path) -> str:
-    """Return the file name of a photograph's map: of the photograph's place in its scene."""
-    place = os.path.relpath(image, scene) if isinstance(image, Path) else str(image)
-    return f"{Path(place).stem}-{_digest(place)}.png"
+    """Return the file name of an image's map, from the image's path inside its scene."""
+    path = os.path.relpath(image, scene) if isinstance(image, Path) else str(image)
+    return f"{Path(path).stem}-{_digest(path)}.png"
 
 
 def with_disparities(posed: PosedScene, scene: Path, cache: Path) -> PosedScene:
-    """Return the scene, its photographs with the maps that are there; as it was without any.
+    """Return the scene with the existing maps added to its images.
 
     Args:
-        posed: as a reader returned it.
-        scene: the path that was read.
-        cache: where maps are kept; those in the scene's own folder come first.
+        posed: returned by a reader.
+        scene: its path.
+        cache: the folder of maps; maps in the scene's own folder take precedence.
     """
-    found: dict[str, Path] = {}
+    maps: dict[str, Path] = {}
     for folder in (map_folder(scene, cache), scene / BESIDE):
         if folder.is_dir():
-            found |= {name: folder / name for name in os.listdir(folder)}
-    if not found:
+            maps |= {name: folder / name for name in os.listdir(folder)}
+    if not maps:
         return posed
-    photographs = [
-        replace(p, disparity=found.get(map_name(p.image, scene))) for p in posed.photographs
+    images = [
+        replace(image, disparity=maps.get(map_name(image.file, scene))) for image in posed.images
     ]
-    return replace(posed, photographs=photographs)
+    return replace(posed, images=images)
 
 
 def write_map(path: Path, disparity: Float[ndarray, "h w"]) -> None:
     """Write disparities as a 16-bit PNG: 1 for the least, LEVELS for the greatest.
 
-    The loss sees no scale and no shift of a view, so none is kept; 0 stays free for what is not
-    known. The file appears complete or not at all.
+    Scale and shift are not stored, since the loss ignores them; 0 means unknown. The file appears
+    complete or not at all.
 
     Raises:
         InputError: NaN or infinity; a file that cannot be written.

@@ -1,4 +1,4 @@
-"""The monocular network: Depth Anything (Yang et al. 2024), by way of transformers."""
+"""The monocular network Depth Anything (Yang et al. 2024), loaded with transformers."""
 
 import torch
 import torch.nn.functional as F
@@ -10,16 +10,15 @@ from asysplat.errors import InputError
 
 MODEL = "LiheYoung/depth-anything-small-hf"  # the weights that Long-LRM trains with; Apache-2.0
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, RGB
-SIDE = 518  # pixels of the shorter side that the network was trained at
+SHORT_SIDE = 518  # pixels of the shorter side in the network's training
 
 
 class DepthAnything:
-    """Estimates the disparity of a photograph, up to a scale and a shift.
+    """Estimates the disparity of an image, up to a scale and a shift.
 
     Args:
-        network: pixel_values [1, 3, H, W], as ImageNet's, -> `.predicted_depth` [1, H, W]; its
-            `config.patch_size` divides H and W.
-        device: where it computes.
+        network: pixel_values [1, 3, H, W], normalized as for ImageNet, -> `.predicted_depth`
+            [1, H, W]; its `config.patch_size` divides H and W.
     """
 
     def __init__(self, network: nn.Module, device: torch.device):
@@ -29,19 +28,19 @@ class DepthAnything:
         )
 
     @torch.inference_mode()
-    def __call__(self, photograph: UInt8[ndarray, "h w 3"]) -> Float[ndarray, "H W"]:
-        """Return the disparity of the whole photograph at the network's own size."""
+    def __call__(self, image: UInt8[ndarray, "h w 3"]) -> Float[ndarray, "H W"]:
+        """Return the disparity of the whole image, at the network's own size."""
         # A copy, since arrays from Pillow are read-only.
-        pixels = torch.tensor(photograph, device=self.device).permute(2, 0, 1)[None] / 255
-        size = network_size(*photograph.shape[:2], self.network.config.patch_size)
+        pixels = torch.tensor(image, device=self.device).permute(2, 0, 1)[None] / 255
+        size = network_size(*image.shape[:2], self.network.config.patch_size)
         pixels = F.interpolate(pixels, size, mode="bicubic", antialias=True)
-        found = self.network(pixel_values=(pixels - self.mean) / self.std)
-        return found.predicted_depth[0].float().cpu().numpy()
+        output = self.network(pixel_values=(pixels - self.mean) / self.std)
+        return output.predicted_depth[0].float().cpu().numpy()
 
 
 def network_size(height: int, width: int, patch: int) -> tuple[int, int]:
-    """Return the size nearest to the photograph's proportions, in whole patches."""
-    scale = SIDE / min(height, width)
+    """Return the size in whole patches that is nearest to the image's proportions."""
+    scale = SHORT_SIDE / min(height, width)
     return tuple(max(1, round(scale * side / patch)) * patch for side in (height, width))
 
 
@@ -49,12 +48,12 @@ def load_depth_anything(model: str, download: bool) -> DepthAnything:
     """Load a network of relative depth with transformers.
 
     Args:
-        model: a folder, or a name in Hugging Face's hub.
-        download: whether to fetch weights that are not on this machine.
+        model: a folder, or a name on the Hugging Face Hub.
+        download: whether to download missing weights.
 
     Raises:
-        InputError: transformers is not installed, the weights are not there, or they are for
-            metric depth.
+        InputError: transformers is not installed, weights are missing, or they are for metric
+            depth.
     """
     try:
         from transformers import AutoModelForDepthEstimation
@@ -76,7 +75,7 @@ def load_depth_anything(model: str, download: bool) -> DepthAnything:
     kind = getattr(network.config, "depth_estimation_type", "relative")
     if kind != "relative":
         raise InputError(
-            f"--model {model} estimates {kind} depth, and disparities are wanted: name a model of "
-            f"relative depth, such as {MODEL}."
+            f"--model {model} estimates {kind} depth, not disparities: name a model of relative "
+            f"depth, such as {MODEL}."
         )
     return DepthAnything(network, torch.device("cuda" if torch.cuda.is_available() else "cpu"))

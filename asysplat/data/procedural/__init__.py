@@ -1,4 +1,4 @@
-"""Synthetic places, the data set that needs no download."""
+"""Synthetic scenes, the data set that needs no download."""
 
 from asysplat.data.procedural.scene import ProceduralScene, split_seed
 

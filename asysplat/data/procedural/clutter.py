@@ -1,20 +1,21 @@
-"""What photographs show and a plain floor plan lacks: thin things, small near things, gloss."""
+"""Details of real places that plain floor plans lack: thin and small near objects, gloss."""
 
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
+from numpy.random import Generator
 
 from asysplat.data.procedural import textures
 from asysplat.data.procedural.floor_plan import TRIES, FloorPlan, any_material, scatter
 from asysplat.data.procedural.textures import Material
 
-BELOW = 0.5  # meters by which poles reach under the floor, as ground outdoors is not level
-GLOSSY = 0.5  # share of the materials
+UNDERGROUND = 0.5  # meters of a pole below the floor, as ground outdoors is not level
+GLOSSY_SHARE = 0.5  # of the materials
 
 
-def add_clutter(plan: FloorPlan, rng: np.random.Generator) -> None:
-    """Add a thing on thin legs, a pole with a small thing, a lamp or a pipe, a thing on top."""
+def add_clutter(plan: FloorPlan, rng: Generator) -> None:
+    """Add an object on thin legs, a stand, a lamp or a pipe, and an object on top of a box."""
     legged = (trestle, railing)[rng.integers(2)]
     beside_walk = [(stand, 0.12, 0.12)]
     if rng.random() < 0.5:
@@ -26,33 +27,35 @@ def add_clutter(plan: FloorPlan, rng: np.random.Generator) -> None:
     put_on_top(plan, rng)
 
 
-def polish(plan: FloorPlan, rng: np.random.Generator) -> None:
-    """Give some of the materials a gloss."""
+def polish(plan: FloorPlan, rng: Generator) -> None:
+    """Make some of the materials glossy."""
     polished = {material: _polished(material, rng) for material in plan.materials()}
     plan.boxes = [(*box, polished[material]) for *box, material in plan.boxes]
     plan.spheres = [(*sphere, polished[material]) for *sphere, material in plan.spheres]
     plan.shell = [polished[material] for material in plan.shell]
 
 
-def _polished(material: Material, rng: np.random.Generator) -> Material:
-    if rng.random() > GLOSSY:
+def _polished(material: Material, rng: Generator) -> Material:
+    if rng.random() > GLOSSY_SHARE:
         return material
     return replace(material, gloss=rng.uniform(0.2, 1.2), shininess=np.exp(rng.uniform(2, 5)))
 
 
-def _near_walk(plan: FloorPlan, rng: np.random.Generator) -> Float[np.ndarray, "K 2"]:
-    """Draw spots 0.6 to 1.5 m from places on the walk."""
+def _near_walk(plan: FloorPlan, rng: Generator) -> Float[np.ndarray, "K 2"]:
+    """Draw spots 0.6 to 1.5 m from points of the path."""
     angle = rng.uniform(0, 2 * np.pi, TRIES)
     offset = rng.uniform(0.6, 1.5, TRIES) * np.array([np.cos(angle), np.sin(angle)])
     return plan.walk[rng.integers(len(plan.walk), size=TRIES)] + offset.T
 
 
 def pole(plan: FloorPlan, x: float, y: float, top: float, half: float, material: Material) -> None:
-    """Add an upright pole, `half` its width in meters."""
-    plan.add_box((x, y, (top - BELOW) / 2), (half, half, (top + BELOW) / 2), 0.0, material)
+    """Add an upright pole; `half` is half its width in meters."""
+    plan.add_box(
+        (x, y, (top - UNDERGROUND) / 2), (half, half, (top + UNDERGROUND) / 2), 0.0, material
+    )
 
 
-def trestle(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def trestle(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
     """Add a table or bench on four thin legs."""
     height, yaw, wood = rng.uniform(0.4, 0.9), rng.uniform(0, np.pi), any_material(rng)
     half = np.array([0.8, rng.uniform(0.3, 0.5)]) * size
@@ -65,19 +68,19 @@ def trestle(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size:
             pole(plan, *leg, height, thin, metal)
 
 
-def railing(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def railing(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
     """Add two rails on two posts."""
     height, yaw, metal = rng.uniform(0.7, 1.1), rng.uniform(0, np.pi), any_material(rng)
     thin = rng.uniform(0.015, 0.03)
     along = np.array([np.cos(yaw), np.sin(yaw)])
     for rail in (height, 0.5 * height):
         plan.add_box((x, y, rail), (size, thin, thin), yaw, metal)
-    for place in (-0.95, 0.95):
-        pole(plan, *(np.array([x, y]) + place * size * along), height, thin, metal)
+    for end in (-0.95, 0.95):
+        pole(plan, *(np.array([x, y]) + end * size * along), height, thin, metal)
 
 
-def stand(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
-    """Add a pole with a small thing on it."""
+def stand(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
+    """Add a pole with a small object on it."""
     height, material = rng.uniform(0.5, 1.4), any_material(rng)
     pole(plan, x, y, height, rng.uniform(0.012, 0.025), any_material(rng))
     half = rng.uniform(0.05, 0.12)
@@ -88,36 +91,36 @@ def stand(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: f
         plan.add_box((x, y, height + sides[2]), sides, rng.uniform(0, np.pi), material)
 
 
-def lamp(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def lamp(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
     """Add a tall pole with a globe."""
     height = rng.uniform(1.4, 1.8)
     pole(plan, x, y, height, rng.uniform(0.012, 0.025), any_material(rng))
     plan.add_sphere((x, y, height + 0.8 * size), 0.8 * size, textures.plaster(rng))
 
 
-def pipe(plan: FloorPlan, rng: np.random.Generator) -> None:
-    """Hang a pipe or a cable across the place, in a room above the lamp."""
+def pipe(plan: FloorPlan, rng: Generator) -> None:
+    """Hang a pipe or a cable across the place; in a room, above the lamp."""
     height = rng.uniform(2.0, 2.5) if plan.room is None else plan.light[2] + 0.15
     center = (*rng.uniform(-1.5, 1.5, 2), height)
     thin = rng.uniform(0.012, 0.035)
     plan.add_box(center, (30.0, thin, thin), rng.uniform(0, np.pi), any_material(rng))
 
 
-def put_on_top(plan: FloorPlan, rng: np.random.Generator) -> None:
-    """Put a small thing on a box that is wide enough and no higher than a table."""
-
-    def carries(center: np.ndarray, half: np.ndarray) -> bool:
-        return bool(half[:2].min() > 0.2 and 0.3 < center[2] + half[2] < 1.2)
-
-    tops = [(center, half, yaw) for center, half, yaw, _ in plan.boxes if carries(center, half)]
+def put_on_top(plan: FloorPlan, rng: Generator) -> None:
+    """Put a small object on a box that is wide enough and at most as high as a table."""
+    tops = [
+        (center, half, yaw)
+        for center, half, yaw, _ in plan.boxes
+        if half[:2].min() > 0.2 and 0.3 < center[2] + half[2] < 1.2
+    ]
     for index in rng.permutation(len(tops))[:1]:
         center, half, yaw = tops[index]
         cos, sin = np.cos(yaw), np.sin(yaw)
         x, y = rng.uniform(-0.8, 0.8, 2) * half[:2]
         size = rng.uniform(0.03, 0.1)
-        place = center + np.array([cos * x - sin * y, sin * x + cos * y, half[2] + size])
+        position = center + np.array([cos * x - sin * y, sin * x + cos * y, half[2] + size])
         if rng.random() < 0.5:
-            plan.add_sphere(place, size, any_material(rng))
+            plan.add_sphere(position, size, any_material(rng))
         else:
             sides = size * np.array([*rng.uniform(0.3, 1.0, 2), 1.0])
-            plan.add_box(place, sides, rng.uniform(0, np.pi), any_material(rng))
+            plan.add_box(position, sides, rng.uniform(0, np.pi), any_material(rng))

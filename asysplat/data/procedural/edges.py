@@ -1,20 +1,20 @@
-"""Smooth edges: several rays a pixel where two surfaces meet (adaptive multisampling).
+"""Antialiased edges: several rays a pixel where two surfaces meet (adaptive multisampling).
 
-The rays only tell which surface they meet; its color is that of the nearest pixel that shows it.
+These rays only find which surface they hit; its color is taken from the nearest pixel showing it.
 """
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-# A rotated grid: an edge at any angle is met by the four rays one after the other.
+# A rotated grid: an edge at any angle crosses the four rays one after the other.
 SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
-# From a pixel to itself and its neighbors (x, y).
+# Offsets (x, y) from a pixel to itself and its neighbors.
 NEIGHBORS = ((0, 0), (0, -1), (-1, 0), (1, 0), (0, 1))
 
 
 def edge_pixels(surfaces: Int[Tensor, "H W"]) -> Int[Tensor, " E"]:
-    """Return the numbers, row by row, of pixels beside or above one of another surface."""
+    """Return the flat indices of pixels beside, above or below a pixel of another surface."""
     edges = torch.zeros_like(surfaces, dtype=torch.bool)
     beside, above = surfaces[:, 1:] != surfaces[:, :-1], surfaces[1:] != surfaces[:-1]
     edges[:, 1:] |= beside
@@ -24,8 +24,8 @@ def edge_pixels(surfaces: Int[Tensor, "H W"]) -> Int[Tensor, " E"]:
     return edges.flatten().nonzero()[:, 0]
 
 
-def samples(directions: Float[Tensor, "3 E"], pixel: float) -> Float[Tensor, "3 SE"]:
-    """Return directions around those of pixel centers, all of one sample after those of another.
+def sample_directions(directions: Float[Tensor, "3 E"], pixel: float) -> Float[Tensor, "3 SE"]:
+    """Return SAMPLES directions around each pixel center's, sample by sample.
 
     Args:
         directions: in camera axes, with z = 1.
@@ -36,29 +36,29 @@ def samples(directions: Float[Tensor, "3 E"], pixel: float) -> Float[Tensor, "3 
     return torch.stack((x + offsets[0], y + offsets[1], z)).flatten(1)
 
 
-def mixed(
-    light: Float[Tensor, "3 HW"],
+def average_samples(
+    colors: Float[Tensor, "3 HW"],
     surfaces: Int[Tensor, "H W"],
     pixels: Int[Tensor, " E"],
-    seen: Int[Tensor, " SE"],
+    sampled: Int[Tensor, " SE"],
 ) -> Float[Tensor, "3 E"]:
-    """Average over the samples of each pixel the light of the surfaces that they meet.
+    """Average the colors of the surfaces that the samples of each pixel hit.
 
-    A surface that none of them shows counts as the pixel's own.
+    A surface that no neighboring pixel shows is replaced by the pixel's own.
 
     Args:
-        light, surfaces: of every pixel's center.
-        pixels: numbers, row by row.
-        seen: surface that each ray of `samples` meets.
+        colors, surfaces: at every pixel's center.
+        pixels: flat indices.
+        sampled: surface hit by each ray of `sample_directions`.
     """
     height, width = surfaces.shape
     x, y = torch.tensor(NEIGHBORS, device=pixels.device).T[..., None]
     around = ((pixels // width + y).clamp(0, height - 1)) * width
     around += (pixels % width + x).clamp(0, width - 1)
     shown = surfaces.flatten()[around]
-    seen = seen.view(len(SAMPLES), -1)
-    # Of the neighbors that show the surface, the first has the largest countdown.
+    sampled = sampled.view(len(SAMPLES), -1)
+    # The first neighbor that shows the surface has the largest countdown.
     countdown = torch.arange(len(NEIGHBORS), 0, -1, device=pixels.device)[:, None, None]
-    latest = torch.where(shown[:, None] == seen, countdown, 0).amax(0)
+    latest = torch.where(shown[:, None] == sampled, countdown, 0).amax(0)
     first = (len(NEIGHBORS) - latest) % len(NEIGHBORS)
-    return light[:, around.gather(0, first)].mean(1)
+    return colors[:, around.gather(0, first)].mean(1)

@@ -1,44 +1,45 @@
-"""Floor plans: what stands where in a room, or in a place outdoors, around a walk.
+"""Random floor plans of a room or an outdoor place, around a camera path.
 
-All in meters, z up, the floor at about 0, the walk around the origin.
+All in meters, z up, the floor at about 0, the path around the origin.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
+from numpy.random import Generator
 
 from asysplat.data.procedural import textures
 from asysplat.data.procedural.textures import Material
 
-CLEARANCE = 0.45  # distance, seen from above, between the walk and what stands on the ground
+CLEARANCE = 0.45  # horizontal distance between the path and objects on the ground
 SKY_RADIUS = 60.0
 TERRAIN_SAMPLES = 121
-TRIES = 64  # spots tried for each thing
+TRIES = 64  # random spots for each object
 
 
 @dataclass
 class FloorPlan:
-    """Everything solid, in plain numbers, and the light.
+    """All solid objects, and the light.
 
     Args:
-        walk: [T, 2] camera positions seen from above, from which things keep clear.
+        walk: [T, 2] camera positions from above; objects keep clear of them.
         boxes: (center, half sizes, yaw in radians, material).
         spheres: (center, radius, material).
         room: lower and upper corner; None outdoors.
         shell: materials of the walls at +-x, +-y, ceiling and floor; outdoors that of the ground.
         heights: [N, N] of the terrain; None in a room.
         light: position of the lamp or sun, [3].
-        light_color: of a white surface that faces it from near by, linear RGB [3].
+        irradiance: of a surface that faces the light from close by, linear RGB [3].
         falloff: distance at which the light is half as strong.
-        ambient: light from everywhere, linear RGB [3].
-        taken: (spot, radius) of what stands on the ground.
+        ambient: light from all directions, linear RGB [3].
+        occupied: (spot, radius) of objects on the ground.
     """
 
     walk: Float[np.ndarray, "T 2"]
     light: np.ndarray
-    light_color: np.ndarray
+    irradiance: np.ndarray
     falloff: float
     ambient: np.ndarray
     shell: list[Material]
@@ -46,7 +47,7 @@ class FloorPlan:
     heights: np.ndarray | None = None
     boxes: list[tuple[np.ndarray, np.ndarray, float, Material]] = field(default_factory=list)
     spheres: list[tuple[np.ndarray, float, Material]] = field(default_factory=list)
-    taken: list[tuple[np.ndarray, float]] = field(default_factory=list)
+    occupied: list[tuple[np.ndarray, float]] = field(default_factory=list)
 
     def add_box(self, center, half, yaw: float, material: Material) -> None:
         self.boxes.append((np.array(center, float), np.array(half, float), yaw, material))
@@ -55,33 +56,28 @@ class FloorPlan:
         self.spheres.append((np.array(center, float), radius, material))
 
     def materials(self) -> list[Material]:
-        """Return every material, each once."""
-        things = (*self.boxes, *self.spheres)
-        return list(dict.fromkeys([*(thing[-1] for thing in things), *self.shell]))
-
-    def free(self, spots: Float[np.ndarray, "K 2"], radius: float) -> Bool[np.ndarray, " K"]:
-        """Tell which spots have room for a disc, clear of the walk and of what stands there."""
-        to_walk = np.linalg.norm(spots[:, None] - self.walk, axis=-1).min(1)
-        good = to_walk > radius + CLEARANCE
-        for place, other in self.taken:
-            good &= np.linalg.norm(spots - place, axis=-1) > 0.85 * (radius + other)
-        return good
+        """Return the distinct materials."""
+        solids = (*self.boxes, *self.spheres)
+        return list(dict.fromkeys([*(solid[-1] for solid in solids), *self.shell]))
 
     def claim(self, spots: Float[np.ndarray, "K 2"], radius: float) -> np.ndarray | None:
-        """Take the first free spot; None if there is none."""
-        good = np.flatnonzero(self.free(spots, radius))
-        if len(good) == 0:
+        """Occupy the first spot with room for a disc; None if there is none."""
+        to_walk = np.linalg.norm(spots[:, None] - self.walk, axis=-1).min(1)
+        free = to_walk > radius + CLEARANCE
+        for spot, other in self.occupied:
+            free &= np.linalg.norm(spots - spot, axis=-1) > 0.85 * (radius + other)
+        if not free.any():
             return None
-        self.taken.append((spots[good[0]], radius))
-        return spots[good[0]]
+        self.occupied.append((spots[free.argmax()], radius))
+        return spots[free.argmax()]
 
 
-def any_material(rng: np.random.Generator) -> Material:
+def any_material(rng: Generator) -> Material:
     kinds = (textures.cloth, textures.planks, textures.tiles, textures.plaster, textures.cloth)
     return kinds[rng.integers(len(kinds))](rng)
 
 
-def table(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def table(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
     """Add a top on two panels, with a ball on it."""
     height, yaw, wood = rng.uniform(0.5, 0.8), rng.uniform(0, np.pi), textures.planks(rng)
     along = np.array([np.cos(yaw), np.sin(yaw)])
@@ -93,7 +89,7 @@ def table(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: f
     plan.add_sphere((x, y, height + radius), radius, any_material(rng))
 
 
-def stack(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def stack(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
     """Add a crate with a smaller one on it."""
     half, yaw = np.array([0.75, 0.6, 0.6]) * size * rng.uniform(0.7, 1.0), rng.uniform(0, np.pi)
     plan.add_box((x, y, half[2]), half, yaw, any_material(rng))
@@ -102,7 +98,7 @@ def stack(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: f
     plan.add_box((x, y, top), small, yaw + rng.uniform(-0.6, 0.6), any_material(rng))
 
 
-def sofa(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def sofa(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
     """Add a seat with a back."""
     yaw, fabric = rng.integers(4) * np.pi / 2 + rng.uniform(-0.15, 0.15), textures.cloth(rng)
     back = np.array([x, y]) + 0.42 * size * np.array([-np.sin(yaw), np.cos(yaw)])
@@ -110,23 +106,23 @@ def sofa(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: fl
     plan.add_box((*back, 0.62), (0.85 * size, 0.1 * size, 0.2), yaw, fabric)
 
 
-def ball(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def ball(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
     plan.add_sphere((x, y, 0.7 * size), 0.7 * size, any_material(rng))
 
 
-def tree(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def tree(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
     height, crown = rng.uniform(1.5, 2.8), rng.uniform(0.8, 1.5)
     bark = textures.planks(rng)
     plan.add_box((x, y, height / 2 - 0.5), (0.12, 0.12, height / 2 + 0.5), rng.uniform(), bark)
     plan.add_sphere((x, y, height + 0.6 * crown), crown, textures.leaves(rng))
 
 
-def boulder(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def boulder(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
     kind = textures.stone if rng.random() < 0.6 else textures.leaves
     plan.add_sphere((x, y, rng.uniform(-0.1, 0.4) * size), size, kind(rng))
 
 
-def house(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: float) -> None:
+def house(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> None:
     """Add a block with a flat roof that juts out, and a dark door."""
     half = np.array([0.8, 0.6, rng.uniform(0.5, 1.0)]) * size
     yaw = rng.uniform(0, np.pi)
@@ -140,11 +136,11 @@ def house(plan: FloorPlan, rng: np.random.Generator, x: float, y: float, size: f
 
 def scatter(
     plan: FloorPlan,
-    rng: np.random.Generator,
+    rng: Generator,
     kinds: list[tuple[Callable, float, float]],
     spots: Callable[[], Float[np.ndarray, "K 2"]],
 ) -> None:
-    """Add one thing of each (kind, smallest size, largest size), if there is a free spot."""
+    """Add one object of each (kind, smallest size, largest size), if there is a free spot."""
     for kind, smallest, largest in kinds:
         size = rng.uniform(smallest, largest)
         spot = plan.claim(spots(), size)
@@ -152,14 +148,14 @@ def scatter(
             kind(plan, rng, *spot, size)
 
 
-def hang_pictures(plan: FloorPlan, rng: np.random.Generator, half: np.ndarray) -> None:
-    """Add pictures and cupboards along the walls."""
+def decorate_walls(plan: FloorPlan, rng: Generator, half: np.ndarray) -> None:
+    """Hang pictures and put cupboards along the walls."""
     for wall in range(4):
         axis, side = wall % 2, 1 if wall < 2 else -1
-        for place in (-0.5, 0.5) if rng.random() < 0.5 else (rng.uniform(-0.5, 0.5),):
+        for position in (-0.5, 0.5) if rng.random() < 0.5 else (rng.uniform(-0.5, 0.5),):
             center, size = np.zeros(3), np.zeros(3)
             center[axis] = side * half[axis]
-            center[1 - axis] = place * half[1 - axis]
+            center[1 - axis] = position * half[1 - axis]
             deep = rng.random() < 0.4
             size[axis] = 0.3 if deep else 0.03
             size[1 - axis] = rng.uniform(0.35, 0.7)
@@ -168,9 +164,7 @@ def hang_pictures(plan: FloorPlan, rng: np.random.Generator, half: np.ndarray) -
             plan.add_box(center, size, 0.0, any_material(rng))
 
 
-def furnished_room(
-    rng: np.random.Generator, walk: Float[np.ndarray, "T 2"], half: np.ndarray
-) -> FloorPlan:
+def furnished_room(rng: Generator, walk: Float[np.ndarray, "T 2"], half: np.ndarray) -> FloorPlan:
     """Furnish a room of the given half sizes, around the origin, with its floor at 0."""
     height = 2 * half[2]
     wall = (textures.plaster, textures.bricks, textures.planks, textures.plaster)[rng.integers(4)]
@@ -181,13 +175,13 @@ def furnished_room(
     plan = FloorPlan(
         walk=walk,
         light=lamp,
-        light_color=np.array([1.0, 0.9, 0.78]),
+        irradiance=np.array([1.0, 0.9, 0.78]),
         falloff=rng.uniform(1.5, 3.0),
         ambient=rng.uniform(0.15, 0.3) * np.array([0.9, 0.95, 1.0]),
         shell=[wallpaper, other, wallpaper, wallpaper, textures.plaster(rng), floor],
         room=(np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], height])),
     )
-    hang_pictures(plan, rng, half)
+    decorate_walls(plan, rng, half)
     plan.add_sphere(lamp + np.array([0, 0, 0.4]), 0.15, textures.plaster(rng))
     rug = textures.cloth(rng)
     plan.add_box((0, 0, 0), (*rng.uniform(0.6, 1.2, 2), 0.015), rng.uniform(0, np.pi), rug)
@@ -197,8 +191,8 @@ def furnished_room(
     return plan
 
 
-def hills(rng: np.random.Generator) -> Float[np.ndarray, "N N"]:
-    """Draw heights that are gentle near the origin and rise toward the horizon."""
+def hills(rng: Generator) -> Float[np.ndarray, "N N"]:
+    """Draw a height field: gentle near the origin, rising toward the horizon."""
     axis = np.linspace(-SKY_RADIUS, SKY_RADIUS, TERRAIN_SAMPLES)
     distance = np.hypot(axis[:, None], axis)
     height = np.zeros_like(distance)
@@ -211,14 +205,14 @@ def hills(rng: np.random.Generator) -> Float[np.ndarray, "N N"]:
     return height * (0.06 + rng.uniform(1.0, 3.0) * rise) + rng.uniform(0, 4) * rise
 
 
-def outdoor_place(rng: np.random.Generator, walk: Float[np.ndarray, "T 2"]) -> FloorPlan:
+def outdoor_place(rng: Generator, walk: Float[np.ndarray, "T 2"]) -> FloorPlan:
     """Put houses, trees, boulders and crates on hills, under a sun."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(20, 60))
     sun = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
     plan = FloorPlan(
         walk=walk,
         light=1e3 * sun,
-        light_color=np.array([1.0, 0.92, 0.8]),
+        irradiance=np.array([1.0, 0.92, 0.8]),
         falloff=1e6,
         ambient=rng.uniform(0.2, 0.4) * np.array([0.8, 0.9, 1.0]),
         shell=[(textures.grass, textures.grass, textures.stone)[rng.integers(3)](rng)],

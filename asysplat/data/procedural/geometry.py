@@ -10,15 +10,22 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asysplat.scene import TensorRecord
+
 MARCH_STEPS = 18
 TINY = 1e-20  # avoids division by 0
-ROUNDING = 1e-3  # radians, more than angles are off
-NEAREST = 0.5  # no ray meets the ground before this t, as cameras are at eye level
+ANGLE_ROUNDING = 1e-3  # radians, more than the error of computed angles
+MIN_GROUND_T = 0.5  # no ray meets the ground before this t, as cameras are at eye level
+
+Points = Float[Tensor, "3 R"]  # or directions
+Origins = Float[Tensor, "3 #R"]  # of rays, or one for all
+PerRay = Float[Tensor, " R"]
+Index = Int[Tensor, "_"]  # of any length
 
 
 @dataclass(frozen=True)
 class Cone:
-    """What the rays from one point may meet; lets a view pass over what lies outside.
+    """A cone around rays from one point, to cull objects outside of it.
 
     Args:
         axis: of length 1.
@@ -30,36 +37,47 @@ class Cone:
     angle: Float[Tensor, ""]
 
     @classmethod
-    def around(cls, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]) -> "Cone":
+    def around(cls, origins: Origins, directions: Points) -> "Cone":
         """Return the narrowest cone about the mean direction; with several origins, all space."""
         unit = directions * (directions * directions).sum(0).rsqrt()
         mean = unit.mean(1)
         axis = mean / mean.norm()
         one = origins.shape[1] == 1
-        widest = (axis @ unit).amin().clamp(-1, 1).acos() if one else axis.new_tensor(torch.pi)
-        return cls(origins[:, 0], axis, widest)
+        angle = (axis @ unit).amin().clamp(-1, 1).acos() if one else axis.new_tensor(torch.pi)
+        return cls(origins[:, 0], axis, angle)
 
-    def meets(self, centers: Float[Tensor, "S 3"], radii: Float[Tensor, " S"]) -> Int[Tensor, " K"]:
-        """Return the spheres that reach into the cone, and maybe some more; never none."""
+    def meets(self, centers: Float[Tensor, "S 3"], radii: Float[Tensor, " S"]) -> Index:
+        """Return the spheres that reach into the cone, and maybe some more; always at least one."""
         to_center = centers - self.apex
         distance = to_center.norm(dim=1)
         off_axis = (to_center @ self.axis / distance).clamp(-1, 1).acos()
         gap = off_axis - (radii / distance).clamp(max=1).asin() - self.angle
-        return (gap <= gap.min().clamp(min=ROUNDING)).nonzero()[:, 0]
+        return (gap <= gap.min().clamp(min=ANGLE_ROUNDING)).nonzero()[:, 0]
+
+
+class Solids(TensorRecord):
+    """Convex objects with `centers` and bounding radii."""
+
+    def within(self, cone: Cone, margin: float = 0.0) -> Index:
+        """Return the objects nearer to the cone than `margin`, as `Cone.meets` does."""
+        return cone.meets(self.centers, self.bounding_radii() + margin)
+
+    def select(self, index: Index) -> "Solids":
+        return self.map(lambda values: values[index])
 
 
 @dataclass(frozen=True)
-class Boxes:
+class Boxes(Solids):
     """Solid boxes; the rows of `axes` are a box's own axes in the world."""
 
     centers: Float[Tensor, "B 3"]
     halves: Float[Tensor, "B 3"]
     axes: Float[Tensor, "B 3 3"]
 
-    def _local(self, directions: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
-        return (self._axes_first() @ directions).view(3, len(self.centers), directions.shape[1])
+    def bounding_radii(self) -> Float[Tensor, " B"]:
+        return self.halves.norm(dim=1)
 
-    def _to_centers(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 B R"]:
+    def _to_centers(self, points: Points) -> Float[Tensor, "3 B R"]:
         """Return the offsets from each point to each box's center, along the box's axes."""
         centers = torch.einsum("bij,bj->ib", self.axes, self.centers).reshape(-1, 1)
         offsets = torch.addmm(centers, self._axes_first(), points, alpha=-1)
@@ -68,26 +86,17 @@ class Boxes:
     def _axes_first(self) -> Float[Tensor, "axes 3"]:
         return self.axes.transpose(0, 1).reshape(-1, 3)
 
-    def hit(
-        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
-    ) -> Float[Tensor, "B R"]:
+    def hit(self, origins: Origins, directions: Points) -> Float[Tensor, "B R"]:
         """Return the t at which each ray enters each box (slab test; Kay and Kajiya, 1986)."""
-        # In place, as most of the time goes into memory.
-        inverse = self._local(directions).add_(TINY).reciprocal_()
+        # In place, as memory traffic takes most of the time.
+        local = (self._axes_first() @ directions).view(3, len(self.centers), -1)
+        inverse = local.add_(TINY).reciprocal_()
         middle = self._to_centers(origins) * inverse
         half_span = inverse.abs_().mul_(self.halves.T[..., None])
         enter, leave = (middle - half_span).amax(0), middle.add_(half_span).amin(0)
         return torch.where((enter <= leave) & (enter > 0), enter, torch.inf)
 
-    def within(self, cone: Cone, reach: float = 0.0) -> Int[Tensor, " K"]:
-        """Return the boxes that come nearer to the cone than `reach`, as `Cone.meets` does."""
-        return cone.meets(self.centers, self.halves.norm(dim=1) + reach)
-
-    def select(self, boxes: Int[Tensor, " K"]) -> "Boxes":
-        """Return the named boxes."""
-        return Boxes(self.centers[boxes], self.halves[boxes], self.axes[boxes])
-
-    def facing(self, points: Float[Tensor, "3 R"], box: Int[Tensor, " R"]) -> Int[Tensor, " R"]:
+    def facing(self, points: Points, box: Int[Tensor, " R"]) -> Int[Tensor, " R"]:
         """Return the axis of its box that is normal to each point's face."""
         to_box = self.axes / self.halves[..., None]
         offset = points - self.centers.T.index_select(1, box)
@@ -95,58 +104,49 @@ class Boxes:
         x, y, z = local.abs()
         return torch.where(z > torch.maximum(x, y), 2, (y > x).long())
 
-    def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
+    def distance(self, points: Points) -> PerRay:
         """Return the distance from each point to the nearest box; 0 inside."""
         outside = (self._to_centers(points).abs() - self.halves.T[..., None]).clamp(min=0)
         return (outside * outside).sum(0).amin(0).sqrt()
 
 
 @dataclass(frozen=True)
-class Spheres:
+class Spheres(Solids):
     """Solid spheres."""
 
     centers: Float[Tensor, "S 3"]
     radii: Float[Tensor, " S"]
 
-    def hit(
-        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
-    ) -> Float[Tensor, "S R"]:
+    def bounding_radii(self) -> Float[Tensor, " S"]:
+        return self.radii
+
+    def hit(self, origins: Origins, directions: Points) -> Float[Tensor, "S R"]:
         """Return the t at which each ray enters each sphere."""
         nearest, half_chord = self._chord(origins, directions)
         enter = nearest - half_chord
         return torch.where(enter > 0, enter, torch.inf)
 
-    def leave(
-        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
-    ) -> Float[Tensor, "S R"]:
+    def leave(self, origins: Origins, directions: Points) -> Float[Tensor, "S R"]:
         """Return the t at which each ray leaves each sphere, for origins inside."""
         nearest, half_chord = self._chord(origins, directions)
         return nearest + half_chord
 
     def _chord(
-        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
+        self, origins: Origins, directions: Points
     ) -> tuple[Float[Tensor, "S R"], Float[Tensor, "S R"]]:
         """Return the t of the middle of each ray's chord, and half its length; NaN for a miss."""
         square = (directions * directions).sum(0)
         to_center = self.centers[..., None] - origins
         nearest = (to_center * directions).sum(1) / square
-        missed_by = nearest[:, None] * directions
-        torch.sub(to_center, missed_by, out=missed_by)
-        left = self.radii[:, None] ** 2 - missed_by.mul_(missed_by).sum(1)
-        return nearest, (left / square).sqrt()
+        offset = nearest[:, None] * directions
+        torch.sub(to_center, offset, out=offset)
+        half_square = self.radii[:, None] ** 2 - offset.mul_(offset).sum(1)
+        return nearest, (half_square / square).sqrt()
 
-    def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
+    def distance(self, points: Points) -> PerRay:
         """Return the distance from each point to the nearest sphere; 0 inside."""
         offset = points - self.centers[..., None]
         return ((offset * offset).sum(1).sqrt() - self.radii[:, None]).amin(0).clamp(min=0)
-
-    def within(self, cone: Cone, reach: float = 0.0) -> Int[Tensor, " K"]:
-        """Return the spheres that come nearer to the cone than `reach`, as `Cone.meets` does."""
-        return cone.meets(self.centers, self.radii + reach)
-
-    def select(self, spheres: Int[Tensor, " K"]) -> "Spheres":
-        """Return the named spheres."""
-        return Spheres(self.centers[spheres], self.radii[spheres])
 
 
 @dataclass(frozen=True)
@@ -156,16 +156,14 @@ class Room:
     lower: Float[Tensor, " 3"]
     upper: Float[Tensor, " 3"]
 
-    def hit(
-        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"]
-    ) -> tuple[Float[Tensor, " R"], Int[Tensor, " R"]]:
+    def hit(self, origins: Origins, directions: Points) -> tuple[PerRay, Int[Tensor, " R"]]:
         """Return the t and the wall (+x -x +y -y +z -z) that each ray from inside meets."""
         forward = directions > 0
         ahead = torch.where(forward, self.upper[:, None] - origins, origins - self.lower[:, None])
         t, axis = (ahead / directions.abs()).min(0)
         return t, 2 * axis + 1 - forward.gather(0, axis[None])[0].long()
 
-    def distance(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, " R"]:
+    def distance(self, points: Points) -> PerRay:
         """Return the distance from each point inside to the nearest wall."""
         return torch.minimum(points - self.lower[:, None], self.upper[:, None] - points).amin(0)
 
@@ -184,7 +182,7 @@ class Terrain:
     def sample(
         self, x: Float[Tensor, "T R"], y: Float[Tensor, "T R"], channels: slice
     ) -> Float[Tensor, "C T R"]:
-        """Interpolate the named channels of the field; outside the square, those of its border."""
+        """Interpolate channels of the field; outside the square, repeat its border."""
         return torch.nn.functional.grid_sample(
             self.field[None, channels],
             torch.stack((x, y), -1)[None] / self.extent,
@@ -197,29 +195,23 @@ class Terrain:
         x, y, z = points
         return z - self.sample(x, y, slice(0, 1))[0]
 
-    def normals(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 R"]:
+    def normals(self, points: Points) -> Points:
         """Return the unit normals of the ground below each point, smooth across samples."""
         slopes = self.sample(points[0, None], points[1, None], slice(1, 3))[:, 0]
         upward = torch.cat((-slopes, torch.ones_like(slopes[:1])))
         return upward * (upward * upward).sum(0).rsqrt()
 
-    def hit(
-        self,
-        origins: Float[Tensor, "3 #R"],
-        directions: Float[Tensor, "3 R"],
-        limits: Float[Tensor, " R"],
-        refine_steps: int,
-    ) -> Float[Tensor, " R"]:
-        """Return the t at which each ray first goes under the ground, before its limit.
+    def hit(self, origins: Origins, directions: Points, max_t: PerRay, refine_steps: int) -> PerRay:
+        """Return the t at which each ray first goes under the ground, before `max_t`.
 
-        Steps grow with distance; the one that crosses is narrowed by false position (Illinois),
-        `refine_steps` times.
+        Steps grow with distance; the step that crosses the ground is narrowed by false position
+        (Illinois), `refine_steps` times.
         """
-        progress = torch.linspace(0, 1, MARCH_STEPS, device=limits.device)[:, None]
-        t = NEAREST * (limits / NEAREST) ** progress
+        progress = torch.linspace(0, 1, MARCH_STEPS, device=max_t.device)[:, None]
+        t = MIN_GROUND_T * (max_t / MIN_GROUND_T) ** progress
         above = self.above(origins[:, None] + t * directions[:, None])
         # The largest countdown among the steps under the ground belongs to the first of them.
-        countdown = torch.arange(MARCH_STEPS, 0, -1.0, device=limits.device)[:, None]
+        countdown = torch.arange(MARCH_STEPS, 0, -1.0, device=max_t.device)[:, None]
         latest = torch.where(above < 0, countdown, 0).amax(0, keepdim=True).long()
         crossed = latest[0] > 0
         after = (MARCH_STEPS - latest).clamp(1, MARCH_STEPS - 1)
@@ -231,7 +223,7 @@ class Terrain:
             gap = self.above(origins[:, None] + middle * directions[:, None])
             over = gap > 0
             low, high = torch.where(over, middle, low), torch.where(over, high, middle)
-            # Halving the gap of the side that stays makes the next guess fall beyond the root.
+            # Halving the gap of the unchanged side makes the next guess fall beyond the root.
             gap_low, gap_high = (
                 torch.where(over, gap, gap_low / 2),
                 torch.where(over, gap_high / 2, gap),

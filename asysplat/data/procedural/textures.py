@@ -1,28 +1,29 @@
-"""Surfaces that look like plaster, brick, planks, tiles, cloth or grass, from one formula.
+"""Textures of plaster, brick, planks, tiles, cloth or grass, from one formula.
 
-A material is a grid of cells (bricks, planks, checks; one huge cell for plain ones) with joints,
-over fractal noise that blends two colors. Everything is band-limited by the pixel's footprint.
+A material is a grid of cells (bricks, planks, checks; one huge cell if plain) with joints, over
+fractal noise that blends two colors. The pixel's footprint limits all frequencies.
 """
 
 import colorsys
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.random import Generator
 from torch import Tensor
 
-LATTICE = 64  # the noise lattice repeats after this many points
+LATTICE = 64  # points after which the noise repeats
 OCTAVES = 6
-PERSISTENCE = 0.75  # 1 would be the 1/f amplitude spectrum of photographs; our edges add the rest
-PLAIN = 1e6  # a cell so large that its joints are never seen
+PERSISTENCE = 0.75  # 1 is the 1/f amplitude spectrum of photographs; edges add the rest
+PLAIN = 1e6  # a cell so large that its joints are never visible
 
 Color = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Material:
-    """How one surface looks; lengths in meters, colors linear RGB."""
+    """Appearance of a surface; lengths in meters, colors linear RGB."""
 
     base: Color
     accent: Color
@@ -30,22 +31,21 @@ class Material:
     shift: float = 0.0  # offset of each row of cells from the one below, in cells
     joint: float = 0.0  # width of the joints
     variation: float = 0.0  # brightness differences between cells
-    checker: float = 0.0  # brightness difference of a chequered pattern
+    checker: float = 0.0  # brightness difference of a checkered pattern
     grain: tuple[float, float] = (1.0, 1.0)  # lattice points of the coarsest noise a meter
-    gloss: float = 0.0  # brightness of a highlight's middle
-    shininess: float = 1.0  # how narrow highlights are: exponent of Blinn and Phong
+    gloss: float = 0.0  # brightness of a highlight's center
+    shininess: float = 1.0  # narrowness of highlights: exponent of Blinn and Phong
 
     def row(self) -> list[float]:
-        plain = (self.shift, self.joint, self.variation, self.checker)
-        film = (self.gloss, self.shininess)
-        return [*self.base, *self.accent, *self.cell, *plain, *self.grain, *film]
+        """Return all numbers in the order of the fields."""
+        return np.hstack(astuple(self)).tolist()
 
 
 def hsv(hue: float, saturation: float, value: float) -> Color:
     return colorsys.hsv_to_rgb(hue % 1.0, saturation, value)
 
 
-def plaster(rng: np.random.Generator) -> Material:
+def plaster(rng: Generator) -> Material:
     hue, value = rng.uniform(0.02, 0.18), rng.uniform(0.45, 0.8)
     if rng.random() < 0.3:
         hue = rng.uniform(0.4, 0.65)
@@ -53,7 +53,7 @@ def plaster(rng: np.random.Generator) -> Material:
     return Material(hsv(hue, saturation, value), hsv(hue + 0.03, saturation, 0.55 * value))
 
 
-def bricks(rng: np.random.Generator) -> Material:
+def bricks(rng: Generator) -> Material:
     hue, value = rng.uniform(0.0, 0.09), rng.uniform(0.25, 0.6)
     saturation, height = rng.uniform(0.15, 0.6), rng.uniform(0.1, 0.3)
     return Material(
@@ -66,7 +66,7 @@ def bricks(rng: np.random.Generator) -> Material:
     )
 
 
-def planks(rng: np.random.Generator) -> Material:
+def planks(rng: Generator) -> Material:
     hue, value = rng.uniform(0.04, 0.11), rng.uniform(0.2, 0.6)
     saturation, width = rng.uniform(0.3, 0.6), rng.uniform(0.12, 0.35)
     return Material(
@@ -80,7 +80,7 @@ def planks(rng: np.random.Generator) -> Material:
     )
 
 
-def tiles(rng: np.random.Generator) -> Material:
+def tiles(rng: Generator) -> Material:
     hue, value, size = rng.uniform(), rng.uniform(0.35, 0.7), rng.uniform(0.25, 0.6)
     saturation = rng.uniform(0.05, 0.35)
     return Material(
@@ -93,7 +93,7 @@ def tiles(rng: np.random.Generator) -> Material:
     )
 
 
-def cloth(rng: np.random.Generator) -> Material:
+def cloth(rng: Generator) -> Material:
     """Draw a plain or striped cloth of any hue."""
     hue, value = rng.uniform(), rng.uniform(0.25, 0.8)
     saturation = rng.uniform(0.3, 0.7)
@@ -107,25 +107,25 @@ def cloth(rng: np.random.Generator) -> Material:
     )
 
 
-def grass(rng: np.random.Generator) -> Material:
+def grass(rng: Generator) -> Material:
     hue, value = rng.uniform(0.12, 0.28), rng.uniform(0.25, 0.45)
     earth = hsv(rng.uniform(0.06, 0.11), 0.5, 0.5 * value)
     return Material(hsv(hue, rng.uniform(0.4, 0.65), value), earth, grain=(0.7, 0.7))
 
 
-def leaves(rng: np.random.Generator) -> Material:
+def leaves(rng: Generator) -> Material:
     hue, value = rng.uniform(0.1, 0.32), rng.uniform(0.2, 0.4)
     return Material(
         hsv(hue, 0.65, 1.3 * value), hsv(hue + 0.05, 0.7, 0.25 * value), grain=(3.0, 3.0)
     )
 
 
-def stone(rng: np.random.Generator) -> Material:
+def stone(rng: Generator) -> Material:
     hue, value = rng.uniform(0.05, 0.15), rng.uniform(0.35, 0.6)
     return Material(hsv(hue, 0.15, value), hsv(hue, 0.25, 0.4 * value), grain=(2.0, 2.0))
 
 
-def noise_lattice(rng: np.random.Generator) -> Float[np.ndarray, "2 N N"]:
+def noise_lattice(rng: Generator) -> Float[np.ndarray, "2 N N"]:
     """Draw two channels of numbers in [-1, 1]; the first row and column repeat at the end."""
     lattice = rng.uniform(-1, 1, (2, LATTICE, LATTICE))
     return np.pad(lattice, ((0, 0), (0, 1), (0, 1)), mode="wrap")
@@ -134,9 +134,7 @@ def noise_lattice(rng: np.random.Generator) -> Float[np.ndarray, "2 N N"]:
 def fractal_noise(
     lattice: Float[Tensor, "2 N N"], uv: Float[Tensor, "2 R"], footprint: Float[Tensor, " R"]
 ) -> Float[Tensor, "2 R"]:
-    """Sum value noise over OCTAVES octaves, leaving out what a pixel cannot resolve.
-
-    The amplitude is about 1.
+    """Sum value noise of amplitude about 1 over the octaves that a pixel can resolve.
 
     Args:
         uv: in lattice points of the coarsest octave.
@@ -149,9 +147,9 @@ def fractal_noise(
     corner = point.floor()
     step = point - corner
     step = step * step * (3 - 2 * step)
-    place = (torch.remainder(corner, LATTICE) + step) * (2 / LATTICE) - 1
+    grid = (torch.remainder(corner, LATTICE) + step) * (2 / LATTICE) - 1
     noise = torch.nn.functional.grid_sample(
-        lattice[None], place.permute(0, 2, 1)[None], align_corners=True
+        lattice[None], grid.permute(0, 2, 1)[None], align_corners=True
     )[0]
     resolved = (2 - 2 * footprint * frequency[:, None]).clamp(0, 1)
     return (noise * (resolved * PERSISTENCE ** octave[:, None])).sum(1)
@@ -165,10 +163,9 @@ def cell_pattern(
     shift: Float[Tensor, " R"],
     joint: Float[Tensor, " R"],
 ) -> tuple[Float[Tensor, " R"], Float[Tensor, " R"], Float[Tensor, " R"]]:
-    """Evaluate a grid of cells: a random tone a cell, a chequered tone, and joint coverage.
+    """Evaluate a grid of cells: a random tone for each cell, a checkered tone, and joint coverage.
 
-    Tones are in [-1, 1], and fade toward a cell's edge over the footprint, so that edges do not
-    alias.
+    Tones are in [-1, 1], and fade toward a cell's edge over the footprint against aliasing.
     """
     in_cells = uv / cell
     row = in_cells[1].floor()
@@ -193,8 +190,8 @@ def albedo(
     """Compute the linear color of each hit.
 
     Args:
-        rows: `Material.row` of each hit's surface; its gloss is not looked at.
-        uv: place on the surface, meters.
+        rows: `Material.row` of each hit's surface; its gloss is ignored.
+        uv: position on the surface, meters.
         footprint: width of the pixel on the surface, meters.
     """
     base, accent, cell, (shift, joint, variation, checker), grain, _ = rows.split(

@@ -1,29 +1,43 @@
-"""Light and depth along rays: Lambert shading, highlights, one hard shadow, soft corners."""
+"""Color and depth along rays: Lambert shading, highlights, one hard shadow, ambient occlusion."""
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.random import Generator
 from torch import Tensor
 
 from asysplat.data.procedural.floor_plan import SKY_RADIUS, FloorPlan
-from asysplat.data.procedural.geometry import TINY, Boxes, Cone, Room, Spheres, Terrain
+from asysplat.data.procedural.geometry import (
+    TINY,
+    Boxes,
+    Cone,
+    Index,
+    Origins,
+    PerRay,
+    Points,
+    Room,
+    Spheres,
+    Terrain,
+)
 from asysplat.data.procedural.textures import Material, albedo, fractal_noise, noise_lattice
 
-CORNER_DISTANCE = 0.4  # meters over which a near surface takes away ambient light
-CORNER_LIGHT = 0.25  # share of ambient light that is left in a corner
-OFF_SURFACE = 2e-3  # meters by which shadow rays start above the surface
-SLANT = ((0.8, 0.1, 0.6), (-0.2, 0.95, 0.25))  # texture axes of spheres
+OCCLUSION_DISTANCE = 0.4  # meters over which a near surface reduces ambient light
+MIN_AMBIENT = 0.25  # share of the ambient light in a corner
+SHADOW_OFFSET = 2e-3  # meters from a surface to the start of its shadow rays
+SPHERE_AXES = ((0.8, 0.1, 0.6), (-0.2, 0.95, 0.25))  # texture axes
 ZENITH = (0.25, 0.45, 0.9)
 HORIZON = (0.85, 0.9, 1.0)
-REFINE_STEPS = 8  # of where a ray meets the ground
-BLOCK = 64  # rays that torch adds up at once, or a multiple
+REFINE_STEPS = 8  # of the point where a ray meets the ground
+BLOCK = 64  # rays that torch sums at once, or a multiple
 SKY = -1  # its number as a surface
+
+Surface = Int[Tensor, " R"]
 
 
 class World:
     """A floor plan as tensors on one device."""
 
-    def __init__(self, plan: FloorPlan, rng: np.random.Generator, device: torch.device):
+    def __init__(self, plan: FloorPlan, rng: Generator, device: torch.device):
         def tensor(values) -> Tensor:
             return torch.as_tensor(np.asarray(values, np.float32), device=device)
 
@@ -41,17 +55,19 @@ class World:
             self._terrain = Terrain(tensor([plan.heights, *slopes]), SKY_RADIUS)
         self._glossy = any(material.gloss for material in plan.materials())
         self._surfaces = tensor(_surface_rows(plan, axes, rng)).T.contiguous()
-        self._shell = 3 * len(plan.boxes) + len(plan.spheres)
+        # Surfaces are numbered: three pairs of faces a box, spheres, walls or ground.
+        self._first_sphere = 3 * len(plan.boxes)
+        self._shell = self._first_sphere + len(plan.spheres)
         self._lattice = tensor(noise_lattice(rng))
         self._light = tensor(plan.light)[:, None]
         self._falloff = plan.falloff
-        self._light_color = tensor(plan.light_color)[:, None]
+        self._irradiance = tensor(plan.irradiance)[:, None]
         self._ambient = tensor(plan.ambient)[:, None]
         self._sky = tensor((HORIZON, ZENITH))[..., None]
 
     def trace(
-        self, origins: Float[Tensor, "3 #R"], directions: Float[Tensor, "3 R"], pixel: float
-    ) -> tuple[Float[Tensor, "3 R"], Float[Tensor, " R"], Int[Tensor, " R"]]:
+        self, origins: Origins, directions: Points, pixel: float
+    ) -> tuple[Points, PerRay, Surface]:
         """Return linear color, t and surface of the nearest hit of rays origin + t * direction.
 
         Args:
@@ -62,7 +78,7 @@ class World:
         t, surface = self._nearest(origins, directions, boxes, spheres, REFINE_STEPS)
         points = origins + t * directions
         color = torch.empty_like(points)
-        sky, solid = _rays_where(surface == SKY), _rays_where(surface != SKY)
+        sky, solid = _padded_rays(surface == SKY), _padded_rays(surface != SKY)
         if len(sky):
             color[:, sky] = self._sky_color(points[:, sky])
         if len(solid):
@@ -72,14 +88,9 @@ class World:
         return color, t, surface
 
     def _surface_color(
-        self,
-        points: Float[Tensor, "3 R"],
-        directions: Float[Tensor, "3 R"],
-        surface: Int[Tensor, " R"],
-        widths: Float[Tensor, " R"],
-        cone: Cone,
-    ) -> Float[Tensor, "3 R"]:
-        """Compute the linear color of points, seen along rays of one cone.
+        self, points: Points, directions: Points, surface: Surface, widths: PerRay, cone: Cone
+    ) -> Points:
+        """Compute the linear color of points, from the directions of rays in one cone.
 
         Args:
             widths: of a pixel at each point, meters.
@@ -95,54 +106,38 @@ class World:
         # A slanted pixel covers more of the surface; with the root, the mean of its two widths.
         footprint = widths / cosine.abs().clamp(0.1, 1).sqrt()
         direct = self._direct(points, normals)
-        light = self._light_color * direct + self._ambient * self._openness(points, normals, cone)
+        light = self._irradiance * direct + self._ambient * self._openness(points, normals, cone)
         color = albedo(self._lattice, material, uv, footprint) * light
         if self._glossy:
             gloss, shininess = material[-2:]
-            highlight = gloss * self._facing_half(points, normals, directions) ** shininess
-            color = color + self._light_color * (direct * highlight)
+            highlight = gloss * self._half_cosine(points, normals, directions) ** shininess
+            color = color + self._irradiance * (direct * highlight)
         return color
 
-    def surfaces(
-        self,
-        origins: Float[Tensor, "3 #R"],
-        directions: Float[Tensor, "3 R"],
-        among: Int[Tensor, " K"],
-    ) -> Int[Tensor, " R"]:
-        """Return the surface of the nearest hit of each ray, as `trace` numbers them.
+    def surfaces(self, origins: Origins, directions: Points, candidates: Index) -> Surface:
+        """Return the surface of the nearest hit of each ray, numbered as in `trace`.
 
-        Where exactly the ground is met matters little to which surface is nearest.
+        Which surface is nearest hardly depends on the exact intersection with the ground.
 
         Args:
-            among: surfaces to look for; what shows none of them is passed over.
+            candidates: surfaces to test; other objects are ignored.
         """
-        shown = torch.zeros(self._surfaces.shape[1] + 1, dtype=torch.bool, device=among.device)
-        shown[among] = True  # the last is the sky
-        num_boxes = len(self._boxes.centers)
-        shown[0] = shown[3 * num_boxes] = True  # never none
-        boxes = shown[: 3 * num_boxes].view(-1, 3).any(1).nonzero()[:, 0]
-        spheres = shown[3 * num_boxes : self._shell].nonzero()[:, 0]
+        tested = torch.zeros(self._surfaces.shape[1] + 1, dtype=torch.bool, device=self._sky.device)
+        tested[candidates] = True  # the last is the sky
+        tested[0] = tested[self._first_sphere] = True  # at least one box and one sphere
+        boxes = tested[: self._first_sphere].view(-1, 3).any(1).nonzero()[:, 0]
+        spheres = tested[self._first_sphere : self._shell].nonzero()[:, 0]
         return self._nearest(origins, directions, boxes, spheres, refine_steps=1)[1]
 
     def _nearest(
-        self,
-        origins: Float[Tensor, "3 #R"],
-        directions: Float[Tensor, "3 R"],
-        boxes: Int[Tensor, " K"],
-        spheres: Int[Tensor, " L"],
-        refine_steps: int,
-    ) -> tuple[Float[Tensor, " R"], Int[Tensor, " R"]]:
-        """Return the t and surface of the nearest hit.
-
-        Args:
-            boxes, spheres: the ones that rays may meet.
-        """
+        self, origins: Origins, directions: Points, boxes: Index, spheres: Index, refine_steps: int
+    ) -> tuple[PerRay, Surface]:
+        """Return the t and surface of the nearest hit, among the given boxes and spheres."""
         box_t, box = self._boxes.select(boxes).hit(origins, directions).min(0)
         sphere_t, sphere = self._spheres.select(spheres).hit(origins, directions).min(0)
         box, sphere = boxes[box], spheres[sphere]
         face = self._boxes.facing(origins + box_t * directions, box)
-        num_boxes = len(self._boxes.centers)
-        surface = torch.where(box_t <= sphere_t, 3 * box + face, 3 * num_boxes + sphere)
+        surface = torch.where(box_t <= sphere_t, 3 * box + face, self._first_sphere + sphere)
         t = torch.minimum(box_t, sphere_t)
         sky_t = self._dome.leave(origins, directions)[0]
         if self._room is not None:
@@ -154,63 +149,56 @@ class World:
         t = torch.minimum(t, shell_t)
         return t, torch.where(t >= sky_t, SKY, surface)
 
-    def _direct(
-        self, points: Float[Tensor, "3 R"], normals: Float[Tensor, "3 R"]
-    ) -> Float[Tensor, " R"]:
-        """Compute the share of the light that arrives straight from its source."""
+    def _direct(self, points: Points, normals: Points) -> PerRay:
+        """Compute the share of the light that arrives directly from its source."""
         to_light = self._light - points
         distance = (to_light * to_light).sum(0).sqrt()
         direct = (normals * to_light).sum(0).clamp(min=0) / distance
         direct = direct / (1 + (distance / self._falloff) ** 2)
-        # What turns away from the light needs no shadow ray.
+        # Points that face away from the light need no shadow ray.
         lit = direct.nonzero()[:, 0]
         if len(lit):
-            start, to_light = (points + OFF_SURFACE * normals)[:, lit], to_light[:, lit]
+            start, to_light = (points + SHADOW_OFFSET * normals)[:, lit], to_light[:, lit]
             cone = Cone.around(self._light, start - self._light)
-            boxes = self._boxes.select(self._boxes.within(cone))
-            spheres = self._spheres.select(self._spheres.within(cone))
+            boxes, spheres = self._near(cone)
             blocked = (boxes.hit(start, to_light).amin(0) < 1) | (
                 spheres.hit(start, to_light).amin(0) < 1
             )
             direct[lit[blocked]] = 0
         return direct
 
-    def _openness(
-        self, points: Float[Tensor, "3 R"], normals: Float[Tensor, "3 R"], cone: Cone
-    ) -> Float[Tensor, " R"]:
-        """Compute the share of the ambient light that arrives."""
-        gap = self._distance(points + CORNER_DISTANCE * normals, cone) / CORNER_DISTANCE
-        return CORNER_LIGHT + (1 - CORNER_LIGHT) * gap.clamp(0, 1)
+    def _near(self, cone: Cone, margin: float = 0.0) -> tuple[Boxes, Spheres]:
+        boxes, spheres = self._boxes, self._spheres
+        return boxes.select(boxes.within(cone, margin)), spheres.select(
+            spheres.within(cone, margin)
+        )
 
-    def _facing_half(
-        self,
-        points: Float[Tensor, "3 R"],
-        normals: Float[Tensor, "3 R"],
-        directions: Float[Tensor, "3 R"],
-    ) -> Float[Tensor, " R"]:
+    def _openness(self, points: Points, normals: Points, cone: Cone) -> PerRay:
+        """Compute the share of the ambient light that arrives."""
+        gap = self._distance(points + OCCLUSION_DISTANCE * normals, cone) / OCCLUSION_DISTANCE
+        return MIN_AMBIENT + (1 - MIN_AMBIENT) * gap.clamp(0, 1)
+
+    def _half_cosine(self, points: Points, normals: Points, directions: Points) -> PerRay:
         """Return the cosine between normal and half vector of eye and light (Blinn, 1977)."""
         to_light = self._light - points
         half = to_light * (to_light * to_light).sum(0).rsqrt()
         half = half - directions * (directions * directions).sum(0).rsqrt()
         return (normals * half).sum(0).clamp(min=0) * (half * half).sum(0).clamp(min=TINY).rsqrt()
 
-    def _distance(self, points: Float[Tensor, "3 R"], cone: Cone) -> Float[Tensor, " R"]:
-        """Return the distance from each point to the nearest thing; the ground's is vertical.
+    def _distance(self, points: Points, cone: Cone) -> PerRay:
+        """Return the distance from each point to the nearest object; vertical to the ground.
 
-        Things that are farther than CORNER_DISTANCE may be left out.
+        Objects farther than OCCLUSION_DISTANCE may be ignored.
         """
         if self._room is not None:
             shell = self._room.distance(points)
         else:
             shell = self._terrain.above(points[:, None])[0]
-        # Points are that far from what the cone holds, and things that far from the points.
-        reach = 2 * CORNER_DISTANCE
-        boxes = self._boxes.select(self._boxes.within(cone, reach))
-        spheres = self._spheres.select(self._spheres.within(cone, reach))
-        things = torch.minimum(boxes.distance(points), spheres.distance(points))
-        return torch.minimum(shell, things)
+        # Once from the cone's surface hits to the points, and once from there to the objects.
+        boxes, spheres = self._near(cone, 2 * OCCLUSION_DISTANCE)
+        return torch.minimum(shell, torch.minimum(boxes.distance(points), spheres.distance(points)))
 
-    def _sky_color(self, points: Float[Tensor, "3 R"]) -> Float[Tensor, "3 R"]:
+    def _sky_color(self, points: Points) -> Points:
         """Blend from a pale horizon to a blue zenith, with clouds."""
         elevation = (points[2] / SKY_RADIUS).clamp(0, 1)
         horizon, zenith = self._sky
@@ -220,12 +208,12 @@ class World:
         return clear + (1 - clear) * clouds.clamp(0, 1)
 
 
-def _rays_where(chosen: Bool[Tensor, " R"]) -> Int[Tensor, " K"]:
-    """Return the numbers of the chosen rays, the last one repeated up to a whole block.
+def _padded_rays(mask: Bool[Tensor, " R"]) -> Index:
+    """Return the indices of the rays in the mask, the last repeated up to a whole block.
 
-    Torch adds up the end of a row in another order; so every ray is rounded as among all the rays.
+    Torch sums the end of a row in another order; padding keeps every ray's rounding the same.
     """
-    rays = chosen.nonzero()[:, 0]
+    rays = mask.nonzero()[:, 0]
     return torch.cat((rays, rays[-1:].expand(-len(rays) % BLOCK)))
 
 
@@ -236,7 +224,7 @@ def _yaw_axes(yaw: float) -> Float[np.ndarray, "3 3"]:
 
 
 def _surface_rows(
-    plan: FloorPlan, axes: Float[np.ndarray, "B 3 3"], rng: np.random.Generator
+    plan: FloorPlan, axes: Float[np.ndarray, "B 3 3"], rng: Generator
 ) -> Float[np.ndarray, "S K"]:
     """Return a row for each box's three pairs of faces, each sphere, and the walls or the ground.
 
@@ -250,14 +238,13 @@ def _surface_rows(
         rows.append([*u, *v, *offset, *normal, curvature, *material.row()])
 
     for (x, y, z), (*_, material) in zip(axes, plan.boxes, strict=True):
-        add(y, z, x, 0.0, material)
-        add(x, z, y, 0.0, material)
-        add(x, y, z, 0.0, material)
+        for face in ((y, z, x), (x, z, y), (x, y, z)):
+            add(*face, 0.0, material)
     for center, radius, material in plan.spheres:
-        add(*SLANT, center, 1 / radius, material)
+        add(*SPHERE_AXES, center, 1 / radius, material)
     x, y, z = np.eye(3)
     walls = [(y, z, x)] * 2 + [(x, z, y)] * 2 + [(x, y, z)] * 2
     ground = [(x, y, z)]
-    for place, material in zip(ground if plan.room is None else walls, plan.shell, strict=True):
-        add(*place, 0.0, material)
+    for face, material in zip(ground if plan.room is None else walls, plan.shell, strict=True):
+        add(*face, 0.0, material)
     return np.array(rows)

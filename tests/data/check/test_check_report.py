@@ -1,4 +1,4 @@
-"""The real scenes, as they are and with cameras that are wrong in known ways."""
+"""Diagnosis of real scenes, with their own cameras and with known mistakes in them."""
 
 import re
 from dataclasses import replace
@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from asysplat.data.bad_images import BadFrames
-from asysplat.data.sequence import FileSequence
+from asysplat.data.bad_images import BadImages
+from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.data.check.matches import find_matches
-from asysplat.data.check.report import LIMIT, judge, measure_fit
+from asysplat.data.check.report import MAX_ERROR, diagnose_cameras, measure_fit
 from asysplat.data.readers import llff, long_lrm, posed, transforms
 
 LAYOUTS = {"fern": llff, "fox": transforms, "mydesk": long_lrm, "hololens-000": posed}
@@ -22,10 +22,10 @@ def real(request, shared):
     folder = shared / "data" / request.param
     if not folder.is_dir():
         pytest.skip(f"{folder} is absent")
-    scene = LAYOUTS[request.param].read_scene(folder, BadFrames())
-    lens = scene.photographs[0].lens
-    sequence = FileSequence(scene, lens.height, lens.width)
-    names = [str(photograph.image) for photograph in scene.photographs]
+    scene = LAYOUTS[request.param].read_scene(folder, BadImages())
+    lens = scene.images[0].lens
+    sequence = FileSequence(scene, SceneOptions(lens.height, lens.width))
+    names = [str(photograph.file) for photograph in scene.images]
     return sequence.cameras.to(torch.float64), find_matches(sequence), names
 
 
@@ -59,7 +59,7 @@ def parts(rotation, position):
     return posed_by(change)
 
 
-# How cameras are broken, and what must be said of it.
+# A broken copy of the cameras, and words of its diagnosis.
 SEVERE = {
     "OpenGL": (axes(1, -2, -3), "OpenGL axes were taken for OpenCV's"),
     "world-to-camera": (
@@ -92,7 +92,7 @@ OTHERS = {
     ),
     "a frame late": (
         posed_by(lambda poses: poses.roll(1, 0)),
-        "every pose belongs to the image 1 frame earlier",
+        "every pose belongs to the image 1 place earlier",
     ),
     "backwards": (posed_by(lambda poses: poses.flip(0)), "the poses run backwards"),
     "y and z of the world too": (
@@ -103,39 +103,39 @@ OTHERS = {
 
 
 def test_cameras_as_published_fit(real):
-    verdict = judge(*real)
+    verdict = diagnose_cameras(*real)
     assert verdict.fits and verdict.sentence == "the cameras fit the images"
-    assert verdict.read.error < 0.6 < LIMIT
-    assert verdict.read.under_1px > 0.8 and verdict.read.behind < 0.01
+    assert verdict.fit.error < 0.6 < MAX_ERROR
+    assert verdict.fit.under_1px > 0.8 and verdict.fit.behind_camera < 0.01
     assert len(real[1].pairs) >= 8
 
 
 @pytest.mark.parametrize("how", SEVERE)
-def test_a_mistake_that_shows_by_many_pixels_is_named(real, how):
+def test_severe_mistakes_are_named(real, how):
     cameras, matches, names = real
     broken, name = SEVERE[how]
-    verdict = judge(broken(cameras), matches, names)
-    assert not verdict.fits and verdict.read.error > 5
+    verdict = diagnose_cameras(broken(cameras), matches, names)
+    assert not verdict.fits and verdict.fit.error > 5
     assert name in verdict.sentence
-    assert verdict.undone.error < LIMIT
+    assert verdict.corrected.error < MAX_ERROR
 
 
 @pytest.mark.parametrize("how", OTHERS)
 def test_other_mistakes_are_named(real, how):
     cameras, matches, names = real
     broken, name = OTHERS[how]
-    verdict = judge(broken(cameras), matches, names)
+    verdict = diagnose_cameras(broken(cameras), matches, names)
     assert not verdict.fits and name in verdict.sentence
 
 
-def test_any_other_resolution_is_fitted(real):
+def test_other_resolutions_are_fitted(real):
     cameras, matches, names = real
-    verdict = judge(scaled(1.4, 1.4)(cameras), matches, names)
+    verdict = diagnose_cameras(scaled(1.4, 1.4)(cameras), matches, names)
     factor = re.search(r"those of images (.+) times the size", verdict.sentence)[1]
     assert not verdict.fits and float(factor) == pytest.approx(1.4, rel=0.01)
 
 
-def test_the_world_s_axes_and_scale_are_no_mistake(real):
+def test_the_world_frame_does_not_matter(real):
     cameras, matches, _ = real
     world = torch.linalg.matrix_exp(torch.tensor([[0, -1.0, 2], [1, 0, 0.5], [-2, -0.5, 0]]))
     moved = cameras.cam_to_world.clone()
@@ -147,11 +147,11 @@ def test_the_world_s_axes_and_scale_are_no_mistake(real):
     )
 
 
-def test_poses_in_no_order_are_explained_by_nothing(real):
+def test_shuffled_poses_match_no_mistake(real):
     cameras, matches, names = real
     order = torch.randperm(cameras.num_views)
     shuffled = replace(cameras, cam_to_world=cameras.cam_to_world[order])
-    verdict = judge(shuffled, matches, names)
+    verdict = diagnose_cameras(shuffled, matches, names)
     assert not verdict.fits and "no usual mistake explains it" in verdict.sentence
 
 
@@ -160,11 +160,13 @@ def test_poses_sorted_as_strings_are_named(real):
     # As if the files had no leading zeros.
     names = [f"images/{frame}.jpg" for frame in range(len(names))]
     order = torch.tensor(sorted(range(len(names)), key=lambda frame: names[frame]))
-    verdict = judge(replace(cameras, cam_to_world=cameras.cam_to_world[order]), matches, names)
+    verdict = diagnose_cameras(
+        replace(cameras, cam_to_world=cameras.cam_to_world[order]), matches, names
+    )
     assert "sorted by their numbers, the poses as strings" in verdict.sentence
 
 
-def test_too_few_matches_tell_nothing(real):
+def test_too_few_matches_give_no_diagnosis(real):
     cameras, matches, names = real
-    verdict = judge(cameras, matches.select(slice(0, 50)), names)
+    verdict = diagnose_cameras(cameras, matches.select(slice(0, 50)), names)
     assert not verdict.fits and "only 50 points" in verdict.sentence

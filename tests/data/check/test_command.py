@@ -1,4 +1,4 @@
-"""`python -m asysplat.data.check`: what it prints, writes and ends with."""
+"""`python -m asysplat.data.check`: output, files and exit codes."""
 
 import json
 import shutil
@@ -10,26 +10,26 @@ from asysplat.data import ProceduralScene
 from asysplat.data.check.__main__ import main
 from asysplat.data.write import write_transforms
 
-HEIGHT, WIDTH, FRAMES = 160, 240, 12
+HEIGHT, WIDTH, COUNT = 160, 240, 12
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made") / "walk"
-    scene = ProceduralScene(4, HEIGHT, WIDTH, FRAMES)
-    write_transforms(scene.views(range(FRAMES)), folder)
+    scene = ProceduralScene(4, HEIGHT, WIDTH, COUNT)
+    write_transforms(scene.views(range(COUNT)), folder)
     return folder
 
 
 @pytest.fixture
 def scene(written, tmp_path):
-    """A scene that a test may spoil."""
+    """A copy that a test may damage."""
     return shutil.copytree(written, tmp_path / "data/walk")
 
 
 @pytest.fixture
 def check(tmp_path, monkeypatch, capsys):
-    """Runs the command; gives how it ended and what it said."""
+    """Runs the command; returns exit code, output and errors."""
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.chdir(tmp_path)
 
@@ -47,27 +47,27 @@ def edit(scene, change) -> None:
     file.write_text(json.dumps(content))
 
 
-def spoil(image) -> None:
-    """Whole at both ends, and so with a size, but not to be decoded."""
+def damage(image) -> None:
+    """Damage the middle: the size can be read, the pixels cannot."""
     data = bytearray(image.read_bytes())
     middle = len(data) // 2
     data[middle : middle + 200] = bytes(200)
     image.write_bytes(data)
 
 
-def test_a_good_scene_is_told_on_one_screen(check, scene, tmp_path):
+def test_a_good_scene_fits_one_screen(check, scene, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
     code, out, err = check(scene)
     assert code == 0 and not err
     assert len(out.splitlines()) < 24
     for text in (
-        *("walk, layout transforms", f"{FRAMES} of {WIDTH} x {HEIGHT}", "known at 100.0%"),
+        *("walk, layout transforms", f"{COUNT} of {WIDTH} x {HEIGHT}", "known at 100.0%"),
         *("The cameras fit the images.", "masks           none", "points          none"),
     ):
         assert text in out
     assert {path: path.stat().st_mtime_ns for path in scene.rglob("*")} == before
-    with Image.open(tmp_path / "check/walk/check.png") as picture:
-        assert min(picture.size) > 500 and len(picture.getcolors(2**20)) > 1000
+    with Image.open(tmp_path / "check/walk/check.png") as figure:
+        assert min(figure.size) > 500 and len(figure.getcolors(2**20)) > 1000
 
 
 def test_nothing_is_overwritten(check, scene, tmp_path):
@@ -80,7 +80,7 @@ def test_nothing_is_overwritten(check, scene, tmp_path):
     assert sorted(path.name for path in folder.iterdir()) == ["check-2.png", "check.png"]
 
 
-def test_a_mistake_ends_with_1_and_its_mend(check, scene):
+def test_a_mistake_exits_with_1_and_its_fix(check, scene):
     def unflip(content):
         for frame in content["frames"]:
             for row in frame["transform_matrix"][:3]:
@@ -93,20 +93,20 @@ def test_a_mistake_ends_with_1_and_its_mend(check, scene):
 
 
 def test_all_damaged_files_are_listed(check, scene):
-    spoil(scene / "images/00003.png")
-    spoil(scene / "images/00007.png")
+    damage(scene / "images/00003.png")
+    damage(scene / "images/00007.png")
     (scene / "images/00009.png").unlink()
     code, out, err = check(scene)
     assert code == 2 and "Traceback" not in err
-    assert err.startswith("error: walk: 3 of 12 frames cannot be used")
+    assert err.startswith("error: walk: 3 of 12 images cannot be used")
     assert all(name in err for name in ("00003.png", "00007.png", "00009.png"))
-    code, out, err = check(scene, "--on-bad-frame", "skip")
+    code, out, err = check(scene, "--on-bad-image", "skip")
     assert code == 0 and out.count("left out") == 3
     assert all(name in out for name in ("00003.png", "00007.png", "00009.png"))
-    assert "frames          9 " in out
+    assert "images          9 " in out
 
 
-def test_depths_of_another_unit_are_told(check, scene):
+def test_a_wrong_depth_unit_is_reported(check, scene):
     edit(scene, lambda content: content.update(depth_unit_scale_factor=0.01))
     code, out, _ = check(scene)
     assert code == 0 and "divide the unit of depth by 9.9" in out
@@ -120,7 +120,7 @@ def blank(scene) -> None:
 def test_images_without_a_point_to_match(check, scene):
     blank(scene)
     code, out, _ = check(scene)
-    assert code == 1 and "Only 0 points were found again" in out
+    assert code == 1 and "Only 0 points were matched" in out
     assert "12, 11 with the same file as another" in out
 
 
@@ -144,7 +144,7 @@ def test_one_of_many_scenes(check, scene):
         (("data", "--layout", "transforms", "--out", "data"), "lies in the data set"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(check, scene, arguments, message):
+def test_errors_are_one_line(check, scene, arguments, message):
     code, _, err = check(*arguments)
     assert code == 2 and message in err
     assert err.startswith("error: ") and err.count("\n") == 1
