@@ -27,25 +27,17 @@ class Figures(lightning.Callback):
         self._draw(trainer, "val", outputs, batch, index)
 
     def on_test_batch_end(
-        self,
-        trainer: Any,
-        module: Any,
-        outputs: Prediction,
-        batch: Any,
-        index: int,
-        test_set: int = 0,
+        self, trainer: Any, module: Any, outputs: Any, batch: Any, index: int, test_set: int = 0
     ) -> None:
         if test_set == 0:
             self._draw(trainer, "test", outputs, batch, index)
 
-    def _draw(
-        self, trainer: Any, split: str, prediction: Prediction, batch: Any, index: int
-    ) -> None:
+    def _draw(self, trainer: Any, split: str, outputs: Prediction, batch: Any, index: int) -> None:
         if index >= self.scenes or not trainer.is_global_zero:
             return
         first = (
             record.map(lambda tensor: tensor[0].detach())
-            for record in (batch["inputs"], batch["targets"], prediction.rendering)
+            for record in (batch["inputs"], batch["targets"], outputs.rendering)
         )
         figure = comparison_figure(*first)
         self.folder.mkdir(parents=True, exist_ok=True)

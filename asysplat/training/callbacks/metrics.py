@@ -1,7 +1,6 @@
 """Compute the metrics of every validation and test image, and of the baselines."""
 
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from asysplat.scene import Views
 from asysplat.training.prediction import Prediction
 
 IMAGE = ("set", "scene", "view")  # the columns that identify a row
-Measure = Callable[[Tensor, Views], dict[str, Tensor]]
 
 
 class Metrics(lightning.Callback):
@@ -53,18 +51,16 @@ class Metrics(lightning.Callback):
         network = None if self.lpips is None else self.lpips.to(targets.images.device)
         return self.protocol.image_metrics(rendered, targets, network)
 
-    def _add(
-        self,
-        test_set: str,
-        batch: dict[str, Any],
-        prediction: Prediction,
-        measure_baseline: Measure,
-    ) -> None:
+    def _add(self, test_set: str, batch: Any, prediction: Prediction, validation: bool) -> None:
         inputs, targets = batch["inputs"], batch["targets"]
         values = self.measure(prediction.rendering.image, targets)
         values |= self.protocol.depth_metrics(prediction.rendering.depth, targets)
         for name, baseline in BASELINES.items():
-            metrics = measure_baseline(baseline(inputs, targets), targets)
+            images = baseline(inputs, targets)
+            if validation:  # the learning curve has no other metric of the baselines
+                values[f"{name}/psnr"] = self.protocol.psnr(images, targets)
+                continue
+            metrics = self.measure(images, targets)
             values |= {f"{name}/{metric}": value for metric, value in metrics.items()}
         for index, scene in enumerate(batch["scene"]):
             for view in range(targets.num_views):
@@ -81,23 +77,14 @@ class Metrics(lightning.Callback):
     def on_validation_batch_end(
         self, trainer: Any, module: Any, outputs: Prediction, batch: Any, *_: Any
     ) -> None:
-        def measure_baseline(image: Tensor, targets: Views) -> dict[str, Tensor]:
-            return {"psnr": self.protocol.psnr(image, targets)}  # the learning curve has no other
-
-        self._add(trainer.datamodule.name, batch, outputs, measure_baseline)
+        self._add(trainer.datamodule.name, batch, outputs, validation=True)
 
     def on_test_batch_end(
-        self,
-        trainer: Any,
-        module: Any,
-        outputs: Prediction,
-        batch: Any,
-        index: int,
-        set_index: int = 0,
+        self, trainer: Any, module: Any, outputs: Any, batch: Any, index: int, set_index: int = 0
     ) -> None:
         test_set = list(trainer.datamodule.tests)[set_index]
         self.work.start()
-        self._add(test_set, batch, outputs, self.measure)
+        self._add(test_set, batch, outputs, validation=False)
         self.work.stop()
 
     def on_validation_epoch_end(self, trainer: Any, module: Any) -> None:

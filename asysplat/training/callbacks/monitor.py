@@ -86,12 +86,18 @@ class TrainingMonitor(Callback):
             wait_for(module.device)
             now = time.perf_counter()
             module.parts.add("optimizer", now - self.optimizer_since)
-            values = shares(module.parts.stop(), now - self.started)
             if self.flops is None:
                 views = batch["inputs"]
                 size = (views.num_views, views.cameras.height, views.cameras.width)
                 self.flops = PASSES * forward_flops(module.net, *size)
-            values |= self._rates(trainer) | memory(module.device)
+            seconds, total = module.parts.stop(), now - self.started
+            shares = {name: seconds.get(name, 0.0) / total for name in PARTS}
+            shares["other"] = max(0.0, 1 - sum(shares.values()))
+            values = {f"time/share_{name}": share for name, share in shares.items()}
+            values |= self._rates(trainer)
+            values["memory/peak_gb"] = peak_memory_gb(module.device)
+            if module.device.type == "cuda":
+                values["memory/peak_share"] = values["memory/peak_gb"] / memory_gb(module.device)
             self.measurements.append(values)
             log(trainer, values, self.step)
             self._begin(trainer)
@@ -105,9 +111,7 @@ class TrainingMonitor(Callback):
     def on_validation_epoch_start(self, trainer: Any, module: Any) -> None:
         self.histograms = {n: Histogram.empty(*b, module.device) for n, b in BOUNDS.items()}
 
-    def on_validation_batch_end(
-        self, trainer: Any, module: Any, outputs: Prediction, *_: Any
-    ) -> None:
+    def on_validation_batch_end(self, _: Any, __: Any, outputs: Prediction, *___: Any) -> None:
         gaussians, rendering = outputs.gaussians, outputs.rendering
         self.histograms["opacity"].add(gaussians.opacities)
         self.histograms["log10_scale"].add(gaussians.scales.log10().mean(-1))
@@ -146,21 +150,6 @@ def log(trainer: Any, numbers: dict[str, float], step: int) -> None:
     """Log numbers at once, whatever `log_every_n_steps` is."""
     for logger in trainer.loggers:
         logger.log_metrics(numbers, step=step)
-
-
-def shares(seconds: dict[str, float], total: float) -> dict[str, float]:
-    """Return the share of each part in a step of `total` seconds, and of the rest, other."""
-    parts = {name: seconds.get(name, 0.0) / total for name in PARTS}
-    parts["other"] = max(0.0, 1 - sum(parts.values()))
-    return {f"time/share_{name}": share for name, share in parts.items()}
-
-
-def memory(device: torch.device) -> dict[str, float]:
-    """Return the peak memory, and on a GPU its share of the GPU's memory."""
-    peak = peak_memory_gb(device)
-    if device.type != "cuda":
-        return {"memory/peak_gb": peak}
-    return {"memory/peak_gb": peak, "memory/peak_share": peak / memory_gb(device)}
 
 
 def gradient_norms(net: nn.Module) -> dict[str, float]:

@@ -1,6 +1,5 @@
 """Drop, count and report steps with non-finite gradients."""
 
-from pathlib import Path
 from typing import Any
 
 import lightning
@@ -9,30 +8,26 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from asysplat.errors import InputError
-from asysplat.training.non_finite import first_non_finite, save_step
+from asysplat.training.non_finite import first_non_finite
 from asysplat.training.random_states import RandomStates, random_states, set_random_states
 from asysplat.training.side_by_side import split
-
-MAX_FILES = 3  # of a run: each has the weights of the model
 
 
 class NonFiniteSteps(lightning.Callback):
     """Drops a step with a NaN or infinite gradient, and restores the buffers that it changed.
 
     The step is then computed again, scene by scene, to report the scene and the first tensor that
-    is not finite. The first MAX_FILES of these steps are saved in the run's folder `non_finite`;
-    python -m asysplat.training.non_finite computes a saved step again.
+    is not finite.
 
     Args:
-        folder: of the run.
         budget: the run ends after this many non-finite steps in a row.
 
     Raises:
         InputError: the budget is used up; the message names a tensor.
     """
 
-    def __init__(self, folder: str | Path, budget: int = 10):
-        self.folder, self.budget = Path(folder) / "non_finite", budget
+    def __init__(self, budget: int = 10):
+        self.budget = budget
         self.count, self.in_a_row = 0, 0
         self.batches: list[tuple[dict[str, Any], RandomStates]] = []  # of the current step
         self.buffers: list[Tensor] = []  # before the step
@@ -62,14 +57,13 @@ class NonFiniteSteps(lightning.Callback):
         optimizer.zero_grad(set_to_none=True)
         for buffer, before in zip(module.buffers(), self.buffers, strict=True):
             buffer.copy_(before)
-        first, scenes, command = self._recompute(trainer, module) or (
+        first, scenes = self._recompute(trainer, module) or (
             bad[0] if bad else "the sum of all gradients",
             [scene for batch, _ in self.batches for scene in batch["scene"]],
-            "",
         )
         print(
             f"step {trainer.global_step}: {first} is not finite on {', '.join(scenes)}; "
-            f"the step is dropped ({self.count} in all){command}",
+            f"the step is dropped ({self.count} in all)",
             flush=True,
         )
         if self.in_a_row >= self.budget:
@@ -78,8 +72,8 @@ class NonFiniteSteps(lightning.Callback):
                 "lower learning_rate or set trainer.precision=32-true."
             )
 
-    def _recompute(self, trainer: Any, module: Any) -> tuple[str, list[str], str] | None:
-        """Return the tensor, the scene and a command to repeat it; None if all is finite now."""
+    def _recompute(self, trainer: Any, module: Any) -> tuple[str, list[str]] | None:
+        """Return the tensor and the scene; None if all is finite now."""
         now = random_states()
         try:
             for batch, states in self.batches:
@@ -87,14 +81,8 @@ class NonFiniteSteps(lightning.Callback):
                 for scene in split(batch):
                     with trainer.precision_plugin.forward_context():
                         first = first_non_finite(module, scene)
-                    if first is None:
-                        continue
-                    if self.count > MAX_FILES:
-                        return first, scene["scene"], ""
-                    name = f"step-{trainer.global_step:06d}-{trainer.global_rank}.pt"
-                    save_step(self.folder / name, module, scene, states)
-                    command = f"python -m asysplat.training.non_finite {self.folder / name}"
-                    return first, scene["scene"], f"\n  to compute it again: {command}"
+                    if first is not None:
+                        return first, scene["scene"]
         finally:
             set_random_states(now)
         return None
