@@ -1,26 +1,13 @@
-"""Repeat a step to find its first non-finite tensor; save the step to a file.
+"""Repeat a step to find its first non-finite tensor."""
 
-python -m asysplat.training.non_finite logs/asysplat/2026-01-31_12-00-00/non_finite/step-000012-0.pt
-"""
-
-import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
-from lightning import Fabric, LightningModule
-from omegaconf import OmegaConf
+from lightning import LightningModule
 from torch import Tensor
-
-from asysplat.errors import InputError
-from asysplat.scene import Cameras, Views
-from asysplat.training.checkpoints import atomic_save
-from asysplat.training.old_names import upgrade_config
-from asysplat.training.random_states import RandomStates, set_random_states
 
 Batch = dict[str, Any]
 
@@ -86,64 +73,3 @@ def tensors(value: Any, part: str = "") -> Iterator[tuple[str, Tensor]]:
     elif isinstance(value, list | tuple):
         for index, each in enumerate(value):
             yield from tensors(each, f"{part}[{index}]")
-
-
-def save_step(path: Path, module: LightningModule, batch: Batch, states: RandomStates) -> None:
-    """Write everything that a step depends on, to be read with weights_only=True.
-
-    Args:
-        path: the file; its folder is created.
-        module: its `hparams` are the configuration of the run.
-        batch: inputs and targets, both Views.
-        states: of the random generators, before the step.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    step = {
-        "configuration": dict(module.hparams),
-        "state_dict": module.state_dict(),
-        "random_states": states,
-        "scene": batch["scene"],
-        **{name: asdict(batch[name]) for name in ("inputs", "targets")},
-    }
-    atomic_save(step, path)
-
-
-def replay(path: Path) -> str | None:
-    """Repeat a saved step; name the first non-finite tensor, see `first_non_finite`.
-
-    Raises:
-        InputError: the file was not written by `save_step`.
-    """
-    try:
-        step = torch.load(path, map_location="cpu", weights_only=True)
-        config = OmegaConf.create(upgrade_config(step["configuration"]))
-    except Exception as error:
-        raise InputError(f"{path} cannot be read as a step: name a file of non_finite/.") from error
-    module = instantiate(config.training, net=instantiate(config.model))
-    module.load_state_dict(step["state_dict"])
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    batch = {name: _views(step[name]).to(device) for name in ("inputs", "targets")}
-    module.train().to(device)
-    set_random_states(step["random_states"])
-    with Fabric(accelerator=device, devices=1, precision=config.trainer.precision).autocast():
-        return first_non_finite(module, batch | {"scene": step["scene"]})
-
-
-def _views(parts: dict[str, Any]) -> Views:
-    return Views(**(parts | {"cameras": Cameras(**parts["cameras"])}))
-
-
-def main() -> None:
-    if len(sys.argv) != 2:
-        sys.exit("usage: python -m asysplat.training.non_finite FILE")
-    try:
-        print(replay(Path(sys.argv[1])) or "all tensors are finite")
-    except InputError as error:
-        sys.exit(f"error: {error}")
-
-
-if __name__ == "__main__":
-    main()
