@@ -41,7 +41,8 @@ def make_section(filled: FilledTable) -> Section:
     grids = [_measured_grid(filled)]
     if any(row.costs for row in filled.rows):
         grids.append(_cost_grid(_networks(filled)))
-    return Section(filled.title, protocol_notes(filled), grids, notes(filled))
+    title, above = filled.title, protocol_notes(filled)
+    return Section(title, anchor(title), above, grids, notes(filled))
 
 
 def make_overview(tables: Sequence[FilledTable]) -> Grid:
@@ -160,6 +161,6 @@ def _cost_grid(rows: Sequence[FilledRow]) -> Grid:
         lines.append(line(Cell(row.name), row, row.costs, check_costs(row)))
         for reading, costs in zip(row.paper.readings, row.reading_costs, strict=False):
             check = "fits" if fits(row.paper, costs) else "no fit"
-            lines.append(line(Cell(f"or: {reading.name}", "muted"), row, costs, check))
+            lines.append(line(Cell(f"or: {reading}", "muted"), row, costs, check))
     headings = [Heading(COSTS[key][0], part) for key, part in columns]
     return Grid(COST_CAPTION, [Heading("Row"), *headings, Heading("Check")], lines)

@@ -35,8 +35,7 @@ class RankAgreement(NamedTuple):
 
 def mean_and_spread(values: Sequence[Number]) -> tuple[float, float | None]:
     """Return mean and sample standard deviation over seeds; None for that of a single seed."""
-    spread = float(np.std(values, ddof=1)) if len(values) > 1 else None
-    return float(np.mean(values)), spread
+    return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
 
 
 def rank_agreement(filled: FilledTable, column: str) -> RankAgreement:

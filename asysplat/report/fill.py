@@ -97,7 +97,7 @@ class FilledTable:
 
 
 def finished_runs(logs: Path) -> Runs:
-    """Find all finished runs below a folder, by the hash of their configuration."""
+    """Find all finished runs below a folder."""
     runs: Runs = {}
     for run in find_runs(logs):
         runs.setdefault(run.config_hash, []).append(run)
@@ -128,11 +128,18 @@ def fill_table(
             continue
         row_config = compose([*overrides, *row.run])
         row_config = OmegaConf.masked_copy(row_config, [k for k in row_config if k != "hydra"])
-        row_runs = _runs_of(row_config, runs)
+        read = data_of(row_config)
+        same = [run for run in runs.get(config_hash(row_config), []) if run.agrees(read)]
+        # For each seed the newest run, first among those tested on all of the data.
+        row_runs = {run.seed: run for run in sorted(same, key=lambda run: run.covers(read))}
         used += row_runs.values()
         rows.append(_fill_row(row, table, row_config, row_runs, list(map(int, seeds)), sets))
+    data = config.data
+    height, width = data.test_size or (data.height, data.width)
+    stages = ", then ".join(describe_stage(stage) for stage in stage_configs(config))
     notes = {
-        "Ours": _scale(config),
+        "Ours": f"{data.name} data, {data.inputs} input views of {height}x{width}, {stages}, "
+        f"{config.width:g} of the paper's width",
         "Not tested": _untested(sets, config, rows),
         "Baselines": _baselines(sets, used),
         "Data": _folders(used),
@@ -144,16 +151,15 @@ def fill_table(
 
 def with_costs(filled: FilledTable, compose: Compose) -> FilledTable:
     """Add the costs of every row and its other readings at the paper's scale."""
-
-    def costs(row: PaperRow, run: tuple[str, ...]) -> Costs:
-        return _costs(compose, run, row.views, row.size)
-
     rows = []
     for row in filled.rows:
         paper = row.paper
         if not paper.quoted and not paper.post_optimization:
-            readings = tuple(costs(paper, reading.run) for reading in paper.readings)
-            row = replace(row, costs=costs(paper, paper.run), reading_costs=readings)
+            own, *readings = (
+                _costs(compose, run, paper.views, paper.size)
+                for run in (paper.run, *paper.readings.values())
+            )
+            row = replace(row, costs=own, reading_costs=tuple(readings))
         rows.append(row)
     return replace(filled, rows=tuple(rows))
 
@@ -164,13 +170,6 @@ def _costs(compose: Compose, run: tuple[str, ...], views: int, size: tuple[int, 
     with torch.device("meta"):
         net = instantiate(config.model)
     return static_costs(net, views, *size)
-
-
-def _runs_of(config: DictConfig, runs: Runs) -> dict[int, Run]:
-    """Find a run for each seed: the newest, first among those tested on all of the data."""
-    data = data_of(config)
-    same = [run for run in runs.get(config_hash(config), []) if run.agrees(data)]
-    return {run.seed: run for run in sorted(same, key=lambda run: run.covers(data))}
 
 
 def _fill_row(
@@ -215,16 +214,6 @@ def _result_key(column: str, row: PaperRow, sets: dict[str, str]) -> str | None:
         return None
     ours = row.test_set or sets[paper_set]
     return f"test/{ours}/post{steps}/{metric}" if steps else f"test/{ours}/{metric}"
-
-
-def _scale(config: DictConfig) -> str:
-    data = config.data
-    height, width = data.test_size or (data.height, data.width)
-    stages = ", then ".join(describe_stage(stage) for stage in stage_configs(config))
-    return (
-        f"{data.name} data, {data.inputs} input views of {height}x{width}, {stages}, "
-        f"{config.width:g} of the paper's width"
-    )
 
 
 def _metrics(table: PaperTable, config: DictConfig, runs: Sequence[Run]) -> tuple[str, ...]:

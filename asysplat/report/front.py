@@ -8,13 +8,9 @@ from asysplat.report.style import FAINT, INK
 
 Point = tuple[str, float, float]  # name, cost, quality
 # Where a name is beside its point: offset in typographic points, alignments.
-Place = tuple[tuple[int, int], str, str]
-ABOVE: Place = ((0, 6), "center", "bottom")
-BELOW: Place = ((0, -6), "center", "top")
-LEFT: Place = ((-7, 0), "right", "center")
-RIGHT: Place = ((7, 0), "left", "center")
-ABOVE_LEFT: Place = ((0, 6), "right", "bottom")
-ABOVE_RIGHT: Place = ((0, 6), "left", "bottom")
+ABOVE, BELOW = ((0, 6), "center", "bottom"), ((0, -6), "center", "top")
+LEFT, RIGHT = ((-7, 0), "right", "center"), ((7, 0), "left", "center")
+ABOVE_LEFT, ABOVE_RIGHT = ((0, 6), "right", "bottom"), ((0, 6), "left", "bottom")
 FONT = 9
 
 

@@ -50,11 +50,10 @@ def inline_svg(figure: Figure, salt: str) -> str:
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     # The page declares the name spaces, and sets the font and the size.
-    text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
+    unused = r"""(?s)<metadata>.*?</metadata>| xmlns(:\w+)?="[^"]*"|font-family: [^;"]*;"""
+    text = re.sub(unused, "", text)
     text = re.sub(r'<svg width="[^"]*" height="[^"]*"', "<svg", text)
-    text = re.sub(r"font-family: [^;\"]*;", "", text)
     text = re.sub(r'<g id="[^"]*"', "<g", text)
     for color, variable in VARIABLES.items():
         text = text.replace(color, f"var({variable})")

@@ -5,7 +5,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 from omegaconf import OmegaConf
 
@@ -46,18 +45,6 @@ class Column:
         return self.format.format(value / self.unit)
 
 
-class Reading(NamedTuple):
-    """Another architecture that the paper's text allows.
-
-    Args:
-        name: what it changes.
-        run: overrides of train.py that build it.
-    """
-
-    name: str
-    run: tuple[str, ...]
-
-
 @dataclass(frozen=True)
 class PaperRow:
     """One method of a table.
@@ -71,7 +58,7 @@ class PaperRow:
         post_optimization: steps on the Gaussians; such rows need evaluate.py.
         test_set: of our run, in place of the one that `our_sets` gives; None for that one.
         unverified: why this row's architecture may differ from the paper's; None if it is known.
-        readings: the other architectures of an unverified row.
+        readings: the other architectures that the paper's text allows: name -> overrides.
     """
 
     name: str
@@ -83,7 +70,7 @@ class PaperRow:
     post_optimization: int = 0
     test_set: str | None = None
     unverified: str | None = None
-    readings: tuple[Reading, ...] = ()
+    readings: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def quoted(self) -> bool:
@@ -119,7 +106,6 @@ class PaperTable:
 
     @property
     def test_sets(self) -> list[str]:
-        """List the test sets of its columns, in order."""
         return list(dict.fromkeys(c.test_set for c in self.columns if c.test_set))
 
 
@@ -184,27 +170,20 @@ def _read(name: str) -> dict:
 
 
 def _table(key: str, entry: dict) -> PaperTable:
-    return PaperTable(
-        key,
-        None if entry["number"] is None else str(entry["number"]),
-        entry["title"],
-        entry["protocol"],
-        tuple(_column(column) for column in entry["columns"]),
-        tuple(_row(row, entry) for row in entry["rows"]),
-        entry.get("rank_by"),
-    )
-
-
-def _column(key: str) -> Column:
-    entry = _read("paper")["columns"][key.rpartition("/")[-1]]
-    unit = float(entry.get("unit", 1))
-    return Column(key, entry["title"], entry.get("better"), entry["format"], unit)
+    columns = []
+    for column in entry["columns"]:
+        kind = _read("paper")["columns"][column.rpartition("/")[-1]]
+        unit = float(kind.get("unit", 1))
+        columns.append(Column(column, kind["title"], kind.get("better"), kind["format"], unit))
+    rows = tuple(_row(row, entry) for row in entry["rows"])
+    number = None if entry["number"] is None else str(entry["number"])
+    title, protocol, rank_by = entry["title"], entry["protocol"], entry.get("rank_by")
+    return PaperTable(key, number, title, protocol, tuple(columns), rows, rank_by)
 
 
 def _row(row: dict, table: dict) -> PaperRow:
-    """Build a row; its views and size are its table's unless it names its own."""
-    printed = row.get("paper", [None] * len(table["columns"]))
-    printed = dict(zip(table["columns"], printed, strict=True))
+    columns = table["columns"]
+    printed = dict(zip(columns, row.get("paper", [None] * len(columns)), strict=True))
     return PaperRow(
         name=row["name"],
         numbers={key: float(v) for key, v in printed.items() if isinstance(v, int | float)},
@@ -215,5 +194,5 @@ def _row(row: dict, table: dict) -> PaperRow:
         post_optimization=row.get("post_optimization", 0),
         test_set=row.get("test_set"),
         unverified=row.get("unverified"),
-        readings=tuple(Reading(r["name"], tuple(r["run"])) for r in row.get("readings", ())),
+        readings={r["name"]: tuple(r["run"]) for r in row.get("readings", ())},
     )

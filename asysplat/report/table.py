@@ -49,13 +49,10 @@ class Section(NamedTuple):
     """One table of the report."""
 
     title: str
+    anchor: str
     above: list[Note]
     grids: list[Grid]
     notes: list[Note]
-
-    @property
-    def anchor(self) -> str:
-        return anchor(self.title)
 
 
 def anchor(title: str) -> str:

@@ -123,7 +123,7 @@ def test_unverified_rows_have_another_reading():
         *("asysplat_only_fine_to_coarse", "asysplat_only_coarse_to_fine"),
         *("single_branch", "two_branch", "longlrm_18", "longlrm_24h"),
     }
-    assert all(reading.run[0] == row.run[0] for row in unverified for reading in row.readings)
+    assert all(run[0] == row.run[0] for row in unverified for run in row.readings.values())
 
 
 def test_text_is_in_the_unit_of_the_title():

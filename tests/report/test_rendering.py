@@ -12,7 +12,7 @@ from asysplat.report.fill import COMPUTED, FilledRow, FilledTable
 from asysplat.report.front import pareto_front
 from asysplat.report.html import render_html
 from asysplat.report.markdown import escape, render_markdown
-from asysplat.report.paper import Column, PaperRow, PaperTable, Reading
+from asysplat.report.paper import Column, PaperRow, PaperTable
 from asysplat.report.plots import make_plots
 from asysplat.report.terminal import render_terminal
 
@@ -27,7 +27,7 @@ COLUMNS = (
 def make_row(name: str, run: tuple[str, ...] | None = ("model=x",), **numbers) -> PaperRow:
     keys = {"psnr": "dl3dv/psnr", "lpips": "dl3dv/lpips"}
     extra = {key: numbers.pop(key) for key in ("bounds", "unverified") if key in numbers}
-    readings = (Reading("without the links", ("model=y",)),) if "unverified" in extra else ()
+    readings = {"without the links": ("model=y",)} if "unverified" in extra else {}
     paper = {keys.get(key, key): float(value) for key, value in numbers.items()}
     return PaperRow(name, paper, run, 32, (256, 256), readings=readings, **extra)
 

@@ -1,6 +1,5 @@
 """Several test sets are tested in one run: each has the same numbers as alone."""
 
-import csv
 import warnings
 from types import SimpleNamespace
 
@@ -72,16 +71,6 @@ def test_a_set_has_the_same_numbers_as_alone(measure, together, name):
         for results in (expected, together.results)
     )
     assert among_others == alone
-
-
-def test_every_image_has_a_row_with_its_set(together):
-    with (together.folder / "metrics.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert next(iter(rows[0])) == "set"
-    counts = {name: sum(row["set"] == name for row in rows) for name in ALONE}
-    assert counts == {"procedural": 2, "rooms": 2, "outdoors": 2, "more_views": 4, "wide": 2}
-    values = [float(row["psnr"]) for row in rows if row["set"] == "rooms"]
-    assert abs(sum(values) / 2 - together.results["test/rooms/psnr"]) < 1e-4
 
 
 def test_a_set_has_its_own_costs(together):
