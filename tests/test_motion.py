@@ -2,11 +2,9 @@
 
 import math
 
-import pytest
 import torch
 
-from asysplat.motion import sh_rotation, transform
-from asysplat.rendering.sh import sh_basis
+from asysplat.motion import transform
 
 
 def motion(seed: int) -> torch.Tensor:
@@ -16,34 +14,6 @@ def motion(seed: int) -> torch.Tensor:
     matrix[:3, :3] = torch.linalg.matrix_exp(skew - skew.mT)
     matrix[:3, 3] = torch.randn(3, generator=generator, dtype=torch.float64)
     return matrix
-
-
-@pytest.mark.parametrize("count", [1, 4, 9, 16])
-@pytest.mark.parametrize("seed", range(3))
-def test_sh_turns_with_its_directions(count, seed):
-    rotation = motion(seed)[:3, :3]
-    directions = torch.nn.functional.normalize(torch.randn(200, 3, dtype=torch.float64), dim=-1)
-    sh = torch.randn(count, dtype=torch.float64)
-    turned = sh_rotation(rotation, count) @ sh
-    before, after = (
-        sh_basis(directions, count) @ sh,
-        sh_basis(directions @ rotation.mT, count) @ turned,
-    )
-    torch.testing.assert_close(after, before, atol=1e-12, rtol=0)
-
-
-def test_an_sh_rotation_is_orthogonal_and_keeps_degrees_apart():
-    matrix = sh_rotation(motion(0)[:3, :3], 16)
-    torch.testing.assert_close(matrix @ matrix.mT, torch.eye(16).double(), atol=1e-12, rtol=0)
-    apart = torch.block_diag(*(torch.ones(2 * d + 1, 2 * d + 1) for d in range(4))) == 0
-    assert matrix[apart].abs().max() < 1e-12
-
-
-def test_a_quarter_turn_about_z():
-    """x goes to y, and y to -x: so do the SH functions -y, z, -x of degree 1."""
-    quarter = torch.tensor([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
-    found = sh_rotation(quarter, 4) @ torch.tensor([0, 2.0, 3.0, 5.0], dtype=torch.float64)
-    torch.testing.assert_close(found, torch.tensor([0, 5.0, 3.0, -2.0], dtype=torch.float64))
 
 
 def test_means_and_orientations(make_scene):

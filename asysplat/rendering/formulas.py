@@ -1,7 +1,7 @@
 """Code that both fast backends share: camera rows, constants, formulas and steps around kernels.
 
-The formulas work on vectors of three numbers, as tuples. Numba and Triton compile the same source:
-`cpu.math` and `cuda.math` provide the `sqrt` and `clamp` that it calls.
+The formulas work on vectors of three numbers, as tuples. Numba and Triton compile the same source;
+`cuda.math` replaces `sqrt`, `clamp` and `select` by Triton's.
 """
 
 import inspect
@@ -123,6 +123,19 @@ def bind(formula: Callable, names: dict[str, object]) -> Callable:
     return FunctionType(bare.__code__, names)
 
 
+sqrt = math.sqrt
+
+
+def clamp(value, low, high):
+    """Limit `value` to [low, high]; NaN stays."""
+    return low if value < low else high if value > high else value
+
+
+def select(condition, yes, no):
+    """Return `yes` if the condition holds, else `no`."""
+    return yes if condition else no
+
+
 def dot(p, q):
     """Compute p . q."""
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
@@ -155,16 +168,9 @@ def times(p, q):
 def project_mean(mean, axes, center, focal, limits):
     """Project a mean and linearize the projection around it.
 
-    Args:
-        mean, center: of the Gaussian and of the camera, in the world.
-        axes: right, down and forward of the camera.
-        focal: fx, fy in pixels.
-        limits: (low, high) of x / z, and of y / z.
-
-    Returns:
-        The offset from the camera's center in world axes; z and 1 / z; the tangents (x / z, y / z);
-        the tangents clamped to the limits, where the Jacobian is taken; the Jacobian's rows in
-        world axes.
+    axes are right, down and forward of the camera; limits (low, high) of x / z, and of y / z.
+    Return the offset from the camera's center in world axes; z and 1 / z; the tangents (x / z, y /
+    z); the clamped tangents, where the Jacobian is taken; the Jacobian's rows in world axes.
     """
     # The offset comes first: it is exact for scenes far from the origin.
     offset = plus(mean, -1.0, center)
@@ -176,6 +182,37 @@ def project_mean(mean, axes, center, focal, limits):
     row_x = scaled(focal[0] * inverse_z, plus(axes[0], -clamped_x, axes[2]))
     row_y = scaled(focal[1] * inverse_z, plus(axes[1], -clamped_y, axes[2]))
     return offset, z, inverse_z, (tangent_x, tangent_y), (clamped_x, clamped_y), row_x, row_y
+
+
+def project_mean_gradient(g_xyz, g_rows, rows, projected, axes, focal):
+    """Compute the gradients of the offset, the axes, fx and fy, cx and cy.
+
+    g_xyz are gradients of the center in pixels and of the depth; rows the Jacobian's rows;
+    projected is offset, 1 / z, tangents and clamped tangents.
+    """
+    (g_x, g_y, g_z), (g_row_x, g_row_y), (row_x, row_y) = g_xyz, g_rows, rows
+    offset, inverse_z, tangents, clamped = projected
+    fx, fy = focal
+    g_z -= inverse_z * (dot(row_x, g_row_x) + dot(row_y, g_row_y))
+    g_fx = g_x * tangents[0] + dot(row_x, g_row_x) / fx
+    g_fy = g_y * tangents[1] + dot(row_y, g_row_y) / fy
+    g_clamped_x = -fx * inverse_z * dot(axes[2], g_row_x)
+    g_clamped_y = -fy * inverse_z * dot(axes[2], g_row_y)
+    # A clamped tangent is the limit, (constant - cx) / fx.
+    g_tangent_x = g_x * fx + select(clamped[0] == tangents[0], g_clamped_x, 0.0)
+    g_tangent_y = g_y * fy + select(clamped[1] == tangents[1], g_clamped_y, 0.0)
+    g_limit_x = select(clamped[0] == tangents[0], 0.0, g_clamped_x)
+    g_limit_y = select(clamped[1] == tangents[1], 0.0, g_clamped_y)
+    g_focal = (g_fx - g_limit_x * clamped[0] / fx, g_fy - g_limit_y * clamped[1] / fy)
+    g_principal = (g_x - g_limit_x / fx, g_y - g_limit_y / fy)
+    g_z -= inverse_z * (g_tangent_x * tangents[0] + g_tangent_y * tangents[1])
+    g_u, g_v = g_tangent_x * inverse_z, g_tangent_y * inverse_z
+    g_offset = plus(plus(scaled(g_u, axes[0]), g_v, axes[1]), g_z, axes[2])
+    g_right = plus(scaled(g_u, offset), fx * inverse_z, g_row_x)
+    g_down = plus(scaled(g_v, offset), fy * inverse_z, g_row_y)
+    g_forward = plus(scaled(g_z, offset), -fx * inverse_z * clamped[0], g_row_x)
+    g_forward = plus(g_forward, -fy * inverse_z * clamped[1], g_row_y)
+    return g_offset, (g_right, g_down, g_forward), g_focal, g_principal
 
 
 def ellipse_rows(quat, scale, row_x, row_y):
@@ -204,14 +241,7 @@ def whitening(xy, var_y, det):
 
 
 def covariance_gradient(g_abc, g_det0, g_det, abc, mx, my, eps):
-    """Compute the gradients of the rows of M.
-
-    Args:
-        g_abc: gradients of `whitening`.
-        g_det0, g_det: gradients of both determinants from elsewhere.
-        abc: from `whitening`.
-        mx, my, eps: arguments of `covariance`.
-    """
+    """Compute the gradients of M's rows from those of `whitening` and both determinants."""
     _, _, yy, minors, _, det = covariance(mx, my, eps)
     var_y = yy + eps
     g_var_y = (g_abc[0] * abc[0] - g_abc[1] * abc[1] - g_abc[2] * abc[2]) / (2 * var_y)

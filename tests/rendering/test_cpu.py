@@ -1,4 +1,4 @@
-"""The CPU back end on other machines than this one, and beside other processes."""
+"""The CPU backend on other machines, and in forked processes."""
 
 import multiprocessing
 import os
@@ -44,7 +44,7 @@ def test_without_avx512_it_is_as_exact(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_forked_process_draws_too(make_scene):
-    """It has none of its parent's threads."""
+    """It does not inherit the threads of its parent."""
     gaussians, cameras = make_scene(dtype=torch.float32, views=4)
     expected = render(gaussians, cameras).image  # the pool of threads is there now
 

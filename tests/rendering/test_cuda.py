@@ -5,11 +5,11 @@ in a process that has it set: there, what is marked `kernel` runs on a CPU.
 """
 
 import os
-import subprocess
 import sys
 
 import pytest
 import torch
+from compiler import run_interpreted
 
 from asysplat.errors import InputError
 from asysplat.rendering import GSPLAT_1_5, Culling, cpu, reference
@@ -99,7 +99,7 @@ def test_images_and_gradients_are_those_of_the_reference(make_scene, name):
     assert max(grads) <= 5e-6
 
 
-# What shows that a skip found something to leave out.
+# The statistic that counts each kind of culling.
 GAINS = {
     "opacity": "culled_by_opacity",
     "frustum": "culled_by_frustum",
@@ -111,7 +111,7 @@ GAINS = {
 
 
 @kernel
-def test_skips_leave_the_bits(make_scene):
+def test_culling_keeps_the_bits(make_scene):
     gaussians, cameras = make_batch(make_scene, count=20, device=DEVICE)
     gaussians.scales.mul_(torch.tensor([9.0, 0.3, 0.3], device=DEVICE))
     gaussians.opacities[:, ::2] = 0.02
@@ -253,10 +253,4 @@ def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
 def test_kernels_in_the_interpreter():
     pytest.importorskip("triton")
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", __file__],
-        env={**os.environ, "TRITON_INTERPRET": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout
+    run_interpreted(__file__)

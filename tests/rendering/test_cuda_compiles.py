@@ -3,15 +3,14 @@ compiler may not."""
 
 import pytest
 import torch
+from compiler import compiled
 
 from asysplat.rendering import render
 
-triton = pytest.importorskip("triton")
+pytest.importorskip("triton")
 
 pytestmark = pytest.mark.medium
 
-TYPES = {torch.float32: "fp32", torch.float64: "fp64", torch.int16: "i16", torch.int32: "i32"}
-TYPES |= {torch.int64: "i64", torch.bool: "i1"}
 KERNELS = {
     "project",
     "list_tiles",
@@ -20,24 +19,6 @@ KERNELS = {
     "sum_pairs",
     "project_backward",
 }
-
-
-def compiled(kernel, arguments, architecture):
-    from triton.backends.compiler import GPUTarget
-    from triton.compiler import ASTSource
-
-    signature, constants = {}, {}
-    for parameter in kernel.params:
-        value = arguments.pop(parameter.name)
-        if parameter.is_constexpr or value is None:
-            constants[parameter.name] = value
-            signature[parameter.name] = "constexpr"
-        elif isinstance(value, torch.Tensor):
-            signature[parameter.name] = "*" + TYPES[value.dtype]
-        else:
-            signature[parameter.name] = "fp32" if isinstance(value, float) else "i32"
-    source = ASTSource(kernel, signature, constants)
-    return triton.compile(source, GPUTarget("cuda", architecture, 32), arguments)
 
 
 @pytest.fixture(params=[80, 90], ids="sm_{}".format)

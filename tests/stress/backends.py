@@ -1,4 +1,4 @@
-"""The backends under test, and what one makes of a scene: images, and gradients of every input."""
+"""The backends under test, and their images and gradients of every input for a scene."""
 
 import os
 from collections.abc import Callable
@@ -82,7 +82,7 @@ def both_ways(
 ) -> Result:
     """Render in the backend's float type, forward and backward.
 
-    `grad_output` gives the gradient of an output from its name and value; unless told a random one,
+    `grad_output` returns the gradient of an output from its name and value; the default is random,
     the same every time.
     """
     leaves = {name: getattr(gaussians, name) for name in FIELDS}
@@ -122,7 +122,7 @@ def assert_same_bits(one: Result, other: Result) -> None:
 def assert_close(
     backend: Backend, result: Result, exact: Result, slack: float = 1, names: tuple = INPUTS
 ) -> None:
-    """Outputs to the backend's image_error, the named gradients to its gradient_error."""
+    """Compare outputs to image_error and the named gradients to gradient_error of the backend."""
     for name, output in exact.outputs.items():
         bound = slack * backend.image_error * max(1, float(output.abs().amax()))
         assert max_error(result.outputs[name], output) <= bound, name
@@ -136,13 +136,13 @@ def max_error(value: Tensor, exact: Tensor) -> float:
 
 
 def relative_error(value: Tensor, exact: Tensor) -> float:
-    """L2; 0 where both are 0."""
+    """Compute the relative L2 error; 0 if both are 0."""
     difference = (value.double() - exact.double()).norm()
     return float(difference / exact.double().norm()) if difference > 0 else 0.0
 
 
 def assert_as_without(result: Result, clean: Result, gone: int) -> None:
-    """Gaussian `gone` left no trace: the others have the bits that they have without it."""
+    """Check that the others have the same bits as without Gaussian `gone`."""
     for name, output in clean.outputs.items():
         assert torch.equal(result.outputs[name], output), name
     for name, grad in clean.grads.items():
@@ -158,6 +158,6 @@ def assert_as_without(result: Result, clean: Result, gone: int) -> None:
 
 
 def facing(cameras: Cameras) -> Cameras:
-    """The cameras at the origin, looking along z, so that means are in their frame."""
+    """Move the cameras to the origin, facing along z, so that means are in their frame."""
     poses = torch.eye(4, dtype=cameras.cam_to_world.dtype).expand_as(cameras.cam_to_world)
     return replace(cameras, cam_to_world=poses.clone())

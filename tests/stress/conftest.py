@@ -11,5 +11,5 @@ def backend(request) -> Backend:
 
 @pytest.fixture(params=FAST, ids=str, scope="session")
 def fast_backend(request) -> Backend:
-    """One that is compared with the reference."""
+    """A backend that is compared with the reference."""
     return request.param

@@ -1,7 +1,7 @@
-"""Memory that nobody has written holds what is told, so that a kernel that trusts it is found out.
+"""Fill uninitialized memory, so that a kernel that reads it changes its results.
 
-Floats of torch and of NumPy on the host are NaN and their integers the largest; what malloc gives,
-and with it what kernels allocate, is filled with one byte.
+Floats of torch and of NumPy on the host become NaN and integers the largest; memory from malloc,
+also that of kernels, is filled with one byte.
 """
 
 import ctypes
@@ -24,7 +24,7 @@ FILLS = (0x7F, 0x80)
 
 @contextmanager
 def poisoned(fill: int | None) -> Iterator[None]:
-    """Fill fresh memory; None leaves it as it comes."""
+    """Fill uninitialized memory; None leaves it as it is."""
     if fill is None:
         yield
         return
@@ -44,7 +44,7 @@ def poisoned(fill: int | None) -> Iterator[None]:
 
 
 def perturb(byte: int) -> None:
-    """Have malloc fill what it gives; 0 for no longer."""
+    """Make malloc fill its memory with a byte; 0 stops that."""
     if not ctypes.CDLL(None).mallopt(M_PERTURB, byte):
         raise OSError("mallopt refuses M_PERTURB")
 

@@ -15,41 +15,25 @@ from poison import FILLS, poisoned
 from rich.progress import track
 from torch import Tensor
 
-from asysplat import Cameras, Gaussians, Views, render
+from asysplat import Gaussians, Views, render
 from asysplat.data import SceneOptions, open_scene
 from asysplat.data.normalize import normalize
 from asysplat.evaluation.metrics import psnr
-from asysplat.export import read_splat
+from asysplat.rendering.sh import SH_C0
 
 SIDE = 256  # pixels
 COUNT = 60_000
-MOST_VIEWS = 32
+MAX_VIEWS = 32
 SH_COUNT = 4
 RATES = {"means": 1e-3, "quats": 1e-2, "scales": 1e-2, "opacities": 3e-2, "sh": 1e-2}
 
 
 def photographs(scene: Path) -> Views:
-    """Views of a scene in the frame of networks; of a .splat file, renderings on a circle."""
-    if scene.suffix == ".splat":
-        return circle_around(read_splat(scene))
+    """Open views of a scene, in the frame of networks."""
     sequence = open_scene(scene, SceneOptions(SIDE, SIDE))
-    count = min(MOST_VIEWS, sequence.num_images)
+    count = min(MAX_VIEWS, sequence.num_images)
     views = sequence.views(np.linspace(0, sequence.num_images - 1, count).astype(int).tolist())
     return normalize(views, views)[0]
-
-
-def circle_around(gaussians: Gaussians, views: int = 16, radius: float = 1.6) -> Views:
-    """What cameras see that look at the origin from around it."""
-    angles = torch.linspace(0, 2 * torch.pi, views + 1)[:-1]
-    poses = torch.eye(4).repeat(views, 1, 1)
-    forward = torch.stack((-angles.sin(), torch.zeros(views), -angles.cos()), -1)
-    poses[:, :3, 2], poses[:, :3, 3] = forward, -radius * forward
-    poses[:, :3, 0] = torch.stack((-angles.cos(), torch.zeros(views), angles.sin()), -1)
-    poses[:, :3, 1] = torch.linalg.cross(poses[:, :3, 2], poses[:, :3, 0])
-    pinhole = torch.tensor([[1.2 * SIDE, 0, SIDE / 2], [0, 1.2 * SIDE, SIDE / 2], [0, 0, 1]])
-    cameras = Cameras(pinhole.repeat(views, 1, 1), poses, SIDE, SIDE)
-    with torch.no_grad():
-        return Views(cameras, render(gaussians, cameras).image.clamp(0, 1))
 
 
 def start(views: Views) -> dict[str, Tensor]:
@@ -63,7 +47,7 @@ def start(views: Views) -> dict[str, Tensor]:
     small = torch.nn.functional.adaptive_avg_pool2d(views.images, side)
     colors = small.permute(0, 2, 3, 1).reshape(-1, 1, 3)
     sh = torch.zeros(len(means), SH_COUNT, 3)
-    sh[:, :1] = (colors - 0.5) / 0.28209479177387814
+    sh[:, :1] = (colors - 0.5) / SH_C0
     fields = {
         "means": means,
         "quats": torch.randn(len(means), 4),

@@ -1,4 +1,4 @@
-"""Scenes without a jump: where finite differences hold, in every mode."""
+"""Scenes without a discontinuity, for finite differences in every mode."""
 
 from dataclasses import dataclass, field, replace
 

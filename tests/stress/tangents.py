@@ -1,4 +1,4 @@
-"""Scenes whose splats end where a tile begins, within what float32 can tell apart."""
+"""Scenes whose splats end where a tile begins, to within the precision of float32."""
 
 import math
 
@@ -18,9 +18,12 @@ BAND = 2e-5  # pixels
 def tangent_scene(
     count: int, height: int, width: int, seed: int = 0, tile: int = TILE
 ) -> tuple[Gaussians, Cameras]:
-    """Gaussians [N] of sigma 1 to 10 pixels and one camera. A quarter of their boxes touch a tile's
-    edge at the right, left, bottom or top each, give or take BAND, one in eight of them in both
-    directions; the field of view is so narrow that moving them changes no shape."""
+    """Make Gaussians [N] of sigma 1 to 10 pixels, whose boxes touch tile edges, and one camera.
+
+    A quarter of the boxes each end at a tile's right, left, bottom or top edge, give or take BAND,
+    one in eight of them in both directions. The field of view is so narrow that moving Gaussians
+    changes no shape.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> torch.Tensor:

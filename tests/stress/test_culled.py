@@ -1,4 +1,4 @@
-"""Gaussians that cannot be drawn leave no trace: cases 1, 2, 6, 9, 14 and 32."""
+"""Culled Gaussians do not change the others: cases 1, 2, 6, 9, 14 and 32."""
 
 import math
 from dataclasses import replace
@@ -23,12 +23,12 @@ NAN, INF = math.nan, math.inf
 
 @pytest.fixture(scope="session")
 def make_scene(make_scene):
-    """Triton's interpreter takes as long as there are tiles: here an image has two of them."""
+    """Two tiles an image for Triton's interpreter, whose time is proportional to them."""
     return partial(make_scene, height=7, width=9) if INTERPRETED else make_scene
 
 
 def spoiled(make_scene, **values):
-    """A scene of which Gaussian 3 has these fields, the same without it, and the cameras."""
+    """Return a scene whose Gaussian 3 has these values, the scene without it, and the cameras."""
     gaussians, cameras = make_scene(views=2, dtype=torch.float32)
     clean = gaussians.keep(torch.arange(12) != 3)
     for name, value in values.items():
@@ -60,7 +60,7 @@ def test_case_01_no_depth_is_culled(backend, make_scene, mean):
 
 @pytest.mark.parametrize("value", [NAN, INF, -INF], ids=str)
 @pytest.mark.parametrize("name", FIELDS)
-def test_case_02_one_number_that_is_none(backend, make_scene, name, value):
+def test_case_02_one_non_finite_number(backend, make_scene, name, value):
     gaussians, clean, cameras = spoiled(make_scene)
     getattr(gaussians, name)[3].view(-1)[-1] = value
     with pytest.raises(InputError, match=rf"{name}\[3\] holds NaN or infinity"):
@@ -139,7 +139,7 @@ POISON = {
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("poison", POISON)
 def test_case_32_poison_in_any_slot(backend, make_scene, poison, name):
-    """Every number of one Gaussian in turn, each in a scene of a batch."""
+    """Poison each number of one Gaussian, each in a scene of a batch."""
     gaussians, clean, cameras = spoiled(make_scene)
     slots = getattr(gaussians, name)[3].numel()
     scenes = repeated(gaussians, slots)
@@ -159,5 +159,5 @@ def test_case_32_poison_in_any_slot(backend, make_scene, poison, name):
 
 
 def repeated(record, count):
-    """A batch of the same."""
+    """Return a batch of copies."""
     return record.map(lambda t: t.expand(count, *t.shape).clone())

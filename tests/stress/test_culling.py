@@ -1,4 +1,4 @@
-"""Work that is skipped is not missed: without each skip the same bits, and a gain to show."""
+"""Exact culling: the same bits without each kind, and every kind saves work."""
 
 from dataclasses import fields
 
@@ -11,7 +11,7 @@ from asysplat.rendering import Culling
 
 
 def needles():
-    """Faint, opaque and long: something for every skip to do."""
+    """Faint, opaque and long: work for every kind of culling."""
     gaussians, cameras = random_scene(1500, 96, 128)
     gaussians.scales[:, 0] *= 6
     gaussians.opacities[::5] = 1e-3
@@ -24,7 +24,7 @@ SCENES = {"needles": needles, "pixel-aligned": lambda: pixel_aligned_scene(40, 9
 NAMES = [field.name for field in fields(Culling)]
 MASKS = torch.ones(1, 96, 128, dtype=torch.bool)
 MASKS[:, :40, 20:100] = False
-# What each skip saves, from the statistics with it and without it.
+# The work that each kind saves, from the statistics with it and without it.
 GAINS = {
     "opacity": lambda with_it, _: with_it["culled_by_opacity"],
     "frustum": lambda with_it, _: with_it["culled_by_frustum"],
@@ -41,7 +41,7 @@ GAINS = {
 @pytest.mark.parametrize("options", [{}, {"depth": "median", "antialiased": True}], ids=str)
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("name", NAMES)
-def test_without_a_skip_all_bits_are_the_same(fast_backend, name, scene, options):
+def test_bits_are_the_same_without_one_kind(fast_backend, name, scene, options):
     gaussians, cameras = SCENES[scene]()
     options = {"masks": MASKS, **options}
     plain = both_ways(fast_backend, gaussians, cameras, **options)
@@ -50,7 +50,7 @@ def test_without_a_skip_all_bits_are_the_same(fast_backend, name, scene, options
     assert_same_bits(both_ways(fast_backend, gaussians, cameras, culling=culling, **options), plain)
 
 
-def test_without_all_skips_all_bits_are_the_same(fast_backend):
+def test_bits_are_the_same_without_any_culling(fast_backend):
     gaussians, cameras = needles()
     none = Culling(**dict.fromkeys(NAMES, False))
     result = both_ways(fast_backend, gaussians, cameras, masks=MASKS, culling=none)
@@ -58,7 +58,7 @@ def test_without_all_skips_all_bits_are_the_same(fast_backend):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_skip_has_a_gain_and_it_is_counted(fast_backend, name):
+def test_each_kind_saves_work_and_counts_it(fast_backend, name):
     gaussians, cameras = needles()
     culling = Culling().disable(name)
     with_it = both_ways(fast_backend, gaussians, cameras, masks=MASKS).stats

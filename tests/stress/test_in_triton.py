@@ -1,17 +1,16 @@
-"""Cases once more, in a process in which Triton interprets the kernels of "cuda".
+"""Run some cases again, in a process in which Triton interprets the kernels of "cuda".
 
-The interpreter is slow: here are some of each kind. All: TRITON_INTERPRET=1 pytest tests/stress
+The interpreter is slow, so these are some of each kind. All of them:
+TRITON_INTERPRET=1 pytest tests/stress
 """
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from backends import INTERPRETED
+from compiler import run_interpreted
 
-# What is left of each file, as pytest's -k says it.
+# The cases of each file, as an expression of pytest's -k.
 SOME = {
     "bad_input": "",
     "boundary_band": "random and depth",
@@ -23,13 +22,13 @@ SOME = {
     "needles": "1e6",
     "opacities": "not gsplat",
     "places": "not case_12 and not case_13 or 1e+06 or 0.01",
-    "properties": "permutation or cropping",
+    "properties": "cropping",
     "sizes": "case_15 and not 4096",
     "threads_and_order": "equal_depths",
 }
 
 
-# Two processes, of which each takes a minute.
+# Two processes, of a minute each.
 HALVES = [list(SOME)[:3], list(SOME)[3:]]
 
 
@@ -40,11 +39,4 @@ def test_cases_in_the_interpreter(names):
     pytest.importorskip("triton")
     paths = [str(Path(__file__).with_name(f"test_{name}.py")) for name in names]
     some = [f"test_{name}.py and ({SOME[name] or 'test'})" for name in names]
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *paths]
-    done = subprocess.run(
-        [*command, "-k", " or ".join(some)],
-        env={**os.environ, "TRITON_INTERPRET": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout
+    run_interpreted(*paths, "-k", " or ".join(some))

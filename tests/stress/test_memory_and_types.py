@@ -1,4 +1,4 @@
-"""Poisoned buffers, types, strides, and what is not asked for: cases 24, 28 and 30."""
+"""Poisoned buffers, types, strides, and unused outputs: cases 24, 28 and 30."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from asysplat.scene import Gaussians
 
 @pytest.fixture
 def poisoned_memory(monkeypatch):
-    """Memory that nobody has written holds NaN, or 99 in integers."""
+    """Uninitialized memory holds NaN, or 99 in integers."""
 
     def poisoned(shape, dtype=float, **options):
         array = allocate(shape, dtype, **options)
@@ -40,7 +40,7 @@ def test_case_24_every_element_is_written(backend, make_scene, request, depth):
 @pytest.mark.parametrize("autocast", [None, torch.bfloat16, torch.float16], ids=str)
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64], ids=str)
 def test_case_28_types(backend, make_scene, dtype, autocast):
-    """Computed in float32 at least; gradients in the inputs' type."""
+    """Computation in float32 at least, gradients in the inputs' type."""
     gaussians, cameras = make_scene(views=2, dtype=dtype)
     background = BACKGROUND.to(dtype, copy=True)
     leaves = [getattr(gaussians, name) for name in FIELDS]

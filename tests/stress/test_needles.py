@@ -4,51 +4,12 @@ float32."""
 import pytest
 import torch
 from backends import EXACT, INTERPRETED
-from torch import Tensor
+from textbook import textbook_alphas
 
 from asysplat.rendering import INRIA, render
 from asysplat.scene import Cameras, Gaussians
 
 COUNT, SIZE = 20 if INTERPRETED else 150, 32
-
-
-def naive_alphas(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """[M, H, W] of M scenes of one Gaussian: world to camera by a matrix, the covariance inverted
-    by its determinant xx yy - xy^2, the exponent -(A dx^2 + C dy^2) / 2 - B dx dy; all float32."""
-    to_camera = torch.linalg.inv(cameras.cam_to_world[:, 0])
-    means = gaussians.means[:, 0]
-    homogeneous = torch.cat((means, torch.ones_like(means[:, :1])), -1)
-    x, y, z = (to_camera @ homogeneous[..., None]).squeeze(-1)[:, :3].unbind(-1)
-    fx, fy = cameras.intrinsics[:, 0, 0, 0], cameras.intrinsics[:, 0, 1, 1]
-    cx, cy = cameras.intrinsics[:, 0, 0, 2], cameras.intrinsics[:, 0, 1, 2]
-    w, i, j, k = torch.nn.functional.normalize(gaussians.quats[:, 0], dim=-1).unbind(-1)
-    rotation = torch.stack(
-        (
-            *(1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)),
-            *(2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i)),
-            *(2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j)),
-        ),
-        -1,
-    ).unflatten(-1, (3, 3))
-    spread = rotation * gaussians.scales
-    covariance = spread @ spread.mT
-    margin = INRIA.frustum_margin * SIZE
-    tx = torch.clamp(x / z, (-cx - margin) / fx, (SIZE - cx + margin) / fx)
-    ty = torch.clamp(y / z, (-cy - margin) / fy, (SIZE - cy + margin) / fy)
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack((fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z), -1)
-    jacobian = jacobian.unflatten(-1, (2, 3)) @ to_camera[:, :3, :3]
-    projected = jacobian @ covariance @ jacobian.mT
-    xx, xy = projected[:, 0, 0] + INRIA.eps2d, projected[:, 0, 1]
-    yy = projected[:, 1, 1] + INRIA.eps2d
-    det = xx * yy - xy * xy
-    a, b, c = (t[:, None, None] for t in (yy / det, -xy / det, xx / det))
-    pixel = torch.arange(SIZE) + 0.5
-    dx = (pixel - (fx * x / z + cx)[:, None])[:, None, :]
-    dy = (pixel - (fy * y / z + cy)[:, None])[:, :, None]
-    power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
-    alpha = (gaussians.opacities[:, :, None] * power.exp()).clamp(max=INRIA.alpha_max)
-    return torch.where((power <= 0) & (alpha >= INRIA.alpha_min), alpha, 0)
 
 
 def one_each(longest: float, offset: float) -> tuple[Gaussians, Cameras]:
@@ -99,7 +60,7 @@ def test_alpha_is_40_times_nearer_than_by_the_textbook(fast_backend, longest, of
     gaussians, cameras = one_each(longest, offset)
     exact = render(gaussians.to(EXACT.dtype), cameras.to(EXACT.dtype)).alpha[:, 0]
     alpha = render(gaussians, cameras, backend=fast_backend.name).alpha[:, 0]
-    naive = naive_alphas(gaussians, cameras)
+    naive, _ = textbook_alphas(gaussians, cameras)
     # Where one of them shows, and not within rounding of the cut-off.
     seen = (exact > 1.001 * INRIA.alpha_min) | (naive > 1.001 * INRIA.alpha_min)
     seen &= (exact == 0) | (exact > 1.001 * INRIA.alpha_min)

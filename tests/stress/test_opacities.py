@@ -10,6 +10,7 @@ from backends import EXACT, assert_close, both_ways, random_gradient
 from asysplat.benchmark.scenes import random_scene
 from asysplat.errors import InputError
 from asysplat.rendering import CONVENTIONS, INRIA, render
+from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Cameras, Gaussians
 
 CENTER = (4, 5)  # of the pixel that the stack stands at
@@ -101,7 +102,6 @@ def test_case_23_both_passes_take_identical_decisions(backend):
         return signs if name == "image" else torch.zeros_like(output)
 
     result = both_ways(backend, gaussians, cameras, torch.zeros(3), grad_output, depth=False)
-    dc = 0.5 / math.sqrt(math.pi)
-    by_colors = (result.grads["sh"].double() * (gaussians.sh.double() + 0.5 / dc)).sum()
+    by_colors = (result.grads["sh"].double() * (gaussians.sh.double() + 0.5 / SH_C0)).sum()
     by_image = (result.image.double() * grad_output("image", result.image)).sum()
     assert abs(float(by_colors - by_image)) < 0.1 / 255

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-SCENES = ("fern", "fox", "mydesk", "hololens-000", "splats/plant.splat")
+SCENES = ("fern", "fox", "mydesk", "hololens-000")
 CHECKS = {"NUMBA_BOUNDSCHECK": "1"}
 POISON = {"GLIBC_TUNABLES": "glibc.malloc.perturb=128"}
 

@@ -50,7 +50,7 @@ def test_ten_renderings_of_a_dense_scene_are_the_same(threads):
 
 
 def test_case_27_equal_depths_are_drawn_by_index(backend, make_scene):
-    """Copies at one place: over one another as two images are, the first in front."""
+    """Copies at one place composite like separate images, the first in front."""
     gaussians, cameras = make_scene(count=1, dtype=torch.float32)
     gaussians = gaussians.map(lambda t: t.repeat(3, *(1,) * (t.ndim - 1)))
     gaussians.sh[:] = torch.randn(3, 4, 3)

@@ -14,7 +14,7 @@ from asysplat.ops.simd.threads import even_bounds, run_blocks, weighted_bounds
 from asysplat.rendering.cpu import project as projection
 from asysplat.rendering.cpu import rasterize as raster
 from asysplat.rendering.cpu.project import Projected, project
-from asysplat.rendering.cpu.project_backward import Needs, Pairs, project_backward
+from asysplat.rendering.cpu.project_backward import project_backward
 from asysplat.rendering.cpu.rasterize import (
     BlendedDepth,
     Gradients,
@@ -112,8 +112,8 @@ class _Passes(torch.autograd.Function):
         tiles = weighted_bounds(lists.first_entry)
         run_blocks(rasterize_backward, tiles, lists, frame, saved, grads, *depths)
         inputs = _inputs(tensors, ctx.size, ctx.settings)
-        needs = Needs(sh=ctx.needs_input_grad[8], cameras=any(ctx.needs_input_grad[9:]))
-        pairs = Pairs(lists.first_pair, grads.pairs)
+        needs = (ctx.needs_input_grad[8], any(ctx.needs_input_grad[9:]))
+        pairs = (lists.first_pair, grads.pairs)
         return (None,) * 4 + _project_backward(frame, inputs, needs, pairs, tensors)
 
 
@@ -249,21 +249,25 @@ def _rasterize(
 
 
 def _project_backward(
-    frame: Frame, inputs: Inputs, needs: Needs, pairs: Pairs, tensors: Sequence[Tensor]
+    frame: Frame,
+    inputs: Inputs,
+    needs: tuple[bool, bool],
+    pairs: tuple[np.ndarray, np.ndarray],
+    tensors: Sequence[Tensor],
 ) -> tuple[Tensor | None, ...]:
     """Compute the gradients of `tensors`: the fields of Gaussians, poses and intrinsics."""
     *fields, cam_to_world, intrinsics = tensors
     field_grads = [_empty_like(field) for field in fields[:4]]
-    field_grads.append(_empty_like(fields[4] if needs.sh else fields[4][:0]))
+    field_grads.append(_empty_like(fields[4] if needs[0] else fields[4][:0]))
     camera_grads = np.empty((frame.images, frame.blocks, CAMERA_GRADIENT))
     grads = Inputs(*(_array(grad) for grad in field_grads), cameras=camera_grads)
     flat = inputs._replace(quats=inputs.quats.reshape(-1), scales=inputs.scales.reshape(-1))
     blocks = even_bounds(frame.images // frame.views * frame.blocks)
-    run_blocks(project_backward, blocks, flat, frame, needs, pairs, grads)
-    if not needs.sh:
+    run_blocks(project_backward, blocks, flat, frame, *pairs, needs, grads)
+    if not needs[0]:
         field_grads[-1] = None
     poses = (None, None)
-    if needs.cameras:
+    if needs[1]:
         rows = torch.from_numpy(camera_grads.sum(1))
         poses = camera_gradients(rows, cam_to_world, intrinsics)
     return (*field_grads, *poses)

@@ -4,7 +4,6 @@ Both projection passes share it; all of it is in float64.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -20,17 +19,13 @@ SQRT_2, TWO_OVER_LN_2 = math.sqrt(2), 2 / math.log(2)
 sqrt = math.sqrt
 
 
-@inline
-def clamp(value, low, high):
-    """Limit `value` to [low, high]; NaN stays."""
-    return low if value < low else high if value > high else value
-
-
 def inline_formula(formula):
     """Compile a shared formula into each kernel that calls it."""
     return inline(formulas.bind(formula, globals()))
 
 
+clamp = inline_formula(formulas.clamp)
+select = inline_formula(formulas.select)
 dot = inline_formula(formulas.dot)
 cross = inline_formula(formulas.cross)
 scaled = inline_formula(formulas.scaled)
@@ -39,6 +34,7 @@ times = inline_formula(formulas.times)
 rotation_columns = inline_formula(formulas.rotation_columns)
 rotation_gradient = inline_formula(formulas.rotation_gradient)
 project_mean = inline_formula(formulas.project_mean)
+project_mean_gradient = inline_formula(formulas.project_mean_gradient)
 ellipse_rows = inline_formula(formulas.ellipse_rows)
 ellipse_rows_gradient = inline_formula(formulas.ellipse_rows_gradient)
 covariance = inline_formula(formulas.covariance)
@@ -67,34 +63,15 @@ def unit_quaternion(quats, start):
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
 
-class Camera(NamedTuple):
-    """A row of `camera_rows`; axes are right, down and forward, limits those of the tangents."""
-
-    axes: tuple[tuple[float, float, float], ...]
-    center: tuple[float, float, float]
-    focal: tuple[float, float]
-    principal: tuple[float, float]
-    limits: tuple[tuple[float, float], ...]
-
-
 @inline
 def load_camera(cameras, image):
-    """Read the camera of an image."""
+    """Read axes (right, down, forward), center, focal lengths, limits and principal point."""
     row = cameras[image]
-    return Camera(
-        axes=(
-            triple(row, formulas.RIGHT),
-            triple(row, formulas.DOWN),
-            triple(row, formulas.FORWARD),
-        ),
-        center=triple(row, formulas.CENTER),
-        focal=(row[formulas.FX], row[formulas.FY]),
-        principal=(row[formulas.CX], row[formulas.CY]),
-        limits=(
-            (row[formulas.LOW_X], row[formulas.HIGH_X]),
-            (row[formulas.LOW_Y], row[formulas.HIGH_Y]),
-        ),
-    )
+    axes = (triple(row, formulas.RIGHT), triple(row, formulas.DOWN), triple(row, formulas.FORWARD))
+    focal, principal = (row[formulas.FX], row[formulas.FY]), (row[formulas.CX], row[formulas.CY])
+    limits_x = (row[formulas.LOW_X], row[formulas.HIGH_X])
+    limits_y = (row[formulas.LOW_Y], row[formulas.HIGH_Y])
+    return axes, triple(row, formulas.CENTER), focal, (limits_x, limits_y), principal
 
 
 @inline

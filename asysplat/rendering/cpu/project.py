@@ -68,16 +68,9 @@ class _Batch(NamedTuple):
 
 @kernel
 def project(start, stop, inputs, frame, out):
-    """Compute the splats of blocks start to stop, and the tiles that they touch.
+    """Compute the splats of blocks start to stop, numbered image by image, and their tiles.
 
-    Args:
-        start, stop: blocks, numbered image by image.
-        inputs: `Inputs` of float32 or float64.
-        frame: sizes and settings.
-        out: `Projected`, written.
-
-    Returns:
-        [pairs of these blocks] int32, the tile of each pair, splat by splat; see `list_tiles`.
+    Return the tile of each pair of these blocks, int32, splat by splat; see `list_tiles`.
     """
     settings = frame.project
     splats, counts = out.splats, out.counts
@@ -145,10 +138,7 @@ def _grow(array, size, min_opacity):
 
 @inline
 def _gather(inputs, g, length, min_opacity, batch):
-    """Copy the Gaussians with an opacity of at least `min_opacity`, of `length`, into the batch.
-
-    Return their number.
-    """
+    """Copy Gaussians of at least `min_opacity` into the batch; return their number."""
     size = 0
     for i in range(length):
         if inputs.opacities[g + i] < min_opacity:
@@ -170,10 +160,11 @@ def _project_batch(count, batch, camera, frame, ellipses):
     settings = frame.project
     opacities = batch.opacities
     alpha_min, eps = settings.alpha_min, settings.eps2d
+    axes, center, focal, limits, principal = camera
     edge = 0.5 - PIXEL_MARGIN
     for i in range(count):
         _, z, _, tangents, _, row_x, row_y = project_mean(
-            triple(batch.means, 3 * i), camera.axes, camera.center, camera.focal, camera.limits
+            triple(batch.means, 3 * i), axes, center, focal, limits
         )
         quat, scale = unit_quaternion(batch.quats, 4 * i), triple(batch.scales, 3 * i)
         mx, my, _, _ = ellipse_rows(quat, scale, row_x, row_y)
@@ -182,8 +173,8 @@ def _project_batch(count, batch, camera, frame, ellipses):
         opacity = float(opacities[i])
         if settings.antialiased:
             opacity *= compensation(det0, det, settings.compensation_min)
-        x = tangents[0] * camera.focal[0] + camera.principal[0]
-        y = tangents[1] * camera.focal[1] + camera.principal[1]
+        x = tangents[0] * focal[0] + principal[0]
+        y = tangents[1] * focal[1] + principal[1]
         log_opacity = log2(opacity)
         room = (log_opacity if settings.cull_extent else 0.0) - settings.log_alpha_min
         deviations = math.sqrt(max(room + EXPONENT_MARGIN, 0.0)) / WHITEN_TO_LOG2

@@ -1,7 +1,6 @@
 """Compute gradients of Gaussians and cameras from those of their splats, in float64."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from asysplat.rendering.cpu.math import (
     load_camera,
     plus,
     project_mean,
+    project_mean_gradient,
     scaled,
     sh_basis_gradient,
     triple,
@@ -42,56 +42,20 @@ MEAN, QUAT, SCALE, SH = 0, 3, 7, 10
 SUMS = SH + 3 * 16
 
 
-class Pairs(NamedTuple):
-    """Gradients of all pairs of splat and tile.
-
-    first [images * N + 1] index of each splat's first pair, and the number of pairs; grads
-    [pairs, 10], see `splat`.
-    """
-
-    first: np.ndarray
-    grads: np.ndarray
-
-
-class Needs(NamedTuple):
-    """Whether SH and cameras require gradients."""
-
-    sh: bool
-    cameras: bool
-
-
-class _Scratch(NamedTuple):
-    """Buffers for one Gaussian.
-
-    sums [58] its gradient over all views, see MEAN; basis [16] the SH functions in its direction,
-    and g_basis [16] their gradients.
-    """
-
-    sums: np.ndarray
-    basis: np.ndarray
-    g_basis: np.ndarray
-
-
 @kernel
-def project_backward(start, stop, inputs, frame, needs, pairs, grads):
-    """Compute the gradients of blocks start to stop of the scenes' Gaussians.
+def project_backward(start, stop, inputs, frame, first_pair, pair_grads, needs, grads):
+    """Compute the gradients of blocks start to stop of the Gaussians, numbered scene by scene.
 
-    Args:
-        start, stop: blocks, numbered scene by scene.
-        inputs: `Inputs`, as for `project`, but with flat quats and scales.
-        frame: sizes and settings.
-        needs: which gradients beside those of the Gaussians' other fields are required.
-        pairs: gradients of the pairs of splat and tile.
-        grads: `Inputs` to write, float32 or float64: every element of the fields, SH if required;
-            cameras [images, blocks, 16] float64, the part of each block.
+    inputs have flat quats and scales; needs says whether SH and cameras require gradients. Every
+    element of the fields in `grads`, float32 or float64, is written, SH only if required; cameras
+    [images, blocks, 16] float64 get the part of each block.
     """
     blocks, num = frame.blocks, frame.num
     count = inputs.sh.shape[1]
     splat_grads = np.empty(GRADIENT)
-    first_pair, pair_grads = pairs
     grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, grad_cameras = grads
-    scratch = _Scratch(np.empty(SUMS), np.empty(16), np.empty(16))
-    sums = scratch.sums
+    sums, basis, g_basis = np.empty(SUMS), np.empty(16), np.empty(16)
+    scratch = (sums, basis, g_basis)
     for index in range(start, stop):
         scene, block = index // blocks, index % blocks
         for view in range(frame.views):
@@ -118,7 +82,7 @@ def project_backward(start, stop, inputs, frame, needs, pairs, grads):
                 grad_means[g, k], grad_scales[g, k] = sums[MEAN + k], sums[SCALE + k]
             for k in range(4):
                 grad_quats[g, k] = sums[QUAT + k]
-            if needs.sh:
+            if needs[0]:
                 for k in range(count):
                     for channel in range(3):
                         grad_sh[g, k, channel] = sums[SH + 3 * k + channel]
@@ -141,29 +105,15 @@ def _add3(out, start, factor, values):
 
 @inline
 def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera):
-    """Add a splat's part to the sums and to the camera's gradient; return the opacity's gradient.
-
-    Args:
-        g: the Gaussian.
-        image: the image of the splat.
-        inputs: with flat quats and scales.
-        settings: of the projection.
-        needs: which gradients are required.
-        splat_grads: [10] of the splat.
-        scratch: buffers, with the sums to add to.
-        g_camera: [16].
-    """
+    """Add the part of Gaussian g's splat in an image to the sums; return the opacity's gradient."""
     eps = settings.eps2d
     sums, basis, g_basis = scratch
-    camera = load_camera(inputs.cameras, image)
-    axes = camera.axes
-    right, down, forward = axes
-    fx, fy = camera.focal
+    axes, center, focal, limits, _ = load_camera(inputs.cameras, image)
 
     # Repeat the forward pass.
     mean = triple(inputs.means[g], 0)
     offset, _, inverse_z, tangents, clamped, row_x, row_y = project_mean(
-        mean, axes, camera.center, (fx, fy), camera.limits
+        mean, axes, center, focal, limits
     )
     quat, scale = unit_quaternion(inputs.quats, 4 * g), triple(inputs.scales, 3 * g)
     mx, my, _, _ = ellipse_rows(quat, scale, row_x, row_y)
@@ -187,29 +137,12 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
     for k in range(4):
         sums[QUAT + k] += g_quat[k]
 
-    # The Jacobian's rows and the center.
-    g_x, g_y = LOG_2 * splat_grads[G_X], LOG_2 * splat_grads[G_Y]
-    g_z = splat_grads[G_DEPTH]
-    g_z -= inverse_z * (dot(row_x, g_row_x) + dot(row_y, g_row_y))
-    g_fx = g_x * tangents[0] + dot(row_x, g_row_x) / fx
-    g_fy = g_y * tangents[1] + dot(row_y, g_row_y) / fy
-    g_cx, g_cy = g_x, g_y
-    g_clamped_x = -fx * inverse_z * dot(forward, g_row_x)
-    g_clamped_y = -fy * inverse_z * dot(forward, g_row_y)
-    g_tangent_x, g_tangent_y = g_x * fx, g_y * fy
-    if clamped[0] == tangents[0]:
-        g_tangent_x += g_clamped_x
-    else:  # the limit is (constant - cx) / fx
-        g_cx -= g_clamped_x / fx
-        g_fx -= g_clamped_x * clamped[0] / fx
-    if clamped[1] == tangents[1]:
-        g_tangent_y += g_clamped_y
-    else:
-        g_cy -= g_clamped_y / fy
-        g_fy -= g_clamped_y * clamped[1] / fy
-    g_z -= inverse_z * (g_tangent_x * tangents[0] + g_tangent_y * tangents[1])
-    g_u, g_v = g_tangent_x * inverse_z, g_tangent_y * inverse_z
-    g_offset = plus(plus(scaled(g_u, right), g_v, down), g_z, forward)
+    # The Jacobian's rows, and center and depth.
+    g_xyz = (LOG_2 * splat_grads[G_X], LOG_2 * splat_grads[G_Y], splat_grads[G_DEPTH])
+    projected = (offset, inverse_z, tangents, clamped)
+    g_offset, g_axes, g_focal, g_principal = project_mean_gradient(
+        g_xyz, (g_row_x, g_row_y), (row_x, row_y), projected, axes, focal
+    )
 
     # Color.
     square = dot(offset, offset)
@@ -226,7 +159,7 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
         if color > 0:
             g_color = splat_grads[G_RED + channel]
             for k in range(count):
-                if needs.sh:
+                if needs[0]:
                     sums[SH + 3 * k + channel] += basis[k] * g_color
                 g_basis[k] += float(sh[g, k, channel]) * g_color
     g_direction = sh_basis_gradient(direction[0], direction[1], direction[2], count, g_basis)
@@ -235,14 +168,13 @@ def _add_splat(g, image, inputs, settings, needs, splat_grads, scratch, g_camera
         g_offset = plus(g_offset, -dot(direction, g_direction) / length, direction)
 
     _add3(sums, MEAN, 1.0, g_offset)
-    if needs.cameras:
-        _add3(g_camera, RIGHT, 1.0, plus(scaled(g_u, offset), fx * inverse_z, g_row_x))
-        _add3(g_camera, DOWN, 1.0, plus(scaled(g_v, offset), fy * inverse_z, g_row_y))
-        through_x = plus(scaled(g_z, offset), -fx * inverse_z * clamped[0], g_row_x)
-        _add3(g_camera, FORWARD, 1.0, plus(through_x, -fy * inverse_z * clamped[1], g_row_y))
+    if needs[1]:
+        _add3(g_camera, RIGHT, 1.0, g_axes[0])
+        _add3(g_camera, DOWN, 1.0, g_axes[1])
+        _add3(g_camera, FORWARD, 1.0, g_axes[2])
         _add3(g_camera, CENTER, -1.0, g_offset)
-        g_camera[FX] += g_fx
-        g_camera[FY] += g_fy
-        g_camera[CX] += g_cx
-        g_camera[CY] += g_cy
+        g_camera[FX] += g_focal[0]
+        g_camera[FY] += g_focal[1]
+        g_camera[CX] += g_principal[0]
+        g_camera[CY] += g_principal[1]
     return g_opacity

@@ -166,14 +166,9 @@ def draw_row(state, row, rank, splat, settings, blended, median):
 
 @kernel
 def rasterize(start, stop, lists, frame, images, saved, blended, median):
-    """Sort and draw tiles start to stop.
+    """Sort and draw tiles start to stop, numbered image by image.
 
-    Args:
-        start, stop: tiles, numbered image by image.
-        lists: `Lists`, whose entries are sorted by depth in place.
-        frame: sizes and settings.
-        images, saved: `Images` and `Saved`; every element is written.
-        blended, median: `BlendedDepth` and `MedianDepth` to write, or None.
+    Every element of `images`, `saved` and, unless None, of `blended` and `median` is written.
     """
     settings = frame.raster
     splats, first_entry, entries = lists.splats, lists.first_entry, lists.entries
@@ -282,11 +277,7 @@ def draw_row_backward(state, row, rank, splat, settings, blended, median):
 def rasterize_backward(start, stop, lists, frame, saved, grads, blended, median):
     """Compute the gradients of every pair in tiles start to stop.
 
-    Args:
-        start, stop: tiles, numbered image by image.
-        lists, frame, saved: from `rasterize`.
-        grads: `Gradients`; its pairs are written.
-        blended, median: the gradient of the depth, with the other field from `rasterize`, or None.
+    blended and median hold the gradient of the depth, and the other field from `rasterize`.
     """
     settings = frame.raster
     splats, first_entry, entries = lists.splats, lists.first_entry, lists.entries

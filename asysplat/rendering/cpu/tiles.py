@@ -83,18 +83,9 @@ def row_span(ellipse, row, frame):
 
 @inline
 def list_tiles(ellipse, box, frame, histogram, tiles, start):
-    """Write the tiles of a splat from tiles[start] on, row by row, and add them to the histogram.
+    """Write the tiles of a splat from tiles[start] on, row by row, and count them in the histogram.
 
-    Args:
-        ellipse: the splat's.
-        box: see `compute_box`.
-        frame: sizes and settings.
-        histogram: [tiles of an image] to add to.
-        tiles: array with space for all tiles of the box.
-        start: index to write at.
-
-    Returns:
-        The number of tiles.
+    Return their number, at most that of its box.
     """
     first_row, last_row, left, right = box[0], box[1], box[2], box[3]
     # The ellipse touches every tile of a box of one row or one column.
@@ -115,10 +106,7 @@ def list_tiles(ellipse, box, frame, histogram, tiles, start):
 
 @kernel
 def start_positions(start, stop, histograms, first_entry, positions):
-    """Convert the counts [images, blocks, tiles] of images start to stop to first positions.
-
-    first_entry: [images * tiles] start of each tile's list.
-    """
+    """Convert counts to first positions, [images, blocks, tiles], of images start to stop."""
     blocks, tiles = histograms.shape[1:]
     for image in range(start, stop):
         for tile in range(tiles):
@@ -132,13 +120,8 @@ def start_positions(start, stop, histograms, first_entry, positions):
 def scatter_pairs(start, stop, tiles, first_pair, positions, frame, entries):
     """Write every pair of splat and tile of blocks start to stop into the lists.
 
-    Args:
-        start, stop: blocks, numbered image by image.
-        tiles: [pairs] the tile of each pair, within its image.
-        first_pair: [images * N + 1], see `Lists`.
-        positions: [images, blocks, tiles] index of a block's next entry of a tile.
-        frame: the sizes.
-        entries: [pairs, 2], see `Lists`; written.
+    tiles [pairs] is the tile of each pair, within its image; positions [images, blocks, tiles] the
+    index of a block's next entry of a tile; entries [pairs, 2], see `Lists`, is written.
     """
     for index in range(start, stop):
         image, block = index // frame.blocks, index % frame.blocks
@@ -154,13 +137,10 @@ def scatter_pairs(start, stop, tiles, first_pair, positions, frame, entries):
 
 @inline
 def sort_by_depth(lists, start, stop, keys, scratch, counts):
-    """Sort entries[start:stop] by the exact depth, then by Gaussian; stable.
+    """Sort entries[start:stop] of a tile by the exact depth, then by Gaussian; stable.
 
-    Args:
-        lists: with the splats; depths are positive, so that their bits sort alike.
-        start, stop: the list of one tile.
-        keys, scratch: [2, m] and [2, m, 2], m >= stop - start.
-        counts: [DIGITS, RADIX].
+    Depths are positive, so that their bits sort alike. keys [2, m] and scratch [2, m, 2] have
+    m >= stop - start; counts is [DIGITS, RADIX].
     """
     entries, splats = lists.entries, lists.splats
     length = stop - start

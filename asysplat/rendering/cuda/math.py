@@ -38,6 +38,12 @@ def clamp(value, low, high):
     return tl.where(value < low, low, tl.where(value > high, high, value))
 
 
+@kernel
+def select(condition, yes, no):
+    """Return `yes` where the condition holds, else `no`."""
+    return tl.where(condition, yes, no)
+
+
 def compile_formula(formula: Callable) -> Callable:
     """Compile a shared formula with the functions of this module."""
     return kernel(formulas.bind(formula, globals()))
@@ -51,6 +57,7 @@ times = compile_formula(formulas.times)
 rotation_columns = compile_formula(formulas.rotation_columns)
 rotation_gradient = compile_formula(formulas.rotation_gradient)
 project_mean = compile_formula(formulas.project_mean)
+project_mean_gradient = compile_formula(formulas.project_mean_gradient)
 ellipse_rows = compile_formula(formulas.ellipse_rows)
 ellipse_rows_gradient = compile_formula(formulas.ellipse_rows_gradient)
 covariance = compile_formula(formulas.covariance)

@@ -57,16 +57,9 @@ def project(
     COUNT: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Compute the splats of BLOCK Gaussians in one image.
+    """Compute the splats of BLOCK Gaussians in one image; see `cpu.project.project`.
 
-    Args:
-        means, quats, scales, opacities, sh, cameras: see `Inputs`; COUNT coefficients of SH.
-        splats: [images * num, 16], see `splat`; written where visible.
-        depths: [images * num], 0 where culled; written.
-        counters: [programs, COUNTERS]; written.
-        num: Gaussians of a scene.
-        views: of a scene.
-        alpha_min, eps2d, near, compensation_min: see `Convention`; log_alpha_min is to base 2.
+    splats, depths [images * num], 0 where culled, and counters [programs, COUNTERS] are written.
     """
     image = tl.program_id(1).to(tl.int64)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

@@ -29,6 +29,7 @@ from asysplat.rendering.cuda.math import (
     load_camera,
     plus,
     project_mean,
+    project_mean_gradient,
     scaled,
     sh_basis,
     sh_basis_gradient,
@@ -46,13 +47,9 @@ PAIRS = tl.constexpr(8)  # of a splat, summed at a time
 
 @kernel
 def sum_pairs(counts, first_pair, grads, num_splats, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
-    """Sum the gradients of each of BLOCK splats over its tiles, in a fixed order.
+    """Sum the gradients [pairs, 10] of each of BLOCK splats over its tiles, in a fixed order.
 
-    The sum replaces the gradient of the splat's first pair.
-
-    Args:
-        counts, first_pair: [num_splats].
-        grads: [pairs, 10]; the first CHANNELS columns are summed.
+    The sum, of the first CHANNELS columns, replaces the gradient of the splat's first pair.
     """
     d = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     count = tl.load(counts + d, mask=d < num_splats, other=0)
@@ -101,15 +98,9 @@ def project_backward(
 ):
     """Compute the gradients of BLOCK Gaussians of a scene: the sum over its views, in order.
 
-    Args:
-        counts, first_pair: [images * num], see `Lists`.
-        grads: [pairs, 10], see `splat` and `sum_pairs`; the last column is read only with
-            HAS_DEPTH.
-        grad_means, grad_quats, grad_scales, grad_opacities: [B * num, ...], every element written.
-        grad_sh: [B * num, COUNT, 3], zeros to add to; None without SH_NEEDED.
-        grad_cameras: [B * views, programs of a scene, 16] float64, the part of each program, from
-            zeros; None without CAMERAS_NEEDED.
-        Others: as for `project`.
+    grads [pairs, 10] come from `sum_pairs`; grad_sh holds zeros to add to, None without SH_NEEDED;
+    grad_cameras [B * views, programs of a scene, 16] the part of each program, from zeros, None
+    without CAMERAS_NEEDED.
     """
     scene = tl.program_id(1).to(tl.int64)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -240,23 +231,11 @@ def splat_backward(
     g_mx, g_my = covariance_gradient(g_abc, g_det0, g_det, abc, mx, my, eps2d)
     g_scale, g_quat, g_row_x, g_row_y = ellipse_rows_gradient(g_mx, g_my, quat, scale, row_x, row_y)
 
-    # The Jacobian's rows and the center.
-    fx, fy = focal
-    g_x, g_y = LOG_2 * g_x, LOG_2 * g_y
-    g_z -= inverse_z * (dot(row_x, g_row_x) + dot(row_y, g_row_y))
-    g_fx = g_x * tangents[0] + dot(row_x, g_row_x) / fx
-    g_fy = g_y * tangents[1] + dot(row_y, g_row_y) / fy
-    g_clamped_x = -fx * inverse_z * dot(axes[2], g_row_x)
-    g_clamped_y = -fy * inverse_z * dot(axes[2], g_row_y)
-    # A clamped tangent is (constant - cx) / fx.
-    free_x, free_y = clamped[0] == tangents[0], clamped[1] == tangents[1]
-    g_tangent_x = g_x * fx + tl.where(free_x, g_clamped_x, 0.0)
-    g_tangent_y = g_y * fy + tl.where(free_y, g_clamped_y, 0.0)
-    g_limit_x = tl.where(free_x, 0.0, g_clamped_x / fx)
-    g_limit_y = tl.where(free_y, 0.0, g_clamped_y / fy)
-    g_z -= inverse_z * (g_tangent_x * tangents[0] + g_tangent_y * tangents[1])
-    g_u, g_v = g_tangent_x * inverse_z, g_tangent_y * inverse_z
-    g_offset = plus(plus(scaled(g_u, axes[0]), g_v, axes[1]), g_z, axes[2])
+    # The Jacobian's rows, and center and depth.
+    projected = (offset, inverse_z, tangents, clamped)
+    g_offset, g_axes, g_focal, g_principal = project_mean_gradient(
+        (LOG_2 * g_x, LOG_2 * g_y, g_z), (g_row_x, g_row_y), (row_x, row_y), projected, axes, focal
+    )
 
     # Color.
     square, length, dx, dy, dz = direction(offset)
@@ -285,18 +264,14 @@ def splat_backward(
         g_offset = plus(g_offset, tl.where(square > MIN_SQUARED_DISTANCE, -radial, 0.0), offset)
 
     if CAMERAS_NEEDED:
-        right_part = plus(scaled(g_u, offset), fx * inverse_z, g_row_x)
-        down_part = plus(scaled(g_v, offset), fy * inverse_z, g_row_y)
-        forward_part = plus(scaled(g_z, offset), -fx * inverse_z * clamped[0], g_row_x)
-        forward_part = plus(forward_part, -fy * inverse_z * clamped[1], g_row_y)
-        store_sum3(grad_cameras, camera_offset + RIGHT, right_part, drawn)
-        store_sum3(grad_cameras, camera_offset + DOWN, down_part, drawn)
-        store_sum3(grad_cameras, camera_offset + FORWARD, forward_part, drawn)
+        store_sum3(grad_cameras, camera_offset + RIGHT, g_axes[0], drawn)
+        store_sum3(grad_cameras, camera_offset + DOWN, g_axes[1], drawn)
+        store_sum3(grad_cameras, camera_offset + FORWARD, g_axes[2], drawn)
         store_sum3(grad_cameras, camera_offset + CENTER, scaled(-1.0, g_offset), drawn)
-        store_sum(grad_cameras, camera_offset + FX, g_fx - g_limit_x * clamped[0], drawn)
-        store_sum(grad_cameras, camera_offset + FY, g_fy - g_limit_y * clamped[1], drawn)
-        store_sum(grad_cameras, camera_offset + CX, g_x - g_limit_x, drawn)
-        store_sum(grad_cameras, camera_offset + CY, g_y - g_limit_y, drawn)
+        store_sum(grad_cameras, camera_offset + FX, g_focal[0], drawn)
+        store_sum(grad_cameras, camera_offset + FY, g_focal[1], drawn)
+        store_sum(grad_cameras, camera_offset + CX, g_principal[0], drawn)
+        store_sum(grad_cameras, camera_offset + CY, g_principal[1], drawn)
     return g_opacity, g_offset, g_quat, g_scale
 
 

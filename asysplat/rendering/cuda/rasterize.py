@@ -1,10 +1,4 @@
-"""Rasterize splats and compute their gradients: a program takes a tile.
-
-The forward pass blends front to back. The backward pass goes back to front: it sums up the light
-from behind a splat, from small terms to large ones, so that nothing cancels. The transmittance in
-front of a splat is the one behind it over 1 - alpha, which keeps its relative precision. The
-forward pass saves where each pixel stopped. Each pair of splat and tile has its own gradient.
-"""
+"""Rasterize splats and compute their gradients, as `cpu.rasterize`: a program takes a tile."""
 
 from typing import NamedTuple
 
@@ -26,7 +20,7 @@ NO_STOP = tl.constexpr(2**31 - 1)  # more than any rank
 
 
 class Saved(NamedTuple):
-    """What `rasterize` saves for `rasterize_backward`; see `rasterize`."""
+    """See `cpu.rasterize.Saved`; median_ranks are -1 without a median depth."""
 
     transmittance: Tensor
     stop_ranks: Tensor
@@ -70,21 +64,10 @@ def rasterize(
     CULL_OPAQUE: tl.constexpr,
     STEP: tl.constexpr,
 ):
-    """Draw a tile; every pixel is written.
+    """Draw a tile; every pixel is written. See `cpu.rasterize`.
 
-    Args:
-        splats: [images * N, 16], see `splat`.
-        entries: [pairs] the splat of each pair, sorted by tile, then by depth.
-        first_entry: [tiles + 1] start of each tile's list.
-        last_entry: [tiles] written: where the list was left because all pixels were opaque.
-        active: [tiles] whether to draw the tile; read only with MASKED.
-        image, alpha, transmittance, depth, origins: see `RenderOutputs`; depth is written with
-            DEPTH or MEDIAN, origins only with DEPTH.
-        stop_ranks: [images, H, W] the rank in the list of the first splat that a pixel dropped;
-            NO_STOP if it dropped none.
-        median_ranks: [images, H, W] the rank of the splat of the median depth, -1 without one.
-        columns, tiles: of an image.
-        STEP: splats between two checks whether all pixels are opaque.
+    depth is written with DEPTH or MEDIAN, origins with DEPTH, median_ranks with MEDIAN; active is
+    read with MASKED. STEP splats lie between two checks whether all pixels are opaque.
     """
     tile = tl.program_id(0).to(tl.int64)
     image_index, left, top, lane_x, lane_y, pixel, inside = tile_window(
@@ -182,15 +165,7 @@ def rasterize_backward(
     MEDIAN: tl.constexpr,
     STEP: tl.constexpr,
 ):
-    """Compute the gradients of every pair in the tile.
-
-    Args:
-        pairs: [pairs] the index of each entry's gradient.
-        grad_image, grad_transmittance, grad_depth: gradients of the outputs of `rasterize`.
-        grads: [pairs, 10], see `splat`; written.
-        Others: as for `rasterize`, which wrote last_entry, transmittance, origins, stop_ranks and
-            median_ranks.
-    """
+    """Compute the gradients [pairs, 10] of every pair in the tile; see `cpu.rasterize`."""
     tile = tl.program_id(0).to(tl.int64)
     image_index, left, top, lane_x, lane_y, pixel, inside = tile_window(
         tile, columns, tiles, height, width

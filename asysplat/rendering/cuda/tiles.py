@@ -17,13 +17,11 @@ PIXEL_MARGIN = tl.constexpr(formulas.PIXEL_MARGIN)
 
 
 class Lists(NamedTuple):
-    """The splats of every tile, by depth; tiles are numbered image by image, row by row.
+    """The splats of every tile, by depth; see `cpu.tiles.Lists`.
 
-    splats [images * N, 16], see `splat`; counts [images * N] pairs of each splat and a tile;
-    first_pair [images * N] index of a splat's first pair, if it has any; first_entry [tiles + 1]
-    start of each tile's list; entries [pairs] the splat of each pair, sorted by tile, then by
-    depth; pairs [pairs] the index of each entry's pair; active [tiles] whether any pixel of the
-    tile counts, None if all do.
+    counts [images * N] pairs of each splat; first_pair [images * N]; entries [pairs] the splat of
+    each pair and pairs [pairs] its index, sorted by tile, then by depth; active None if all tiles
+    are.
     """
 
     splats: Tensor
@@ -55,17 +53,11 @@ def list_tiles(
     CULL_ELLIPSE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Visit the tiles of BLOCK splats, by depth.
+    """Visit the tiles of BLOCK splats, in the `order` [num_visible] of their depths.
 
-    Args:
-        splats: [images * N, 16], N is `num`.
-        order: [num_visible] the visible splats, by depth.
-        counts: [images * N] tiles of each splat; written without WRITE, read with it.
-        box_tiles: [programs] tiles of all boxes; written without WRITE.
-        ends: [num_visible] 1 + the index of a splat's last pair; read with WRITE.
-        tile_of, owners: [pairs] tile and splat of each pair; written with WRITE.
-        first_pair: [images * N] written for the visible splats with WRITE.
-        columns, tiles: of an image.
+    Without WRITE, write the counts [images * N] of tiles and box_tiles [programs]. With WRITE,
+    write tile_of and owners [pairs], the tile and splat of each pair, and first_pair [images * N];
+    ends [num_visible] is 1 + the index of a splat's last pair.
     """
     rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = rank < num_visible
@@ -100,11 +92,7 @@ def list_tiles(
 
 @kernel
 def tile_range(center, start, stop, size):
-    """Compute the first and the last tile that has a pixel center in center + [start, stop].
-
-    The image has `size` pixels; the last tile is before the first if there is none. NaN means the
-    image's edge.
-    """
+    """See `cpu.tiles.tile_range`."""
     first, last = center + start - 0.5 - PIXEL_MARGIN, center + stop - 0.5 + PIXEL_MARGIN
     # Clamp the float: a number beyond int32 has no int.
     first = tl.where(first > 0, tl.minimum(first, size * 1.0), 0.0)
@@ -131,13 +119,7 @@ def box_columns(ellipse, width):
 
 @kernel
 def row_span(ellipse, row, height, width, CULL_ELLIPSE: tl.constexpr):
-    """Compute the first and the last tile of a row of tiles that the ellipse touches.
-
-    Without CULL_ELLIPSE these are the tiles of its box. The ellipse is (a dx + b dy)^2 + (c dy)^2
-    <= (c extent)^2. Between the row's outermost pixel centers, its right edge is farthest out at
-    its tip or, if the tip lies outside of them, at the center nearest to it; the left edge mirrors
-    it.
-    """
+    """See `cpu.tiles.row_span`; without CULL_ELLIPSE the tiles of the ellipse's box."""
     if not CULL_ELLIPSE:
         return box_columns(ellipse, width)
     x, y, a, b, c, extent = ellipse
