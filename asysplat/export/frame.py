@@ -78,11 +78,7 @@ def clicked_camera(
 ) -> int | None:
     """Return the camera whose image, at the end of its frustum, a ray hits first; None: no one.
 
-    Args:
-        cameras: [V].
-        length: of the frustums.
-        start: origin of the ray.
-        ray: to the near plane; images before it are not visible.
+    The ray ends at the near plane; images before it are not visible.
     """
     rotations = cameras.cam_to_world[:, :3, :3]
     starts = ((start - cameras.centers)[:, None] @ rotations)[:, 0]
@@ -96,12 +92,7 @@ def clicked_camera(
 
 
 def page_camera(page: Any, max_pixels: int) -> tuple[Cameras, bool]:
-    """Return a page's camera of at most so many pixels, and whether these are all of the page.
-
-    Args:
-        page: viser's CameraHandle.
-        max_pixels: limit.
-    """
+    """Return the camera of viser's CameraHandle, and whether it has all pixels of the page."""
     height, width = max(page.image_height, 1), max(page.image_width, 1)
     focal = height / 2 / math.tan(page.fov / 2)
     cam_to_world = torch.eye(4)

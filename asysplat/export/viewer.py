@@ -2,13 +2,20 @@
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Event, Thread
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float, UInt8
+from matplotlib import colormaps
+from numpy import ndarray
+from torch import Tensor
+from torch.nn.functional import interpolate
 
 from asysplat.errors import InputError
+from asysplat.evaluation.figures import disparity
 from asysplat.export.frame import (
     clicked_camera,
     distance_along,
@@ -19,12 +26,13 @@ from asysplat.export.frame import (
     page_frame,
     quaternion,
 )
-from asysplat.export.layers import LAYERS, draw_layer, image_at, thumbnail
-from asysplat.scene import Gaussians, Views
+from asysplat.rendering import render
+from asysplat.scene import Cameras, Gaussians, Views
 
-SAME_POSITION = 1e-3  # distance of a camera to an input camera, in the page's unit
+LAYERS = ("color", "depth", "alpha")
+THUMBNAIL_SIDE = 96  # pixels
+MAX_SAMPLES = 10_000  # pixels from which the range of disparities is computed
 WAITING = "Waiting for the first rendering; kernels may have to compile, for minutes."
-NO_IMAGE = "To see the error, click a camera: it is known where an image was taken."
 POLL_SECONDS = 0.01  # between two checks for changes
 TARGET_SECONDS = 0.05  # of a rendering while something changes
 REST_SECONDS = 0.2  # without a change, before rendering at full resolution
@@ -33,19 +41,12 @@ MIN_PIXELS, MAX_PIXELS = 320 * 200, 1920 * 1080  # of a rendering
 
 @dataclass
 class Page:
-    """The rendering state of an open page.
+    """The rendering state of an open page."""
 
-    Args:
-        state: what was rendered last.
-        pixels: of a rendering while something changes.
-        due: time of the rendering at full resolution.
-        seconds: of the last such rendering.
-    """
-
-    state: object = None
-    pixels: int = MAX_PIXELS // 16
-    due: float = math.inf
-    seconds: float = 0.0
+    state: object = None  # what was rendered last
+    pixels: int = MAX_PIXELS // 16  # of a rendering while something changes
+    due: float = math.inf  # time of the rendering at full resolution
+    seconds: float = 0.0  # of the last such rendering
 
 
 class Viewer:
@@ -60,8 +61,8 @@ class Viewer:
     Args:
         views: input views, [V].
         gaussians: [N]; None to `show` them later.
-        port: the next free one is used if it is taken; 0: any free one.
-        host: address to listen at; 0.0.0.0 admits other machines.
+        port, host: to listen at. The next free port is used if it is taken, any for 0; the host
+            0.0.0.0 admits other machines.
 
     Raises:
         InputError: viser is not installed; views or Gaussians with batch dimensions.
@@ -82,17 +83,15 @@ class Viewer:
         if gaussians is not None:
             _check_one_scene("gaussians", gaussians.opacities.shape[:-1])
         self._frame = page_frame(views.cameras, gaussians)
-        self._views = self._frame.apply(
-            Views(views.cameras, views.images, masks=views.masks).to("cpu")
-        )
-        self._cameras = self._views.cameras
+        views = self._frame.apply(Views(views.cameras, views.images).to("cpu"))
+        self._cameras = views.cameras
         self._up, self._length = mean_up(self._cameras), frustum_length(self._cameras)
         self._scene: tuple[Gaussians | None, str] = (None, WAITING)
         self._version = object()
         self._closed = Event()
         self._server = viser.ViserServer(host=host, port=port, label="asysplat", verbose=False)
         self._add_panel()
-        self._add_cameras()
+        self._add_cameras(views.images)
         if gaussians is not None:
             self.show(gaussians)
         first = self._server.initial_camera
@@ -109,11 +108,9 @@ class Viewer:
         return f"http://{'localhost' if host == '0.0.0.0' else host}:{self._server.get_port()}"
 
     def show(self, gaussians: Gaussians, text: str = "") -> None:
-        """Show another state of the scene; may be called from any thread, and does not block.
+        """Show other Gaussians, [N], and Markdown in the panel; any thread may call it.
 
-        Args:
-            gaussians: [N], copied.
-            text: Markdown for the panel.
+        Returns at once.
 
         Raises:
             InputError: Gaussians with batch dimensions.
@@ -125,8 +122,7 @@ class Viewer:
         self._scene = (shown, text)
         degree = math.isqrt(gaussians.sh.shape[-2]) - 1
         if degree != self._sh_degree.max:
-            self._sh_degree.max = degree
-            self._sh_degree.value = degree
+            self._sh_degree.max = self._sh_degree.value = degree
         self._change()
 
     def wait(self) -> None:
@@ -158,12 +154,13 @@ class Viewer:
         self._sh_degree = gui.add_slider("SH degree", 0, 3, 1, 3)
         self._min_opacity = gui.add_slider("Minimum opacity", 0.0, 1.0, 0.01, 0.0)
         self._size = gui.add_slider("Size", 0.05, 1.0, 0.05, 1.0)
-        for handle in (self._layer, self._sh_degree, self._min_opacity, self._size):
+        self._settings = (self._layer, self._sh_degree, self._min_opacity, self._size)
+        for handle in self._settings:
             handle.on_update(lambda _: self._change())
         self._show_cameras = gui.add_checkbox("Cameras", True)
         self._text = gui.add_markdown(WAITING)
 
-    def _add_cameras(self) -> None:
+    def _add_cameras(self, images: Float[Tensor, "V 3 H W"]) -> None:
         scene = self._server.scene
         scene.set_up_direction(self._up.numpy())
         parent = scene.add_frame("/cameras", show_axes=False)
@@ -178,7 +175,7 @@ class Viewer:
                 thickness=1.5,
                 thickness_units="screen",
                 color=(209, 98, 45),
-                image=thumbnail(self._views.images[view]),
+                image=thumbnail(images[view]),
                 wxyz=quaternion(self._cameras, view),
                 position=self._cameras.centers[view].numpy(),
             )
@@ -200,10 +197,7 @@ class Viewer:
             camera.position, camera.look_at, camera.up_direction, camera.fov = self._pose(view)
 
     def _pose(self, view: int) -> tuple:
-        """Return position, look-at, up and field of view of a page at an input camera.
-
-        The up is the scene's, corrected for the camera's roll.
-        """
+        """Return position, look-at, up (the scene's, with the camera's roll) and field of view."""
         right, _, forward = self._cameras.cam_to_world[view, :3, :3].unbind(-1)
         position = self._cameras.centers[view]
         gaussians, _ = self._scene
@@ -227,14 +221,14 @@ class Viewer:
                     continue
                 page.state, page.due = state, math.inf
                 in_full = self._draw(client, page.pixels if changed else MAX_PIXELS)
-                end = time.perf_counter()
+                seconds = time.perf_counter() - start
                 if not changed:
-                    page.seconds = end - start
+                    page.seconds = seconds
                     continue
-                factor = min(max(TARGET_SECONDS / (end - start), 0.5), 2)
+                factor = min(max(TARGET_SECONDS / seconds, 0.5), 2)
                 page.pixels = round(min(max(factor * page.pixels, MIN_PIXELS), MAX_PIXELS))
                 if not in_full:  # the pause leaves the machine at least half of its time
-                    page.due = end + max(REST_SECONDS, page.seconds)
+                    page.due = start + seconds + max(REST_SECONDS, page.seconds)
 
     def _draw(self, client: Any, max_pixels: int) -> bool:
         """Render a page's camera and send the image; return whether at full resolution."""
@@ -244,13 +238,8 @@ class Viewer:
             return True
         try:
             camera, in_full = page_camera(client.camera, max_pixels)
-            settings = (self._layer, self._sh_degree, self._min_opacity, self._size)
-            layer, *values = (handle.value for handle in settings)
-            target = image_at(self._views, camera, SAME_POSITION) if layer == "error" else None
-            if layer == "error" and target is None:
-                text = f"{NO_IMAGE}\n\n{text}"
             camera = camera.to(gaussians.means.device)
-            image = draw_layer(gaussians, camera, layer, *values, target)
+            image = draw_layer(gaussians, camera, *(handle.value for handle in self._settings))
             if client.client_id not in self._server.get_clients():  # closed meanwhile
                 return True
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
@@ -262,6 +251,49 @@ class Viewer:
         milliseconds = 1000 * (time.perf_counter() - start)
         self._text.content = f"{size} in {milliseconds:.0f} ms\n\n{text}"
         return in_full
+
+
+@torch.no_grad()
+def draw_layer(
+    gaussians: Gaussians,
+    camera: Cameras,
+    layer: str = "color",
+    sh_degree: int = 3,
+    min_opacity: float = 0.0,
+    size: float = 1.0,
+) -> UInt8[ndarray, "H W 3"]:
+    """Render one layer of a scene, as colors.
+
+    Args:
+        gaussians: [N]; those with an opacity below `min_opacity` are left out.
+        camera: one view.
+        layer: "color", "alpha", or "depth": disparities, the nearest bright.
+        sh_degree: maximum degree of SH.
+        size: factor of the scales, > 0.
+    """
+    opacities = gaussians.opacities
+    opacities = opacities.where(opacities >= min_opacity, 0)
+    gaussians = replace(gaussians, scales=size * gaussians.scales, opacities=opacities)
+    rendering = render(gaussians, camera, depth=layer == "depth", sh_degree=sh_degree)
+    if layer == "depth":
+        values = disparity(rendering.depth[0])
+        sample = values.flatten()[:: 1 + values.numel() // MAX_SAMPLES]
+        values = values / sample.quantile(0.99).clamp_min(1e-12)
+        colors = colormaps["viridis"](np.arange(256), bytes=True)[:, :3]
+        return colors[(255 * values.clamp(0, 1)).round().byte().cpu().numpy()]
+    alpha = rendering.alpha[0].expand(3, -1, -1)
+    return _bytes(alpha if layer == "alpha" else rendering.image[0].clamp(0, 1))
+
+
+def thumbnail(image: Float[Tensor, "3 H W"]) -> UInt8[ndarray, "h w 3"]:
+    """Shrink an RGB image in [0, 1] to at most THUMBNAIL_SIDE pixels a side."""
+    factor = min(1, THUMBNAIL_SIDE / max(image.shape[1:]))
+    size = [max(round(factor * side), 1) for side in image.shape[1:]]
+    return _bytes(interpolate(image[None], size, mode="area")[0])
+
+
+def _bytes(image: Float[Tensor, "3 H W"]) -> UInt8[ndarray, "H W 3"]:
+    return (255 * image).round().byte().permute(1, 2, 0).cpu().numpy()
 
 
 def _check_one_scene(name: str, batch: tuple[int, ...]) -> None:

@@ -14,25 +14,19 @@ from asysplat.scene import Gaussians, Views
 
 VIEWER_SECONDS = 1.0  # between two updates of the viewer
 PRINT_SECONDS = 10.0  # between two lines where there is no terminal
-STDERR = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class RefinementDisplay:
-    """A progress bar and, if asked for, a viewer; Ctrl-C ends the refinement after its step.
+    """Show a progress bar and, with `view`, a viewer; Ctrl-C ends the refinement after its step.
 
-    Use it as a context manager: it handles SIGINT and SIGTERM, and restores the previous handlers
-    at its end or with the first signal.
-
-    Args:
-        views: the input views.
-        view: whether to open a viewer for the browser.
+    As a context manager it handles SIGINT and SIGTERM, until its end or the first signal.
     """
 
     def __init__(self, views: Views, view: bool):
         self.last: RefinementProgress | None = None
         self.stopped = False
-        self._console = Console()
+        self._terminal = Console().is_terminal
         self._printed = self._shown = time.monotonic()
         self._viewer = Viewer(views) if view else None
         if self._viewer is not None:
@@ -45,8 +39,7 @@ class RefinementDisplay:
             progress.BarColumn(),
             progress.TextColumn("{task.fields[text]}"),
             progress.TimeRemainingColumn(),
-            console=self._console,
-            disable=not self._console.is_terminal,
+            disable=not self._terminal,
         )
         self._task = self._bar.add_task("", total=1.0, text="")
         self._bar.start()
@@ -64,7 +57,7 @@ class RefinementDisplay:
         text = f"step {now.step}, PSNR {now.psnr:.2f} dB, {now.gaussians:,} Gaussians"
         self._bar.update(self._task, completed=now.share, text=text)
         clock = time.monotonic()
-        if not self._console.is_terminal and clock - self._printed > PRINT_SECONDS:
+        if not self._terminal and clock - self._printed > PRINT_SECONDS:
             self._printed = clock
             print(f"{now.seconds:.0f} s: {text}", flush=True)
         if self._viewer is not None and clock - self._shown > VIEWER_SECONDS:
@@ -84,8 +77,8 @@ class RefinementDisplay:
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self.stopped = True
         self._restore_handlers()  # first: the next signal may follow the message at once
-        # print is not reentrant, and may be running.
-        os.write(STDERR, b"stopping after this step; repeat to stop at once and save nothing\n")
+        # To stderr, without print, which is not reentrant and may be running.
+        os.write(2, b"stopping after this step; repeat to stop at once and save nothing\n")
 
     def _restore_handlers(self) -> None:
         for number, handler in self._handlers.items():

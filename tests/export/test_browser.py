@@ -10,8 +10,7 @@ from browser import find_chromium, open_page
 
 from asysplat.data import ProceduralScene
 from asysplat.export.frame import page_camera
-from asysplat.export.layers import draw_layer
-from asysplat.export.viewer import MAX_PIXELS, Viewer
+from asysplat.export.viewer import MAX_PIXELS, Viewer, draw_layer
 
 pytest.importorskip("viser", minversion="1.1")
 HEIGHT, WIDTH = 480, 900
@@ -45,7 +44,7 @@ def until(found):
 
 def arrive(tab, viewer, client, view, folder):
     """Wait until the page stands in a camera, and shows there what is rendered; keep a picture."""
-    place = viewer._views.cameras.centers[view]
+    place = viewer._cameras.centers[view]
     until(lambda: np.allclose(client.camera.position, place, atol=1e-4))
 
     def apart():
@@ -62,7 +61,7 @@ def arrive(tab, viewer, client, view, folder):
 
 @pytest.mark.medium
 def test_a_person_sees_what_is_rendered_and_flies_by_clicks(chromium, viewer, tmp_path):
-    cameras = viewer._views.cameras
+    cameras = viewer._cameras
     viewer._show_cameras.value = False
     with open_page(chromium, viewer.url, tmp_path, WIDTH, HEIGHT) as tab:
         (client,) = until(viewer._server.get_clients).values()
