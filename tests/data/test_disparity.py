@@ -138,7 +138,7 @@ def test_training_reads_the_maps(command, scene, tmp_path):
     sizes = {"height": 16, "width": 16, "window": (6, 12), "inputs": 2, "targets": 2}
     loading = {"batch_size": 1, "num_workers": 0, "seed": 0, "steps_per_epoch": 1}
     data = files_data(
-        str(scene), name="room", disparities=str(tmp_path / "maps"), **sizes, **loading
+        root=str(scene), name="room", disparities=str(tmp_path / "maps"), **sizes, **loading
     )
     batch = collate([TrainingTasks(data)[0]] * 2)
     targets = batch["targets"]
