@@ -2,7 +2,6 @@
 
 import math
 import shutil
-from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
@@ -21,37 +20,29 @@ SAVED_BYTES = 12  # of a parameter in a checkpoint, which has no gradients
 CHECKPOINTS = 3  # best, last, and one that is being written
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What a training needs; printed as lines.
-
-    Args:
-        parameters, steps: of the network, of the optimizer.
-        memory_gb, capacity_gb: the peak of a training step, and what each process has.
-        seconds: of the micro-batches of a step, without optimizer and communication.
-        disk_gb, free_gb: of a run's checkpoints, and of their disk.
-    """
-
-    parameters: int
-    steps: int
-    memory_gb: float
-    capacity_gb: float
-    seconds: float
-    disk_gb: float
-    free_gb: float
-
-    def __str__(self) -> str:
-        time = timedelta(seconds=round(self.steps * self.seconds))
-        return (
-            f"plan: {self.parameters / 1e6:.2f}M parameters, {self.steps:,} steps\n"
-            f"  memory: about {self.memory_gb:.3g} of {self.capacity_gb:.3g} GB\n"
-            f"  time: {self.seconds:.3g} s a step, {time} without validation\n"
-            f"  disk: checkpoints of {self.disk_gb:.2g} GB, {self.free_gb:.3g} free"
-        )
+def plan_lines(
+    parameters: int,
+    steps: int,
+    memory: float,
+    capacity: float,
+    seconds: float,
+    disk: float,
+    free: float,
+) -> str:
+    """Write what a training needs; memory and disk in GB, seconds of a step's micro-batches."""
+    time = timedelta(seconds=round(steps * seconds))
+    return (
+        f"plan: {parameters / 1e6:.2f}M parameters, {steps:,} steps\n"
+        f"  memory: about {memory:.3g} of {capacity:.3g} GB\n"
+        f"  time: {seconds:.3g} s a step, {time} without validation\n"
+        f"  disk: checkpoints of {disk:.2g} GB, {free:.3g} free"
+    )
 
 
-def make_plan(trainer: lightning.Trainer, module: SplattingModule) -> Plan:
-    """Try a micro-batch and check memory and disk; the network is left as it was.
+def make_plan(trainer: lightning.Trainer, module: SplattingModule) -> str:
+    """Try a micro-batch, check memory and disk, and describe what the training needs.
+
+    The network is left as it was.
 
     Args:
         trainer: has its data module, with tasks.
@@ -60,7 +51,11 @@ def make_plan(trainer: lightning.Trainer, module: SplattingModule) -> Plan:
     Raises:
         InputError: a step does not fit into memory, or checkpoints do not fit on the disk.
     """
-    parameters, free = count_parameters(module.net), _free_gb(trainer)
+    parameters, free = count_parameters(module.net), math.inf
+    if trainer.checkpoint_callback is not None:
+        folder = Path(trainer.checkpoint_callback.dirpath).absolute()
+        existing = next(path for path in (folder, *folder.parents) if path.exists())
+        free = shutil.disk_usage(existing).free / GB
     disk = CHECKPOINTS * SAVED_BYTES * parameters / GB
     if disk > free:
         raise InputError(
@@ -83,7 +78,7 @@ def make_plan(trainer: lightning.Trainer, module: SplattingModule) -> Plan:
             "data.micro_batch; if that is not enough, take fewer data.inputs, smaller data.height "
             "and data.width, or a larger device."
         )
-    return Plan(parameters, trainer.max_steps, needed, capacity, seconds, disk, free)
+    return plan_lines(parameters, trainer.max_steps, needed, capacity, seconds, disk, free)
 
 
 def _try(trainer: lightning.Trainer, module: SplattingModule) -> tuple[float, float]:
@@ -103,12 +98,3 @@ def _try(trainer: lightning.Trainer, module: SplattingModule) -> tuple[float, fl
     for buffer, before in zip(module.net.buffers(), buffers, strict=True):
         buffer.copy_(before)
     return split.accumulated * meter.seconds[-1], max(meter.gb, default=0.0)
-
-
-def _free_gb(trainer: lightning.Trainer) -> float:
-    """Return the free space of the disk of the checkpoints; infinity if none are written."""
-    if trainer.checkpoint_callback is None:
-        return math.inf
-    folder = Path(trainer.checkpoint_callback.dirpath).absolute()
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    return shutil.disk_usage(existing).free / GB

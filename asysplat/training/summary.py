@@ -33,38 +33,8 @@ def write_json(path: Path, results: Results) -> None:
         partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
 
 
-def quality_table(results: Results, data: str) -> Table:
-    """Make the table of one test set: a column for each metric, a row for each image source.
-
-    Each earlier stage of the training has a row.
-    """
-    columns = [name for name in METRICS if f"test/{data}/{name}" in results]
-    title = f"test scenes: {data}, metrics: {results['protocol/name']}"
-    table = Table("", *(METRICS[name] for name in columns), title=title)
-    ending = f"/test/{data}/psnr"
-    stages = [key.removesuffix(ending) for key in results if key.endswith(ending)]
-    sources = {f"after {stage}": f"{stage}/test/{{}}" for stage in stages} | SOURCES
-    for label, prefix in sources.items():
-        table.add_row(label, *_cells(results.get(f"{prefix.format(data)}/{n}") for n in columns))
-    return table
-
-
-def psnr_table(results: Results, names: Sequence[str]) -> Table:
-    """Make the table of several test sets: a row for each, PSNR of each image source."""
-    table = Table("", *SOURCES, title="other test sets, PSNR (dB)")
-    for name in names:
-        table.add_row(name, *_cells(results[f"{p.format(name)}/psnr"] for p in SOURCES.values()))
-    return table
-
-
 def post_optimization_table(results: Results, name: str, costs: str) -> Table:
-    """Make the table of one test set after steps of post-optimization.
-
-    Args:
-        results: as in evaluation.json.
-        name: of the test set.
-        costs: prefix of the keys of its costs.
-    """
+    """Make the table of a test set after post-optimization; `costs`: the prefix of its costs."""
     keys = [key.split("/") for key in results if key.startswith(f"test/{name}/post")]
     steps = sorted({int(key[2].removeprefix("post")) for key in keys})
     metrics = [metric for metric in METRICS if [metric] in [key[3:] for key in keys]]
@@ -109,14 +79,28 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
 
     Args:
         results: of a run; what was not measured is left out.
-        data: the test set to print in full; of others only PSNR is printed.
+        data: the test set to print in full, each stage in a row; of others only PSNR is printed.
         folder: of the run.
     """
     keys = [key.split("/") for key in results]
     test_sets = [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
+    tables = []
+    if data in test_sets:
+        metrics = [name for name in METRICS if f"test/{data}/{name}" in results]
+        title = f"test scenes: {data}, metrics: {results['protocol/name']}"
+        tables = [Table("", *(METRICS[name] for name in metrics), title=title)]
+        ending = f"/test/{data}/psnr"
+        stages = [key.removesuffix(ending) for key in results if key.endswith(ending)]
+        sources = {f"after {stage}": f"{stage}/test/{{}}" for stage in stages} | SOURCES
+        for label, source in sources.items():
+            values = (results.get(f"{source.format(data)}/{name}") for name in metrics)
+            tables[0].add_row(label, *_cells(values))
     others = [name for name in test_sets if name != data]
-    tables = [quality_table(results, data)] if data in test_sets else []
-    tables += [psnr_table(results, others)] if others else []
+    if others:
+        tables.append(Table("", *SOURCES, title="other test sets, PSNR (dB)"))
+    for name in others:
+        values = (results[f"{source.format(name)}/psnr"] for source in SOURCES.values())
+        tables[-1].add_row(name, *_cells(values))
     _print([*tables, cost_sentence(results)], folder, "test")
     print(f"run: {folder}")
 

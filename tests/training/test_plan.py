@@ -4,23 +4,13 @@ import pytest
 from conftest import COSTS
 
 from asysplat.training import plan
-from asysplat.training.plan import Plan
+from asysplat.training.plan import plan_lines
 
 FEW = [COSTS, "steps=1", "validate_every=1", "data.test_sets=null", "data.batch_size=2"]
 
 
 def test_plan_in_words():
-    words = str(
-        Plan(
-            parameters=98_111_472,
-            steps=60_000,
-            memory_gb=37.0,
-            capacity_gb=141.2,
-            seconds=1.9,
-            disk_gb=3.5,
-            free_gb=812.0,
-        )
-    )
+    words = plan_lines(98_111_472, 60_000, 37.0, 141.2, 1.9, 3.5, 812.0)
     for part in ("98.11M", "about 37 of 141 GB", "1 day, 7:40:00"):
         assert part in words
     assert "checkpoints of 3.5 GB, 812 free" in words
