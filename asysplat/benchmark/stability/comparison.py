@@ -14,11 +14,12 @@ ALL_PRECISIONS = PRECISIONS | {"fp16": torch.float16}
 ROUNDINGS = 256  # roundings of an operator in sequence
 PERTURBATIONS = 2  # random perturbations of the inputs; the worst counts
 RULE = (
-    f"R = {ROUNDINGS**0.5:g} roundings, the sum of {ROUNDINGS} in sequence as a random walk (for a "
-    "network in fp32 32, the sum of 1,024). The tolerance is the change of the float64 result when "
-    "each input is moved by R halves of a unit in its last place, up or down at random (the worse "
-    f"of {PERTURBATIONS} such changes; in a network each layer's output and gradient move too), "
-    "plus R halves of a unit in the last place of the result"
+    "A case is green if all results and gradients are finite, and the L2 error of each is within "
+    "its tolerance (worst: the closest to it). The tolerance is the change in float64 when each "
+    "input, and in a network each layer's output and gradient, moves by R halves of a unit in its "
+    f"last place, up or down at random (the worse of {PERTURBATIONS}), plus R halves of a unit in "
+    f"the last place of the result. R = {ROUNDINGS**0.5:g}, a random walk of {ROUNDINGS} "
+    "roundings; for a network in fp32 32, of 1,024"
 )
 NEGLIGIBLE = 1e-12  # of all gradients: a smaller one that consists of noise is 0 in truth
 

@@ -59,8 +59,8 @@ def _measure_training(model: str, precision: str, steps: int) -> Result:
     for batch in hostile_batches(steps):
         optimizer.zero_grad()
         with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
-            outcome = module(batch, depth=module.loss.needs_depth)
-            loss = module.loss(outcome, batch)["loss"]
+            prediction = module(batch, depth=module.loss.needs_depth)
+            loss = module.loss(prediction, batch)["loss"]
         loss.backward()
         grads = [p.grad for p in module.parameters() if p.grad is not None]
         losses.append(loss.detach())
@@ -105,7 +105,7 @@ def _measure_refinement(name: str, steps: int) -> Result:
 
     def watch(_: RefinementProgress, refinement: Refinement) -> bool:
         nonlocal non_finite
-        non_finite = refinement.fields.non_finite
+        non_finite = refinement.fields.optimizer.non_finite
         return False
 
     end = refine(start, views, steps=steps, background=torch.zeros(3), watch=watch)
