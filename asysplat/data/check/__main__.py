@@ -14,7 +14,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from asysplat.data.bad_images import BadImages, Policy
+from asysplat.data.bad_images import BadImages
 from asysplat.data.check.report import Report, check_scene
 from asysplat.data.check.show import draw_report, print_report
 from asysplat.data.readers import LAYOUTS, find_scenes
@@ -22,33 +22,22 @@ from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
 
 MAX_SCENES = 3  # checked of a folder of more
-RESOLUTION = 110  # pixels an inch of the figure
 
 
 def main(arguments: list[str] | None = None) -> int:
-    options = parse(arguments)
-    try:
-        return check(options, Console())
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-
-
-def parse(arguments: list[str] | None) -> Namespace:
     parser = ArgumentParser(prog="python -m asysplat.data.check", description=__doc__)
     parser.add_argument("path", type=Path, help="a scene, or a folder of scenes")
     parser.add_argument("--layout", default="auto", choices=("auto", *LAYOUTS))
-    parser.add_argument(
-        "--scene", help=f"check this scene of a folder; default: the first {MAX_SCENES}"
-    )
+    help_of_scene = f"check this scene of a folder; default: the first {MAX_SCENES}"
+    parser.add_argument("--scene", help=help_of_scene)
     parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("check"),
-        help="folder of SCENE/check.png, outside the data set; existing files are kept",
-    )
-    return parser.parse_args(arguments)
+    help_of_out = "folder of SCENE/check.png, outside the data set; existing files are kept"
+    parser.add_argument("--out", type=Path, default=Path("check"), help=help_of_out)
+    try:
+        return check(parser.parse_args(arguments), Console())
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
 
 
 def check(options: Namespace, console: Console) -> int:
@@ -61,23 +50,17 @@ def check(options: Namespace, console: Console) -> int:
         console.print(f"checking {len(selected)} of {len(scenes)} scenes{more}", highlight=False)
     all_fit = True
     for path in selected:
-        report = check_one(layout, path, options.on_bad_image, console)
+        bad = BadImages(options.on_bad_image)
+        scene = LAYOUTS[layout].read_scene(path, bad)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the report lists the skipped images
+            report = check_scene(scene, bad, console)
         title = f"{report.sequence.name}, layout {layout}"
         figure = save_figure(report, title, options.out)
         print_report(report, title, console)
         console.print(f"figure: {figure}\n", soft_wrap=True, highlight=False)
         all_fit &= report.verdict.fits
     return 0 if all_fit else 1
-
-
-def check_one(layout: str, path: Path, on_bad_image: Policy, console: Console) -> Report:
-    """Create the report of one scene, with progress bars."""
-    bad = BadImages(on_bad_image)
-    scene = LAYOUTS[layout].read_scene(path, bad)
-    with warnings.catch_warnings():
-        # The report lists the skipped images.
-        warnings.simplefilter("ignore")
-        return check_scene(scene, bad, console)
 
 
 def save_figure(report: Report, title: str, out: Path) -> Path:
@@ -87,7 +70,7 @@ def save_figure(report: Report, title: str, out: Path) -> Path:
     names = chain(["check.png"], (f"check-{number}.png" for number in count(2)))
     file = next(folder / name for name in names if not (folder / name).exists())
     with file.open("xb") as handle:
-        draw_report(report, title).savefig(handle, format="png", dpi=RESOLUTION)
+        draw_report(report, title).savefig(handle, format="png", dpi=110)
     return file
 
 

@@ -90,11 +90,8 @@ def find_matches(sequence: ImageSequence, console: Console | None = None) -> Mat
         if len(pair) >= MIN_MATCHES and pair.pairs not in [other.pairs for other in pairs]:
             pairs.append(pair)
     with_parallax = [pair for pair in pairs if _has_parallax(pair)]
-    return _join(with_parallax if 2 * len(with_parallax) > len(pairs) else pairs)
-
-
-def _join(pairs: list[Matches]) -> Matches:
-    """Join the pairs, at most MAX_MATCHES matches of each, spread over its keypoints."""
+    pairs = with_parallax if 2 * len(with_parallax) > len(pairs) else pairs
+    # At most MAX_MATCHES of each, spread over its keypoints.
     limited = [pair.select(slice(None, None, -(-len(pair) // MAX_MATCHES))) for pair in pairs]
     empty = Matches(torch.empty(0, 2, dtype=torch.int64), torch.empty(0, 2, 2).double())
     return Matches(

@@ -1,6 +1,7 @@
 """Measure a scene's pixels, camera path, sparse points and depth maps."""
 
 from dataclasses import dataclass
+from statistics import fmean as mean
 
 import torch
 from jaxtyping import Float
@@ -66,9 +67,9 @@ def read_pixels(
     sampled = torch.cat(depths) if depths else torch.empty(0)
     return sequence.with_images(intact), PixelStats(
         brightness=(min(brightness), max(brightness)),
-        depth_known=_mean(known),
+        depth_known=mean(known) if known else None,
         depths=quartiles(sampled[sampled > 0]),
-        unmasked=_mean(unmasked),
+        unmasked=mean(unmasked) if unmasked else None,
     )
 
 
@@ -77,10 +78,6 @@ def quartiles(values: Float[Tensor, " N"]) -> Quartiles | None:
     if not len(values):
         return None
     return tuple(values.double().quantile(torch.tensor([0.25, 0.5, 0.75]).double()).tolist())
-
-
-def _mean(shares: list[float]) -> float | None:
-    return sum(shares) / len(shares) if shares else None
 
 
 @dataclass(frozen=True)
@@ -126,41 +123,25 @@ def measure_path(cameras: Cameras) -> CameraPath:
     )
 
 
-@dataclass(frozen=True)
-class PointVisibility:
-    """The number of sparse points, and how many cameras have them in view.
+def count_points(cameras: Cameras, points: Float[Tensor, "P 3"]) -> tuple[float, float]:
+    """Count the images that each point (float64) lies in, in front of the camera.
 
-    Args:
-        count: number of points.
-        shared: share of the points inside the images of two cameras or more.
-        views: median number of images that a point lies in.
+    Returns:
+        The share of the points inside two images or more, and the median number of images.
     """
-
-    count: int
-    shared: float
-    views: float
-
-
-def count_points(cameras: Cameras, points: Float[Tensor, "P 3"]) -> PointVisibility:
-    """Count the images that each point (float64) lies in, in front of the camera."""
     views = torch.zeros(len(points), dtype=torch.int64)
     for view in range(cameras.num_views):
         _, _, inside = cameras.select([view]).to(torch.float64).project(points)
         views += inside[0]
-    shared = (views >= 2).double().mean()
-    return PointVisibility(len(points), float(shared), float(views.double().median()))
+    return float((views >= 2).double().mean()), float(views.double().median())
 
 
-@dataclass(frozen=True)
-class DepthScale:
-    """Quartiles of depth maps over triangulated depths, and the number of points compared."""
+def compare_depths(sequence: ImageSequence, matches: Matches) -> tuple[Quartiles | None, int]:
+    """Compare depth maps with precisely triangulated matches.
 
-    ratios: Quartiles
-    points: int
-
-
-def compare_depths(sequence: ImageSequence, matches: Matches) -> DepthScale | None:
-    """Compare depth maps with precisely triangulated matches; None if they share no pixel."""
+    Returns:
+        Quartiles of stored over triangulated depths, and the number of points compared.
+    """
     cameras = sequence.cameras.to(torch.float64)
     depths, angles = triangulate(cameras, matches)
     precise = (angles > MIN_RAY_ANGLE) & (depths > 0).all(-1)
@@ -176,4 +157,4 @@ def compare_depths(sequence: ImageSequence, matches: Matches) -> DepthScale | No
         ratios.append(stored[row, column] / depths[in_image])
     known = torch.cat(ratios)
     known = known[known > 0]
-    return DepthScale(quartiles(known), len(known)) if len(known) else None
+    return quartiles(known), len(known)

@@ -12,9 +12,8 @@ from asysplat.data.bad_images import BadImages
 from asysplat.data.check.matches import Matches, epipolar_distances, find_matches, triangulate
 from asysplat.data.check.measurements import (
     CameraPath,
-    DepthScale,
     PixelStats,
-    PointVisibility,
+    Quartiles,
     compare_depths,
     count_points,
     measure_path,
@@ -102,9 +101,13 @@ def diagnose_cameras(cameras: Cameras, matches: Matches, names: Sequence[str]) -
     cameras = cameras.to(torch.float64)
     fit = measure_fit(cameras, matches)
     tried = []
-    for mistake in common_mistakes(names) + _fitted_mistakes(cameras, matches):
+    sample = matches.select(slice(None, None, FIT_STRIDE))
+    fitted = [_fit_factor(create, cameras, sample) for create in (other_resolution, other_focal)]
+    for mistake in common_mistakes(names) + fitted:
         corrected = mistake.correct(cameras)
-        if _differ(cameras, corrected):
+        same_poses = torch.equal(cameras.cam_to_world, corrected.cam_to_world)
+        # Exchanging equal fx and fy changes nothing.
+        if not (same_poses and torch.allclose(cameras.intrinsics, corrected.intrinsics, rtol=0.02)):
             tried.append((mistake, measure_fit(corrected, matches)))
     least = min(corrected.penalty for _, corrected in tried)
     mistake, corrected = next(pair for pair in tried if pair[1].penalty <= TIE * least)
@@ -134,11 +137,6 @@ def measure_fit(cameras: Cameras, matches: Matches) -> Fit:
     )
 
 
-def _fitted_mistakes(cameras: Cameras, matches: Matches) -> list[Mistake]:
-    sample = matches.select(slice(None, None, FIT_STRIDE))
-    return [_fit_factor(create, cameras, sample) for create in (other_resolution, other_focal)]
-
-
 def _fit_factor(create: Callable[[float], Mistake], cameras: Cameras, matches: Matches) -> Mistake:
     """Create the mistake with the factor of least error, to about 0.3 %."""
 
@@ -150,12 +148,6 @@ def _fit_factor(create: Callable[[float], Mistake], cameras: Cameras, matches: M
     return create(min(np.geomspace(coarse / step, coarse * step, TRIALS).tolist(), key=error))
 
 
-def _differ(one: Cameras, other: Cameras) -> bool:
-    """Return whether a correction changed the cameras; exchanging equal fx and fy does not."""
-    same_poses = torch.equal(one.cam_to_world, other.cam_to_world)
-    return not (same_poses and torch.allclose(one.intrinsics, other.intrinsics, rtol=0.02))
-
-
 @dataclass(frozen=True)
 class Report:
     """All measurements of a scene; lengths are in scene units.
@@ -165,9 +157,9 @@ class Report:
         damaged: an error for each image that cannot be used.
         lenses: every kind of lens and the number of images that it took.
         identical: number of images whose file equals an earlier one.
-        depth_scale: None without depth maps, or if no match has a known depth.
-        points: None without sparse points.
+        points: number, shared share and median views of the sparse points; None without any.
         matches: the points that the cameras are compared with.
+        depth_scale: see `compare_depths`; None without depth maps.
     """
 
     sequence: FileSequence
@@ -176,9 +168,9 @@ class Report:
     identical: int
     pixels: PixelStats
     path: CameraPath
-    points: PointVisibility | None
+    points: tuple[int, float, float] | None
     matches: Matches
-    depth_scale: DepthScale | None
+    depth_scale: tuple[Quartiles | None, int] | None
     verdict: Verdict
 
 
@@ -193,32 +185,28 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
     Raises:
         InputError: too few usable images, or damaged images that must not be skipped.
     """
-    sequence = FileSequence(scene, SceneOptions(*_size(scene, bad)))
-    sequence, pixels = read_pixels(sequence, bad, console)
-    images, cameras = sequence.scene.images, sequence.cameras
-    matches = find_matches(sequence, console)
-    points = sequence.scene.points
-    files = {content_hash(image.file) for image in images}
-    has_depths = pixels.depth_known is not None
-    names = [str(image.file) for image in images]
-    return Report(
-        sequence=sequence,
-        damaged=list(bad.errors),
-        lenses=Counter(image.lens for image in images).most_common(),
-        identical=len(images) - len(files),
-        pixels=pixels,
-        path=measure_path(cameras),
-        points=None if points is None else count_points(cameras, torch.tensor(points).double()),
-        matches=matches,
-        depth_scale=compare_depths(sequence, matches) if has_depths else None,
-        verdict=diagnose_cameras(cameras, matches, names),
-    )
-
-
-def _size(scene: PosedScene, bad: BadImages) -> tuple[int, int]:
-    """Return height and width: the first image's, shrunk to a longer side of MAX_SIDE."""
     if not scene.images:
         bad.report(scene.name, 0)
     lens = scene.images[0].lens
     scale = min(1.0, MAX_SIDE / max(lens.height, lens.width))
-    return round(lens.height * scale), round(lens.width * scale)
+    size = (round(lens.height * scale), round(lens.width * scale))
+    sequence = FileSequence(scene, SceneOptions(*size))
+    sequence, pixels = read_pixels(sequence, bad, console)
+    images, cameras = sequence.scene.images, sequence.cameras
+    matches = find_matches(sequence, console)
+    points = sequence.scene.points
+    if points is not None:
+        points = (len(points), *count_points(cameras, torch.tensor(points).double()))
+    has_depths = pixels.depth_known is not None
+    return Report(
+        sequence=sequence,
+        damaged=list(bad.errors),
+        lenses=Counter(image.lens for image in images).most_common(),
+        identical=len(images) - len({content_hash(image.file) for image in images}),
+        pixels=pixels,
+        path=measure_path(cameras),
+        points=points,
+        matches=matches,
+        depth_scale=compare_depths(sequence, matches) if has_depths else None,
+        verdict=diagnose_cameras(cameras, matches, [str(image.file) for image in images]),
+    )

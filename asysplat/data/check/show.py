@@ -44,8 +44,8 @@ def print_report(report: Report, title: str, console: Console) -> None:
     for name, text in _lines(report):
         table.add_row(name, Text(text))
     console.print(table)
-    style = "bold green" if report.verdict.fits else "bold red"
-    sentence = report.verdict.sentence
+    fits, sentence = report.verdict.fits, report.verdict.sentence
+    style = "bold green" if fits else "bold red"
     console.print(Text(f"{sentence[0].upper()}{sentence[1:]}.", style))
 
 
@@ -64,7 +64,9 @@ def _lines(report: Report) -> Iterator[tuple[str, str]]:
     yield "a step", f"{step}; {turn}"
     if path.repeated:
         yield "", f"{path.repeated} images with the pose of an earlier image"
-    yield "points", _points(report)
+    yield "points", "none" if report.points is None else (
+        "{}, {:.1%} in front of and inside two views or more; {:g} views a point"
+    ).format(*report.points)
     yield "depth maps", _depths(report)
     masked = pixels.unmasked is not None
     yield "masks", f"{pixels.unmasked:.1%} of the pixels are kept" if masked else "none"
@@ -89,29 +91,19 @@ def _lens(lens: Lens) -> str:
     )
 
 
-def _points(report: Report) -> str:
-    points = report.points
-    if points is None:
-        return "none"
-    return (
-        f"{points.count}, {points.shared:.1%} in front of and inside two views or more; "
-        f"{points.views:g} views a point"
-    )
-
-
 def _depths(report: Report) -> str:
-    pixels, scale = report.pixels, report.depth_scale
-    if pixels.depth_known is None:
+    pixels = report.pixels
+    if report.depth_scale is None:
         return "none"
+    ratios, points = report.depth_scale
     text = f"known at {pixels.depth_known:.1%} of the pixels"
     if pixels.depths is not None:
         text += ", quartiles {:.4g} {:.4g} {:.4g}".format(*pixels.depths)
-    if scale is None:
-        return text
-    text += "; over triangulated depths {:.3f} {:.3f} {:.3f}".format(*scale.ratios)
-    text += f" ({scale.points} points)"
-    if report.verdict.fits and not DEPTH_AGREEMENT[0] < scale.ratios[1] < DEPTH_AGREEMENT[1]:
-        text += f": divide the unit of depth by {scale.ratios[1]:.4g}"
+    if ratios is not None:
+        text += "; over triangulated depths {:.3f} {:.3f} {:.3f}".format(*ratios)
+        text += f" ({points} points)"
+        if report.verdict.fits and not DEPTH_AGREEMENT[0] < ratios[1] < DEPTH_AGREEMENT[1]:
+            text += f": divide the unit of depth by {ratios[1]:.4g}"
     return text
 
 

@@ -8,7 +8,7 @@ https://colmap.github.io/format.html
 import re
 import struct
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -19,14 +19,7 @@ from numpy import ndarray
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
-from asysplat.data.readers.common import (
-    folders_with,
-    images_in,
-    inverted,
-    natural_order,
-    rigid,
-    scaled,
-)
+from asysplat.data.readers import common
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -46,9 +39,8 @@ SAME_WORLD = 1e-3  # greatest difference of rotations, and of positions over the
 
 def find_scenes(root: Path) -> list[Path]:
     """Find folders with a model in `sparse/0`, `sparse`, `colmap/sparse/0` or the folder itself."""
-    return folders_with(
-        root, *(f"{model}/cameras.{kind}" for model in MODELS for kind in ("bin", "txt"))
-    )
+    marks = (f"{model}/cameras.{kind}" for model in MODELS for kind in ("bin", "txt"))
+    return common.folders_with(root, *marks)
 
 
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:
@@ -62,21 +54,20 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     if model is None:
         raise InputError(f"{scene} has no COLMAP model: expected one in {', '.join(MODELS)}.")
     colmap = _read(model)
-    registered = sorted(_registered(colmap), key=lambda image: natural_order(Path(image.name)))
+    registered = [image for image in colmap.images.values() if image.has_pose]
+    registered.sort(key=lambda image: common.natural_order(Path(image.name)))
     folder = _images_folder(scene, model, [image.name for image in registered])
     _warn_of_unregistered(model, [folder / image.name for image in registered])
-    lenses = {
-        camera: _lens(colmap.cameras[camera], f"{model}, camera {camera}")
-        for camera in {image.camera_id for image in registered}
-    }
+    cameras = {image.camera_id for image in registered}
+    lenses = {key: _lens(colmap.cameras[key], f"{model}, camera {key}") for key in cameras}
 
     def read(image: pycolmap.Image) -> PosedImage:
         path = folder / image.name
-        lens = scaled(lenses[image.camera_id], image_size(path), str(path))
+        lens = common.scaled(lenses[image.camera_id], image_size(path), str(path))
         return PosedImage(path, lens, _cam_to_world(image, model))
 
     images = bad.read_each(read, ((image,) for image in registered))
-    return PosedScene(scene.name, images, partial(_read_points, model))
+    return PosedScene(scene.name, images, partial(_points, model))
 
 
 def points_beside(scene: Path, posed: Sequence[PosedImage]) -> Points | None:
@@ -88,24 +79,19 @@ def points_beside(scene: Path, posed: Sequence[PosedImage]) -> Points | None:
     Raises:
         InputError: a model that is cut short.
     """
-    model = _find_model(scene)
-    if model is None:
+    if (model := _find_model(scene)) is None:
         return None
     colmap = _read(model)
-    images = {Path(image.name).name: image for image in _registered(colmap)}
-    pairs = [
-        (image.cam_to_world, _cam_to_world(images[image.file.name], model))
-        for image in posed
-        if image.file.name in images
-    ]
-    return _points(colmap) if pairs and _same_world(np.array(pairs)) else None
-
-
-def _same_world(pairs: Float[ndarray, "N 2 4 4"]) -> bool:
-    difference = np.abs(pairs[:, 0] - pairs[:, 1])
-    spread = np.ptp(pairs[:, 0, :3, 3], axis=0).max()
+    images = {Path(image.name).name: image for image in colmap.images.values() if image.has_pose}
+    posed = [image for image in posed if image.file.name in images]
+    if not posed:
+        return None
+    given = np.array([image.cam_to_world for image in posed])
+    others = [_cam_to_world(images[image.file.name], model) for image in posed]
+    difference, spread = np.abs(given - others), np.ptp(given[:, :3, 3], axis=0).max()
     rotation, translation = difference[:, :3, :3].max(), difference[:, :3, 3].max()
-    return bool(rotation < SAME_WORLD and translation < SAME_WORLD * spread)
+    same_world = rotation < SAME_WORLD and translation < SAME_WORLD * spread
+    return _points(colmap) if same_world else None
 
 
 def _find_model(scene: Path) -> Path | None:
@@ -128,7 +114,14 @@ def _read(model: Path) -> pycolmap.Reconstruction:
             "points3D files again."
         ) from error
     if binary:
-        _check_cameras(model / "cameras.bin", colmap.cameras.values())
+        # COLMAP invents cameras beyond the file's end.
+        expected = 8 + sum(24 + 8 * len(camera.params) for camera in colmap.cameras.values())
+        size = (model / "cameras.bin").stat().st_size
+        if size != expected:
+            raise InputError(
+                f"{model / 'cameras.bin'} has {size} bytes and its cameras take {expected}: it is "
+                "cut short or damaged, so copy it again."
+            )
     else:
         _check_count(model / "images.txt", colmap.num_images())
         _check_count(model / "points3D.txt", colmap.num_points3D())
@@ -157,16 +150,6 @@ def _check_lengths(file: Path) -> None:
         ) from error
 
 
-def _check_cameras(file: Path, cameras: Iterable[pycolmap.Camera]) -> None:
-    """Check the file's length, since COLMAP invents cameras beyond its end."""
-    expected = 8 + sum(24 + 8 * len(camera.params) for camera in cameras)
-    if file.stat().st_size != expected:
-        raise InputError(
-            f"{file} has {file.stat().st_size} bytes and its cameras take {expected}: it is cut "
-            "short or damaged, so copy it again."
-        )
-
-
 def _check_count(file: Path, count: int) -> None:
     """Check the number of entries against the file's header; COLMAP accepts any number of lines."""
     with file.open(encoding="utf-8", errors="replace") as lines:
@@ -179,22 +162,15 @@ def _check_count(file: Path, count: int) -> None:
         )
 
 
-def _registered(colmap: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    return [image for image in colmap.images.values() if image.has_pose]
-
-
 def _cam_to_world(image: pycolmap.Image, model: Path) -> Float[ndarray, "4 4"]:
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()
-    return inverted(rigid(pose, f"{model}, pose of {image.name}"))
+    return common.inverted(common.rigid(pose, f"{model}, pose of {image.name}"))
 
 
-def _read_points(model: Path) -> Points | None:
-    return _points(_read(model))
-
-
-def _points(colmap: pycolmap.Reconstruction) -> Points | None:
-    points = sorted(colmap.points3D.items())
+def _points(colmap: pycolmap.Reconstruction | Path) -> Points | None:
+    model = _read(colmap) if isinstance(colmap, Path) else colmap
+    points = sorted(model.points3D.items())
     return np.array([point.xyz for _, point in points]) if points else None
 
 
@@ -236,7 +212,7 @@ def _images_folder(scene: Path, model: Path, names: Sequence[str]) -> Path:
 def _warn_of_unregistered(model: Path, registered: Sequence[Path]) -> None:
     used = set(registered)
     folders = sorted({path.parent for path in registered})
-    left = [path for folder in folders for path in images_in(folder) if path not in used]
+    left = [path for folder in folders for path in common.images_in(folder) if path not in used]
     if left:
         names = ", ".join(path.name for path in left[:MAX_NAMES])
         warnings.warn(

@@ -7,6 +7,7 @@ https://github.com/DL3DV-10K/Dataset
 https://huggingface.co/datasets/DL3DV/DL3DV-Benchmark
 """
 
+import re
 from pathlib import Path
 
 from asysplat.data.bad_images import BadImages
@@ -18,7 +19,6 @@ from asysplat.errors import InputError
 TRANSFORMS = "transforms.json"
 BENCHMARK = "nerfstudio"  # the folder in a benchmark scene
 IMAGES = ("images_4", "images_8", "images_2")  # 960P first, as the paper uses
-HASH_LENGTH = 64
 
 
 def find_scenes(root: Path) -> list[Path]:
@@ -66,9 +66,5 @@ def _images(folder: Path) -> str | None:
 
 def _is_scene(folder: Path) -> bool:
     content = _content(folder)
-    hashed = _is_hash(folder.name) or _is_hash(folder.parent.name)
+    hashed = any(re.fullmatch("[0-9a-f]{64}", name) for name in (folder.name, folder.parent.name))
     return (hashed or not (content / "images").is_dir()) and _images(content) is not None
-
-
-def _is_hash(name: str) -> bool:
-    return len(name) == HASH_LENGTH and not set(name) - set("0123456789abcdef")

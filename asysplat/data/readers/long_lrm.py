@@ -9,16 +9,9 @@ from typing import Any
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
+from asysplat.data.readers import common
 from asysplat.data.readers.colmap import points_beside
-from asysplat.data.readers.common import (
-    folders_with,
-    frame_label,
-    inverted,
-    read_frames,
-    read_text,
-    rigid,
-    scaled,
-)
+from asysplat.data.readers.common import read_text
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -32,7 +25,7 @@ def find_scenes(root: Path) -> list[Path]:
     json file per line, relative to itself.
     """
     if not root.is_file():
-        return folders_with(root, CAMERAS)
+        return common.folders_with(root, CAMERAS)
     if root.suffix == ".txt":
         lines = [line.strip() for line in read_text(root).splitlines() if line.strip()]
         files = [root.parent / line for line in lines]
@@ -49,13 +42,13 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     file = scene if scene.suffix == ".json" else scene / CAMERAS
 
     def read(index: int, entry: Any) -> PosedImage:
-        where = frame_label(file, index, entry)
+        where = common.frame_label(file, index, entry)
         image = file.parent / entry["file_path"]
         size = image_size(image)
-        pose = rigid(entry.get("w2c"), f"{where}: w2c")
-        return PosedImage(image, scaled(_lens(entry, where), size, where), inverted(pose))
+        pose = common.inverted(common.rigid(entry.get("w2c"), f"{where}: w2c"))
+        return PosedImage(image, common.scaled(_lens(entry, where), size, where), pose)
 
-    images = bad.read_each(read, enumerate(read_frames(file)["frames"]))
+    images = bad.read_each(read, enumerate(common.read_frames(file)["frames"]))
     return PosedScene(file.parent.name, images, partial(points_beside, file.parent, images))
 
 

@@ -27,16 +27,7 @@ import numpy as np
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
-from asysplat.data.readers.common import (
-    MILLIMETERS,
-    array_of,
-    beside,
-    folders_with,
-    has_path,
-    read_frames,
-    read_json,
-    rigid,
-)
+from asysplat.data.readers import common
 from asysplat.data.readers.transforms import read_images
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
@@ -68,7 +59,6 @@ PARTS = {
     "iphone/nerfstudio/transforms.json": Part("rgb", "rgb_masks", "depth", EXTRACT),
     ARKIT: Part("rgb", "rgb_masks", "depth", EXTRACT),
 }
-CAMERAS = ("dslr", "iphone")
 # From the scan's world to that of the transforms files, and back.
 TURN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 
@@ -81,9 +71,9 @@ def find_scenes(root: Path) -> list[Path]:
     """
     if root.is_file():
         return [root] if _key(root) else []
-    if root.name in CAMERAS:
+    if root.name in ("dslr", "iphone"):
         return _first(root.parent, root.name)
-    return [file for scene in folders_with(root, *PARTS) for file in _first(scene)]
+    return [file for scene in common.folders_with(root, *PARTS) for file in _first(scene)]
 
 
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:
@@ -126,7 +116,7 @@ def _first(scene: Path, camera: str = "") -> list[Path]:
 
 
 def _transforms(file: Path, folder: Path, part: Part, bad: BadImages) -> list[PosedImage]:
-    content = read_frames(file)
+    content = common.read_frames(file)
     downloaded = (folder / part.masks).is_dir()
     masks = content.get("has_mask", downloaded)
     if masks and not downloaded:
@@ -136,7 +126,7 @@ def _transforms(file: Path, folder: Path, part: Part, bad: BadImages) -> list[Po
     depths = part.depths and (folder / part.depths).is_dir()
     frames = []
     for entry in _good_frames(content, file, folder / part.images):
-        if has_path(entry):
+        if common.has_path(entry):
             name = f"{Path(entry['file_path']).stem}.png"
             entry = {
                 **entry,
@@ -167,7 +157,7 @@ def _good_frames(content: dict[str, Any], file: Path, images: Path) -> list[Any]
 
 def _arkit(file: Path, folder: Path, part: Part, bad: BadImages) -> list[PosedImage]:
     """Read ARKit's poses, by image: camera-to-world with OpenCV axes and intrinsics in pixels."""
-    content = read_json(file)
+    content = common.read_json(file)
     if not isinstance(content, dict):
         raise InputError(f"{file} is no object of frames by name: download it again.")
     masks, depths = (
@@ -180,30 +170,26 @@ def _arkit(file: Path, folder: Path, part: Part, bad: BadImages) -> list[PosedIm
             raise InputError(f"{where} is {entry!r}: give its intrinsic and aligned_pose.")
         image = folder / part.images / f"{name}.jpg"
         size = image_size(image)
+        stored = entry.get("intrinsic")
+        matrix = common.array_of(stored)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or (np.diag(matrix) <= 0).any():
+            raise InputError(
+                f"{where}: intrinsic is {stored}: give 3x3 numbers, fx and fy above 0, in pixels."
+            )
         return PosedImage(
             file=image,
-            lens=_pinhole(entry.get("intrinsic"), size, f"{where}: intrinsic"),
-            cam_to_world=rigid(entry.get("aligned_pose"), f"{where}: aligned_pose"),
-            depth=depths and beside(depths / f"{name}.png", size, where),
-            depth_unit=MILLIMETERS,
-            mask=masks and beside(masks / f"{name}.png", size, where),
+            lens=Lens(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
+            cam_to_world=common.rigid(entry.get("aligned_pose"), f"{where}: aligned_pose"),
+            depth=depths and common.beside(depths / f"{name}.png", size, where),
+            depth_unit=common.MILLIMETERS,
+            mask=masks and common.beside(masks / f"{name}.png", size, where),
         )
 
     return bad.read_each(read, sorted(content.items()))
 
 
-def _pinhole(stored: Any, size: tuple[int, int], where: str) -> Lens:
-    matrix = array_of(stored)
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or (np.diag(matrix) <= 0).any():
-        raise InputError(f"{where} is {stored}: give 3x3 numbers, fx and fy above 0, in pixels.")
-    return Lens(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-
-
 def _points(file: Path) -> Points | None:
-    """Read columns 2 to 4 of COLMAP's points3D.txt.
-
-    https://colmap.github.io/format.html#points3d-txt
-    """
+    """Read columns 2 to 4 of COLMAP's points3D.txt, https://colmap.github.io/format.html."""
     if not file.is_file():
         return None
     with file.open(encoding="utf-8", errors="replace") as lines:

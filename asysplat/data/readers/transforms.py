@@ -12,19 +12,9 @@ from typing import Any
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
+from asysplat.data.readers import common
 from asysplat.data.readers.colmap import points_beside
-from asysplat.data.readers.common import (
-    MILLIMETERS,
-    beside,
-    folders_with,
-    frame_label,
-    natural_order,
-    number,
-    opencv_from_opengl,
-    read_frames,
-    rigid,
-    scaled,
-)
+from asysplat.data.readers.common import number
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -33,7 +23,7 @@ PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 
 def find_scenes(root: Path) -> list[Path]:
     """Find folders with a `transforms.json`; `root` may be the json file itself."""
-    return [root] if root.suffix == ".json" else folders_with(root, "transforms.json")
+    return [root] if root.suffix == ".json" else common.folders_with(root, "transforms.json")
 
 
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:
@@ -43,7 +33,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     10), or, if a name has no number, as in the file. Paths are relative to the file's folder.
     """
     file = scene if scene.suffix == ".json" else scene / "transforms.json"
-    images = read_images(read_frames(file), file, bad)
+    images = read_images(common.read_frames(file), file, bad)
     return PosedScene(file.parent.name, images, partial(points_beside, file.parent, images))
 
 
@@ -67,8 +57,11 @@ def read_images(
     shared: list[tuple[Path, tuple[int, int]]] = []  # images without w and h of their own
 
     def read(index: int, entry: Any) -> PosedImage:
-        where = frame_label(file, index, entry)
-        image = _find_image(folder / entry["file_path"])
+        where = common.frame_label(file, index, entry)
+        image = folder / entry["file_path"]
+        # The path may lack the file's extension.
+        names = (image.name + suffix for suffix in ("", ".png", ".jpg"))
+        image = next((path for name in names if (path := image.with_name(name)).is_file()), image)
         size = image_size(image)
         if not ("w" in entry and "h" in entry):
             shared.append((image, size))
@@ -79,19 +72,28 @@ def read_images(
                     "images of one size, or w, h and intrinsics for every image."
                 )
         fields = {**content, **entry}
-        pose = rigid(fields.get("transform_matrix"), f"{where}: transform_matrix")
+        pose = common.rigid(fields.get("transform_matrix"), f"{where}: transform_matrix")
+
+        def beside(key: str) -> Path | None:
+            """Return the depth map or mask under `key`; None where there is none."""
+            name = fields.get(key)
+            if not isinstance(name, str | None):
+                raise InputError(f"{where}: {key} is {name!r}: give a file name, or leave it out.")
+            return None if name is None else common.beside(folder / name, size, f"{where}: {key}")
+
+        unit = number(fields, "depth_unit_scale_factor", where, default=common.MILLIMETERS)
         return PosedImage(
             file=image,
             lens=_lens(fields, size, resized, where),
-            cam_to_world=opencv_from_opengl(pose),
-            depth=_beside(folder, fields, "depth_file_path", size, where),
-            depth_unit=number(fields, "depth_unit_scale_factor", where, default=MILLIMETERS),
-            mask=_beside(folder, fields, "mask_path", size, where),
+            cam_to_world=common.opencv_from_opengl(pose),
+            depth=beside("depth_file_path"),
+            depth_unit=unit,
+            mask=beside("mask_path"),
         )
 
     images = bad.read_each(read, enumerate(content["frames"]))
     if all(re.search(r"\d", image.file.stem) for image in images):
-        images.sort(key=lambda image: natural_order(image.file))
+        images.sort(key=lambda image: common.natural_order(image.file))
     return images
 
 
@@ -124,7 +126,7 @@ def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: s
         distortion=tuple(number(fields, name, where, default=0.0) for name in names),
         fisheye=fisheye,
     )
-    return scaled(lens, size, where)
+    return common.scaled(lens, size, where)
 
 
 def _focal(fields: dict[str, Any], width: int, height: int, where: str) -> tuple[float, float]:
@@ -146,21 +148,3 @@ def _focal(fields: dict[str, Any], width: int, height: int, where: str) -> tuple
             "give lengths > 0 in pixels, or angles between 0 and pi."
         )
     return fx, fy
-
-
-def _find_image(path: Path) -> Path:
-    """Return `path`, with the extension that the file has if `path` has none."""
-    candidates = (path, *(path.with_name(path.name + suffix) for suffix in (".png", ".jpg")))
-    return next((candidate for candidate in candidates if candidate.is_file()), path)
-
-
-def _beside(
-    folder: Path, fields: dict[str, Any], key: str, size: tuple[int, int], where: str
-) -> Path | None:
-    """Return the depth map or mask under `key`; None where there is none."""
-    name = fields.get(key)
-    if name is None:
-        return None
-    if not isinstance(name, str):
-        raise InputError(f"{where}: {key} is {name!r}: give a file name, or leave it out.")
-    return beside(folder / name, size, f"{where}: {key}")
