@@ -11,11 +11,7 @@ TINY = torch.finfo(torch.float32).tiny  # replaces scales and opacities that rou
 
 
 def existing(path: str | Path) -> Path:
-    """Return the path of an existing file.
-
-    Raises:
-        InputError: it does not exist.
-    """
+    """Return the path of an existing file; raise InputError if there is none."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} is not a file: name an existing one.")

@@ -13,8 +13,6 @@ from torch.nn.functional import normalize
 from asysplat.data.normalize import Normalization
 from asysplat.scene import Cameras, Gaussians
 
-FRUSTUM_LENGTHS = (0.03, 0.2)  # shortest and longest, in the page's unit
-
 
 def page_frame(cameras: Cameras, gaussians: Gaussians | None) -> Normalization:
     """Return the frame of the pages: input cameras around 0, the farthest at distance 1.
@@ -40,14 +38,6 @@ def mean_up(cameras: Cameras) -> Float[Tensor, "3"]:
     up = -cameras.cam_to_world[:, :3, 1]
     mean = up.mean(0)
     return normalize(mean if mean.norm() > 1e-3 else up[0], dim=0)
-
-
-def frustum_length(cameras: Cameras) -> float:
-    """Return half the median distance to the nearest camera, clamped to FRUSTUM_LENGTHS."""
-    distances = torch.cdist(cameras.centers, cameras.centers)
-    distances.fill_diagonal_(math.inf)
-    shortest, longest = FRUSTUM_LENGTHS
-    return min(max(0.5 * distances.amin(1).median().item(), shortest), longest)
 
 
 def field_of_view(cameras: Cameras, view: int) -> tuple[float, float]:
@@ -76,10 +66,7 @@ def distance_along(
 def clicked_camera(
     cameras: Cameras, length: float, start: Float[Tensor, "3"], ray: Float[Tensor, "3"]
 ) -> int | None:
-    """Return the camera whose image, at the end of its frustum, a ray hits first; None: no one.
-
-    The ray ends at the near plane; images before it are not visible.
-    """
+    """Return the first camera whose image a ray, which ends at the near plane, hits behind it."""
     rotations = cameras.cam_to_world[:, :3, :3]
     starts = ((start - cameras.centers)[:, None] @ rotations)[:, 0]
     rays = ray @ rotations

@@ -32,7 +32,7 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
         [frames] upright cameras that look at the point, with the mean intrinsics.
 
     Raises:
-        InputError: a batch dimension, no views, no frames, or what `Cameras.validate` refuses.
+        InputError: see `checked_poses`.
     """
     poses = checked_poses(cameras, frames)
     vectors = pose_vectors(poses)
@@ -45,10 +45,22 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
     radius = max(lengths(flat).mean(), lengths(offsets).mean() / MAX_STEEPNESS)
-    x, y = _perpendicular_axes(up, poses[middle, :3, 3] - focus)
+    direction = poses[middle, :3, 3] - focus
+    x = direction - (direction @ up) * up
+    if np.linalg.norm(x) < ROUNDING * np.linalg.norm(direction):
+        x = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    x /= np.linalg.norm(x)
+    y = np.cross(up, x)
     angles = _angles(np.arctan2(flat @ y, flat @ x), frames)[:, None]
     circle = radius * (np.cos(angles) * x + np.sin(angles) * y)
-    return with_poses(cameras, _look_at(focus, focus + heights.mean() * up + circle, up))
+    centers = focus + heights.mean() * up + circle
+    forward = focus - centers
+    right = np.cross(forward, up)
+    axes = np.stack((right, np.cross(forward, right), forward), 2)
+    path = np.tile(np.eye(4), (frames, 1, 1))
+    path[:, :3, :3] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    path[:, :3, 3] = centers
+    return with_poses(cameras, path)
 
 
 def _up(poses: Float[ndarray, "V 4 4"], middle: int) -> Float[ndarray, "3"]:
@@ -92,17 +104,6 @@ def _visible(
     return inside[:, 0].detach().numpy()
 
 
-def _perpendicular_axes(
-    up: Float[ndarray, "3"], direction: Float[ndarray, "3"]
-) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
-    """Return orthonormal vectors perpendicular to `up`; the first is nearest to a direction."""
-    x = direction - (direction @ up) * up
-    if np.linalg.norm(x) < ROUNDING * np.linalg.norm(direction):
-        x = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    x /= np.linalg.norm(x)
-    return x, np.cross(up, x)
-
-
 def _angles(angles: Float[ndarray, " S"], frames: int) -> Float[ndarray, " T"]:
     """Return the frames' angles: a full circle, or to and fro over the cameras' arc."""
     turn = 2 * np.pi * np.arange(frames) / frames
@@ -114,15 +115,3 @@ def _angles(angles: Float[ndarray, " S"], frames: int) -> Float[ndarray, " T"]:
     swing = (2 * np.pi - gaps[widest]) / 2
     middle = angles[widest] + gaps[widest] + swing
     return middle + max(swing, MIN_SWING) * np.sin(turn)
-
-
-def _look_at(
-    point: Float[ndarray, "3"], centers: Float[ndarray, "T 3"], up: Float[ndarray, "3"]
-) -> Float[ndarray, "T 4 4"]:
-    forward = point - centers
-    right = np.cross(forward, up)
-    axes = np.stack((right, np.cross(forward, right), forward), 2)
-    poses = np.tile(np.eye(4), (len(centers), 1, 1))
-    poses[:, :3, :3] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    poses[:, :3, 3] = centers
-    return poses

@@ -28,7 +28,7 @@ def smoothed_path(cameras: Cameras, frames: int) -> Cameras:
         [frames] with the mean intrinsics, all equal if the cameras are.
 
     Raises:
-        InputError: a batch dimension, no views, no frames, or what `Cameras.validate` refuses.
+        InputError: see `checked_poses`.
     """
     poses = checked_poses(cameras, frames)
     poses = poses[_short_order(pose_vectors(poses))]
@@ -63,10 +63,7 @@ def _short_order(vectors: Float[ndarray, "V 12"]) -> Int[ndarray, " V"]:
 def _smoothed(
     poses: Float[ndarray, "V 4 4"], positions: Float[ndarray, " V"]
 ) -> Float[ndarray, "samples 7"]:
-    """Interpolate poses by splines and smooth these.
-
-    Args:
-        positions: of the poses along the path, increasing.
+    """Interpolate poses at increasing positions by splines, and smooth these.
 
     Returns:
         centers and quaternions wxyz of any norm.

@@ -23,11 +23,9 @@ MAX_OPACITY = 1 - 1e-7  # the logit of 1 is infinite
 
 
 def write_ply(path: str | Path, gaussians: Gaussians) -> None:
-    """Write one scene as binary little-endian PLY.
+    """Write one scene, without batch dimension, as binary little-endian PLY.
 
-    Args:
-        gaussians: without batch dimension; quaternions are normalized, and an opacity of 1 is
-            written as 1 - 1e-7.
+    Quaternions are normalized, and an opacity of 1 is written as 1 - 1e-7.
 
     Raises:
         InputError: invalid Gaussians, or a file that cannot be written.
@@ -46,13 +44,8 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     table = torch.cat(columns, 1).numpy().astype("<f4", copy=False)
     rest = _rest(3 * (gaussians.sh.shape[1] - 1))
     names = [*MEAN, *NORMAL, *COLOR, *rest, "opacity", *SCALE, *ROTATION]
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(table)}",
-        *(f"property float {name}" for name in names),
-        "end_header\n",
-    ]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [*(f"property float {name}" for name in names), "end_header\n"]
     with atomic_write(path) as partial, open(partial, "wb") as file:
         file.write("\n".join(header).encode())
         file.write(table.data)
@@ -90,8 +83,8 @@ def read_ply(path: str | Path) -> Gaussians:
             f"{path}: {names[column]} of vertex {row} is {table[row, column]}: repair or remove "
             "that vertex."
         )
-    parts = torch.from_numpy(table).split((3, 3, count, 1, 3, 4), 1)
-    means, color, rest, logits, scales, quats = parts
+    columns = torch.from_numpy(table).split((3, 3, count, 1, 3, 4), 1)
+    means, color, rest, logits, scales, quats = columns
     gaussians = Gaussians(
         means=means.contiguous(),
         quats=quats.contiguous(),

@@ -4,10 +4,9 @@ Format: http://paulbourke.net/dataformats/ply
 """
 
 import warnings
-from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -21,19 +20,12 @@ TYPES |= {"uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float
 MAX_LINE = 4096  # bytes of a header's line: other files may have no lines
 
 
-@dataclass(frozen=True)
-class Element:
-    """One kind of rows, as declared by the header.
-
-    Args:
-        name: "vertex", "face" or another.
-        count: number of rows.
-        types: numpy's type of each property, in the file's order; None for a list.
-    """
+class Element(NamedTuple):
+    """One kind of rows, as declared by the header: numpy's type by property, None for a list."""
 
     name: str
     count: int
-    types: dict[str, str | None] = field(default_factory=dict)
+    types: dict[str, str | None]
 
     def row(self, byte_order: str) -> np.dtype:
         """Return the type of a row."""
@@ -84,7 +76,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
             case ["format", name, "1.0"] if name in BYTE_ORDERS:
                 byte_order = BYTE_ORDERS[name]
             case ["element", name, count] if count.isdecimal():
-                elements.append(Element(name, int(count)))
+                elements.append(Element(name, int(count), {}))
             case ["property", "list", _, _, name] if elements:
                 elements[-1].types[name] = None
             case ["property", kind, name] if (

@@ -17,11 +17,7 @@ NAMES = tuple(field.name for field in fields(Gaussians))
 def write_safetensors(
     path: str | Path, gaussians: Gaussians, metadata: dict[str, str] | None = None
 ) -> None:
-    """Write means, quats, scales, opacities and sh in float32, under those names.
-
-    Args:
-        gaussians: one scene, without batch dimension.
-        metadata: stored with them, such as units or the scene's origin.
+    """Write one scene's means, quats, scales, opacities and sh in float32, and metadata.
 
     Raises:
         InputError: invalid Gaussians, or a file that cannot be written.
@@ -48,8 +44,7 @@ def read_safetensors(path: str | Path) -> tuple[Gaussians, dict[str, str]]:
             f"{path} cannot be read as safetensors ({error}): it is cut off or of another format; "
             "copy it again."
         ) from error
-    missing = [name for name in NAMES if name not in tensors]
-    if missing:
+    if missing := [name for name in NAMES if name not in tensors]:
         raise InputError(
             f"{path} has no {', '.join(missing)}: expected the fields {', '.join(NAMES)} of a "
             "scene."

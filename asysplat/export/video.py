@@ -20,14 +20,9 @@ INDEX_FIRST = {"movflags": "+faststart"}  # browsers start before the download e
 def write_video(
     path: str | Path, images: Iterable[Float[Tensor, "3 H W"]], fps: int | float = 30
 ) -> None:
-    """Write images as H.264 in yuv420p, one at a time.
+    """Write RGB images of one size, clamped to [0, 1], as H.264 in yuv420p, one at a time.
 
     The last row or column is repeated where a height or width is odd.
-
-    Args:
-        path: ends in .mp4.
-        images: RGB, clamped to [0, 1], all of one size.
-        fps: frames per second, > 0.
 
     Raises:
         InputError: PyAV is missing, another suffix, no image, NaN, images of different sizes, or a

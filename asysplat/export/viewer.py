@@ -12,25 +12,15 @@ from jaxtyping import Float, UInt8
 from matplotlib import colormaps
 from numpy import ndarray
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import disparity
-from asysplat.export.frame import (
-    clicked_camera,
-    distance_along,
-    field_of_view,
-    frustum_length,
-    mean_up,
-    page_camera,
-    page_frame,
-    quaternion,
-)
+from asysplat.export import frame
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 
 LAYERS = ("color", "depth", "alpha")
-THUMBNAIL_SIDE = 96  # pixels
+FRUSTUM_LENGTH = 0.1  # in the page's unit
 MAX_SAMPLES = 10_000  # pixels from which the range of disparities is computed
 WAITING = "Waiting for the first rendering; kernels may have to compile, for minutes."
 POLL_SECONDS = 0.01  # between two checks for changes
@@ -55,26 +45,16 @@ class Viewer:
     Each page that opens `url` has its own camera; the panel's settings hold for all pages. A click
     on a camera moves the page's camera there. Scenes may have any size.
 
-        with Viewer(views, gaussians) as viewer:
-            viewer.wait()
-
     Args:
         views: input views, [V].
         gaussians: [N]; None to `show` them later.
-        port, host: to listen at. The next free port is used if it is taken, any for 0; the host
-            0.0.0.0 admits other machines.
+        port: of this machine; the next free one is used if it is taken; 0: any free one.
 
     Raises:
         InputError: viser is not installed; views or Gaussians with batch dimensions.
     """
 
-    def __init__(
-        self,
-        views: Views,
-        gaussians: Gaussians | None = None,
-        port: int = 8080,
-        host: str = "127.0.0.1",
-    ):
+    def __init__(self, views: Views, gaussians: Gaussians | None = None, port: int = 8080):
         try:
             import viser
         except ImportError as error:
@@ -82,30 +62,29 @@ class Viewer:
         _check_one_scene("views", views.images.shape[:-4])
         if gaussians is not None:
             _check_one_scene("gaussians", gaussians.opacities.shape[:-1])
-        self._frame = page_frame(views.cameras, gaussians)
+        self._frame = frame.page_frame(views.cameras, gaussians)
         views = self._frame.apply(Views(views.cameras, views.images).to("cpu"))
         self._cameras = views.cameras
-        self._up, self._length = mean_up(self._cameras), frustum_length(self._cameras)
+        self._up = frame.mean_up(self._cameras)
         self._scene: tuple[Gaussians | None, str] = (None, WAITING)
         self._version = object()
         self._closed = Event()
-        self._server = viser.ViserServer(host=host, port=port, label="asysplat", verbose=False)
+        self._server = viser.ViserServer("127.0.0.1", port, label="asysplat", verbose=False)
         self._add_panel()
         self._add_cameras(views.images)
         if gaussians is not None:
             self.show(gaussians)
         first = self._server.initial_camera
         first.position, first.look_at, first.up, first.fov = self._pose(0)
-        # At an input camera, its own thumbnail must not hide the scene.
-        first.near = 1.5 * self._length
+        # At an input camera, its own image must not hide the scene.
+        first.near = 1.5 * FRUSTUM_LENGTH
         self._thread = Thread(target=self._render_pages, name="asysplat-viewer", daemon=True)
         self._thread.start()
 
     @property
     def url(self) -> str:
         """The address to open in a browser."""
-        host = self._server.get_host()
-        return f"http://{'localhost' if host == '0.0.0.0' else host}:{self._server.get_port()}"
+        return f"http://127.0.0.1:{self._server.get_port()}"
 
     def show(self, gaussians: Gaussians, text: str = "") -> None:
         """Show other Gaussians, [N], and Markdown in the panel; any thread may call it.
@@ -165,18 +144,18 @@ class Viewer:
         scene.set_up_direction(self._up.numpy())
         parent = scene.add_frame("/cameras", show_axes=False)
         for view in range(self._cameras.num_views):
-            fov, aspect = field_of_view(self._cameras, view)
+            fov, aspect = frame.field_of_view(self._cameras, view)
             frustum = scene.add_camera_frustum(
                 f"/cameras/{view}",
                 fov=fov,
                 aspect=aspect,
                 # viser's scale is the cube root of the frustum's volume, not its length.
-                scale=self._length * (aspect * math.tan(fov / 2) ** 2 / 3) ** (1 / 3),
+                scale=FRUSTUM_LENGTH * (aspect * math.tan(fov / 2) ** 2 / 3) ** (1 / 3),
                 thickness=1.5,
                 thickness_units="screen",
                 color=(209, 98, 45),
-                image=thumbnail(images[view]),
-                wxyz=quaternion(self._cameras, view),
+                image=_bytes(images[view]),
+                wxyz=frame.quaternion(self._cameras, view),
                 position=self._cameras.centers[view].numpy(),
             )
             frustum.on_click(self._click)
@@ -184,10 +163,10 @@ class Viewer:
 
     def _click(self, event: Any) -> None:
         # The browser also reports clicks on frustums before its near plane, which are invisible.
-        camera, _ = page_camera(event.client.camera, MAX_PIXELS)
+        camera, _ = frame.page_camera(event.client.camera, MAX_PIXELS)
         start, ray = (torch.tensor(v).float() for v in (event.ray_origin, event.ray_direction))
         to_near = event.client.camera.near / (ray @ camera.cam_to_world[0, :3, 2])
-        view = clicked_camera(self._cameras, self._length, start, to_near * ray)
+        view = frame.clicked_camera(self._cameras, FRUSTUM_LENGTH, start, to_near * ray)
         if view is not None:
             self._move(event.client, view)
 
@@ -201,10 +180,10 @@ class Viewer:
         right, _, forward = self._cameras.cam_to_world[view, :3, :3].unbind(-1)
         position = self._cameras.centers[view]
         gaussians, _ = self._scene
-        distance = 1.0 if gaussians is None else distance_along(gaussians, position, forward)
+        distance = 1.0 if gaussians is None else frame.distance_along(gaussians, position, forward)
         up = self._up - (self._up @ right) * right
         vectors = (position, position + distance * forward, up)
-        return *(vector.numpy() for vector in vectors), field_of_view(self._cameras, view)[0]
+        return *(vector.numpy() for vector in vectors), frame.field_of_view(self._cameras, view)[0]
 
     def _change(self) -> None:
         self._version = object()
@@ -237,7 +216,7 @@ class Viewer:
         if gaussians is None:
             return True
         try:
-            camera, in_full = page_camera(client.camera, max_pixels)
+            camera, in_full = frame.page_camera(client.camera, max_pixels)
             camera = camera.to(gaussians.means.device)
             image = draw_layer(gaussians, camera, *(handle.value for handle in self._settings))
             if client.client_id not in self._server.get_clients():  # closed meanwhile
@@ -283,13 +262,6 @@ def draw_layer(
         return colors[(255 * values.clamp(0, 1)).round().byte().cpu().numpy()]
     alpha = rendering.alpha[0].expand(3, -1, -1)
     return _bytes(alpha if layer == "alpha" else rendering.image[0].clamp(0, 1))
-
-
-def thumbnail(image: Float[Tensor, "3 H W"]) -> UInt8[ndarray, "h w 3"]:
-    """Shrink an RGB image in [0, 1] to at most THUMBNAIL_SIDE pixels a side."""
-    factor = min(1, THUMBNAIL_SIDE / max(image.shape[1:]))
-    size = [max(round(factor * side), 1) for side in image.shape[1:]]
-    return _bytes(interpolate(image[None], size, mode="area")[0])
 
 
 def _bytes(image: Float[Tensor, "3 H W"]) -> UInt8[ndarray, "H W 3"]:

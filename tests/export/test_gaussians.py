@@ -1,4 +1,4 @@
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -48,3 +48,21 @@ def test_a_full_disk_leaves_the_old_file(scene, make_scene, tmp_path, name):
     with largest_file(5000), pytest.raises(InputError, match=message):
         write_gaussians(file, larger)
     assert file.read_bytes() == before and list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("name", ["scene.ply", "scene.safetensors"])
+def test_what_cannot_be_rendered_is_not_written_over_a_file(scene, tmp_path, name):
+    file = tmp_path / name
+    with pytest.raises(InputError, match=rf"{name} is not a file"):
+        read_gaussians(file)
+    file.write_text("old")
+    for bad, message in (
+        (replace(scene, scales=-scene.scales), r"scales\[0\] is <= 0"),
+        (replace(scene, means=scene.means / 0), r"means\[0\] holds NaN or infinity"),
+        (replace(scene, opacities=scene.opacities + 1), r"opacities\[0\] lies outside"),
+        (scene.keep(scene.opacities > 2), "no Gaussians"),
+        (Gaussians.stack([scene, scene]), "one by one"),
+    ):
+        with pytest.raises(InputError, match=message):
+            write_gaussians(file, bad)
+        assert file.read_text() == "old"

@@ -1,4 +1,4 @@
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import pytest
 import torch
@@ -28,17 +28,12 @@ def test_all_bits_come_back(written, scene):
     assert set(load_file(written)) == {field.name for field in fields(Gaussians)}
 
 
-def test_no_metadata(scene, tmp_path):
-    write_safetensors(tmp_path / "scene.safetensors", scene)
-    assert read_safetensors(tmp_path / "scene.safetensors")[1] == {}
-
-
 def test_views_of_other_types_with_gradients_are_written(make_scene, tmp_path):
     scene, _ = make_scene(dtype=torch.float64)
     scene = scene.map(lambda tensor: torch.stack((tensor, tensor), -1)[..., 0].requires_grad_())
     write_safetensors(tmp_path / "scene.safetensors", scene)
-    read, _ = read_safetensors(tmp_path / "scene.safetensors")
-    assert torch.equal(read.sh, scene.sh.float()) and not read.sh.requires_grad
+    read, metadata = read_safetensors(tmp_path / "scene.safetensors")
+    assert torch.equal(read.sh, scene.sh.float()) and not read.sh.requires_grad and metadata == {}
 
 
 def change(file, **tensors):
@@ -61,12 +56,11 @@ def test_scenes_that_cannot_be_used_are_refused(written, tensors, message):
         read_safetensors(written)
 
 
-@pytest.mark.parametrize("scenes", [lambda s: s.keep(s.opacities > 2), lambda s: s.stack([s, s])])
-def test_one_scene_and_not_none_is_read(written, scene, scenes):
-    tensors = scenes(scene)
-    change(written, **{f.name: getattr(tensors, f.name) for f in fields(Gaussians)})
-    with pytest.raises(InputError, match=r"scene\.safetensors has opacities of shape .*\[N\]"):
-        read_safetensors(written)
+def test_one_scene_and_not_none_is_read(written, scene):
+    for bad in (scene.keep(scene.opacities > 2), scene.stack([scene, scene])):
+        change(written, **{f.name: getattr(bad, f.name) for f in fields(Gaussians)})
+        with pytest.raises(InputError, match=r"scene\.safetensors has opacities of shape .*\[N\]"):
+            read_safetensors(written)
 
 
 @pytest.mark.parametrize("size", [0, 7, 100, -1])
@@ -74,10 +68,3 @@ def test_files_that_are_cut_off_are_refused(written, size):
     written.write_bytes(written.read_bytes()[:size])
     with pytest.raises(InputError, match=r"scene\.safetensors cannot be read as safetensors"):
         read_safetensors(written)
-
-
-def test_what_cannot_be_rendered_is_not_written(written, scene):
-    before = written.read_bytes()
-    with pytest.raises(InputError, match=r"opacities\[0\] lies outside"):
-        write_safetensors(written, replace(scene, opacities=scene.opacities + 1))
-    assert written.read_bytes() == before

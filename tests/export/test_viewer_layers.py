@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from asysplat import Cameras, Gaussians, render
-from asysplat.export.viewer import draw_layer, thumbnail
+from asysplat.export.viewer import draw_layer
 
 
 @pytest.fixture(scope="module")
@@ -61,12 +61,3 @@ def test_settings_of_the_panel(scene):
         assert (drawn != draw_layer(gaussians, camera)).any()
     alphas = [draw_layer(gaussians, camera, layer="alpha", size=size).mean() for size in (0.5, 1.0)]
     assert alphas[0] < 0.8 * alphas[1]
-
-
-def test_thumbnails_are_small_and_as_bright():
-    image = torch.rand(3, 150, 300)
-    small = thumbnail(image)
-    assert small.shape == (48, 96, 3)
-    np.testing.assert_allclose(small.mean((0, 1)) / 255, image.mean((1, 2)), atol=0.01)
-    part = image[:, :20, :30]
-    np.testing.assert_array_equal(thumbnail(part), bytes_of(part).transpose(1, 2, 0))

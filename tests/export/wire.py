@@ -44,6 +44,20 @@ class WirePage:
         }
         self._socket.send(msgspec.msgpack.encode(message))
 
+    def click(self, cameras, view: int) -> None:
+        """Click on a camera's frustum, from behind it."""
+        forward = cameras.cam_to_world[view, :3, 2]
+        message = {
+            "type": "SceneNodeClickMessage",
+            "name": f"/cameras/{view}",
+            "instance_index": None,
+            "ray_origin": (cameras.centers[view] - 0.02 * forward).tolist(),
+            "ray_direction": forward.tolist(),
+            "screen_pos": (0.5, 0.5),
+            "modifier": None,
+        }
+        self._socket.send(msgspec.msgpack.encode(message))
+
     def picture(self) -> np.ndarray:
         """Wait for the next picture, [H, W, 3]."""
         while not self._pictures:
