@@ -18,14 +18,12 @@ class VisibleAdam:
 
     Args:
         parameters: tensors by name, without gradients, contiguous, all with N rows, one for each
-            Gaussian.
+            Gaussian. A step changes them in place; `keep` and `append` replace them.
         betas: decay of the running averages of a gradient and of its square, in [0, 1).
         eps: > 0, added to the root of the latter.
 
     Attributes:
-        parameters: the tensors. A step changes them in place; `keep` and `append` replace them.
-        non_finite: number of visible rows that were not updated so far, because a gradient was NaN
-            or infinite.
+        non_finite: number of visible rows not updated so far, for a NaN or infinite gradient.
     """
 
     def __init__(
@@ -54,10 +52,10 @@ class VisibleAdam:
         """Update the visible rows, except those with a non-finite gradient.
 
         Args:
-            gradients: by name; those of tensors without a learning rate are not read.
+            gradients: by name.
             rates: learning rates >= 0, by name; a tensor without one, or with 0, is not updated and
-                costs nothing. A tensor that broadcasts to a row gives the rates of its elements:
-                [K, 1] for the K coefficients of `sh`.
+                needs no gradient. A tensor that broadcasts to a row gives the rates of its
+                elements: [K, 1] for the K coefficients of `sh`.
             visible: the rows to update.
 
         Raises:

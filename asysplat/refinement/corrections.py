@@ -15,23 +15,13 @@ class Corrections:
     """A gain and an offset per channel, and a small rigid motion, of each input image.
 
     Held-out views and later renderings are not corrected: the mean gain is kept at 1, the mean
-    offset and motion at 0.
-
-    Args:
-        count: number of images, V.
-        rates: learning rates; a correction with rate 0 is off.
+    offset and motion at 0. A correction with rate 0 is off.
     """
 
     def __init__(self, count: int, rates: Rates):
         self._rates = {"exposure": rates.exposure, "poses": rates.poses}
-        self._adam = VisibleAdam(
-            {"exposure": torch.zeros(count, 2, 3), "poses": torch.zeros(count, 2, 3)}, eps=1e-8
-        )
-
-    @property
-    def enabled(self) -> bool:
-        """Whether any correction has a learning rate."""
-        return any(self._rates.values())
+        self._adam = VisibleAdam({n: torch.zeros(count, 2, 3) for n in self._rates}, eps=1e-8)
+        self.enabled = any(self._rates.values())
 
     def leaves(self, view: int) -> dict[str, Tensor]:
         """Return the parameters of one image, [1, 2, 3] each, as leaves of a graph."""

@@ -30,26 +30,12 @@ class Fields:
     ):
         self.count = gaussians.sh.shape[1] if sh_degree is None else (sh_degree + 1) ** 2
         self._origins, parameters = self._unconstrained(gaussians)
-        self._units = units[:, None].to(self._origins)
-        self._adam = VisibleAdam(parameters)
+        self.units = units.to(self._origins)
+        self.optimizer = VisibleAdam(parameters)
+        self.parameters = self.optimizer.parameters
 
     def __len__(self) -> int:
         return len(self._origins)
-
-    @property
-    def parameters(self) -> Parameters:
-        """The tensors that the optimizer updates, by name."""
-        return self._adam.parameters
-
-    @property
-    def units(self) -> Float[Tensor, "N"]:
-        """The length of an offset of 1."""
-        return self._units[:, 0]
-
-    @property
-    def non_finite(self) -> int:
-        """Number of rows that were not updated because of NaN or infinite gradients."""
-        return self._adam.non_finite
 
     def leaves(self) -> Parameters:
         """Return the parameters as leaves of a graph."""
@@ -59,7 +45,7 @@ class Fields:
         """Return the Gaussians of given or current parameters, differentiable in them."""
         parameters = self.parameters if parameters is None else parameters
         return Gaussians(
-            means=torch.addcmul(self._origins, self._units, parameters["offsets"]),
+            means=torch.addcmul(self._origins, self.units[:, None], parameters["offsets"]),
             quats=parameters["quats"],
             scales=parameters["log_scales"].exp(),
             opacities=parameters["logits"].sigmoid(),
@@ -67,40 +53,27 @@ class Fields:
         )
 
     def step(self, gradients: Parameters, rates: Rates, factor: float) -> Bool[Tensor, "N"]:
-        """Update the visible Gaussians (with a gradient of the opacity); return their mask.
-
-        Args:
-            gradients: of the parameters.
-            rates: learning rates.
-            factor: of all rates.
-        """
+        """Update the visible Gaussians (with a gradient of the opacity); return their mask."""
         visible = gradients["logits"] != 0
         bands = torch.full((self.count, 1), rates.sh * rates.sh_rest)
         bands[0] = rates.sh
-        self._adam.step(
-            gradients,
-            {
-                "offsets": rates.means * factor,
-                "quats": rates.quats * factor,
-                "log_scales": rates.scales * factor,
-                "logits": rates.opacities * factor,
-                "sh": bands * factor,
-            },
-            visible,
-        )
+        by_name = {"offsets": rates.means, "quats": rates.quats, "log_scales": rates.scales}
+        by_name |= {"logits": rates.opacities, "sh": bands}
+        scaled = {name: rate * factor for name, rate in by_name.items()}
+        self.optimizer.step(gradients, scaled, visible)
         return visible
 
     def keep(self, index: Int[Tensor, "M"]) -> None:
         """Keep the rows of `index`."""
-        self._adam.keep(index)
-        self._origins, self._units = self._origins[index], self._units[index]
+        self.optimizer.keep(index)
+        self._origins, self.units = self._origins[index], self.units[index]
 
     def append(self, gaussians: Gaussians, units: Float[Tensor, "M"]) -> None:
         """Add Gaussians, with a new optimizer state."""
         origins, parameters = self._unconstrained(gaussians)
-        self._adam.append(parameters)
+        self.optimizer.append(parameters)
         self._origins = torch.cat((self._origins, origins))
-        self._units = torch.cat((self._units, units[:, None].to(self._units)))
+        self.units = torch.cat((self.units, units.to(self.units)))
 
     def _unconstrained(self, gaussians: Gaussians) -> tuple[Float[Tensor, "N 3"], Parameters]:
         """Return the origins of the offsets, and the parameters: copies in float32."""

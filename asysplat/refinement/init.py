@@ -39,17 +39,11 @@ def initial_gaussians(
     Gaussians of several views on the same surface are merged, in cells of a pixel of the network's
     input or of the prior's depth map.
 
-    Args:
-        init: one of INITS.
-        photographs: of the scene.
-        max_gaussians: limit, >= 1.
-        network: for init=network.
-
     Raises:
-        InputError: an unknown init, or photographs without the points or depths that it needs.
+        InputError: `init` is none of INITS, or needs points or depths that the photographs lack.
     """
-    views = photographs.inputs
-    height, width = views.cameras.height, views.cameras.width
+    views, pixels = photographs.inputs, 1.0
+    longest = max(views.cameras.height, views.cameras.width)
     if init == "points":
         if photographs.points is None:
             raise InputError(
@@ -57,32 +51,26 @@ def initial_gaussians(
                 "layout with points (COLMAP)."
             )
         gaussians = gaussians_from_points(photographs.points, views)
-        return merge_to_limit(gaussians, views.cameras, 1.0, max_gaussians)
-    if init == "network":
+    elif init == "network":
         gaussians = network.eval()(_resize(views, NETWORK_MAX_SIDE, network.patch))
-        side = PRIOR_MAX_SIDE
+        pixels = longest / PRIOR_MAX_SIDE
     elif init in ("plane_sweep", "depth"):
         if init == "depth" and views.depths is None:
             raise InputError(
                 f"init=depth: {photographs.name} has no depth maps; choose plane_sweep or points."
             )
         prior = _run_prior(PlaneSweepPrior() if init == "plane_sweep" else DepthPrior(), views)
-        gaussians, side = gaussians_from_prior(views, prior), max(prior.distance.shape[-2:])
+        gaussians = gaussians_from_prior(views, prior)
+        pixels = longest / max(prior.distance.shape[-2:])
     else:
         raise InputError(f"init={init}: choose {', '.join(INITS)}, or a file of Gaussians.")
-    return merge_to_limit(
-        gaussians, views.cameras, max(1.0, max(height, width) / side), max_gaussians
-    )
+    return merge_to_limit(gaussians, views.cameras, max(1.0, pixels), max_gaussians)
 
 
 def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:
     """Place an isotropic Gaussian at the surface point of each pixel of a prior's depth maps.
 
     Pixels that are masked out, wholly or in part, get none, unless all are masked out.
-
-    Args:
-        views: [V].
-        prior: of these views, [1, V, h, w].
     """
     size = tuple(prior.distance.shape[-2:])
     cameras = views.cameras.resized(*size)
@@ -104,9 +92,7 @@ def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:
 def gaussians_from_points(points: Float[Tensor, "P 3"], views: Views) -> Gaussians:
     """Place a faint isotropic Gaussian at each sparse point, as Kerbl et al. (2023).
 
-    Args:
-        points: in the world of the views.
-        views: [V]; a point has the mean color of its pixels.
+    It has the mean color of the point's pixels.
 
     Raises:
         InputError: no points, or NaN or infinite coordinates.

@@ -55,11 +55,7 @@ def merge_to_limit(
 ) -> Gaussians:
     """Merge Gaussians in cells of `pixels`, then larger ones until few enough are left.
 
-    Args:
-        gaussians: [N], N >= 1.
-        cameras: of the views that show them.
-        pixels: > 0, side of a cell, in pixels of the view where these are smallest.
-        max_gaussians: >= 1.
+    `pixels`, > 0, is the side of a cell in pixels of the view where these are smallest.
 
     Raises:
         InputError: see `Gaussians.validate`.

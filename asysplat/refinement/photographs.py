@@ -23,23 +23,14 @@ ANY_SIZE = 8  # pixels a side: to read cameras, before the size is known
 
 @dataclass(frozen=True)
 class Photographs:
-    """Views of one scene in the network's frame.
+    """Views of one scene, and its sparse points if any, in the network's frame."""
 
-    Args:
-        name: of the scene.
-        inputs: input views.
-        held_out: held-out views; None without any.
-        input_files, held_out_files: their file names.
-        frame: the network's frame, in the world of the files.
-        points: sparse points in the network's frame; None where the files have none.
-    """
-
-    name: str
+    name: str  # of the scene
     inputs: Views
     held_out: Views | None
     input_files: list[str]
     held_out_files: list[str]
-    frame: Normalization
+    frame: Normalization  # the network's frame, in the world of the files
     points: Float[Tensor, "P 3"] | None
 
 
@@ -57,13 +48,11 @@ def open_photographs(
     """Open posed photographs, select some evenly, and bring them into the network's frame.
 
     Args:
-        path: a scene, in any layout that `open_scene` reads.
+        path, layout, on_bad_image: see `open_scene`.
         height, width: of the views, in pixels; width None keeps the first photograph's aspect
             ratio.
-        views: number of input views, at most.
+        views, max_held_out: number of input and of held-out views, at most.
         held_out_every: hold out every n-th photograph, from the first on; None: none.
-        max_held_out: number of held-out views, at most.
-        layout, on_bad_image: see `open_scene`.
         say: takes warnings: fewer views than asked for, or cameras that do not fit the photographs.
 
     Raises:
@@ -103,20 +92,11 @@ def open_photographs(
     input_views = sequence.views(inputs).validate(str(path))
     targets = sequence.views(held_out).validate(str(path)) if held_out else input_views
     input_views, targets, frame = normalize(input_views, targets)
-    return Photographs(
-        name=scene.name,
-        inputs=input_views,
-        held_out=targets if held_out else None,
-        input_files=input_files,
-        held_out_files=[files[index] for index in held_out],
-        frame=frame,
-        points=_to_frame(scene.points, frame),
-    )
-
-
-def _to_frame(points: object, frame: Normalization) -> Float[Tensor, "P 3"] | None:
-    if points is None or len(points) == 0:
-        return None
-    pose = frame.world_to_mean
-    points = torch.as_tensor(points, dtype=torch.float64) @ pose[:3, :3].mT + pose[:3, 3]
-    return (points * frame.scale).float()
+    points = None
+    if scene.points is not None and len(scene.points):
+        pose = frame.world_to_mean
+        points = torch.as_tensor(scene.points, dtype=torch.float64)
+        points = ((points @ pose[:3, :3].mT + pose[:3, 3]) * frame.scale).float()
+    held_out_files = [files[index] for index in held_out]
+    targets = targets if held_out else None
+    return Photographs(scene.name, input_views, targets, input_files, held_out_files, frame, points)

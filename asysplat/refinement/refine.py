@@ -37,21 +37,13 @@ VIEWS_PER_ROUND = 8  # rendered to find pixels with large errors
 
 @dataclass(frozen=True)
 class RefinementProgress:
-    """Progress of a refinement.
+    """Progress of a refinement."""
 
-    Args:
-        step: steps so far.
-        share: of the refinement that is done, in [0, 1].
-        seconds: since its start.
-        psnr: mean over the last steps, one for each input image, in dB; each before its update.
-        gaussians: their number.
-    """
-
-    step: int
-    share: float
-    seconds: float
-    psnr: float
-    gaussians: int
+    step: int  # steps so far
+    share: float  # of the refinement that is done, in [0, 1]
+    seconds: float  # since its start
+    psnr: float  # mean over the last steps, one for each input image, each before its update
+    gaussians: int  # their number
 
 
 class Refinement:
@@ -61,8 +53,7 @@ class Refinement:
         gaussians: [N], initial values.
         views: the input views, [V].
         background: RGB; None: the mean color of the views.
-        settings: see `RefinementSettings`.
-        seed: of the order of the views and of new Gaussians.
+        settings, seed: the seed is of the order of the views and of new Gaussians.
 
     Raises:
         InputError: no Gaussians, or invalid values.
@@ -85,7 +76,7 @@ class Refinement:
         self._generator = torch.Generator().manual_seed(seed)
         self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
         self.corrections = Corrections(views.num_views, settings.rates)
-        size = (max(1, side // 2) for side in (views.cameras.height, views.cameras.width))
+        size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = resize(views, *size) if settings.half_size > 0 else views
         self._queue: list[int] = []
         self._steps = 0
@@ -100,11 +91,7 @@ class Refinement:
         return self.fields.gaussians().map(lambda field: field.detach().clone())
 
     def step(self, share: float) -> float:
-        """Take a step; return the mean squared error of its views.
-
-        Args:
-            share: of the refinement that is done, in [0, 1].
-        """
+        """Take a step at a share of the refinement, in [0, 1]; return its mean squared error."""
         settings, views = self.settings, self._views(share)
         chosen = self._next_views(settings.views_per_step or self.views.num_views)
         leaves, factor = self.fields.leaves(), self._rate_factor(share)
@@ -120,27 +107,21 @@ class Refinement:
         if settings.densify == "mcmc":
             inject_position_noise(self.fields, factor, self._generator)
         self._steps += 1
-        self._last_visible[visible] = self._steps
+        if settings.densify == "error":
+            self._last_visible[visible] = self._steps
         return error
 
     def densify(self, share: float) -> None:
-        """Prune, add or relocate Gaussians, by the method of the settings.
-
-        Args:
-            share: of the refinement that is done, in [0, 1].
-        """
+        """Prune, add or relocate Gaussians, by the method of the settings; share: see `step`."""
         settings = self.settings
-        if settings.densify == "error":
-            self._prune_and_spawn(share)
-            return
         if settings.densify == "mcmc":
             relocate(self.fields, self._max_gaussians, settings.growth, self._generator)
         elif settings.densify == "gradient":
             self._screen_gradients.clone_and_split(self._max_gaussians, self._generator)
-        self._last_visible = self._last_visible.new_full((len(self.fields),), self._steps)
+        elif settings.densify == "error":
+            self._prune_and_spawn(self._views(share))
 
-    def _prune_and_spawn(self, share: float) -> None:
-        views = self._views(share)
+    def _prune_and_spawn(self, views: Views) -> None:
         opacities = self.fields.parameters["logits"].detach().sigmoid()
         # Every view has been used twice since.
         unseen = self._steps - self._last_visible > 2 * views.num_views
@@ -163,10 +144,7 @@ class Refinement:
     def _gradients(
         self, target: Views, view: int, leaves: Parameters, factor: float
     ) -> tuple[float, Sequence[Tensor]]:
-        """Render a view; return its squared error and the gradients of the leaves.
-
-        The view's exposure and pose corrections are updated at once.
-        """
+        """Render a view and update its corrections; return its MSE and the leaves' gradients."""
         cameras, correction = target.cameras, {}
         if self.corrections.enabled:
             correction = self.corrections.leaves(view)
@@ -237,18 +215,21 @@ def refine(
     if (seconds is None) == (steps is None) or not (steps if seconds is None else seconds) > 0:
         raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")
     refinement = Refinement(gaussians, views, background, settings, seed)
-    if seconds is not None:
-        _compile_kernels(gaussians, views, settings)
+    if seconds is not None:  # a step with few Gaussians compiles the kernels before the time runs
+        one_view = replace(settings, views_per_step=1)
+        few = gaussians.map(lambda field: field[:10])
+        small = Refinement(few, views.select([0]), settings=one_view)
+        small.step(0.0)
+        small.densify(0.0)
     max_steps = settings.max_steps(views.num_views)
     errors: deque[float] = deque(maxlen=views.num_views)
     step, rounds, share = 0, 0, 0.0
     clock = time.perf_counter()
     while share < 1:
-        if settings.densify != "none" and share < settings.until:
-            due = int(share / settings.until * (settings.rounds + 1))
-            if due > rounds:
-                refinement.densify(share)
-                rounds = due
+        due = int(share / settings.until * (settings.rounds + 1)) if share < settings.until else 0
+        if due > rounds:
+            refinement.densify(share)
+            rounds = due
         errors.append(refinement.step(share))
         step += 1
         passed = time.perf_counter() - clock
@@ -259,11 +240,3 @@ def refine(
         if watch is not None and watch(progress, refinement):
             break
     return refinement.gaussians
-
-
-def _compile_kernels(gaussians: Gaussians, views: Views, settings: RefinementSettings) -> None:
-    """Take a step with few Gaussians, so that compiling kernels takes none of the time."""
-    few = gaussians.map(lambda field: field[:10])
-    small = Refinement(few, views.select([0]), settings=replace(settings, views_per_step=1))
-    small.step(0.0)
-    small.densify(0.0)

@@ -12,30 +12,17 @@ Unit = Literal["pixel", "scene"]
 
 @dataclass(frozen=True)
 class Rates:
-    """Learning rates of Adam; with 0 a field is not optimized and costs nothing.
+    """Learning rates of Adam; with 0 a field is not optimized and costs nothing."""
 
-    Args:
-        means: in `unit`.
-        unit: "pixel", the size of a pixel at the Gaussian; or "scene", the distance of the farthest
-            camera from the mean of all.
-        quats: of unit quaternions.
-        scales: of log scales.
-        opacities: of opacity logits.
-        sh: of SH of degree 0.
-        sh_rest: of higher degrees, times `sh`.
-        exposure: of a log gain and an offset per channel of each image.
-        poses: of each image's rotation, in radians, and position, in the scene's unit.
-    """
-
-    means: float = 0.4
-    unit: Unit = "pixel"
-    quats: float = 8e-3
-    scales: float = 0.04
-    opacities: float = 0.4
-    sh: float = 0.02
-    sh_rest: float = 0.05
-    exposure: float = 0.0
-    poses: float = 0.0
+    means: float = 0.4  # in `unit`
+    unit: Unit = "pixel"  # its size at the Gaussian; "scene": the farthest camera's distance
+    quats: float = 8e-3  # of unit quaternions
+    scales: float = 0.04  # of log scales
+    opacities: float = 0.4  # of opacity logits
+    sh: float = 0.02  # of SH of degree 0
+    sh_rest: float = 0.05  # of higher degrees, times `sh`
+    exposure: float = 0.0  # of a log gain and an offset per channel of each image
+    poses: float = 0.0  # of each image's rotation, in radians, and position, in the scene's unit
 
     def __post_init__(self):
         """Check the ranges."""
@@ -50,42 +37,25 @@ class Rates:
 class RefinementSettings:
     """Settings of a refinement: the default is ours, `PAPER` the paper's post-optimization.
 
-    Args:
-        rates: learning rates.
-        ssim: weight of 1 - SSIM beside L1; None: the mean squared error alone.
-        views_per_step: input views rendered in a step; None: all.
-        sh_degree: 0 to 3; None keeps the degree of the Gaussians.
-        half_size: initial share of the refinement at half the image size.
-        densify: "error": spawn Gaussians at pixels with a large error; "mcmc": relocate dead
-            Gaussians (Kheradmand et al. 2024); "gradient": clone and split by screen-space
-            gradients (Kerbl et al. 2023); "none".
-        max_gaussians: limit of densification; a lower one holds if all input images together have
-            fewer than 8 pixels for each.
-        rounds: rounds of densification, over the first `until` of the refinement.
-        until: see `rounds`.
-        growth: Gaussians added in a round, at most, as a share of all, beside replacements of
-            pruned ones.
-        decay: factor of all rates at the end of the last `cool_down` of the refinement.
-        cool_down: see `decay`.
-        max_steps_per_image: steps with each input image after which the refinement ends, whatever
-            time is left, as more would fit noise. None: no limit.
-
     Raises:
         InputError: a number out of range.
     """
 
     rates: Rates = field(default_factory=Rates)
-    ssim: float | None = 0.2
-    views_per_step: int | None = 1
-    sh_degree: int | None = 1
-    half_size: float = 0.25
+    ssim: float | None = 0.2  # weight of 1 - SSIM beside L1; None: the mean squared error alone
+    views_per_step: int | None = 1  # input views rendered in a step; None: all
+    sh_degree: int | None = 1  # 0 to 3; None keeps the degree of the Gaussians
+    half_size: float = 0.25  # initial share of the refinement at half the image size
+    # "error": spawn Gaussians at pixels with a large error; "mcmc": relocate dead ones (Kheradmand
+    # et al. 2024); "gradient": clone and split by screen-space gradients (Kerbl et al. 2023).
     densify: Densify = "error"
-    max_gaussians: int = 150_000
-    rounds: int = 12
-    until: float = 0.6
-    growth: float = 0.15
-    decay: float = 0.05
-    cool_down: float = 0.5
+    max_gaussians: int = 150_000  # lower if all input images have fewer than 8 pixels for each
+    rounds: int = 12  # of densification
+    until: float = 0.6  # initial share of the refinement with densification
+    growth: float = 0.15  # added in a round, as a share of all, beside replacements of pruned ones
+    decay: float = 0.05  # factor of all rates at the end of the cool-down
+    cool_down: float = 0.5  # last share of the refinement
+    # Steps with each input image that end it, whatever time is left: more would fit noise.
     max_steps_per_image: int | None = 400
 
     def __post_init__(self):
@@ -114,9 +84,7 @@ class RefinementSettings:
 
 # Suppl. A, "Post optimization": as Long-LRM does.
 PAPER = RefinementSettings(
-    rates=Rates(
-        means=5e-4, unit="scene", sh=1e-3, sh_rest=1.0, quats=0.0, scales=0.0, opacities=0.0
-    ),
+    Rates(means=5e-4, unit="scene", sh=1e-3, sh_rest=1.0, quats=0.0, scales=0.0, opacities=0.0),
     ssim=None,
     views_per_step=None,
     sh_degree=None,

@@ -22,11 +22,7 @@ SPLIT_FACTOR = 1.6  # by which the two halves are smaller
 
 
 class ScreenGradients:
-    """Mean norms of the screen-space gradients of Gaussians, over the views that show them.
-
-    Args:
-        fields: of the Gaussians.
-    """
+    """Mean norms of the screen-space gradients of Gaussians, over the views that show them."""
 
     def __init__(self, fields: Fields):
         self.fields = fields
@@ -45,11 +41,8 @@ class ScreenGradients:
     def add(self, gradients: Float[Tensor, "N 3"], cameras: Cameras) -> None:
         """Accumulate the gradients of the offsets from one view.
 
-        Only the projection of the center is considered, not the change of the splat's shape.
-
-        Args:
-            gradients: 0 where a Gaussian is not visible.
-            cameras: of the view, [1].
+        Only the projection of the center is considered, not the change of the splat's shape. The
+        gradients are 0 where a Gaussian is not visible.
         """
         visible = gradients.any(dim=1)
         pose, intrinsics = cameras.cam_to_world[0], cameras.intrinsics[0]
@@ -65,11 +58,8 @@ class ScreenGradients:
     def clone_and_split(self, max_gaussians: int, generator: torch.Generator) -> None:
         """Clone small and split large Gaussians with large gradients; prune transparent ones.
 
-        A clone has the position of its original. Afterwards the gradients are reset.
-
-        Args:
-            max_gaussians: limit up to which some are added, largest gradients first.
-            generator: of random numbers.
+        A clone has the position of its original. Gaussians are added up to the limit, those with
+        the largest gradients first. Afterwards the gradients are reset.
         """
         fields, gaussians = self.fields, self.fields.gaussians()
         opaque = gaussians.opacities > MIN_OPACITY

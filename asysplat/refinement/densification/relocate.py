@@ -35,8 +35,7 @@ def relocate(fields: Fields, max_gaussians: int, growth: float, generator: torch
 
     Args:
         fields: of the Gaussians; changed ones are moved to the end.
-        max_gaussians: limit up to which copies are added.
-        growth: copies added, as a share of the Gaussians.
+        max_gaussians, growth: copies are added up to a limit, and to a share of the Gaussians.
         generator: of random numbers.
     """
     alive = fields.gaussians().opacities > MIN_OPACITY
@@ -51,10 +50,7 @@ def relocate(fields: Fields, max_gaussians: int, growth: float, generator: torch
 def inject_position_noise(fields: Fields, factor: float, generator: torch.Generator) -> None:
     """Add noise to the positions of faint Gaussians, shaped by their covariance (Eq. 8).
 
-    Args:
-        fields: of the Gaussians, in a scene whose farthest camera is at distance 1.
-        factor: of the learning-rate schedule.
-        generator: of random numbers.
+    `factor` is that of the learning rates; the scene's farthest camera is at distance 1.
     """
     gaussians = fields.gaussians()
     faint = torch.nonzero(gaussians.opacities < NOISE_MAX_OPACITY)[:, 0]
