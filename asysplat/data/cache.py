@@ -9,6 +9,7 @@ import tempfile
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -66,22 +67,9 @@ class ImageCache:
                 stacklevel=2,
             )
             self.folder = None
-        else:
-            if self._on_disk > self.disk_bytes:
-                self._clear()
-
-    def _files(self) -> list[tuple[float, int, Path]]:
-        """List the last use, the bytes and the path of every file on disk."""
-        entries = []
-        for file in self.folder.glob("*/*.npy"):
-            try:
-                stat = file.stat()
-            except OSError:  # another process has cleared it
-                continue
-            entries.append((stat.st_mtime, stat.st_size, file))
-        return entries
-
-    def _clear(self) -> None:
+            return
+        if self._on_disk <= self.disk_bytes:
+            return
         entries = sorted(self._files())
         self._on_disk = sum(size for _, size, _ in entries)
         for _, size, file in entries:
@@ -89,6 +77,15 @@ class ImageCache:
                 break
             file.unlink(missing_ok=True)
             self._on_disk -= size
+
+    def _files(self) -> list[tuple[float, int, Path]]:
+        """List the last use, the bytes and the path of every file on disk."""
+        entries = []
+        for file in self.folder.glob("*/*.npy"):
+            with suppress(OSError):  # another process has cleared it
+                stat = file.stat()
+                entries.append((stat.st_mtime, stat.st_size, file))
+        return entries
 
 
 def _read(file: Path) -> ndarray | None:

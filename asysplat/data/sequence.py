@@ -126,22 +126,18 @@ class FileSequence:
 
     def __init__(self, scene: PosedScene, options: SceneOptions):
         self.scene, self.name, self.options = scene, scene.name, options
+        self.num_images = len(scene.images)
         images, (height, width) = scene.images, (options.height, options.width)
-        intrinsics = [resized_intrinsics(image.lens, height, width) for image in images]
-        poses = [image.cam_to_world for image in images]
+        intrinsics = np.array([resized_intrinsics(image.lens, height, width) for image in images])
+        poses = np.array([image.cam_to_world for image in images])
         self.cameras = Cameras(
-            torch.tensor(np.array(intrinsics), dtype=torch.float32).view(len(images), 3, 3),
-            torch.tensor(np.array(poses), dtype=torch.float32).view(len(images), 4, 4),
-            height,
-            width,
+            torch.tensor(intrinsics, dtype=torch.float32).view(len(images), 3, 3),
+            torch.tensor(poses, dtype=torch.float32).view(len(images), 4, 4),
+            *(height, width),
         )
         self._has_depths = any(image.depth for image in images)
         self._has_disparities = any(image.disparity for image in images)
         self._has_masks = any(image.mask or image.lens.is_distorted for image in images)
-
-    @property
-    def num_images(self) -> int:
-        return len(self.scene.images)
 
     @property
     def points(self) -> Points | None:
@@ -173,12 +169,12 @@ class FileSequence:
 
     def without_damaged(self, bad: BadImages) -> "FileSequence":
         """Return the images whose pixels can be read, and collect the errors of the others."""
-
-        def read(index: int, image: PosedImage) -> PosedImage:
-            self.views([index])
-            return image
-
-        return self.with_images(bad.read_each(read, enumerate(self.scene.images)))
+        intact = []
+        for index, image in enumerate(self.scene.images):
+            with bad.collect():
+                self.views([index])
+                intact.append(image)
+        return self.with_images(intact)
 
     def _image(self, image: PosedImage) -> Float[Tensor, "3 H W"]:
         pixels = self._pixels(image.file, load_image, image.lens)
@@ -220,20 +216,15 @@ class FileSequence:
     def _pixels(self, file: ImageFile, load: Load, lens: Lens, nearest: bool = False) -> Tensor:
         """Return a file's pixels at this sequence's size, from the cache if they are there."""
 
-        def make() -> ndarray:
-            return self._fit(load(file), lens, nearest)
-
         cache, size = self.options.cache, (self.options.height, self.options.width)
+        # Arrays are copied, since those from the cache and from Pillow are read-only.
         if cache is None:
-            pixels = make()
-        else:
-            made_from = repr((lens, *size, load.__name__)).encode()
-            key = f"{content_hash(file)}-{hashlib.blake2b(made_from, digest_size=8).hexdigest()}"
-            # Pixels that are neither undistorted nor resized are as quickly decoded again.
-            changed = lens.is_distorted or (lens.height, lens.width) != size
-            pixels = cache.get(key, make, to_disk=changed)
-        # A copy, since arrays from the cache and from Pillow are read-only.
-        return torch.tensor(pixels)
+            return torch.tensor(self._fit(load(file), lens, nearest))
+        made_from = repr((lens, *size, load.__name__)).encode()
+        key = f"{content_hash(file)}-{hashlib.blake2b(made_from, digest_size=8).hexdigest()}"
+        # Pixels that are neither undistorted nor resized are as quickly decoded again.
+        changed = lens.is_distorted or (lens.height, lens.width) != size
+        return torch.tensor(cache.get(key, lambda: self._fit(load(file), lens, nearest), changed))
 
     def _fit(self, pixels: ndarray, lens: Lens, nearest: bool = False) -> ndarray:
         if pixels.dtype == bool:

@@ -11,16 +11,9 @@ import numpy as np
 
 from asysplat.data.procedural import ProceduralScene, split_seed
 from asysplat.data.readers import find_scenes, open_scene
-from asysplat.data.selection import named_selection
+from asysplat.data.selection import named_selection, views
 from asysplat.data.selection.index import read_index
-from asysplat.data.selection.views import (
-    Selection,
-    Split,
-    spread,
-    training_images,
-    training_selection,
-    uniform_selection,
-)
+from asysplat.data.selection.views import Selection, Split
 from asysplat.data.sequence import FileSequence, ImageSequence, SceneOptions
 from asysplat.errors import InputError
 
@@ -73,22 +66,16 @@ class ProceduralSource:
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         scene = self._scene("train", int(rng.integers(2**31)))
         window = tuple(self.window)
-        return Task(scene, training_selection(self.num_images, inputs, targets, window, rng))
+        return Task(scene, views.training_selection(self.num_images, inputs, targets, window, rng))
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
-        selection = uniform_selection(self.num_images, inputs, targets)
+        selection = views.uniform_selection(self.num_images, inputs, targets)
         count = self.val_scenes if split == "val" else self.test_scenes
         return [Task(self._scene(split, index), selection) for index in range(count)]
 
     def _scene(self, split: Literal["train", "val", "test"], index: int) -> ProceduralScene:
-        return ProceduralScene(
-            split_seed(split, index),
-            self.height,
-            self.width,
-            self.num_images,
-            places=self.places,
-            varied=self.varied and split == "train",
-        )
+        size, varied = (self.height, self.width, self.num_images), self.varied and split == "train"
+        return ProceduralScene(split_seed(split, index), *size, places=self.places, varied=varied)
 
 
 class SceneFolder(Sequence):
@@ -181,8 +168,8 @@ class FilesSource:
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         sequence = self.scenes[self._training[rng.integers(len(self._training))]]
         count = sequence.num_images
-        images = range(count) if self.split_by_scenes else training_images(count)
-        drawn = training_selection(
+        images = range(count) if self.split_by_scenes else views.training_images(count)
+        drawn = views.training_selection(
             len(images), inputs, targets, tuple(self.window), rng, self.targets_may_be_inputs
         )
         chosen = Selection([images[i] for i in drawn.inputs], [images[i] for i in drawn.targets])
@@ -213,7 +200,7 @@ class FilesSource:
 
     @cached_property
     def _validation(self) -> list[int]:
-        return spread(self._others, min(self.val_scenes, len(self._others)))
+        return views.spread(self._others, min(self.val_scenes, len(self._others)))
 
     @cached_property
     def _training(self) -> list[int]:

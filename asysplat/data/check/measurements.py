@@ -44,12 +44,7 @@ def read_pixels(
 ) -> tuple[FileSequence, PixelStats]:
     """Decode every image once, and return the sequence without the damaged images.
 
-    Args:
-        bad: collects the images that cannot be decoded.
-        console: where to show a progress bar; None shows none.
-
-    Raises:
-        InputError: too few usable images, or damaged images that must not be skipped.
+    Arguments and errors as for `check_scene`.
     """
     intact, brightness, known, unmasked, depths = [], [], [], [], []
     bar = {"console": console, "transient": True, "disable": console is None}

@@ -45,12 +45,9 @@ class Mistake:
 
 
 def common_mistakes(names: Sequence[str]) -> list[Mistake]:
-    """List the common mistakes, the most likely first.
+    """List the common mistakes, the most likely first; `names` are the image files, in order.
 
     Mistakes with a factor to fit are not listed: see `other_resolution` and `other_focal`.
-
-    Args:
-        names: image files, in the order of the sequence.
     """
     resolutions = [other_resolution(factor) for factor in RESOLUTIONS]
     axes = _swapped_axes()

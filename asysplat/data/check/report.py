@@ -86,12 +86,7 @@ class Verdict:
 
 
 def diagnose_cameras(cameras: Cameras, matches: Matches, names: Sequence[str]) -> Verdict:
-    """Compare the cameras as read with the correction of every common mistake.
-
-    Args:
-        cameras: of all images, in order.
-        names: the image files.
-    """
+    """Compare the cameras as read, of the image files `names`, with common mistakes corrected."""
     if len(matches) < MIN_MATCHES:
         return Verdict(
             False,

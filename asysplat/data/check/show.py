@@ -44,8 +44,8 @@ def print_report(report: Report, title: str, console: Console) -> None:
     for name, text in _lines(report):
         table.add_row(name, Text(text))
     console.print(table)
-    fits, sentence = report.verdict.fits, report.verdict.sentence
-    style = "bold green" if fits else "bold red"
+    sentence = report.verdict.sentence
+    style = "bold green" if report.verdict.fits else "bold red"
     console.print(Text(f"{sentence[0].upper()}{sentence[1:]}.", style))
 
 
@@ -194,10 +194,7 @@ def _draw_pair(report: Report, pair: tuple[int, int], plots: Sequence[Axes]) -> 
 
 
 def _upright(cameras: Cameras) -> Float[ndarray, "3 3"]:
-    """Return right, ahead and up in the world as columns, from the first camera's right axis.
-
-    Up is the mean of the cameras' up directions.
-    """
+    """Return right, ahead and (mean) up as columns, from the first camera's right axis."""
     rotations = cameras.cam_to_world[:, :3, :3].double().numpy()
     up, right = -rotations[:, :, 1].mean(0), rotations[0, :, 0]
     ahead = np.cross(up, right)

@@ -7,7 +7,7 @@ the same folder (data.disparities).
 """
 
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Callable
 from pathlib import Path
 
@@ -32,17 +32,29 @@ Estimate = Callable[[ndarray], ndarray]  # [h, w, 3] of uint8 -> [H, W] of float
 
 def main(arguments: list[str] | None = None, estimate: Estimate | None = None) -> int:
     """Run the command with its arguments; `estimate` replaces the network."""
-    options = parse(arguments)
+    parser = ArgumentParser(prog="python -m asysplat.data.disparity", description=__doc__)
+    parser.add_argument("path", type=Path, help="a scene, or a folder of scenes")
+    parser.add_argument("--layout", default="auto", choices=("auto", *LAYOUTS))
+    parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument("--folder", type=Path, default=CACHE, help="folder of the maps")
+    help_of_beside = f"put maps into each scene's own folder, {BESIDE}/"
+    place.add_argument("--beside", action="store_true", help=help_of_beside)
+    help_of_model = "a folder, or a name on the Hugging Face Hub"
+    parser.add_argument("--model", default=MODEL, help=help_of_model)
+    parser.add_argument("--download", action="store_true", help="download missing weights")
+    options = parser.parse_args(arguments)
     try:
         layout, scenes = find_scenes(options.path, options.layout)
         refuse_inside(options.folder, options.path, "name a folder elsewhere, or say --beside")
         estimate = estimate or load_depth_anything(options.model, options.download)
         console = Console(stderr=True)
         for scene in scenes:
-            folder = _folder(scene, options)
-            written, kept = write_maps(
-                layout, scene, folder, estimate, options.on_bad_image, console
-            )
+            folder = scene / BESIDE if options.beside else map_folder(scene, options.folder)
+            if options.beside and not scene.is_dir():
+                raise InputError(f"{scene} is not a folder: use --folder in place of --beside.")
+            bad = BadImages(options.on_bad_image)
+            written, kept = write_maps(layout, scene, folder, estimate, bad, console)
             print(f"{scene.name}: {written} maps written, {kept} were there: {folder}", flush=True)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -50,25 +62,8 @@ def main(arguments: list[str] | None = None, estimate: Estimate | None = None) -
     return 0
 
 
-def parse(arguments: list[str] | None) -> Namespace:
-    parser = ArgumentParser(prog="python -m asysplat.data.disparity", description=__doc__)
-    parser.add_argument("path", type=Path, help="a scene, or a folder of scenes")
-    parser.add_argument("--layout", default="auto", choices=("auto", *LAYOUTS))
-    parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
-    place = parser.add_mutually_exclusive_group()
-    place.add_argument("--folder", type=Path, default=CACHE, help="folder of the maps")
-    place.add_argument(
-        "--beside", action="store_true", help=f"put maps into each scene's own folder, {BESIDE}/"
-    )
-    parser.add_argument(
-        "--model", default=MODEL, help="a folder, or a name on the Hugging Face Hub"
-    )
-    parser.add_argument("--download", action="store_true", help="download missing weights")
-    return parser.parse_args(arguments)
-
-
 def write_maps(
-    layout: str, scene: Path, folder: Path, estimate: Estimate, on_bad_image: str, console: Console
+    layout: str, scene: Path, folder: Path, estimate: Estimate, bad: BadImages, console: Console
 ) -> tuple[int, int]:
     """Write the missing maps of one scene.
 
@@ -78,7 +73,6 @@ def write_maps(
     Raises:
         InputError: files that cannot be read or written; the maps written before stay.
     """
-    bad = BadImages(on_bad_image)
     posed = LAYOUTS[layout].read_scene(scene, bad)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -106,14 +100,6 @@ def shrink(disparity: ndarray, height: int, width: int) -> ndarray:
     scale = min(1.0, MAX_SHORT_SIDE / min(height, width))
     size = (round(scale * height), round(scale * width))
     return interpolate(torch.as_tensor(disparity)[None, None], size, mode="area")[0, 0].numpy()
-
-
-def _folder(scene: Path, options: Namespace) -> Path:
-    if not options.beside:
-        return map_folder(scene, options.folder)
-    if not scene.is_dir():
-        raise InputError(f"{scene} is not a folder: use --folder in place of --beside.")
-    return scene / BESIDE
 
 
 if __name__ == "__main__":

@@ -31,12 +31,9 @@ def map_name(image: ImageFile, scene: Path) -> str:
 
 
 def with_disparities(posed: PosedScene, scene: Path, cache: Path) -> PosedScene:
-    """Return the scene with the existing maps added to its images.
+    """Add the existing maps in `cache` to the images of a scene with path `scene`.
 
-    Args:
-        posed: returned by a reader.
-        scene: its path.
-        cache: the folder of maps; maps in the scene's own folder take precedence.
+    Maps in the scene's own folder take precedence.
     """
     maps: dict[str, Path] = {}
     for folder in (map_folder(scene, cache), scene / BESIDE):

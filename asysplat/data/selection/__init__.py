@@ -22,15 +22,13 @@ def named_selection(
     Raises:
         InputError: an unknown method, or too few images.
     """
-    count = cameras.num_views
-    if selection == "every_8th":
-        return every_8th_selection(count, num_inputs, num_targets, split)
+    if selection not in SELECTIONS:
+        raise InputError(
+            f"data.selection is {selection!r}: expected one of {', '.join(SELECTIONS)}, index."
+        )
     if selection == "kmeans":
         return kmeans_selection(cameras, num_inputs, num_targets, split)
-    if selection == "first_96":
-        return first_96_selection(count, num_inputs, num_targets, split)
     if selection == "uniform":
-        return uniform_selection(count, num_inputs, num_targets)
-    raise InputError(
-        f"data.selection is {selection!r}: expected one of {', '.join(SELECTIONS)}, index."
-    )
+        return uniform_selection(cameras.num_views, num_inputs, num_targets)
+    by_number = every_8th_selection if selection == "every_8th" else first_96_selection
+    return by_number(cameras.num_views, num_inputs, num_targets, split)

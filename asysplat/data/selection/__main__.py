@@ -34,11 +34,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def index_entries(options: argparse.Namespace) -> dict[str, Entry]:
-    """Select the test images of every scene that `root` is or holds.
-
-    Raises:
-        InputError: a scene that cannot be read or is too short, or two scenes of one name.
-    """
+    """Select the test images of every scene that `root` is or holds."""
     layout, scenes = find_scenes(options.root, options.layout)
     entries: dict[str, Entry] = {}
     for scene in scenes:

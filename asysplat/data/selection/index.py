@@ -99,11 +99,13 @@ def read_index(path: Path | str, num_inputs: int) -> ViewIndex:
         if content["hash"] != _hash_of(stored) or not isinstance(content.get("scenes"), dict):
             raise InputError(f"{path} was changed after it was written: write it again.")
         scenes = content["scenes"]
-    entries = {
-        name: _entry(f"{path}, scene {name}", entry)
-        for name, entry in scenes.items()
-        if entry is not None
-    }
+    entries = {}
+    for name, stored in scenes.items():
+        if stored is not None:
+            entry = stored if isinstance(stored, dict) else {}
+            where = f"{path}, scene {name}"
+            lists = (_indices(f"{where}, {key}", entry.get(key)) for key in ("context", "target"))
+            entries[name] = Entry(Selection(*lists), entry.get("cameras"))
     return ViewIndex(path, entries)
 
 
@@ -126,21 +128,12 @@ def write_index(path: Path, selection: str, entries: Mapping[str, Entry]) -> Non
 def camera_hash(cameras: Cameras) -> str:
     """Hash the cameras' positions and viewing directions, for any origin and unit."""
     steps = (pose_features(cameras) * 10**DECIMALS).round().astype("<i8")
-    return _digest(np.ascontiguousarray(steps).tobytes())
+    return hashlib.blake2b(np.ascontiguousarray(steps).tobytes(), digest_size=16).hexdigest()
 
 
 def _hash_of(content: dict[str, Any]) -> str:
-    return _digest(json.dumps(content, sort_keys=True).encode())
-
-
-def _digest(data: bytes) -> str:
+    data = json.dumps(content, sort_keys=True).encode()
     return hashlib.blake2b(data, digest_size=16).hexdigest()
-
-
-def _entry(where: str, stored: Any) -> Entry:
-    entry = stored if isinstance(stored, dict) else {}
-    lists = (_indices(f"{where}, {key}", entry.get(key)) for key in ("context", "target"))
-    return Entry(Selection(*lists), entry.get("cameras"))
 
 
 def _long_lrm_entry(file: Path, content: dict[str, Any], num_inputs: int) -> tuple[str, Entry]:

@@ -91,9 +91,9 @@ def every_8th_selection(
     num_images: int, num_inputs: int, num_targets: int, split: Split
 ) -> Selection:
     """Select inputs evenly over the training images, at most `num_targets` held-out targets."""
-    inputs, targets = _training_split(num_images, num_targets, split)
-    check_held_out(num_images, len(inputs), num_inputs, split)
-    return Selection(spread(inputs, num_inputs), targets)
+    images, targets = training_images(num_images), held_out(num_images, split)
+    check_held_out(num_images, len(images), num_inputs, split)
+    return Selection(spread(images, num_inputs), spread(targets, min(num_targets, len(targets))))
 
 
 def first_96_selection(
@@ -114,15 +114,10 @@ def paper_split(num_images: int, num_targets: int, split: Split) -> tuple[list[i
     For test, every 8th image is a target, and inputs are chosen from all others. For val, at most
     `num_targets` images are targets, and inputs are chosen from the training images.
     """
-    if split == "val":
-        return _training_split(num_images, num_targets, split)
     targets = held_out(num_images, split)
+    if split == "val":
+        return training_images(num_images), spread(targets, min(num_targets, len(targets)))
     return sorted(set(range(num_images)) - set(targets)), targets
-
-
-def _training_split(n: int, num_targets: int, split: Split) -> tuple[list[int], list[int]]:
-    targets = held_out(n, split)
-    return training_images(n), spread(targets, min(num_targets, len(targets)))
 
 
 def spread(images: Sequence[int], count: int) -> list[int]:
