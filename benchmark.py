@@ -15,9 +15,9 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from asysplat.benchmark.compare import compare, read_old
-from asysplat.benchmark.options import check_repeats, describe_machine, find_suite
+from asysplat.benchmark.options import describe_machine, find_suite
 from asysplat.benchmark.output import write_results
-from asysplat.errors import input_error_behind
+from asysplat.errors import InputError, input_error_behind
 from asysplat.interrupts import keep_interrupts
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.training.revision import revision
@@ -39,7 +39,8 @@ def main(options: DictConfig) -> None:
 def benchmark(options: DictConfig) -> bool:
     """Measure, print the tables, write all; return whether anything is worse than in `compare`."""
     suite = find_suite(options.suite)
-    check_repeats(options.repeats)
+    if not isinstance(options.repeats, int) or options.repeats < 1:
+        raise InputError(f"repeats={options.repeats} cannot be: give a whole number from 1.")
     path = Path(options.output) / options.suite
     old = read_old(options.compare, path.with_suffix(".json"))
     console = Console()
@@ -48,11 +49,9 @@ def benchmark(options: DictConfig) -> bool:
     tables = suite.tables(results)
     for table in tables:
         console.print(table)
-    written = write_results(results, tables, suite.plot(results), suite.WATCHED, path)
-    for name, place in zip(("numbers", "tables", "figure", "tensorboard"), written, strict=True):
-        console.print(f"{name}: {place}", soft_wrap=True)
-    if hasattr(suite, "page"):
-        path.with_suffix(".md").write_text(suite.page(results))
+    figure = suite.plot(results) if hasattr(suite, "plot") else None
+    for file in write_results(results, tables, figure, path):
+        console.print(f"written: {file}", soft_wrap=True)
     if hasattr(suite, "verdict") and (complaint := suite.verdict(results)):
         sys.exit(complaint)
     if old is None:

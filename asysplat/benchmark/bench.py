@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import torch
-from matplotlib.figure import Figure
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
@@ -16,7 +15,6 @@ from asysplat.benchmark.compare import RATIO, Watched
 from asysplat.benchmark.model import Workload, make_net, make_views, record_products
 from asysplat.benchmark.ops import OpCase, PlaneSweepCase, make_path
 from asysplat.benchmark.options import CPU
-from asysplat.benchmark.plot import bars
 from asysplat.benchmark.render import Backend, prepare, run
 from asysplat.benchmark.scenes import random_scene
 from asysplat.benchmark.table import machine_note, make_table, spread, text
@@ -58,14 +56,8 @@ def make_pairs() -> Iterator[Pair]:
         for case in cases:
             paths = [make_path(case, name, torch.float32, CPU) for name in ("cpu", over)]
             yield Pair(case.name, over, *(path.forward_backward for path in paths))
-    yield from _render_and_refinement()
-    yield _image_loss()
-    yield _adam()
-    yield _network()
 
-
-def _render_and_refinement() -> Iterator[Pair]:
-    """Pair both passes of the renderer, and a step of the refinement, with the reference's."""
+    # Both passes of the renderer, and a step of the refinement
     gaussians, camera = random_scene(GAUSSIANS, SIDE, SIDE)
     inputs = prepare((gaussians, camera))
     passes = {name: partial(run, Backend(name), Culling(), inputs) for name in ("cpu", "reference")}
@@ -75,36 +67,28 @@ def _render_and_refinement() -> Iterator[Pair]:
     refinement = Refinement(gaussians, photograph)
     yield Pair("refinement", "reference", lambda: refinement.step(1.0), passes["reference"])
 
-
-def _image_loss() -> Pair:
     generator = torch.Generator().manual_seed(0)
     rendered, target = torch.rand(2, 3, 2 * SIDE, 2 * SIDE, generator=generator)
     rendered.requires_grad_()
 
-    def both_passes(backend: str) -> None:
-        loss = image_loss(rendered, target, backend=backend)
-        torch.autograd.grad(loss, rendered)
+    def loss_passes(backend: str) -> None:
+        torch.autograd.grad(image_loss(rendered, target, backend=backend), rendered)
 
-    runs = [partial(both_passes, name) for name in ("cpu", "reference")]
-    return Pair("image_loss", "reference", *runs)
+    losses = [partial(loss_passes, name) for name in ("cpu", "reference")]
+    yield Pair("image_loss", "reference", *losses)
 
-
-def _adam() -> Pair:
     generator = torch.Generator().manual_seed(0)
     visible = torch.rand(ROWS, generator=generator) < 0.5
-    settings = AdamSettings(0.9, 0.999, 1e-15)
-    runs = []
+    steps = []
     for step in (adam_step_cpu, adam_step_reference):
         numbers = torch.rand(4, ROWS, 12, generator=generator)  # mean and square: above 0
         rows = Rows(*numbers, torch.zeros(ROWS, dtype=torch.int32), torch.full((12,), 1e-3))
-        runs.append(partial(step, [rows], visible, settings))
-    return Pair("adam", "reference", *runs)
+        steps.append(partial(step, [rows], visible, AdamSettings(0.9, 0.999, 1e-15)))
+    yield Pair("adam", "reference", *steps)
 
-
-def _network() -> Pair:
-    """Pair a forward pass with its matrix products and convolutions."""
+    # A forward pass and its matrix products and convolutions
     net, _ = make_net(NETWORK, {"scale": "laptop"}, CPU)
-    workload = Workload(NETWORK, net, "fp32", make_views(VIEWS, VIEW_SIDE, VIEW_SIDE, CPU))
+    workload = Workload(net, "fp32", make_views(VIEWS, VIEW_SIDE, VIEW_SIDE, CPU))
     counts = record_products(workload.forward)["forward"]
     calls = [product.prepare(CPU) for product, count in counts.items() for _ in range(count)]
 
@@ -112,7 +96,7 @@ def _network() -> Pair:
         for call in calls:
             call()
 
-    return Pair(NETWORK, "products", workload.forward, run_products)
+    yield Pair(NETWORK, "products", workload.forward, run_products)
 
 
 def measure(options: DictConfig, console: Console) -> Result:
@@ -143,16 +127,15 @@ def measure(options: DictConfig, console: Console) -> Result:
 
 
 def _seconds(pair: Pair) -> dict[str, float]:
-    return {"workload": _best(pair.workload), "baseline": _best(pair.baseline)}
-
-
-def _best(run: Run) -> float:
-    """Return the least processor time of BEST_OF runs, in seconds."""
-    times = [time.process_time()]
-    for _ in range(BEST_OF):
-        run()
-        times.append(time.process_time())
-    return min(end - start for start, end in pairwise(times))
+    """Return the least processor time of BEST_OF runs of both, in seconds."""
+    seconds = {}
+    for name in ("workload", "baseline"):
+        times = [time.process_time()]
+        for _ in range(BEST_OF):
+            getattr(pair, name)()
+            times.append(time.process_time())
+        seconds[name] = min(end - start for start, end in pairwise(times))
+    return seconds
 
 
 def tables(results: Result) -> list[Table]:
@@ -169,16 +152,3 @@ def tables(results: Result) -> list[Table]:
         f"one thread, processor time, the best of {BEST_OF} runs in each round"
     )
     return [make_table("Ratios to a baseline", columns, results["rows"], notes, names=2)]
-
-
-def plot(results: Result) -> Figure:
-    """Plot the ratios, and 1."""
-    rows = results["rows"]
-    ratios = [row["ratio"] for row in rows]
-    return bars(
-        [f"{row['workload']} / its {row['over']}" for row in rows],
-        {"ratio": [ratio["median"] for ratio in ratios]},
-        ("as long", [1.0] * len(rows)),
-        "seconds over those of the baseline",
-        spread=[ratio["iqr"] for ratio in ratios],
-    )

@@ -15,8 +15,7 @@ MACHINE = ("cpu", "instructions", "cores", "threads", "gpu")  # what times depen
 NO_ERROR = 1e-12  # errors below are taken for it
 
 
-@dataclass(frozen=True)
-class Kind:
+class Kind(NamedTuple):
     """The kind of a number, and from which change on it counts."""
 
     unit: str  # dB are compared by their difference, all others by their ratio
@@ -52,14 +51,6 @@ class Watched(NamedTuple):
     rows: str = "rows"  # the key of the rows in the results
 
 
-class Key(NamedTuple):
-    """A number: the name of its row, the row's sizes as JSON, and the number's path in it."""
-
-    name: str
-    sizes: str
-    path: str
-
-
 class Value(NamedTuple):
     """A number with its interquartile range or the noise that its row names, else 0."""
 
@@ -90,10 +81,7 @@ class ResultsComparison:
 
 
 def read_old(path: str | None, output: Path) -> Result | None:
-    """Read the results to compare with, if a path is given.
-
-    Args:
-        output: the file that the new results are written to.
+    """Read the results to compare with, if a path is given; the new ones are written to `output`.
 
     Raises:
         InputError: the file cannot be read, is none of this suite, or would be written over.
@@ -125,7 +113,7 @@ def compare(old: Result, new: Result, watched: Watched) -> ResultsComparison:
     Raises:
         InputError: the results have no row in common.
     """
-    before, after = watched_values(old, watched), watched_values(new, watched)
+    before, after = _values(old, watched), _values(new, watched)
     if before and not before.keys() & after.keys():
         raise InputError(
             "compare= has none of the rows that were measured: name a file of the same suite, "
@@ -138,9 +126,10 @@ def compare(old: Result, new: Result, watched: Watched) -> ResultsComparison:
         note = f"another machine: {', '.join(changed)}; seconds are not compared."
         comparison.notes.append(note)
     for key, was in before.items():
-        kind = watched.kinds[key.path]
+        name, _, path = key
+        kind = watched.kinds[path]
         if key not in after:
-            comparison.missing.append(f"{key.name}, {key.path}: was {was.text(kind.unit)}")
+            comparison.missing.append(f"{name}, {path}: was {was.text(kind.unit)}")
         elif kind.any_machine or not changed:
             comparison.compared += 1
             is_now = after[key]
@@ -150,12 +139,12 @@ def compare(old: Result, new: Result, watched: Watched) -> ResultsComparison:
                 sentences = comparison.worse if change > 0 else comparison.better
                 word = kind.worse if change > 0 else kind.better
                 values = f"{is_now.text(kind.unit)}, was {was.text(kind.unit)}"
-                sentences.append(f"{word}: {key.name}, {key.path}: {values}")
+                sentences.append(f"{word}: {name}, {path}: {values}")
     return comparison
 
 
-def watched_values(results: Result, watched: Watched) -> dict[Key, Value]:
-    """Return all numbers that are watched."""
+def _values(results: Result, watched: Watched) -> dict[tuple[str, str, str], Value]:
+    """Return all watched numbers by their row's name, its sizes as JSON, and the path in it."""
     values = {}
     for row in results.get(watched.rows, []):
         name = "/".join(str(row[key]) for key in watched.names if row.get(key) is not None)
@@ -163,8 +152,8 @@ def watched_values(results: Result, watched: Watched) -> dict[Key, Value]:
         for path in watched.kinds:
             value = at(row, path)
             if isinstance(value, dict) and "median" in value:
-                values[Key(name, sizes, path)] = Value(value["median"], value["iqr"])
+                values[name, sizes, path] = Value(value["median"], value["iqr"])
             elif value not in (None, {}):
                 noise = at(row, f"noise.{path}") or 0.0
-                values[Key(name, sizes, path)] = Value(worst(row, path), noise)
+                values[name, sizes, path] = Value(worst(row, path), noise)
     return values

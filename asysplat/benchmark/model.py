@@ -3,9 +3,8 @@
 import inspect
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
 from traceback import walk_stack
 from types import FrameType
 
@@ -21,20 +20,12 @@ from asysplat import models, ops
 from asysplat.benchmark.compare import RATIO, TIME, Watched
 from asysplat.benchmark.options import PRECISIONS, check_names, find_device
 from asysplat.benchmark.plot import bars
-from asysplat.benchmark.products import Counts, Product, RecordProducts, time_products
+from asysplat.benchmark.products import Product, RecordProducts, time_products
 from asysplat.benchmark.scenes import on_an_arc, random_scene
 from asysplat.benchmark.table import machine_note, make_table, number, spread, text
-from asysplat.benchmark.timing import (
-    Measurement,
-    Result,
-    Run,
-    now,
-    rise_gb,
-    seconds_of,
-    time_in_rounds,
-)
+from asysplat.benchmark.timing import Measurement, Result, Run, now, seconds_of, time_in_rounds
 from asysplat.evaluation.cost import GB, count_parameters, memory_gb
-from asysplat.evaluation.static_cost import GIGA, activation_gb
+from asysplat.evaluation.static_cost import activation_gb
 from asysplat.models.network import Network
 from asysplat.models.tokenizer import Tokenizer
 from asysplat.overrides import check_overrides
@@ -58,9 +49,7 @@ COMPONENTS = {  # none within another
 OTHERS = "others"
 PARTS = (*COMPONENTS, OTHERS)
 OPERATORS = ("ssd", "selective_scan", "grid_attention")
-LAYER_CODES = {
-    inspect.unwrap(kind.forward).__code__ for kinds in COMPONENTS.values() for kind in kinds
-}
+LAYER_CODES = {inspect.unwrap(kind.forward).__code__ for k in COMPONENTS.values() for kind in k}
 OPERATOR_CODES = {inspect.unwrap(getattr(ops, name)).__code__: name for name in OPERATORS}
 BACKWARD = 2  # products in the backward pass for each of the forward pass
 MAX_FILLED = 0.75  # of the memory, by the estimate of a step
@@ -74,7 +63,6 @@ step: forward and backward; -: not measured, or would not fit into memory"""
 class Workload:
     """A network, its input and their precision."""
 
-    name: str  # of the model
     net: Network  # with random weights
     precision: str  # of PRECISIONS; bf16 by autocast
     views: Views  # of one scene
@@ -84,7 +72,6 @@ class Workload:
         return self.views.images.device
 
     def forward(self) -> Gaussians:
-        """Predict the scene's Gaussians."""
         self.net.eval()
         with torch.no_grad(), self._autocast(self.device.type):
             return self.net(self.views)
@@ -98,7 +85,7 @@ class Workload:
         sum(means).backward()
         self.net.zero_grad(set_to_none=True)
 
-    @cached_property
+    @property
     def step_gb(self) -> float:
         """Estimate the memory of a step: activations, parameters and their gradients."""
         cameras = self.views.cameras
@@ -141,7 +128,7 @@ def make_views(views: int, height: int, width: int, device: torch.device) -> Vie
 
 
 def _component(frame: FrameType) -> str | None:
-    """Return the component that a frame is a method of; None where it is of none."""
+    """Return the component that a frame is a method of, if any."""
     layer = frame.f_locals.get("self")
     return next((name for name, kinds in COMPONENTS.items() if isinstance(layer, kinds)), None)
 
@@ -185,15 +172,11 @@ def measure(options: DictConfig, console: Console) -> Result:
         "rows": one for each network, number of views and precision, times in seconds. The floor is
         the time that the forward pass's matrix products take by themselves. A step that is not
         measured, or would not fit into memory, is None.
-
-    Raises:
-        InputError: an unknown model, override, precision or device; a resolution
-            that a network cannot take.
     """
     device, config = find_device(options.device), options.model
     check_names("model.precisions", config.precisions, PRECISIONS)
     measurements: list[Measurement] = []
-    counts: list[Mapping[str, Counts]] = []  # of the products of each row, by part
+    groups = {}  # the products of each part, by the row's number
     with console.status("networks, products and memory"):
         for name in config.names:
             net, size = make_net(name, config.overrides, device)
@@ -201,23 +184,30 @@ def measure(options: DictConfig, console: Console) -> Result:
             for num_views in config.views or [size["inputs"]]:
                 views = make_views(num_views, size["height"], size["width"], device)
                 for precision in config.precisions:
-                    workload = Workload(name, net, precision, views)
-                    measurements.append(_prepare(workload, config.steps))
-                    counts.append(record_products(workload.forward))
-    parts = ("forward", *PARTS)
-    groups = {(i, part): c.get(part, {}) for i, c in enumerate(counts) for part in parts}
+                    workload = Workload(net, precision, views)
+                    measurements.append(_prepare(name, workload, config.steps))
+                    counts = record_products(workload.forward)
+                    for part in ("forward", *PARTS):
+                        groups[len(measurements) - 1, part] = counts.get(part, {})
     products = Measurement(lambda: time_products(groups, device))
     with console.status(f"{options.repeats} rounds"):
         time_in_rounds([*measurements, products], options.repeats)
     rows = []
     for i, timed in enumerate(measurements):
-        floors = {part: products.summary((i, part)) for part in parts}
-        gflops = sum(n * product.flops() for product, n in counts[i]["forward"].items()) / GIGA
-        rows.append(timed.row | {"gflops": gflops} | _summarize(timed, floors))
+        times = {name: timed.summary(name) for name in timed.seconds}
+        forward, step, floor = times["forward"], times.get("step"), products.summary((i, "forward"))
+        over_floor = {"forward": forward["median"] / floor["median"]}
+        over_floor["step"] = step and step["median"] / ((1 + BACKWARD) * floor["median"])
+        row = timed.row | {"forward": forward, "step": step, "floor": floor}
+        row |= {"over_floor": over_floor, "components": {}}
+        for part in [name for name in PARTS if name in times]:
+            own_floor = products.summary((i, part))["median"]
+            row["components"][part] = {"seconds": times[part], "floor": own_floor}
+        rows.append(row | {"operators": {name: times[name] for name in OPERATORS if name in times}})
     return {"rows": rows}
 
 
-def _prepare(workload: Workload, steps: bool) -> Measurement:
+def _prepare(name: str, workload: Workload, steps: bool) -> Measurement:
     """Measure memory, and prepare what is timed."""
     device, cameras = workload.device, workload.views.cameras
     passes = {"forward": workload.forward}
@@ -229,77 +219,49 @@ def _prepare(workload: Workload, steps: bool) -> Measurement:
         return of_passes | part_seconds(workload.forward, device)
 
     row = {
-        "model": workload.name,
+        "model": name,
         "parameters": count_parameters(workload.net),
         "views": cameras.num_views,
         "height": cameras.height,
         "width": cameras.width,
         "precision": workload.precision,
-        "threads": torch.get_num_threads(),
-        "step_needs_gb": workload.step_gb,
-        "peak_gb": {name: rise_gb(run, device) for name, run in passes.items()},
     }
     return Measurement(seconds, row)
 
 
-def _summarize(timed: Measurement, floors: Mapping[str, Result]) -> Result:
-    """Summarize the rounds of a network, beside those of the products of its forward pass."""
-    times = {name: timed.summary(name) for name in timed.seconds}
-    forward, step, floor = times["forward"], times.get("step"), floors["forward"]
-    step_over_floor = step and step["median"] / ((1 + BACKWARD) * floor["median"])
-    return {
-        "forward": forward,
-        "step": step,
-        "floor": floor,
-        "over_floor": {"forward": forward["median"] / floor["median"], "step": step_over_floor},
-        "components": {
-            name: {"seconds": times[name], "floor": floors[name]["median"]}
-            for name in PARTS
-            if name in times
-        },
-        "operators": {name: times[name] for name in OPERATORS if name in times},
-    }
-
-
 def tables(results: Result) -> list[Table]:
     """Show every network, and what its forward pass consists of."""
-    rows, notes = results["rows"], f"{machine_note(results)}\n{NOTES}"
+    rows, parts = results["rows"], []
+    for row in rows:
+        own = [{"part": name, **part} for name, part in row["components"].items()]
+        own += [{"part": f"  of which {n}", "seconds": s} for n, s in row["operators"].items()]
+        for part in own:
+            seconds, floor = part["seconds"]["median"], part.get("floor")
+            part["share"] = seconds / row["forward"]["median"]
+            part["over_floor"] = seconds / floor if floor else None
+            parts.append(row | {"floor": None} | part)
     part_notes = "of which: operators, within the components that call them"
-    parts = [part for row in rows for part in _parts(row)]
     return [
-        make_table("Networks", NETWORKS, rows, notes, names=2),
+        make_table("Networks", NETWORKS, rows, f"{machine_note(results)}\n{NOTES}", names=2),
         make_table("Parts of a forward pass", FORWARD, parts, part_notes, names=3),
     ]
 
 
 def plot(results: Result) -> Figure:
     """Plot the parts of a forward pass, for each view, and its floor."""
-    rows, per_view = results["rows"], [1000 / row["views"] for row in results["rows"]]
+    rows = results["rows"]
 
-    def milliseconds(part: str) -> list[float]:
-        seconds = [row["components"].get(part, {}).get("seconds", {}) for row in rows]
-        return [f * each.get("median", 0) for f, each in zip(per_view, seconds, strict=True)]
+    def milliseconds(seconds: Sequence[Result]) -> list[float]:
+        pairs = zip(rows, seconds, strict=True)
+        return [1000 / row["views"] * each.get("median", 0) for row, each in pairs]
 
+    parts = {p: [row["components"].get(p, {}).get("seconds", {}) for row in rows] for p in PARTS}
     return bars(
         [f"{row['model']}, {row['views']} views, {row['precision']}" for row in rows],
-        {part: milliseconds(part) for part in PARTS},
-        ("floor", [f * row["floor"]["median"] for f, row in zip(per_view, rows, strict=True)]),
+        {part: milliseconds(seconds) for part, seconds in parts.items()},
+        ("floor", milliseconds([row["floor"] for row in rows])),
         "milliseconds of a forward pass for each view",
     )
-
-
-def _parts(row: Result) -> list[Result]:
-    """List the components and, below, the operators."""
-    parts = [{"part": name, **part} for name, part in row["components"].items()]
-    parts += [
-        {"part": f"  of which {name}", "seconds": seconds, "floor": None}
-        for name, seconds in row["operators"].items()
-    ]
-    for part in parts:
-        seconds, floor = part["seconds"]["median"], part["floor"]
-        part["share"] = seconds / row["forward"]["median"]
-        part["over_floor"] = seconds / floor if floor else None
-    return [row | part for part in parts]
 
 
 NETWORKS = {
@@ -310,8 +272,6 @@ NETWORKS = {
     "forward\n/ floor": number("over_floor.forward", "{:.2f}"),
     "step\nms": spread("step"),
     "step\n/ floor": number("over_floor.step", "{:.2f}"),
-    "forward\nGB": number("peak_gb.forward", "{:.2f}"),
-    "step\nGB": number("peak_gb.step", "{:.2f}"),
 }
 FORWARD = {
     "model": text("{model}"),

@@ -4,7 +4,6 @@ import os
 import platform
 import re
 from collections.abc import Iterable
-from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,23 +14,15 @@ import torch
 
 from asysplat.errors import InputError
 
-SUITES = {
-    name: f"asysplat.benchmark.{name}"
-    for name in ("render", "ops", "model", "data", "pareto", "bench", "stability")
-}
-SUITES["stability"] += ".report"
+NAMES = ("render", "ops", "model", "data", "pareto", "bench")
+SUITES = {name: f"asysplat.benchmark.{name}" for name in NAMES}
+SUITES["stability"] = "asysplat.benchmark.stability.report"
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
 CPU = torch.device("cpu")
-CPU_INFO = Path("/proc/cpuinfo")  # Linux alone
-PACKAGES = ("torch", "numba", "triton")
 
 
 def find_suite(name: str) -> ModuleType:
-    """Import the suite called `name`.
-
-    Raises:
-        InputError: no suite has this name.
-    """
+    """Import the suite called `name`; raise InputError where no suite has this name."""
     check_names("suite", [name], SUITES)
     return import_module(SUITES[name])
 
@@ -41,12 +32,6 @@ def check_names(option: str, names: Iterable[str], known: Iterable[str]) -> None
     for name in list(names) or [None]:
         if name not in known:
             raise InputError(f"{option}={name} is unknown: choose from {', '.join(known)}.")
-
-
-def check_repeats(repeats: object) -> None:
-    """Raise InputError unless `repeats` is a whole number from 1."""
-    if not isinstance(repeats, int) or repeats < 1:
-        raise InputError(f"repeats={repeats} cannot be: give a whole number from 1.")
 
 
 def find_device(name: str) -> torch.device:
@@ -62,18 +47,21 @@ def find_device(name: str) -> torch.device:
 
 
 def describe_machine() -> dict[str, str | int]:
-    """Return the processor, cores, torch's threads, the GPU if any, and versions of PACKAGES."""
-    model = CPU_INFO.exists() and re.search(r"model name\s*:\s*(.+)", CPU_INFO.read_text())
+    """Return the processor, cores, torch's threads, the GPU if any, and versions of packages."""
+    info = Path("/proc/cpuinfo")  # Linux alone
+    model = info.exists() and re.search(r"model name\s*:\s*(.+)", info.read_text())
     machine = {
         "cpu": model[1] if model else platform.processor() or platform.machine(),
         "instructions": llvmlite.binding.get_host_cpu_name(),  # what Numba compiles for
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
+        "torch": version("torch"),
+        "numba": version("numba"),
     }
     if torch.cuda.is_available():
         machine["gpu"] = torch.cuda.get_device_name()
-    for package in PACKAGES:
-        with suppress(PackageNotFoundError):
-            machine[package] = version(package)
-    return machine
+    try:
+        return machine | {"triton": version("triton")}
+    except PackageNotFoundError:
+        return machine

@@ -1,4 +1,4 @@
-"""Write a suite's numbers, tables and figure, and the same for TensorBoard."""
+"""Write a suite's numbers, tables and figure."""
 
 import json
 from collections.abc import Sequence
@@ -7,9 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from rich.table import Table
-from torch.utils.tensorboard import SummaryWriter
 
-from asysplat.benchmark.compare import Watched, watched_values
 from asysplat.benchmark.table import markdown
 from asysplat.benchmark.timing import Result
 from asysplat.files import atomic_write
@@ -35,28 +33,20 @@ def dumps(value: Any, indent: str = "") -> str:
 
 
 def write_results(
-    results: Result, tables: Sequence[Table], figure: Figure, watched: Watched, path: Path
+    results: Result, tables: Sequence[Table], figure: Figure | None, path: Path
 ) -> list[Path]:
-    """Write <path>.json, <path>.md, <path>.png and a folder for TensorBoard; return their paths.
-
-    TensorBoard shows every revision of the code as a run of its own.
+    """Write <path>.json, <path>.md and, of a figure, <path>.png; return their paths.
 
     Raises:
         InputError: a file cannot be written.
         ValueError: a result is NaN or infinite.
     """
-    numbers, text, image = (path.with_suffix(end) for end in (".json", ".md", ".png"))
-    content = dumps(results) + "\n"
+    texts = {".json": dumps(results) + "\n", ".md": "\n".join(map(markdown, tables))}
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(numbers) as partial:
-        partial.write_text(content)
-    with atomic_write(text) as partial:
-        partial.write_text("\n".join(map(markdown, tables)))
-    with atomic_write(image) as partial:
-        figure.savefig(partial, dpi=150)
-    board = path.parent / "tensorboard" / path.name / results["revision"]
-    with SummaryWriter(board, purge_step=0) as writer:
-        writer.add_figure(path.name, figure, close=False)
-        for key, value in watched_values(results, watched).items():
-            writer.add_scalar(f"{path.name}/{key.name}/{key.path}", value.median, 0)
-    return [numbers, text, image, board]
+    for suffix, content in texts.items():
+        with atomic_write(path.with_suffix(suffix)) as partial:
+            partial.write_text(content)
+    if figure is not None:
+        with atomic_write(path.with_suffix(".png")) as partial:
+            figure.savefig(partial, dpi=150)
+    return [path.with_suffix(s) for s in (*texts, ".png") if s in texts or figure is not None]

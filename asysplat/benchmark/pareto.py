@@ -19,8 +19,8 @@ import torch.nn.functional as F
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lpips import LPIPS
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
@@ -28,26 +28,11 @@ from rich.table import Table
 from torch import Tensor
 
 from asysplat import load
+from asysplat.benchmark import timing
 from asysplat.benchmark.compare import DECIBELS, LPIPS_DISTANCE, TIME, Watched
 from asysplat.benchmark.options import CPU, PRECISIONS, check_names, find_device
-from asysplat.benchmark.plot import plain_log_ticks
-from asysplat.benchmark.table import (
-    Columns,
-    at,
-    machine_note,
-    make_table,
-    number,
-    spread,
-    text,
-)
-from asysplat.benchmark.timing import (
-    Measurement,
-    Result,
-    rise_gb,
-    seconds_of,
-    summary,
-    time_in_rounds,
-)
+from asysplat.benchmark.table import Columns, at, machine_note, make_table, number, spread, text
+from asysplat.benchmark.timing import Measurement, Result, rise_gb, seconds_of, summary
 from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.procedural.scene import split_seed
@@ -65,7 +50,6 @@ from asysplat.report.front import draw_front, pareto_front
 from asysplat.report.style import FAINT, OURS, STYLE
 from asysplat.scene import Views
 
-ALL = "all"
 BASE = "base"  # the setting that each knob changes
 EXACT = "fp64"
 SIZES = {"inputs": 16, "targets": 4}  # most views of a scene, unless its family says otherwise
@@ -79,12 +63,8 @@ NOISE_OF_SECONDS = {"psnr": 0.25, "lpips": 0.02}
 WATCHED = Watched(
     names=("family", "scene", "setting"),
     alike=("side", "values"),
-    kinds={
-        "seconds": TIME,
-        "error.decibels": replace(DECIBELS, min_change=1.0),
-        "psnr": DECIBELS,
-        "lpips": LPIPS_DISTANCE,
-    },
+    kinds={"seconds": TIME, "error.decibels": DECIBELS._replace(min_change=1.0)}
+    | {"psnr": DECIBELS, "lpips": LPIPS_DISTANCE},
 )
 TITLES = {
     "feed_forward": "Feed-forward",
@@ -130,10 +110,6 @@ class FeedForward:
     def trained(self) -> bool:
         return self.checkpoint is not None
 
-    def exact(self, base: "FeedForward") -> "FeedForward":
-        """Return the setting whose images this one's are compared with."""
-        return replace(base if self.trained else self, precision=EXACT)
-
     def prepare(self, refinement: DictConfig, device: torch.device) -> RenderScene:
         """Load the network; return the function that renders a scene on the device.
 
@@ -144,10 +120,10 @@ class FeedForward:
         dtype = torch.float64 if self.precision == EXACT else torch.float32
         if (device, dtype) != (CPU, torch.float32):
             net = deepcopy(net).to(device, dtype)
-        return lambda scene: self._render(scene, net, dtype)
+        return partial(self._render, net, dtype)
 
     @torch.no_grad()
-    def _render(self, scene: Photographs, net: Network, dtype: torch.dtype) -> Tensor:
+    def _render(self, net: Network, dtype: torch.dtype, scene: Photographs) -> Tensor:
         scene = select_inputs(scene, self.views, self.side)
         inputs, targets = scene.inputs.to(dtype), scene.held_out.to(dtype)
         half = PRECISIONS.get(self.precision) == torch.bfloat16
@@ -159,16 +135,9 @@ class FeedForward:
         if self.cell is not None or self.max_gaussians is not None:
             limit = self.max_gaussians or gaussians.num_gaussians
             gaussians = merge_to_limit(gaussians, inputs.cameras, self.cell or 1.0, limit)
-        out = render(
-            gaussians,
-            targets.cameras,
-            mean_color(inputs),
-            depth=False,
-            sh_degree=self.sh_degree,
-            convention=replace(INRIA, **self.convention),
-            views_at_once=self.views_at_once,
-        )
-        return out.image
+        options = {"sh_degree": self.sh_degree, "views_at_once": self.views_at_once}
+        options |= {"depth": False, "convention": replace(INRIA, **self.convention)}
+        return render(gaussians, targets.cameras, mean_color(inputs), **options).image
 
 
 @dataclass(frozen=True)
@@ -188,15 +157,10 @@ class Refined:
         check_names("init", [self.init], INITS)
         _check_whole(self, "views", "side")
         _check_whole(self, "steps", minimum=0)
-        given = self.steps is not None, self.seconds is not None and 0 < self.seconds < math.inf
-        if given.count(True) != 1:
+        if (self.steps is not None) == (0 < (self.seconds or 0) < math.inf):
             raise InputError(
                 f"steps={self.steps} and seconds={self.seconds}: give one of them, above 0."
             )
-
-    def exact(self, base: "Refined") -> "Refined":
-        """Return the setting whose images this one's are compared with."""
-        return base
 
     def prepare(self, refinement: DictConfig, device: torch.device) -> RenderScene:
         """Read the settings; return the function that renders a scene on the CPU.
@@ -210,10 +174,10 @@ class Refined:
             message = f"{self.refinement} are no settings of a refinement."
             raise InputError(str(input_error_behind(error) or message)) from None
         net = _load_network("shipped", ()) if self.init == "network" else None
-        return lambda scene: self._render(scene, settings, net)
+        return partial(self._render, settings, net)
 
     def _render(
-        self, scene: Photographs, settings: RefinementSettings, net: Network | None
+        self, settings: RefinementSettings, net: Network | None, scene: Photographs
     ) -> Tensor:
         scene = select_inputs(scene, self.views, self.side)
         gaussians = initial_gaussians(self.init, scene, settings.max_gaussians, net)
@@ -225,12 +189,8 @@ class Refined:
             return render(gaussians, scene.held_out.cameras, background, depth=False).image
 
 
-FAMILIES = {
-    "feed_forward": FeedForward,
-    "networks": FeedForward,
-    "refined": Refined,
-    "reconstruct": Refined,
-}
+FAMILIES = dict.fromkeys(("feed_forward", "networks"), FeedForward)
+FAMILIES |= dict.fromkeys(("refined", "reconstruct"), Refined)
 Setting = FeedForward | Refined
 
 
@@ -254,33 +214,26 @@ def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
         InputError: an unknown family, knob or field of a setting, or a value out of range.
     """
     check_names("pareto.families", config["families"], FAMILIES)
-    families = {
-        family: _make_settings(family, config[family]["base"], config[family]["knobs"] or {})
-        for family in config["families"]
-    }
-    if config["knobs"] == ALL:
-        return families
-    every = dict.fromkeys(name for settings in families.values() for name in settings)
-    check_names("pareto.knobs", config["knobs"], [*every, ALL])
-    return {
-        family: {n: setting for n, setting in settings.items() if n in (BASE, *config["knobs"])}
-        for family, settings in families.items()
-    }
-
-
-def _make_settings(family: str, base: Mapping, knobs: Mapping[str, Mapping]) -> dict[str, Setting]:
-    settings = {}
-    for name, changes in ({BASE: {}} | dict(knobs)).items():
-        where = f"pareto.{family}.{name}"
-        if not isinstance(changes, Mapping):
-            raise InputError(f"{where}={changes} is no setting: give {{name: value}}.")
-        known = [each.name for each in fields(FAMILIES[family])]
-        check_names(where, {**base, **changes}, known)
-        try:
-            settings[name] = FAMILIES[family](**(dict(base) | dict(changes)))
-        except (InputError, TypeError) as error:
-            raise InputError(f"{where}: {error}") from error
-    return settings
+    families = {}
+    for family in config["families"]:
+        kind, base = FAMILIES[family], config[family]["base"]
+        families[family] = {}
+        for name, changes in ({BASE: {}} | (config[family]["knobs"] or {})).items():
+            where = f"pareto.{family}.{name}"
+            if not isinstance(changes, Mapping):
+                raise InputError(f"{where}={changes} is no setting: give {{name: value}}.")
+            check_names(where, base | changes, [each.name for each in fields(kind)])
+            try:
+                families[family][name] = kind(**(base | changes))
+            except (InputError, TypeError) as error:
+                raise InputError(f"{where}: {error}") from error
+    if (chosen := config["knobs"]) != "all":
+        names = dict.fromkeys(name for settings in families.values() for name in settings)
+        check_names("pareto.knobs", chosen, [*names, "all"])
+        for settings in families.values():
+            for name in settings.keys() - {BASE, *chosen}:
+                del settings[name]
+    return families
 
 
 def find_scenes(
@@ -289,17 +242,12 @@ def find_scenes(
     """Return functions that open scenes, and the reasons why others are not measured.
 
     The functions take the side of the photographs in pixels, and the largest numbers of input and
-    of held-out views.
-
-    Args:
-        names: of PROCEDURAL, REAL, or folders in `folder`.
-        folder: holds scenes of photographs.
+    of held-out views. `names` are of PROCEDURAL, REAL, or folders in `folder`.
 
     Raises:
         InputError: a name that no scene has, or no scene is there.
     """
-    folders = [path for path in folder.iterdir() if path.is_dir()] if folder.is_dir() else []
-    present = sorted(path.name for path in folders)
+    present = sorted(path.name for path in folder.glob("*") if path.is_dir())
     check_names("pareto.scenes", names, dict.fromkeys([*PROCEDURAL, *REAL, *present]))
     scenes, absent = {}, {}
     for name in names:
@@ -359,80 +307,79 @@ def select_inputs(scene: Photographs, views: int | None, side: int | None) -> Ph
     return replace(scene, inputs=inputs, held_out=targets, points=None)
 
 
-@dataclass(frozen=True)
-class Meter:
-    """How settings are measured on every scene."""
+def measure_scene(
+    scene: Photographs,
+    settings: Mapping[str, Setting],
+    renderers: Mapping[str, RenderScene],
+    protocol: Protocol,
+    lpips: LPIPS | None,
+    refinement: DictConfig,
+    device: torch.device,
+    repeats: int,
+) -> list[Result]:
+    """Measure all settings in turns, those with a limit in seconds once; return a row for each.
 
-    protocol: Protocol
-    lpips: LPIPS | None  # see `load_lpips`; None: no LPIPS
-    refinement: DictConfig  # a file of conf/refinement
-    device: torch.device  # of the networks; refinements are on the CPU
-    repeats: int  # timed rounds
+    Args:
+        renderers: of each setting.
+        lpips: see `load_lpips`; None: no LPIPS.
+        refinement: a file of conf/refinement.
+        device: of the networks; refinements are on the CPU.
 
-    def rows(
-        self,
-        scene: Photographs,
-        settings: Mapping[str, Setting],
-        renderers: Mapping[str, RenderScene],
-    ) -> list[Result]:
-        """Measure all settings in turns, those with a limit in seconds once; a row for each.
+    Raises:
+        InputError: the setting BASE cannot render this scene. Of another that cannot, all
+            numbers are None, and "not_measured" says why.
+    """
+    base = settings[BASE]
+    own_device = CPU if isinstance(base, Refined) else device
+    views = {name: getattr(scene, name).to(own_device) for name in ("inputs", "held_out")}
+    scene = replace(scene, **views)
+    images, measurements, absent = {}, {}, {}
 
-        Raises:
-            InputError: the setting BASE cannot render this scene. Of another that cannot, all
-                numbers are None, and "not_measured" says why.
-        """
-        base = settings[BASE]
-        device = CPU if isinstance(base, Refined) else self.device
-        scene = replace(scene, inputs=scene.inputs.to(device), held_out=scene.held_out.to(device))
-        images: dict[str, Tensor] = {}
-        measurements: dict[str, Measurement] = {}
-        absent: dict[str, str] = {}
+    def run(name: str) -> None:
+        images[name] = renderers[name](scene)
 
-        def run(name: str) -> None:
-            images[name] = renderers[name](scene)
-
-        once = isinstance(base, Refined) and base.seconds is not None
-        if once:  # compiles kernels
-            replace(base, seconds=None, steps=1).prepare(self.refinement, CPU)(scene)
-        for name in settings:
-            run_once = partial(run, name)
-            try:
-                if once:
-                    seconds = {"seconds": [seconds_of(run_once, device)]}
-                    measurements[name] = Measurement(dict, {"peak_gb": None}, seconds)
-                else:
-                    costs = {"peak_gb": max(0.0, rise_gb(run_once, device))}
-                    timer = partial(seconds_of, run_once, device)
-                    measurements[name] = Measurement(lambda t=timer: {"seconds": t()}, costs)
-            except InputError as error:
-                if name == BASE:
-                    raise
-                absent[name] = str(error)
-        if not once:
-            time_in_rounds(list(measurements.values()), self.repeats)
-        exact_images = {repr(base): images[BASE]}
-        rows = []
-        for name, setting in settings.items():
-            row = {"setting": name, "values": asdict(setting), "not_measured": absent.get(name)}
-            row |= dict.fromkeys(("seconds", "over_base", "peak_gb"))
-            row |= dict.fromkeys(("error", "psnr", "ssim", "lpips"))
-            if name in measurements:
-                timed, image = measurements[name], images[name]
-                own, of_base = (m.seconds["seconds"] for m in (timed, measurements[BASE]))
-                ratios = [a / b for a, b in zip(own, of_base, strict=True)]
-                row |= {"seconds": summary(own), "over_base": summary(ratios)} | timed.row
-                exact = setting.exact(base)
-                if exact != setting:
-                    key = repr(exact)
-                    if key not in exact_images:
-                        render_exact = exact.prepare(self.refinement, self.device)
-                        exact_images[key] = render_exact(scene)
-                    row["error"] = image_error(image, exact_images[key])
-                if setting.trained:
-                    metrics = self.protocol.image_metrics(image, scene.held_out, self.lpips)
-                    row |= {metric: values.mean().item() for metric, values in metrics.items()}
-            rows.append(row | ({"noise": NOISE_OF_SECONDS} if once else {}))
-        return rows
+    once = isinstance(base, Refined) and base.seconds is not None
+    if once:  # compiles kernels
+        replace(base, seconds=None, steps=1).prepare(refinement, CPU)(scene)
+    for name in settings:
+        run_once = partial(run, name)
+        try:
+            if once:
+                seconds = {"seconds": [seconds_of(run_once, own_device)]}
+                measurements[name] = Measurement(dict, {"peak_gb": None}, seconds)
+            else:
+                costs = {"peak_gb": max(0.0, rise_gb(run_once, own_device))}
+                timer = partial(seconds_of, run_once, own_device)
+                measurements[name] = Measurement(lambda t=timer: {"seconds": t()}, costs)
+        except InputError as error:
+            if name == BASE:
+                raise
+            absent[name] = str(error)
+    if not once:
+        timing.time_in_rounds(list(measurements.values()), repeats)
+    exact_images = {repr(base): images[BASE]}
+    rows = []
+    for name, setting in settings.items():
+        row = {"setting": name, "values": asdict(setting), "not_measured": absent.get(name)}
+        row |= dict.fromkeys(("seconds", "over_base", "peak_gb", "error", "psnr", "ssim", "lpips"))
+        if name in measurements:
+            timed, image = measurements[name], images[name]
+            own, of_base = (m.seconds["seconds"] for m in (timed, measurements[BASE]))
+            ratios = [a / b for a, b in zip(own, of_base, strict=True)]
+            row |= {"seconds": summary(own), "over_base": summary(ratios)} | timed.row
+            exact = base
+            if isinstance(setting, FeedForward):
+                exact = replace(base if setting.trained else setting, precision=EXACT)
+            if exact != setting:
+                key = repr(exact)
+                if key not in exact_images:
+                    exact_images[key] = exact.prepare(refinement, device)(scene)
+                row["error"] = image_error(image, exact_images[key])
+            if setting.trained:
+                metrics = protocol.image_metrics(image, scene.held_out, lpips)
+                row |= {metric: values.mean().item() for metric, values in metrics.items()}
+        rows.append(row | ({"noise": NOISE_OF_SECONDS} if once else {}))
+    return rows
 
 
 def image_error(image: Tensor, exact: Tensor) -> Result:
@@ -453,12 +400,9 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": one for each family, scene and setting: "seconds", their ratio to the base's of the
         same round "over_base", "peak_gb" above what was held before, "error" of the images
-        against the exact ones ("decibels", "max"), and "psnr", "ssim" and "lpips" against the
-        photographs; None for what was not measured. "settings": the means over scenes, see
-        `summarize`. "not_measured": what, and why.
-
-    Raises:
-        InputError: an unknown family, scene or knob, or a value out of range.
+        against the exact ones ("decibels", "max"), and metrics against the photographs; None for
+        what was not measured. "settings": the means, see `summarize`. "not_measured": what, and
+        why.
     """
     config = OmegaConf.to_container(options.pareto, resolve=True)
     shared = Path(config["shared"])
@@ -471,7 +415,7 @@ def measure(options: DictConfig, console: Console) -> Result:
         for family, settings in families.items()
     }
     scenes, absent = find_scenes(config["scenes"], shared / "data")
-    meter = Meter(protocol, lpips, options.refinement, device, options.repeats)
+    common = (protocol, lpips, options.refinement, device, options.repeats)
     if lpips is None:
         absent["LPIPS"] = f"{shared / 'weights'} has no weights of its backbone"
     if not torch.cuda.is_available():
@@ -483,33 +427,24 @@ def measure(options: DictConfig, console: Console) -> Result:
                 continue
             sizes = {"side": config["side"]} | SIZES | (config[family].get("photographs") or {})
             with console.status(f"{name}: {len(settings)} settings, {family}"):
-                found = meter.rows(open_scene(**sizes), settings, renderers[family])
+                found = measure_scene(open_scene(**sizes), settings, renderers[family], *common)
             console.print(f"{name}: {family}, {len(found)} settings", highlight=False)
             where = {"family": family, "scene": name, "side": sizes["side"]}
             rows += [where | row for row in found]
-    absent |= {
-        "{family}, {scene}, {setting}".format(**row): row["not_measured"]
-        for row in rows
-        if row["not_measured"]
-    }
-    return {
-        "protocol": protocol.sentences(),
-        "not_measured": absent,
-        "rows": rows,
-        "settings": summarize(rows),
-    }
+    for row in [row for row in rows if row["not_measured"]]:
+        absent["{family}, {scene}, {setting}".format(**row)] = row["not_measured"]
+    results = {"protocol": protocol.sentences(), "not_measured": absent}
+    return results | {"rows": rows, "settings": summarize(rows)}
 
 
 def summarize(rows: Sequence[Result]) -> list[Result]:
-    """Average each setting of each family over its scenes.
+    """Average each setting of each family over the scenes that it was measured on.
 
     Returns:
-        "scenes" counts those that it was measured on; "seconds", "psnr", "lpips" and
-        "error_decibels" are means; "over_base" is a geometric one; "lost" is the PSNR below the
-        base's, "most_lost" that of the worst scene; "error_max" and "peak_gb" are the largest;
-        "busy" whether any measurement was; "on_front" whether no other setting of the family
-        has both less seconds and a higher PSNR (a lower error, where there is no PSNR). None for
-        what was measured on no scene.
+        "over_base" is a geometric mean; "lost" is the PSNR below the base's, "most_lost" that of
+        the worst scene; "error_max" and "peak_gb" are the largest; "on_front" whether no other
+        setting of the family has both less seconds and a higher PSNR (a lower error, where there
+        is no PSNR). None for what was measured on no scene.
     """
     bases = {(row["family"], row["scene"]): row for row in rows if row["setting"] == BASE}
     means = [
@@ -530,28 +465,23 @@ def _means(group: Sequence[Result], bases: Mapping[tuple[str, str], Result]) -> 
     def values(path: str) -> list[float]:
         return [value for row in timed_rows if (value := at(row, path)) is not None]
 
-    def mean(numbers: Sequence[float]) -> float | None:
-        return fmean(numbers) if numbers else None
-
-    lost = [
-        bases[row["family"], row["scene"]]["psnr"] - row["psnr"]
-        for row in timed_rows
-        if row["psnr"] is not None
-    ]
-    ratios = values("over_base.median")
-    return {
-        "scenes": len(timed_rows),
-        "seconds": mean(values("seconds.median")),
-        "over_base": math.exp(fmean(map(math.log, ratios))) if ratios else None,
-        "psnr": mean(values("psnr")),
-        "lost": mean(lost),
-        "most_lost": max(lost, default=None),
-        "lpips": mean(values("lpips")),
-        "error_decibels": mean(values("error.decibels")),
-        "error_max": max(values("error.max"), default=None),
-        "peak_gb": max(values("peak_gb"), default=None),
-        "busy": any(row["seconds"]["busy"] for row in timed_rows),
+    measured = [row for row in timed_rows if row["psnr"] is not None]
+    lost = [bases[row["family"], row["scene"]]["psnr"] - row["psnr"] for row in measured]
+    means = {
+        "seconds": values("seconds.median"),
+        "psnr": values("psnr"),
+        "lost": lost,
+        "lpips": values("lpips"),
+        "error_decibels": values("error.decibels"),
+        "over_base": list(map(math.log, values("over_base.median"))),
     }
+    means = {name: fmean(numbers) if numbers else None for name, numbers in means.items()}
+    if means["over_base"] is not None:
+        means["over_base"] = math.exp(means["over_base"])
+    largest = {"most_lost": lost, "error_max": values("error.max"), "peak_gb": values("peak_gb")}
+    largest = {name: max(numbers, default=None) for name, numbers in largest.items()}
+    busy = any(row["seconds"]["busy"] for row in timed_rows)
+    return {"scenes": len(timed_rows), **means, **largest, "busy": busy}
 
 
 def points(rows: Sequence[Result], quality: str | None) -> list[tuple[str, float, float]]:
@@ -574,13 +504,10 @@ def tables(results: Result) -> list[Table]:
     notes = "\n".join(filter(None, (machine_note(results), NOTES, absent)))
     scenes = _grouped(results["rows"], "family", "scene").items()
     families = _grouped(results["settings"], "family").items()
-    return [
-        *(make_table(f"{TITLES[name]}, {scene}", ROWS, rows) for (name, scene), rows in scenes),
-        *(
-            make_table(f"{TITLES[name]}, means over scenes", MEANS, rows, notes)
-            for (name,), rows in families
-        ),
-    ]
+    shown = [make_table(f"{TITLES[name]}, {scene}", ROWS, rows) for (name, scene), rows in scenes]
+    for (name,), rows in families:
+        shown.append(make_table(f"{TITLES[name]}, means over scenes", MEANS, rows, notes))
+    return shown
 
 
 def plot(results: Result) -> Figure:
@@ -597,22 +524,19 @@ def plot(results: Result) -> Figure:
         for column, rows in enumerate(families.values()):
             busy = [row["setting"] for row in rows if row["busy"]]
             for axes, quality in zip(grid[:, column], shown, strict=True):
-                _plot_points(axes, points(rows, quality), busy)
+                if found := points(rows, quality):
+                    axes.set_xscale("log")
+                    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+                    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                    axes.xaxis.set_minor_formatter(NullFormatter())
+                    draw_front(axes, found, "higher", OURS, busy)
+                else:
+                    style = {"color": FAINT, "ha": "center", "transform": axes.transAxes}
+                    axes.text(0.5, 0.5, "not measured", **style)
+                    axes.set_axis_off()
         note = "hollow: measured while the machine was busy; crowded names are left out"
         figure.supxlabel(note, fontsize=9, color=FAINT)
     return figure
-
-
-def _plot_points(
-    axes: Axes, found: Sequence[tuple[str, float, float]], busy: Sequence[str]
-) -> None:
-    if not found:
-        axes.text(0.5, 0.5, "not measured", color=FAINT, ha="center", transform=axes.transAxes)
-        axes.set_axis_off()
-        return
-    axes.set_xscale("log")
-    plain_log_ticks(axes, (1, 2, 3, 5))
-    draw_front(axes, found, "higher", OURS, busy)
 
 
 ROWS: Columns = {

@@ -17,7 +17,6 @@ from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.benchmark import Timer
 
-from asysplat.evaluation.cost import true_flops
 from asysplat.ops.ssd.chunked import CHUNK
 
 aten = torch.ops.aten
@@ -56,15 +55,6 @@ class Product:
         ]
         return lambda: self.function(*arguments)
 
-    def flops(self) -> int:
-        return true_flops(self.prepare("meta"))
-
-    def seconds(self, count: int, device: torch.device) -> float:
-        """Return the seconds of one of `count` calls."""
-        scope = {"call": self.prepare(device)}
-        timer = Timer("call()", globals=scope, num_threads=torch.get_num_threads())
-        return timer.timeit(min(count, MAX_CALLS)).mean
-
 
 Counts = Mapping[Product, int]
 
@@ -85,7 +75,7 @@ class RecordProducts(TorchDispatchMode):
 def _products_of_call(func: OpOverload, args: tuple) -> Counts:
     """Count the products of a call; an operator that is one call to torch has several."""
     if func in CALLS:
-        return {Product(func, tuple(_without_values(value) for value in args)): 1}
+        return {Product(func, tuple(map(_without_values, args))): 1}
     if func._schema.name.startswith("aten::_scaled_dot_product"):
         q, k, v = args[:3]
         sizes = attention_sizes(q.shape[:-2].numel(), q.shape[-2], k.shape[-2], q.shape[-1])
@@ -98,13 +88,12 @@ def _products_of_call(func: OpOverload, args: tuple) -> Counts:
 
 
 def _without_values(value: Any) -> Operand | Any:
-    if isinstance(value, Tensor):
-        innermost = value.ndim == 4 and value.is_contiguous(memory_format=torch.channels_last)
-        layout = torch.channels_last if innermost else torch.contiguous_format
-        if value.is_contiguous():
-            layout = torch.contiguous_format
-        return Operand(tuple(value.shape), value.dtype, layout)
-    return tuple(value) if isinstance(value, list) else value
+    if not isinstance(value, Tensor):
+        return tuple(value) if isinstance(value, list) else value
+    innermost = value.ndim == 4 and value.is_contiguous(memory_format=torch.channels_last)
+    channels_last = innermost and not value.is_contiguous()
+    layout = torch.channels_last if channels_last else torch.contiguous_format
+    return Operand(tuple(value.shape), value.dtype, layout)
 
 
 def ssd_sizes(batch: int, length: int, heads: int, head_dim: int, state: int) -> list[Size]:
@@ -158,11 +147,14 @@ def _largest_divisor(number: int, limit: int) -> int:
 
 
 def time_products(groups: Mapping[Hashable, Counts], device: torch.device) -> dict[Hashable, float]:
-    """Time each product once; return the seconds of one call of it, and those of each group."""
+    """Time each product once; return the seconds of each group."""
     union = reduce(or_, map(Counter, groups.values()))  # with the greatest count of any group
-    seconds = {product: product.seconds(count, device) for product, count in union.items()}
-    sums = {
+    seconds = {}
+    for product, count in union.items():
+        scope = {"call": product.prepare(device)}
+        timer = Timer("call()", globals=scope, num_threads=torch.get_num_threads())
+        seconds[product] = timer.timeit(min(count, MAX_CALLS)).mean
+    return {
         name: sum((count * seconds[product] for product, count in counts.items()), 0.0)
         for name, counts in groups.items()
     }
-    return seconds | sums

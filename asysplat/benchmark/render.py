@@ -1,6 +1,5 @@
 """Every backend of the renderer, and every culling switched off: seconds, memory, error."""
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
 from typing import NamedTuple
@@ -14,21 +13,13 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
+from asysplat.benchmark import timing
 from asysplat.benchmark.compare import ERROR, TIME, Watched
 from asysplat.benchmark.options import CPU
 from asysplat.benchmark.plot import time_against_error
 from asysplat.benchmark.scenes import SCENES, SMALLER, Scene, find_scenes
 from asysplat.benchmark.table import error, machine_note, make_table, number, spread, text
-from asysplat.benchmark.timing import (
-    Measurement,
-    Result,
-    now,
-    ratios,
-    relative_l2,
-    rise_gb,
-    time_in_rounds,
-)
-from asysplat.ops.simd.threads import time_kernels
+from asysplat.benchmark.timing import Measurement, Result, now, relative_l2
 from asysplat.rendering import Culling, render
 from asysplat.scene import Cameras, Gaussians
 
@@ -39,7 +30,6 @@ WATCHED = Watched(
     | dict.fromkeys(("error.image_p99", "error.image_max", "error.gradients"), ERROR),
 )
 CULLING = tuple(field.name for field in fields(Culling))
-CUDA_CULLING = tuple(name for name in CULLING if name != "rows")
 FIELDS = tuple(field.name for field in fields(Gaussians))
 FLIP = 1e-4  # a difference that rounding alone does not make; a flip makes up to 1/255
 PASSES = ("forward", "backward")
@@ -53,12 +43,7 @@ class Backend(NamedTuple):
     culling: tuple[str, ...] = ()  # names of the culling that can be switched off
 
 
-class Inputs(NamedTuple):
-    """A scene on the device of a backend."""
-
-    gaussians: Gaussians  # leaves that require gradients
-    cameras: Cameras
-    weights: Tensor  # [V, 3, H, W] the gradient of the image, from a normal distribution
+Inputs = tuple[Gaussians, Cameras, Tensor]  # see `prepare`
 
 
 class Outputs(NamedTuple):
@@ -67,7 +52,6 @@ class Outputs(NamedTuple):
     image: Tensor  # [V, 3, H, W]
     gradients: tuple[Tensor, ...]  # of each of FIELDS
     seconds: dict[str, float]  # of "forward" and "backward"
-    kernels: dict[str, float]  # seconds of each kernel, of the cpu backend
     stats: dict[str, int]
 
 
@@ -75,14 +59,18 @@ def find_backends() -> list[Backend]:
     """List the reference, then the fast backends that can run here."""
     backends = [Backend("reference"), Backend("cpu", culling=CULLING)]
     if torch.cuda.is_available():
-        backends.append(Backend("cuda", torch.device("cuda"), CUDA_CULLING))
+        without_rows = tuple(name for name in CULLING if name != "rows")
+        backends.append(Backend("cuda", torch.device("cuda"), without_rows))
     return backends
 
 
 def prepare(scene: Scene, device: torch.device = CPU, ignored: Tensor | None = None) -> Inputs:
     """Move a scene to a device.
 
-    The weights are the same at every call, but for 0 at the pixels `ignored`, [V, H, W].
+    Returns:
+        Gaussians that require gradients, cameras, and the gradient of the image [V, 3, H, W],
+        from a normal distribution: the same at every call, but for 0 at the pixels `ignored`,
+        [V, H, W].
     """
     gaussians, cameras = (part.to(device) for part in scene)
     size = (cameras.num_views, 3, cameras.height, cameras.width)
@@ -90,20 +78,19 @@ def prepare(scene: Scene, device: torch.device = CPU, ignored: Tensor | None = N
     if ignored is not None:
         weights = weights * ~ignored[:, None]
     leaves = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
-    return Inputs(leaves, cameras, weights.to(gaussians.means))
+    return leaves, cameras, weights.to(gaussians.means)
 
 
 def run(backend: Backend, culling: Culling, inputs: Inputs) -> Outputs:
     """Render without background, and compute the gradients."""
     gaussians, cameras, weights = inputs
     leaves = [getattr(gaussians, name) for name in FIELDS]
-    with time_kernels() as kernels:
-        start = now(backend.device)
-        out = render(gaussians, cameras, backend=backend.name, culling=culling, depth=False)
-        middle = now(backend.device)
-        gradients = torch.autograd.grad(out.image, leaves, weights)
-        seconds = {"forward": middle - start, "backward": now(backend.device) - middle}
-    return Outputs(out.image.detach(), gradients, seconds, kernels, out.stats)
+    start = now(backend.device)
+    out = render(gaussians, cameras, backend=backend.name, culling=culling, depth=False)
+    middle = now(backend.device)
+    gradients = torch.autograd.grad(out.image, leaves, weights)
+    seconds = {"forward": middle - start, "backward": now(backend.device) - middle}
+    return Outputs(out.image.detach(), gradients, seconds, out.stats)
 
 
 def run_exact(scene: Scene, ignored: Tensor | None = None) -> Outputs:
@@ -139,14 +126,9 @@ def measure(options: DictConfig, console: Console) -> Result:
 
     Returns:
         "rows": one for each scene, backend and culling that is off, times in seconds.
-
-    Raises:
-        InputError: an unknown scene.
     """
-    rows: list[Result] = []
-    for name in track(find_scenes(options.scenes), "scenes", console=console):
-        rows += _measure_scene(name, options.repeats)
-    return {"rows": rows}
+    names = track(find_scenes(options.scenes), "scenes", console=console)
+    return {"rows": [row for name in names for row in _measure_scene(name, options.repeats)]}
 
 
 def _measure_scene(name: str, repeats: int) -> list[Result]:
@@ -167,21 +149,11 @@ def _measure_scene(name: str, repeats: int) -> list[Result]:
             run_once = partial(run, backend, culling, inputs)
             error = errors(run(backend, culling, small_inputs), exact, ignored)
             row = {"scene": name, "backend": backend.name, "without": off, **_sizes(scene)}
-            row |= {
-                "threads": torch.get_num_threads(),
-                "error": {"measured_on": _sizes(small), **error},
-                "peak_gb": rise_gb(run_once, backend.device),
-            }
-            measurements.append(Measurement(partial(_seconds, run_once, row), row))
-    time_in_rounds(measurements, repeats)
-    for timed in measurements:
-        row = timed.row
-        row |= {name: timed.summary(name) for name in PASSES}
-        row["faster_than_reference"] = ratios(measurements[0].row, row, PASSES)
-        if row["backend"] == "cpu":
-            kernels = [name for name in timed.seconds if name not in PASSES]
-            row["stages"] = {name: timed.summary(name) for name in kernels}
-    return [timed.row for timed in measurements]
+            row["error"] = {"measured_on": _sizes(small), **error}
+            row["stats"] = run_once().stats
+            measurements.append(Measurement(lambda run_once=run_once: run_once().seconds, row))
+    timing.time_in_rounds(measurements, repeats)
+    return [m.row | {name: m.summary(name) for name in PASSES} for m in measurements]
 
 
 def _sizes(scene: Scene) -> dict[str, int]:
@@ -190,40 +162,24 @@ def _sizes(scene: Scene) -> dict[str, int]:
     return sizes | {"height": cameras.height, "width": cameras.width}
 
 
-def _seconds(run_once: Callable[[], Outputs], row: Result) -> dict[str, float]:
-    """Time both passes and the kernels in them; add the counts to the row."""
-    outputs = run_once()
-    row["stats"] = outputs.stats
-    return outputs.seconds | outputs.kernels
-
-
 def tables(results: Result) -> list[Table]:
-    """Show all rows, and the kernels of the cpu backend."""
-    rows = results["rows"]
-    ours = [row for row in rows if row["backend"] == "cpu" and row["without"] is None]
+    """Show all rows."""
     notes = (
         f"{machine_note(results)}; *: errors of a smaller scene of the same make;\n"
         "errors outside the pixels where some backend's rounding decides otherwise at a cut-off"
     )
     columns = {
         "scene": text("{scene}"),
-        "backend": lambda row: (
-            f"  no {row['without']} culling" if row["without"] else row["backend"]
-        ),
+        "backend": lambda r: f"  no {r['without']} culling" if r["without"] else r["backend"],
         "forward\nms": spread("forward"),
         "backward\nms": spread("backward"),
-        "memory\nMB": number("peak_gb", "{:.0f}", unit=1e-3),
         "image\np99": error("error.image_p99"),
         "image\nmax": error("error.image_max"),
         "flips\n1e-6": number("error.flipped", "{:.0f}", unit=1e-6),
         "gradients\nworst": error("error.gradients"),
     }
-    kernels = ours[0]["stages"] if ours else ()
-    passes = {name.replace("_", "\n"): spread(f"stages.{name}") for name in kernels}
-    return [
-        make_table("Every backend, and without one kind of culling", columns, rows, notes, names=2),
-        make_table("Kernels of the cpu backend, ms", {"scene": text("{scene}"), **passes}, ours),
-    ]
+    title = "Every backend, and without one kind of culling"
+    return [make_table(title, columns, results["rows"], notes, names=2)]
 
 
 def plot(results: Result) -> Figure:
@@ -233,4 +189,4 @@ def plot(results: Result) -> Figure:
         "backward": ("worst gradient against float64, relative L2", "error.gradients"),
     }
     rows = [row for row in results["rows"] if row["without"] is None]
-    return time_against_error(rows, labels, backend="backend", case="scene")
+    return time_against_error(rows, labels)

@@ -80,11 +80,6 @@ def on_an_arc(camera: Cameras, views: int) -> Cameras:
     return Cameras(intrinsics, camera.cam_to_world @ turns, camera.height, camera.width)
 
 
-def _scene_on_an_arc(views: int) -> Scene:
-    gaussians, camera = pixel_aligned_scene(256, 256, 256)
-    return gaussians, on_an_arc(camera, views)
-
-
 def _scene(
     position: Tensor,
     depths: Tensor,
@@ -110,6 +105,11 @@ def _scene(
     return gaussians.to(torch.float32), camera_at_origin(focal, height, width)
 
 
+def _scene_on_an_arc(views: int) -> Scene:
+    gaussians, camera = pixel_aligned_scene(256, 256, 256)
+    return gaussians, on_an_arc(camera, views)
+
+
 SCENES = {
     "A": partial(random_scene, 50_000, 256, 256),
     "B": partial(random_scene, 50_000, 540, 960),
@@ -125,11 +125,7 @@ SMALLER = {  # scenes that float64 can afford: errors are measured on these inst
 
 
 def find_scenes(names: str | Sequence[str]) -> list[str]:
-    """Return the names of scenes: one, several, or "all".
-
-    Raises:
-        InputError: a name that no scene has, or none.
-    """
+    """Return the names of scenes: one, several, or "all"; raise InputError for unknown ones."""
     names = [names] if isinstance(names, str) else list(names)
     check_names("scenes", names, [*SCENES, "all"])
     return list(SCENES) if "all" in names else names

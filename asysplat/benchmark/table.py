@@ -5,13 +5,12 @@ from typing import Any
 
 from rich.box import ROUNDED
 from rich.table import Table
-from rich.text import Text
 
-from asysplat.benchmark.timing import BUSY, Result, is_busy
+from asysplat.benchmark.timing import BUSY, Result
 from asysplat.report.markdown import escape
 
 NOTHING = "-"  # for what was not measured
-Write = Callable[[Result], str | Text]
+Write = Callable[[Result], str]
 Columns = Mapping[str, Write]
 
 
@@ -64,22 +63,19 @@ def text(pattern: str) -> Write:
 
 def number(path: str, pattern: str, unit: float = 1.0) -> Write:
     """Write a number, divided by its unit."""
-    return _cell(path, lambda value: pattern.format(value / unit))
+    return lambda row: NOTHING if at(row, path) is None else pattern.format(at(row, path) / unit)
 
 
 def spread(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> Write:
     """Write median ± interquartile range, and "busy" where that is wide; seconds in ms."""
 
-    def write(value: Result) -> str:
-        numbers = [value[name] for name in ("median", "iqr")]
-        words = " ± ".join(pattern.format(number / unit) for number in numbers)
-        return f"{words} busy" if is_busy(*numbers) else words
+    def write(row: Result) -> str:
+        if (value := at(row, path)) is None:
+            return NOTHING
+        words = " ± ".join(pattern.format(value[name] / unit) for name in ("median", "iqr"))
+        return f"{words} busy" if value["iqr"] > BUSY * value["median"] else words
 
-    return _cell(path, write)
-
-
-def _cell(path: str, write: Callable[[Any], str | Text]) -> Write:
-    return lambda row: NOTHING if at(row, path) is None else write(at(row, path))
+    return write
 
 
 def error(path: str) -> Write:

@@ -1,7 +1,7 @@
 """Seconds, memory and errors, measured alike in every suite."""
 
 import time
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,7 +28,6 @@ class Measurement:
     seconds: dict[Hashable, list[float]] = field(default_factory=dict)
 
     def summary(self, name: Hashable) -> Result:
-        """Summarize the seconds of this name."""
         return summary(self.seconds[name])
 
 
@@ -47,20 +46,7 @@ def time_in_rounds(measurements: Sequence[Measurement], repeats: int) -> None:
 def summary(values: Sequence[float]) -> Result:
     """Return median and interquartile range, and whether the machine was busy."""
     low, median, high = np.percentile(values, [25, 50, 75]).tolist()
-    return {"median": median, "iqr": high - low, "busy": is_busy(median, high - low)}
-
-
-def is_busy(median: float, iqr: float) -> bool:
-    """Return whether a measurement spreads too much to be relied on."""
-    return iqr > BUSY * median
-
-
-def ratios(one: Result, other: Result, names: Iterable[str]) -> dict[str, float | None]:
-    """Divide medians by those of another result; None where one of them was not timed."""
-    return {
-        name: one[name]["median"] / other[name]["median"] if one[name] and other[name] else None
-        for name in names
-    }
+    return {"median": median, "iqr": high - low, "busy": high - low > BUSY * median}
 
 
 def now(device: torch.device) -> float:
@@ -77,10 +63,9 @@ def seconds_of(run: Run, device: torch.device) -> float:
 
 
 def rise_gb(run: Run, device: torch.device) -> float:
-    """Return the peak memory of a run above what was held before it, in 1e9 bytes.
+    """Return the peak memory of a run, warmed up, above what was held before it, in 1e9 bytes.
 
-    A first run warms up. The result is too small where a process cannot reset its peak: on a CPU
-    without Linux.
+    It is too small where a process cannot reset its peak: on a CPU without Linux.
     """
     run()
     before = memory_before_gb(device)

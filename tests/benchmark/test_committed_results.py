@@ -16,7 +16,7 @@ CELLS = {
     "render": ["15.2 ± 4.9", "3.1e-07", "1.7e-06*", "7934.2 ± 1063.5", "no ellipse culling"],
     "ops": ["166.6 ± 13.4", "1.5e-07*", "28.0", "102.0", "1.06"],
     "model": ["20957.8 ± 0.0", "50449.0 ± 0.0", "1.73", "of which grid_attention"],
-    "growth/model": ["10320.5 ± 0.0", "1.28", "0.44"],
+    "growth/model": ["10320.5 ± 0.0", "1.28", "4900.6 ± 0.0"],
     "bench": ["selective_scan", "its chunked", "its products"],
     "data": ["179.6 ± 6.0", "1329 ± 46", "33.1", "40 ± 5 frames / s"],
     "pareto": ["plane_sweep_48", "22.59", "Refined, means over scenes"],
@@ -25,20 +25,27 @@ TIMED = {"data": "frames_per_second", "bench": "ratio", "pareto": "seconds"}
 
 
 @pytest.fixture
-def read(repository):
-    return lambda name: json.loads((repository / "docs" / "results" / f"{name}.json").read_text())
+def path(repository):
+    return lambda name: repository / "docs" / "results" / f"{name}.json"
+
+
+@pytest.fixture
+def read(path):
+    return lambda name: json.loads(path(name).read_text())
 
 
 @pytest.mark.parametrize("name", CELLS)
-def test_tables_and_figure(read, name):
+def test_tables_and_figure(path, read, name):
     results, suite = read(name), find_suite(name.rpartition("/")[2])
+    assert path(name).read_text() == dumps(results) + "\n"
     console = Console(width=500, file=StringIO())
     for table in suite.tables(results):
         console.print(table)
     text = " ".join(console.file.getvalue().split())  # notes are wrapped
     assert [cell for cell in CELLS[name] if cell not in text] == []
     assert results["machine"]["cpu"] in text
-    assert suite.plot(results).axes
+    if hasattr(suite, "plot"):
+        assert suite.plot(results).axes
 
 
 @pytest.mark.parametrize("name", CELLS)
@@ -53,10 +60,3 @@ def test_results_are_compared_with_themselves(read, name):
             row[key]["median"] *= 0.1 if name == "data" else 10
     worse = compare(results, slower, suite.WATCHED).worse
     assert worse and all(sentence.startswith("slower: ") for sentence in worse)
-
-
-@pytest.mark.parametrize("name", CELLS)
-def test_files_are_compact(repository, read, name):
-    assert (repository / "docs" / "results" / f"{name}.json").read_text() == dumps(
-        read(name)
-    ) + "\n"

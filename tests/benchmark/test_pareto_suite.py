@@ -122,8 +122,7 @@ def test_absent_scenes_are_not_measured(measured):
     assert absent["fern"].endswith("is no folder") and "weights" in absent["LPIPS"]
     assert "feed_forward, room, side_24" in absent
     assert ("a GPU" in absent) != torch.cuda.is_available()
-    captions = [table.caption for table in tables(results)]
-    assert "not measured: fern, " in captions[-1]
+    assert "not measured: fern, " in tables(results)[-1].caption
 
 
 @pytest.mark.medium
@@ -167,9 +166,8 @@ def test_knobs_leave_gaussians_out(make_pareto, room, monkeypatch):
     options, rendered = make_pareto(), []
 
     def count(gaussians, *args, **kwargs):
-        rendered.append(
-            (gaussians.num_gaussians, gaussians.opacities.min().item(), kwargs["sh_degree"])
-        )
+        least = gaussians.opacities.min().item()
+        rendered.append((gaussians.num_gaussians, least, kwargs["sh_degree"]))
         return render(gaussians, *args, **kwargs)
 
     monkeypatch.setattr(pareto, "render", count)
@@ -195,25 +193,26 @@ def test_a_folder_of_photographs_is_a_scene(shared_folder):
     assert scene.inputs.images.shape[-2:] == (SIDE, SIDE)
 
 
-def make_row(family, scene, setting, seconds, busy=False, **numbers):
+def make_row(family, scene, setting, seconds, psnr=None, error=None, busy=False):
     row = {"family": family, "scene": scene, "setting": setting, "not_measured": None}
-    row |= {"psnr": None, "lpips": None, "error": None, "peak_gb": 0.1}
+    row |= {"psnr": psnr, "lpips": None, "peak_gb": 0.1}
+    row["error"] = error and dict(zip(("decibels", "max"), error, strict=True))
     timed = seconds and {"median": seconds, "iqr": 0.0, "busy": busy}
     over = seconds and {"median": seconds / 4.0, "iqr": 0.0, "busy": False}
-    return row | {"seconds": timed, "over_base": over} | numbers
+    return row | {"seconds": timed, "over_base": over}
 
 
 MADE_ROWS = [
-    make_row("refined", "a", BASE, 4.0, psnr=30.0),
-    make_row("refined", "b", BASE, 4.0, psnr=20.0),
-    make_row("refined", "a", "quick", 1.0, psnr=29.0, error={"decibels": 40.0, "max": 0.1}),
-    make_row("refined", "b", "quick", 4.0, True, psnr=19.5, error={"decibels": 30.0, "max": 0.3}),
-    make_row("refined", "a", "slow", 8.0, psnr=25.0),
-    make_row("refined", "b", "slow", 8.0, psnr=25.0),
+    make_row("refined", "a", BASE, 4.0, 30.0),
+    make_row("refined", "b", BASE, 4.0, 20.0),
+    make_row("refined", "a", "quick", 1.0, 29.0, (40.0, 0.1)),
+    make_row("refined", "b", "quick", 4.0, 19.5, (30.0, 0.3), busy=True),
+    make_row("refined", "a", "slow", 8.0, 25.0),
+    make_row("refined", "b", "slow", 8.0, 25.0),
     make_row("refined", "a", "absent", None),
-    make_row("networks", "a", BASE, 4.0, error={"decibels": 90.0, "max": 0.0}),
-    make_row("networks", "a", "other", 3.0, error={"decibels": 80.0, "max": 0.0}),
-    make_row("networks", "a", "worse", 3.5, error={"decibels": 70.0, "max": 0.0}),
+    make_row("networks", "a", BASE, 4.0, error=(90.0, 0.0)),
+    make_row("networks", "a", "other", 3.0, error=(80.0, 0.0)),
+    make_row("networks", "a", "worse", 3.5, error=(70.0, 0.0)),
 ]
 
 
@@ -227,13 +226,8 @@ def test_means_are_over_scenes():
     assert quick["busy"] and not means["refined", BASE]["busy"]
     absent = means["refined", "absent"]
     assert absent["scenes"] == 0 and absent["seconds"] is absent["psnr"] is absent["lost"] is None
-    front = [name for name, row in means.items() if row["on_front"]]
-    assert front == [
-        ("refined", BASE),
-        ("refined", "quick"),
-        ("networks", BASE),
-        ("networks", "other"),
-    ]
+    front = [f"{family} {name}" for (family, name), row in means.items() if row["on_front"]]
+    assert front == ["refined base", "refined quick", "networks base", "networks other"]
 
 
 def test_tables_and_figure_have_every_setting():
@@ -246,11 +240,7 @@ def test_tables_and_figure_have_every_setting():
     assert "-" in cells["absent"] and "0" not in cells["absent"][3:]
     figure = plot(results)
     panels = {(axes.get_title(), axes.get_ylabel()): axes for axes in figure.axes}
-    of_refined = next(
-        axes
-        for (title, label), axes in panels.items()
-        if title == "Refined" and "photographs" in label
-    )
+    of_refined = panels["Refined", pareto.QUALITIES["psnr"]]
     names = {text.get_text() for text in of_refined.texts}
     assert names == {BASE, "quick", "slow"}
     line, *dots = of_refined.lines
@@ -260,42 +250,46 @@ def test_tables_and_figure_have_every_setting():
     assert any(text.get_text() == "not measured" for axes in figure.axes for text in axes.texts)
 
 
+def knob(family, changes):
+    return {family: {"knobs": {"a": changes}}}
+
+
 MISTAKES = {
     "a family": ({"families": ["refine"]}, r"^pareto\.families=refine is unknown: choose from "),
     "a knob": ({"knobs": ["bf61"]}, r"^pareto\.knobs=bf61 is unknown: choose from base, bf16, "),
     "a scene": ({"scenes": ["ferns"]}, r"^pareto\.scenes=ferns is unknown: choose from room, "),
     "no scene": ({"scenes": ["fern"]}, r"^pareto\.scenes=\['fern'\]: none is a folder of"),
     "a setting": (
-        {"feed_forward": {"knobs": {"a": {"precison": "bf16"}}}},
+        knob("feed_forward", {"precison": "bf16"}),
         r"^pareto\.feed_forward\.a=precison is unknown: choose from views, side, checkpoint, ",
     ),
     "a value": (
-        {"feed_forward": {"knobs": {"a": {"precision": "fp8"}}}},
+        knob("feed_forward", {"precision": "fp8"}),
         r"^pareto\.feed_forward\.a: precision=fp8 is unknown: choose from fp32, ",
     ),
     "views": (
-        {"refined": {"knobs": {"a": {"views": 0}}}},
+        knob("refined", {"views": 0}),
         r"^pareto\.refined\.a: views=0: give a whole number from 1\.",
     ),
     "a limit": (
-        {"reconstruct": {"knobs": {"a": {"seconds": 0}}}},
+        knob("reconstruct", {"seconds": 0}),
         r"^pareto\.reconstruct\.a: steps=None and seconds=0: give one of them, above 0\.",
     ),
     "a start": (
-        {"reconstruct": {"knobs": {"a": {"init": "dust"}}}},
+        knob("reconstruct", {"init": "dust"}),
         r"^pareto\.reconstruct\.a: init=dust is unknown: choose from",
     ),
-    "no settings": ({"refined": {"knobs": {"a": 3}}}, r"^pareto\.refined\.a=3 is no setting"),
+    "no settings": (knob("refined", 3), r"^pareto\.refined\.a=3 is no setting"),
     "an override": (
-        {"feed_forward": {"knobs": {"a": {"overrides": ["model.layer=8m"]}}}},
+        knob("feed_forward", {"overrides": ["model.layer=8m"]}),
         r"^model\.layer is unknown: did you mean model\.layers",
     ),
     "weights": (
-        {"feed_forward": {"knobs": {"a": {"overrides": ["model.layers=8m"]}}}},
+        knob("feed_forward", {"overrides": ["model.layers=8m"]}),
         r"does not fit this model",
     ),
     "a refinement": (
-        {"refined": {"knobs": {"a": {"refinement": {"half_size": 2.0}}}}},
+        knob("refined", {"refinement": {"half_size": 2.0}}),
         r"^refinement\.half_size=2\.0: give 0 to 1\.",
     ),
 }

@@ -12,7 +12,6 @@ from asysplat.benchmark.options import CPU, find_suite
 from asysplat.benchmark.render import (
     CULLING,
     FIELDS,
-    PASSES,
     errors,
     find_backends,
     flips,
@@ -50,20 +49,14 @@ def test_json_has_every_backend_and_culling(results):
     for scene in ("tiny", "twin"):
         assert (scene, "reference", None) in rows
         assert all((scene, "cpu", off) in rows for off in (None, *CULLING))
-    for (scene, backend, _), row in rows.items():
+    for (scene, _, _), row in rows.items():
         size = {"tiny": (500, 24, 40), "twin": (512, 32, 32)}[scene]
         assert (row["gaussians"], row["height"], row["width"]) == size and row["views"] == 1
-        assert row["threads"] == torch.get_num_threads() and row["peak_gb"] >= 0
         assert row["error"]["measured_on"]["gaussians"] == {"tiny": 500, "twin": 128}[scene]
         assert row["error"]["gradients"].keys() == set(FIELDS)
         assert 0 <= row["error"]["image_p99"] <= row["error"]["image_max"]
         assert {"visible", "pairs", "tile_size"} <= row["stats"].keys()
         assert row["forward"].keys() == row["backward"].keys() == {"median", "iqr", "busy"}
-        assert row["faster_than_reference"].keys() == {"forward", "backward"}
-        if backend == "cpu":
-            assert {"rasterize", "rasterize_backward"} < row["stages"].keys()
-            whole = sum(row[name]["median"] for name in PASSES)
-            assert 0 < sum(kernel["median"] for kernel in row["stages"].values()) < 1.5 * whole
 
 
 @pytest.mark.medium
@@ -81,9 +74,8 @@ def test_errors_are_those_of_image_and_gradients():
     outputs = run(find_backends()[0], Culling(), prepare(scene))
     none = flips(exact, exact)
     close = errors(outputs, exact, none)
-    assert (
-        not none.any() and 0 < close["image_max"] < 1e-3 and max(close["gradients"].values()) < 1e-2
-    )
+    assert not none.any() and 0 < close["image_max"] < 1e-3
+    assert max(close["gradients"].values()) < 1e-2
 
     image = exact.image.clone()
     image[0, 0, 0, 0] += 1
@@ -118,18 +110,14 @@ def test_unknown_options_are_named():
 
 
 @pytest.mark.medium
-def test_a_mistake_is_one_sentence(repository, tmp_path):
+def test_a_mistake_is_one_sentence(repository, run_script, tmp_path):
     command = [sys.executable, "benchmark.py", "scenes=[A,D]", f"output={tmp_path}"]
-    result = subprocess.run(command, cwd=repository, capture_output=True, text=True)
-    check_refusal(result, "scenes=D is unknown", tmp_path)
-
-
-def test_another_mistake_is_one_sentence(run_script, tmp_path):
-    result = run_script("benchmark.py", "repeats=0", f"output={tmp_path}")
-    check_refusal(result, "repeats=0 cannot be", tmp_path)
-
-
-def check_refusal(result, says, tmp_path):
-    assert result.returncode != 0
-    assert result.stderr.startswith(f"error: {says}") and result.stderr.count("\n") == 1
+    own_process = subprocess.run(command, cwd=repository, capture_output=True, text=True)
+    same_process = run_script("benchmark.py", "repeats=0", f"output={tmp_path}")
+    for result, says in (
+        (own_process, "scenes=D is unknown"),
+        (same_process, "repeats=0 cannot be"),
+    ):
+        assert result.returncode != 0
+        assert result.stderr.startswith(f"error: {says}") and result.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())

@@ -63,9 +63,8 @@ def test_cameras_on_an_arc_look_at_its_middle():
     cameras.validate()
     assert cameras.num_views == 5
     middle = torch.tensor([0, 0, DISTANCE, 1])
-    torch.testing.assert_close(
-        torch.linalg.inv(cameras.cam_to_world) @ middle, middle.expand(5, 4), rtol=0, atol=1e-5
-    )
+    in_cameras = torch.linalg.inv(cameras.cam_to_world) @ middle
+    torch.testing.assert_close(in_cameras, middle.expand(5, 4), rtol=0, atol=1e-5)
     first, last = cameras.cam_to_world[0, :3, 2], cameras.cam_to_world[-1, :3, 2]
     assert (first @ last).item() == pytest.approx(math.cos(ARC), abs=1e-6)
     torch.testing.assert_close(cameras.cam_to_world[2], camera.cam_to_world[0])

@@ -1,11 +1,8 @@
 """Kernels on as many threads as torch uses."""
 
 import os
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from contextvars import ContextVar
 from functools import cache
 from threading import get_ident
 from typing import TypeVar
@@ -15,7 +12,6 @@ import torch
 
 Result = TypeVar("Result")
 PER_THREAD = 4  # portions of the work for each thread: the fast threads take more of them
-_timed: ContextVar[dict[str, float] | None] = ContextVar("_timed", default=None)
 
 
 def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:
@@ -24,16 +20,6 @@ def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object)
     The results are returned in the order of `bounds`. A kernel's output must depend on its range
     alone, so that the number of threads changes no bit.
     """
-    seconds = _timed.get()
-    if seconds is None:
-        return _run(kernel, bounds, *args)
-    start = time.perf_counter()
-    results = _run(kernel, bounds, *args)
-    seconds[kernel.__name__] = seconds.get(kernel.__name__, 0.0) + time.perf_counter() - start
-    return results
-
-
-def _run(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:
     threads = torch.get_num_threads()
     ranges = [
         (a, b) for a, b in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True) if a < b
@@ -43,17 +29,6 @@ def _run(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> li
     pool = _pool(threads, get_ident())
     jobs = [pool.submit(kernel, start, stop, *args) for start, stop in ranges]
     return [job.result() for job in jobs]
-
-
-@contextmanager
-def time_kernels() -> Iterator[dict[str, float]]:
-    """Sum the seconds of the kernels run by `run_blocks` in this context, by name."""
-    seconds: dict[str, float] = {}
-    before = _timed.set(seconds)
-    try:
-        yield seconds
-    finally:
-        _timed.reset(before)
 
 
 def even_bounds(count: int) -> np.ndarray:
