@@ -44,7 +44,17 @@ def files_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDa
     Raises:
         InputError: as `procedural_data` and FilesSource.
     """
-    _warn_of_missing_paths(test_sets or {}, options["name"])
+    missing = [
+        name
+        for name, changes in (test_sets or {}).items()
+        if _has_root(changes) and changes["root"] is None and name != options["name"]
+    ]
+    if missing:
+        warnings.warn(
+            f"Not tested, because their paths are not set: {', '.join(missing)}. To test them, add "
+            f"{' '.join(f'paths.{name}=...' for name in missing)} to the command.",
+            stacklevel=2,
+        )
     sets = tested_sets(test_sets, options["name"], on_disk=True)
     of_tests = {"root": options.get("test_root") or options["root"], "test_root": None}
     changeable = ("layout", "selection", "index", "root")
@@ -74,8 +84,21 @@ def _data_module(
     if test_size is not None:
         main["height"], main["width"] = test_size
         sets[name] = partial(_test_tasks, make_source, **main)
+    changeable = ("inputs", "targets", *SIZE, *changeable)
     for other, changes in test_sets.items():
-        _check_test_set(other, changes, name, ("inputs", "targets", *SIZE, *changeable))
+        where = f"data.test_sets.{other}"
+        if other == name:
+            raise InputError(f"{where} has the name of the data set itself: give it another name.")
+        if not isinstance(changes, Mapping):
+            raise InputError(
+                f"{where} is {changes!r}: give the options that differ, such as {where}.inputs=16."
+            )
+        for option in changes:
+            if option not in changeable:
+                raise InputError(
+                    f"{where}.{option} is no option of a test set: give any of "
+                    f"{', '.join(changeable)}."
+                )
         sets[other] = partial(_test_tasks, make_source, **{**main, **changes})
     return SceneDataModule(source=make_source(**scenes), test_sets=sets, **size, **module)
 
@@ -102,36 +125,7 @@ def _has_root(options: Any) -> bool:
     return isinstance(options, Mapping) and "root" in options
 
 
-def _warn_of_missing_paths(test_sets: Mapping[str, Any], name: str) -> None:
-    missing = [
-        other
-        for other, options in test_sets.items()
-        if _has_root(options) and options["root"] is None and other != name
-    ]
-    if missing:
-        warnings.warn(
-            f"Not tested, because their paths are not set: {', '.join(missing)}. To test them, add "
-            f"{' '.join(f'paths.{other}=...' for other in missing)} to the command.",
-            stacklevel=3,
-        )
-
-
 def _test_tasks(
     make_source: Callable[..., Source], inputs: int, targets: int, **options: Any
 ) -> list[Task]:
     return make_source(**options).evaluation("test", inputs, targets)
-
-
-def _check_test_set(other: str, changes: Any, name: str, options: tuple[str, ...]) -> None:
-    where = f"data.test_sets.{other}"
-    if other == name:
-        raise InputError(f"{where} has the name of the data set itself: give it another name.")
-    if not isinstance(changes, Mapping):
-        raise InputError(
-            f"{where} is {changes!r}: give the options that differ, such as {where}.inputs=16."
-        )
-    for option in changes:
-        if option not in options:
-            raise InputError(
-                f"{where}.{option} is no option of a test set: give any of {', '.join(options)}."
-            )

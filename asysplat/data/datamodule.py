@@ -96,8 +96,18 @@ class SceneDataModule(lightning.LightningDataModule):
                     raise InputError(f"data.test_sets.{name}: {error}") from error
             self.evaluation["test"] = self.tests[self.name]
             samples |= {name: tasks[0] for name, tasks in self.tests.items()}
-            if self.points:
-                _warn_of_no_points(samples)
+            missing = [
+                f"{sample['scene']} ({name})"
+                for name, sample in samples.items()
+                if sample["inputs"].point_depths is None
+            ]
+            if self.points and missing:
+                warnings.warn(
+                    "data.points=true, but there are no sparse points of "
+                    f"{', '.join(missing)}: their priors work without points. data/README.md lists "
+                    "the files that hold them.",
+                    stacklevel=2,
+                )
 
     def check_sizes(self, check: Callable[[int, int], None]) -> None:
         """Call `check(height, width)` for every set; its InputError names the set."""
@@ -120,9 +130,8 @@ class SceneDataModule(lightning.LightningDataModule):
         return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
 
     def train_dataloader(self) -> DataLoader:
-        per_epoch = self.steps_per_epoch * self.batch_size
-        start = self.trainer.current_epoch * per_epoch
-        return self.tasks(start, per_epoch, done=batches_done(self.trainer))
+        count = self.steps_per_epoch * self.batch_size
+        return self.tasks(self.trainer.current_epoch * count, count, batches_done(self.trainer))
 
     def tasks(self, start: int, count: int, done: int = 0) -> DataLoader:
         """Return this process's micro-batches of the tasks `start` to `start + count`.
@@ -243,20 +252,6 @@ def load(task: Task, share: float = 1.0, points: bool = False) -> Sample:
         inputs = replace(inputs, point_depths=depths_of_points(sparse, inputs.cameras))
     inputs, targets, frame = normalize(inputs, targets)
     return {"scene": task.sequence.name, "inputs": inputs, "targets": targets, "frame": frame}
-
-
-def _warn_of_no_points(samples: Mapping[str, Sample]) -> None:
-    missing = [
-        f"{sample['scene']} ({name})"
-        for name, sample in samples.items()
-        if sample["inputs"].point_depths is None
-    ]
-    if missing:
-        warnings.warn(
-            f"data.points=true, but there are no sparse points of {', '.join(missing)}: their "
-            "priors work without points. data/README.md lists the files that hold them.",
-            stacklevel=3,
-        )
 
 
 def collate(samples: list[Sample]) -> Sample:

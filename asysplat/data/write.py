@@ -5,9 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from PIL import Image
-from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.scene import Views
@@ -37,19 +35,31 @@ def write_transforms(views: Views, folder: Path) -> None:
         raise InputError(f"{target} exists: name a new folder, nothing is overwritten.")
     views = views.to("cpu")
     (folder / "images").mkdir(parents=True, exist_ok=True)
+    top = {"camera_model": "PINHOLE", "w": views.cameras.width, "h": views.cameras.height}
+    if views.depths is not None:
+        (folder / "depth").mkdir(exist_ok=True)
+        top["depth_unit_scale_factor"] = 1 / STEPS_PER_UNIT
     frames = []
     poses = views.cameras.cam_to_world * torch.tensor([1.0, -1.0, -1.0, 1.0])
     for index, (pose, matrix) in enumerate(zip(poses, views.cameras.intrinsics, strict=True)):
         name = f"{index:05d}.png"
         (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
         frame = {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
-        _write_image(folder / "images" / name, views.images[index])
+        levels = (views.images[index].clamp(0, 1) * 255).round().to(torch.uint8)
+        Image.fromarray(levels.permute(1, 2, 0).numpy()).save(folder / "images" / name)
         if views.depths is not None:
-            (folder / "depth").mkdir(exist_ok=True)
             frame["depth_file_path"] = f"depth/{name}"
-            _write_depth(folder / "depth" / name, views.depths[index])
+            steps = (views.depths[index].double() * STEPS_PER_UNIT).round().numpy()
+            steps = np.where(steps > MAX_STEP, 0, steps).astype(np.uint16)  # beyond it: unknown
+            Image.fromarray(steps).save(folder / "depth" / name)
         frames.append(frame | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
-    target.write_text(json.dumps(_with_shared_intrinsics(views, frames), indent=1))
+    # Intrinsics shared by all frames are written once, at the top.
+    for name in ("fl_x", "fl_y", "cx", "cy"):
+        if len({frame[name] for frame in frames}) == 1:
+            top[name] = frames[0][name]
+            for frame in frames:
+                del frame[name]
+    target.write_text(json.dumps(top | {"frames": frames}, indent=1))
 
 
 def refuse_inside(folder: Path, data: Path, advice: str) -> None:
@@ -63,27 +73,3 @@ def refuse_inside(folder: Path, data: Path, advice: str) -> None:
         raise InputError(
             f"{folder.absolute()} lies in the data set {data}, which is never changed: {advice}."
         )
-
-
-def _with_shared_intrinsics(views: Views, frames: list[dict]) -> dict:
-    """Return the file's content; intrinsics shared by all frames are written once, at the top."""
-    top = {"camera_model": "PINHOLE", "w": views.cameras.width, "h": views.cameras.height}
-    if views.depths is not None:
-        top["depth_unit_scale_factor"] = 1 / STEPS_PER_UNIT
-    for name in ("fl_x", "fl_y", "cx", "cy"):
-        if len({frame[name] for frame in frames}) == 1:
-            top[name] = frames[0][name]
-            for frame in frames:
-                del frame[name]
-    return top | {"frames": frames}
-
-
-def _write_image(path: Path, image: Float[Tensor, "3 H W"]) -> None:
-    levels = (image.clamp(0, 1) * 255).round().to(torch.uint8)
-    Image.fromarray(levels.permute(1, 2, 0).numpy()).save(path)
-
-
-def _write_depth(path: Path, depth: Float[Tensor, "H W"]) -> None:
-    """Write a depth map; depths beyond 16 bits become 0, unknown."""
-    steps = (depth.double() * STEPS_PER_UNIT).round().numpy()
-    Image.fromarray(np.where(steps > MAX_STEP, 0, steps).astype(np.uint16)).save(path)

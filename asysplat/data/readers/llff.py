@@ -40,7 +40,17 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     rows = _read_rows(file)
 
     def read(index: int, image: Path) -> PosedImage:
-        return _read_image(image, rows[index], f"{file}, row {index} ({image.name})")
+        where, size = f"{file}, row {index} ({image.name})", image_size(image)
+        down, right, backward, center, (height, width, focal) = rows[index, :15].reshape(3, 5).T
+        if not all(np.isfinite(value) and value > 0 for value in (height, width, focal)):
+            raise InputError(
+                f"{where} has height, width, focal length {height:g}, {width:g}, {focal:g}: "
+                "give three numbers > 0 in pixels."
+            )
+        lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
+        pose = np.eye(4)
+        pose[:3] = np.stack((right, down, -backward, center), axis=-1)
+        return PosedImage(image, scaled(lens, size, where), rigid(pose, where))
 
     images = bad.read_each(read, enumerate(_images(file, len(rows))))
     return PosedScene(scene.name, images, partial(points_beside, scene, images))
@@ -71,17 +81,3 @@ def _images(file: Path, count: int) -> list[Path]:
         f"{file} has {count} rows, but the images there are {counts or 'none'}: "
         f"give one image per row, in one of {', '.join(FOLDERS)}."
     )
-
-
-def _read_image(image: Path, row: Float[ndarray, "17"], where: str) -> PosedImage:
-    size = image_size(image)
-    down, right, backward, center, (height, width, focal) = row[:15].reshape(3, 5).T
-    if not all(np.isfinite(value) and value > 0 for value in (height, width, focal)):
-        raise InputError(
-            f"{where} has height, width, focal length {height:g}, {width:g}, {focal:g}: "
-            "give three numbers > 0 in pixels."
-        )
-    lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
-    pose = np.eye(4)
-    pose[:3] = np.stack((right, down, -backward, center), axis=-1)
-    return PosedImage(image, scaled(lens, size, where), rigid(pose, where))

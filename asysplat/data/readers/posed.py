@@ -35,7 +35,14 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     """
     file = next((scene / name for name in POSES if (scene / name).is_file()), scene / POSES[-1])
     poses, images = _read_numbers(file, 16), images_in(scene / "images")
-    (fx, _, cx), (_, fy, cy), _ = _read_matrix(scene / "K.txt").tolist()
+    matrix = _read_numbers(scene / "K.txt", 3)
+    zeros = matrix[[0, 1, 2, 2], [1, 0, 0, 1]] if len(matrix) == 3 else matrix
+    if len(matrix) != 3 or zeros.any() or matrix[2, 2] != 1:
+        raise InputError(
+            f"{scene / 'K.txt'} holds {matrix.tolist()}: expected the pinhole matrix "
+            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels."
+        )
+    (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     depths = scene / "depth"
     if len(poses) != len(images):
         raise InputError(
@@ -56,17 +63,6 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
     posed = bad.read_each(read, enumerate(images))
     return PosedScene(scene.name, posed, partial(points_beside, scene, posed))
-
-
-def _read_matrix(file: Path) -> Float[ndarray, "3 3"]:
-    matrix = _read_numbers(file, 3)
-    zeros = matrix[[0, 1, 2, 2], [1, 0, 0, 1]] if len(matrix) == 3 else matrix
-    if len(matrix) != 3 or zeros.any() or matrix[2, 2] != 1:
-        raise InputError(
-            f"{file} holds {matrix.tolist()}: expected the pinhole matrix "
-            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels."
-        )
-    return matrix
 
 
 def _read_numbers(file: Path, columns: int) -> Float[ndarray, "rows columns"]:

@@ -79,7 +79,6 @@ def _in_folder(folder: Path) -> list[Path]:
 
 
 def _load(chunk: Path) -> dict[str, dict[str, Any]]:
-    """Load a chunk's scenes, by key."""
     if not chunk.is_file():
         raise InputError(f"{chunk} does not exist: copy it there, or name another chunk.")
     return _load_once(chunk, chunk.stat().st_mtime_ns)

@@ -56,10 +56,12 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
                 f"{image} is {size[0]} x {size[1]}, but {parameters} is for {lens.width} x "
                 f"{lens.height}: give intrinsics for the images' own resolution."
             )
+        numbers = row.split()
+        pose = [numbers[start : start + 4] for start in range(0, len(numbers), 4)]
         return PosedImage(
             file=image,
             lens=lens,
-            cam_to_world=rigid(_four_by_four(row), f"{trajectory}, row {index + 1}"),
+            cam_to_world=rigid(pose, f"{trajectory}, row {index + 1}"),
             depth=beside(depth, size, str(image)) if has_depths else None,
             depth_unit=depth_unit,
         )
@@ -79,8 +81,3 @@ def _camera(file: Path) -> tuple[Lens, float]:
         raise InputError(f"{file}: w, h, fx, fy and scale of its camera must be above 0.")
     lens = Lens(round(width), round(height), fx, fy, cx + HALF_A_PIXEL, cy + HALF_A_PIXEL)
     return lens, 1 / scale
-
-
-def _four_by_four(row: str) -> list[list[str]]:
-    numbers = row.split()
-    return [numbers[start : start + 4] for start in range(0, len(numbers), 4)]
