@@ -1,16 +1,12 @@
 from asysplat.errors import InputError, input_error_behind
 
 
-def raised_from(cause, error):
-    error.__cause__ = cause
-    return error
-
-
 def test_the_sentence_behind_other_errors_is_found():
-    mistake = InputError("scene.json is empty: write it again.")
-    wrapped = raised_from(raised_from(mistake, KeyError("x")), RuntimeError("y"))
-    assert str(input_error_behind(wrapped)) == str(mistake)
-    assert input_error_behind(RuntimeError("y")) is None
+    mistake, outer = InputError("scene.json is empty: write it again."), RuntimeError("y")
+    outer.__cause__ = KeyError("x")
+    assert input_error_behind(outer) is None
+    outer.__cause__.__cause__ = mistake
+    assert str(input_error_behind(outer)) == str(mistake)
 
 
 def test_a_worker_s_traceback_is_left_out():

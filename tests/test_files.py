@@ -32,30 +32,28 @@ def test_a_new_file_and_one_in_place_of_another(tmp_path):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError, InputError])
-def test_what_interrupts_leaves_the_old_file(old, error):
+def test_an_interrupted_write_leaves_the_old_file(old, error):
     with pytest.raises(error), atomic_write(old) as partial:
         partial.write_text("half")
         raise error
     assert_untouched(old)
 
 
-def test_a_full_disk_leaves_the_old_file(old):
+def full(descriptor):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("when", ["written", "flushed"])
+def test_a_full_disk_leaves_the_old_file(old, monkeypatch, when):
+    limit, reason = (1000, "File too large") if when == "written" else (10**6, "No space left")
+    if when == "flushed":
+        monkeypatch.setattr(os, "fsync", full)
     with (
-        largest_file(1000),
-        pytest.raises(InputError, match=r"scene\.ply cannot be written \(File too large\)"),
+        largest_file(limit),
+        pytest.raises(InputError, match=rf"scene\.ply cannot be written \({reason}"),
         atomic_write(old) as partial,
     ):
         partial.write_bytes(bytes(2000))
-    assert_untouched(old)
-
-
-def test_a_disk_that_is_full_only_when_flushed_leaves_the_old_file(old, monkeypatch):
-    def full(descriptor):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(InputError, match="No space left"), atomic_write(old) as partial:
-        partial.write_text("new")
     assert_untouched(old)
 
 

@@ -60,15 +60,6 @@ def test_gaussians_of_a_prior_are_at_the_surface_points(room):
     assert (gaussians.quats == torch.tensor([1.0, 0, 0, 0])).all()
 
 
-def test_a_gaussian_of_a_prior_covers_its_pixel():
-    """8 x 10 pixels with a focal length of 5: at a distance of 2, one is 2 / 5 wide."""
-    views = front_views()
-    distance = torch.full((1, 1, 8, 10), 2.0)
-    gaussians = gaussians_from_prior(views, Prior(distance, distance, distance / 4))
-    torch.testing.assert_close(gaussians.scales, torch.full((80, 3), SPREAD * 2 / 5))
-    torch.testing.assert_close(gaussians.means.norm(dim=-1), torch.full((80,), 2.0))
-
-
 @pytest.mark.parametrize("size", [(4, 5), (3, 7), (8, 10), (20, 11), (1, 1)], ids=str)
 def test_a_prior_of_any_size(size):
     """Of fewer pixels than the photographs, of more, and of such as do not divide them."""
@@ -76,6 +67,9 @@ def test_a_prior_of_any_size(size):
     distance = torch.full((1, 1, *size), 2.0)
     gaussians = gaussians_from_prior(views, Prior(distance, distance, distance / 4)).validate()
     assert gaussians.num_gaussians == size[0] * size[1]
+    if size == (8, 10):  # a focal length of 5: at a distance of 2, a pixel is 2 / 5 wide
+        torch.testing.assert_close(gaussians.scales, torch.full((80, 3), SPREAD * 2 / 5))
+        torch.testing.assert_close(gaussians.means.norm(dim=-1), torch.full((80,), 2.0))
     if size == (4, 5):
         blocks = views.images[0].unflatten(1, (4, 2)).unflatten(3, (5, 2)).mean((2, 4))
         torch.testing.assert_close(colors(gaussians), blocks.flatten(1).mT, rtol=0, atol=1e-6)
@@ -105,21 +99,13 @@ def test_footprints_are_the_smallest_over_visible_views():
     views = front_views(places=[(0.0, 0, 0), (0.0, 0, 1), (9.0, 0, 0)])
     cameras = replace(views.cameras, intrinsics=views.cameras.intrinsics.clone())
     cameras.intrinsics[2, :2, :2] *= 100  # the third is fine, and sees nothing of this
-    points = torch.tensor(
-        [
-            [0.0, 0, 2],  # at depths 2 and 1, a focal length of 5
-            [0.9, 0, 1.5],  # outside of the second: 0.9 / 0.5 * 5 + 5 = 14 of 10 pixels
-            [0.0, 3, -4],  # behind all: 5 from the first, 500 the third's focal length
-        ]
-    )
+    # At depths 2 and 1, a focal length of 5; outside of the second: 0.9 / 0.5 * 5 + 5 = 14 of 10
+    # pixels; behind all: 5 from the first, 500 the third's focal length.
+    points = torch.tensor([[0.0, 0, 2], [0.9, 0, 1.5], [0.0, 3, -4]])
     behind = (9.0**2 + 3**2 + 4**2) ** 0.5 / 500
     expected = torch.tensor([1 / 5, 1.5 / 5, behind])
     torch.testing.assert_close(footprints(points, cameras), expected)
-
-
-def test_footprints_at_a_camera_are_above_0():
-    views = front_views()
-    found = footprints(torch.zeros(2, 3), views.cameras)
+    found = footprints(torch.zeros(2, 3), front_views().cameras)
     assert (found > 0).all() and (found < 1e-30).all()
 
 
@@ -143,18 +129,11 @@ def test_points_have_the_mean_distance_of_neighbors_as_size():
     gaussians = gaussians_from_points(points, front_views(focal=50.0)).validate()
     torch.testing.assert_close(gaussians.scales[0], torch.full((3,), (3 + 4 + 1) / 3))
     assert (gaussians.opacities == POINT_OPACITY).all()
-
-
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_points_are_enough(count):
-    points = torch.tensor([[0.0, 0, 2], [0.0, 0, 2.5], [0.5, 0, 2]])[:count]
-    gaussians = gaussians_from_points(points, front_views()).validate()
-    size = {1: 2 / 5, 2: 0.5, 3: 0.5}[count]  # a pixel, and the mean distance of the others
-    torch.testing.assert_close(gaussians.scales[0], torch.full((3,), size))
-
-
-def test_coincident_points_have_the_size_of_a_pixel():
-    for place in ([0.0, 0.0, 2.0], [0.0, 0.0, 0.0]):  # before a camera, and at it
+    for few, size in ((1, 2 / 5), (2, 0.5), (3, 0.5)):  # a pixel, and the mean of the others
+        points = torch.tensor([[0.0, 0, 2], [0.0, 0, 2.5], [0.5, 0, 2]])[:few]
+        gaussians = gaussians_from_points(points, front_views()).validate()
+        torch.testing.assert_close(gaussians.scales[0], torch.full((3,), size))
+    for place in ([0.0, 0.0, 2.0], [0.0, 0.0, 0.0]):  # coincident: before a camera, and at it
         points = torch.tensor(place).repeat(6, 1)
         gaussians = gaussians_from_points(points, front_views()).validate()
         expected = footprints(points, front_views().cameras)
@@ -162,10 +141,8 @@ def test_coincident_points_have_the_size_of_a_pixel():
 
 
 def test_invalid_points_are_refused():
-    for points, found in (
-        (torch.zeros(0, 3), "got 0 points"),
-        (torch.tensor([[0.0, 0, 1], [torch.nan, torch.inf, 1]]), "2 points with 2 coordinates"),
-    ):
+    bad = torch.tensor([[0.0, 0, 1], [torch.nan, torch.inf, 1]])
+    for points, found in ((bad[:0], "got 0 points"), (bad, "2 points with 2 coordinates")):
         with pytest.raises(InputError, match=f"{found}.*give at least one point, and finite"):
             gaussians_from_points(points, front_views())
 

@@ -32,6 +32,13 @@ def same_bits(one, other):
     return all(torch.equal(getattr(one, name), getattr(other, name)) for name in NAMES)
 
 
+def watched(start, views, settings, record=lambda progress, _: progress, **limit):
+    """Refine; return the result and the records of all steps."""
+    records = []
+    found = refine(start, views, settings, watch=lambda *now: records.append(record(*now)), **limit)
+    return found, records
+
+
 def small_views(count=2, height=12, width=15):
     """Photographs of noise, from cameras that look along z."""
     poses = torch.eye(4).repeat(count, 1, 1)
@@ -64,10 +71,8 @@ def test_input_and_held_out_views_improve(room, start, kind):
 @pytest.mark.medium
 def test_spawned_gaussians_improve_held_out_views(room, start):
     views, held = room
-    with_more, without = (
-        refine(start, views, RefinementSettings(densify=kind), steps=80)
-        for kind in ("error", "none")
-    )
+    with_more = refine(start, views, RefinementSettings(densify="error"), steps=80)
+    without = refine(start, views, RefinementSettings(densify="none"), steps=80)
     assert quality(with_more, held) >= quality(without, held) + 0.5
 
 
@@ -86,14 +91,13 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(room, start,
 @pytest.mark.medium
 def test_post_optimization_changes_only_means_and_colors_and_improves(room, start):
     views = room[0].select([0, 3, 6, 9])
-    shown, moved = [], []
 
-    def watch(progress, refinement):
-        shown.append(progress.psnr)
-        moved.append((refinement.gaussians.means - start.means).abs().max().item())
-        return False
+    def record(progress, refinement):
+        moved = (refinement.gaussians.means - start.means).abs().max().item()
+        return progress.psnr, moved
 
-    found = refine(start, views, PAPER, steps=28, watch=watch)
+    found, records = watched(start, views, PAPER, record, steps=28)
+    shown, moved = zip(*records, strict=True)
     for name in NAMES:
         one, other = getattr(found, name), getattr(start, name)
         if name in ("means", "sh"):
@@ -112,58 +116,43 @@ def test_masked_pixels_have_no_effect():
     masks[0, :7] = False
     masks[1, :, 3:6] = False
     noise = torch.where(masks[:, None], views.images, torch.rand_like(views.images))
-    found = []
-    for images in (views.images, noise):
-        settings = RefinementSettings(ssim=0.0, half_size=0.5, rounds=2)
-        found.append(
-            refine(small_start(), Views(views.cameras, images, masks=masks), settings, steps=10)
-        )
-    assert found[0].num_gaussians > 20
-    assert same_bits(*found)
-
-
-def small_start():
-    torch.manual_seed(7)
-    return small_scene()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_fully_masked_views(kind):
-    views = replace(small_views(), masks=torch.zeros(2, 12, 15, dtype=torch.bool))
-    found = refine(small_scene(), views, RefinementSettings(densify=kind), steps=6).validate()
-    assert found.num_gaussians >= 1
+    settings, start = RefinementSettings(ssim=0.0, half_size=0.5, rounds=2), small_scene()
+    one, other = (
+        refine(start, Views(views.cameras, images, masks=masks), settings, steps=10)
+        for images in (views.images, noise)
+    )
+    assert one.num_gaussians > 20
+    assert same_bits(one, other)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (5, 7), (10, 40), (11, 11), (23, 31)], ids=str)
 def test_images_of_any_size(size, kind):
     """Also of less than the 11 pixels of an SSIM window, and of an odd number of them."""
-    views = small_views(2, *size)
-    found = refine(
-        small_scene(), views, RefinementSettings(densify=kind, rounds=4), steps=8
-    ).validate()
-    assert not torch.equal(found.sh[:20, 0], small_start().sh[:, 0])
+    views, start = small_views(2, *size), small_scene()
+    settings = RefinementSettings(densify=kind, rounds=4)
+    found = refine(start, views, settings, steps=8).validate()
+    assert not torch.equal(found.sh[:20, 0], start.sh[:, 0])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [1, 2])
 def test_one_view_and_few_gaussians(kind, count):
     views = small_views(1)
-    start = isotropic_gaussians(
-        torch.tensor([[0.0, 0, 3]]).repeat(count, 1),
-        *torch.full((2, count), 0.5),
-        torch.rand(count, 3),
-    )
+    means, half = torch.tensor([[0.0, 0, 3]]).repeat(count, 1), torch.full((count,), 0.5)
+    start = isotropic_gaussians(means, half, half, torch.rand(count, 3))
     settings = RefinementSettings(densify=kind, rounds=3, growth=1.0)
     found = refine(start, views, settings, steps=10).validate()
     assert quality(found, views) > quality(start, views)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_cameras_at_one_position(kind):
-    views = small_views(3)
+def test_fully_masked_views_and_cameras_at_one_position(kind):
+    views, settings = small_views(3), RefinementSettings(densify=kind)
+    masked = replace(views, masks=torch.zeros(3, 12, 15, dtype=torch.bool))
+    refine(small_scene(), masked, settings, steps=6).validate()
     views.cameras.cam_to_world[:, :3, 3] = 0
-    refine(small_scene(), views, RefinementSettings(densify=kind), steps=6).validate()
+    refine(small_scene(), views, settings, steps=6).validate()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -182,10 +171,9 @@ def test_one_is_left_if_all_are_pruned(kind):
     hidden, faint = small_scene(), small_scene()
     hidden.means[:, 2] *= -1
     faint.opacities[:] = torch.linspace(1e-5, MIN_OPACITY / 2, 20)
+    options = {"rounds": 30, "until": 1.0, "rates": Rates(opacities=0.0)}
+    settings = RefinementSettings(densify=kind, **options)
     for start in (hidden, faint):
-        settings = RefinementSettings(
-            densify=kind, rounds=30, until=1.0, rates=Rates(opacities=0.0)
-        )
         found = refine(start, small_views(), settings, steps=20).validate()
         assert found.num_gaussians >= 1
 
@@ -222,16 +210,10 @@ def test_a_limit_below_the_initial_number_adds_none(kind):
 @pytest.mark.parametrize(("limit", "expected"), [(40, 40), (10**6, 2 * 12 * 15 // 8)])
 def test_the_limit_and_growth(kind, limit, expected):
     """Two images of 12 x 15 pixels: at most one Gaussian for 8 pixels."""
-    counts = []
-
-    def watch(progress, _):
-        counts.append(progress.gaussians)
-        return False
-
-    settings = RefinementSettings(
-        densify=kind, max_gaussians=limit, rounds=9, growth=0.25, until=1.0
-    )
-    refine(small_scene(), small_views(), settings, steps=20, watch=watch)
+    options = {"rounds": 9, "growth": 0.25, "until": 1.0}
+    settings = RefinementSettings(densify=kind, max_gaussians=limit, **options)
+    _, records = watched(small_scene(), small_views(), settings, steps=20)
+    counts = [progress.gaussians for progress in records]
     assert counts[0] == 20 and max(counts) == counts[-1] == expected
     assert all(b <= 1.25 * a for a, b in pairwise(counts))
 
@@ -241,9 +223,8 @@ def test_pruned_gaussians_are_replaced(growth):
     """In a long refinement more would be lost between two rounds than one adds."""
     start = small_scene()
     start.opacities[:] = torch.where(torch.arange(20) < 10, MIN_OPACITY / 2, 0.95)
-    refinement = Refinement(
-        start, small_views(), settings=RefinementSettings(growth=growth, max_gaussians=40)
-    )
+    settings = RefinementSettings(growth=growth, max_gaussians=40)
+    refinement = Refinement(start, small_views(), settings=settings)
     refinement.densify(0.0)
     assert len(refinement.fields) == 20 * (1 + growth)
     assert (refinement.gaussians.opacities > MIN_OPACITY).all()
@@ -251,88 +232,66 @@ def test_pruned_gaussians_are_replaced(growth):
 
 def test_rounds_and_their_time():
     """Of 3 rounds in the first half of 16 steps, the steps before which Gaussians are added."""
-    found = []
-    for settings in (
-        RefinementSettings(rounds=3, until=0.5, max_gaussians=10**6),
-        RefinementSettings(rounds=0),
-        RefinementSettings(until=0.0),
-        RefinementSettings(densify="none"),
+    for options, expected in (
+        ({"rounds": 3, "until": 0.5, "max_gaussians": 10**6}, [2, 4, 6]),
+        ({"rounds": 0}, []),
+        ({"until": 0.0}, []),
+        ({"densify": "none"}, []),
     ):
-        counts = [20]
-
-        def watch(progress, _, counts=counts):
-            counts.append(progress.gaussians)
-            return False
-
-        refine(small_scene(), small_views(), settings, steps=16, watch=watch)
-        found.append([step for step in range(16) if counts[step + 1] > counts[step]])
-    assert found == [[2, 4, 6], [], [], []]
+        settings = RefinementSettings(**options)
+        _, records = watched(small_scene(), small_views(), settings, steps=16)
+        counts = [20, *(progress.gaussians for progress in records)]
+        assert [step for step in range(16) if counts[step + 1] > counts[step]] == expected
 
 
 def test_rates_cool_down_at_the_end():
     """With a constant gradient, a step of Adam is as long as its rate."""
-    views, steps, before = small_views(1), [], [None]
-
-    def watch(_, refinement):
-        sh = refinement.gaussians.sh[0, 0]
-        if before[0] is not None:
-            steps.append((sh - before[0]).abs().max().item())
-        before[0] = sh
-        return False
-
+    views = small_views(1)
     views.images[:] = 1
-    one = isotropic_gaussians(
-        torch.tensor([[0.0, 0, 3]]), *torch.full((2, 1), 0.5), torch.zeros(1, 3)
-    )
+    half = torch.tensor([0.5])
+    one = isotropic_gaussians(torch.tensor([[0.0, 0, 3]]), half, half, torch.zeros(1, 3))
     rates = Rates(means=0.0, quats=0.0, scales=0.0, opacities=0.0, sh=1e-4)
-    settings = RefinementSettings(
-        rates, densify="none", cool_down=0.5, decay=0.1, ssim=0.0, half_size=0.0
-    )
-    refine(one, views, settings, steps=40, watch=watch)
+    options = {"cool_down": 0.5, "decay": 0.1, "ssim": 0.0, "half_size": 0.0}
+    settings = RefinementSettings(rates, densify="none", **options)
+    _, colors = watched(one, views, settings, lambda _, now: now.gaussians.sh[0, 0], steps=40)
+    steps = torch.stack(colors).diff(dim=0).abs().amax(1).tolist()
     expected = [1e-4 * 0.1 ** max(0, (step / 40 - 0.5) / 0.5) for step in range(1, 40)]
     assert steps == pytest.approx(expected, rel=0.02)
 
 
 def test_watch_is_called_after_each_step_and_may_stop():
-    views, seen = small_views(), []
+    seen = []
 
     def watch(progress, refinement):
         assert progress.gaussians == len(refinement.fields)
-        seen.append(progress)
+        seen.append((progress.step, progress.share))
         return progress.step == 3
 
-    refine(small_scene(), views, RefinementSettings(densify="none"), steps=10, watch=watch)
-    assert [progress.step for progress in seen] == [1, 2, 3]
-    assert [progress.share for progress in seen] == [0.1, 0.2, 0.3]
-    assert all(b.seconds >= a.seconds >= 0 for a, b in pairwise(seen))
+    settings = RefinementSettings(densify="none")
+    refine(small_scene(), small_views(), settings, steps=10, watch=watch)
+    assert seen == [(1, 0.1), (2, 0.2), (3, 0.3)]
 
 
 def test_the_psnr_is_that_before_the_last_steps():
-    views = small_views(1)
-    small, shown = small_scene(), []
-
-    def watch(progress, refinement):
-        shown.append((progress.psnr, quality(refinement.gaussians, views)))
-        return False
-
-    before = quality(small, views)
+    views, small = small_views(1), small_scene()
     settings = RefinementSettings(densify="none", half_size=0.0)
-    refine(small, views, settings, steps=4, watch=watch)
-    found, after = zip(*shown, strict=True)
-    assert found == pytest.approx([before, *after[:-1]], abs=0.05)  # without a clamp of the image
+
+    def record(progress, refinement):
+        return progress.psnr, quality(refinement.gaussians, views)
+
+    _, records = watched(small, views, settings, record, steps=4)
+    found, after = zip(*records, strict=True)
+    expected = [quality(small, views), *after[:-1]]
+    assert found == pytest.approx(expected, abs=0.05)  # without a clamp of the image
 
 
 def test_seconds_end_a_refinement():
-    start, steps = small_scene(), []
-
-    def watch(progress, _):
-        steps.append(progress)
-        return False
-
-    found = refine(start, small_views(), seconds=0.3, watch=watch)
-    assert steps and not same_bits(found, start)
-    assert all(progress.share < 1 for progress in steps[:-1]) and steps[-1].share == 1
-    assert steps[-1].seconds >= 0.3
+    start = small_scene()
+    found, records = watched(start, small_views(), RefinementSettings(), seconds=0.3)
+    assert records and not same_bits(found, start)
+    assert all(progress.share < 1 for progress in records[:-1]) and records[-1].share == 1
+    assert all(b.seconds >= a.seconds >= 0 for a, b in pairwise(records))
+    assert records[-1].seconds >= 0.3
 
 
 def test_resized_images_have_the_same_means_and_field_of_view():
@@ -409,70 +368,37 @@ def test_mistakes_are_refused():
             refine(*arguments, steps=1)
 
 
-def unchecked(kind, **options):
-    """Make a dataclass without the checks of types that tests have."""
+@pytest.mark.parametrize(
+    "kind, sentence, options",
+    [
+        (RefinementSettings, "half_size=1.5: give 0 to 1", {"half_size": 1.5}),
+        (RefinementSettings, "growth=-0.1", {"growth": -0.1}),
+        (RefinementSettings, "densify=adc: choose error, mcmc, gradient", {"densify": "adc"}),
+        (RefinementSettings, "sh_degree=4: choose", {"sh_degree": 4}),
+        (RefinementSettings, "max_gaussians=0: give at least 1", {"max_gaussians": 0}),
+        (RefinementSettings, "rounds=-1", {"rounds": -1}),
+        (RefinementSettings, "views_per_step=0: give at least 1, or null", {"views_per_step": 0}),
+        (RefinementSettings, "image=0: give at least 1, or null", {"max_steps_per_image": 0}),
+        (Rates, "rates.unit=meter: choose pixel or scene", {"unit": "meter"}),
+        (Rates, "rates.means=-0.1: give a number >= 0", {"means": -0.1}),
+        (Rates, "rates.sh=nan", {"sh": math.nan}),
+    ],
+)
+def test_settings_out_of_range_are_named(kind, sentence, options):
     made = object.__new__(kind)
-    inspect.unwrap(kind.__init__)(made, **options)
-    return made
-
-
-@pytest.mark.parametrize(
-    "sentence, options",
-    {
-        "half_size=1.5: give 0 to 1": {"half_size": 1.5},
-        "growth=-0.1": {"growth": -0.1},
-        "densify=adc: choose error, mcmc, gradient, none": {"densify": "adc"},
-        "sh_degree=4: choose": {"sh_degree": 4},
-        "max_gaussians=0: give at least 1": {"max_gaussians": 0},
-        "rounds=-1": {"rounds": -1},
-        "views_per_step=0: give at least 1, or null": {"views_per_step": 0},
-        "max_steps_per_image=0: give at least 1, or null": {"max_steps_per_image": 0},
-    }.items(),
-)
-def test_settings_out_of_range_are_named(sentence, options):
     with pytest.raises(InputError, match=f"refinement.*{sentence}"):
-        unchecked(RefinementSettings, **options)
-
-
-@pytest.mark.parametrize(
-    "sentence, options",
-    {
-        "unit=meter: choose pixel or scene": {"unit": "meter"},
-        "means=-0.1: give a number >= 0": {"means": -0.1},
-        "sh=nan": {"sh": math.nan},
-    }.items(),
-)
-def test_rates_out_of_range_are_named(sentence, options):
-    with pytest.raises(InputError, match=f"refinement.rates.{sentence}"):
-        unchecked(Rates, **options)
+        inspect.unwrap(kind.__init__)(made, **options)  # without the checks of types in tests
 
 
 def test_max_steps_per_image_ends_the_refinement():
     """Many steps end early, with the bits of as many as are worth it."""
-    scene, views = small_scene(), small_views(count=2)
-    found, taken = {}, {}
-    for limit, asked in ((None, 6), (3, 200), (3, 4)):
-        shares = []
-        found[asked] = refine(
-            scene,
-            views,
-            RefinementSettings(max_steps_per_image=limit),
-            steps=asked,
-            watch=lambda progress, _, shares=shares: shares.append(progress.share) and False,
-        )
-        taken[asked] = len(shares)
-        assert shares == pytest.approx([(n + 1) / len(shares) for n in range(len(shares))])
-    assert taken == {6: 6, 200: 6, 4: 4}
+    scene, views, found = small_scene(), small_views(count=2), {}
+    for limit, asked, taken in ((None, 6, 6), (3, 200, 6), (3, 4, 4)):
+        settings = RefinementSettings(max_steps_per_image=limit)
+        found[asked], records = watched(scene, views, settings, steps=asked)
+        shares = [progress.share for progress in records]
+        assert shares == pytest.approx([(step + 1) / taken for step in range(taken)])
     assert same_bits(found[6], found[200]) and not same_bits(found[6], found[4])
-
-
-def test_a_step_with_all_views_counts_for_each():
-    taken = []
-    refine(
-        small_scene(),
-        small_views(),
-        RefinementSettings(max_steps_per_image=5, views_per_step=None, densify="none"),
-        seconds=1000,
-        watch=lambda progress, _: taken.append(progress.step) and False,
-    )
-    assert taken[-1] == 5
+    settings = RefinementSettings(max_steps_per_image=5, views_per_step=None, densify="none")
+    _, records = watched(scene, views, settings, seconds=1000)
+    assert records[-1].step == 5  # a step with all views counts for each

@@ -65,9 +65,8 @@ def test_any_number_of_copies_as_in_equation_9(count):
 
 def test_more_than_max_copies_count_as_max_copies():
     one = torch.tensor([0.9, 1.0]), torch.ones(2, 3)
-    most, more = (
-        split_opacity_and_scale(*one, torch.full((2,), count)) for count in (MAX_COPIES, 1000)
-    )
+    most = split_opacity_and_scale(*one, torch.full((2,), MAX_COPIES))
+    more = split_opacity_and_scale(*one, torch.full((2,), 1000))
     assert torch.equal(more[0], most[0]) and torch.equal(more[1], most[1])
     assert more[0].isfinite().all() and (more[1] > 0).all() and more[1].isfinite().all()
 
@@ -88,20 +87,15 @@ def test_the_image_stays_when_dead_gaussians_move(scene, dead):
     assert dead < 40 or (draw(uncorrected, cameras) - before).abs().mean() > 2e-2
 
 
-def test_the_image_stays_when_copies_are_added(scene):
+def test_copies_are_added_up_to_the_limit_and_the_image_stays(scene):
     gaussians, cameras = scene
-    fields = fields_of(gaussians)
-    relocate(fields, 1000, 0.5, generator())
-    assert len(fields) == 120
-    difference = draw(fields.gaussians(), cameras) - draw(gaussians, cameras)
-    assert difference.abs().mean() <= 1e-2
-
-
-def test_the_limit_adds_no_more_and_removes_none(scene):
-    for most, growth, expected in ((100, 0.5, 100), (80, 1.0, 80), (20, 1.0, 80), (200, 0.05, 84)):
-        fields = fields_of(scene[0])
+    limits = ((1000, 0.5, 120), (100, 0.5, 100), (80, 1.0, 80), (20, 1.0, 80), (200, 0.05, 84))
+    for most, growth, expected in limits:
+        fields = fields_of(gaussians)
         relocate(fields, most, growth, generator())
         assert len(fields) == expected
+        difference = draw(fields.gaussians(), cameras) - draw(gaussians, cameras)
+        assert difference.abs().mean() <= 1e-2
 
 
 def test_copies_have_the_fields_of_their_original(scene):
@@ -119,9 +113,8 @@ def test_copies_have_the_fields_of_their_original(scene):
         assert torch.equal(getattr(found, name), getattr(gaussians, name)[source])
     assert torch.equal(fields.units, old_units[source])
     counts = same.sum(0)[source - 30]
-    expected = split_opacity_and_scale(
-        gaussians.opacities[source], gaussians.scales[source], counts
-    )
+    originals = gaussians.opacities[source], gaussians.scales[source]
+    expected = split_opacity_and_scale(*originals, counts)
     torch.testing.assert_close((found.opacities, found.scales), expected)
     assert counts.max() > 2 and counts.min() == 1
 
@@ -143,9 +136,7 @@ def test_copies_have_a_new_optimizer_state(scene):
 
 
 def test_live_gaussians_are_sampled_by_opacity():
-    opacities = torch.cat(
-        (torch.full((2000,), 1e-3), torch.full((50,), 0.2), torch.full((50,), 0.6))
-    )
+    opacities = torch.tensor([1e-3, 0.2, 0.6]).repeat_interleave(torch.tensor([2000, 50, 50]))
     means = torch.arange(2100.0)[:, None].repeat(1, 3)
     start = isotropic_gaussians(means, torch.ones(2100), opacities, torch.rand(2100, 3))
     fields = fields_of(start)
@@ -157,9 +148,8 @@ def test_live_gaussians_are_sampled_by_opacity():
 
 
 def test_without_live_gaussians_all_stay():
-    start = isotropic_gaussians(
-        torch.rand(6, 3), torch.ones(6), torch.full((6,), 1e-6), torch.rand(6, 3)
-    )
+    start, faint = torch.rand(6, 3), torch.full((6,), 1e-6)
+    start = isotropic_gaussians(start, torch.ones(6), faint, torch.rand(6, 3))
     fields = fields_of(start)
     relocate(fields, 6, 0.0, generator())
     assert torch.equal(fields.gaussians().means, start.means)
@@ -183,9 +173,8 @@ def test_noise_has_the_shape_of_the_covariance():
     """Noise of the deviation NOISE * sigmoid(100 (0.005 - o)) * factor, times the covariance."""
     count = 4000
     quats, scales = torch.tensor([[0.8, 0.1, -0.5, 0.3]]), torch.tensor([[0.1, 0.02, 0.3]])
-    start = isotropic_gaussians(
-        torch.zeros(count, 3), torch.ones(count), torch.full((count,), 0.01), torch.rand(count, 3)
-    )
+    colors, one = torch.rand(count, 3), torch.ones(count)
+    start = isotropic_gaussians(0 * colors, one, 0.01 * one, colors)
     start = replace(start, quats=quats.repeat(count, 1), scales=scales.repeat(count, 1))
     fields = fields_of(start)
     inject_position_noise(fields, 0.5, generator())

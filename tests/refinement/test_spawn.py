@@ -108,9 +108,8 @@ def test_the_same_generator_draws_the_same(room, threads):
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 2)], ids=str)
 def test_tiny_images(room, size):
-    cameras = room.cameras.resized(*size)
-    views = Views(cameras, torch.rand(4, 3, *size))
-    found = spawn_at_errors(views, torch.zeros(4, 3, *size), torch.ones(4, *size), 3, generator())
+    views = Views(room.cameras.resized(*size), torch.rand(4, 3, *size))
+    found = spawn_at_errors(views, 0 * views.images, torch.ones(4, *size), 3, generator())
     assert found.validate().num_gaussians == 3
 
 
