@@ -39,10 +39,9 @@ def main(config: DictConfig) -> None:
     except KeyboardInterrupt:
         sys.exit("stopped.")
     except Exception as error:
-        input_error = input_error_behind(error)
-        if input_error is None:
-            raise
-        sys.exit(f"error: {input_error}")
+        if input_error := input_error_behind(error):
+            sys.exit(f"error: {input_error}")
+        raise
 
 
 def reconstruct(config: DictConfig) -> None:
@@ -53,32 +52,17 @@ def reconstruct(config: DictConfig) -> None:
     limit = read_limit(config)
     settings = instantiate(config.refinement)
     results = Results(Path(config.paths.run), config)
-    photographs = open_photographs(
-        config.path,
-        config.height,
-        config.width,
-        config.views,
-        config.held_out_every,
-        config.max_held_out,
-        config.layout,
-        config.on_bad_image,
-    )
+    names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
+    photographs = open_photographs(config.path, **{name: config[name] for name in names})
     gaussians = initialize(config, photographs, settings.max_gaussians)
     background = mean_color(photographs.inputs)
     results.save_start(gaussians, photographs, background)
     with RefinementDisplay(photographs.inputs, config.view) as display:
-        gaussians = refine(
-            gaussians,
-            photographs.inputs,
-            settings,
-            background=background,
-            seed=config.seed,
-            watch=display,
-            **limit,
-        )
+        options = {"background": background, "seed": config.seed, "watch": display, **limit}
+        gaussians = refine(gaussians, photographs.inputs, settings, **options)
         if display.last.step >= settings.max_steps(photographs.inputs.num_views):
             print(f"ended after refinement.max_steps_per_image={settings.max_steps_per_image}")
-        results.save(gaussians, photographs, background, display.last)
+        results.save(gaussians, display.last)
         display.show(gaussians)
 
 

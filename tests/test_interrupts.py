@@ -36,13 +36,8 @@ def test_an_interrupt_that_python_would_ignore_arrives(repository, case, kept):
         except KeyboardInterrupt:
             print("stopped")
     """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)],
-        cwd=repository,
-        capture_output=True,
-        text=True,
-        timeout=50,
-    )
+    command, options = [sys.executable, "-c", textwrap.dedent(script)], {"timeout": 50}
+    done = subprocess.run(command, cwd=repository, capture_output=True, text=True, **options)
     assert done.stdout == ("stopped\n" if kept else "went on\n")
     assert ("Traceback" in done.stderr) is not kept, done.stderr
     assert done.returncode == 0

@@ -35,9 +35,9 @@ class RefinementDisplay:
     def __enter__(self) -> "RefinementDisplay":
         self._handlers = {number: signal.signal(number, self._stop) for number in SIGNALS}
         self._bar = progress.Progress(
-            progress.TextColumn("refining"),
+            "refining",
             progress.BarColumn(),
-            progress.TextColumn("{task.fields[text]}"),
+            "{task.fields[text]}",
             progress.TimeRemainingColumn(),
             disable=not self._terminal,
         )
