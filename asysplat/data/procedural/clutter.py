@@ -29,16 +29,14 @@ def add_clutter(plan: FloorPlan, rng: Generator) -> None:
 
 def polish(plan: FloorPlan, rng: Generator) -> None:
     """Make some of the materials glossy."""
-    polished = {material: _polished(material, rng) for material in plan.materials()}
+    polished = {material: material for material in plan.materials()}
+    for material in polished:
+        if rng.random() <= GLOSSY_SHARE:
+            gloss, shininess = rng.uniform(0.2, 1.2), np.exp(rng.uniform(2, 5))
+            polished[material] = replace(material, gloss=gloss, shininess=shininess)
     plan.boxes = [(*box, polished[material]) for *box, material in plan.boxes]
     plan.spheres = [(*sphere, polished[material]) for *sphere, material in plan.spheres]
     plan.shell = [polished[material] for material in plan.shell]
-
-
-def _polished(material: Material, rng: Generator) -> Material:
-    if rng.random() > GLOSSY_SHARE:
-        return material
-    return replace(material, gloss=rng.uniform(0.2, 1.2), shininess=np.exp(rng.uniform(2, 5)))
 
 
 def _near_walk(plan: FloorPlan, rng: Generator) -> Float[np.ndarray, "K 2"]:

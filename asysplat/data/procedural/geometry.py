@@ -224,8 +224,6 @@ class Terrain:
             over = gap > 0
             low, high = torch.where(over, middle, low), torch.where(over, high, middle)
             # Halving the gap of the unchanged side makes the next guess fall beyond the root.
-            gap_low, gap_high = (
-                torch.where(over, gap, gap_low / 2),
-                torch.where(over, gap_high / 2, gap),
-            )
+            gap_low = torch.where(over, gap, gap_low / 2)
+            gap_high = torch.where(over, gap_high / 2, gap)
         return torch.where(crossed, middle[0], torch.inf)

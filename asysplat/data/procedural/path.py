@@ -113,31 +113,23 @@ def _along_gaze(rng: Generator, positions: Points, gaze: Times) -> Points:
     return positions + np.stack((*TARGET_DISTANCE * _direction(gaze), down), 1)
 
 
-def look_at(positions: Points, targets: Points, rolls: Times) -> Float[np.ndarray, "T 4 4"]:
-    """Return OpenCV camera-to-world matrices; a roll (radians) turns a camera about its axis."""
-    forward = targets - positions
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    right = np.cross(forward, UP)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    down = np.cross(forward, right)
-    cos, sin = np.cos(rolls)[:, None], np.sin(rolls)[:, None]
-    matrices = np.tile(np.eye(4), (len(positions), 1, 1))
-    matrices[:, :3, 0] = cos * right + sin * down
-    matrices[:, :3, 1] = cos * down - sin * right
-    matrices[:, :3, 2] = forward
-    matrices[:, :3, 3] = positions
-    return matrices
-
-
 def hand_held_path(
     rng: Generator, num_images: int, radius: float, path: Path = arc
 ) -> Float[np.ndarray, "T 4 4"]:
-    """Draw camera-to-world matrices along a path, with tremble and a slight roll.
+    """Draw OpenCV camera-to-world matrices along a path, with tremble and a slight roll.
 
     `num_images` samples the same path more or less finely.
     """
     time = np.linspace(0, 1, num_images)
     positions, targets = path(rng, time, radius)
-    tremble = np.stack([0.01 * sway(rng, time, 7.0, 11.0) for _ in range(3)], 1)
-    rolls = 0.035 * sway(rng, time, 1.3, 3.1)
-    return look_at(positions + tremble, targets, rolls)
+    positions = positions + np.stack([0.01 * sway(rng, time, 7.0, 11.0) for _ in range(3)], 1)
+    rolls = 0.035 * sway(rng, time, 1.3, 3.1)[:, None]
+    forward = targets - positions
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, UP)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    down, cos, sin = np.cross(forward, right), np.cos(rolls), np.sin(rolls)
+    matrices = np.tile(np.eye(4), (num_images, 1, 1))
+    columns = (cos * right + sin * down, cos * down - sin * right, forward, positions)
+    matrices[:, :3] = np.stack(columns, -1)
+    return matrices

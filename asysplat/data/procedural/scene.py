@@ -98,7 +98,9 @@ class ProceduralScene:
         """Render the images at `indices`, with the exact depth at every pixel center."""
         cameras = self.cameras.select(list(indices))
         light, depths = self._trace(cameras)
-        return Views(cameras, self._develop(light), depths)
+        # An S-curve of the logarithm, as film has.
+        light = light.clamp(min=MIN_LIGHT).log()
+        return Views(cameras, torch.sigmoid(light * self._gamma - self._threshold), depths)
 
     def _trace(self, cameras: Cameras) -> tuple[Float[Tensor, "V 3 H W"], Float[Tensor, "V H W"]]:
         """Trace light and depth at every pixel."""
@@ -127,10 +129,6 @@ class ProceduralScene:
                         sharp, surfaces.view(size), part, sampled
                     )
         return light.unflatten(-1, size), depths.unflatten(-1, size)
-
-    def _develop(self, light: Float[Tensor, "V 3 H W"]) -> Float[Tensor, "V 3 H W"]:
-        """Map light to [0, 1] by an S-curve of its logarithm, as film does."""
-        return torch.sigmoid(light.clamp(min=MIN_LIGHT).log() * self._gamma - self._threshold)
 
     def _expose(self) -> None:
         """Set one exposure and contrast for the whole path."""

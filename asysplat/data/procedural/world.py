@@ -42,7 +42,8 @@ class World:
             return torch.as_tensor(np.asarray(values, np.float32), device=device)
 
         centers, halves, yaws, _ = zip(*plan.boxes, strict=True)
-        axes = np.stack([_yaw_axes(yaw) for yaw in yaws])
+        turns = [(np.cos(yaw), np.sin(yaw)) for yaw in yaws]
+        axes = np.array([[[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]] for cos, sin in turns])
         self._boxes = Boxes(tensor(centers), tensor(halves), tensor(axes))
         centers, radii, _ = zip(*plan.spheres, strict=True)
         self._spheres = Spheres(tensor(centers), tensor(radii))
@@ -168,14 +169,25 @@ class World:
         return direct
 
     def _near(self, cone: Cone, margin: float = 0.0) -> tuple[Boxes, Spheres]:
-        boxes, spheres = self._boxes, self._spheres
-        return boxes.select(boxes.within(cone, margin)), spheres.select(
-            spheres.within(cone, margin)
+        return tuple(
+            each.select(each.within(cone, margin)) for each in (self._boxes, self._spheres)
         )
 
     def _openness(self, points: Points, normals: Points, cone: Cone) -> PerRay:
-        """Compute the share of the ambient light that arrives."""
-        gap = self._distance(points + OCCLUSION_DISTANCE * normals, cone) / OCCLUSION_DISTANCE
+        """Compute the share of the ambient light that arrives.
+
+        It depends on the distance from a point above the surface to the nearest object; to the
+        ground, the vertical distance.
+        """
+        points = points + OCCLUSION_DISTANCE * normals
+        if self._room is not None:
+            shell = self._room.distance(points)
+        else:
+            shell = self._terrain.above(points[:, None])[0]
+        # Once from the cone's surface hits to the points, and once from there to the objects.
+        boxes, spheres = self._near(cone, 2 * OCCLUSION_DISTANCE)
+        gap = torch.minimum(shell, torch.minimum(boxes.distance(points), spheres.distance(points)))
+        gap = gap / OCCLUSION_DISTANCE
         return MIN_AMBIENT + (1 - MIN_AMBIENT) * gap.clamp(0, 1)
 
     def _half_cosine(self, points: Points, normals: Points, directions: Points) -> PerRay:
@@ -184,19 +196,6 @@ class World:
         half = to_light * (to_light * to_light).sum(0).rsqrt()
         half = half - directions * (directions * directions).sum(0).rsqrt()
         return (normals * half).sum(0).clamp(min=0) * (half * half).sum(0).clamp(min=TINY).rsqrt()
-
-    def _distance(self, points: Points, cone: Cone) -> PerRay:
-        """Return the distance from each point to the nearest object; vertical to the ground.
-
-        Objects farther than OCCLUSION_DISTANCE may be ignored.
-        """
-        if self._room is not None:
-            shell = self._room.distance(points)
-        else:
-            shell = self._terrain.above(points[:, None])[0]
-        # Once from the cone's surface hits to the points, and once from there to the objects.
-        boxes, spheres = self._near(cone, 2 * OCCLUSION_DISTANCE)
-        return torch.minimum(shell, torch.minimum(boxes.distance(points), spheres.distance(points)))
 
     def _sky_color(self, points: Points) -> Points:
         """Blend from a pale horizon to a blue zenith, with clouds."""
@@ -215,12 +214,6 @@ def _padded_rays(mask: Bool[Tensor, " R"]) -> Index:
     """
     rays = mask.nonzero()[:, 0]
     return torch.cat((rays, rays[-1:].expand(-len(rays) % BLOCK)))
-
-
-def _yaw_axes(yaw: float) -> Float[np.ndarray, "3 3"]:
-    """Return the axes, as rows, of a box turned about the vertical."""
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
 
 
 def _surface_rows(
