@@ -40,12 +40,22 @@ def repository() -> Path:
 
 
 @pytest.fixture(scope="session")
-def build(repository):
+def composed():
+    """The configuration of a script, train.py unless named, with these overrides."""
+
+    def config(*overrides: str, script: str = "train", **options):
+        with initialize_config_dir(str(REPO / "conf"), version_base=None):
+            return compose(script, list(overrides), **options)
+
+    return config
+
+
+@pytest.fixture(scope="session")
+def build(composed):
     """The network that `train.py` would build for these overrides."""
 
     def network(*overrides: str, device: str = "cpu") -> torch.nn.Module:
-        with initialize_config_dir(str(repository / "conf"), version_base=None):
-            config = compose("train", list(overrides))
+        config = composed(*overrides)
         with torch.device(device):
             return instantiate(config.model)
 
@@ -54,12 +64,11 @@ def build(repository):
 
 @pytest.fixture(scope="session")
 def run_script():
-    """The function below: a script as its own interpreter would run it, without starting one."""
     return _run_script
 
 
 def _run_script(name: str, *overrides: str) -> subprocess.CompletedProcess:
-    """Run a script of the repository with these overrides, in this process."""
+    """Run a script as its own interpreter would, in this process."""
     script, out, err, status = REPO / name, io.StringIO(), io.StringIO(), None
 
     def show(message, category, filename, lineno, file=None, line=None):
@@ -96,7 +105,6 @@ def _run_script(name: str, *overrides: str) -> subprocess.CompletedProcess:
 
 @pytest.fixture(scope="session")
 def make_scene():
-    """The function below: as many Gaussians and cameras as a test asks for."""
     return _make_scene
 
 

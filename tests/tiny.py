@@ -1,4 +1,7 @@
-"""Options for a run of the tiniest size."""
+"""Options for a run of the tiniest size, and the smallest module to train."""
+
+import lightning
+import torch
 
 SIZE = ["width=0.125", "state_size=8"]
 NETWORK = [*SIZE, "model.layers=1m1s"]
@@ -14,3 +17,17 @@ QUIET = {
     "enable_progress_bar": False,
     "enable_model_summary": False,
 }
+
+
+class OneLayer(lightning.LightningModule):
+    """A linear layer trained by SGD."""
+
+    def __init__(self, inputs=1):
+        super().__init__()
+        self.layer = torch.nn.Linear(inputs, 1, bias=False)
+
+    def training_step(self, batch, index):
+        return self.layer(torch.ones(1)).sum()
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from tiny import NETWORK, SCENES, STEPS, VIEWS
@@ -16,10 +17,31 @@ TINY = [*NETWORK, *STEPS, *VIEWS, "callbacks.costs=null"]
 TINY_SCENES = [*SCENES, "data.test_scenes=2"]
 
 
+def finished(result: subprocess.CompletedProcess) -> Path:
+    """The folder of a finished run, which the script prints last."""
+    assert result.returncode == 0, result.stderr
+    label, folder = result.stdout.strip().splitlines()[-1].split(": ", 1)
+    assert label == "run"
+    return Path(folder)
+
+
 @pytest.fixture
 def train(tmp_path, run_script, repository):
     """A function that runs train.py with overrides and logs below tmp_path."""
     return make_train(tmp_path, run_script, repository)
+
+
+@pytest.fixture(scope="module")
+def module_train(tmp_path_factory, run_script, repository):
+    """The same for the runs that several tests share."""
+    return make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory, run_script, repository) -> Path:
+    """The folder of a finished run of 6 steps."""
+    train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
+    return finished(train("name=whole", "steps=6", "callbacks.monitor.every=2", COSTS))
 
 
 def make_train(logs, run_script, repository):

@@ -1,37 +1,19 @@
 """Two processes that train together take the steps of one process on both their scenes."""
 
-from pathlib import Path
-
 import pytest
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from test_module import MODELS
+from test_side_by_side import make_batch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from asysplat.scene import Cameras, Views
-
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
-CONF = Path(__file__).parents[2] / "conf"
-PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
-MODELS = sorted(p.stem for p in (CONF / "model").glob("*.yaml") if p.stem not in PARTS)
 OVERRIDES = ["width=0.125", "state_size=8", "training.loss.depth=0", "training.loss.perceptual=0"]
-SIZE, INPUTS, TARGETS, PROCESSES = 32, 2, 1, 2
-
-
-def make_batch():
-    """A scene for each process: noise seen from a line of cameras."""
-    views = INPUTS + TARGETS
-    pose = torch.eye(4).repeat(PROCESSES, views, 1, 1)
-    pose[..., 0, 3] = torch.linspace(-1, 1, views)
-    intrinsics = torch.tensor([[30.0, 0, SIZE / 2], [0, 30.0, SIZE / 2], [0, 0, 1]])
-    cameras = Cameras(intrinsics.repeat(PROCESSES, views, 1, 1), pose, SIZE, SIZE)
-    images = torch.rand(PROCESSES, views, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
-    every = Views(cameras, images)
-    return {"inputs": every.select(range(INPUTS)), "targets": every.select(range(INPUTS, views))}
+PROCESSES = 2
 
 
 class Loss(nn.Module):
@@ -46,10 +28,8 @@ class Loss(nn.Module):
         return self.module.loss(prediction, batch)["loss"]
 
 
-def make_loss(model):
+def make_loss(config):
     """The same weights in every process."""
-    with initialize_config_dir(str(CONF), version_base=None):
-        config = compose("train", [f"model={model}", *OVERRIDES])
     torch.manual_seed(0)
     return Loss(instantiate(config.training, net=instantiate(config.model)))
 
@@ -65,11 +45,11 @@ def gradients(loss):
     return {name: p.grad for name, p in loss.module.net.named_parameters() if p.requires_grad}
 
 
-def steps(model, rank):
+def steps(config, rank):
     """What two steps of the model showed this process."""
-    whole = make_batch()
+    whole = {k: views for k, views in make_batch(PROCESSES).items() if k != "scene"}
     own = {name: views.map(lambda tensor: tensor[rank, None]) for name, views in whole.items()}
-    alone, loss = make_loss(model), make_loss(model)
+    alone, loss = make_loss(config), make_loss(config)
     together = DistributedDataParallel(loss)
     optimizer = loss.module.configure_optimizers()["optimizer"]
 
@@ -102,14 +82,14 @@ def steps(model, rank):
     }
 
 
-def process(rank, folder):
+def process(rank, folder, configs):
     torch.set_num_threads(1)
     meeting = f"file://{folder}/meeting"
     dist.init_process_group("gloo", init_method=meeting, rank=rank, world_size=PROCESSES)
     results = {}
-    for model in MODELS:
+    for model, config in configs.items():
         try:
-            results[model] = steps(model, rank)
+            results[model] = steps(config, rank)
         except RuntimeError as error:  # the other models' are still of interest
             results[model] = str(error)
     torch.save(results, f"{folder}/{rank}.pt")
@@ -117,10 +97,11 @@ def process(rank, folder):
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory):
+def results(tmp_path_factory, composed):
     """What both processes found, by model; started once for all models."""
     folder = str(tmp_path_factory.mktemp("processes"))
-    mp.spawn(process, args=(folder,), nprocs=PROCESSES)
+    configs = {model: composed(f"model={model}", *OVERRIDES) for model in MODELS}
+    mp.spawn(process, args=(folder, configs), nprocs=PROCESSES)
     return [torch.load(f"{folder}/{rank}.pt") for rank in range(PROCESSES)]
 
 
@@ -134,22 +115,3 @@ def test_two_processes_take_the_step_of_one(results, model):
         worst = max(result["errors"], key=result["errors"].get)
         assert result["errors"][worst] < 1e-3, worst
         assert result["same"] and result["finite"]
-
-
-def first_moments(train, *overrides):
-    """Train; return AdamW's running means of the gradients after the last step."""
-    batches = ["model=asysplat_pred_fine", "model.layers=1m1t"]
-    result = train.alone(*batches, *overrides)
-    assert result.returncode == 0, result.stderr
-    (line,) = [line for line in result.stdout.splitlines() if line.startswith("run: ")]
-    path = Path(line.removeprefix("run: ")) / "checkpoints" / "last.ckpt"
-    states = torch.load(path, weights_only=True)["optimizer_states"][0]["state"]
-    return torch.cat([states[key]["exp_avg"].flatten() for key in sorted(states)])
-
-
-def test_the_script_with_two_devices(train):
-    """The run of one process on the same batches."""
-    two = first_moments(train, "name=two", "trainer.devices=2", "data.batch_size=2")
-    one = first_moments(train, "name=one", "trainer.devices=1", "data.batch_size=2")
-    other = first_moments(train, "name=other", "trainer.devices=1", "data.batch_size=1")
-    assert (two - one).norm() < 1e-4 * one.norm() < 1e-3 * (other - one).norm()

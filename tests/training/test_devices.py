@@ -1,12 +1,12 @@
 """The same global batch on several processes and in micro-batches: the curve of one process."""
 
 import json
-from pathlib import Path
+from types import SimpleNamespace
 
+import events
 import pytest
 import torch
-from conftest import make_train
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from conftest import finished
 
 FEW = [
     *("trainer.accelerator=cpu", "steps=2", "validate_every=1", "data.batch_size=4"),
@@ -16,33 +16,29 @@ FEW = [
 TWO = "trainer.devices=2"
 
 
-class RunFiles:
+def read_run(result) -> SimpleNamespace:
     """The curves, the test results and the weights of a run."""
-
-    def __init__(self, printed: str):
-        (line,) = [line for line in printed.splitlines() if line.startswith("run: ")]
-        folder = Path(line.removeprefix("run: "))
-        self.checkpoint = folder / "checkpoints" / "last.ckpt"
-        events = EventAccumulator(str(folder / "tensorboard"))
-        events.Reload()
-        names = [name for name in events.Tags()["scalars"] if name.startswith(("train/", "val/"))]
-        self.curves = {n: [event.value for event in events.Scalars(n)] for n in sorted(names)}
-        results = json.loads((folder / "metrics.json").read_text())
-        self.test = {k: v for k, v in results.items() if k.startswith(("test/", "baseline/"))}
-        self.rows = len((folder / "metrics.csv").read_text().splitlines()) - 1
-        state = torch.load(self.checkpoint, weights_only=True)["state_dict"]
-        state = {name: t for name, t in state.items() if t.is_floating_point()}  # counters are not
-        self.weights = torch.cat([state[name].flatten().double() for name in sorted(state)])
+    folder = finished(result)
+    checkpoint = folder / "checkpoints" / "last.ckpt"
+    results = json.loads((folder / "metrics.json").read_text())
+    state = torch.load(checkpoint, weights_only=True)["state_dict"]
+    state = {name: t for name, t in state.items() if t.is_floating_point()}  # counters are not
+    return SimpleNamespace(
+        checkpoint=checkpoint,
+        curves={
+            name: [value for _, value in row]
+            for name, row in events.scalars(folder).items()
+            if name.startswith(("train/", "val/"))
+        },
+        test={k: v for k, v in results.items() if k.startswith(("test/", "baseline/"))},
+        rows=len((folder / "metrics.csv").read_text().splitlines()) - 1,
+        weights=torch.cat([state[name].flatten().double() for name in sorted(state)]),
+    )
 
 
 @pytest.fixture(scope="module")
-def train(tmp_path_factory, run_script, repository):
-    return make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
-
-
-def read_run(result) -> RunFiles:
-    assert result.returncode == 0, result.stderr
-    return RunFiles(result.stdout)
+def train(module_train):
+    return module_train
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +46,7 @@ def one(train):
     return read_run(train("name=one", "trainer.devices=1", "data.micro_batch=4", *FEW))
 
 
-def check_the_same(found: RunFiles, expected: RunFiles) -> None:
+def check_the_same(found, expected) -> None:
     """The norm of all gradients is summed in fp32, and by process."""
     assert found.curves.keys() == expected.curves.keys()
     assert {"train/loss", "train/psnr", "train/grad_norm", "val/psnr"} <= found.curves.keys()

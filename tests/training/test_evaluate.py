@@ -2,14 +2,13 @@
 
 import csv
 import json
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-import hydra
 import pytest
 import torch
-from conftest import COSTS, TINY_SCENES, make_train
-from hydra import initialize_config_dir
+from conftest import COSTS, TINY_SCENES, finished
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from tiny import SIZE, VIEWS
@@ -31,12 +30,10 @@ MODEL = ["model=asysplat_4m4s", "metrics=longlrm", *SIZE]  # of Table 2
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, run_script, repository) -> Path:
+def whole(module_train) -> Path:
     """The folder of a finished run of the model of Table 2."""
-    train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
-    result = train(*MODEL, "model.layers=4m4s", "~callbacks.figures", "~callbacks.curve", COSTS)
-    assert result.returncode == 0, result.stderr
-    return Path(result.stdout.strip().splitlines()[-1].removeprefix("run: "))
+    left_out = ["~callbacks.figures", "~callbacks.curve"]
+    return finished(module_train(*MODEL, "model.layers=4m4s", *left_out, COSTS))
 
 
 @pytest.fixture
@@ -90,26 +87,22 @@ def test_files_have_every_image_and_every_scene(whole, evaluated):
         rows = list(csv.DictReader(file))
     of_set = [row for row in rows if row["set"] == "rooms" and row["source"] == "post3"]
     # 2 scenes of 2 targets and 3 inputs.
-    assert [sum(r["images"] == images for r in of_set) for images in ("targets", "inputs")] == [
-        4,
-        6,
-    ]
+    assert Counter(row["images"] for row in of_set) == {"targets": 4, "inputs": 6}
     mean = sum(float(row["psnr"]) for row in of_set if row["images"] == "targets") / 4
     assert mean == pytest.approx(evaluated["test/rooms/post3/psnr"], abs=1e-4)
     with (whole / "evaluation_scenes.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 3 * 2 * (3 + 2)
 
 
-def test_the_report_has_rows_with_post_optimization(whole, evaluated, repository):
+def test_the_report_has_rows_with_post_optimization(whole, evaluated, composed):
     one_stage = ["stage=stage1", "earlier_stages=[]"]
     tiny = [*SIZE, *VIEWS, *TINY_SCENES, *TRAINING, *one_stage]
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        filled = fill_table(
-            load_paper()["state_of_the_art"],
-            tiny,
-            lambda overrides: hydra.compose("train", list(overrides), return_hydra_config=True),
-            finished_runs(whole.parents[1]),
-        )
+    filled = fill_table(
+        load_paper()["state_of_the_art"],
+        tiny,
+        lambda overrides: composed(*overrides, return_hydra_config=True),
+        finished_runs(whole.parents[1]),
+    )
     rows = {r.paper.post_optimization: r for r in filled.rows if r.name.startswith("AsySplat")}
     for steps in (3, 10):
         values = rows[steps].values

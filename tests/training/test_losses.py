@@ -33,9 +33,16 @@ def cameras(size, views=2):
 
 
 def gaussians_at(means):
-    shape = means.shape[:-1]
-    ones = torch.ones(*shape, 4)
-    return Gaussians(means, ones, ones[..., :3], ones[..., 0] / 2, torch.zeros(*shape, 1, 3))
+    ones = torch.ones(*means.shape[:-1], 4)
+    return Gaussians(means, ones, ones[..., :3], ones[..., 0] / 2, 0 * ones[..., None, :3])
+
+
+def one_view(depth=None):
+    return Rendering(torch.rand(1, 3, 4, 4), torch.ones(1, 4, 4), depth, {})
+
+
+def make_loss(mse=0.0, perceptual=0.0, depth=0.0, **options):
+    return SplattingLoss(mse=mse, perceptual=perceptual, depth=depth, **options)
 
 
 def pair(size=32, depths=True):
@@ -54,7 +61,7 @@ def pair(size=32, depths=True):
 
 def test_mean_squared_error():
     prediction, batch = pair()
-    terms = SplattingLoss(mse=2.0, perceptual=0.0, depth=0.0)(prediction, batch)
+    terms = make_loss(mse=2.0)(prediction, batch)
     expected = (prediction.rendering.image - batch["targets"].images).square().mean()
     torch.testing.assert_close(terms["loss"], 2 * expected)
     assert set(terms) == {"loss", "mse"}
@@ -92,11 +99,10 @@ def test_opacity_is_a_term_and_off_by_default():
     prediction, batch = pair()
     gaussians = replace(prediction.gaussians, opacities=torch.rand(2048).requires_grad_())
     prediction = Prediction(gaussians, prediction.rendering)
-    options = {"mse": 1.0, "perceptual": 0.0, "depth": 0.0}
-    terms = SplattingLoss(**options, opacity=0.1)(prediction, batch)
+    terms = make_loss(mse=1.0, opacity=0.1)(prediction, batch)
     torch.testing.assert_close(terms["opacity"], gaussians.opacities.mean())
     torch.testing.assert_close(terms["loss"], terms["mse"] + 0.1 * terms["opacity"])
-    assert "opacity" not in SplattingLoss(**options)(prediction, batch)
+    assert "opacity" not in make_loss(mse=1.0)(prediction, batch)
 
 
 # Disparities (1, 2, 4) against (1, 2, 3), normalized: (-1, 0, 2) against (-1.5, 0, 1.5), whose
@@ -112,21 +118,13 @@ def test_rendered_disparity_by_hand():
     depth[:, ::2, ::2], target[:, ::2, ::2] = torch.tensor(DEPTHS), torch.tensor(TARGET)
     depth.requires_grad_()
     views = Views(cameras(4, views=1), torch.rand(1, 3, 4, 4), target)
-    rendering = Rendering(torch.rand(1, 3, 4, 4), torch.ones(1, 4, 4), depth, {})
-    prediction = Prediction(gaussians_at(torch.ones(4, 3)), rendering)
-    loss = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0)
+    prediction = Prediction(gaussians_at(torch.ones(4, 3)), one_view(depth))
+    loss = make_loss(depth=1.0)
     assert loss.needs_depth
     terms = loss(prediction, {"inputs": None, "targets": views})
     torch.testing.assert_close(terms["depth"].item(), BY_HAND)
     terms["loss"].backward()
     assert depth.grad[:, ::2, ::2].abs().sum() > 0 and (depth.grad[:, 1::2] == 0).all()
-
-
-def placed(depth, camera):
-    """Means [V * h * w, 3] at those depths of those cameras, anywhere beside the axis."""
-    local = torch.stack((torch.randn_like(depth), torch.randn_like(depth), depth), -1)
-    rotation, center = camera.cam_to_world[:, None, None, :3, :3], camera.centers[:, None, None]
-    return ((rotation @ local[..., None])[..., 0] + center).flatten(0, 2)
 
 
 def test_input_disparity_by_hand():
@@ -141,15 +139,16 @@ def test_input_disparity_by_hand():
     # The second view's are a scaled copy: nothing to add.
     target[:, ::2, ::2] = torch.stack((torch.tensor(TARGET), 3 * depth[1]))
     inputs = Views(camera, torch.rand(2, 3, 4, 4), target)
-    means = placed(depth, camera).requires_grad_()
+    local = torch.stack((torch.randn_like(depth), torch.randn_like(depth), depth), -1)
+    rotation, center = pose[:, None, None, :3, :3], pose[:, None, None, :3, 3]
+    means = ((rotation @ local[..., None])[..., 0] + center).flatten(0, 2).requires_grad_()
     gaussians = gaussians_at(means)
     torch.testing.assert_close(own_depths(gaussians, inputs), depth)
 
-    loss = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0, depth_term=InputDisparity)
+    loss = make_loss(depth=1.0, depth_term=InputDisparity)
     assert not loss.needs_depth
-    rendering = Rendering(torch.rand(1, 3, 4, 4), torch.ones(1, 4, 4), None, {})
     targets = Views(cameras(4, views=1), torch.rand(1, 3, 4, 4))
-    terms = loss(Prediction(gaussians, rendering), {"inputs": inputs, "targets": targets})
+    terms = loss(Prediction(gaussians, one_view()), {"inputs": inputs, "targets": targets})
     # Three pixels of the first view and four of the second.
     torch.testing.assert_close(terms["depth"].item(), BY_HAND * 3 / 7)
     terms["loss"].backward()
@@ -186,7 +185,7 @@ def test_pixels_without_depth_do_not_count(rows):
     """Of some rows, and of all, where the term is 0."""
     prediction, batch = pair()
     batch["targets"].depths[:, :rows] = 0
-    terms = SplattingLoss(mse=0.0, perceptual=0.0, depth=1.0)(prediction, batch)
+    terms = make_loss(depth=1.0)(prediction, batch)
     terms["loss"].backward()
     grad = prediction.rendering.depth.grad
     assert (grad[:, :rows] == 0).all() and grad.isfinite().all()
@@ -196,7 +195,7 @@ def test_pixels_without_depth_do_not_count(rows):
 @pytest.mark.parametrize("reading", [{}, {"depth_term": InputDisparity}])
 def test_data_without_depth_turns_the_term_off_with_one_warning(reading):
     prediction, batch = pair(depths=False)
-    loss = SplattingLoss(mse=1.0, perceptual=0.0, depth=1.0, **reading)
+    loss = make_loss(mse=1.0, depth=1.0, **reading)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(3):
@@ -208,9 +207,7 @@ def test_data_without_depth_turns_the_term_off_with_one_warning(reading):
 def test_a_missing_backbone_turns_the_term_off_with_a_warning(tmp_path, monkeypatch, term, name):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     with pytest.warns(UserWarning, match=f"{name} is neither .* paths.weights"):
-        loss = SplattingLoss(
-            mse=1.0, perceptual=0.5, depth=0.0, perceptual_term=lambda: term(str(tmp_path))
-        )
+        loss = make_loss(mse=1.0, perceptual=0.5, perceptual_term=lambda: term(str(tmp_path)))
     assert set(loss(*pair())) == {"loss", "mse"}
 
 
@@ -240,32 +237,36 @@ def distances(tmp_path_factory):
     return made
 
 
+def pair_of_images(distance):
+    """Noise twice, its distance, and both as networks take them before any scale."""
+    rendered, target = torch.rand(2, 2, 3, 32, 32), torch.rand(2, 2, 3, 32, 32)
+    return distance(rendered, target), *(x.flatten(0, 1) - MEAN for x in (rendered, target))
+
+
 def test_vgg16s_layers_and_weights(distances):
     distance, features = distances["vgg16"]
-    rendered, target = torch.rand(2, 2, 3, 32, 32), torch.rand(2, 2, 3, 32, 32)
-    a, b = ((images.flatten(0, 1) - MEAN) / STD for images in (rendered, target))
-    expected = 0.0
+    found, a, b = pair_of_images(distance)
+    a, b, expected = a / STD, b / STD, 0.0
     for index, layer in enumerate(features[:30]):
         a, b = layer(a), layer(b)
         if index in (3, 8, 15, 22, 29):
             assert isinstance(layer, torch.nn.ReLU)
             expected = expected + (a - b).abs().mean() / 5
-    torch.testing.assert_close(distance(rendered, target), expected)
+    torch.testing.assert_close(found, expected)
 
 
 def test_long_lrms_layers_and_weights(distances):
     """Blocks of VGG19 with mean pooling that end before layers 4, 9, 14, 23 and 32."""
     distance, features = distances["longlrm"]
-    rendered, target = torch.rand(2, 2, 3, 32, 32), torch.rand(2, 2, 3, 32, 32)
-    a, b = (255 * (images.flatten(0, 1) - MEAN) for images in (rendered, target))
+    found, a, b = pair_of_images(distance)
+    a, b = 255 * a, 255 * b
     expected, start = (a - b).abs().mean(), 0
-    weights = (0.3846, 0.2083, 0.2703, 0.1786, 6.6667)
-    for weight, end in zip(weights, (4, 9, 14, 23, 32), strict=True):
+    for end, weight in {4: 0.3846, 9: 0.2083, 14: 0.2703, 23: 0.1786, 32: 6.6667}.items():
         for layer in features[start:end]:
             pools = isinstance(layer, torch.nn.MaxPool2d)
             a, b = (F.avg_pool2d(x, 2) if pools else layer(x) for x in (a, b))
         expected, start = expected + weight * (a - b).abs().mean(), end
-    torch.testing.assert_close(distance(rendered, target), expected / 255)
+    torch.testing.assert_close(found, expected / 255)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -287,7 +288,7 @@ def test_perceptual_term_has_the_same_bits_under_autocast(distances, name):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_perceptual_term(distances, name):
     distance, _ = distances[name]
-    loss = SplattingLoss(mse=0.0, perceptual=1.0, depth=0.0, perceptual_term=lambda: distance)
+    loss = make_loss(perceptual=1.0, perceptual_term=lambda: distance)
     prediction, batch = pair()
     terms = loss(prediction, batch)
     terms["loss"].backward()

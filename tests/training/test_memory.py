@@ -2,23 +2,14 @@
 
 import pytest
 import torch
-from test_module import make_module
-from test_side_by_side import make_batch
+from test_side_by_side import make_batch, module  # noqa: F401
 
 from asysplat.evaluation.cost import memory_before_gb, peak_memory_gb, reset_peak_memory
 from asysplat.rendering import render
 from asysplat.training import SplattingLoss
 
 
-@pytest.fixture
-def module(build):
-    torch.manual_seed(0)
-    module = make_module(build("width=0.125", "state_size=8", "model.layers=1m1s"))
-    module.loss = SplattingLoss(mse=1.0, perceptual=0.0, depth=0.1, ssim=0.1)
-    return module
-
-
-def step(module):
+def step(module):  # noqa: F811
     """The gradients of a step that renders two views of three scenes, and what autograd keeps."""
     batch, kept = make_batch(), {}
     batch["targets"] = batch["inputs"]
@@ -36,7 +27,8 @@ def step(module):
     return grads, sum(storage.nbytes() for storage in kept.values())
 
 
-def test_the_same_gradients_in_less_memory(module):
+def test_the_same_gradients_in_less_memory(module):  # noqa: F811
+    module.loss = SplattingLoss(mse=1.0, perceptual=0.0, depth=0.1, ssim=0.1)
     expected, whole = step(module)
     # What the renderer keeps autograd does not see: the next test measures it.
     for views_at_once, checkpointing, most in ((1, False, 1.0), (None, True, 0.8), (1, True, 0.8)):

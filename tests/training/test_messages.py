@@ -8,23 +8,14 @@ import pytest
 from asysplat.errors import InputError
 from asysplat.training.messages import error_sentence
 
-
-def raised_from(error, cause):
-    try:
-        raise error from cause
-    except Exception as found:
-        return found
-
-
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "logs/events")
+FULL_AS_CAUSE = RuntimeError("write")
+FULL_AS_CAUSE.__cause__ = FULL
 LOST = RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. ")
 SENTENCES = {
     "a mistake": (InputError("steps=0: give more."), "steps=0: give more."),
     "a full disk": (FULL, "no space on the disk for logs/events (No space left on device)"),
-    "a full disk behind": (
-        raised_from(RuntimeError("write"), FULL),
-        "no space on the disk",
-    ),
+    "a full disk behind": (FULL_AS_CAUSE, "no space on the disk"),
     "a quota": (OSError(errno.EDQUOT, "Disk quota exceeded"), "no space on the disk (Disk quota"),
     "a lost loader": (LOST, "a process that loads data was lost (DataLoader worker (pid 12) is ki"),
 }

@@ -1,10 +1,15 @@
-"""What the optimizer is given: which parameters decay, and which are not trained at all."""
+"""Steps of the optimizer: which parameters decay or train, the learning rate, new tasks."""
 
+import math
 from functools import partial
 from pathlib import Path
 
+import lightning
 import pytest
 import torch
+from hydra.utils import instantiate
+from tiny import OneLayer
+from torch.utils.data import DataLoader
 
 from asysplat.scene import Cameras, Views
 from asysplat.training import SplattingLoss, SplattingModule
@@ -15,12 +20,13 @@ FOLDER = Path(__file__).parents[2] / "conf" / "model"
 MODELS = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem not in PARTS)
 
 
-def make_module(net, background=(0.5, 0.5, 0.5)):
+def make_module(net, background=(0.5, 0.5, 0.5), warmup_steps=1, total_steps=2, **options):
+    options = {"lr": 1e-3, "weight_decay": 0.05, "fused": True} | options
     return SplattingModule(
         net=net,
         loss=SplattingLoss(mse=1.0, perceptual=0.0, depth=0.0),
-        optimizer=partial(torch.optim.AdamW, lr=1e-3, weight_decay=0.05, fused=True),
-        schedule=partial(cosine, warmup_steps=1, total_steps=2),
+        optimizer=partial(torch.optim.AdamW, **options),
+        schedule=partial(cosine, warmup_steps=warmup_steps, total_steps=total_steps),
         background=background,
     )
 
@@ -96,3 +102,53 @@ def test_the_background_follows_the_inputs(build):
     prediction = module.eval()(batch, depth=False)
     expected = inputs.images.mean((1, 3, 4))[:, None, :, None, None].expand(2, 1, 3, 32, 32)
     torch.testing.assert_close(prediction.rendering.image, expected)
+
+
+def rates(warmup_steps, total_steps, steps):
+    optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=0.4)
+    schedule = cosine(optimizer, warmup_steps, total_steps)
+    found = []
+    for _ in range(steps):
+        found += schedule.get_last_lr()
+        optimizer.step()
+        schedule.step()
+    return found
+
+
+def test_linear_warm_up_then_a_cosine_to_zero():
+    found = rates(warmup_steps=4, total_steps=12, steps=15)
+    assert found[:5] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.4])
+    assert found[6] == pytest.approx(0.2 * (1 + math.cos(math.pi / 4)))
+    assert found[8] == pytest.approx(0.2) and found[12:] == [0.0, 0.0, 0.0]
+    # Without a warm-up, and with one of the whole training.
+    assert rates(warmup_steps=0, total_steps=3, steps=3) == pytest.approx([0.4, 0.3, 0.1])
+    assert rates(warmup_steps=2, total_steps=2, steps=3) == pytest.approx([0.2, 0.4, 0.4])
+
+
+STEPS, PER_EPOCH = 6, 2
+
+
+class Numbers(lightning.LightningDataModule):
+    """Task i is the number i."""
+
+    def train_dataloader(self):
+        start = self.trainer.current_epoch * PER_EPOCH
+        return DataLoader(range(start, start + PER_EPOCH), batch_size=None)
+
+
+class TaskRecorder(OneLayer):
+    def __init__(self):
+        super().__init__()
+        self.read = []
+
+    def training_step(self, batch, index):
+        self.read.append(int(batch))
+        return super().training_step(batch, index)
+
+
+def test_no_task_comes_twice(composed, tmp_path):
+    config = composed("trainer=cpu", f"steps={STEPS}").trainer
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    module = TaskRecorder()
+    instantiate(config, default_root_dir=tmp_path, **quiet).fit(module, Numbers())
+    assert module.read == list(range(STEPS))

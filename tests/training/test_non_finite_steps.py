@@ -1,18 +1,17 @@
-"""A non-finite step changes nothing, is reported and counted; too many end the run."""
+"""Non-finite steps and bad scenes are reported and counted; too many end the run."""
 
 import lightning
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from tiny import NETWORK, QUIET, STEPS, VIEWS
+from tiny import NETWORK, QUIET, STEPS, VIEWS, OneLayer
 from torch import nn
 from torch.utils.data import DataLoader
 
 from asysplat.data.datamodule import collate
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
-from asysplat.training.callbacks import NonFiniteSteps
+from asysplat.training.callbacks import BadScenes, NonFiniteSteps
 from asysplat.training.non_finite import first_non_finite
 
 
@@ -55,23 +54,28 @@ class Module(lightning.LightningModule):
         return DataLoader(samples, collate_fn=collate)
 
 
-def fit(module, folder, loader=None, **options):
-    callback = NonFiniteSteps(**options)
+def fit(module, callback, folder, loader=None, **options):
     trainer = lightning.Trainer(
         **QUIET,
         max_epochs=1,
         callbacks=[callback],
         enable_checkpointing=False,
         default_root_dir=folder,
-        gradient_clip_val=1.0,
+        **options,
     )
     trainer.fit(module, loader)
+    return trainer
+
+
+def fit_finite(module, folder, loader=None, **options):
+    callback = NonFiniteSteps(**options)
+    fit(module, callback, folder, loader, gradient_clip_val=1.0)
     return callback
 
 
 def test_a_non_finite_step_is_dropped_and_reported(tmp_path, capsys):
     module = Module([1.0, float("nan"), 0.5])
-    callback = fit(module, tmp_path)
+    callback = fit_finite(module, tmp_path)
     before, bad, after = module.history
     assert not torch.equal(before["layer.weight"], bad["layer.weight"])
     assert bad.keys() == after.keys() and "norm.running_mean" in bad
@@ -83,9 +87,9 @@ def test_a_non_finite_step_is_dropped_and_reported(tmp_path, capsys):
     )
 
 
-def test_budget(tmp_path):
+def test_budget_of_non_finite_steps(tmp_path):
     with pytest.raises(InputError, match=r"^5 steps in a row .*\(last: the batch's inputs\.images"):
-        fit(Module([1.0] + 9 * [float("inf")]), tmp_path, budget=5)
+        fit_finite(Module([1.0] + 9 * [float("inf")]), tmp_path, budget=5)
 
 
 def first(module, scale=1.0):
@@ -110,14 +114,39 @@ def test_first_non_finite_tensor():
 
 
 @pytest.mark.medium
-def test_first_non_finite_tensor_of_the_network(repository, tmp_path, capsys):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        config = compose("train", [*NETWORK, *STEPS, *VIEWS, "training.loss.depth=0.0"])
+def test_first_non_finite_tensor_of_the_network(composed, tmp_path, capsys):
+    config = composed(*NETWORK, *STEPS, *VIEWS, "training.loss.depth=0.0")
     net = instantiate(config.model)
     with torch.no_grad():
         net.head.decode.weight[0, 0] = torch.nan
     batch = [noise(4, size=32, name=name) for name in ("kitchen", "hall")]
     loader = DataLoader(batch, batch_size=2, collate_fn=collate)
-    fit(instantiate(config.training, net=net), tmp_path, loader)
+    fit_finite(instantiate(config.training, net=net), tmp_path, loader)
     expected = "step 0: the output of net.head.decode is not finite on kitchen;"
     assert expected in capsys.readouterr().out
+
+
+def fit_bad(bad_scenes, folder, **options):
+    callback = BadScenes(**options)
+    batches = [{"bad_scenes": errors} for errors in bad_scenes]
+    trainer = fit(OneLayer(), callback, folder, DataLoader(batches, batch_size=None))
+    return trainer.callback_metrics, callback
+
+
+def test_each_bad_scene_is_printed_once_and_all_scenes_are_counted(tmp_path, capsys):
+    logged, counter = fit_bad([["a is cut short"], [], ["b", "a is cut short"]], tmp_path)
+    assert logged["train/bad_scenes"] == 3
+    output = capsys.readouterr().out
+    assert output == (
+        "step 1: a bad scene is replaced by another: a is cut short\n"
+        "step 3: a bad scene is replaced by another: b\n"
+    )
+    again = BadScenes()
+    again.load_state_dict(counter.state_dict())
+    assert (again.count, again.errors) == (3, ["a is cut short", "b"])
+
+
+def test_budget_of_bad_scenes(tmp_path):
+    fit_bad([["a", "b"], ["b"]], tmp_path, budget=2)
+    with pytest.raises(InputError, match=r"^more than 2 training scenes .*:\n  a\n  b\n  c$"):
+        fit_bad([["a", "b"], ["b", "c"]], tmp_path, budget=2)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from conftest import finished
 from hydra.utils import get_object
 from omegaconf import OmegaConf
 
@@ -35,9 +35,8 @@ def old_run(tmp_path) -> Path:
 
 
 @pytest.fixture
-def config(repository):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        return compose("train", [*overrides_of_today(), "paths.run=unused"])
+def config(composed):
+    return composed(*overrides_of_today(), "paths.run=unused")
 
 
 def test_a_sweep_and_the_report_find_it(old_run, config):
@@ -93,8 +92,7 @@ def test_it_is_evaluated_resumed_and_started_from(old_run, run_script, train):
         assert found[key.format("post0/")] == pytest.approx(expected, rel=1e-4)
     last = old_run / "checkpoints" / "last.ckpt"
     options = [*overrides_of_today(), "logger=none", "data.test_sets=null", "callbacks.costs=null"]
-    result = train(*options, f"init_path={last}", "earlier_stages=[]")
-    assert result.returncode == 0, result.stderr
+    finished(train(*options, f"init_path={last}", "earlier_stages=[]"))
     (old_run / "metrics.json").unlink()
     result = train(*options, f"ckpt_path={last}", "steps=3")
     assert result.returncode == 0, result.stderr

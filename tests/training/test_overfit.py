@@ -1,17 +1,14 @@
 """The whole chain can learn: network, renderer, loss and optimizer on one scene."""
 
-from functools import partial
-
 import pytest
 import torch
+from test_module import make_module
 
 from asysplat.data.datamodule import collate, load
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.selection.views import uniform_selection
 from asysplat.data.sources import Task
 from asysplat.evaluation.metrics import psnr
-from asysplat.training import SplattingLoss, SplattingModule
-from asysplat.training.schedule import cosine
 
 STEPS = 250
 
@@ -20,15 +17,9 @@ STEPS = 250
 def test_one_scene_overfitted_passes_30_db(build):
     scene = ProceduralScene(3, 32, 32)
     batch = collate([load(Task(scene, uniform_selection(96, 4, 2)))])
-    module = SplattingModule(
-        net=build("width=0.25", "state_size=32", "model.layers=1m1s"),
-        loss=SplattingLoss(mse=1.0, perceptual=0.0, depth=0.0),
-        optimizer=partial(
-            torch.optim.AdamW, lr=1e-3, betas=(0.9, 0.95), weight_decay=0.0, fused=True
-        ),
-        schedule=partial(cosine, warmup_steps=10, total_steps=STEPS),
-        background=(0.5, 0.5, 0.5),
-    )
+    net = build("width=0.25", "state_size=32", "model.layers=1m1s")
+    adamw = {"betas": (0.9, 0.95), "weight_decay": 0.0}
+    module = make_module(net, warmup_steps=10, total_steps=STEPS, **adamw)
     options = module.configure_optimizers()
     optimizer, schedule = options["optimizer"], options["lr_scheduler"]["scheduler"]
     for step in range(STEPS):

@@ -6,31 +6,24 @@ import lightning
 import pytest
 import torch
 from rich.console import Console
-from tiny import QUIET
+from tiny import QUIET, OneLayer
 from torch.utils.data import DataLoader
 
 from asysplat.training.callbacks import TrainingProgressBar, progress
 
 
-class Module(lightning.LightningModule):
-    """One weight, and always the same quality."""
-
-    def __init__(self):
-        super().__init__()
-        self.layer = torch.nn.Linear(2, 1, bias=False)
+class Module(OneLayer):
+    """Its quality is always the same."""
 
     def training_step(self, batch, index):
         self.log("train/psnr", 20.0, prog_bar=True)
-        return self.layer(batch).sum()
+        return super().training_step(batch, index)
 
     def validation_step(self, batch, index):
         self.log("val/psnr", 18.5)
 
     def test_step(self, batch, index, dataloader_idx=0):
         pass
-
-    def configure_optimizers(self):
-        return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
 def loader(count=2):
@@ -60,11 +53,8 @@ def lines(text):
 def test_lines_after_each_validation_without_a_terminal(tmp_path, capsys):
     fit(tmp_path, 6)
     output = lines(capsys.readouterr().out)
-    assert [line.partition(" left")[0].rpartition(",")[0] for line in output] == [
-        "step 2 of 6",
-        "step 4 of 6",
-        "step 6 of 6",
-    ]
+    steps = [line.partition(" left")[0].rpartition(",")[0] for line in output]
+    assert steps == ["step 2 of 6", "step 4 of 6", "step 6 of 6"]
     assert all(line.endswith("left: PSNR 20.0, validation 18.5") for line in output)
 
 

@@ -1,17 +1,9 @@
 """What users set most is refused out of its range, in one sentence, and taken within."""
 
 import pytest
-from hydra import compose, initialize_config_dir
 
 from asysplat.errors import InputError
 from asysplat.training.ranges import RANGES, check_ranges
-
-
-@pytest.fixture(scope="module")
-def composed(repository):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        yield lambda *overrides: compose("train", list(overrides))
-
 
 REFUSED = {
     "steps=-5": "steps=-5: give a whole number of at least 1.",

@@ -1,21 +1,15 @@
-"""Which options and data make two runs different."""
+"""Which options, files and data make two runs, or two evaluations, different."""
 
 import json
 import subprocess
 
 import pytest
-from hydra import compose, initialize_config_dir
 
 from asysplat.training import revision as revisions
+from asysplat.training.evaluation_target import find_target
 from asysplat.training.runs import config_hash, data_of, describe_run, find_run, find_runs
 
 DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
-
-
-@pytest.fixture
-def composed(repository):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        yield lambda *overrides: compose("train", list(overrides))
 
 
 @pytest.fixture
@@ -167,3 +161,58 @@ def test_without_a_repository_of_its_own_a_package_has_a_version(checkout, monke
     (checkout / "site-packages").mkdir()
     monkeypatch.setattr(revisions, "ROOT", checkout / "site-packages")
     assert fresh() in (f"version {revisions.version('asysplat')}", "unknown")
+
+
+GARDEN = ["data=files", "data.root=/a/garden"]
+
+
+@pytest.fixture
+def scene_folder(composed, tmp_path):
+    """A function that returns the folder of the scenes' results of a command."""
+
+    def find(*overrides):
+        paths = [f"paths.logs={tmp_path}", "paths.run=unused"]
+        return find_target(composed(*overrides, *paths, script="evaluate"), overrides).scene_folder
+
+    return find
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Two files of the same content and one of another."""
+    paths = [tmp_path / name for name in ("a.ckpt", "elsewhere.ckpt", "other.ckpt")]
+    for path, content in zip(paths, (b"1", b"1", b"2"), strict=True):
+        path.write_bytes(content)
+    return paths
+
+
+@pytest.mark.parametrize("option", ["init_path", "scene"])
+def test_weights_are_compared_by_content(scene_folder, files, option):
+    same, moved, other = (scene_folder(f"{option}={path}", *GARDEN) for path in files)
+    assert moved.name == same.name and other.name != same.name
+    assert same.parents[1].name == f"a-{same.name[:8]}"
+
+
+OTHER_EVALUATION = {
+    "steps": [*GARDEN, "steps=[0,3]"],
+    "data": ["data=files", "data.root=/a/bicycle"],
+    "frames": [*GARDEN, "data.inputs=16"],
+    "protocol": [*GARDEN, "metrics=longlrm"],
+    "seed": [*GARDEN, "seed=1"],
+    "test sets": [*GARDEN, "test_sets=[mipnerf360]", "paths.mipnerf360=/a/360"],
+}
+
+
+@pytest.mark.parametrize("case", OTHER_EVALUATION)
+def test_other_options_are_another_evaluation(scene_folder, files, case):
+    weights = f"init_path={files[0]}"
+    first = scene_folder(weights, *GARDEN)
+    assert scene_folder(weights, *GARDEN, "data.cache.folder=null", "paths.weights=/b") == first
+    assert scene_folder(weights, *OTHER_EVALUATION[case]) != first
+
+
+def test_another_revision_of_the_code_is_another_evaluation(scene_folder, files, monkeypatch):
+    command = (f"init_path={files[0]}", *GARDEN)
+    first = scene_folder(*command)
+    monkeypatch.setattr("asysplat.training.runs.revision", lambda: "other")
+    assert scene_folder(*command) != first

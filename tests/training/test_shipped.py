@@ -7,7 +7,6 @@ import itertools
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from asysplat.data import FilesSource, SceneOptions
@@ -22,9 +21,8 @@ TARGETS = 4
 
 
 @pytest.fixture(scope="module")
-def module(repository):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        config = compose("train", [])
+def module(composed):
+    config = composed()
     built = instantiate(config.training, net=instantiate(config.model))
     load_weights("shipped", built)
     return built.eval()
@@ -43,11 +41,9 @@ def measure(module, lpips, batch):
     with torch.no_grad():
         image = module(batch, depth=False).rendering.image.clamp(0, 1)
     drawn = (image, nearest_view_images(inputs, targets), mean_color_images(inputs, targets))
+    true = targets.images
     return [
-        (
-            psnr(each, targets.images).mean().item(),
-            lpips_distance(lpips, each, targets.images).mean().item(),
-        )
+        (psnr(each, true).mean().item(), lpips_distance(lpips, each, true).mean().item())
         for each in drawn
     ]
 

@@ -12,17 +12,17 @@ from asysplat.training.side_by_side import SideBySide, split
 SCENES = 3
 
 
-def make_batch():
+def make_batch(scenes=SCENES):
     """Noise seen from a line of cameras; each scene knows other pixels' depths."""
     generator = torch.Generator().manual_seed(0)
-    pose = torch.eye(4).repeat(SCENES, 3, 1, 1)
+    pose = torch.eye(4).repeat(scenes, 3, 1, 1)
     pose[..., 0, 3] = torch.linspace(-1, 1, 3)
-    intrinsics = torch.tensor([[30.0, 0, 16], [0, 30.0, 16], [0, 0, 1]]).repeat(SCENES, 3, 1, 1)
-    images = torch.rand(SCENES, 3, 3, 32, 32, generator=generator)
-    depths = 1 + torch.rand(SCENES, 3, 32, 32, generator=generator)
+    intrinsics = torch.tensor([[30.0, 0, 16], [0, 30.0, 16], [0, 0, 1]]).repeat(scenes, 3, 1, 1)
+    images = torch.rand(scenes, 3, 3, 32, 32, generator=generator)
+    depths = 1 + torch.rand(scenes, 3, 32, 32, generator=generator)
     depths[0, ..., 4:] = 0
     views = Views(Cameras(intrinsics, pose, 32, 32), images, depths)
-    names = [f"scene {index}" for index in range(SCENES)]
+    names = [f"scene {index}" for index in range(scenes)]
     return {"scene": names, "inputs": views.select([0, 1]), "targets": views.select([2])}
 
 

@@ -12,7 +12,7 @@ import events
 import processes
 import pytest
 import torch
-from full_disk import largest_file
+from conftest import finished
 
 from asysplat.training.checkpoints import read_notes
 
@@ -63,21 +63,16 @@ def kill_at_random_moments(train, kills, longest, *overrides):
     return killed
 
 
-def last_weights(folder):
-    path = folder / "checkpoints" / "last.ckpt"
-    return torch.load(path, weights_only=True)["state_dict"]
-
-
 def rows(path):
     with path.open() as file:
-        return [
-            {key: value for key, value in row.items() if key != "minutes"}
-            for row in csv.DictReader(file)
-        ]
+        return [row | {"minutes": None} for row in csv.DictReader(file)]
 
 
 def check_same(whole, killed):
-    weights, survived = last_weights(whole), last_weights(killed)
+    weights, survived = (
+        torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+        for folder in (whole, killed)
+    )
     assert weights.keys() == survived.keys()
     assert [name for name in weights if not torch.equal(weights[name], survived[name])] == []
     for name in ("curve.csv", "metrics.csv"):
@@ -88,33 +83,31 @@ def check_same(whole, killed):
     assert (killed / "checkpoints" / "previous.ckpt").exists()
 
 
-@pytest.mark.medium
-def test_killed_twice_it_ends_with_the_same_bits_and_logs(train):
-    options = [*OPTIONS, "steps=6", "validate_every=3"]
-    result = train("name=whole", *options)
-    assert result.returncode == 0, result.stderr
-    assert kill_at_random_moments(train, 2, 3, *options) > 0
-    whole = folder_of(train, "whole")
+SLOW = (pytest.mark.slow, pytest.mark.timeout(3600))
+
+
+@pytest.mark.parametrize(
+    ("kills", "longest", "steps", "validate_every"),
+    [
+        pytest.param(2, 3, 6, 3, marks=pytest.mark.medium),
+        pytest.param(20, 6, 150, 10, marks=SLOW),
+    ],
+)
+def test_a_killed_run_ends_with_the_same_bits_and_logs(
+    train, kills, longest, steps, validate_every
+):
+    options = [*OPTIONS, f"steps={steps}", f"validate_every={validate_every}"]
+    whole = finished(train("name=whole", *options))
+    killed = kill_at_random_moments(train, kills, longest, *options)
+    print(f"killed {killed} times")
+    assert killed == kills if kills == 20 else killed > 0
     check_same(whole, folder_of(train, "killed"))
 
     before = events.scalars(whole)
     (whole / "metrics.json").unlink()  # as if killed after its training, while it is measured
-    result = train("name=whole", *options, "ckpt_path=last")
-    assert result.returncode == 0, result.stderr
+    finished(train("name=whole", *options, "ckpt_path=last"))
     assert events.scalars(whole) == before
     check_same(whole, folder_of(train, "killed"))
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_killed_twenty_times_it_ends_with_the_same_bits_and_logs(train):
-    options = [*OPTIONS, "steps=150", "validate_every=10"]
-    result = train("name=whole", *options)
-    assert result.returncode == 0, result.stderr
-    killed = kill_at_random_moments(train, 20, 6, *options)
-    print(f"killed {killed} times")
-    assert killed == 20
-    check_same(folder_of(train, "whole"), folder_of(train, "killed"))
 
 
 @pytest.mark.medium
@@ -134,28 +127,13 @@ def test_a_signal_to_all_processes_and_then_a_lost_loader(train):
     before = last.stat().st_mtime
     process, output = start_or_resume(train, "noticed", *options)
     wait_for(lambda: last.exists() and last.stat().st_mtime > before, process)
-    kill_workers(process)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    assert children
+    for worker in children:
+        os.kill(int(worker), signal.SIGKILL)
     process.join()
     text = output.read_text()
     assert process.exitcode == 1, text
     assert f"resuming from {last}" in text and text.count("stopped; to go on") == 2
     assert "error: a process that loads data was lost (DataLoader worker (pid" in text
     assert "Traceback" not in text
-
-
-def kill_workers(process):
-    """Kill the processes that load data."""
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    assert children
-    for worker in children:
-        os.kill(int(worker), signal.SIGKILL)
-
-
-@pytest.mark.medium
-def test_a_full_disk_ends_a_run_with_a_sentence(train):
-    with largest_file(5_000_000):  # which the checkpoint exceeds
-        result = train("name=full", "steps=2")
-    assert result.returncode == 1
-    assert "best.ckpt cannot be written (File too large): name a folder" in result.stderr
-    assert "Traceback" not in result.stderr
-    assert list(folder_of(train, "full").rglob("*.ckpt")) == []

@@ -4,7 +4,6 @@ import json
 import signal
 
 import pytest
-from hydra import compose, initialize_config_dir
 
 from asysplat.training.runs import describe_run
 
@@ -19,12 +18,11 @@ def finished_seeds(logs) -> list[int]:
 
 
 @pytest.fixture
-def finish(train, repository, tmp_path):
+def finish(train, composed, tmp_path):
     """Leaves behind what a finished run does, without running it."""
 
     def write(seed, **changes):
-        with initialize_config_dir(str(repository / "conf"), version_base=None):
-            config = compose("train", [*train.complete(*SWEEP), f"seed={seed}"])
+        config = composed(*train.complete(*SWEEP), f"seed={seed}")
         (tmp_path / str(seed)).mkdir()
         described = describe_run(config) | {f"run/{key}": value for key, value in changes.items()}
         (tmp_path / str(seed) / "metrics.json").write_text(json.dumps(described))

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import lightning
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from tiny import NETWORK, QUIET, SCENES, VIEWS
 
@@ -20,12 +19,11 @@ TINY = [*NETWORK, *VIEWS, *SCENES, "paths.run=unused"]
 
 
 @pytest.fixture(scope="module")
-def measure(repository, tmp_path_factory):
+def measure(composed, tmp_path_factory):
     """The test of an untrained model: its results, folder and costs."""
 
     def run(*overrides):
-        with initialize_config_dir(str(repository / "conf"), version_base=None):
-            config = compose("train", [*TINY, *overrides])
+        config = composed(*TINY, *overrides)
         torch.manual_seed(0)
         module = instantiate(config.training, net=instantiate(config.model))
         folder = tmp_path_factory.mktemp("run")
