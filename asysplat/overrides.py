@@ -12,7 +12,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
 
@@ -31,12 +31,16 @@ def check_overrides(overrides: Iterable[str], script: str = "train") -> None:
         InputError: an override cannot be parsed, or an unknown name; the message suggests the
             nearest ones.
     """
-    parsed = [_parse(override) for override in overrides]
-    ours = [override for override in parsed if not override.key_or_group.startswith("hydra")]
-    for override in ours:
-        _check_choices(override)
-    composed = [override for override in ours if _folder(override) or _adds(override)]
-    settings = [override for override in ours if override not in composed]
+    composed, settings = [], []
+    for override in map(_parse, overrides):
+        key = override.key_or_group
+        if key.startswith("hydra"):
+            continue
+        group = (CONF / key).is_dir()
+        if group and not override.is_delete():
+            _check_choices(override)
+        adds = override.is_add() or override.is_force_add()
+        (composed if group or adds else settings).append(override)
     if not settings:
         return
     config = _compose(script, composed)
@@ -45,8 +49,10 @@ def check_overrides(overrides: Iterable[str], script: str = "train") -> None:
         key = override.key_or_group
         if key not in options:
             raise InputError(f"{key} is unknown: {_hint(key, options, script)}")
-        if key == "stage":
-            _check_stage(override, config)
+        for stage in _values(override) if key == "stage" else ():
+            if stage not in config["stages"]:
+                *others, last = config["stages"]
+                raise InputError(f"stage={stage} is unknown: choose {', '.join(others)} or {last}.")
 
 
 def exit_at_unknown_overrides(script: str) -> None:
@@ -75,15 +81,10 @@ def _parse(override: str) -> Override:
         ) from None
 
 
-def _adds(override: Override) -> bool:
-    return override.is_add() or override.is_force_add()
-
-
 def _check_choices(override: Override) -> None:
-    folder, group = _folder(override), override.key_or_group
-    if folder is None or override.is_delete():
-        return
-    known = {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    group = override.key_or_group
+    folder = CONF / group
+    known = sorted(path.stem for path in folder.glob("*.yaml"))
     choices = (choice for value in _values(override) for choice in value.strip("[]").split(","))
     for choice in choices:
         if choice and choice not in known:
@@ -94,20 +95,6 @@ def _check_choices(override: Override) -> None:
             )
 
 
-def _check_stage(override: Override, config: DictConfig) -> None:
-    """Check that the scale has the training stage."""
-    for stage in _values(override):
-        if stage not in config.stages:
-            *others, last = config.stages
-            raise InputError(f"stage={stage} is unknown: choose {', '.join(others)} or {last}.")
-
-
-def _folder(override: Override) -> Path | None:
-    """Return the folder with the choices of a group; None if the key is not a group in conf/."""
-    folder = CONF / override.key_or_group
-    return folder if folder.is_dir() else None
-
-
 def _values(override: Override) -> list[str]:
     """Return the values as typed; for a sweep that lists its values, all of them."""
     if not override.is_sweep_override():
@@ -116,39 +103,31 @@ def _values(override: Override) -> list[str]:
     return list(override.sweep_string_iterator()) if listed else []
 
 
-def _compose(script: str, overrides: Sequence[Override]) -> DictConfig:
+def _compose(script: str, overrides: Sequence[Override]) -> dict:
     """Compose the configuration with these overrides, with the first value of each sweep."""
     given = [override.input_line for override in overrides if override.is_delete()]
     for override in overrides:
         if not override.is_delete():
             given += [f"{override.get_key_element()}={value}" for value in _values(override)[:1]]
-    ready = GlobalHydra.instance().is_initialized()
-    with (
-        contextlib.nullcontext()
-        if ready
-        else hydra.initialize_config_dir(str(CONF), version_base="1.3")
-    ):
+    with contextlib.ExitStack() as stack:
+        if not GlobalHydra.instance().is_initialized():
+            stack.enter_context(hydra.initialize_config_dir(str(CONF), version_base="1.3"))
         try:
-            return hydra.compose(script, given)
+            return OmegaConf.to_container(hydra.compose(script, given))
         except HydraException as error:
             raise InputError(f"{' '.join(given)}: {str(error).splitlines()[0]}") from error
 
 
-def _paths(config: DictConfig) -> Iterator[str]:
+def _paths(config: dict, prefix: str = "") -> Iterator[str]:
     """Yield the dotted path of every option, such as data.cache.folder, and of its parents."""
-
-    def below(node: dict, prefix: str) -> Iterator[str]:
-        for key, value in node.items():
-            yield f"{prefix}{key}"
-            if isinstance(value, dict):
-                yield from below(value, f"{prefix}{key}.")
-
-    return below(OmegaConf.to_container(config), "")
+    for key, value in config.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from _paths(value, f"{prefix}{key}.")
 
 
 def _hint(key: str, known: Collection[str], script: str) -> str:
-    nearest = _nearest(key, known)
-    if nearest:
+    if nearest := _nearest(key, known):
         return f"did you mean {nearest}?"
     group = key.partition(".")[0]
     choices = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
@@ -168,6 +147,5 @@ def _nearest(key: str, known: Collection[str]) -> str | None:
         parts = path.split(".")
         for start in range(len(parts)):
             ends.setdefault(".".join(parts[start:]), path)
-    return next(
-        (ends[end] for end in difflib.get_close_matches(key, ends, 1, MIN_SIMILARITY)), None
-    )
+    nearest = difflib.get_close_matches(key, ends, 1, MIN_SIMILARITY)
+    return ends[nearest[0]] if nearest else None

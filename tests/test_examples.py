@@ -17,20 +17,29 @@ from asysplat import read_gaussians
 from asysplat.data import SceneOptions, open_scene
 
 
+@pytest.fixture
+def run_example(repository, monkeypatch):
+    """Run examples/NAME.py with the words of a command line."""
+
+    def run(name, *words):
+        monkeypatch.setattr("sys.argv", [name, *map(str, words)])
+        runpy.run_path(str(repository / "examples" / f"{name}.py"), run_name="__main__")
+
+    return run
+
+
 @pytest.mark.parametrize("name", ["render_scene", "predict_scene"])
-def test_it_draws_a_figure(repository, tmp_path, monkeypatch, capsys, name):
+def test_it_draws_a_figure(run_example, tmp_path, capsys, name):
     figure = tmp_path / f"{name}.png"
-    monkeypatch.setattr("sys.argv", [name, str(figure)])
-    runpy.run_path(str(repository / "examples" / f"{name}.py"), run_name="__main__")
+    run_example(name, figure)
     assert cv2.imread(str(figure)).std() > 20
     assert str(figure) in capsys.readouterr().out
 
 
 @pytest.mark.slow  # the notebook does the same
-def test_a_scene_is_reconstructed(repository, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["reconstruct_scene"])
+def test_a_scene_is_reconstructed(run_example, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    runpy.run_path(str(repository / "examples" / "reconstruct_scene.py"), run_name="__main__")
+    run_example("reconstruct_scene")
     count = read_gaussians("reconstructed.ply").num_gaussians
     assert f"{count:,} Gaussians" in capsys.readouterr().out
     assert cv2.imread("reconstructed.png").std() > 20
@@ -69,10 +78,9 @@ def test_names_that_bring_much_along_are_imported_when_asked_for(repository):
 
 
 @pytest.mark.medium
-def test_photographs_are_checked_and_trained_on(repository, tmp_path, monkeypatch):
+def test_photographs_are_checked_and_trained_on(run_example, repository, tmp_path):
     scene = tmp_path / "my_scene"
-    monkeypatch.setattr("sys.argv", ["write_scene", str(scene)])
-    runpy.run_path(str(repository / "examples" / "write_scene.py"), run_name="__main__")
+    run_example("write_scene", scene)
     assert open_scene(scene, SceneOptions(64, 64)).num_images == 48
     tiny = [*NETWORK, *VIEWS, "steps=1", "validate_every=1", "data.cache.folder=null"]
     tiny += [f"paths.logs={tmp_path}/logs", "~callbacks.figures"]

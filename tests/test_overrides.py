@@ -27,13 +27,9 @@ KNOWN = [
 
 
 @pytest.mark.parametrize("overrides", KNOWN, ids=" ".join)
-def test_known_overrides(overrides):
+def test_known_overrides(overrides, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # sweeps/ is found from any folder
     check_overrides(overrides)
-
-
-def test_tables_are_found_from_any_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    check_overrides(["sweeps=layers", "steps=1"])
 
 
 UNKNOWN = {
@@ -68,16 +64,15 @@ def test_unknown_overrides(override):
 
 
 def test_options_of_the_other_scripts():
-    check_overrides(["table=[layers,geometry_ratio]", "costs=true", "logs=elsewhere"], "report")
-    check_overrides(["suite=ops", "ops.ssd.length=512", "model.names=[longlrm]"], "benchmark")
-    check_overrides(["run=logs/asysplat/one", "steps=[0,5]", "paths.logs=elsewhere"], "evaluate")
-    check_overrides(["init_path=shipped", "data=files", "data.root=x", "scale=gpu"], "evaluate")
-    with pytest.raises(InputError, match="did you mean scene"):
-        check_overrides(["scen=a.ply"], "evaluate")
-    with pytest.raises(InputError, match="did you mean costs"):
-        check_overrides(["cots=true"], "report")
-    with pytest.raises(InputError, match="did you mean repeats"):
-        check_overrides(["repeat=3"], "benchmark")
+    for script, known, unknown, nearest in (
+        ("report", "table=[layers,geometry_ratio] costs=true logs=elsewhere", "cots=true", "costs"),
+        ("benchmark", "suite=ops ops.ssd.length=512 model.names=[longlrm]", "repeat=3", "repeats"),
+        ("evaluate", "run=logs/asysplat/one steps=[0,5] paths.logs=elsewhere", "scen=a", "scene"),
+        ("evaluate", "init_path=shipped data=files data.root=x scale=gpu", "scen=a.ply", "scene"),
+    ):
+        check_overrides(known.split(), script)
+        with pytest.raises(InputError, match=f"did you mean {nearest}"):
+            check_overrides([unknown], script)
 
 
 @pytest.mark.medium
