@@ -49,7 +49,11 @@ def evaluate(options: DictConfig) -> None:
     target = find_target(options, HydraConfig.get().overrides.task)
     config = target.config
     lightning.seed_everything(config.seed, workers=True, verbose=False)
-    fabric = make_fabric(config.trainer)
+    try:  # the device and the precision of a prediction, as in the test of train.py
+        choices = {key: config.trainer[key] for key in ("accelerator", "precision")}
+        fabric = lightning.Fabric(devices=1, **choices)
+    except (ValueError, MisconfigurationException) as error:
+        raise InputError(f"trainer: {error}") from error
     measure = make_measure(config, options, fabric.device)
     data = instantiate(config.data)
     data.setup()
@@ -74,20 +78,6 @@ def evaluate(options: DictConfig) -> None:
     print_evaluation(results, list(scenes), target.folder)
 
 
-def make_fabric(trainer: DictConfig) -> lightning.Fabric:
-    """Choose the device and the precision of a prediction, as in the test of train.py.
-
-    Raises:
-        InputError: there is no such device or precision.
-    """
-    try:
-        return lightning.Fabric(
-            accelerator=trainer.accelerator, devices=1, precision=trainer.precision
-        )
-    except (ValueError, MisconfigurationException) as error:
-        raise InputError(f"trainer: {error}") from error
-
-
 def make_measure(config: DictConfig, options: DictConfig, device: torch.device) -> PostOptimization:
     """Build what measures a scene; without LPIPS, and a warning, if its backbone is missing."""
     protocol = instantiate(config.metrics)
@@ -105,12 +95,7 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
 def open_network(
     config: DictConfig, data: SceneDataModule, fabric: lightning.Fabric
 ) -> tuple[Predict, Mapping[str, float]]:
-    """Build the model and load its weights.
-
-    Returns:
-        The function that predicts the Gaussians of a scene, and the shares that the early exit of
-        its last call left out.
-    """
+    """Load a model; return its prediction of a scene, and what its last early exit left out."""
     net = instantiate(config.model)
     data.check_sizes(net.check_size)
     load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
@@ -127,12 +112,7 @@ def open_network(
 
 
 def open_gaussians(path: str, data: SceneDataModule, device: torch.device) -> Predict:
-    """Read the Gaussians of the data's one scene.
-
-    Raises:
-        InputError: the file cannot be used, the data has several scenes, or the input views show
-            none of the Gaussians.
-    """
+    """Read the Gaussians of the data's one scene, of which its input views must show some."""
     scenes = data.tests[data.name]
     if len(scenes) != 1:
         raise InputError(

@@ -38,7 +38,7 @@ def train(config: DictConfig) -> float | None:
     with prepare_run(config) as run:
         for stage in run.stages:
             train_stage(run, stage)
-    return run.psnr
+    return run.results.get(f"test/{config.data.name}/psnr")
 
 
 def train_stage(run: PreparedRun, stage: Stage) -> None:
@@ -49,11 +49,7 @@ def train_stage(run: PreparedRun, stage: Stage) -> None:
     net = instantiate(config.model)
     module = instantiate(config.training, net=net)
     early_exit = instantiate(config.speed)
-    logger = stage.prepare(data, module, early_exit)
-    callbacks = instantiate(config.get("callbacks") or {})
-    callbacks = {name: callback for name, callback in callbacks.items() if callback is not None}
-    trainer = stage.make_trainer(data, callbacks, logger)
-
+    trainer, callbacks = stage.prepare(data, module, early_exit)
     trainer.fit(module, data, ckpt_path=stage.checkpoint, weights_only=True)
     net.early_exit = early_exit
     trainer.test(module, data, verbose=False)

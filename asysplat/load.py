@@ -4,12 +4,12 @@ Import it from the package, `from asysplat import load`: the module has the name
 """
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
-from omegaconf import DictConfig
 from torch import nn
 
 from asysplat.errors import InputError
@@ -42,17 +42,12 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
             )
         net = instantiate(read_config(config_path).model)
     else:
-        config = _default_config(overrides)
+        check_overrides(overrides)
+        initialized = GlobalHydra.instance().is_initialized()
+        with nullcontext() if initialized else initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("train", list(overrides))
         net = instantiate(config.model)
         net.early_exit = instantiate(config.speed)
         net.check_early_exit(net.early_exit)
     load_weights(checkpoint, nn.ModuleDict({"net": net}))  # named as in a checkpoint
     return net.eval()
-
-
-def _default_config(overrides: Sequence[str]) -> DictConfig:
-    check_overrides(overrides)
-    if GlobalHydra.instance().is_initialized():
-        return compose("train", list(overrides))
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", list(overrides))

@@ -18,15 +18,7 @@ def measure_scene(
     protocol: Protocol,
     lpips: LPIPS | None = None,
 ) -> dict[str, list[float]]:
-    """Render each view and compute all metrics of the protocol: name -> a number a view.
-
-    Args:
-        gaussians: [N].
-        views: the images, [V].
-        background: RGB.
-        protocol: of the metrics.
-        lpips: see `load_lpips`; None for no LPIPS.
-    """
+    """Render each of [V] views and compute all metrics of the protocol: name -> a number a view."""
     metrics: dict[str, list[float]] = {}
     for view in range(views.num_views):
         target = views.select([view])

@@ -51,11 +51,7 @@ def scene_rows(scenes: Scenes) -> list[ImageRow]:
 
 
 def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, float]:
-    """Average over each test set.
-
-    Args:
-        scenes: of all sets.
-        over: see `average`.
+    """Average over each test set; `over`: see `average`.
 
     Returns:
         test/<set>/post<steps>/<metric>, of the input views inputs/<set>/post<steps>/psnr,
@@ -72,11 +68,10 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
         for name, share in average([dict(r.early_exit) for r in results], "images").items():
             averages[f"early_exit/{test_set}/{name}"] = share
         for source in dict.fromkeys(row["source"] for row in rows):
-            kind = "test" if source in results[0].costs else "baseline"
-            for name, value in _means(rows, "targets", source, over).items():
-                averages[f"{kind}/{test_set}/{source}/{name}"] = value
-            for name, value in _means(rows, "inputs", source, over).items():
-                averages[f"inputs/{test_set}/{source}/{name}"] = value
+            tested = "test" if source in results[0].costs else "baseline"
+            for kind, images in ((tested, "targets"), ("inputs", "inputs")):
+                for name, value in _means(rows, images, source, over).items():
+                    averages[f"{kind}/{test_set}/{source}/{name}"] = value
         for source in results[0].costs:
             every = [result.costs[source] for result in results]
             averages[f"{costs}/{source}/seconds"] = mean_but_longest([c["seconds"] for c in every])

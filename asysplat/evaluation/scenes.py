@@ -56,7 +56,11 @@ def measure_scenes(
 
             result = measure(sample["scene"], predict, inputs, targets, show)
             result.early_exit.update(early_exit)
-            bars.console.print(_sentence(name, result), soft_wrap=True, highlight=False)
+            rows = scene_rows({name: [result]})
+            psnrs = {row["source"]: row["psnr"] for row in rows if row["source"] in result.costs}
+            psnrs = [f"{source.removeprefix('post')}: {psnr:.2f}" for source, psnr in psnrs.items()]
+            sentence = f"{name} {result.scene}, PSNR after steps of post-optimization: "
+            bars.console.print(sentence + ", ".join(psnrs), soft_wrap=True, highlight=False)
             return result
 
         results: dict[str, list[SceneResult]] = {name: [] for name in tests}
@@ -70,9 +74,3 @@ def measure_scenes(
                 results[name].append(result)
                 bars.advance(scenes)
     return results
-
-
-def _sentence(name: str, result: SceneResult) -> str:
-    rows = [row for row in scene_rows({name: [result]}) if row["source"] in result.costs]
-    steps = ", ".join(f"{row['source'].removeprefix('post')}: {row['psnr']:.2f}" for row in rows)
-    return f"{name} {result.scene}, PSNR after steps of post-optimization: {steps}"

@@ -19,7 +19,6 @@ from asysplat.training.old_names import upgrade_checkpoint
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_plane_sweep.safetensors"
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # of a run, to resume from
-LISTED = 5  # differences between a file and a model
 WITHOUT_EFFECT = ("ckpt_path", "paths.", "callbacks.")  # options that change no weight
 
 
@@ -28,8 +27,7 @@ def find_checkpoint(ckpt_path: str | None, run: Path, runs: Path) -> Path | None
 
     Args:
         ckpt_path: None, a file, or "last" for the last one of the newest run below `runs`.
-        run: the run's own folder: if it or one of its stages has checkpoints, the run was
-            interrupted and resumes.
+        run: the run's own folder; if it or one of its stages has checkpoints, it was interrupted.
         runs: folder of all runs of one name.
 
     Raises:
@@ -43,7 +41,16 @@ def find_checkpoint(ckpt_path: str | None, run: Path, runs: Path) -> Path | None
         path = newest_folder(runs) / "checkpoints" / LAST
     else:
         path = Path(ckpt_path)
-    return _usable(path)
+    damage, before = _damage(path), path.with_name(PREVIOUS)
+    if damage and path.name == LAST and _damage(before) is None:
+        print(f"{path} {damage}: resuming from the one before it", flush=True)
+        path, damage = before, None
+    if damage:
+        raise InputError(
+            f"ckpt_path={path} {damage}: name a .ckpt file that a run has written, or last."
+        )
+    print(f"resuming from {path}", flush=True)
+    return path
 
 
 def has_checkpoints(folder: Path) -> bool:
@@ -66,21 +73,6 @@ def newest_folder(runs: Path) -> Path:
     return max(paths, key=lambda path: path.stat().st_mtime).parents[1]
 
 
-def _usable(path: Path) -> Path:
-    """Return `path`, or previous.ckpt beside it if it is last.ckpt and absent or damaged."""
-    damage = _damage(path)
-    before = path.with_name(PREVIOUS)
-    if damage and path.name == LAST and _damage(before) is None:
-        print(f"{path} {damage}: resuming from the one before it", flush=True)
-        path, damage = before, None
-    if damage:
-        raise InputError(
-            f"ckpt_path={path} {damage}: name a .ckpt file that a run has written, or last."
-        )
-    print(f"resuming from {path}", flush=True)
-    return path
-
-
 def _damage(path: Path) -> str | None:
     """Describe the damage of a checkpoint; None if its checksums are right."""
     if not path.is_file():
@@ -96,8 +88,7 @@ def _damage(path: Path) -> str | None:
 def read_notes(path: Path) -> dict[str, Any]:
     """Read what a run's checkpoint holds beside its weights, which stay on the disk.
 
-    `hyper_parameters` is the configuration, `callbacks` the states of the callbacks by their names;
-    see also `Checkpoints`.
+    `hyper_parameters` is the configuration, `callbacks` the states of the callbacks by their names.
 
     Raises:
         InputError: the file cannot be read as a run's checkpoint.
@@ -115,10 +106,7 @@ def read_notes(path: Path) -> dict[str, Any]:
 def config_diff(notes: Mapping[str, Any], config: Mapping[str, Any], revision: str) -> list[str]:
     """List the options that differ from those of a checkpoint: the bits of the runs will differ.
 
-    Args:
-        notes: the checkpoint's, see `read_notes`.
-        config: the configuration, of plain values.
-        revision: of the code.
+    `notes` are the checkpoint's, see `read_notes`, and `revision` is that of the code.
     """
     before, now = (_flat(options) for options in (notes.get("hyper_parameters", {}), config))
     keys = [key for key in before.keys() & now.keys() if before[key] != now[key]]
@@ -146,16 +134,30 @@ def check_checkpoint(path: Path | None, module: nn.Module) -> None:
     """
     if path is None:
         return
-    shapes = _read_shapes(path)
+    try:
+        if path.suffix == ".safetensors":
+            with safe_open(path, "pt") as file:
+                names = file.keys()
+                shapes = {name: tuple(file.get_slice(name).get_shape()) for name in names}
+        else:
+            state = torch.load(path, map_location="meta", weights_only=True)["state_dict"]
+            shapes = {name: tuple(tensor.shape) for name, tensor in state.items()}
+    except Exception as error:
+        raise InputError(
+            f"{path} cannot be read as a checkpoint: name a .ckpt file that a run has written, or "
+            "a .safetensors file."
+        ) from error
     expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
     names = sorted(expected.keys() | shapes.keys())
-    different = [name for name in names if shapes.get(name) != expected.get(name)]
-    if not different:
+    pairs = [(name, shapes.get(name), expected.get(name)) for name in names]
+    lines = [
+        f"{name} is {there} there and {here} here" for name, there, here in pairs if there != here
+    ]
+    if not lines:
         return
-    lines = [f"{n} is {shapes.get(n)} there and {expected.get(n)} here" for n in different[:LISTED]]
     raise InputError(
-        f"{path} does not fit this model, {len(different)} of {len(names)} weights differ: "
-        f"{', '.join(lines)}{', ...' if len(different) > LISTED else ''}; give the options that "
+        f"{path} does not fit this model, {len(lines)} of {len(names)} weights differ: "
+        f"{', '.join(lines[:5])}{', ...' if len(lines) > 5 else ''}; give the options that "
         "it was trained with (a run's config.yaml, or the card beside a .safetensors file)."
     )
 
@@ -164,8 +166,7 @@ def load_weights(path: str | None, module: nn.Module) -> None:
     """Load weights, but neither optimizer nor schedule.
 
     Args:
-        path: a .ckpt or .safetensors file, or "shipped" for the model in checkpoints/; None: load
-            nothing.
+        path: a .ckpt or .safetensors file, "shipped" for the model in checkpoints/, or None.
         module: to load into.
 
     Raises:
@@ -193,10 +194,8 @@ def weights_file(path: str) -> Path:
 
 def save_weights(weights: Mapping[str, Tensor], path: Path) -> None:
     """Write a state dict in half precision, as a .safetensors file."""
-    halves = {
-        name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
-        for name, tensor in weights.items()
-    }
+    halves = {n: t.half() if t.is_floating_point() else t for n, t in weights.items()}
+    halves = {name: tensor.contiguous() for name, tensor in halves.items()}
     with atomic_write(path) as partial:
         partial.write_bytes(save(halves))
 
@@ -215,18 +214,3 @@ def atomic_save(values: Any, path: Path) -> None:
             if isinstance(error.__context__, OSError):
                 raise error.__context__ from None
             raise
-
-
-def _read_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Read the shapes of the weights in a file, by name, without the weights."""
-    try:
-        if path.suffix == ".safetensors":
-            with safe_open(path, "pt") as file:
-                return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
-        state = torch.load(path, map_location="meta", weights_only=True)["state_dict"]
-        return {name: tuple(tensor.shape) for name, tensor in state.items()}
-    except Exception as error:
-        raise InputError(
-            f"{path} cannot be read as a checkpoint: name a .ckpt file that a run has written, or "
-            "a .safetensors file."
-        ) from error

@@ -48,13 +48,8 @@ class InputDisparity:
     renders_depth = False
 
     def __call__(self, prediction: Prediction, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
-        """Compute the term; None if the inputs have neither disparities nor depths.
-
-        Raises:
-            InputError: the Gaussians are no map for each input view, see `own_depths`.
-        """
-        inputs = batch["inputs"]
-        target = reference_disparities(inputs)
+        """Compute the term; None if the inputs have neither disparities nor depths."""
+        inputs, target = batch["inputs"], reference_disparities(batch["inputs"])
         if target is None:
             return None
         depth = own_depths(prediction.gaussians, inputs)
@@ -102,29 +97,20 @@ def disparity_distance(
 ) -> Float[Tensor, ""]:
     """Compute the mean over scenes of the mean SmoothL1 between normalized disparities.
 
-    The inner mean is over a scene's valid pixels.
-
-    Args:
-        depth: predicted.
-        target: disparities.
-        valid: pixels with both.
+    The inner mean is over a scene's valid pixels, which have a predicted depth and a target.
     """
     predicted, expected = (
         normalized_disparity(maps.flatten(0, -3), valid.flatten(0, -3)).view_as(maps)
         for maps in (1 / torch.where(valid, depth, 1), target)
     )
     error = F.smooth_l1_loss(predicted, expected, reduction="none") * valid
-    of_scene = (-3, -2, -1)
-    return (error.sum(of_scene) / valid.sum(of_scene).clamp_min(1)).mean()
+    return (error.sum((-3, -2, -1)) / valid.sum((-3, -2, -1)).clamp_min(1)).mean()
 
 
 def normalized_disparity(
     disparity: Float[Tensor, "V H W"], valid: Bool[Tensor, "V H W"]
 ) -> Float[Tensor, "V H W"]:
-    """Compute (disparity - median) / mean absolute deviation of each view's valid pixels.
-
-    Other pixels are 0.
-    """
+    """Compute (disparity - median) / mean absolute deviation of each view; invalid pixels are 0."""
     values = torch.where(valid, disparity, torch.nan).flatten(1)
     median = values.nanmedian(dim=1, keepdim=True).values
     centered = torch.where(valid.flatten(1), values - median.nan_to_num(), 0)

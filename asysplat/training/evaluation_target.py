@@ -16,18 +16,11 @@ OWN_OPTIONS = ("run", "scene", "steps")  # the others are train.py's
 
 @dataclass(frozen=True)
 class EvaluationTarget:
-    """What an evaluation measures.
+    """What an evaluation measures."""
 
-    Args:
-        config: of the data, the model and the metrics, as train.py takes it; its init_path names
-            the weights.
-        folder: for the results.
-        described: everything that the results depend on.
-    """
-
-    config: DictConfig
-    folder: Path
-    described: dict[str, str | int]
+    config: DictConfig  # as train.py takes it; its init_path names the weights
+    folder: Path  # for the results
+    described: dict[str, str | int]  # everything that the results depend on
 
     @property
     def scene_folder(self) -> Path:
@@ -36,11 +29,7 @@ class EvaluationTarget:
 
 
 def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarget:
-    """Find what the options of evaluate.py name.
-
-    Args:
-        options: conf/evaluate.yaml.
-        overrides: of the command.
+    """Find what the options of evaluate.py, and the overrides of its command, name.
 
     Raises:
         InputError: none of run, init_path and scene is given, or several are; files do not exist;
@@ -71,13 +60,13 @@ def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationT
     """Take a run with its own options; the evaluation is written beside its results."""
     folder = Path(options.run)
     if options.run == "last":
-        folders = [run.folder for run in find_runs(Path(options.paths.logs))]
-        if not folders:
+        runs = list(find_runs(Path(options.paths.logs)))
+        if not runs:
             raise InputError(
                 f"run=last found no finished run in {options.paths.logs}: name its folder, or set "
                 "paths.logs=."
             )
-        folder = folders[-1]
+        folder = runs[-1].folder
     checkpoint = folder / "checkpoints" / "last.ckpt"
     for path in (folder / RESULTS, folder / "config.yaml", checkpoint):
         if not path.is_file():
@@ -85,8 +74,8 @@ def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationT
                 f"run={options.run} has no {path.relative_to(folder)}: name the folder of a "
                 "finished run, or last."
             )
-    keys = [override.partition("=")[0].lstrip("+~") for override in overrides]
-    for key in keys:
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+~")
         if key not in OWN_OPTIONS and not key.startswith("paths."):
             raise InputError(
                 f"{key} does not go with run={options.run}, which is measured as it was tested: "

@@ -11,16 +11,11 @@ BINS = 60
 
 @dataclass
 class Histogram:
-    """Counts of numbers between two bounds; numbers beyond them are in the first or last bin.
-
-    Args:
-        low, high: the bounds.
-        counts: of bins of equal width; float64.
-    """
+    """Counts of numbers between two bounds; numbers beyond them are in the first or last bin."""
 
     low: float
     high: float
-    counts: Float[Tensor, "bins"]
+    counts: Float[Tensor, "bins"]  # float64, of bins of equal width
 
     @classmethod
     def empty(cls, low: float, high: float, device: torch.device) -> "Histogram":

@@ -13,10 +13,7 @@ from asysplat.training.histogram import Histogram
 def make_wandb_logger(folder: Path | str, project: str, name: str, offline: bool) -> WandbLogger:
     """Create a logger to Weights & Biases, which needs an account unless it is offline.
 
-    Args:
-        folder: of the run.
-        project, name: of the run at Weights & Biases.
-        offline: write to the folder only; `wandb sync` uploads it later.
+    Offline it writes to the folder of the run only, and `wandb sync` uploads it later.
 
     Raises:
         InputError: wandb is not installed.

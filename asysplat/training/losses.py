@@ -61,12 +61,7 @@ class SplattingLoss(nn.Module):
         return self._depth_term is not None and self._depth_term.renders_depth
 
     def forward(self, prediction: Prediction, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Compute the weighted sum, as "loss", and each term that is on, unweighted.
-
-        Args:
-            prediction: with rendered depth if `needs_depth`.
-            batch: inputs and targets, both Views.
-        """
+        """Compute the weighted sum, as "loss", and each term that is on, unweighted."""
         targets = batch["targets"]
         terms, image = {}, targets.masked(prediction.rendering.image)
         if self.mse:

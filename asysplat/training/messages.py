@@ -21,11 +21,7 @@ def quiet_lightning() -> None:
 
 @contextmanager
 def exit_with_message(stopped: str) -> Iterator[None]:
-    """End the process with one sentence at an error of `error_sentence` or an interrupt.
-
-    Args:
-        stopped: the sentence for Ctrl-C.
-    """
+    """End the process with the sentence `stopped` at Ctrl-C, or that of `error_sentence`."""
     try:
         yield
     except KeyboardInterrupt:
@@ -45,7 +41,8 @@ def error_sentence(error: BaseException) -> str | None:
     mistake = input_error_behind(error)
     if mistake is not None:
         return str(mistake)
-    for each in _causes(error):
+    each: BaseException | None = error
+    while each is not None:
         if isinstance(each, OSError) and each.errno in NO_SPACE:
             place = f" for {each.filename}" if each.filename else ""
             return f"there is no space on the disk{place} ({each.strerror}): free some."
@@ -54,11 +51,5 @@ def error_sentence(error: BaseException) -> str | None:
                 f"a process that loads data was lost ({each}); if memory was short, set "
                 "data.num_workers lower."
             )
+        each = each.__cause__ or each.__context__
     return None
-
-
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield an error and the errors that it was raised from."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__

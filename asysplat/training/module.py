@@ -29,8 +29,7 @@ class SplattingModule(lightning.LightningModule):
     Args:
         net: views -> Gaussians; see `freeze_unused`.
         loss: of an prediction against its batch.
-        optimizer: parameter groups -> optimizer; weight decay applies to those of `decaying`
-            alone.
+        optimizer: parameter groups -> optimizer; only `decaying` parameters have weight decay.
         schedule: optimizer -> its learning rates, one for each step.
         background: RGB in [0, 1] behind the Gaussians, or "inputs": the mean color of the input
             views; in training black or white, whichever is less like that mean, so that
@@ -71,26 +70,14 @@ class SplattingModule(lightning.LightningModule):
             fully_shard(block, mesh=self.device_mesh["data_parallel"])
 
     def forward(self, batch: Batch, depth: bool, net: nn.Module | None = None) -> Prediction:
-        """Predict the Gaussians of the inputs and render them at the target cameras.
-
-        Args:
-            batch: `inputs` and `targets`, both Views.
-            depth: whether to render depth too.
-            net: a copy of the network to use instead.
-        """
+        """Predict the Gaussians of the inputs, by `net` if given; render them at the targets."""
         net = self.net if net is None else net
         with self.parts("network"), self.parts.of("prior", net.prior):
             gaussians = net(batch["inputs"])
         targets, background = batch["targets"], self.background_for(batch)
         with self.parts("rendering"):
-            rendering = render(
-                gaussians,
-                targets.cameras,
-                background,
-                depth=depth,
-                masks=targets.masks,
-                views_at_once=self.views_at_once,
-            )
+            options = {"masks": targets.masks, "views_at_once": self.views_at_once}
+            rendering = render(gaussians, targets.cameras, background, depth=depth, **options)
         return Prediction(gaussians, rendering)
 
     def background_for(self, batch: Batch) -> Tensor:
@@ -118,10 +105,7 @@ class SplattingModule(lightning.LightningModule):
     def compute_terms(self, batch: Batch, net: nn.Module | None = None) -> dict[str, Tensor]:
         """Compute "loss", which has gradients, its terms and "psnr": means over the scenes.
 
-        Args:
-            batch: `scene`, and `inputs` and `targets`, both Views.
-            net: computes the whole batch at once; None: this module's network, whose copies
-                compute the scenes side by side on a CPU.
+        Without `net`, copies of this module's network compute the scenes side by side on a CPU.
         """
         # The copies of a network whose parameters are sharded (FSDP) could not gather them.
         on_cpu = self.device.type == "cpu" and self.device_mesh is None
@@ -142,16 +126,11 @@ class SplattingModule(lightning.LightningModule):
     def configure_optimizers(self) -> dict[str, Any]:
         decay = set(decaying(self.net))
         trained = [p for p in self.parameters() if p.requires_grad]
-        optimizer = self.optimizer(
-            [
-                {"params": [p for p in trained if p in decay]},
-                {"params": [p for p in trained if p not in decay], "weight_decay": 0.0},
-            ]
-        )
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self.schedule(optimizer), "interval": "step"},
-        }
+        decayed = {"params": [p for p in trained if p in decay]}
+        others = {"params": [p for p in trained if p not in decay], "weight_decay": 0.0}
+        optimizer = self.optimizer([decayed, others])
+        schedule = {"scheduler": self.schedule(optimizer), "interval": "step"}
+        return {"optimizer": optimizer, "lr_scheduler": schedule}
 
     def configure_gradient_clipping(
         self,
@@ -159,20 +138,12 @@ class SplattingModule(lightning.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip by the norm of all gradients, or by value.
-
-        Lightning refuses a fused optimizer under autocast, because of fp16's loss scaling, which
-        bf16 does not need.
-        """
-        if not gradient_clip_val:
-            return
-        if gradient_clip_algorithm == "value":
-            torch.nn.utils.clip_grad_value_(self.parameters(), gradient_clip_val)
-        else:
-            torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val)
-
-
-WEIGHTED = (nn.Linear, nn.Conv1d, nn.Conv2d)
+        # Lightning refuses a fused optimizer under autocast, because of fp16's loss scaling, which
+        # bf16 does not need.
+        value = gradient_clip_algorithm == "value"
+        clip = nn.utils.clip_grad_value_ if value else nn.utils.clip_grad_norm_
+        if gradient_clip_val:
+            clip(self.parameters(), gradient_clip_val)
 
 
 def decaying(net: nn.Module) -> list[nn.Parameter]:
@@ -181,7 +152,8 @@ def decaying(net: nn.Module) -> list[nn.Parameter]:
     Zero is no neutral value of the others: norms, biases, learned tokens, and A, dt and D of the
     scans.
     """
-    return [module.weight for module in net.modules() if isinstance(module, WEIGHTED)]
+    kinds = (nn.Linear, nn.Conv1d, nn.Conv2d)
+    return [module.weight for module in net.modules() if isinstance(module, kinds)]
 
 
 def freeze_unused(net: Network) -> None:
@@ -192,11 +164,10 @@ def freeze_unused(net: Network) -> None:
     """
     with torch.device("meta"):
         views = blank_views(2, net.patch, net.patch)
-        state = {n: torch.empty(t.shape, dtype=t.dtype) for n, t in net.named_buffers()}
-        leaves = {
-            n: torch.empty(p.shape, dtype=p.dtype, requires_grad=True)
-            for n, p in net.named_parameters()
-        }
+        state = {n: torch.empty_like(t, device="meta") for n, t in net.named_buffers()}
+        leaves = {n: torch.empty_like(p, device="meta") for n, p in net.named_parameters()}
+        for leaf in leaves.values():
+            leaf.requires_grad_()
     gaussians = torch.func.functional_call(net, state | leaves, (views,))
     outputs = [getattr(gaussians, field.name).sum() for field in fields(gaussians)]
     grads = torch.autograd.grad(sum(outputs), list(leaves.values()), allow_unused=True)

@@ -16,11 +16,8 @@ def first_non_finite(module: LightningModule, batch: Batch) -> str | None:
     """Compute a batch's loss and gradients; name the first tensor that is NaN or infinite.
 
     The order is: inputs, outputs of modules (inner before outer ones), terms of the loss, gradients
-    at those outputs from the last to the first, gradients of parameters.
-
-    Args:
-        module: has `compute_terms(batch, net)`, whose "loss" is minimized. It is left as it was.
-        batch: inputs and targets, both Views.
+    at those outputs from the last to the first, gradients of parameters. `module` has
+    `compute_terms(batch, net)`, whose "loss" is minimized; it is left as it was.
     """
     names: list[str] = []
 

@@ -62,12 +62,7 @@ def read_config(path: Path) -> DictConfig:
 
 
 def upgrade_config(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return a resolved configuration under today's names.
-
-    Args:
-        config: of plain values.
-        prefix: dotted path of `config` within the whole, with a dot at its end.
-    """
+    """Return a resolved configuration under today's names; `prefix`: its path within the whole."""
     upgraded = {}
     for key, value in config.items():
         path = f"{prefix}{key}"
@@ -83,7 +78,7 @@ def upgrade_config(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any
 
 def upgrade_results(results: Mapping[str, Any]) -> dict[str, Any]:
     """Return what metrics.json or evaluation.json holds, under today's names."""
-    return {_upgrade_key(key): value for key, value in results.items()}
+    return _upgrade(results)
 
 
 def upgrade_checkpoint(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
@@ -98,14 +93,14 @@ def upgrade_checkpoint(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _upgrade(state: Any) -> Any:
-    """Rename the keys of results in the nested state of a callback."""
-    if isinstance(state, Mapping):
-        return {_upgrade_key(key): _upgrade(value) for key, value in state.items()}
-    return [_upgrade(each) for each in state] if isinstance(state, list) else state
-
-
-def _upgrade_key(key: Any) -> Any:
-    if isinstance(key, str):
-        for old, new in RESULTS.items():
+    """Rename the keys of results in nested values."""
+    if isinstance(state, list):
+        return [_upgrade(each) for each in state]
+    if not isinstance(state, Mapping):
+        return state
+    upgraded = {}
+    for key, value in state.items():
+        for old, new in RESULTS.items() if isinstance(key, str) else ():
             key = re.sub(old, new, key)
-    return key
+        upgraded[key] = _upgrade(value)
+    return upgraded

@@ -3,10 +3,8 @@
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager
 from threading import get_ident
-from typing import Any
 
 import torch
 from torch import nn
@@ -16,12 +14,10 @@ from asysplat.evaluation.measured_cost import wait_for
 PARTS = ("data", "prior", "network", "rendering", "loss", "backward", "optimizer")
 
 
-@dataclass
 class _Thread:
-    """The seconds of each part in one thread, and of the parts inside each open part."""
-
-    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    inner: list[float] = field(default_factory=list)
+    def __init__(self):
+        self.seconds: dict[str, float] = defaultdict(float)  # of each part
+        self.inner: list[float] = []  # seconds of the parts inside each open part
 
 
 class Parts:
@@ -76,21 +72,14 @@ class Parts:
         if not self.measuring or module is None:
             yield
             return
-        open_parts = []
-
-        def begin(*_: Any) -> None:
-            open_parts.append(self(name))
-            open_parts[-1].__enter__()
-
-        def end(*_: Any) -> None:
-            open_parts.pop().__exit__(None, None, None)
-
-        hooks = (module.register_forward_pre_hook(begin), module.register_forward_hook(end))
+        part = ExitStack()
+        begin = module.register_forward_pre_hook(lambda *_: part.enter_context(self(name)))
+        end = module.register_forward_hook(lambda *_: part.close())
         try:
             yield
         finally:
-            for hook in hooks:
-                hook.remove()
+            begin.remove()
+            end.remove()
 
     def _now(self) -> float:
         wait_for(self.device)

@@ -71,25 +71,14 @@ def longlrm(backbone_dir: str | None = None, download: bool = False) -> Perceptu
 
     Long-LRM publishes weights converted from MatConvNet for these units; its code uses
     torchvision's by default, as does this function. The published weights are read from
-    vgg19_features_fp16.pth in `backbone_dir` if torch's hub cache has no VGG19.
-
-    Args:
-        backbone_dir: folder that may hold the network's weights.
-        download: whether to download missing weights.
-
-    Returns:
-        None, with a warning, if the weights are not on this machine.
+    vgg19_features_fp16.pth in `backbone_dir` if torch's hub cache has no VGG19. Arguments and a
+    missing network are as for `vgg16`.
     """
     backbone = _backbone("vgg19", backbone_dir, download)
     if backbone is None:
         return None
-    features = VGGFeatures(
-        "vgg19",
-        backbone,
-        taps=(3, 8, 13, 22, 31),
-        std=(1 / LONG_LRM_SCALE,) * 3,
-        mean_pooling=True,
-    )
+    std = (1 / LONG_LRM_SCALE,) * 3
+    features = VGGFeatures("vgg19", backbone, taps=(3, 8, 13, 22, 31), std=std, mean_pooling=True)
     scaled = [weight / LONG_LRM_SCALE for weight in LONG_LRM_WEIGHTS]
     return PerceptualDistance(features, scaled, image_weight=1.0)
 

@@ -44,10 +44,6 @@ def make_plan(trainer: lightning.Trainer, module: SplattingModule) -> str:
 
     The network is left as it was.
 
-    Args:
-        trainer: has its data module, with tasks.
-        module: on its device.
-
     Raises:
         InputError: a step does not fit into memory, or checkpoints do not fit on the disk.
     """

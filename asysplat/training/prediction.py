@@ -8,12 +8,7 @@ from asysplat.scene import Gaussians
 
 @dataclass(frozen=True)
 class Prediction:
-    """The prediction for a batch.
-
-    Args:
-        gaussians: predicted from the input views.
-        rendering: of these Gaussians at the target cameras.
-    """
+    """Gaussians predicted from the input views, and their rendering at the target cameras."""
 
     gaussians: Gaussians
     rendering: Rendering

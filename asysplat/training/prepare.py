@@ -5,13 +5,12 @@ train.py instantiates what the configuration names, fits and tests; the rest of 
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import lightning
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
-from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.data.datamodule import SceneDataModule
@@ -47,30 +46,24 @@ Callbacks = Mapping[str, lightning.Callback]
 
 @dataclass
 class Stage:
-    """A stage of a run.
-
-    Args:
-        config: of the stage.
-        weights: to start from, as `init_path` names them.
-        checkpoint: to resume from.
-        earlier: results of the stages before it.
-    """
+    """A stage of a run."""
 
     config: DictConfig
-    weights: str | None
-    checkpoint: Path | None
-    earlier: Results
+    weights: str | None  # to start from, as `init_path` names them
+    checkpoint: Path | None  # to resume from
+    earlier: Results  # of the stages before it
 
     def prepare(
         self, data: SceneDataModule, module: SplattingModule, early_exit: EarlyExit | None
-    ) -> Logger | None:
-        """Check the parts, load the weights, write config.yaml and build the logger.
+    ) -> tuple[lightning.Trainer, Callbacks]:
+        """Check the parts, load the weights, write config.yaml, build callbacks and trainer.
 
         A stage that is resumed drops the events that it logged after the checkpoint, since it will
-        log them again.
+        log them again. The trainer accumulates the micro-batches of each process.
 
         Raises:
-            InputError: sizes or weights that do not fit the model.
+            InputError: sizes or weights do not fit the model, the trainer refuses an option, or a
+                device does not exist.
         """
         config, net, folder = self.config, module.net, Path(self.config.paths.run)
         net.check_early_exit(early_exit)
@@ -93,21 +86,13 @@ class Stage:
         logger = instantiate(config.logger)
         if logger is not None and not resumes:
             log_choices(logger, config)
-        return logger
 
-    def make_trainer(
-        self, data: SceneDataModule, callbacks: Callbacks, logger: Logger | None
-    ) -> lightning.Trainer:
-        """Build Lightning's trainer, which accumulates the micro-batches of each process.
-
-        Raises:
-            InputError: it refuses an option, or a device does not exist.
-        """
-        record = StageRecord(self.config.stage, self.earlier)
+        callbacks = instantiate(config.get("callbacks") or {})
+        callbacks = {name: each for name, each in callbacks.items() if each is not None}
         try:
             trainer = instantiate(
-                self.config.trainer,
-                callbacks=[*callbacks.values(), record],
+                config.trainer,
+                callbacks=[*callbacks.values(), StageRecord(config.stage, self.earlier)],
                 logger=logger or False,
                 # Otherwise Lightning adds its own callbacks.
                 enable_checkpointing="checkpoints" in callbacks,
@@ -120,24 +105,17 @@ class Stage:
         trainer.accumulate_grad_batches = split.accumulated
         if trainer.is_global_zero:
             print(split)
-        return trainer
+        return trainer, callbacks
 
 
 @dataclass
 class PreparedRun:
-    """A run that has its folder to itself.
-
-    Args:
-        config: of the run.
-        described: see `describe_run`.
-        stages: that are still to be trained.
-        results: of the stages that are finished.
-    """
+    """A run that has its folder to itself."""
 
     config: DictConfig
-    described: Results
-    stages: Sequence[Stage]
-    results: Results = field(default_factory=dict)
+    described: Results  # see `describe_run`
+    stages: Sequence[Stage]  # that are still to be trained
+    results: Results  # of the stages that are finished
 
     def record(self, stage: Stage, trainer: lightning.Trainer, callbacks: Callbacks) -> None:
         """Collect what a tested stage measured; write metrics.json after the last; print it."""
@@ -146,22 +124,17 @@ class PreparedRun:
             if name in callbacks:
                 new_results |= callbacks[name].results
         data, folder = self.config.data.name, Path(stage.config.paths.run)
-        shown = self.results | new_results
-        if stage is self.stages[-1]:
+        shown, is_last = self.results | new_results, stage is self.stages[-1]
+        if is_last:
             self.results = shown = self.described | shown
         else:
             self.results |= results_of_stage(stage.config.stage, new_results)
         if trainer.is_global_zero:
             if trainer.logger is not None:
                 log_results(trainer.logger, new_results, data)
-            if stage is self.stages[-1]:
+            if is_last:
                 write_json(folder / RESULTS, shown)
             print_summary(shown, data, folder)
-
-    @property
-    def psnr(self) -> float | None:
-        """The test PSNR of the data's own test set."""
-        return self.results.get(f"test/{self.config.data.name}/psnr")
 
 
 @contextmanager
@@ -184,7 +157,7 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
         checkpoint = find_checkpoint(config.ckpt_path, folder, runs)
         first, results = resume_point(checkpoint, configs)
         weights = config.init_path if checkpoint is None else None
-        stages = []
+        stages: list[Stage] = []
         for stage in configs[first:]:
             if stage is not config:
                 stage.paths.run = str(folder / stage.stage)

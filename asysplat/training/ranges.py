@@ -1,7 +1,7 @@
 """Check the values of the most used options, before any work starts."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
@@ -10,83 +10,78 @@ from asysplat.errors import InputError
 SEEDS = 2**32  # NumPy takes seeds below it
 
 
-def is_whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
+def is_whole(value: object, low: int | float = 0, below: int | float = math.inf) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value < below
 
 
 def is_number(value: object) -> bool:
-    return is_whole(value) or (isinstance(value, float) and math.isfinite(value))
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def is_window(value: object) -> bool:
-    return isinstance(value, ListConfig) and list(map(is_whole, value)) == [True, True]
+def is_window(value: object, low: int | float = -math.inf) -> bool:
+    return isinstance(value, ListConfig) and [is_whole(each, low) for each in value] == [True] * 2
 
 
 # The expected value, its check, and the options.
-RANGES: tuple[tuple[str, Callable[[object], bool], tuple[str, ...]], ...] = (
+RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
     (
         "a whole number of at least 1",
-        lambda value: is_whole(value) and value >= 1,
+        lambda value: is_whole(value, 1),
         (
-            *("steps", "validate_every", "state_size"),
-            *("data.inputs", "data.targets", "data.height", "data.width", "data.batch_size"),
-            *("data.val_scenes", "data.test_scenes", "data.micro_batch", "trainer.num_nodes"),
+            *("steps", "validate_every", "state_size", "trainer.num_nodes"),
+            *(f"data.{key}" for key in ("inputs", "targets", "height", "width", "batch_size")),
+            *(f"data.{key}" for key in ("val_scenes", "test_scenes", "micro_batch")),
             *("callbacks.non_finite_steps.budget", "callbacks.monitor.every"),
         ),
     ),
     (
         "a whole number of at least 1, or null for all at once",
-        lambda value: value is None or (is_whole(value) and value >= 1),
-        ("training.views_at_once",),
+        lambda value: value is None or is_whole(value, 1),
+        ["training.views_at_once"],
     ),
     (
         "a whole number of at least 0",
-        lambda value: is_whole(value) and value >= 0,
+        is_whole,
         (
             *("data.num_workers", "training.schedule.warmup_steps"),
             *("callbacks.figures.scenes", "callbacks.bad_scenes.budget"),
         ),
     ),
-    (
-        f"a whole number from 0 to {SEEDS - 1}",
-        lambda value: is_whole(value) and 0 <= value < SEEDS,
-        ("seed",),
-    ),
+    (f"a whole number from 0 to {SEEDS - 1}", lambda value: is_whole(value, 0, SEEDS), ["seed"]),
     (
         "a number above 0",
         lambda value: is_number(value) and value > 0,
-        ("width", "parameter_budget", "learning_rate"),
+        ["width", "parameter_budget", "learning_rate"],
     ),
     (
         "a number of at least 0",
         lambda value: is_number(value) and value >= 0,
         (
             "training.optimizer.weight_decay",
-            *("training.loss.mse", "training.loss.ssim"),
-            *("training.loss.perceptual", "training.loss.depth", "training.loss.opacity"),
+            *(f"training.loss.{key}" for key in ("mse", "ssim", "perceptual", "depth", "opacity")),
         ),
     ),
     (
         "a share between 0 and 1, such as 0.9, or null for the model's own",
         lambda value: value is None or (is_number(value) and 0 < value < 1),
-        ("geometry_ratio",),
+        ["geometry_ratio"],
     ),
     (
         "a number above 0 and up to 1, or null to skip nothing",
         lambda value: value is None or (is_number(value) and 0 < value <= 1),
-        ("speed.skip_layers_above", "speed.skip_network_above"),
+        ["speed.skip_layers_above", "speed.skip_network_above"],
     ),
     (
         "a number of at least 0, or null",
         lambda value: value is None or (is_number(value) and value >= 0),
-        ("callbacks.checkpoints.minutes",),
+        ["callbacks.checkpoints.minutes"],
     ),
-    ("fail or skip", lambda value: value in ("fail", "skip"), ("data.on_bad_scene",)),
-    ("two whole numbers, such as [64,96]", is_window, ("data.window",)),
+    ("fail or skip", lambda value: value in ("fail", "skip"), ["data.on_bad_scene"]),
+    ("two whole numbers, such as [64,96]", is_window, ["data.window"]),
     (
         "height and width in pixels, such as [64,96], or null for the size that trains",
-        lambda value: value is None or (is_window(value) and min(value) >= 1),
-        ("data.test_size",),
+        lambda value: value is None or is_window(value, 1),
+        ["data.test_size"],
     ),
 )
 

@@ -17,13 +17,14 @@ def revision() -> str:
     If tracked files of CODE differ from the commit, "+" and a hash of the differences follow. A
     package outside a repository of its own gives its version instead.
     """
-    # A package installed below somebody else's repository is not part of it.
-    if _git("rev-parse", "--show-cdup") != b"\n":
-        return _version()
     commit = _git("rev-parse", "--short=12", "HEAD")
     changes = _git("diff", "HEAD", "--", *CODE)
-    if commit is None or changes is None:
-        return _version()
+    # A package installed below somebody else's repository is not part of it.
+    if _git("rev-parse", "--show-cdup") != b"\n" or commit is None or changes is None:
+        try:
+            return f"version {version('asysplat')}"
+        except PackageNotFoundError:
+            return "unknown"
     mark = f"+{hashlib.sha256(changes).hexdigest()[:8]}" if changes else ""
     return commit.decode().strip() + mark
 
@@ -34,10 +35,3 @@ def _git(*arguments: str) -> bytes | None:
         return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, check=True).stdout
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def _version() -> str:
-    try:
-        return f"version {version('asysplat')}"
-    except PackageNotFoundError:
-        return "unknown"

@@ -18,12 +18,7 @@ def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
     """Choose the folder of a run, for `hydra.run.dir` of conf/train.yaml.
 
     An interrupted run resumes in its own folder. Other runs that start from a checkpoint, such as
-    more steps of a finished run, get a new folder.
-
-    Args:
-        ckpt_path: the option.
-        runs: the folder of all runs of one name.
-        new: the folder of a new run.
+    more steps of a finished run, get the folder `new`. `runs` has all runs of one name.
     """
     if ckpt_path == "last":
         try:
@@ -40,11 +35,7 @@ def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a run's folder for this process and those that it trains with.
-
-    Raises:
-        InputError: another run trains there.
-    """
+    """Lock a run's folder for this process and those that it trains with, or raise InputError."""
     if rank_zero_only.rank != 0:
         yield
         return

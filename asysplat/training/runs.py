@@ -5,6 +5,7 @@ import json
 import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import reduce
 from operator import getitem
@@ -36,21 +37,13 @@ NOT_HASHED = (
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run.
-
-    Args:
-        folder: of its files.
-        config_hash: see the function `config_hash`.
-        seed: of its random numbers.
-        revision: of the code that made it, see `revision`.
-        results: the flat content of metrics.json and, if there is one, evaluation.json.
-    """
+    """A finished run."""
 
     folder: Path
-    config_hash: str
+    config_hash: str  # by today's code, see the function `config_hash`
     seed: int
-    revision: str
-    results: dict[str, Any]
+    revision: str  # of the code that made it
+    results: dict[str, Any]  # of metrics.json and, if there is one, evaluation.json
 
     def agrees(self, data: Mapping[str, str]) -> bool:
         """Return whether the run and `data` (see `data_of`) contradict each other nowhere."""
@@ -62,17 +55,11 @@ class Run:
 
 
 def config_hash(config: DictConfig, earlier: Sequence[DictConfig] | None = None) -> str:
-    """Hash the resolved configuration, without the keys that change no number.
+    """Hash the resolved configuration, without the seed and the keys that change no number.
 
-    These are left out:
-
-    - the seed, callbacks, the logger, the number of loader processes and the cache;
-    - how many devices share a step, how many scenes and views each holds at a time;
-    - paths: of the test root, disparities and a checkpoint to start from, only whether they are
-      given is hashed; `data_of` names the first and the last;
-    - further test sets, which do not change the numbers of the others; `data_of` names them too.
-
-    Runs of one hash, seed and data have the same numbers. Missing values (`???`) are allowed.
+    These are NOT_HASHED, the number of loader processes, and further test sets. Of the test root,
+    disparities and a checkpoint to start from, only whether they are given is hashed. Runs of one
+    hash, seed and `data_of` have the same numbers. Missing values (`???`) are allowed.
 
     Args:
         config: of a run.
@@ -123,7 +110,6 @@ def data_of(config: DictConfig) -> dict[str, str]:
 
 
 def _name(path: str | Path | None) -> str | None:
-    """Return the name of a folder; None if it is not given."""
     return None if path in (None, MISSING) else Path(os.path.abspath(path)).name
 
 
@@ -139,17 +125,11 @@ def content_of(path: str | Path | None) -> str | None:
 
 
 def hash_of(values: Any) -> str:
-    """Hash plain values."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def describe_run(config: DictConfig) -> dict[str, str | int]:
-    """Describe a run for metrics.json.
-
-    Returns:
-        run/config_hash, run/seed, run/revision (see `revision`), run/machine, run/format (see
-        `asysplat.training.old_names`) and `data_of`.
-    """
+    """Describe a run for metrics.json: hash, seed, revision, machine, format and `data_of`."""
     gpus = torch.cuda.device_count()
     machine = f"{gpus} x {torch.cuda.get_device_name()}" if gpus else f"{os.cpu_count()} CPU cores"
     return {
@@ -163,10 +143,7 @@ def describe_run(config: DictConfig) -> dict[str, str | int]:
 
 
 def find_runs(logs: Path) -> Iterator[Run]:
-    """Yield every finished run below `logs`, oldest first.
-
-    A results file that cannot be read, as an interrupted run may leave, is left out with a warning.
-    """
+    """Yield every finished run below `logs`, oldest first; warn of results that are damaged."""
     paths = sorted(logs.rglob(RESULTS), key=lambda path: (path.stat().st_mtime, path))
     for path in paths:
         try:
@@ -186,23 +163,17 @@ def find_runs(logs: Path) -> Iterator[Run]:
 
 def _config_hash_now(folder: Path, results: Mapping[str, Any]) -> str:
     """Return the hash that today's code computes for the configuration of a run."""
-    stored = results["run/config_hash"]
-    if results.get("run/format") == FORMAT:
-        return stored
-    try:
-        config = read_config(folder / "config.yaml")
-        stages = config.get("earlier_stages") or ()
-        return config_hash(config, [read_config(folder / s / "config.yaml") for s in stages])
-    except (OSError, ValueError, KeyError, AttributeError):  # no or another configuration
-        return stored
+    if results.get("run/format") != FORMAT:
+        with suppress(OSError, ValueError, KeyError, AttributeError):  # no or another configuration
+            config = read_config(folder / "config.yaml")
+            stages = config.get("earlier_stages") or ()
+            return config_hash(config, [read_config(folder / s / "config.yaml") for s in stages])
+    return results["run/config_hash"]
 
 
 def find_run(logs: Path, config: DictConfig) -> Run | None:
-    """Find the newest finished run of this configuration, seed and data.
-
-    Runs of this revision of the code come before runs of others.
-    """
+    """Find the newest finished run of this configuration, seed and data, of this revision first."""
     key, data = (config_hash(config), config.seed), data_of(config)
-    same = [run for run in find_runs(logs) if (run.config_hash, run.seed) == key]
-    same = [run for run in same if run.covers(data)]
+    runs = (run for run in find_runs(logs) if (run.config_hash, run.seed) == key)
+    same = [run for run in runs if run.covers(data)]
     return max(reversed(same), key=lambda run: run.revision == revision(), default=None)

@@ -9,9 +9,7 @@ from torch.optim.lr_scheduler import LambdaLR
 def cosine(optimizer: Optimizer, warmup_steps: int, total_steps: int) -> LambdaLR:
     """Return the schedule of a linear warm-up to the optimizer's rate, then a cosine to 0.
 
-    Args:
-        optimizer: with the highest learning rate.
-        warmup_steps, total_steps: in optimizer steps; the warm-up is part of the total.
+    The warm-up is part of the total; both are counted in optimizer steps.
     """
 
     def factor(step: int) -> float:

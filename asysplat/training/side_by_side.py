@@ -9,7 +9,7 @@ import copy
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial, reduce
+from functools import cache, reduce
 from typing import Any
 
 import torch
@@ -26,12 +26,8 @@ class SideBySide:
     """Computes means over the scenes of a batch, and their gradients.
 
     Batch norms normalize each scene by itself, as if it had its own process; their running means
-    change by the mean over the scenes.
-
-    Args:
-        net: whose parameters are trained.
-        compute: batch, network -> terms, "loss" among them.
-        parts: measures the backward pass of each scene.
+    change by the mean over the scenes. `compute` returns terms, "loss" among them; `parts` measures
+    the backward pass of each scene.
     """
 
     def __init__(
@@ -49,16 +45,11 @@ class SideBySide:
         copies = self._copies(len(scenes))
         parameters = [p for p in self.net.parameters() if p.requires_grad]
         # Autocast is a setting of the calling thread alone.
-        autocast = partial(
-            torch.autocast,
-            "cpu",
-            enabled=torch.is_autocast_enabled("cpu"),
-            dtype=torch.get_autocast_dtype("cpu"),
-            cache_enabled=False,  # it would be shared by all threads
-        )
+        enabled, dtype = torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu")
 
         def differentiate(scene: Batch, net: nn.Module) -> tuple[Terms, tuple[Tensor, ...]]:
-            with autocast():
+            # A cache would be shared by all threads.
+            with torch.autocast("cpu", enabled=enabled, dtype=dtype, cache_enabled=False):
                 terms = self.compute(scene, net)
             with self.parts("backward"):
                 grads = torch.autograd.grad(terms["loss"], parameters, materialize_grads=True)
@@ -99,14 +90,11 @@ class SideBySide:
 
 def split(batch: Batch) -> list[Batch]:
     """Split a batch into batches of one scene."""
-    return [
-        {
-            "scene": [scene],
-            "inputs": batch["inputs"].map(lambda tensor, i=index: tensor[i, None]),
-            "targets": batch["targets"].map(lambda tensor, i=index: tensor[i, None]),
-        }
-        for index, scene in enumerate(batch["scene"])
-    ]
+    scenes = [{"scene": [scene]} for scene in batch["scene"]]
+    for index, scene in enumerate(scenes):
+        for name in ("inputs", "targets"):
+            scene[name] = batch[name].map(lambda tensor, i=index: tensor[i, None])
+    return scenes
 
 
 class _WithGradients(torch.autograd.Function):
@@ -127,9 +115,7 @@ class _WithGradients(torch.autograd.Function):
 @cache
 def _pool(workers: int, threads: int) -> ThreadPoolExecutor:
     """Return a pool of worker threads, each with `threads` for its operators."""
-    return ThreadPoolExecutor(
-        workers, "asysplat-scene", initializer=torch.set_num_threads, initargs=(threads,)
-    )
+    return ThreadPoolExecutor(workers, "asysplat-scene", torch.set_num_threads, (threads,))
 
 
 # A forked process starts without its parent's threads.

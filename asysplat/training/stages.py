@@ -25,6 +25,8 @@ def stage_configs(config: DictConfig) -> list[DictConfig]:
         InputError: `earlier_stages` has a stage that the scale does not have, or a stage twice.
     """
     names = [*(config.get("earlier_stages") or ()), config.stage]
+    size = config.data.test_size or [config.data.height, config.data.width]
+    configs = []
     for index, name in enumerate(names):
         if name not in config.stages:
             raise InputError(
@@ -36,14 +38,11 @@ def stage_configs(config: DictConfig) -> list[DictConfig]:
                 f"{name} is twice among the stages of the run, {', '.join(names)}: leave it out of "
                 "earlier_stages; earlier_stages=[] trains one stage alone."
             )
-    size = config.data.test_size or [config.data.height, config.data.width]
-    configs = []
-    for index, name in enumerate(names[:-1]):
         earlier = config.copy()
         earlier.stage, earlier.earlier_stages = name, names[:index]
         earlier.data.test_size = size
         configs.append(earlier)
-    return [*configs, config]
+    return [*configs[:-1], config]
 
 
 def check_stages(stages: Sequence[DictConfig]) -> None:
@@ -82,10 +81,6 @@ class StageRecord(lightning.Callback):
 
     A later stage writes its first checkpoint before its first step, which saves the results of the
     stage before it.
-
-    Args:
-        stage: its name.
-        earlier: results of the stages before it, see `results_of_stage`.
     """
 
     def __init__(self, stage: str, earlier: Results):

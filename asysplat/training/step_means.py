@@ -12,9 +12,6 @@ class StepMeans:
 
     Both equal those of one process with the whole batch. Every micro-batch starts from the same
     running means.
-
-    Args:
-        net: its batch norms' running means are averaged.
     """
 
     def __init__(self, net: nn.Module):
@@ -35,11 +32,7 @@ class StepMeans:
         self._set(self.before)
 
     def finish(self, reduce: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
-        """Update the running means; return the mean of every term.
-
-        Args:
-            reduce: a tensor of this process -> its mean over all processes.
-        """
+        """Update the running means; return the mean of every term; `reduce`: over processes."""
         self._set([reduce(torch.stack(each).mean(0)) for each in zip(*self.updated, strict=True)])
         names = list(self.terms[0])
         means = torch.stack([torch.stack([each[n] for each in self.terms]).mean() for n in names])

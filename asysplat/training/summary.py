@@ -33,25 +33,6 @@ def write_json(path: Path, results: Results) -> None:
         partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
 
 
-def post_optimization_table(results: Results, name: str, costs: str) -> Table:
-    """Make the table of a test set after post-optimization; `costs`: the prefix of its costs."""
-    keys = [key.split("/") for key in results if key.startswith(f"test/{name}/post")]
-    steps = sorted({int(key[2].removeprefix("post")) for key in keys})
-    metrics = [metric for metric in METRICS if [metric] in [key[3:] for key in keys]]
-    title = f"test scenes: {name}, metrics: {results['protocol/name']}, "
-    title += f"{results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
-    titles = ("seconds", "GB", "inputs (dB)", *(METRICS[metric] for metric in metrics))
-    table = Table(Column("steps", min_width=12), *titles, title=title)
-    rows = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
-    rows |= {label: (prefix.format(name), "") for label, prefix in BASELINES.items()}
-    for label, (prefix, source) in rows.items():
-        spent = _cells((results.get(f"{costs}/{source}/{u}") for u in ("seconds", "gb")), digits=2)
-        inputs = results.get(f"inputs/{name}/{source}/psnr")
-        values = [inputs, *(results.get(f"{prefix}/{metric}") for metric in metrics)]
-        table.add_row(label, *spent, *_cells(values))
-    return table
-
-
 def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
     return ["" if value is None else f"{value:.{digits}f}" for value in values]
 
@@ -106,15 +87,24 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
 
 
 def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> None:
-    """Print a table for each test set, the figures and, last, the folder.
-
-    Args:
-        results: as in evaluation.json.
-        sets: the test sets, the data set's own first.
-        folder: of the results.
-    """
-    costs = ["cost" if name == sets[0] else f"cost/{name}" for name in sets]
-    tables = [post_optimization_table(results, *each) for each in zip(sets, costs, strict=True)]
+    """Print a table for each test set, the data set's own first, the figures and the folder."""
+    tables = []
+    for name in sets:
+        costs = "cost" if name == sets[0] else f"cost/{name}"
+        keys = [key.split("/") for key in results if key.startswith(f"test/{name}/post")]
+        steps = sorted({int(key[2].removeprefix("post")) for key in keys})
+        metrics = [metric for metric in METRICS if [metric] in [key[3:] for key in keys]]
+        title = f"test scenes: {name}, metrics: {results['protocol/name']}, "
+        title += f"{results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
+        titles = ("seconds", "GB", "inputs (dB)", *(METRICS[metric] for metric in metrics))
+        tables.append(Table(Column("steps", min_width=12), *titles, title=title))
+        rows = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
+        rows |= {label: (prefix.format(name), "") for label, prefix in BASELINES.items()}
+        for label, (prefix, source) in rows.items():
+            spent = [results.get(f"{costs}/{source}/{unit}") for unit in ("seconds", "gb")]
+            values = [results.get(f"inputs/{name}/{source}/psnr")]
+            values += [results.get(f"{prefix}/{metric}") for metric in metrics]
+            tables[-1].add_row(label, *_cells(spent, digits=2), *_cells(values))
     _print(tables, folder, "evaluation")
     print(f"evaluation: {folder}")
 

@@ -21,9 +21,7 @@ HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
 PAGE = {
     "quality": {
         "PSNR (dB)": ["Multiline", ["train/psnr", "val/psnr", "val/nearest_view/psnr"]],
-        "SSIM": ["Multiline", ["val/ssim"]],
-        "LPIPS": ["Multiline", ["val/lpips"]],
-        "AbsRel": ["Multiline", ["val/absrel"]],
+        **{name: ["Multiline", [f"val/{name.lower()}"]] for name in ("SSIM", "LPIPS", "AbsRel")},
     },
     "training": {
         "loss": ["Multiline", [f"train/{term}" for term in ("loss", *TERMS)]],
@@ -55,14 +53,10 @@ def event_files(loggers: Sequence[Logger]) -> dict[str, int]:
 
 @rank_zero_only
 def cut_events(folder: Path, sizes: Mapping[str, int]) -> None:
-    """Drop the events that a run logged after a checkpoint, since it will log them again.
+    """Cut a run's files of events to the `sizes` that they had when its checkpoint was written.
 
     `purge_step` cannot do this: the last validation before and the first step after the checkpoint
     have the same step.
-
-    Args:
-        folder: of the run.
-        sizes: of its files of events when the checkpoint was written.
     """
     for path in (folder / "tensorboard").glob(EVENTS):
         if path.name not in sizes:
