@@ -95,7 +95,7 @@ def initialize(config: DictConfig, photographs: Photographs, max_gaussians: int)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
     if network is not None and network.early_exit_shares:
         shares = (f"{share:.0%} of {name}" for name, share in network.early_exit_shares.items())
-        print(f"skipped by the network: {', '.join(shares)}")
+        print(f"early exit left out {', '.join(shares)}")
     return gaussians
 
 
