@@ -50,7 +50,8 @@ def make_train(logs, run_script, repository):
     def complete(*overrides):
         synthetic = not any(override.startswith("data=") for override in overrides)
         scenes = TINY_SCENES if synthetic else []
-        tiny = [option for option in (*TINY, *scenes) if option.split("=")[0] not in str(overrides)]
+        given = {override.lstrip("~+").split("=")[0] for override in overrides}
+        tiny = [option for option in (*TINY, *scenes) if option.split("=")[0] not in given]
         return [*overrides, f"paths.logs={logs}", *tiny]
 
     def run(*overrides):

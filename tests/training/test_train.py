@@ -224,7 +224,7 @@ REFUSED = {
     "a missing folder": (["data=transforms", "data.root=nowhere"], "data.root=nowhere"),
     "no folder": (["data=transforms"], "add data.root=..."),
     "no checkpoint": (["ckpt_path=last", "name=new"], "leave ckpt_path out"),
-    "too many views": (["data.inputs=30"], "has 24 frames"),
+    "too many views": (["data.inputs=30"], "has 24 images"),
 }
 
 
