@@ -465,8 +465,8 @@ def _means(group: Sequence[Result], bases: Mapping[tuple[str, str], Result]) -> 
     def values(path: str) -> list[float]:
         return [value for row in timed_rows if (value := at(row, path)) is not None]
 
-    measured = [row for row in timed_rows if row["psnr"] is not None]
-    lost = [bases[row["family"], row["scene"]]["psnr"] - row["psnr"] for row in measured]
+    rows = [row for row in timed_rows if row["psnr"] is not None]
+    lost = [bases[row["family"], row["scene"]]["psnr"] - row["psnr"] for row in rows]
     means = {
         "seconds": values("seconds.median"),
         "psnr": values("psnr"),
