@@ -193,7 +193,7 @@ def weights_file(path: str) -> Path:
 
 
 def save_weights(weights: Mapping[str, Tensor], path: Path) -> None:
-    """Write a state dict in half precision, as a .safetensors file."""
+    """Write the state dict of a module in half precision, as a .safetensors file to ship."""
     halves = {n: t.half() if t.is_floating_point() else t for n, t in weights.items()}
     halves = {name: tensor.contiguous() for name, tensor in halves.items()}
     with atomic_write(path) as partial:

@@ -12,12 +12,7 @@ import pytest
 import torch
 import yaml
 from conftest import COSTS, finished
-from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-from asysplat.errors import InputError
-from asysplat.training import publish as publishing
-from asysplat.training.publish import publish
 
 
 def metrics(folder: Path) -> dict:
@@ -250,32 +245,3 @@ def test_a_checkpoint_of_another_model(train, whole, tmp_path, option):
     assert result.returncode != 0 and "Traceback" not in result.stderr
     assert f"{path} does not fit this model" in result.stderr
     assert not list(tmp_path.rglob("*.ckpt"))
-
-
-@pytest.mark.medium
-def test_a_run_is_published(whole, tmp_path, monkeypatch):
-    target = tmp_path / "checkpoints" / "net"
-    publish(whole, target)
-    weights = load_file(target.with_suffix(".safetensors"))
-    trained = torch.load(whole / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
-    assert weights.keys() == trained.keys()
-    for name, there in trained.items():
-        torch.testing.assert_close(weights[name].to(there), there, rtol=1e-3, atol=1e-6)
-    card = target.with_suffix(".md").read_text()
-    for part in ("python train.py", "6 steps of", "revision", "| this model |"):
-        assert part in card, card
-    # What was written by hand outlives the next one.
-    target.with_suffix(".md").write_text(card + "\n## Limits\n\nNot for mirrors.\n")
-    publish(whole, target)
-    again = target.with_suffix(".md").read_text()
-    assert again == card + "\n## Limits\n\nNot for mirrors.\n"
-
-    monkeypatch.setattr(publishing, "LARGEST", 1000)
-    with pytest.raises(InputError, match=r"at most 0 MB ship; train a narrower model"):
-        publish(whole, target)
-
-
-def test_an_unfinished_run_is_not_published(tmp_path):
-    with pytest.raises(InputError, match=r"is no finished run: .*metrics.json is missing"):
-        publish(tmp_path, tmp_path / "net")
-    assert not (tmp_path / "net.safetensors").exists()
