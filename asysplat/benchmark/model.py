@@ -24,8 +24,8 @@ from asysplat.benchmark.products import Product, RecordProducts, time_products
 from asysplat.benchmark.scenes import on_an_arc, random_scene
 from asysplat.benchmark.table import machine_note, make_table, number, spread, text
 from asysplat.benchmark.timing import Measurement, Result, Run, now, seconds_of, time_in_rounds
-from asysplat.evaluation.cost import GB, count_parameters, memory_gb
-from asysplat.evaluation.static_cost import activation_gb
+from asysplat.evaluation.measured_cost import GB, memory_gb
+from asysplat.evaluation.static_cost import activation_gb, count_parameters
 from asysplat.models.network import Network
 from asysplat.models.tokenizer import Tokenizer
 from asysplat.overrides import check_overrides

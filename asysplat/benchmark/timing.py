@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from asysplat.evaluation.cost import memory_before_gb, peak_memory_gb
-from asysplat.evaluation.measured_cost import wait_for
+from asysplat.evaluation.measured_cost import memory_before_gb, peak_memory_gb, wait_for
 
 Result = dict[str, Any]  # plain values, as JSON has them
 Run = Callable[[], object]

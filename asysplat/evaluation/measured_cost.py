@@ -1,21 +1,25 @@
 """Measure the seconds and the peak memory of repeated work."""
 
+import ctypes
+import gc
+import os
+import re
+import resource
 import statistics
+import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from asysplat.evaluation.cost import peak_memory_gb, reset_peak_memory
-from asysplat.rendering import render
-from asysplat.scene import Cameras, Gaussians
-
+GB = 1e9
+STATUS, CLEAR_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")  # Linux alone
 SECONDS = (
     "mean of all measurements but the longest, which is left out as an outlier; "
     "of a single measurement, that one"
 )
-RENDERINGS = 6  # timed; the longest, which may include compilation, is left out
 
 
 def mean_but_longest(seconds: Sequence[float]) -> float:
@@ -67,24 +71,52 @@ class CostMeter:
         return costs
 
 
-def render_seconds(
-    gaussians: Gaussians, cameras: Cameras, background: Tensor, depth: bool
-) -> float:
-    """Measure the seconds of one rendering with the gradients of all Gaussian fields.
+def memory_gb(device: torch.device | str) -> float:
+    """Return the memory of the device in 1e9 bytes; for a CPU, that of the machine."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_properties(device).total_memory / GB
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GB
 
-    Args:
-        gaussians, cameras, background, depth: as for `render`.
+
+def reset_peak_memory(device: torch.device | str) -> bool:
+    """Reset the peak that `peak_memory_gb` reads to the memory in use now.
 
     Returns:
-        The `mean_but_longest` of RENDERINGS renderings.
+        Whether the peak was reset: on CUDA, and on Linux if /proc is writable.
     """
-    leaves = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
-    meter = CostMeter(gaussians.means.device)
-    for _ in range(RENDERINGS):
-        meter.start()
-        with torch.enable_grad():
-            out = render(leaves, cameras, background, depth=depth)
-            total = out.image.sum() if out.depth is None else out.image.sum() + out.depth.sum()
-        total.backward()
-        meter.stop()
-    return mean_but_longest(meter.seconds)
+    if torch.device(device).type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        return True
+    try:
+        CLEAR_PEAK.write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def memory_before_gb(device: torch.device | str) -> float:
+    """Return freed memory to the system, reset the peak, and return the memory in use now.
+
+    Without this, work that reuses freed memory would not raise the peak.
+    """
+    gc.collect()
+    with suppress(OSError, AttributeError):  # only glibc has it
+        ctypes.CDLL(None).malloc_trim(0)
+    reset_peak_memory(device)
+    return peak_memory_gb(device)
+
+
+def peak_memory_gb(device: torch.device | str) -> float:
+    """Read the peak memory in 1e9 bytes since `reset_peak_memory` or the process's start.
+
+    On CUDA this is the memory of the tensors; elsewhere the resident set of the whole process, with
+    libraries, data, and freed memory that was not returned to the system.
+    """
+    if torch.device(device).type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / GB
+    if STATUS.exists():
+        kilobytes = re.search(r"VmHWM:\s+(\d+) kB", STATUS.read_text())[1]
+        return int(kilobytes) * 1024 / GB
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    bytes_per_unit = 1 if sys.platform == "darwin" else 1024
+    return peak * bytes_per_unit / GB

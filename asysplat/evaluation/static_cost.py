@@ -1,16 +1,72 @@
-"""Count the costs of a forward pass without data, on tensors without content."""
+"""Count parameters and FLOPs; the costs of a forward pass on tensors without content."""
 
 import copy
+import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, UntypedStorage, nn
 from torch._subclasses import FakeTensorMode
+from torch.utils.flop_counter import FlopCounterMode
 
-from asysplat.evaluation.cost import GB, count_parameters, module_flops, true_flops
 from asysplat.models.layers import Layers
 from asysplat.scene import Cameras, Views
 
 GIGA = 1e9
+NORMS = (nn.LayerNorm, nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
+
+
+def count_parameters(module: nn.Module) -> int:
+    """Count the scalars among the module's parameters, frozen ones included."""
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def module_flops(net: nn.Module, run: Callable[[], object]) -> int:
+    """Count the FLOPs of one `run()`, which calls `net`, as the paper counts them.
+
+    2 x multiply-adds of Linear, Conv1d and Conv2d modules, 4 operations an element for LayerNorm
+    and BatchNorm. Like a profiler of modules, it does not count attention products, scans, RMSNorm,
+    activations, biases, and depthwise Conv1d (Mamba runs it in a fused kernel). Works on the meta
+    device.
+    """
+    total = 0
+
+    def count(module: nn.Module, _inputs: object, output: Tensor) -> None:
+        nonlocal total
+        total += output.numel() * _flops_per_output(module)
+
+    counted = [module for module in net.modules() if _flops_per_output(module)]
+    hooks = [module.register_forward_hook(count) for module in counted]
+    try:
+        run()
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return total
+
+
+def _flops_per_output(module: nn.Module) -> int:
+    """Return what `module_flops` counts for one element of the module's output."""
+    if isinstance(module, NORMS):
+        return 4
+    if isinstance(module, nn.Linear):
+        return 2 * module.in_features
+    if isinstance(module, nn.Conv1d) and module.groups == module.in_channels:
+        return 0
+    if isinstance(module, (nn.Conv1d, nn.Conv2d)):
+        return 2 * module.in_channels // module.groups * math.prod(module.kernel_size)
+    return 0
+
+
+def true_flops(run: Callable[[], object]) -> int:
+    """Count the FLOPs of one `run()`: every matrix product, einsum, attention and scan.
+
+    Run it on the meta device, which needs no memory; elsewhere torch's counter may not know the
+    kernel (some releases count attention on a CPU as 0). Other element-wise work is not counted.
+    """
+    with FlopCounterMode(display=False) as counter:
+        run()
+    return counter.get_total_flops()
 
 
 def blank_views(num_views: int, height: int, width: int) -> Views:
@@ -87,4 +143,4 @@ def activation_gb(net: nn.Module, num_views: int, height: int, width: int) -> fl
             torch.func.functional_call(net, state, (views,))
     for group, was in zip(groups, checkpointing, strict=True):
         group.checkpointing = was
-    return sum(storage.nbytes() for storage in storages.values()) / GB
+    return sum(storage.nbytes() for storage in storages.values()) / GIGA

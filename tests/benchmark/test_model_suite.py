@@ -20,7 +20,7 @@ from asysplat.benchmark.model import (
 )
 from asysplat.benchmark.options import CPU
 from asysplat.errors import InputError
-from asysplat.evaluation.cost import true_flops
+from asysplat.evaluation.static_cost import true_flops
 
 pytestmark = pytest.mark.medium
 

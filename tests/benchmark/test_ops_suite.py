@@ -25,7 +25,7 @@ from asysplat.benchmark.products import (
 )
 from asysplat.benchmark.scenes import DISTANCE
 from asysplat.errors import InputError
-from asysplat.evaluation.cost import true_flops
+from asysplat.evaluation.static_cost import true_flops
 from asysplat.scene import Cameras
 
 pytestmark = pytest.mark.medium

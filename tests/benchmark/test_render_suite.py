@@ -28,7 +28,7 @@ from asysplat.benchmark.scenes import (
 )
 from asysplat.benchmark.timing import rise_gb
 from asysplat.errors import InputError
-from asysplat.evaluation.cost import CLEAR_PEAK
+from asysplat.evaluation.measured_cost import CLEAR_PEAK
 from asysplat.rendering import Culling
 
 

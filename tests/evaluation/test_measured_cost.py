@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from asysplat.evaluation import measured_cost
-from asysplat.evaluation.cost import reset_peak_memory
+from asysplat.evaluation.measured_cost import reset_peak_memory
 from asysplat.evaluation.measured_cost import CostMeter, mean_but_longest
 
 CPU = torch.device("cpu")

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from asysplat.data.batches import BatchSplit
 from asysplat.evaluation import measured_cost
-from asysplat.evaluation.cost import reset_peak_memory
+from asysplat.evaluation.measured_cost import reset_peak_memory
 from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.training.callbacks import Costs
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from test_side_by_side import make_batch, module  # noqa: F401
 
-from asysplat.evaluation.cost import memory_before_gb, peak_memory_gb, reset_peak_memory
+from asysplat.evaluation.measured_cost import memory_before_gb, peak_memory_gb, reset_peak_memory
 from asysplat.rendering import render
 from asysplat.training import SplattingLoss
 

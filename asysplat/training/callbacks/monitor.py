@@ -8,8 +8,7 @@ import torch
 from lightning import Callback
 from torch import nn
 
-from asysplat.evaluation.cost import memory_gb, peak_memory_gb
-from asysplat.evaluation.measured_cost import wait_for
+from asysplat.evaluation.measured_cost import memory_gb, peak_memory_gb, wait_for
 from asysplat.evaluation.peak import peak_flops
 from asysplat.evaluation.static_cost import forward_flops
 from asysplat.training.histogram import Histogram
