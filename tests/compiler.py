@@ -1,10 +1,14 @@
 """Triton without a GPU: its compiler for other machines, and its interpreter."""
 
 import os
-import subprocess
-import sys
 
+import pytest
 import torch
+
+# Triton reads TRITON_INTERPRET when it is first imported: tests of "cuda" run a second time in a
+# process that has it set, on a CPU.
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+DEVICE = "cpu" if INTERPRETED else "cuda"
 
 TYPES = {torch.bfloat16: "bf16", torch.float32: "fp32", torch.float64: "fp64"}
 TYPES |= {torch.int16: "i16", torch.int32: "i32", torch.int64: "i64", torch.bool: "i1"}
@@ -53,12 +57,6 @@ def collect_kernels(monkeypatch, architecture, variant):
     return kernels
 
 
-def run_interpreted(*arguments):
-    """Run test files again in a process in which Triton interprets its kernels on a CPU."""
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments],
-        env={**os.environ, "TRITON_INTERPRET": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout
+def kernel(test):
+    """Run a test where there is a device for kernels."""
+    return test if INTERPRETED else pytest.mark.gpu(test)

@@ -14,12 +14,13 @@ from unittest import mock
 
 import pytest
 import torch
+from compiler import INTERPRETED
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from asysplat.scene import Cameras, Gaussians
 
-if os.environ.get("TRITON_INTERPRET") == "1":
+if INTERPRETED:
     import interpreter  # noqa: F401
 
 REPO = Path(__file__).resolve().parents[1]
@@ -138,6 +139,14 @@ def _make_scene(count=12, views=1, height=13, width=17, degree=1, dtype=torch.fl
 @pytest.fixture(autouse=True)
 def seed():
     torch.manual_seed(0)
+
+
+@pytest.fixture
+def threads():
+    """Set the number of threads until the test's end."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
 
 
 def pytest_collection_modifyitems(items):

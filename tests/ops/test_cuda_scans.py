@@ -1,42 +1,17 @@
-"""The Triton scans against the reference in float64: on a GPU, or in Triton's interpreter.
-
-Triton reads TRITON_INTERPRET when it is first imported, so one test runs this file a second time,
-in a process that has it set: there, what is marked `kernel` runs on a CPU.
-"""
-
-import os
+"""The Triton scans against the reference in float64: on a GPU, or in Triton's interpreter."""
 
 import pytest
 import torch
-from compiler import run_interpreted
+from compiler import DEVICE, INTERPRETED, kernel
+from scans import NAMES, SCANS, make_arguments
 
 from asysplat.errors import InputError
-from asysplat.ops import selective_scan, ssd
 
-INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-DEVICE = "cpu" if INTERPRETED else "cuda"
-SCANS = {"ssd": ssd, "selective_scan": selective_scan}
 CHUNKS = {"ssd": 16, "selective_scan": 4} if INTERPRETED else {"ssd": 64, "selective_scan": 16}
-NAMES = ("y", "x", "dt", "A", "B", "C", "D")
 
 
-def kernel(test):
-    """Runs where there is a device for kernels."""
-    return test if INTERPRETED else pytest.mark.gpu(test)
-
-
-def arguments(name, length, batch=2, channels=3, head_dim=16, state=16, dtype=torch.float32):
-    """x, dt, A, B, C, D; `channels` heads of `head_dim`, or channels."""
-    heads = (channels, head_dim) if name == "ssd" else (channels,)
-    rates = (channels,) if name == "ssd" else (channels, state)
-    return [
-        torch.randn(batch, length, *heads).to(dtype),
-        torch.rand(batch, length, channels),
-        -torch.rand(rates) - 0.1,
-        torch.randn(batch, length, state).to(dtype),
-        torch.randn(batch, length, state).to(dtype),
-        torch.randn(channels),
-    ]
+def arguments(name, length, **options):
+    return list(make_arguments(name, length, **{"head_dim": 16, "state": 16} | options))
 
 
 def run(name, tensors, backend, reverse):
@@ -52,7 +27,7 @@ def check(name, tensors, reverse=False, tolerance=2e-6, backend="reference", dim
     """Relative L2 errors; over all, or of each channel or head, along its place in `dims`."""
     exact = run(name, [tensor.double() for tensor in tensors], backend, reverse)
     got = run(name, tensors, "cuda", reverse)
-    for part, a, b, like in zip(NAMES, got, exact, (tensors[0], *tensors), strict=True):
+    for part, a, b, like in zip(("y", *NAMES), got, exact, (tensors[0], *tensors), strict=True):
         assert a.dtype == like.dtype and a.isfinite().all(), part
         dim = None if dims is None else dims[part]
         if dim is not None:
@@ -159,10 +134,3 @@ def test_long_sequences_equal_the_chunked_form_and_repeat(name, reverse):
     )
     first, again = (run(name, tensors, "cuda", reverse) for _ in range(2))
     assert all(map(torch.equal, first, again))
-
-
-@pytest.mark.medium
-@pytest.mark.skipif(INTERPRETED, reason="this is that process")
-def test_kernels_in_the_interpreter():
-    pytest.importorskip("triton")
-    run_interpreted(__file__)

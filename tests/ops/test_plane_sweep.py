@@ -1,15 +1,10 @@
-"""The plane sweep: its backends against the reference in float64, and known depths.
+"""The plane sweep: its backends against the reference in float64, and known depths."""
 
-Triton reads TRITON_INTERPRET when it is first imported, so one test runs this file a second time,
-in a process that has it set: there, "cuda" runs on a CPU.
-"""
-
-import os
 from importlib import import_module
 
 import pytest
 import torch
-from compiler import run_interpreted
+from compiler import DEVICE, INTERPRETED
 from surfaces import cameras_at, depth_of_plane, four_cameras, slanted_plane, texture
 
 from asysplat.models.prior.plane_sweep import plane_sweep
@@ -21,12 +16,11 @@ from asysplat.models.prior.projections import (
 from asysplat.ops.plane_sweep import reference
 from asysplat.scene import Cameras
 
-INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 FAST = [
     pytest.param("cpu", marks=pytest.mark.skipif(INTERPRETED, reason="for cuda alone")),
     pytest.param("cuda", marks=[] if INTERPRETED else pytest.mark.gpu),
 ]
-DEVICE = {"cpu": "cpu", "cuda": "cpu" if INTERPRETED else "cuda"}
+DEVICES = {"cpu": "cpu", "cuda": DEVICE}
 # height, width, scenes, views, neighbors, planes, stride
 SIZES = [
     (6, 8, 1, 3, 2, 16, 1),
@@ -63,7 +57,7 @@ def test_cost_volume_equals_the_reference(backend, size):
     form = import_module(f"asysplat.ops.plane_sweep.{backend}")
     arguments = cost_arguments(*size)
     exact = reference.cost_volume(*converted(arguments, torch.float64))
-    device = DEVICE[backend]
+    device = DEVICES[backend]
     got = form.cost_volume(*(a.to(device) if torch.is_tensor(a) else a for a in arguments))
     assert got.dtype == torch.float32 and got.shape == exact.shape
     # Inside the image may depend on the last bit at its border: at one pixel in a thousand.
@@ -80,7 +74,7 @@ def test_sgm_equals_the_reference(backend, size):
     weights = torch.rand(scenes, views, height, width)
     edges = 0.2 * torch.rand(scenes, views, 2, height, width)
     exact = reference.sgm(costs.double(), weights.double(), edges.double())
-    got = form.sgm(*(tensor.to(DEVICE[backend]) for tensor in (costs, weights, edges)))
+    got = form.sgm(*(tensor.to(DEVICES[backend]) for tensor in (costs, weights, edges)))
     for there, here in zip(exact, got, strict=True):
         assert here.dtype == torch.float32 and here.shape == there.shape
         # Two planes may cost the same to the last bit: at one pixel in a hundred.
@@ -98,7 +92,7 @@ def test_consistency_equals_the_reference(backend, size):
     trust = torch.rand(scenes, views, height, width)
     arguments = inverse, inverse.mean((-1, -2)) / 4, trust, chosen, projections
     exact = reference.consistency(*converted(arguments, torch.float64))
-    got = form.consistency(*(tensor.to(DEVICE[backend]) for tensor in arguments))
+    got = form.consistency(*(tensor.to(DEVICES[backend]) for tensor in arguments))
     for name, there, here in zip(exact._fields, exact, got, strict=True):
         assert here.dtype == torch.float32 and here.shape == there.shape
         # Inside and agreeing may depend on the last bit: at one pixel in a thousand.
@@ -197,10 +191,3 @@ def test_scenes_of_a_batch_are_independent():
         alone = plane_sweep(images, cameras.to(torch.float32))
         torch.testing.assert_close(together.inverse_depth[scene], alone.inverse_depth[0])
         torch.testing.assert_close(together.confidence[scene], alone.confidence[0])
-
-
-@pytest.mark.medium
-@pytest.mark.skipif(INTERPRETED, reason="this is that process")
-def test_kernels_in_the_interpreter():
-    pytest.importorskip("triton")
-    run_interpreted(__file__, "-k", "cuda")

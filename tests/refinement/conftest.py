@@ -9,14 +9,6 @@ from asysplat.refinement.init import gaussians_from_prior
 from asysplat.refinement.merge import merge_to_limit
 
 
-@pytest.fixture
-def threads():
-    """Sets their number, until the test's end."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="session")
 def room():
     """Photographs of a room with their depths: 12 to fit to, and 3 between them."""

@@ -1,15 +1,10 @@
-"""The Triton renderer against the reference in float64: on a GPU, or in Triton's interpreter.
+"""The Triton renderer against the reference in float64: on a GPU, or in Triton's interpreter."""
 
-Triton reads TRITON_INTERPRET when it is first imported, so one test runs this file a second time,
-in a process that has it set: there, what is marked `kernel` runs on a CPU.
-"""
-
-import os
 import sys
 
 import pytest
 import torch
-from compiler import run_interpreted
+from compiler import DEVICE, INTERPRETED, kernel
 
 from asysplat.errors import InputError
 from asysplat.rendering import GSPLAT_1_5, Culling, cpu, reference
@@ -17,15 +12,8 @@ from asysplat.rendering.interface import RenderSettings
 from asysplat.rendering.render import BACKENDS
 from asysplat.scene import Cameras, Gaussians
 
-INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-DEVICE = "cpu" if INTERPRETED else "cuda"
 draw_by_cuda = BACKENDS["cuda"]
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
-
-
-def kernel(test):
-    """Runs where there is a device for kernels."""
-    return test if INTERPRETED else pytest.mark.gpu(test)
 
 
 def weighted_sum(image):
@@ -247,10 +235,3 @@ def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
     monkeypatch.setitem(sys.modules, "triton", None)
     with pytest.raises(InputError, match="'cuda' needs triton: pip install triton"):
         draw_by_cuda(*make_batch(make_scene), RenderSettings())
-
-
-@pytest.mark.medium
-@pytest.mark.skipif(INTERPRETED, reason="this is that process")
-def test_kernels_in_the_interpreter():
-    pytest.importorskip("triton")
-    run_interpreted(__file__)

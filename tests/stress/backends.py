@@ -1,10 +1,10 @@
 """The backends under test, and their images and gradients of every input for a scene."""
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
+from compiler import INTERPRETED
 from torch import Tensor
 
 from asysplat.rendering import render
@@ -42,9 +42,7 @@ BACKENDS = (
     Backend("cpu", torch.float32, 1e-6, 5e-6, 3000),
 )
 FAST = tuple(backend for backend in BACKENDS if backend.name != "reference")
-# A process in which Triton interprets its kernels, see test_in_triton.py, tests them alone.
-INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-if INTERPRETED:
+if INTERPRETED:  # see test_in_triton.py
     FAST = BACKENDS = (Backend("cuda", torch.float32, 1e-6, 5e-6, 60),)
 
 

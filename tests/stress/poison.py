@@ -45,7 +45,7 @@ def poisoned(fill: int | None) -> Iterator[None]:
 
 def perturb(byte: int) -> None:
     """Make malloc fill its memory with a byte; 0 stops that."""
-    if not ctypes.CDLL(None).mallopt(M_PERTURB, byte):
+    if sys.platform == "linux" and not ctypes.CDLL(None).mallopt(M_PERTURB, byte):
         raise OSError("mallopt refuses M_PERTURB")
 
 

@@ -2,39 +2,23 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from backends import BACKGROUND, FIELDS, INPUTS, assert_same_bits, both_ways
+from poison import FILLS, poisoned
 
 from asysplat.rendering import render
 from asysplat.scene import Gaussians
 
 
-@pytest.fixture
-def poisoned_memory(monkeypatch):
-    """Uninitialized memory holds NaN, or 99 in integers."""
-
-    def poisoned(shape, dtype=float, **options):
-        array = allocate(shape, dtype, **options)
-        array.fill(np.nan if array.dtype.kind == "f" else 99)
-        return array
-
-    allocate = np.empty
-    monkeypatch.setattr(np, "empty", poisoned)
-    torch.use_deterministic_algorithms(True)  # fills torch's
-    yield
-    torch.use_deterministic_algorithms(False)
-
-
 @pytest.mark.parametrize("depth", [False, "expected", "median"])
-def test_case_24_every_element_is_written(backend, make_scene, request, depth):
+def test_case_24_every_element_is_written(backend, make_scene, depth):
     gaussians, cameras = make_scene(count=60, views=3, height=33, width=35, dtype=torch.float32)
     gaussians.means[::2, 2] -= 10  # culled
     gaussians.opacities[1::4] = 1.0  # and opaque: some are behind the stop
     clean = both_ways(backend, gaussians, cameras, depth=depth)
-    request.getfixturevalue("poisoned_memory")
-    assert_same_bits(both_ways(backend, gaussians, cameras, depth=depth), clean)
+    with poisoned(FILLS[0]):
+        assert_same_bits(both_ways(backend, gaussians, cameras, depth=depth), clean)
 
 
 @pytest.mark.parametrize("autocast", [None, torch.bfloat16, torch.float16], ids=str)

@@ -127,13 +127,19 @@ def test_cropping_an_image(make_scene, backend, seed, left, top):
 @few
 @given(
     seed=seeds,
-    views=st.integers(2, 4),
+    views=st.integers(2, 9),
+    at_once=st.integers(1, 4),
     depth=st.sampled_from([False, "expected", "accumulated", "median"]),
     antialiased=st.booleans(),
 )
-def test_deferred_backpropagation(make_scene, backend, seed, views, depth, antialiased):
-    """Drawing one view at a time, twice, gives the gradient of all at once."""
+def test_case_18_deferred_backpropagation(
+    make_scene, backend, seed, views, at_once, depth, antialiased
+):
+    """Drawing a few views at a time, twice, gives the gradient of all at once."""
     gaussians, cameras = make_scene(views=views, seed=seed)
     options = {"depth": depth, "antialiased": antialiased}
     plain = both_ways(backend, gaussians, cameras, **options)
-    assert_close(backend, both_ways(backend, gaussians, cameras, views_at_once=1, **options), plain)
+    chunked = both_ways(backend, gaussians, cameras, views_at_once=at_once, **options)
+    for name in ("visible", "pairs", "tile_size"):
+        assert chunked.stats[name] == plain.stats[name]
+    assert_close(backend, chunked, plain)

@@ -71,16 +71,6 @@ def test_case_17_too_little_memory_is_met_by_fewer_views(backend, make_scene, mo
     assert_close(backend, result, plain)
 
 
-@pytest.mark.parametrize("views_at_once", [1, 7])
-def test_case_18_many_views_a_few_at_a_time(backend, make_scene, views_at_once):
-    gaussians, cameras = make_scene(views=20, height=5, width=6, dtype=torch.float32)
-    plain = both_ways(backend, gaussians, cameras)
-    chunked = both_ways(backend, gaussians, cameras, views_at_once=views_at_once)
-    for name in ("visible", "pairs", "tile_size"):
-        assert chunked.stats[name] == plain.stats[name]
-    assert_close(backend, chunked, plain)
-
-
 def test_case_18_offsets_are_counted_in_64_bits():
     most = np.full(3, 2**31 - 1, np.int32)
     assert _starts(most).tolist() == [0, 2**31 - 1, 2 * (2**31 - 1), 3 * (2**31 - 1)]

@@ -10,14 +10,6 @@ from asysplat.benchmark.scenes import random_scene
 from asysplat.scene import Cameras, Gaussians
 
 
-@pytest.fixture
-def threads():
-    """Sets their number, until the test's end."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
 @pytest.mark.parametrize("depth", ["expected", "median"])
 def test_case_26_any_number_of_threads_gives_the_same_bits(backend, threads, depth):
     scenes = [random_scene(backend.many, 48, 64, seed) for seed in range(2)]

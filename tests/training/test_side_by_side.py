@@ -34,14 +34,6 @@ def module(build):
     return module
 
 
-@pytest.fixture
-def threads():
-    """Sets torch's number of threads; the test's end restores it."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
 def state(module):
     """What a step of training left: gradients and running means."""
     found = {name: p.grad.clone() for name, p in module.net.named_parameters() if p.requires_grad}

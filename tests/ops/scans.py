@@ -1,6 +1,5 @@
 """The scans and backends under test, their arguments, and both passes."""
 
-import os
 from dataclasses import dataclass
 
 import torch
@@ -12,10 +11,6 @@ from asysplat.ops import selective_scan, ssd
 SCANS = {"ssd": ssd, "selective_scan": selective_scan}
 NAMES = ("x", "dt", "A", "B", "C", "D")
 BACKENDS = ["chunked", "cpu"]
-# A process in which Triton interprets its kernels tests them alone.
-INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-if INTERPRETED:
-    BACKENDS = ["cuda"]
 PATHS = [(name, backend) for name in SCANS for backend in BACKENDS]
 EXACT_PATHS = [(name, backend) for name in SCANS for backend in ("reference", "chunked")]  # float64
 
