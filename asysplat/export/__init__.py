@@ -1,8 +1,7 @@
 """Files of Gaussians, camera paths, videos and the viewer."""
 
+from asysplat.export.camera_paths import orbit, smoothed_path
 from asysplat.export.gaussians import read_gaussians, write_gaussians
-from asysplat.export.orbit import orbit
-from asysplat.export.path import smoothed_path
 from asysplat.export.ply import read_ply, write_ply
 from asysplat.export.splat import read_splat
 from asysplat.export.tensors import read_safetensors, write_safetensors

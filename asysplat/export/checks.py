@@ -32,17 +32,3 @@ def as_written(gaussians: Gaussians) -> Gaussians:
     if gaussians.num_gaussians == 0:
         raise InputError("Gaussians has no Gaussians: give at least one to write.")
     return gaussians.map(torch.Tensor.detach).to("cpu", torch.float32).validate()
-
-
-def as_read(path: Path, gaussians: Gaussians) -> Gaussians:
-    """Check a scene that was read from `path`.
-
-    Raises:
-        InputError: a batch dimension, no Gaussians, or see `Gaussians.validate`.
-    """
-    if gaussians.opacities.ndim != 1 or gaussians.num_gaussians == 0:
-        shape = tuple(gaussians.opacities.shape)
-        raise InputError(
-            f"{path} has opacities of shape {shape}: expected [N], one Gaussian or more."
-        )
-    return gaussians.validate(f"{path}: Gaussians")

@@ -11,7 +11,7 @@ import torch
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from asysplat.errors import InputError
-from asysplat.export.checks import TINY, as_read, as_written, existing
+from asysplat.export.checks import TINY, as_written, existing
 from asysplat.export.ply_table import read_vertices
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
@@ -92,7 +92,7 @@ def read_ply(path: str | Path) -> Gaussians:
         opacities=logits[:, 0].double().sigmoid().float().clamp_min(TINY),
         sh=torch.cat((color[:, None], rest.unflatten(1, (3, count // 3)).mT), 1),
     )
-    return as_read(path, gaussians)
+    return gaussians.validate(f"{path}: Gaussians")
 
 
 def _rest(count: int) -> list[str]:

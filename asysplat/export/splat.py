@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from asysplat.errors import InputError
-from asysplat.export.checks import TINY, as_read, existing
+from asysplat.export.checks import TINY, existing
 from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Gaussians
 
@@ -38,4 +38,4 @@ def read_splat(path: str | Path) -> Gaussians:
         opacities=rgba[:, 3].clamp_min(TINY),
         sh=(rgba[:, None, :3] - 0.5) / SH_C0,
     )
-    return as_read(path, gaussians)
+    return gaussians.validate(f"{path}: Gaussians")

@@ -7,7 +7,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from asysplat.errors import InputError
-from asysplat.export.checks import as_read, as_written, existing
+from asysplat.export.checks import as_written, existing
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 
@@ -53,4 +53,9 @@ def read_safetensors(path: str | Path) -> tuple[Gaussians, dict[str, str]]:
         gaussians = Gaussians(**{name: tensors[name] for name in NAMES})
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return as_read(path, gaussians), metadata
+    if gaussians.opacities.ndim != 1 or gaussians.num_gaussians == 0:
+        shape = tuple(gaussians.opacities.shape)
+        raise InputError(
+            f"{path} has opacities of shape {shape}: expected [N], one Gaussian or more."
+        )
+    return gaussians.validate(f"{path}: Gaussians"), metadata

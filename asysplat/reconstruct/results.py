@@ -1,6 +1,5 @@
 """The result folder of a reconstruction: scene files, metrics, figures, a video."""
 
-import csv
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -16,12 +15,9 @@ from asysplat.errors import InputError
 from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
+from asysplat.evaluation.rows import average, write_csv
 from asysplat.evaluation.scene import measure_scene
-from asysplat.export.orbit import orbit
-from asysplat.export.path import smoothed_path
-from asysplat.export.ply import write_ply
-from asysplat.export.tensors import write_safetensors
-from asysplat.export.video import write_video
+from asysplat.export import orbit, smoothed_path, write_ply, write_safetensors, write_video
 from asysplat.files import atomic_write
 from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.refine import RefinementProgress
@@ -109,23 +105,19 @@ class Results:
             sets["held_out"] = (held_out, photographs.held_out_files)
         for name, (views, files) in sets.items():
             metrics = measure_scene(gaussians, views, self._background, self._protocol, self._lpips)
-            results |= _means(name, metrics)
-            for view, file in enumerate(files):
-                row = {metric: values[view] for metric, values in metrics.items()}
-                rows.append({"set": name, "file": file, **row})
+            numbers = [{m: metrics[m][view] for m in metrics} for view in range(views.num_views)]
+            results |= _means(name, numbers)
+            labels = ({"set": name, "file": file} for file in files)
+            rows += [label | row for label, row in zip(labels, numbers, strict=True)]
         for name, draw in BASELINES.items() if held_out is not None else ():
-            metrics = {}
+            numbers = []
             for view, image in enumerate(draw(inputs, held_out)):  # SSIM of all takes much memory
                 target = held_out.select([view])
-                values = self._protocol.image_metrics(image[None], target, self._lpips)
-                for metric, value in values.items():
-                    metrics.setdefault(metric, []).append(value.item())
-            results |= _means(f"baseline/{name}", metrics)
+                metrics = self._protocol.image_metrics(image[None], target, self._lpips)
+                numbers.append({metric: value.item() for metric, value in metrics.items()})
+            results |= _means(f"baseline/{name}", numbers)
         write_json(self.folder / "metrics.json", results)
-        with atomic_write(self.folder / "metrics.csv") as path, open(path, "w", newline="") as file:
-            writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
-            writer.writeheader()
-            writer.writerows(rows)
+        write_csv(self.folder / "metrics.csv", rows)
         _print_table(results)
 
     @torch.no_grad()
@@ -136,18 +128,15 @@ class Results:
         rows = min(SHEET_ROWS, views.num_views)
         views = views.select(torch.linspace(0, views.num_views - 1, rows).round().long())
         outs = [render(gaussians, views.cameras.select([v]), self._background) for v in range(rows)]
-        tensors = {
-            part: torch.cat([getattr(out, part) for out in outs])
-            for part in ("image", "alpha", "depth")
-        }
+        parts = ("image", "alpha", "depth")
+        tensors = {part: torch.cat([getattr(out, part) for out in outs]) for part in parts}
         figure = comparison_figure(inputs, views, Rendering(**tensors, stats={}))
         with atomic_write(self.folder / name) as path:
             figure.savefig(path, dpi=110)
 
 
-def _means(name: str, metrics: dict[str, list[float]]) -> dict[str, float]:
-    means = {metric: torch.tensor(values).nanmean() for metric, values in metrics.items()}
-    return {f"{name}/{metric}": mean.item() for metric, mean in means.items()}
+def _means(name: str, rows: list[dict[str, float]]) -> dict[str, float]:
+    return {f"{name}/{metric}": mean for metric, mean in average(rows, "images").items()}
 
 
 def _print_table(results: dict[str, float | int | str]) -> None:
@@ -157,7 +146,6 @@ def _print_table(results: dict[str, float | int | str]) -> None:
     for row in TABLE_ROWS:
         if f"{row}/psnr" in results:
             cells = (results.get(f"{row}/{metric}") for metric in columns)
-            table.add_row(
-                row.replace("_", " "), *("" if cell is None else f"{cell:.3f}" for cell in cells)
-            )
+            cells = ("" if cell is None else f"{cell:.3f}" for cell in cells)
+            table.add_row(row.replace("_", " "), *cells)
     Console().print(table)

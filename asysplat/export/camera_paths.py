@@ -1,0 +1,234 @@
+"""Camera paths of videos: along the input cameras, or around the scene."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from asysplat.errors import InputError
+from asysplat.rendering.reference.math import rotations
+from asysplat.scene import Cameras
+
+ROUNDING = 1e-6  # relative to coordinates, or in radians; smaller differences are rounding
+# Of paths along the cameras.
+MAX_DETOUR = 1.5  # of the given order, over that of nearest neighbors
+SAMPLES = 2000  # of a path, before it is smoothed
+SMOOTHING = 0.02  # standard deviation of the Gaussian filter, over the path's length
+# Of orbits.
+PARALLEL = 0.01  # mean squared angle between axes and their mean, below it parallel: 6 degrees
+FOCUS_DISTANCE = 4.0  # in spreads of the cameras, if their axes do not meet
+MIN_UP_COSINE = 0.5  # between the world's up and the cameras' mean up: 60 degrees
+MAX_GAP = np.radians(90)  # between neighbors on a full circle
+MIN_SWING = np.radians(5)  # to either side
+MAX_STEEPNESS = 10.0  # distance over radius, so that no camera looks straight down
+
+
+def smoothed_path(cameras: Cameras, frames: int) -> Cameras:
+    """Build a smooth path through the cameras at constant speed, from the first to the last.
+
+    A turn of one radian counts as much as a translation by the cameras' spread. Cameras that are
+    not in the order of a walk are sorted by nearest neighbors first.
+
+    Args:
+        cameras: [V], without batch dimension.
+        frames: number of video frames.
+
+    Returns:
+        [frames] with the mean intrinsics, all equal if the cameras are.
+
+    Raises:
+        InputError: a batch dimension, no views, no frames, or see `Cameras.validate`.
+    """
+    poses = _checked_poses(cameras, frames)
+    poses = poses[_short_order(_pose_vectors(poses))]
+    steps = _lengths(np.diff(_pose_vectors(poses), axis=0))
+    moves = steps > ROUNDING
+    if not moves.any():
+        return _with_poses(cameras, poses[:1].repeat(frames, 0))
+    positions = np.append(0.0, steps[moves].cumsum())
+    smoothed = _smoothed(poses[np.append(True, moves)], positions)
+    positions = np.append(0.0, _lengths(np.diff(_pose_vectors(_rigid(smoothed)), axis=0)).cumsum())
+    times = np.linspace(0, positions[-1], frames)
+    evenly = np.stack([np.interp(times, positions, column) for column in smoothed.T], 1)
+    return _with_poses(cameras, _rigid(evenly))
+
+
+def _short_order(vectors: Float[ndarray, "V 12"]) -> Int[ndarray, " V"]:
+    """Return the given order, or that of nearest neighbors if it is far shorter.
+
+    The latter starts with the view farthest from the mean, an end of the path.
+    """
+    given = np.arange(len(vectors))
+    order = [int(_lengths(vectors - vectors.mean(0)).argmax())]
+    left = np.delete(given, order[0])
+    while len(left):
+        nearest = _lengths(vectors[left] - vectors[order[-1]]).argmin()
+        order.append(int(left[nearest]))
+        left = np.delete(left, nearest)
+    as_given, short = (_lengths(np.diff(vectors[o], axis=0)).sum() for o in (given, order))
+    return np.array(order) if as_given > MAX_DETOUR * short else given
+
+
+def _smoothed(
+    poses: Float[ndarray, "V 4 4"], positions: Float[ndarray, " V"]
+) -> Float[ndarray, "samples 7"]:
+    """Interpolate poses by splines, smoothed, as centers and quaternions wxyz of any norm."""
+    # Here, as they would slow down import asysplat.
+    from scipy.interpolate import CubicSpline
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    samples = np.linspace(0, positions[-1], SAMPLES)
+    centers = CubicSpline(positions, poses[:, :3, 3])(samples)
+    quats = RotationSpline(positions, Rotation.from_matrix(poses[:, :3, :3]))(samples)
+    quats = quats.as_quat(scalar_first=True)
+    # q and -q are the same rotation: neighbors get the same sign.
+    flips = (quats[1:] * quats[:-1]).sum(1) < 0
+    quats[1:] *= np.where(flips, -1, 1).cumprod()[:, None]
+    states = np.concatenate((centers, quats), 1)
+    return gaussian_filter1d(states, SMOOTHING * SAMPLES, axis=0, mode="nearest")
+
+
+def _rigid(states: Float[ndarray, "T 7"]) -> Float[ndarray, "T 4 4"]:
+    poses = np.tile(np.eye(4), (len(states), 1, 1))
+    poses[:, :3, :3] = rotations(torch.from_numpy(states[:, 3:])).numpy()
+    poses[:, :3, 3] = states[:, :3]
+    return poses
+
+
+def orbit(cameras: Cameras, frames: int) -> Cameras:
+    """Build a closed path around the focus point, at the cameras' mean height and distance.
+
+    A full circle if the cameras are all around, else to and fro within their arc, as other sides of
+    the scene are unobserved.
+
+    Args:
+        cameras: [V], without batch dimension.
+        frames: number of video frames.
+
+    Returns:
+        [frames] upright cameras that look at the point, with the mean intrinsics.
+
+    Raises:
+        InputError: a batch dimension, no views, no frames, or see `Cameras.validate`.
+    """
+    poses = _checked_poses(cameras, frames)
+    vectors = _pose_vectors(poses)
+    middle = int(_lengths(vectors - vectors.mean(0)).argmin())
+    focus = _focus(poses, cameras, middle)
+    visible = _visible(focus, poses, cameras)
+    visible[middle] = True
+    up = _up(poses, middle)
+    offsets = poses[visible, :3, 3] - focus
+    heights = offsets @ up
+    flat = offsets - heights[:, None] * up
+    radius = max(_lengths(flat).mean(), _lengths(offsets).mean() / MAX_STEEPNESS)
+    direction = poses[middle, :3, 3] - focus
+    x = direction - (direction @ up) * up
+    if np.linalg.norm(x) < ROUNDING * np.linalg.norm(direction):
+        x = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    x /= np.linalg.norm(x)
+    y = np.cross(up, x)
+    angles = _angles(np.arctan2(flat @ y, flat @ x), frames)[:, None]
+    circle = radius * (np.cos(angles) * x + np.sin(angles) * y)
+    centers = focus + heights.mean() * up + circle
+    forward = focus - centers
+    right = np.cross(forward, up)
+    axes = np.stack((right, np.cross(forward, right), forward), 2)
+    path = np.tile(np.eye(4), (frames, 1, 1))
+    path[:, :3, :3] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    path[:, :3, 3] = centers
+    return _with_poses(cameras, path)
+
+
+def _up(poses: Float[ndarray, "V 4 4"], middle: int) -> Float[ndarray, "3"]:
+    """Return the world's up direction.
+
+    Photographers keep the horizon level, so that up is perpendicular to all cameras' x axes. If
+    these are parallel, up is the cameras' mean up.
+    """
+    right, up = poses[:, :3, 0], -poses[:, :3, 1].mean(0)
+    if np.linalg.norm(up) < ROUNDING:  # they cancel
+        up = -poses[middle, :3, 1]
+    up /= np.linalg.norm(up)
+    variances, directions = np.linalg.eigh(right.T @ right / len(right))
+    across = directions[:, 0] * np.sign(directions[:, 0] @ up)
+    return across if variances[1] > PARALLEL and across @ up > MIN_UP_COSINE else up
+
+
+def _focus(poses: Float[ndarray, "V 4 4"], cameras: Cameras, middle: int) -> Float[ndarray, "3"]:
+    """Return the point nearest to all optical axes, if it is visible in most views.
+
+    Otherwise (axes nearly parallel, or meeting at or behind the cameras) return a point in front of
+    the middle camera.
+    """
+    centers, axes, size = poses[:, :3, 3], poses[:, :3, 2], _spread(poses)
+    if size:
+        across = np.eye(3) - axes[:, :, None] * axes[:, None]
+        matrix = across.mean(0)
+        if np.linalg.eigvalsh(matrix)[0] > PARALLEL:
+            point = np.linalg.solve(matrix, np.einsum("vij,vj->i", across, centers) / len(poses))
+            if _visible(point, poses, cameras).mean() > 0.5:
+                return point
+    return centers[middle] + (FOCUS_DISTANCE * size or 1.0) * axes[middle]
+
+
+def _visible(
+    point: Float[ndarray, "3"], poses: Float[ndarray, "V 4 4"], cameras: Cameras
+) -> Bool[ndarray, " V"]:
+    exact = replace(cameras.to("cpu", torch.float64), cam_to_world=torch.from_numpy(poses))
+    _, _, inside = exact.project(torch.from_numpy(point[None]))
+    return inside[:, 0].detach().numpy()
+
+
+def _angles(angles: Float[ndarray, " S"], frames: int) -> Float[ndarray, " T"]:
+    """Return the frames' angles: a full circle, or to and fro over the cameras' arc."""
+    turn = 2 * np.pi * np.arange(frames) / frames
+    angles = np.sort(angles)
+    gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
+    widest = gaps.argmax()
+    if gaps[widest] < MAX_GAP:
+        return turn
+    swing = (2 * np.pi - gaps[widest]) / 2
+    middle = angles[widest] + gaps[widest] + swing
+    return middle + max(swing, MIN_SWING) * np.sin(turn)
+
+
+def _checked_poses(cameras: Cameras, frames: int) -> Float[ndarray, "V 4 4"]:
+    if cameras.intrinsics.ndim != 3 or cameras.num_views == 0:
+        raise InputError(
+            f"Cameras.intrinsics has shape {tuple(cameras.intrinsics.shape)}: expected [V, 3, 3] "
+            "of one scene, with one view or more."
+        )
+    if frames < 1:
+        raise InputError(f"frames is {frames}: give 1 or more.")
+    return cameras.validate().cam_to_world.detach().cpu().double().numpy()
+
+
+def _with_poses(cameras: Cameras, poses: Float[ndarray, "T 4 4"]) -> Cameras:
+    """Return cameras with other poses and the mean intrinsics."""
+    return replace(
+        cameras,
+        intrinsics=cameras.intrinsics.mean(0).repeat(len(poses), 1, 1),
+        cam_to_world=torch.from_numpy(poses).to(cameras.cam_to_world),
+    )
+
+
+def _spread(poses: Float[ndarray, "V 4 4"]) -> float:
+    """Return the RMS distance of the centers from their mean, 0 if it is rounding."""
+    centers = poses[:, :3, 3]
+    size = float(np.sqrt(np.square(centers - centers.mean(0)).sum(1).mean()))
+    return size if size > ROUNDING * np.abs(centers).max() else 0.0
+
+
+def _pose_vectors(poses: Float[ndarray, "V 4 4"]) -> Float[ndarray, "V 12"]:
+    """Return vectors whose distances are in spreads, and in radians for small turns."""
+    size = _spread(poses)
+    centers = poses[:, :3, 3] / size if size else np.zeros((len(poses), 3))
+    return np.concatenate((centers, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2)), 1)
+
+
+def _lengths(vectors: Float[ndarray, "T D"]) -> Float[ndarray, " T"]:
+    return np.linalg.norm(vectors, axis=1)
