@@ -26,10 +26,10 @@ MAX_SCENES = 3  # checked of a folder of more
 
 def main(arguments: list[str] | None = None) -> int:
     parser = ArgumentParser(prog="python -m asysplat.data.check", description=__doc__)
-    parser.add_argument("path", type=Path, help="a scene, or a folder of scenes")
+    parser.add_argument(
+        "path", type=Path, help=f"a scene, or a folder of scenes, of which {MAX_SCENES} are checked"
+    )
     parser.add_argument("--layout", default="auto", choices=("auto", *LAYOUTS))
-    help_of_scene = f"check this scene of a folder; default: the first {MAX_SCENES}"
-    parser.add_argument("--scene", help=help_of_scene)
     parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
     help_of_out = "folder of SCENE/check.png, outside the data set; existing files are kept"
     parser.add_argument("--out", type=Path, default=Path("check"), help=help_of_out)
@@ -41,15 +41,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def check(options: Namespace, console: Console) -> int:
-    """Check the selected scenes, and return 0 if the cameras of all fit, else 1."""
+    """Check up to MAX_SCENES scenes, and return 0 if the cameras of all fit, else 1."""
     layout, scenes = find_scenes(options.path, options.layout)
     refuse_inside(options.out, options.path, "name a folder elsewhere with --out")
-    selected = _select(scenes, options.scene)
-    if len(scenes) > 1:
-        more = "" if len(selected) == len(scenes) else "; --scene NAME checks another"
-        console.print(f"checking {len(selected)} of {len(scenes)} scenes{more}", highlight=False)
+    checked = scenes[:MAX_SCENES]
+    if len(scenes) > len(checked):
+        more = f"checking {len(checked)} of {len(scenes)} scenes; name one of them to check another"
+        console.print(more, highlight=False)
     all_fit = True
-    for path in selected:
+    for path in checked:
         bad = BadImages(options.on_bad_image)
         scene = LAYOUTS[layout].read_scene(path, bad)
         with warnings.catch_warnings():
@@ -72,18 +72,6 @@ def save_figure(report: Report, title: str, out: Path) -> Path:
     with file.open("xb") as handle:
         draw_report(report, title).savefig(handle, format="png", dpi=110)
     return file
-
-
-def _select(scenes: list[Path], name: str | None) -> list[Path]:
-    if name is None:
-        return scenes[:MAX_SCENES]
-    selected = [scene for scene in scenes if name in scene.parts]
-    if not selected:
-        raise InputError(
-            f"--scene {name} is none of the {len(scenes)} scenes: name one, such as "
-            f"{scenes[0].name}."
-        )
-    return selected
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Measure a scene's pixels, camera path, sparse points and depth maps."""
 
-from dataclasses import dataclass
-from statistics import fmean as mean
+from statistics import fmean
 
 import torch
 from jaxtyping import Float
@@ -14,128 +13,69 @@ from asysplat.data.check.matches import Matches, epipolar_distances, triangulate
 from asysplat.data.sequence import FileSequence, ImageSequence
 from asysplat.scene import Cameras
 
-DEPTH_STRIDE = 97  # one depth in so many is sampled; a prime, so that no pixel column is favored
 POSE_TOLERANCE = 1e-6  # of equal poses: share of the path's extent, and entries of the rotation
 MAX_EPIPOLAR_ERROR = 1.0  # pixels, of a match whose depth is compared
 MIN_RAY_ANGLE = 1.5  # degrees between the rays of such a match
 
-Quartiles = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class PixelStats:
-    """Statistics of all images that can be decoded.
-
-    Args:
-        brightness: mean colors, in [0, 1], of the darkest and of the brightest image.
-        depth_known: share of the pixels whose depth is known; None without depth maps.
-        depths: quartiles of those depths, in scene units.
-        unmasked: share of the pixels that masks keep; None without masks.
-    """
-
-    brightness: tuple[float, float]
-    depth_known: float | None
-    depths: Quartiles | None
-    unmasked: float | None
-
 
 def read_pixels(
     sequence: FileSequence, bad: BadImages, console: Console | None
-) -> tuple[FileSequence, PixelStats]:
-    """Decode every image once, and return the sequence without the damaged images.
+) -> tuple[FileSequence, dict[str, float]]:
+    """Decode every image once; arguments and errors as for `check_scene`.
 
-    Arguments and errors as for `check_scene`.
+    Returns:
+        The sequence without the damaged images; and the share of the pixels with a known depth
+        under "depths", and of those that masks keep under "masks", where there are such files.
     """
-    intact, brightness, known, unmasked, depths = [], [], [], [], []
+    intact, shares = [], {}
     bar = {"console": console, "transient": True, "disable": console is None}
     for index, image in enumerate(track(sequence.scene.images, "decoding", **bar)):
         with bad.collect():
             views = sequence.views([index])
             intact.append(image)
-            brightness.append(float(views.images.mean()))
-            if views.depths is not None:
-                known.append(float((views.depths > 0).double().mean()))
-                depths.append(views.depths.flatten()[::DEPTH_STRIDE])
-            if views.masks is not None:
-                unmasked.append(float(views.masks.double().mean()))
+            for name in ("depths", "masks"):
+                if (values := getattr(views, name)) is not None:
+                    shares.setdefault(name, []).append(float((values > 0).double().mean()))
     bad.report(sequence.name, len(intact))
-    sampled = torch.cat(depths) if depths else torch.empty(0)
-    return sequence.with_images(intact), PixelStats(
-        brightness=(min(brightness), max(brightness)),
-        depth_known=mean(known) if known else None,
-        depths=quartiles(sampled[sampled > 0]),
-        unmasked=mean(unmasked) if unmasked else None,
-    )
+    return sequence.with_images(intact), {name: fmean(each) for name, each in shares.items()}
 
 
-def quartiles(values: Float[Tensor, " N"]) -> Quartiles | None:
-    """Return the quartiles; None without values."""
-    if not len(values):
-        return None
-    return tuple(values.double().quantile(torch.tensor([0.25, 0.5, 0.75]).double()).tolist())
+def measure_path(
+    cameras: Cameras,
+) -> tuple[float, Float[Tensor, " steps"], Float[Tensor, " steps"], int]:
+    """Measure the path of the cameras, in the order of the images.
 
-
-@dataclass(frozen=True)
-class CameraPath:
-    """Lengths in scene units and angles in degrees; steps are from image to image.
-
-    Args:
-        length: of the whole path.
-        extent: longest side of the box around all cameras.
-        step, longest_step: median and greatest distance.
-        turn, widest_turn: median and greatest rotation.
-        repeated: number of images with the pose of an earlier image.
+    Returns:
+        The longest side of the box around all cameras, and the distance from image to image, in
+        scene units; the rotation from image to image, in degrees; and the number of images with the
+        pose of an earlier image.
     """
-
-    length: float
-    extent: float
-    step: float
-    longest_step: float
-    turn: float
-    widest_turn: float
-    repeated: int
-
-
-def measure_path(cameras: Cameras) -> CameraPath:
-    """Measure the path of the cameras, in the order of the images."""
     centers = cameras.centers.double()
     rotations = cameras.cam_to_world[:, :3, :3].double()
-    steps = (centers[1:] - centers[:-1]).norm(dim=-1)
     # From the chord, since an arccosine is not precise for small angles.
     chords = (rotations[1:] - rotations[:-1]).flatten(1).norm(dim=-1)
     turns = torch.rad2deg(2 * torch.arcsin((chords / 8**0.5).clamp(max=1)))
     extent = (centers.amax(0) - centers.amin(0)).max()
     poses = torch.cat((centers / extent.clamp(min=1e-12), rotations.flatten(1)), 1)
     equal = torch.cdist(poses, poses, compute_mode="donot_use_mm_for_euclid_dist") < POSE_TOLERANCE
-    return CameraPath(
-        length=float(steps.sum()),
-        extent=float(extent),
-        step=float(steps.median()),
-        longest_step=float(steps.max()),
-        turn=float(turns.median()),
-        widest_turn=float(turns.max()),
-        repeated=int(equal.tril(-1).any(1).sum()),
-    )
+    repeated = int(equal.tril(-1).any(1).sum())
+    return float(extent), (centers[1:] - centers[:-1]).norm(dim=-1), turns, repeated
 
 
-def count_points(cameras: Cameras, points: Float[Tensor, "P 3"]) -> tuple[float, float]:
-    """Count the images that each point (float64) lies in, in front of the camera.
-
-    Returns:
-        The share of the points inside two images or more, and the median number of images.
-    """
+def shared_points(cameras: Cameras, points: Float[Tensor, "P 3"]) -> float:
+    """Return the share of points (float64) inside two images or more, in front of the cameras."""
     views = torch.zeros(len(points), dtype=torch.int64)
     for view in range(cameras.num_views):
         _, _, inside = cameras.select([view]).to(torch.float64).project(points)
         views += inside[0]
-    return float((views >= 2).double().mean()), float(views.double().median())
+    return float((views >= 2).double().mean())
 
 
-def compare_depths(sequence: ImageSequence, matches: Matches) -> tuple[Quartiles | None, int]:
+def compare_depths(sequence: ImageSequence, matches: Matches) -> tuple[float, int]:
     """Compare depth maps with precisely triangulated matches.
 
     Returns:
-        Quartiles of stored over triangulated depths, and the number of points compared.
+        The median of stored over triangulated depths, and the number of points compared.
     """
     cameras = sequence.cameras.to(torch.float64)
     depths, angles = triangulate(cameras, matches)
@@ -152,4 +92,4 @@ def compare_depths(sequence: ImageSequence, matches: Matches) -> tuple[Quartiles
         ratios.append(stored[row, column] / depths[in_image])
     known = torch.cat(ratios)
     known = known[known > 0]
-    return quartiles(known), len(known)
+    return float(known.median()), len(known)

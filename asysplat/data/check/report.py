@@ -1,7 +1,7 @@
 """Diagnose the cameras of a scene, and collect all measurements in a report."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,13 +11,10 @@ from rich.console import Console
 from asysplat.data.bad_images import BadImages
 from asysplat.data.check.matches import Matches, epipolar_distances, find_matches, triangulate
 from asysplat.data.check.measurements import (
-    CameraPath,
-    PixelStats,
-    Quartiles,
     compare_depths,
-    count_points,
     measure_path,
     read_pixels,
+    shared_points,
 )
 from asysplat.data.check.mistakes import Mistake, common_mistakes, other_focal, other_resolution
 from asysplat.data.images import Lens, content_hash
@@ -35,6 +32,9 @@ MIN_RAY_ANGLE = 1.0  # degrees; below it, noise decides on which side two rays m
 MAX_FACTOR = 10.0  # fitted factors lie between 1 / MAX_FACTOR and MAX_FACTOR
 TRIALS = 41  # factors tried, coarsely and then finely
 FIT_STRIDE = 3  # one match in so many is used to fit them
+MAX_LENSES = 3  # printed one by one
+MAX_DAMAGED = 10  # printed one by one
+DEPTH_AGREEMENT = (0.8, 1.25)  # median of depth maps over triangulated depths without advice
 
 NO_MISTAKE_FOUND = (
     "the cameras do not fit the images, and no usual mistake explains it: check in check.png "
@@ -74,15 +74,11 @@ class Verdict:
         fits: whether the cameras as read fit the images.
         sentence: the same in words; if they do not fit, the reason and what to do.
         fit: of the cameras as read; None with too few matches.
-        mistake, corrected: the mistake that explains the matches best, and the fit of the cameras
-            after its correction.
     """
 
     fits: bool
     sentence: str
     fit: Fit | None = None
-    mistake: Mistake | None = None
-    corrected: Fit | None = None
 
 
 def diagnose_cameras(cameras: Cameras, matches: Matches, names: Sequence[str]) -> Verdict:
@@ -111,12 +107,12 @@ def diagnose_cameras(cameras: Cameras, matches: Matches, names: Sequence[str]) -
         error = f"{corrected.error:.2f} px"
         sentence = f"{mistake.name} (corrected, the error is {error}): {mistake.fix}"
     elif fit.penalty < MAX_ERROR:
-        return Verdict(True, "the cameras fit the images", fit, mistake, corrected)
+        return Verdict(True, "the cameras fit the images", fit)
     elif fit.error < MAX_ERROR:
         sentence = "the points that the images share lie behind the cameras: see check.png"
     else:
         sentence = ROUGH_FIT if fit.penalty < ROUGH_ERROR else NO_MISTAKE_FOUND
-    return Verdict(False, sentence, fit, mistake, corrected)
+    return Verdict(False, sentence, fit)
 
 
 def measure_fit(cameras: Cameras, matches: Matches) -> Fit:
@@ -145,27 +141,17 @@ def _fit_factor(create: Callable[[float], Mistake], cameras: Cameras, matches: M
 
 @dataclass(frozen=True)
 class Report:
-    """All measurements of a scene; lengths are in scene units.
+    """The check of a scene.
 
     Args:
         sequence: the usable images, at the size at which they were matched.
-        damaged: an error for each image that cannot be used.
-        lenses: every kind of lens and the number of images that it took.
-        identical: number of images whose file equals an earlier one.
-        points: number, shared share and median views of the sparse points; None without any.
+        rows: the name and text of each printed measurement.
         matches: the points that the cameras are compared with.
-        depth_scale: see `compare_depths`; None without depth maps.
     """
 
     sequence: FileSequence
-    damaged: list[str]
-    lenses: list[tuple[Lens, int]]
-    identical: int
-    pixels: PixelStats
-    path: CameraPath
-    points: tuple[int, float, float] | None
+    rows: list[tuple[str, str]]
     matches: Matches
-    depth_scale: tuple[Quartiles | None, int] | None
     verdict: Verdict
 
 
@@ -185,23 +171,70 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
     lens = scene.images[0].lens
     scale = min(1.0, MAX_SIDE / max(lens.height, lens.width))
     size = (round(lens.height * scale), round(lens.width * scale))
-    sequence = FileSequence(scene, SceneOptions(*size))
-    sequence, pixels = read_pixels(sequence, bad, console)
-    images, cameras = sequence.scene.images, sequence.cameras
+    sequence, known = read_pixels(FileSequence(scene, SceneOptions(*size)), bad, console)
     matches = find_matches(sequence, console)
-    points = sequence.scene.points
-    if points is not None:
-        points = (len(points), *count_points(cameras, torch.tensor(points).double()))
-    has_depths = pixels.depth_known is not None
-    return Report(
-        sequence=sequence,
-        damaged=list(bad.errors),
-        lenses=Counter(image.lens for image in images).most_common(),
-        identical=len(images) - len({content_hash(image.file) for image in images}),
-        pixels=pixels,
-        path=measure_path(cameras),
-        points=points,
-        matches=matches,
-        depth_scale=compare_depths(sequence, matches) if has_depths else None,
-        verdict=diagnose_cameras(cameras, matches, [str(image.file) for image in images]),
+    files = [image.file for image in sequence.scene.images]
+    verdict = diagnose_cameras(sequence.cameras, matches, [str(file) for file in files])
+    rows = [
+        *_describe_files(sequence, known),
+        ("depth maps", _describe_depths(sequence, known, matches, verdict)),
+        *_at_most(MAX_DAMAGED, "left out", bad.errors),
+        *_describe_fit(matches, verdict.fit),
+    ]
+    return Report(sequence, rows, matches, verdict)
+
+
+def _describe_files(sequence: FileSequence, known: dict[str, float]) -> Iterator[tuple[str, str]]:
+    images, points = sequence.scene.images, sequence.points
+    identical = len(images) - len({content_hash(image.file) for image in images})
+    same = f", {identical} with the same file as another" if identical else ""
+    yield "images", f"{len(images)}{same}"
+    lenses = Counter(image.lens for image in images).most_common()
+    yield from _at_most(
+        MAX_LENSES, "lens", [f"{count} of {_describe_lens(lens)}" for lens, count in lenses]
     )
+    extent, steps, turns, repeated = measure_path(sequence.cameras)
+    yield "path", f"{extent:.4g} wide"
+    step = f"{steps.median():.3g} in the median, {steps.max():.3g} at most"
+    yield "a step", f"{step}; {turns.median():.2g}° in the median, {turns.max():.3g}° at most"
+    if repeated:
+        yield "", f"{repeated} images with the pose of an earlier image"
+    shared = points is not None and shared_points(sequence.cameras, torch.tensor(points).double())
+    inside = f"in front of and inside two views or more: {shared:.1%}"
+    yield "points", "none" if points is None else f"{len(points)}, {inside}"
+    yield "masks", f"{known['masks']:.1%} of the pixels are kept" if "masks" in known else "none"
+
+
+def _describe_lens(lens: Lens) -> str:
+    kind = " fisheye" if lens.fisheye else " distorted" if lens.is_distorted else ""
+    numbers = f"fx {lens.fx:.5g}, fy {lens.fy:.5g}, cx {lens.cx:.5g}, cy {lens.cy:.5g}"
+    return f"{lens.width} x {lens.height}{kind}: {numbers}"
+
+
+def _describe_depths(
+    sequence: FileSequence, known: dict[str, float], matches: Matches, verdict: Verdict
+) -> str:
+    if "depths" not in known:
+        return "none"
+    text = f"known at {known['depths']:.1%} of the pixels"
+    ratio, points = compare_depths(sequence, matches)
+    if points:
+        text += f"; {ratio:.3f} of the triangulated depths of {points} points"
+    if verdict.fits and not DEPTH_AGREEMENT[0] < ratio < DEPTH_AGREEMENT[1]:
+        text += f": divide the unit of depth by {ratio:.4g}"
+    return text
+
+
+def _describe_fit(matches: Matches, fit: Fit | None) -> Iterator[tuple[str, str]]:
+    yield "matches", f"{len(matches)} of {len(matches.pairs)} pairs of images"
+    if fit is not None:
+        text = f"{fit.error:.2f} px in the median, {fit.under_1px:.0%} under 1 px"
+        behind = f"; {fit.behind_camera:.0%} lie behind a camera"
+        yield "epipolar error", text + (behind if fit.behind_camera >= 0.01 else "")
+
+
+def _at_most(count: int, name: str, texts: Sequence[str]) -> Iterator[tuple[str, str]]:
+    for text in texts[:count]:
+        yield name, text
+    if len(texts) > count:
+        yield "", f"and {len(texts) - count} more"

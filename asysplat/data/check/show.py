@@ -1,8 +1,6 @@
 """Print a report on one screen, and draw it as a figure."""
 
-from collections.abc import Iterator, Sequence
-from math import atan, degrees, isfinite
-from typing import TypeVar
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -16,15 +14,9 @@ from rich.text import Text
 
 from asysplat.data.check.matches import epipolar_lines
 from asysplat.data.check.report import Report
-from asysplat.data.images import Lens
+from asysplat.data.selection.views import spread
 from asysplat.scene import Cameras
 
-# On the screen.
-MAX_LENSES = 3  # printed one by one; of more, the number
-MAX_DAMAGED = 10  # printed one by one
-DEPTH_AGREEMENT = (0.8, 1.25)  # median of depth maps over triangulated depths without advice
-
-# In the figure.
 WIDTH, PATH_HEIGHT, MAX_IMAGE_HEIGHT, TITLE_HEIGHT = 12.0, 5.0, 4.5, 0.3  # inches
 MAX_PAIRS = 3  # of images
 MAX_LINES = 10  # in a pair
@@ -33,96 +25,18 @@ MAX_POINTS = 5000  # sparse points, about
 POINT_QUANTILES = (0.05, 0.95)  # of the sparse points that the axes include
 MARGIN = 0.1  # around the path and the points, of their size
 
-Item = TypeVar("Item")
-
 
 def print_report(report: Report, title: str, console: Console) -> None:
     """Print the measurements line by line, and the verdict last."""
     table = Table(title=Text(title, "bold"), title_justify="left", box=None, show_header=False)
     table.add_column(style="cyan", no_wrap=True)
     table.add_column()
-    for name, text in _lines(report):
+    for name, text in report.rows:
         table.add_row(name, Text(text))
     console.print(table)
     sentence = report.verdict.sentence
     style = "bold green" if report.verdict.fits else "bold red"
     console.print(Text(f"{sentence[0].upper()}{sentence[1:]}.", style))
-
-
-def _lines(report: Report) -> Iterator[tuple[str, str]]:
-    sequence, pixels, path = report.sequence, report.pixels, report.path
-    same = f", {report.identical} with the same file as another" if report.identical else ""
-    yield "images", f"{sequence.num_images}{same}"
-    for lens, count in report.lenses[:MAX_LENSES]:
-        yield "lens", f"{count} of {_lens(lens)}"
-    if len(report.lenses) > MAX_LENSES:
-        yield "", f"and {len(report.lenses) - MAX_LENSES} other lenses"
-    yield "brightness", "{:.2f} to {:.2f}, means of images in [0, 1]".format(*pixels.brightness)
-    yield "path", f"{path.length:.4g} long, {path.extent:.4g} wide"
-    step = f"{path.step:.3g} in the median, {path.longest_step:.3g} at most"
-    turn = f"{path.turn:.2g}° in the median, {path.widest_turn:.3g}° at most"
-    yield "a step", f"{step}; {turn}"
-    if path.repeated:
-        yield "", f"{path.repeated} images with the pose of an earlier image"
-    yield "points", "none" if report.points is None else (
-        "{}, {:.1%} in front of and inside two views or more; {:g} views a point"
-    ).format(*report.points)
-    yield "depth maps", _depths(report)
-    masked = pixels.unmasked is not None
-    yield "masks", f"{pixels.unmasked:.1%} of the pixels are kept" if masked else "none"
-    for sentence in report.damaged[:MAX_DAMAGED]:
-        yield "left out", sentence
-    if len(report.damaged) > MAX_DAMAGED:
-        yield "", f"and {len(report.damaged) - MAX_DAMAGED} more"
-    yield from _fits(report)
-
-
-def _lens(lens: Lens) -> str:
-    across, down = (
-        degrees(atan(center / focal) + atan((size - center) / focal))
-        for center, focal, size in zip(
-            (lens.cx, lens.cy), (lens.fx, lens.fy), (lens.width, lens.height), strict=True
-        )
-    )
-    kind = " fisheye" if lens.fisheye else " distorted" if lens.is_distorted else ""
-    return (
-        f"{lens.width} x {lens.height}{kind}, {across:.1f}° x {down:.1f}°: fx {lens.fx:.5g}, "
-        f"fy {lens.fy:.5g}, cx {lens.cx:.5g}, cy {lens.cy:.5g}"
-    )
-
-
-def _depths(report: Report) -> str:
-    pixels = report.pixels
-    if report.depth_scale is None:
-        return "none"
-    ratios, points = report.depth_scale
-    text = f"known at {pixels.depth_known:.1%} of the pixels"
-    if pixels.depths is not None:
-        text += ", quartiles {:.4g} {:.4g} {:.4g}".format(*pixels.depths)
-    if ratios is not None:
-        text += "; over triangulated depths {:.3f} {:.3f} {:.3f}".format(*ratios)
-        text += f" ({points} points)"
-        if report.verdict.fits and not DEPTH_AGREEMENT[0] < ratios[1] < DEPTH_AGREEMENT[1]:
-            text += f": divide the unit of depth by {ratios[1]:.4g}"
-    return text
-
-
-def _fits(report: Report) -> Iterator[tuple[str, str]]:
-    verdict, matches, cameras = report.verdict, report.matches, report.sequence.cameras
-    pairs = matches.pairs
-    if not pairs:
-        yield "matches", "none"
-        return
-    gaps = sorted(abs(first - second) for first, second in pairs)
-    pairs_apart = f"{len(pairs)} pairs, {gaps[0]} to {gaps[-1]} images apart"
-    yield "matches", f"{len(matches)} of {pairs_apart}, at {cameras.width} x {cameras.height}"
-    if fit := verdict.fit:
-        text = f"{fit.error:.2f} px in the median, {fit.under_1px:.0%} under 1 px"
-        suffix = f"; {fit.behind_camera:.0%} lie behind a camera"
-        yield "epipolar error", text + (suffix if fit.behind_camera >= 0.01 else "")
-    if verdict.corrected is not None and isfinite(verdict.corrected.penalty):
-        name = "next best" if verdict.fits else "nearest"
-        yield name, f"{verdict.corrected.error:.2f} px, if {verdict.mistake.name}"
 
 
 def draw_report(report: Report, title: str) -> Figure:
@@ -138,8 +52,9 @@ def draw_report(report: Report, title: str) -> Figure:
     figure.suptitle(f"{title}: {report.verdict.sentence}", wrap=True)
     paths, images = figure.subfigures(2, 1, height_ratios=(PATH_HEIGHT, pair_height))
     _draw_path(report, *paths.subplots(1, 2))
-    pairs = _spread(report.matches.pairs, MAX_PAIRS)
-    if pairs:
+    all_pairs = report.matches.pairs
+    shown = spread(range(len(all_pairs)), min(MAX_PAIRS, len(all_pairs)))
+    if pairs := [all_pairs[index] for index in shown]:
         columns = images.subplots(2, len(pairs), squeeze=False).T.tolist()
         for plots, pair in zip(columns, pairs, strict=True):
             _draw_pair(report, pair, plots)
@@ -153,7 +68,7 @@ def _draw_path(report: Report, above: Axes, side: Axes) -> None:
     ahead = cameras.cam_to_world[:, :3, 2].double().numpy() @ axes
     sparse = np.empty((0, 3)) if points is None else points @ axes
     drawn = sparse[:: max(1, len(sparse) // MAX_POINTS)]
-    arrows = _spread(range(len(centers)), MAX_ARROWS)
+    arrows = spread(range(len(centers)), min(MAX_ARROWS, len(centers)))
     for plot, x, y, direction in ((above, 0, 1, "above"), (side, 1, 2, "the side")):
         plot.set_title(f"path from {direction}, dark to light; scene units")
         plot.scatter(drawn[:, x], drawn[:, y], s=1, c="0.7", linewidths=0)
@@ -171,8 +86,8 @@ def _draw_pair(report: Report, pair: tuple[int, int], plots: Sequence[Axes]) -> 
     sequence = report.sequence
     height, width = sequence.cameras.height, sequence.cameras.width
     matches = report.matches.of(pair)
-    left_to_right = matches.points[:, 0, 0].argsort().tolist()
-    matches = matches.select(torch.tensor(_spread(left_to_right, MAX_LINES)))
+    left_to_right = matches.points[:, 0, 0].argsort()
+    matches = matches.select(left_to_right[spread(range(len(matches)), MAX_LINES)])
     lines = epipolar_lines(sequence.cameras.to(torch.float64), matches)
     images = sequence.views(pair).images.permute(0, 2, 3, 1).numpy()
     for view, plot in enumerate(plots):
@@ -207,9 +122,3 @@ def _limits(centers: Float[ndarray, " N"], points: Float[ndarray, " P"]) -> tupl
     values = [*centers, *(np.quantile(points, POINT_QUANTILES) if len(points) else ())]
     margin = MARGIN * max(max(values) - min(values), 1e-6)
     return min(values) - margin, max(values) + margin
-
-
-def _spread(items: Sequence[Item], count: int) -> list[Item]:
-    """Select at most `count` evenly spaced items."""
-    positions = np.linspace(0, len(items) - 1, min(count, len(items)))
-    return [items[round(position)] for position in positions]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from asysplat.data.check.matches import Matches, epipolar_distances, epipolar_lines, triangulate
-from asysplat.data.check.measurements import count_points, measure_path
+from asysplat.data.check.measurements import measure_path, shared_points
 from asysplat.scene import Cameras
 
 HEIGHT, WIDTH = 120, 160
@@ -86,11 +86,10 @@ def test_a_path_is_measured():
     turn = torch.deg2rad(torch.tensor([0.0, 0, 0.5, 30, 0.5]))
     poses[:, 0, 0], poses[:, 2, 2] = turn.cos(), turn.cos()
     poses[:, 0, 2], poses[:, 2, 0] = turn.sin(), -turn.sin()
-    path = measure_path(Cameras(torch.eye(3).repeat(5, 1, 1), poses, HEIGHT, WIDTH))
-    assert (path.length, path.extent, path.step, path.longest_step) == (3, 3, 0, 2)
-    assert path.turn == pytest.approx(0.5, rel=1e-4)
-    assert path.widest_turn == pytest.approx(29.5, rel=1e-4)
-    assert path.repeated == 1
+    cameras = Cameras(torch.eye(3).repeat(5, 1, 1), poses, HEIGHT, WIDTH)
+    extent, steps, turns, repeated = measure_path(cameras)
+    assert (extent, steps.tolist(), repeated) == (3, [1, 2, 0, 0], 1)
+    assert turns.tolist() == pytest.approx([0, 0.5, 29.5, 29.5], rel=1e-4)
 
 
 def test_points_are_counted_where_they_are_seen():
@@ -99,4 +98,4 @@ def test_points_are_counted_where_they_are_seen():
     lens = torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
     cameras = Cameras(lens.repeat(3, 1, 1), poses, HEIGHT, WIDTH)
     points = torch.tensor([[0, 0, 4], [3.1, 0, 4], [3.3, 0, 4], [0, 0, 6]]).double()
-    assert count_points(cameras, points) == (0.75, 2)
+    assert shared_points(cameras, points) == 0.75
