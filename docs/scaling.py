@@ -55,8 +55,7 @@ def tables() -> dict[str, str]:
     def parts_row(name: str) -> tuple:
         seconds = parts[name]["seconds"]["median"]
         few, many = (growth[i]["components"][name]["seconds"]["median"] for i in (0, 3))
-        over_products = f"{seconds / parts[name]['floor']:.2f}"
-        return name, f"{seconds / all_parts:.0%}", over_products, f"{many / few:.1f}"
+        return name, f"{seconds / all_parts:.0%}", f"{many / few:.1f}"
 
     def render_row(row: dict[str, Any]) -> tuple:
         seconds = TARGETS * (row["forward"]["median"] + row["backward"]["median"])
@@ -116,7 +115,7 @@ def tables() -> dict[str, str]:
             map(views_row, network),
         ),
         "parts": markdown(
-            "part | of the seconds | over its products | 8 to 64 views, times",
+            "part | of the seconds | 8 to 64 views, times",
             map(parts_row, parts),
         ),
         "render": markdown(

@@ -1,5 +1,6 @@
 """Small workloads over their baselines: ratios that a change of the code must not raise."""
 
+import math
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -10,10 +11,11 @@ import torch
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from asysplat.benchmark.compare import RATIO, Watched
-from asysplat.benchmark.model import Workload, make_net, make_views, record_products
-from asysplat.benchmark.ops import OpCase, PlaneSweepCase, make_path
+from asysplat.benchmark.model import Workload, make_net, make_views
+from asysplat.benchmark.ops import make_path
 from asysplat.benchmark.options import CPU
 from asysplat.benchmark.render import Backend, prepare, run
 from asysplat.benchmark.scenes import random_scene
@@ -22,21 +24,27 @@ from asysplat.benchmark.timing import Measurement, Result, Run, summary, time_in
 from asysplat.ops.adam.cpu import adam_step_cpu
 from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 from asysplat.ops.image_loss import image_loss
+from asysplat.ops.ssd.chunked import CHUNK
 from asysplat.refinement import Refinement
 from asysplat.rendering import Culling
 from asysplat.scene import Views
 
+aten = torch.ops.aten
 BEST_OF = 3  # runs in a round: interruptions only make a run slower
 WATCHED = Watched(names=("workload", "over"), alike=(), kinds={"ratio": RATIO})
-PLANE_SWEEP = {"batch": 1, "views": 4, "height": 32, "width": 32, "stride": 2}
-CASES = {
-    "chunked": (
-        OpCase("ssd", {"batch": 1, "length": 512, "heads": 4, "head_dim": 64, "state": 64}),
-        OpCase("selective_scan", {"batch": 8, "length": 128, "channels": 64, "state": 16}),
+OPERATORS = {  # the backend that is the baseline, and the sizes of the inputs
+    "ssd": ("chunked", {"batch": 1, "length": 512, "heads": 4, "head_dim": 64, "state": 64}),
+    "selective_scan": ("chunked", {"batch": 8, "length": 128, "channels": 64, "state": 16}),
+    "plane_sweep": (
+        "reference",
+        {"batch": 1, "views": 4, "height": 32, "width": 32}
+        | {"stride": 2, "planes": 48, "neighbors": 3},
     ),
-    "reference": (PlaneSweepCase("plane_sweep", PLANE_SWEEP | {"planes": 48, "neighbors": 3}),),
 }
 GAUSSIANS, SIDE = 5000, 96  # of the renderer's scene
+PRODUCTS = {
+    call.default for call in (aten.mm, aten.addmm, aten.bmm, aten.baddbmm, aten.convolution)
+}
 ROWS = 20_000  # of which Adam updates half
 NETWORK, VIEWS, VIEW_SIDE = "asysplat_plane_sweep", 4, 64
 
@@ -52,10 +60,9 @@ class Pair(NamedTuple):
 
 def make_pairs() -> Iterator[Pair]:
     """Make all pairs; the same numbers at every call."""
-    for over, cases in CASES.items():
-        for case in cases:
-            paths = [make_path(case, name, torch.float32, CPU) for name in ("cpu", over)]
-            yield Pair(case.name, over, *(path.forward_backward for path in paths))
+    for name, (over, sizes) in OPERATORS.items():
+        paths = [make_path(name, sizes, backend, torch.float32, CPU) for backend in ("cpu", over)]
+        yield Pair(name, over, *(path.forward_backward for path in paths))
 
     # Both passes of the renderer, and a step of the refinement
     gaussians, camera = random_scene(GAUSSIANS, SIDE, SIDE)
@@ -89,14 +96,40 @@ def make_pairs() -> Iterator[Pair]:
     # A forward pass and its matrix products and convolutions
     net, _ = make_net(NETWORK, {"scale": "laptop"}, CPU)
     workload = Workload(net, "fp32", make_views(VIEWS, VIEW_SIDE, VIEW_SIDE, CPU))
-    counts = record_products(workload.forward)["forward"]
-    calls = [product.prepare(CPU) for product, count in counts.items() for _ in range(count)]
+    with RecordProducts() as products:
+        workload.forward()
+    yield Pair(NETWORK, "products", workload.forward, products.run)
 
-    def run_products() -> None:
-        for call in calls:
+
+class RecordProducts(TorchDispatchMode):
+    """Records the matrix products and convolutions that are called, also in attention and SSD."""
+
+    def __init__(self):
+        super().__init__()
+        self.calls: list[Run] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        sizes = []  # of products [b, m, k] x [b, k, n]
+        if func in PRODUCTS:
+            self.calls.append(partial(func, *args))
+        elif func._schema.name.startswith("aten::_scaled_dot_product"):
+            *batch, queries, head_dim = args[0].shape
+            heads, keys = math.prod(batch), args[1].shape[-2]
+            sizes = [(heads, queries, head_dim, keys), (heads, queries, keys, head_dim)]
+        elif func._schema.name == "asysplat::ssd":
+            (batch, length, heads, head_dim), state = args[1].shape, args[4].shape[-1]
+            chunks, inner = batch * -(-length // CHUNK), heads * head_dim
+            # Scores, scores x inputs, the update of the state and its reading
+            sizes = [(chunks, CHUNK, state, CHUNK), (chunks * heads, CHUNK, CHUNK, head_dim)]
+            sizes += [(chunks, state, CHUNK, inner), (chunks, CHUNK, state, inner)]
+        for b, m, k, n in sizes:
+            self.calls.append(partial(torch.bmm, torch.randn(b, m, k), torch.randn(b, k, n)))
+        return func(*args, **(kwargs or {}))
+
+    @torch.no_grad()
+    def run(self) -> None:
+        for call in self.calls:
             call()
-
-    yield Pair(NETWORK, "products", workload.forward, run_products)
 
 
 def measure(options: DictConfig, console: Console) -> Result:

@@ -1,10 +1,8 @@
-"""Every path of the operators: time beside the sequential loop and bare products; error."""
+"""Every path of the operators: time beside the sequential loop; error."""
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -14,7 +12,7 @@ from rich.table import Table
 from torch import Tensor
 
 from asysplat import ops
-from asysplat.benchmark import products, timing
+from asysplat.benchmark import timing
 from asysplat.benchmark.compare import ERROR, TIME, Watched
 from asysplat.benchmark.options import PRECISIONS, check_names, find_device
 from asysplat.benchmark.scenes import DISTANCE, FOCAL, camera_at_origin, on_an_arc, random_numbers
@@ -31,15 +29,15 @@ WATCHED = Watched(
     alike=("sizes", "loop_tokens", "error.measured_on"),
     kinds=dict.fromkeys(PASSES, TIME) | dict.fromkeys(ERRORS.values(), ERROR),
 )
-LOOP, REFERENCE, MATMULS = "loop", "reference", "matmuls"
+LOOP, REFERENCE = "loop", "reference"
 NOTES = """\
 loop: reference.py in fp32 on {loop} tokens, times scaled to the whole sequence; of plane_sweep \
 the reference
-matmuls: the operator's matrix products by themselves
 error: against the reference in float64, relative in L2; *: of a smaller one of its kind"""
 
 STEPS = (1e-3, 1e-1)  # dt of an untrained network
 SCANS = ("ssd", "selective_scan")
+ATTENTION, PLANE_SWEEP = "grid_attention", "plane_sweep"
 FP32_INPUTS = ("dt", "A", "D")
 # The shape of each input, in the order that they are drawn.
 SHAPES = {
@@ -50,159 +48,119 @@ SHAPES = {
     "selective_scan": {**dict.fromkeys(("x", "dt"), "batch length channels"), "A": "channels state"}
     | {**dict.fromkeys("BC", "batch length state"), "D": "channels"},
     # One attention layer; grid 1 is full attention
-    "grid_attention": dict.fromkeys("qkv", "batch views height width heads head_dim"),
+    ATTENTION: dict.fromkeys("qkv", "batch views height width heads head_dim"),
 }
-PRODUCTS = {"ssd": products.ssd_sizes, "grid_attention": products.grid_attention_sizes}
+# The backends beside "cpu" or "cuda", and the sizes that are arguments of the operator.
+BACKENDS = dict.fromkeys(SCANS, "chunked") | {ATTENTION: "sdpa", PLANE_SWEEP: REFERENCE}
+ARGUMENTS = dict.fromkeys(SCANS, ()) | {ATTENTION: ("grid",)}
+ARGUMENTS[PLANE_SWEEP] = ("stride", "planes", "neighbors")
 # The plane sweep's scene: cameras on an arc before a slanted wall with a texture.
 SLANT = 0.3  # by which the wall is farther away, a unit to the right
 WAVES = 20  # of each color
 
 Tensors = dict[str, Tensor]
+Sizes = Mapping[str, int]  # of the inputs, as SHAPES names them, and the operator's arguments
 
 
-@dataclass(frozen=True)
-class OpCase:
-    """An operator at one size."""
-
-    operator: str  # of `asysplat.ops`
-    sizes: Mapping[str, int]  # of its inputs, as SHAPES names them, and the grid of an attention
-    exact: Mapping[str, int] = field(default_factory=dict)  # sizes that differ for errors
-
-    differentiable = True
-    precisions = tuple(PRECISIONS)  # in which it computes
-
-    @property
-    def name(self) -> str:
-        return "/".join([self.operator, *map(str, self.options.values())])
-
-    @property
-    def options(self) -> dict[str, int]:
-        """Return the arguments of the operator besides tensors."""
-        return {"grid": self.sizes["grid"]} if "grid" in self.sizes else {}
-
-    @property
-    def backends(self) -> tuple[str, ...]:
-        return ("chunked" if self.operator in SCANS else "sdpa", "cpu", "cuda")
-
-    def resized(self, sizes: Mapping[str, int]) -> "OpCase":
-        return replace(self, sizes={**self.sizes, **sizes})
-
-    def tensors(self) -> Tensors:
-        """Make inputs in float64; the same numbers at every call."""
-        uniform, normal = random_numbers(0)
-        tensors = {}
-        for name, sides in SHAPES[self.operator].items():
-            shape = [self.sizes[side] for side in sides.split()]
-            if name == "dt":  # log-uniform
-                low, high = map(math.log, STEPS)
-                tensors[name] = (low + (high - low) * uniform(shape)).exp()
-            elif name != "A":
-                tensors[name] = normal(shape)
-            elif self.operator == "ssd":
-                tensors[name] = -1 - 15 * uniform(shape)
-            else:
-                states = torch.arange(1.0, self.sizes["state"] + 1, dtype=torch.float64)
-                tensors[name] = -states.repeat(self.sizes["channels"], 1)
-        return tensors
-
-    def run(self, tensors: Tensors, backend: str) -> Tensor:
-        return getattr(ops, self.operator)(**tensors, **self.options, backend=backend)
-
-    def products(self) -> list[products.Size]:
-        """List its matrix products; a selective scan has none."""
-        return PRODUCTS[self.operator](**self.sizes) if self.operator in PRODUCTS else []
+def make_inputs(operator: str, sizes: Sizes) -> Tensors:
+    """Make inputs in float64; the same numbers at every call."""
+    if operator == PLANE_SWEEP:
+        return _make_views(**{name: sizes[name] for name in ("batch", "views", "height", "width")})
+    uniform, normal = random_numbers(0)
+    tensors = {}
+    for name, sides in SHAPES[operator].items():
+        shape = [sizes[side] for side in sides.split()]
+        if name == "dt":  # log-uniform
+            low, high = map(math.log, STEPS)
+            tensors[name] = (low + (high - low) * uniform(shape)).exp()
+        elif name != "A":
+            tensors[name] = normal(shape)
+        elif operator == "ssd":
+            tensors[name] = -1 - 15 * uniform(shape)
+        else:
+            states = torch.arange(1.0, sizes["state"] + 1, dtype=torch.float64)
+            tensors[name] = -states.repeat(sizes["channels"], 1)
+    return tensors
 
 
-@dataclass(frozen=True)
-class PlaneSweepCase(OpCase):
-    """A plane sweep, which has no gradients and computes in fp32 alone."""
-
-    differentiable = False
-    precisions = ("fp32",)
-    backends = (REFERENCE, "cpu", "cuda")
-
-    @property
-    def options(self) -> dict[str, int]:
-        return {name: self.sizes[name] for name in ("stride", "planes", "neighbors")}
-
-    @property
-    def name(self) -> str:
-        return self.operator
-
-    def tensors(self) -> Tensors:
-        """Make images and their cameras in float64; the same numbers at every call."""
-        height, width = self.sizes["height"], self.sizes["width"]
-        camera = camera_at_origin(FOCAL * width, height, width)
-        cameras = on_an_arc(camera, self.sizes["views"]).to(torch.float64)
-        # A wall at about DISTANCE, z = DISTANCE + SLANT x
-        origins, directions = cameras.rays()
-        missing = DISTANCE + SLANT * origins[..., 0] - origins[..., 2]
-        along = missing / (directions[..., 2] - SLANT * directions[..., 0])
-        points = (origins + along[..., None] * directions)[..., :2]
-        uniform, normal = random_numbers(0)
-        waves, phases = 6 * normal(3, WAVES, 2), 2 * math.pi * uniform(3, WAVES)
-        angles = torch.einsum("vhwi,cni->vcnhw", points, waves) + phases[..., None, None]
-        images = (0.5 + 0.08 * angles.sin().sum(2)).clamp(0, 1)
-        tensors = {"images": images, "intrinsics": cameras.intrinsics}
-        tensors["cam_to_world"] = cameras.cam_to_world
-        return {n: t.expand(self.sizes["batch"], *t.shape) for n, t in tensors.items()}
-
-    def run(self, tensors: Tensors, backend: str) -> Tensor:
-        """Return the inverse depths."""
-        images = tensors["images"]
-        cameras = Cameras(tensors["intrinsics"], tensors["cam_to_world"], *images.shape[-2:])
-        return plane_sweep(images, cameras, **self.options, backend=backend).inverse_depth
+def _make_views(batch: int, views: int, height: int, width: int) -> Tensors:
+    """Make images of a wall at about DISTANCE, z = DISTANCE + SLANT x, and their cameras."""
+    camera = camera_at_origin(FOCAL * width, height, width)
+    cameras = on_an_arc(camera, views).to(torch.float64)
+    origins, directions = cameras.rays()
+    missing = DISTANCE + SLANT * origins[..., 0] - origins[..., 2]
+    along = missing / (directions[..., 2] - SLANT * directions[..., 0])
+    points = (origins + along[..., None] * directions)[..., :2]
+    uniform, normal = random_numbers(0)
+    waves, phases = 6 * normal(3, WAVES, 2), 2 * math.pi * uniform(3, WAVES)
+    angles = torch.einsum("vhwi,cni->vcnhw", points, waves) + phases[..., None, None]
+    images = (0.5 + 0.08 * angles.sin().sum(2)).clamp(0, 1)
+    tensors = {"images": images, "intrinsics": cameras.intrinsics}
+    tensors["cam_to_world"] = cameras.cam_to_world
+    return {name: tensor.expand(batch, *tensor.shape) for name, tensor in tensors.items()}
 
 
 @dataclass(frozen=True)
 class Path:
     """A backend of an operator, with inputs."""
 
-    case: OpCase
+    operator: str  # of `asysplat.ops`
+    sizes: Sizes
     backend: str
     inputs: Tensors  # that require gradients
     weights: Tensor  # the gradient of the output, from a normal distribution
 
+    def run(self) -> Tensor:
+        """Return the output; of a plane sweep the inverse depths."""
+        options = {name: self.sizes[name] for name in ARGUMENTS[self.operator]}
+        options["backend"] = self.backend
+        if self.operator != PLANE_SWEEP:
+            return getattr(ops, self.operator)(**self.inputs, **options)
+        images, *cameras = self.inputs.values()
+        return plane_sweep(images, Cameras(*cameras, *images.shape[-2:]), **options).inverse_depth
+
+    @torch.no_grad()
     def forward(self) -> Tensor:
-        with torch.no_grad():
-            return self.case.run(self.inputs, self.backend)
+        return self.run()
 
     def forward_backward(self) -> tuple[Tensor, Tensors]:
-        """Return the output, and the gradient of each input."""
-        if not self.case.differentiable:
+        """Return the output, and the gradient of each input; a plane sweep has none."""
+        if self.operator == PLANE_SWEEP:
             return self.forward(), {}
-        output = self.case.run(self.inputs, self.backend)
+        output = self.run()
         gradients = torch.autograd.grad(output, list(self.inputs.values()), self.weights)
         return output.detach(), dict(zip(self.inputs, gradients, strict=True))
 
     def seconds(self) -> dict[str, float]:
         """Time each pass once."""
-        names = list(PASSES)[: 2 if self.case.differentiable else 1]
+        names = list(PASSES)[: 1 if self.operator == PLANE_SWEEP else 2]
         return {n: timing.seconds_of(getattr(self, n), self.weights.device) for n in names}
 
     def exact(self) -> tuple[Tensor, Tensors]:
         """Run the reference in float64 on the CPU, on inputs rounded as this path's are."""
         inputs = {n: t.detach().cpu().double().requires_grad_() for n, t in self.inputs.items()}
         weights = self.weights.cpu().double()
-        return Path(self.case, REFERENCE, inputs, weights).forward_backward()
+        return Path(self.operator, self.sizes, REFERENCE, inputs, weights).forward_backward()
 
     def errors(self, exact: tuple[Tensor, Tensors]) -> Result:
         """Compare the output and the gradient of each input with the exact ones, relative in L2."""
         output, gradients = self.forward_backward()
         errors = {name: relative_l2(gradients[name], true) for name, true in exact[1].items()}
-        sizes, forward = dict(self.case.sizes), relative_l2(output, exact[0])
+        sizes, forward = dict(self.sizes), relative_l2(output, exact[0])
         return {"measured_on": sizes, "forward": forward, "gradients": errors or None}
 
 
-def make_path(case: OpCase, backend: str, dtype: torch.dtype, device: torch.device) -> Path:
-    """Make a path on the inputs of a case, in `dtype` but for FP32_INPUTS."""
+def make_path(
+    operator: str, sizes: Sizes, backend: str, dtype: torch.dtype, device: torch.device
+) -> Path:
+    """Make a path on the inputs of an operator, in `dtype` but for FP32_INPUTS."""
     inputs = {}
-    for name, tensor in case.tensors().items():
+    for name, tensor in make_inputs(operator, sizes).items():
         own = torch.float32 if name in FP32_INPUTS else dtype
         inputs[name] = tensor.to(device, own).requires_grad_()
     first = next(iter(inputs.values()))  # the output has its shape and type
     weights = torch.randn(first.shape, generator=torch.Generator().manual_seed(1))
-    return Path(case, backend, inputs, weights.to(first))
+    return Path(operator, sizes, backend, inputs, weights.to(first))
 
 
 def measure(options: DictConfig, console: Console) -> Result:
@@ -210,87 +168,80 @@ def measure(options: DictConfig, console: Console) -> Result:
 
     Returns:
         "rows": one for each operator, precision and path, times in seconds. The path "loop" is the
-        reference in fp32 on a shorter sequence, its times scaled to the whole; "matmuls" are the
-        operator's matrix products by themselves. plane_sweep has neither and no gradients, but its
-        reference on all pixels.
+        reference in fp32 on a shorter sequence, its times scaled to the whole. plane_sweep has
+        none and no gradients, but its reference on all pixels.
     """
     device = find_device(options.device)
     sizes = OmegaConf.to_container(options.ops, resolve=True)
     check_names("ops.precisions", sizes["precisions"], PRECISIONS)
-    exact, grids = sizes["exact"], sizes["grid_attention"].pop("grids")
-    cases = [OpCase(scan, sizes[scan], exact[scan]) for scan in SCANS]
-    attention = OpCase("grid_attention", sizes["grid_attention"], exact["grid_attention"])
-    cases += [attention.resized({"grid": grid}) for grid in grids]
-    cases.append(PlaneSweepCase("plane_sweep", sizes["plane_sweep"], exact["plane_sweep"]))
+    grids = sizes[ATTENTION].pop("grids")
+    cases = [(scan, sizes[scan]) for scan in SCANS]
+    cases += [(ATTENTION, sizes[ATTENTION] | {"grid": grid}) for grid in grids]
+    cases.append((PLANE_SWEEP, sizes[PLANE_SWEEP]))
     results: list[Result] = []
-    for case in track(cases, "operators", console=console):
-        measurements = make_rows(case, sizes["precisions"], sizes["loop_tokens"], device)
+    for operator, own in track(cases, "operators", console=console):
+        exact = own | sizes["exact"][operator]
+        tokens, precisions = sizes["loop_tokens"], sizes["precisions"]
+        measurements = list(make_rows(operator, own, exact, precisions, tokens, device))
         timing.time_in_rounds(measurements, options.repeats)
-        paths = {}
-        for timed in measurements:
-            row = timed.row
-            row |= {name: timed.summary(name) if name in timed.seconds else None for name in PASSES}
-            paths[row["path"], row["precision"]] = row
-        loop = paths.get((LOOP, "fp32")) or paths.get((REFERENCE, "fp32"))
-        for row in paths.values():
-            matmuls = paths.get((MATMULS, row["precision"]))
-            row["faster_than_loop"] = loop and _ratios(loop, row)
-            row["over_matmuls"] = matmuls and _ratios(row, matmuls)
-        results += paths.values()
+        rows = [
+            timed.row | {n: timed.summary(n) if n in timed.seconds else None for n in PASSES}
+            for timed in measurements
+        ]
+        slow = (LOOP, REFERENCE)
+        loop = next((r for r in rows if r["path"] in slow and r["precision"] == "fp32"), None)
+        for row in rows:
+            row["faster_than_loop"] = loop and {
+                name: row[name] and loop[name]["median"] / row[name]["median"] for name in PASSES
+            }
+        results += rows
     return {"rows": results}
 
 
-def _ratios(one: Result, other: Result) -> dict[str, float | None]:
-    both = [name for name in PASSES if one[name] and other[name]]
-    medians = {name: one[name]["median"] / other[name]["median"] for name in both}
-    return dict.fromkeys(PASSES) | medians
-
-
 def make_rows(
-    case: OpCase, precisions: Iterable[str], loop_tokens: int, device: torch.device
-) -> list[Measurement]:
-    """Prepare the measurements of one operator: its paths, its bare products, the loop.
+    operator: str,
+    sizes: Sizes,
+    exact_sizes: Sizes,
+    precisions: list[str],
+    loop_tokens: int,
+    device: torch.device,
+) -> Iterator[Measurement]:
+    """Yield the measurements of one operator: its paths, then the loop.
 
-    `precisions` are those of the inputs; the loop is timed on `loop_tokens`.
+    Errors are measured at `exact_sizes`. `precisions` are those of the inputs; a plane sweep has
+    fp32 alone. The loop is timed on `loop_tokens`.
     """
-    rows, small = [], case.resized(case.exact)
-
-    def add(precision: str, path: str, timer: timing.Timer, **costs: Any) -> None:
-        names = {"operator": case.name, "sizes": dict(case.sizes), "precision": precision}
-        rows.append(Measurement(timer, names | {"path": path, "error": None} | costs))
-
-    for precision in [name for name in precisions if name in case.precisions]:
+    name = f"{operator}/{sizes['grid']}" if "grid" in sizes else operator
+    row = {"operator": name, "sizes": dict(sizes)}
+    for precision in precisions:
+        if operator == PLANE_SWEEP and precision != "fp32":
+            continue
         dtype = PRECISIONS[precision]
-        exact = make_path(small, REFERENCE, dtype, device).exact()
-        for backend in case.backends:
-            if backend in {"cpu", "cuda"} - {device.type}:
-                continue
+        exact = make_path(operator, exact_sizes, REFERENCE, dtype, device).exact()
+        for backend in (BACKENDS[operator], device.type):
             try:
-                errors = make_path(small, backend, dtype, device).errors(exact)
+                errors = make_path(operator, exact_sizes, backend, dtype, device).errors(exact)
             except InputError:  # the operator has no such backend, or it cannot run here
                 continue
-            path = make_path(case, backend, dtype, device)
-            add(precision, backend, path.seconds, error=errors)
-        if sizes := case.products():
-            sizes = {"forward": sizes, "forward_backward": products.with_gradients(sizes)}
-            groups = {n: products.products(size, dtype, device) for n, size in sizes.items()}
-            add(precision, MATMULS, partial(products.time_products, groups, device))
-    if case.operator in SCANS:  # the reference in fp32, which takes one token after the other
-        reference = make_path(small, REFERENCE, torch.float32, device)
-        length = min(loop_tokens, case.sizes["length"])
-        path = make_path(case.resized({"length": length}), REFERENCE, torch.float32, device)
-        scale = case.sizes["length"] / length
-        errors = reference.errors(reference.exact())
+            path = make_path(operator, sizes, backend, dtype, device)
+            own = {"precision": precision, "path": backend, "error": errors}
+            yield Measurement(path.seconds, row | own)
+    if operator in SCANS:  # the reference in fp32, which takes one token after the other
+        reference = make_path(operator, exact_sizes, REFERENCE, torch.float32, device)
+        length = min(loop_tokens, sizes["length"])
+        path = make_path(operator, sizes | {"length": length}, REFERENCE, torch.float32, device)
 
-        def scaled() -> dict[str, float]:
+        def seconds() -> dict[str, float]:
+            scale = sizes["length"] / length
             return {name: scale * value for name, value in path.seconds().items()}
 
-        add("fp32", LOOP, scaled, error=errors, loop_tokens=length)
-    return rows
+        errors = reference.errors(reference.exact())
+        own = {"precision": "fp32", "path": LOOP, "error": errors, "loop_tokens": length}
+        yield Measurement(seconds, row | own)
 
 
 def tables(results: Result) -> list[Table]:
-    """Show each pass: its time, against the sequential loop and bare products; error."""
+    """Show each pass: its time, against the sequential loop; error."""
     rows = results["rows"]
     loop = max((row["loop_tokens"] for row in rows if row["path"] == LOOP), default=0)
     notes = f"{machine_note(results)}\n{NOTES.format(loop=loop)}"
@@ -302,7 +253,6 @@ def tables(results: Result) -> list[Table]:
             "path": text("{path}"),
             "ms": spread(name),
             "loop\n/ path": number(f"faster_than_loop.{name}", "{:.1f}"),
-            "path\n/ matmuls": number(f"over_matmuls.{name}", "{:.2f}"),
             "error": error(ERRORS[name]),
         }
         shown.append(make_table(title, columns, [row for row in rows if row[name]], notes, 3))

@@ -42,14 +42,13 @@ def time_against_error(rows: Sequence[Result], errors: Mapping[str, tuple[str, s
 def bars(
     names: Sequence[str],
     parts: Mapping[str, Sequence[float]],
-    limit: tuple[str, Sequence[float]],
     label: str,
+    tolerance: float | None = None,
 ) -> Figure:
-    """Plot a horizontal bar for each name, made of parts, with a mark at its limit.
+    """Plot a horizontal bar for each name, made of parts, and a line at a tolerance.
 
     Args:
         parts: the lengths of a part in all bars; one that is 0 everywhere is left out.
-        limit: its name, and its value for each bar.
         label: of the lengths.
     """
     colors = matplotlib.colormaps["tab10"].colors
@@ -61,7 +60,8 @@ def bars(
             if any(lengths):
                 axes.barh(names, lengths, left=starts, color=color, label=part)
             starts = [start + length for start, length in zip(starts, lengths, strict=True)]
-        axes.plot(limit[1], names, "|", color=INK, ms=18, mew=2, label=limit[0])
+        if tolerance is not None:
+            axes.axvline(tolerance, color=INK, label="tolerance")
         axes.set_xlabel(label)
         axes.invert_yaxis()
         figure.legend(loc="outside right upper", frameon=False)

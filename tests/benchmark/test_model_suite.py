@@ -1,26 +1,20 @@
 """The suite on networks of a moment: its results are complete and consistent."""
 
-from collections import Counter
-
 import pytest
-import torch
 from hydra import initialize_config_dir
 
 from asysplat.benchmark import model as suite
 from asysplat.benchmark.model import (
     COMPONENTS,
-    NETWORKS,
     OPERATORS,
     OTHERS,
     Workload,
     make_net,
     make_views,
-    record_products,
     tables,
 )
 from asysplat.benchmark.options import CPU
 from asysplat.errors import InputError
-from asysplat.evaluation.static_cost import true_flops
 
 pytestmark = pytest.mark.medium
 
@@ -62,20 +56,14 @@ def test_rows_are_complete_and_consistent(measured):
     for row in rows.values():
         assert (row["height"], row["width"]) == (64, 64)
         assert row["parameters"] > 1e5
-        passes = {"forward": row["forward"], "step": row["step"]}
-        floors = {"forward": row["floor"]["median"], "step": 3 * row["floor"]["median"]}
-        for key, seconds in passes.items():
-            assert seconds["iqr"] >= 0
-            assert row["over_floor"][key] == pytest.approx(seconds["median"] / floors[key])
-        assert 0 < row["floor"]["median"] < row["forward"]["median"]
-        assert all(part["floor"] >= 0 for part in row["components"].values())
+        assert all(row[key]["median"] > 0 and row[key]["iqr"] >= 0 for key in ("forward", "step"))
     assert len(tables(results)) == 2
 
 
 def test_steps_are_optional(run_model):
-    for row in run_model(names=NAMES[:1], views=[2], steps=False)["rows"]:
-        assert row["step"] is None and row["over_floor"]["step"] is None
-        assert NETWORKS["step\nms"](row) == NETWORKS["step\n/ floor"](row) == "-"
+    results = run_model(names=NAMES[:1], views=[2], steps=False)
+    assert results["rows"][0]["step"] is None
+    assert list(tables(results)[0].columns[-1].cells) == ["-"]
 
 
 def test_components_are_those_of_the_model(measured):
@@ -88,28 +76,6 @@ def test_components_are_those_of_the_model(measured):
         for operator, component in scans.items():
             within = row["components"][component]["seconds"]["median"]
             assert row["operators"][operator]["median"] < within
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_products_are_those_that_torch_counts(conf, name):
-    net, size = make_net(name, OVERRIDES, CPU)
-    for views in VIEWS:
-        inputs = make_views(views, size["height"], size["width"], CPU)
-        forward = Workload(net, "fp32", inputs).forward
-        counts = record_products(forward)["forward"]
-        flops = sum(n * true_flops(product.prepare("meta")) for product, n in counts.items())
-        assert flops == pytest.approx(true_flops(forward), rel=0.01)
-
-
-def test_products_have_the_precision_and_the_component_they_run_in(workload):
-    counts = record_products(workload.forward)
-    assert counts.pop("forward") == sum(counts.values(), Counter())
-    assert counts.keys() == {*COMPONENTS, OTHERS} - {"full attention"}
-    layers = [p for name, part in counts.items() if name != OTHERS for p in part]
-    linears = [p for p in layers if p.function is torch.ops.aten.mm.default]
-    assert linears and all(p.arguments[0].dtype == torch.bfloat16 for p in linears)
-    convolutions = {n for n, part in counts.items() if any("convolution" in str(p) for p in part)}
-    assert convolutions == {"Mamba2", "MambaVision", "sparse attention", OTHERS}
 
 
 def test_gradients_are_taken_away_again(workload):

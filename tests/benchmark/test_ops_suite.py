@@ -1,31 +1,14 @@
-"""The suite on operators of a moment, and the products that they are compared with."""
+"""The suite on operators of a moment."""
 
 import math
 
 import pytest
 import torch
 
-from asysplat.benchmark.ops import (
-    PASSES,
-    SCANS,
-    SLANT,
-    OpCase,
-    PlaneSweepCase,
-    make_path,
-    make_rows,
-)
+from asysplat.benchmark.ops import PASSES, SCANS, SLANT, make_inputs, make_path, make_rows
 from asysplat.benchmark.options import CPU, PRECISIONS, check_names, find_device
-from asysplat.benchmark.products import (
-    MAX_NUMBERS,
-    Operand,
-    RecordProducts,
-    products,
-    time_products,
-    with_gradients,
-)
 from asysplat.benchmark.scenes import DISTANCE
 from asysplat.errors import InputError
-from asysplat.evaluation.static_cost import true_flops
 from asysplat.scene import Cameras
 
 pytestmark = pytest.mark.medium
@@ -62,8 +45,7 @@ def test_every_operator_has_all_paths(rows):
     for operator in (*SCANS, *ATTENTION):
         for precision in BOUNDS:
             paths = {path for name, p, path in rows if (name, p) == (operator, precision)}
-            assert paths - {"loop", "matmuls"}
-            assert ("matmuls" in paths) == (operator != "selective_scan")
+            assert paths - {"loop"}
             assert ("loop" in paths) == (operator in SCANS and precision == "fp32")
     paths = {(precision, path) for name, precision, path in rows if name == "plane_sweep"}
     assert paths == {("fp32", path) for path in ("reference", "cpu")}
@@ -71,9 +53,6 @@ def test_every_operator_has_all_paths(rows):
 
 def test_errors_are_below_their_bounds(rows):
     for (operator, precision, path), row in rows.items():
-        if path == "matmuls":
-            assert row["error"] is None
-            continue
         error = row["error"]
         assert error["measured_on"] != row["sizes"]
         if operator == "plane_sweep":
@@ -87,9 +66,8 @@ def test_errors_are_below_their_bounds(rows):
 
 
 def test_ratios_are_those_of_the_times(rows):
-    for (operator, precision, _), row in rows.items():
+    for (operator, _, _), row in rows.items():
         loop = rows.get((operator, "fp32", "loop")) or rows.get((operator, "fp32", "reference"))
-        matmuls = rows.get((operator, precision, "matmuls"))
         for name in PASSES:
             if row[name] is None:
                 assert (operator, name) == ("plane_sweep", "forward_backward")
@@ -99,18 +77,14 @@ def test_ratios_are_those_of_the_times(rows):
             if loop:
                 expected = loop[name]["median"] / seconds
                 assert row["faster_than_loop"][name] == pytest.approx(expected)
-            if matmuls:
-                expected = seconds / matmuls[name]["median"]
-                assert row["over_matmuls"][name] == pytest.approx(expected)
         assert bool(loop) == bool(row["faster_than_loop"])
-        assert bool(matmuls) == bool(row["over_matmuls"])
         if row["path"] == "loop":
             assert row["loop_tokens"] == LOOP_TOKENS
 
 
 def test_errors_are_relative():
-    case = OpCase("selective_scan", {"batch": 1, "length": 5, "channels": 3, "state": 2})
-    path = make_path(case, "reference", torch.float32, CPU)
+    sizes = {"batch": 1, "length": 5, "channels": 3, "state": 2}
+    path = make_path("selective_scan", sizes, "reference", torch.float32, CPU)
     output, gradients = path.exact()
     wrong = 2 * output, {name: 4 * grad for name, grad in gradients.items()}
     errors = path.errors(wrong)
@@ -118,60 +92,6 @@ def test_errors_are_relative():
     assert errors["gradients"] == pytest.approx(
         dict.fromkeys(["x", "dt", "A", "B", "C", "D"], 3 / 4), abs=1e-5
     )
-
-
-def flops_of(counts):
-    return sum(count * true_flops(product.prepare("meta")) for product, count in counts.items())
-
-
-MAPS = {"batch": 1, "views": 3, "height": 4, "width": 8, "heads": 2, "head_dim": 16, "grid": 2}
-SEQUENCE = {"batch": 2, "length": 256, "heads": 4, "head_dim": 16, "state": 32}
-CASES = [(OpCase("ssd", SEQUENCE), "chunked"), (OpCase("grid_attention", MAPS), "sdpa")]
-
-
-@pytest.mark.parametrize("case, path", CASES, ids=lambda value: getattr(value, "name", None))
-def test_products_are_those_of_the_operator(case, path):
-    def forward():
-        case.run({name: tensor.to("meta") for name, tensor in case.tensors().items()}, path)
-
-    counts = products(case.products(), torch.float32, CPU)
-    # The rest is the recurrence between the chunks.
-    assert flops_of(counts) == pytest.approx(true_flops(forward), rel=0.01)
-    both = products(with_gradients(case.products()), torch.float32, CPU)
-    assert flops_of(both) == 3 * flops_of(counts)
-    assert counts <= both
-
-
-def test_large_products_are_split():
-    batch, m, k, n = 6, 1000, 64, 30_000
-    counts = products([(batch, m, k, n)], torch.bfloat16, CPU)
-    assert flops_of(counts) == 2 * batch * m * k * n
-    for product in counts:
-        a, b = (operand.shape for operand in product.arguments)
-        assert max(math.prod(a), math.prod(b), a[-2] * b[-1]) <= MAX_NUMBERS["cpu"]
-
-
-def test_calls_are_recorded_under_their_label():
-    a, weight = torch.randn(2, 5, 8), torch.randn(6, 8)
-    maps, kernel = torch.randn(1, 4, 7, 7), torch.randn(6, 2, 3, 3)
-    bias = torch.randn(6)
-
-    def forward():
-        torch.nn.functional.linear(a, weight)
-        torch.nn.functional.linear(a, weight, bias)
-        torch.nn.functional.conv2d(maps, kernel, bias, stride=2, padding=1, groups=2)
-        torch.nn.functional.scaled_dot_product_attention(a, a, a)
-
-    labels = ["first"]
-    with torch.no_grad(), RecordProducts(lambda: labels[-1]) as recorder:
-        forward()
-        labels.append("second")
-        a @ a.mT
-    assert flops_of(recorder.counts["first"]) == true_flops(forward)
-    (product,) = recorder.counts["second"]
-    assert [operand.shape for operand in product.arguments] == [(2, 5, 8), (2, 8, 5)]
-    assert product.arguments[0] == Operand((2, 5, 8), torch.float32)
-    assert time_products(recorder.counts, CPU)["second"] > 0
 
 
 def test_unknown_options_are_named():
@@ -185,17 +105,16 @@ def test_unknown_options_are_named():
 
 
 def test_a_wrong_size_is_an_error():
-    case = OpCase("grid_attention", MAPS | {"grid": 0})
+    sizes = TINY["grid_attention"] | {"grid": 0}
     with pytest.raises(InputError, match="grid=0"):
-        make_rows(case, PRECISIONS, LOOP_TOKENS, CPU)
+        list(make_rows("grid_attention", sizes, sizes, ["fp32"], LOOP_TOKENS, CPU))
 
 
 def test_the_plane_sweep_finds_the_wall():
-    sizes = {"batch": 2, "views": 4, "height": 24, "width": 32}
-    case = PlaneSweepCase("plane_sweep", sizes | {"stride": 2, "planes": 24, "neighbors": 3})
-    tensors = case.tensors()
+    sizes = TINY["plane_sweep"] | {"batch": 2, "planes": 24, "neighbors": 3}
+    tensors = make_inputs("plane_sweep", sizes)
     assert tensors["images"].min() >= 0 and tensors["images"].max() <= 1
-    inverse_depths = case.run({name: tensor.float() for name, tensor in tensors.items()}, "cpu")
+    inverse_depths = make_path("plane_sweep", sizes, "cpu", torch.float32, CPU).forward()
     assert torch.equal(inverse_depths[0], inverse_depths[1])
     cameras = Cameras(tensors["intrinsics"], tensors["cam_to_world"], 24, 32).resized(12, 16)
     # Along rays of z = 1: the wall is at z = DISTANCE + SLANT x.

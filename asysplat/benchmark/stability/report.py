@@ -133,7 +133,7 @@ def plot(results: Result) -> Figure:
     areas = summary(results["rows"])
     names = [f"{row['area']}: {row['cases'] - row['red']} of {row['cases']} green" for row in areas]
     shares = {"largest error": [row["share"] or 0.0 for row in areas]}
-    return bars(names, shares, ("tolerance", [1.0] * len(areas)), "error / tolerance")
+    return bars(names, shares, "error / tolerance", tolerance=1.0)
 
 
 def _red(rows: Sequence[Result]) -> list[Result]:
