@@ -5,9 +5,9 @@ from pathlib import Path
 
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.training.histogram import Histogram
 
 
 def make_wandb_logger(folder: Path | str, project: str, name: str, offline: bool) -> WandbLogger:
@@ -34,24 +34,11 @@ def log_figure(logger: Logger, name: str, figure: Figure, step: int) -> None:
         logger.log_image(name, [figure], step)
 
 
-def log_histogram(logger: Logger, name: str, histogram: Histogram, step: int) -> None:
-    """Log a histogram to TensorBoard or Weights & Biases."""
-    edges, counts = histogram.edges, histogram.counts.cpu()
-    middles = ((edges[1:] + edges[:-1]) / 2).double()
+def log_histogram(logger: Logger, name: str, values: Tensor, step: int) -> None:
+    """Log a histogram of values to TensorBoard or Weights & Biases."""
     if isinstance(logger, TensorBoardLogger):
-        logger.experiment.add_histogram_raw(
-            name,
-            min=histogram.low,
-            max=histogram.high,
-            num=int(counts.sum()),
-            sum=float(counts @ middles),
-            sum_squares=float(counts @ middles**2),
-            bucket_limits=edges[1:].tolist(),
-            bucket_counts=counts.tolist(),
-            global_step=step,
-        )
+        logger.experiment.add_histogram(name, values, step)
     elif isinstance(logger, WandbLogger):
         import wandb  # an extra
 
-        value = wandb.Histogram(np_histogram=(counts.numpy(), edges.numpy()))
-        logger.experiment.log({name: value, "trainer/global_step": step})
+        logger.experiment.log({name: wandb.Histogram(values), "trainer/global_step": step})

@@ -72,7 +72,7 @@ class SplattingModule(lightning.LightningModule):
     def forward(self, batch: Batch, depth: bool, net: nn.Module | None = None) -> Prediction:
         """Predict the Gaussians of the inputs, by `net` if given; render them at the targets."""
         net = self.net if net is None else net
-        with self.parts("network"), self.parts.of("prior", net.prior):
+        with self.parts("network"):
             gaussians = net(batch["inputs"])
         targets, background = batch["targets"], self.background_for(batch)
         with self.parts("rendering"):

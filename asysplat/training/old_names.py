@@ -10,7 +10,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-FORMAT = 2  # of the files of a run; raise it with every line that is added below
+FORMAT = 3  # of the files of a run; raise it with every line that is added below
 
 CLASSES = {
     "asysplat.models.SceneSkips": "asysplat.models.EarlyExit",
@@ -22,14 +22,12 @@ CLASSES = {
     "asysplat.training.callbacks.Pictures": "asysplat.training.callbacks.Figures",
     "asysplat.training.callbacks.Progress": "asysplat.training.callbacks.TrainingProgressBar",
     "asysplat.training.callbacks.SkipNonFiniteSteps": "asysplat.training.callbacks.NonFiniteSteps",
-    "asysplat.training.callbacks.Skipped": "asysplat.training.callbacks.EarlyExitShares",
     "asysplat.training.callbacks.SkippedScenes": "asysplat.training.callbacks.BadScenes",
     "asysplat.training.callbacks.Watch": "asysplat.training.callbacks.TrainingMonitor",
 }
 KEYS = {  # of the configuration; a new name has the same parent
     "callbacks.guard": "non_finite_steps",
     "callbacks.pictures": "figures",
-    "callbacks.skipped": "early_exit",
     "callbacks.skips": "bad_scenes",
     "callbacks.watch": "monitor",
     "data.num_frames": "num_images",
@@ -40,7 +38,9 @@ KEYS = {  # of the configuration; a new name has the same parent
 }
 ANY = object()
 REMOVED = {  # with the value that had no effect
+    "callbacks.early_exit": ANY,  # its numbers are results of Metrics
     "callbacks.guard.folder": ANY,
+    "callbacks.skipped": ANY,
     "speed.coverage": None,
     "speed.faint": None,
 }

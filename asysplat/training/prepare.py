@@ -120,9 +120,7 @@ class PreparedRun:
     def record(self, stage: Stage, trainer: lightning.Trainer, callbacks: Callbacks) -> None:
         """Collect what a tested stage measured; write metrics.json after the last; print it."""
         new_results = dict(callbacks["costs"].values) if "costs" in callbacks else {}
-        for name in ("metrics", "early_exit"):
-            if name in callbacks:
-                new_results |= callbacks[name].results
+        new_results |= callbacks["metrics"].results if "metrics" in callbacks else {}
         data, folder = self.config.data.name, Path(stage.config.paths.run)
         shown, is_last = self.results | new_results, stage is self.stages[-1]
         if is_last:

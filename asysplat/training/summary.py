@@ -47,11 +47,9 @@ def cost_sentence(results: Results) -> str:
             f"{results['cost/gaussians']:.0f} Gaussians a scene",
         ]
     if "cost/seconds_per_step" in results:
-        step, rendering = results["cost/seconds_per_step"], results["cost/render_seconds_per_step"]
-        costs.append(f"{step:.2f} s a step, {rendering / step:.1%} of it for rendering")
+        costs.append(f"{results['cost/seconds_per_step']:.2f} s a step")
     if "cost/peak_gb" in results:
-        per_token = results["cost/peak_bytes_per_token"] / 1e3
-        costs.append(f"{results['cost/peak_gb']:.2f} GB at most, {per_token:.0f} kB a token")
+        costs.append(f"{results['cost/peak_gb']:.2f} GB at most")
     return ", ".join(costs)
 
 

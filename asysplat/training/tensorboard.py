@@ -1,4 +1,4 @@
-"""TensorBoard: custom scalars of quality, training and time, and the hparams tab."""
+"""TensorBoard: files of events that end at a checkpoint, and the hparams tab."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -14,25 +14,8 @@ CHOICES = (
     *(f"data.{key}" for key in ("name", "inputs", "height", "width", "batch_size")),
     *(f"training.loss.{key}" for key in ("ssim", "perceptual", "depth", "opacity")),
 )
-TERMS = ("mse", "ssim", "perceptual", "depth", "opacity")
 EVENTS = "events.out.tfevents.*"
 HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
-
-PAGE = {
-    "quality": {
-        "PSNR (dB)": ["Multiline", ["train/psnr", "val/psnr", "val/nearest_view/psnr"]],
-        **{name: ["Multiline", [f"val/{name.lower()}"]] for name in ("SSIM", "LPIPS", "AbsRel")},
-    },
-    "training": {
-        "loss": ["Multiline", [f"train/{term}" for term in ("loss", *TERMS)]],
-        "gradient norm": ["Multiline", ["train/grad_norm", "gradient/.*"]],
-        "learning rate": ["Multiline", ["train/learning_rate"]],
-    },
-    "time": {
-        "share of a step": ["Multiline", ["time/share_.*"]],
-        "views a second": ["Multiline", ["time/views_per_second"]],
-    },
-}
 
 
 def make_logger(folder: Path | str) -> TensorBoardLogger:
@@ -66,13 +49,9 @@ def cut_events(folder: Path, sizes: Mapping[str, int]) -> None:
 
 
 def log_choices(logger: Logger, config: DictConfig) -> None:
-    """Log the layout of the "custom scalars" page, and the options for the hparams tab.
-
-    The metrics of the hparams tab must be named before they are measured.
-    """
+    """Log the options for the hparams tab, which needs the names of its metrics now."""
     choices = {key: OmegaConf.select(config, key) for key in CHOICES}
     if isinstance(logger, TensorBoardLogger):
-        logger.experiment.add_custom_scalars(PAGE)
         logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in HPARAMS_METRICS})
     else:
         logger.log_hyperparams(choices)

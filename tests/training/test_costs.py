@@ -1,4 +1,4 @@
-"""Costs of a test: of the network alone and of the rendering, without the metrics."""
+"""Costs of a test, which are of the network alone, and of a step."""
 
 from types import SimpleNamespace
 
@@ -9,10 +9,8 @@ from tiny import QUIET
 from torch import nn
 from torch.utils.data import DataLoader
 
-from asysplat.data.batches import BatchSplit
 from asysplat.evaluation import measured_cost
-from asysplat.evaluation.measured_cost import reset_peak_memory
-from asysplat.evaluation.measured_cost import CostMeter
+from asysplat.evaluation.measured_cost import CostMeter, reset_peak_memory
 from asysplat.training.callbacks import Costs
 
 MB = 1_000_000
@@ -64,41 +62,26 @@ resident = pytest.mark.skipif(
 
 
 @resident
-def test_inference_memory_is_that_of_the_prediction():
-    plain = measure({"main": [1, 1]})
-    predicting = measure({"main": [1, 300, 1]})
-    rendering = measure({"main": [1, 1]}, rendering=300)
-    rise = predicting["inference_gb"] - plain["inference_gb"]
-    assert rise == pytest.approx(0.3, abs=TOLERANCE_GB)
-    assert predicting["render_gb"] == pytest.approx(plain["render_gb"], abs=TOLERANCE_GB)
+def test_memory_of_each_test_set_is_that_of_its_predictions():
+    plain, rendering = measure({"main": [1, 1]}), measure({"main": [1, 1]}, rendering=300)
+    predicting = measure({"main": [1, 300, 1], "more_views": [200, 1]})
     assert rendering["inference_gb"] == pytest.approx(plain["inference_gb"], abs=TOLERANCE_GB)
-    rise = rendering["render_gb"] - plain["render_gb"]
-    assert rise == pytest.approx(0.3, abs=TOLERANCE_GB)
-
-
-@resident
-def test_each_test_set_has_its_own_costs():
-    found = measure({"main": [1, 1], "more_views": [200, 1]})
-    rise = found["more_views/inference_gb"] - found["inference_gb"]
-    assert rise == pytest.approx(0.2, abs=TOLERANCE_GB)
-    assert found["inference_seconds"] > 0 and found["more_views/render_seconds"] > 0
+    for key, expected in (("inference_gb", 0.3), ("more_views/inference_gb", 0.2)):
+        rise = predicting[key] - plain["inference_gb"]
+        assert rise == pytest.approx(expected, abs=TOLERANCE_GB)
 
 
 def test_seconds_leave_the_longest_out(monkeypatch):
-    # Four times per scene: start and end of the prediction and of the rendering.
-    clock = iter([0.0, 1.0, 1.0, 2.0, 10.0, 40.0, 40.0, 44.0, 50.0, 53.0, 53.0, 59.0])
+    clock = iter([0.0, 1.0, 10.0, 40.0, 50.0, 53.0])  # start and end of each prediction
     monkeypatch.setattr(measured_cost, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    found = measure({"main": [1, 1, 1]})
-    assert (found["inference_seconds"], found["render_seconds"]) == (2.0, 2.5)
+    assert measure({"main": [1, 1, 1]})["inference_seconds"] == 2.0
 
 
-def test_seconds_of_steps_leave_the_longest_out(monkeypatch):
+def test_seconds_of_steps_leave_the_longest_out():
     costs = Costs()
-    costs.split = BatchSplit(processes=1, micro_batch=1, accumulated=1)
     costs.step = CostMeter(torch.device("cpu"))
     costs.step.seconds = [30.0, 1.0, 3.0]
-    monkeypatch.setattr(costs, "_render_seconds", lambda *_: 0.5)
     trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
+    trainer.accumulate_grad_batches = 4
     costs.on_fit_end(trainer, Module(1))
-    expected = {"cost/seconds_per_step": 2.0, "cost/render_seconds_per_step": 0.5}
-    assert costs.values == expected
+    assert costs.values == {"cost/seconds_per_step": 8.0}

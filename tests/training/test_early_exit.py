@@ -9,7 +9,8 @@ import pytest
 from conftest import finished
 from omegaconf import OmegaConf, open_dict
 
-from asysplat.training.callbacks import EarlyExitShares
+from asysplat.evaluation.protocol import Protocol
+from asysplat.training.callbacks import Metrics
 from asysplat.training.runs import config_hash
 
 
@@ -18,9 +19,12 @@ def logged(shares_of_sets):
     log = {}
     module = SimpleNamespace(net=SimpleNamespace(early_exit_shares={}), log_dict=log.update)
     data = SimpleNamespace(tests=shares_of_sets)
-    trainer = Mock(lightning.Trainer, datamodule=data, world_size=1)
-    callback = EarlyExitShares()
-    callback.on_test_epoch_start(trainer, module)
+    trainer = Mock(lightning.Trainer, datamodule=data, world_size=1, is_global_zero=False)
+    callback = Metrics(
+        Mock(Protocol, sentences=dict, mean_over="images"), "unused", backbone_dir="unused"
+    )
+    callback._add = Mock()
+    callback.on_test_epoch_start()
     for index, shares in enumerate(shares_of_sets.values()):
         for number, share in enumerate(shares):
             module.net.early_exit_shares = share

@@ -1,4 +1,4 @@
-"""TrainingMonitor: shares, rates and norms of a step, histograms of Gaussians."""
+"""TrainingMonitor: shares, rates and norms of a step."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,6 @@ from asysplat.evaluation.peak import peak_flops
 from asysplat.training import loggers, parts
 from asysplat.training.callbacks import TrainingMonitor, monitor
 from asysplat.training.callbacks.monitor import gradient_norms, sentence
-from asysplat.training.histogram import Histogram
 from asysplat.training.loggers import make_wandb_logger
 from asysplat.training.parts import Parts
 
@@ -93,7 +92,7 @@ def test_shares_and_rates_of_measured_steps(clock):
         assert first[f"time/share_{part}"] == pytest.approx(expected.get(part, 0) / 20)
     assert "time/mfu" not in first and first["memory/peak_gb"] > 0
     text = sentence(second)
-    assert "took 10 s, 2 views/s: data 10%, prior 0%, network 40%" in text
+    assert "took 10 s, 2 views/s: data 10%, network 40%" in text
     assert "MFU not measured" in text
 
 
@@ -116,20 +115,6 @@ def test_gradient_norms_by_part():
     net["geometry"].bias.grad = torch.tensor([4.0])
     net["head"].bias.grad = torch.tensor([-2.0])
     assert gradient_norms(net) == {"gradient/geometry": 5, "gradient/head": 2}
-
-
-def test_histograms_count_scene_by_scene():
-    histogram = Histogram.empty(0.0, 6.0, CPU)  # sixty bins of a tenth
-    assert histogram.median() != histogram.median()  # NaN
-    histogram.add(torch.tensor([[0.05, 0.15], [float("nan"), -1.0]]))
-    histogram.add(torch.tensor([2.55, 7.0]))
-    assert histogram.counts[[0, 1, 25, 59]].tolist() == [2, 1, 1, 1]
-    assert histogram.counts.sum() == 5 and histogram.edges[25] == pytest.approx(2.5)
-    assert histogram.median() == pytest.approx(0.15)  # half of the second bin
-    numbers = torch.rand(100_000) * 5
-    spread = Histogram.empty(-1.0, 6.0, CPU)
-    spread.add(numbers)
-    assert spread.median() == pytest.approx(numbers.median().item(), abs=0.01)
 
 
 def test_the_peak_is_known_for_listed_gpus(monkeypatch):

@@ -66,7 +66,11 @@ def test_its_checkpoint_loads(old_run):
         assert torch.equal(tensor, saved[f"net.{name}"])
 
 
-@pytest.mark.parametrize("target", (OLD_RUN / "targets.txt").read_text().split())
+TARGETS = set((OLD_RUN / "targets.txt").read_text().split())
+TARGETS.remove("asysplat.training.callbacks.Skipped")  # a part of Metrics
+
+
+@pytest.mark.parametrize("target", sorted(TARGETS))
 def test_every_class_of_the_old_configuration_is_there(target):
     assert get_object(CLASSES.get(target, target))
 

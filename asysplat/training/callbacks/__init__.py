@@ -4,7 +4,6 @@ from asysplat.training.callbacks.bad_scenes import BadScenes
 from asysplat.training.callbacks.checkpoints import Checkpoints
 from asysplat.training.callbacks.costs import Costs
 from asysplat.training.callbacks.curve import Curve
-from asysplat.training.callbacks.early_exit import EarlyExitShares
 from asysplat.training.callbacks.figures import Figures
 from asysplat.training.callbacks.metrics import Metrics
 from asysplat.training.callbacks.monitor import TrainingMonitor
@@ -16,7 +15,6 @@ __all__ = [
     "Checkpoints",
     "Costs",
     "Curve",
-    "EarlyExitShares",
     "Figures",
     "Metrics",
     "NonFiniteSteps",

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.lpips import load_lpips
-from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.rows import ImageRow, average, write_csv
 from asysplat.scene import Views
@@ -22,8 +21,8 @@ IMAGE = ("set", "scene", "view")  # the columns that identify a row
 class Metrics(lightning.Callback):
     """Computes PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image, for loggers and a CSV.
 
-    `results` holds the means of every test set, the protocol's sentences, and the cost of the
-    metrics of a test scene and its baselines: cost/metrics_seconds and _gb, see `CostMeter`.
+    `results` holds the means of every test set, the protocol's sentences, and the shares that the
+    network's early exit left out, early_exit/<set>/<what>, means over scenes; none if exact.
 
     Args:
         protocol: of the metrics.
@@ -36,6 +35,7 @@ class Metrics(lightning.Callback):
         self.protocol, self.folder = protocol, Path(folder)
         self.backbone_dir, self.download = Path(backbone_dir), download
         self.rows: list[ImageRow] = []
+        self.shares: list[ImageRow] = []
         sentences = protocol.sentences()
         self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in sentences.items()}
 
@@ -70,9 +70,8 @@ class Metrics(lightning.Callback):
     def on_validation_epoch_start(self, *_: Any) -> None:
         self.rows = []
 
-    def on_test_epoch_start(self, trainer: Any, module: Any) -> None:
-        self.rows = []
-        self.work = CostMeter(module.device)
+    def on_test_epoch_start(self, *_: Any) -> None:
+        self.rows, self.shares = [], []
 
     def on_validation_batch_end(
         self, trainer: Any, module: Any, outputs: Prediction, batch: Any, *_: Any
@@ -83,23 +82,28 @@ class Metrics(lightning.Callback):
         self, trainer: Any, module: Any, outputs: Any, batch: Any, index: int, set_index: int = 0
     ) -> None:
         test_set = list(trainer.datamodule.tests)[set_index]
-        self.work.start()
         self._add(test_set, batch, outputs, validation=False)
-        self.work.stop()
+        if module.net.early_exit_shares:
+            row: ImageRow = {"set": test_set, "scene": batch["scene"][0], "view": 0}
+            self.shares.append(row | module.net.early_exit_shares)
 
     def on_validation_epoch_end(self, trainer: Any, module: Any) -> None:
         means = average(gather(trainer, self.rows), self.protocol.mean_over)
         module.log_dict({f"val/{name}": value for name, value in means.items()})
 
     def on_test_epoch_end(self, trainer: Any, module: Any) -> None:
-        rows, results = gather(trainer, self.rows), {}
+        rows, shares = gather(trainer, self.rows), gather(trainer, self.shares)
+        results = {}
         for test_set in trainer.datamodule.tests:
             of_set = [row for row in rows if row["set"] == test_set]
             for name, value in average(of_set, self.protocol.mean_over).items():
                 kind = "baseline" if "/" in name else "test"
                 results[f"{kind}/{test_set}/{name}"] = value
+            of_set = [row for row in shares if row["set"] == test_set]
+            for name, share in average(of_set, "images").items():
+                results[f"early_exit/{test_set}/{name}"] = share
         module.log_dict(results)
-        self.results |= results | self.work.costs("cost/metrics")
+        self.results |= results
         if trainer.is_global_zero:
             write_csv(self.folder / "metrics.csv", rows)
 

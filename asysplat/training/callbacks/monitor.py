@@ -2,16 +2,16 @@
 
 import statistics
 import time
+from collections import defaultdict
 from typing import Any
 
 import torch
 from lightning import Callback
-from torch import nn
+from torch import Tensor, nn
 
 from asysplat.evaluation.measured_cost import memory_gb, peak_memory_gb, wait_for
 from asysplat.evaluation.peak import peak_flops
 from asysplat.evaluation.static_cost import forward_flops
-from asysplat.training.histogram import Histogram
 from asysplat.training.loggers import log_histogram
 from asysplat.training.parts import PARTS
 from asysplat.training.prediction import Prediction
@@ -19,8 +19,7 @@ from asysplat.training.prediction import Prediction
 GIGA = 1e9
 PASSES = 3  # forward, and a backward of about twice its products; recomputation does not count
 MIN_ALPHA = 0.5  # the depth of a pixel with less coverage is not counted
-# The bounds of the histograms of each validation; of scales and depths the decimal logarithm.
-BOUNDS = {"opacity": (0.0, 1.0), "log10_scale": (-5.0, 1.0), "log10_depth": (-2.0, 2.0)}
+SAMPLES = 10_000  # of each validation scene and histogram, at least, if there are as many
 
 
 class TrainingMonitor(Callback):
@@ -31,8 +30,9 @@ class TrainingMonitor(Callback):
       step share_<part>, the share of its seconds of each of PARTS and of the rest, other.
     - memory/: peak_gb, see `peak_memory_gb`; on a GPU also its share of the GPU's memory.
     - gradient/: the norm of each part of the network, before it is clipped.
-    - gaussians/: histograms and medians of opacities, of scales (the geometric mean of a
-      Gaussian's three) and of depths as rendered at the targets, in units of the farthest input.
+    - gaussians/: histograms and medians, over the scenes of the first process, of opacities, of
+      scales (the geometric mean of a Gaussian's three) and of depths as rendered at the targets, in
+      units of the farthest input.
 
     FLOPs are three times those of the network's products (`true_flops`) in the forward pass.
 
@@ -90,7 +90,7 @@ class TrainingMonitor(Callback):
                 size = (views.num_views, views.cameras.height, views.cameras.width)
                 self.flops = PASSES * forward_flops(module.net, *size)
             seconds, total = module.parts.stop(), now - self.started
-            shares = {name: seconds.get(name, 0.0) / total for name in PARTS}
+            shares = {name: spent / total for name, spent in seconds.items()}
             shares["other"] = max(0.0, 1 - sum(shares.values()))
             values = {f"time/share_{name}": share for name, share in shares.items()}
             values |= self._rates(trainer)
@@ -108,21 +108,27 @@ class TrainingMonitor(Callback):
             print(sentence({n: statistics.fmean(m[n] for m in self.measurements) for n in names}))
 
     def on_validation_epoch_start(self, trainer: Any, module: Any) -> None:
-        self.histograms = {n: Histogram.empty(*b, module.device) for n, b in BOUNDS.items()}
+        self.samples: dict[str, list[Tensor]] = defaultdict(list)
 
     def on_validation_batch_end(self, _: Any, __: Any, outputs: Prediction, *___: Any) -> None:
         gaussians, rendering = outputs.gaussians, outputs.rendering
-        self.histograms["opacity"].add(gaussians.opacities)
-        self.histograms["log10_scale"].add(gaussians.scales.log10().mean(-1))
-        depths = rendering.depth[rendering.alpha > MIN_ALPHA]
-        self.histograms["log10_depth"].add(depths.log10())
+        values = {
+            "opacity": gaussians.opacities.flatten(),
+            "log10_scale": gaussians.scales.log10().mean(-1).flatten(),
+            "log10_depth": rendering.depth[rendering.alpha > MIN_ALPHA].log10(),
+        }
+        for name, each in values.items():
+            sample = each[:: max(1, len(each) // SAMPLES)].float()
+            self.samples[name].append(sample[sample.isfinite()].cpu())
 
     def on_validation_epoch_end(self, trainer: Any, module: Any) -> None:
-        for name, histogram in self.histograms.items():
-            histogram.counts = trainer.strategy.reduce(histogram.counts, reduce_op="sum")
-            log(trainer, {f"gaussians/{name}_median": histogram.median()}, trainer.global_step)
+        for name, samples in self.samples.items():
+            values = torch.cat(samples)
+            if not len(values):
+                continue
+            log(trainer, {f"gaussians/{name}_median": values.median().item()}, trainer.global_step)
             for logger in trainer.loggers:
-                log_histogram(logger, f"gaussians/{name}", histogram, trainer.global_step)
+                log_histogram(logger, f"gaussians/{name}", values, trainer.global_step)
 
     def _begin(self, trainer: Any) -> None:
         self.begin_step, self.seconds, self.scenes, self.views = trainer.global_step, 0.0, 0, 0
