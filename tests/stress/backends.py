@@ -1,10 +1,10 @@
 """The backends under test, and their images and gradients of every input for a scene."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from compiler import INTERPRETED
 from torch import Tensor
 
 from asysplat.rendering import render
@@ -42,7 +42,9 @@ BACKENDS = (
     Backend("cpu", torch.float32, 1e-6, 5e-6, 3000),
 )
 FAST = tuple(backend for backend in BACKENDS if backend.name != "reference")
-if INTERPRETED:  # see test_in_triton.py
+# A process in which Triton interprets its kernels, see test_in_triton.py, tests them alone.
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+if INTERPRETED:
     FAST = BACKENDS = (Backend("cuda", torch.float32, 1e-6, 5e-6, 60),)
 
 
@@ -75,18 +77,20 @@ def both_ways(
     gaussians: Gaussians,
     cameras: Cameras,
     background: Tensor = BACKGROUND,
-    grad_output: Callable[[str, Tensor], Tensor] | None = None,
+    grad_output: Callable[[str, Tensor], Tensor | None] | None = None,
+    inputs: tuple[str, ...] = INPUTS,
     **options,
 ) -> Result:
     """Render in the backend's float type, forward and backward.
 
-    `grad_output` returns the gradient of an output from its name and value; the default is random,
-    the same every time.
+    `grad_output` returns the gradient of an output from its name and value, None if it is unused;
+    the default is random, the same every time. Of the leaves only `inputs` need gradients.
     """
     leaves = {name: getattr(gaussians, name) for name in FIELDS}
     leaves |= {"cam_to_world": cameras.cam_to_world, "intrinsics": cameras.intrinsics}
     leaves["background"] = background
-    leaves = {k: t.detach().to(backend.dtype).clone().requires_grad_() for k, t in leaves.items()}
+    leaves = {k: t.detach().to(backend.dtype).clone() for k, t in leaves.items()}
+    leaves |= {name: leaves[name].requires_grad_() for name in inputs}
     out = render(
         Gaussians(*(leaves[name] for name in FIELDS)),
         replace(cameras, intrinsics=leaves["intrinsics"], cam_to_world=leaves["cam_to_world"]),
@@ -96,13 +100,21 @@ def both_ways(
     )
     outputs = {"image": out.image, "alpha": out.alpha, "depth": out.depth}
     outputs = {name: output for name, output in outputs.items() if output is not None}
-    grad_outputs = [
-        (grad_output or random_gradient)(name, output.detach()) for name, output in outputs.items()
-    ]
-    grad_outputs = [grad.to(backend.dtype) for grad in grad_outputs]
-    grads = torch.autograd.grad(list(outputs.values()), list(leaves.values()), grad_outputs)
     detached = {name: output.detach() for name, output in outputs.items()}
-    return Result(detached, dict(zip(INPUTS, grads, strict=True)), out.stats)
+    grads = {name: (grad_output or random_gradient)(name, t) for name, t in detached.items()}
+    grads = {name: grad for name, grad in grads.items() if grad is not None}
+    grads = {k: t.to(backend.dtype) for k, t in grads.items() if outputs[k].requires_grad}
+    of_inputs = torch.autograd.grad(
+        [outputs[name] for name in grads],
+        [leaves[name] for name in inputs],
+        list(grads.values()),
+        materialize_grads=True,
+    )
+    return Result(detached, dict(zip(inputs, of_inputs, strict=True)), out.stats)
+
+
+def ones(name: str, output: Tensor) -> Tensor:
+    return torch.ones_like(output)
 
 
 def random_gradient(name: str, output: Tensor) -> Tensor:

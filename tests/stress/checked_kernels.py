@@ -4,7 +4,9 @@ and in poisoned memory: the same bits and the same statistics.
 NUMBA_BOUNDSCHECK=1 python tests/stress/checked_kernels.py
 """
 
-import itertools
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
 
 import numba
 import numpy as np
@@ -53,30 +55,24 @@ def wild_scene(seed: int, height: int, width: int, degree: int) -> tuple[Gaussia
     return gaussians, Cameras(pinhole.expand(2, 2, 3, 3), poses, height, width)
 
 
-def check_renderer() -> int:
-    """How many scenes were drawn; each in all memories, forward and backward."""
-    culling = Culling()
-    cases = [(tangent_scene(30_000, 256, 256, seed), {}) for seed in range(3)]
+def scenes() -> Iterator[Callable[[], Result]]:
+    for seed in range(3):
+        yield partial(both_ways, CPU, *tangent_scene(30_000, 256, 256, seed))
     sizes = [(1, 1, 0), (13, 17, 3), (16, 16, 1), (33, 300, 2), (300, 15, 0)]
     for seed, (height, width, degree) in enumerate(sizes):
-        scene = wild_scene(seed, height, width, degree)
-        cases += [(scene, {"antialiased": True}), (scene, {"depth": "median"})]
-        for name in ("ellipse", "extent", "frustum", "rows", "opaque"):
-            cases.append((scene, {"culling": culling.disable(name)}))
         masks = torch.zeros(2, 2, height, width, dtype=torch.bool)
         masks[..., : height // 2] = True
-        cases.append((scene, {"masks": masks}))
-    for scene, options in cases:
-        in_all_memories(lambda scene=scene, options=options: both_ways(CPU, *scene, **options))
-    return len(cases)
+        options = [{"antialiased": True}, {"depth": "median"}, {"masks": masks}]
+        for name in ("ellipse", "extent", "frustum", "rows", "opaque"):
+            options.append({"culling": Culling().disable(name)})
+        for option in options:
+            yield partial(both_ways, CPU, *wild_scene(seed, height, width, degree), **option)
 
 
-def check_scans() -> int:
-    """How many sequences were scanned; each in all memories, forward and backward."""
+def sequences() -> Iterator[Callable[[], Result]]:
     cases = [(ssd, size) for size in SSD_SIZES] + [(selective_scan, size) for size in SCAN_SIZES]
-    for (scan, size), state, reverse in itertools.product(cases, STATES, (False, True)):
-        in_all_memories(lambda s=scan, size=size, n=state, r=reverse: scanned(s, size, n, r))
-    return len(cases) * len(STATES) * 2
+    for (scan, size), state, reverse in product(cases, STATES, (False, True)):
+        yield partial(scanned, scan, size, state, reverse)
 
 
 def scanned(scan, size: tuple[int, ...], state: int, reverse: bool) -> Result:
@@ -100,8 +96,7 @@ def scanned(scan, size: tuple[int, ...], state: int, reverse: bool) -> Result:
     return Result({"y": y.detach()}, dict(zip(inputs, grads, strict=True)), {})
 
 
-def check_sweeps() -> int:
-    """How many scenes were swept, each in all memories."""
+def sweeps() -> Iterator[Callable[[], Result]]:
     sizes = [(1, 1, 1, 4), (3, 4, 1, 20), (12, 9, 3, 33), (7, 37, 1, 17), (24, 32, 2, 64)]
     for seed, (height, width, stride, planes) in enumerate(sizes):
         generator = torch.Generator().manual_seed(seed)
@@ -112,20 +107,17 @@ def check_sweeps() -> int:
         poses[..., :3, 3] = torch.randn(2, 4, 3, generator=generator)
         pinhole = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
         cameras = Cameras(pinhole.expand(2, 4, 3, 3), poses, height, width)
-        in_all_memories(lambda i=images, c=cameras, s=stride, p=planes: swept(i, c, s, p))
-    return len(sizes)
+        yield partial(swept, images, cameras, stride, planes)
 
 
 def swept(images: Tensor, cameras: Cameras, stride: int, planes: int) -> Result:
     return Result(vars(plane_sweep(images, cameras, stride, planes, backend="cpu")), {}, {})
 
 
-def check_losses() -> int:
-    """How many pairs of images were compared, each in all memories, with a gradient and without."""
+def losses() -> Iterator[Callable[[], Result]]:
     sizes = [(1, 1), (10, 40), (11, 11), (12, 16), (64, 27), (65, 33), (140, 100)]
-    for (height, width), grad in itertools.product(sizes, (False, True)):
-        in_all_memories(lambda h=height, w=width, g=grad: compared(h, w, g))
-    return 2 * len(sizes)
+    for (height, width), grad in product(sizes, (False, True)):
+        yield partial(compared, height, width, grad)
 
 
 def compared(height: int, width: int, grad: bool) -> Result:
@@ -136,12 +128,9 @@ def compared(height: int, width: int, grad: bool) -> Result:
     return Result({"loss": loss.detach()}, dict(zip(["rendered"], grads, strict=False)), {})
 
 
-def check_adam() -> int:
-    """How many numbers of rows took steps, each in all memories."""
-    numbers = (0, 1, 17, 1023, 1025, 2100)
-    for num in numbers:
-        in_all_memories(lambda n=num: stepped(n))
-    return len(numbers)
+def optimizers() -> Iterator[Callable[[], Result]]:
+    for rows in (0, 1, 17, 1023, 1025, 2100):
+        yield partial(stepped, rows)
 
 
 def stepped(num: int) -> Result:
@@ -160,7 +149,7 @@ def stepped(num: int) -> Result:
     return Result(optimizer.parameters | state, {}, {"non_finite": optimizer.non_finite})
 
 
-def in_all_memories(run) -> None:
+def check_in_all_memories(run: Callable[[], Result]) -> None:
     plain = run()
     for fill in FILLS:
         with poisoned(fill):
@@ -187,23 +176,17 @@ def _step_out(which, numbers, rows):
         store(rows, 0, gather_pairs(numbers.reshape(2, 8, 2), zeros() + ONE, zeros() + EIGHT)[0])
 
 
-def check_the_checks() -> int:
-    """A step out of an array is an error, whichever way it is taken."""
-    kinds = 7
-    for which in range(kinds):
+if __name__ == "__main__":
+    assert numba.config.BOUNDSCHECK, "set NUMBA_BOUNDSCHECK=1"
+    for which in range(7):
         try:
             _step_out(which, np.zeros(32, np.float32), np.zeros((2, 16), np.float32))
         except IndexError:
             continue
         raise AssertionError(f"step {which} out of an array went unseen")
-    return kinds
-
-
-if __name__ == "__main__":
-    assert numba.config.BOUNDSCHECK, "set NUMBA_BOUNDSCHECK=1"
-    print(f"{check_the_checks()} steps out of an array seen")
-    print(f"{check_scans()} sequences, {len(FILLS) + 1} memories: the same bits", flush=True)
-    print(f"{check_sweeps()} sweeps, {len(FILLS) + 1} memories: the same bits", flush=True)
-    print(f"{check_losses()} pairs of images, {len(FILLS) + 1} memories: the same bits", flush=True)
-    print(f"{check_adam()} optimizers, {len(FILLS) + 1} memories: the same bits", flush=True)
-    print(f"{check_renderer()} scenes, {len(FILLS) + 1} memories: the same bits and statistics")
+    for cases in (sequences, sweeps, losses, optimizers, scenes):
+        runs = list(cases())
+        for run in runs:
+            check_in_all_memories(run)
+        name = f"{len(runs)} {cases.__name__}, {len(FILLS) + 1} memories"
+        print(f"{name}: the same bits and statistics", flush=True)

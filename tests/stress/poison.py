@@ -8,16 +8,16 @@ import ctypes
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
 import torch
 
-import asysplat.rendering  # noqa: F401, for its modules
-
+# The module that allocates by NumPy outside of kernels; in the package, `draw` is a function.
+draw = import_module("asysplat.rendering.cpu.draw")
 M_PERTURB = -6  # of mallopt (glibc)
-HOSTS = ("asysplat.rendering.cpu.draw",)  # modules that allocate by NumPy outside of kernels
 # As float32 and as int32: 3.4e38 and 2139062143; -1.2e-38 and -2139062144.
 FILLS = (0x7F, 0x80)
 
@@ -29,16 +29,12 @@ def poisoned(fill: int | None) -> Iterator[None]:
         yield
         return
     numpy = SimpleNamespace(**{**vars(np), "empty": _empty, "empty_like": _empty_like})
-    hosts = [mock.patch.object(sys.modules[name], "np", numpy) for name in HOSTS]
     perturb(fill ^ 0xFF)  # it fills with the complement
     torch.use_deterministic_algorithms(True)  # and with it torch.empty is filled
-    for host in hosts:
-        host.start()
     try:
-        yield
+        with mock.patch.object(draw, "np", numpy):
+            yield
     finally:
-        for host in hosts:
-            host.stop()
         torch.use_deterministic_algorithms(False)
         perturb(0)
 

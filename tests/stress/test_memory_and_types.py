@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from backends import BACKGROUND, FIELDS, INPUTS, assert_same_bits, both_ways
+from backends import BACKGROUND, FIELDS, INPUTS, assert_same_bits, both_ways, ones
 from poison import FILLS, poisoned
 
 from asysplat.rendering import render
@@ -36,9 +36,7 @@ def test_case_28_types(backend, make_scene, dtype, autocast):
     at_least = torch.promote_types(dtype, torch.float32)
     assert out.image.dtype == out.alpha.dtype == out.depth.dtype == at_least
     plain = replace(backend, dtype=at_least)
-    result = both_ways(
-        plain, gaussians, cameras, background, grad_output=lambda _, t: torch.ones_like(t)
-    )
+    result = both_ways(plain, gaussians, cameras, background, grad_output=ones)
     assert torch.equal(out.image, result.image)
     (out.image.sum() + out.alpha.sum() + out.depth.sum()).backward()
     for name, leaf in zip(INPUTS, leaves, strict=True):
@@ -51,7 +49,7 @@ def test_case_30_strided_and_expanded_inputs_and_gradients(backend, make_scene):
     gaussians.sh[:] = gaussians.sh[:1]
     gaussians.opacities[:] = 0.5
     cameras.intrinsics[:] = cameras.intrinsics[:1]
-    plain = both_ways(backend, gaussians, cameras, grad_output=lambda _, t: torch.ones_like(t))
+    plain = both_ways(backend, gaussians, cameras, grad_output=ones)
 
     def strided(tensor):
         return torch.stack((tensor, tensor), -1)[..., 0]
@@ -105,34 +103,28 @@ def test_case_30_strided_and_expanded_inputs_and_gradients(backend, make_scene):
 @pytest.mark.parametrize("used", ["image", "alpha", "depth"])
 def test_case_30_unused_outputs(backend, make_scene, used, depth):
     """The gradient of one output is that of all with zeros for the others."""
-    gaussians, cameras = make_scene(views=2, dtype=torch.float32)
+    scene = make_scene(views=2, dtype=torch.float32)
 
-    def grad_output(name, output):
+    def zeros(name, output):
         return torch.full_like(output, float(name == used))
 
-    expected = both_ways(backend, gaussians, cameras, grad_output=grad_output, depth=depth)
-    gaussians = gaussians.map(lambda t: t.to(backend.dtype).requires_grad_())
-    background = BACKGROUND.to(backend.dtype)
-    out = render(gaussians, cameras.to(backend.dtype), background, backend.name, depth)
-    grads = torch.autograd.grad(
-        getattr(out, used).sum(), [getattr(gaussians, name) for name in FIELDS], allow_unused=True
-    )
-    for name, grad in zip(FIELDS, grads, strict=True):
-        value = torch.zeros_like(expected.grads[name]) if grad is None else grad
-        torch.testing.assert_close(value, expected.grads[name], rtol=1e-5, atol=1e-5, msg=name)
+    def alone(name, output):
+        return torch.ones_like(output) if name == used else None
+
+    expected = both_ways(backend, *scene, grad_output=zeros, depth=depth)
+    result = both_ways(backend, *scene, grad_output=alone, depth=depth)
+    for name in INPUTS:
+        torch.testing.assert_close(
+            result.grads[name], expected.grads[name], rtol=1e-5, atol=1e-5, msg=name
+        )
 
 
 @pytest.mark.parametrize("name", INPUTS)
 def test_case_30_one_input_alone_needs_a_gradient(backend, make_scene, name):
-    gaussians, cameras = make_scene(views=2, dtype=torch.float32)
-    expected = both_ways(backend, gaussians, cameras, grad_output=lambda _, t: torch.ones_like(t))
-    gaussians, cameras = gaussians.to(backend.dtype), cameras.to(backend.dtype)
-    background = BACKGROUND.to(backend.dtype, copy=True)
-    record = next((r for r in (gaussians, cameras) if hasattr(r, name)), None)
-    leaf = (background if record is None else getattr(record, name)).requires_grad_()
-    out = render(gaussians, cameras, background, backend=backend.name)
-    (out.image.sum() + out.alpha.sum() + out.depth.sum()).backward()
-    assert torch.equal(leaf.grad, expected.grads[name])
+    scene = make_scene(views=2, dtype=torch.float32)
+    expected = both_ways(backend, *scene, grad_output=ones)
+    result = both_ways(backend, *scene, grad_output=ones, inputs=(name,))
+    assert torch.equal(result.grads[name], expected.grads[name])
 
 
 def test_case_30_no_input_needs_a_gradient(backend, make_scene):
