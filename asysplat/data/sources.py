@@ -12,7 +12,7 @@ import numpy as np
 from asysplat.data.procedural import ProceduralScene, split_seed
 from asysplat.data.readers import find_scenes, open_scene
 from asysplat.data.selection import named_selection, views
-from asysplat.data.selection.index import read_index
+from asysplat.data.selection.index import read_index, selection_of
 from asysplat.data.selection.views import Selection, Split
 from asysplat.data.sequence import FileSequence, ImageSequence, SceneOptions
 from asysplat.errors import InputError
@@ -222,11 +222,11 @@ class FilesSource:
     def _index_tasks(self, inputs: int) -> list[Task]:
         index = read_index(self.index, inputs)
         tasks = [
-            Task(sequence, index.selection(sequence.name, sequence.cameras, inputs))
-            for sequence in self._tests
-            if sequence.name in index.entries
+            Task(each, selection_of(index, self.index, each.name, each.cameras, inputs))
+            for each in self._tests
+            if each.name in index
         ]
-        missing = set(index.entries) - {task.sequence.name for task in tasks}
+        missing = set(index) - {task.sequence.name for task in tasks}
         if missing:
             raise InputError(
                 f"data.index={self.index} names {len(missing)} scenes that do not exist, such as "

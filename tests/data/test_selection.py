@@ -7,7 +7,7 @@ import torch
 from asysplat.data import ProceduralScene
 from asysplat.data.selection import kmeans_selection, named_selection
 from asysplat.data.selection.__main__ import main as index_command
-from asysplat.data.selection.index import Entry, camera_hash, read_index, write_index
+from asysplat.data.selection.index import camera_hash, read_index, selection_of, write_index
 from asysplat.data.selection.kmeans import nearest_to_centers, pose_features
 from asysplat.data.selection.views import (
     Selection,
@@ -245,7 +245,7 @@ def test_kmeans_of_a_real_walk(shared):
     selected = kmeans_selection(cameras, 32, 8, "test")
     assert selected.inputs == MYDESK
     assert selected.targets == list(range(0, 498, 8))
-    published = read_index(file, 32).selection("mydesk", cameras, 32)
+    published = selection_of(read_index(file, 32), file, "mydesk", cameras, 32)
     assert published.targets == selected.targets and len(published.inputs) == 32
     # They cover the walk about as well: the farthest image from an input is about as far.
     features = pose_features(cameras)
@@ -260,12 +260,12 @@ def test_pixelsplat_s_index(tmp_path):
     file = tmp_path / "index.json"
     file.write_text('{"5aca": {"context": [2, 9], "target": [2, 4, 9]}, "322": null}')
     index = read_index(file, 2)
-    assert list(index.entries) == ["5aca"]
-    assert index.selection("5aca", line(10), 2) == Selection([2, 9], [2, 4, 9])
+    assert list(index) == ["5aca"]
+    assert selection_of(index, file, "5aca", line(10), 2) == Selection([2, 9], [2, 4, 9])
     with pytest.raises(InputError, match=r"index\.json, scene 5aca has 2 inputs and data\.inputs"):
-        index.selection("5aca", line(10), 3)
+        selection_of(index, file, "5aca", line(10), 3)
     with pytest.raises(InputError, match="names image 9, and the scene has 9 images"):
-        index.selection("5aca", line(9), 2)
+        selection_of(index, file, "5aca", line(9), 2)
 
 
 def test_long_lrm_s_lists(tmp_path):
@@ -273,10 +273,9 @@ def test_long_lrm_s_lists(tmp_path):
         content = {"scene_name": scene, "frames": [{}] * 20, "fold_8_kmeans_2_input": [3, 12]}
         (tmp_path / scene).mkdir()
         (tmp_path / scene / "opencv_cameras.json").write_text(json.dumps(content))
-    expected = Selection([3, 12], [0, 8, 16])
-    one = read_index(tmp_path / "a/opencv_cameras.json", 2)
-    assert one.entries == {"a": Entry(expected)}
-    assert read_index(tmp_path, 2).entries == {"a": Entry(expected), "b": Entry(expected)}
+    expected = (Selection([3, 12], [0, 8, 16]), None)
+    assert read_index(tmp_path / "a/opencv_cameras.json", 2) == {"a": expected}
+    assert read_index(tmp_path, 2) == {"a": expected, "b": expected}
     with pytest.raises(InputError, match=r"no list fold_8_kmeans_4_input .*fold_8_kmeans_2_input"):
         read_index(tmp_path, 4)
 
@@ -284,10 +283,10 @@ def test_long_lrm_s_lists(tmp_path):
 def test_our_index_detects_other_cameras_and_changes(tmp_path):
     file = tmp_path / "index.json"
     selected = kmeans_selection(line(), 4, 4, "test")
-    write_index(file, "kmeans", {"walk": Entry(selected, camera_hash(line()))})
-    assert read_index(file, 4).selection("walk", line(), 4) == selected
+    write_index(file, "kmeans", {"walk": (selected, camera_hash(line()))})
+    assert selection_of(read_index(file, 4), file, "walk", line(), 4) == selected
     with pytest.raises(InputError, match="made for other cameras"):
-        read_index(file, 4).selection("walk", circle(), 4)
+        selection_of(read_index(file, 4), file, "walk", circle(), 4)
     with pytest.raises(InputError, match=r"index\.json exists"):
         write_index(file, "kmeans", {})
     file.write_text(file.read_text().replace("kmeans", "uniform"))
@@ -330,7 +329,8 @@ def test_the_command_writes_an_index_outside_of_the_data_set(tmp_path, capsys):
     assert "2 scenes" in capsys.readouterr().out
     index = read_index(file, 4)
     cameras = ProceduralScene(4, 8, 8, num_images=24).cameras
-    assert index.selection("4", cameras, 4) == kmeans_selection(cameras, 4, 8, "test")
+    expected = kmeans_selection(cameras, 4, 8, "test")
+    assert selection_of(index, file, "4", cameras, 4) == expected
     inside = tmp_path / "scenes/index.json"
     with pytest.raises(SystemExit, match="lies in the data set"):
         index_command([str(tmp_path / "scenes"), str(inside), "--inputs", "4"])

@@ -9,8 +9,10 @@ from pathlib import Path
 
 from asysplat.data.readers import find_scenes, open_scene
 from asysplat.data.selection import SELECTIONS, named_selection
-from asysplat.data.selection.index import Entry, camera_hash, write_index
+from asysplat.data.selection.index import camera_hash, write_index
+from asysplat.data.selection.views import Selection
 from asysplat.data.sequence import SceneOptions
+from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
 
 
@@ -23,29 +25,22 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--inputs", type=int, default=32)
     parser.add_argument("--targets", type=int, default=8, help="of every_8th and uniform")
     options = parser.parse_args(arguments)
+    index: dict[str, tuple[Selection, str]] = {}
     try:
-        entries = index_entries(options)
-        if options.index.resolve().is_relative_to(options.root.resolve()):
-            raise InputError(f"{options.index} lies in the data set: name a file outside of it.")
-        write_index(options.index, options.selection, entries)
+        layout, scenes = find_scenes(options.root, options.layout)
+        refuse_inside(options.index, options.root, "name a file outside of it")
+        for scene in scenes:
+            sequence = open_scene(scene, SceneOptions(1, 1, layout))  # reads cameras, no pixels
+            name, cameras = sequence.name, sequence.cameras
+            if name in index:
+                raise InputError(f"{options.root} holds two scenes called {name}: rename one.")
+            counts = (options.inputs, options.targets)
+            selection = named_selection(options.selection, cameras, *counts, "test")
+            index[name] = selection, camera_hash(cameras)
+        write_index(options.index, options.selection, index)
     except InputError as error:
         sys.exit(f"error: {error}")
-    print(f"{options.index}: {len(entries)} scenes")
-
-
-def index_entries(options: argparse.Namespace) -> dict[str, Entry]:
-    """Select the test images of every scene that `root` is or holds."""
-    layout, scenes = find_scenes(options.root, options.layout)
-    entries: dict[str, Entry] = {}
-    for scene in scenes:
-        sequence = open_scene(scene, SceneOptions(1, 1, layout))  # reads cameras, no pixels
-        if sequence.name in entries:
-            raise InputError(f"{options.root} holds two scenes called {sequence.name}: rename one.")
-        selection = named_selection(
-            options.selection, sequence.cameras, options.inputs, options.targets, "test"
-        )
-        entries[sequence.name] = Entry(selection, camera_hash(sequence.cameras))
-    return entries
+    print(f"{options.index}: {len(index)} scenes")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,49 +23,11 @@ LONG_LRM_FILE = "opencv_cameras.json"
 LONG_LRM_LIST = re.compile(r"fold_(\d+)_kmeans_(\d+)_input")
 
 
-@dataclass(frozen=True)
-class Entry:
-    """The entry of one scene; `cameras` is the hash of its cameras, where the index has one."""
-
-    selection: Selection
-    cameras: str | None = None
+# Scene -> its selection, and the hash of its cameras where the index has one.
+Index = Mapping[str, tuple[Selection, str | None]]
 
 
-@dataclass(frozen=True)
-class ViewIndex:
-    """The entries of an index file by the name of the scene; `path` is for messages."""
-
-    path: Path
-    entries: Mapping[str, Entry]
-
-    def selection(self, scene: str, cameras: Cameras, num_inputs: int) -> Selection:
-        """Return the selection of a scene.
-
-        Raises:
-            InputError: the index was made for other cameras or another number of inputs, or names
-                an image that the scene lacks.
-        """
-        entry, where = self.entries[scene], f"{self.path}, scene {scene}"
-        if entry.cameras not in (None, camera_hash(cameras)):
-            raise InputError(
-                f"{where}: the index was made for other cameras: write it again for these files."
-            )
-        inputs, targets = entry.selection.inputs, entry.selection.targets
-        if len(inputs) != num_inputs:
-            raise InputError(
-                f"{where} has {len(inputs)} inputs and data.inputs is {num_inputs}: set one to the "
-                "other."
-            )
-        last = max(inputs + targets)
-        if last >= cameras.num_views:
-            raise InputError(
-                f"{where} names image {last}, and the scene has {cameras.num_views} images: it "
-                "belongs to another version of the scene; write the index again for this one."
-            )
-        return entry.selection
-
-
-def read_index(path: Path | str, num_inputs: int) -> ViewIndex:
+def read_index(path: Path | str, num_inputs: int) -> Index:
     """Read an index of any of the three forms.
 
     pixelSplat's: {scene: {"context": [...], "target": [...]} or null}; scenes that are null are
@@ -86,30 +47,58 @@ def read_index(path: Path | str, num_inputs: int) -> ViewIndex:
                 f"data.index={path} is a folder without {LONG_LRM_FILE}: name an index file, or "
                 "scenes in the layout of Long-LRM."
             )
-        entries = [_long_lrm_entry(file, read_frames(file), num_inputs) for file in files]
-        return ViewIndex(path, dict(entries))
+        return dict(_long_lrm_entry(file, read_frames(file), num_inputs) for file in files)
     content = read_json(path)
     if not isinstance(content, dict):
         raise InputError(f'{path} is no index: give {{"scene": {{"context": [], "target": []}}}}.')
     if isinstance(content.get("frames"), list):
-        return ViewIndex(path, dict([_long_lrm_entry(path, content, num_inputs)]))
+        return dict([_long_lrm_entry(path, content, num_inputs)])
     scenes = content
     if "hash" in content:
         stored = {name: value for name, value in content.items() if name != "hash"}
         if content["hash"] != _hash_of(stored) or not isinstance(content.get("scenes"), dict):
             raise InputError(f"{path} was changed after it was written: write it again.")
         scenes = content["scenes"]
-    entries = {}
+    index = {}
     for name, stored in scenes.items():
         if stored is not None:
             entry = stored if isinstance(stored, dict) else {}
             where = f"{path}, scene {name}"
             lists = (_indices(f"{where}, {key}", entry.get(key)) for key in ("context", "target"))
-            entries[name] = Entry(Selection(*lists), entry.get("cameras"))
-    return ViewIndex(path, entries)
+            index[name] = Selection(*lists), entry.get("cameras")
+    return index
 
 
-def write_index(path: Path, selection: str, entries: Mapping[str, Entry]) -> None:
+def selection_of(
+    index: Index, path: Path | str, scene: str, cameras: Cameras, num_inputs: int
+) -> Selection:
+    """Return the selection of a scene in the index that was read from `path`.
+
+    Raises:
+        InputError: the index was made for other cameras or another number of inputs, or names an
+            image that the scene lacks.
+    """
+    selection, made_for = index[scene]
+    where = f"{path}, scene {scene}"
+    if made_for not in (None, camera_hash(cameras)):
+        raise InputError(
+            f"{where}: the index was made for other cameras: write it again for these files."
+        )
+    if len(selection.inputs) != num_inputs:
+        raise InputError(
+            f"{where} has {len(selection.inputs)} inputs and data.inputs is {num_inputs}: set one "
+            "to the other."
+        )
+    last = max(selection.inputs + selection.targets)
+    if last >= cameras.num_views:
+        raise InputError(
+            f"{where} names image {last}, and the scene has {cameras.num_views} images: it belongs "
+            "to another version of the scene; write the index again for this one."
+        )
+    return selection
+
+
+def write_index(path: Path, method: str, index: Index) -> None:
     """Write an index in our own form, with a hash over all of it that reveals later changes.
 
     Raises:
@@ -117,11 +106,11 @@ def write_index(path: Path, selection: str, entries: Mapping[str, Entry]) -> Non
     """
     if path.exists():
         raise InputError(f"{path} exists: name a new file, nothing is overwritten.")
-    scenes = {}
-    for name, entry in entries.items():
-        lists = {"context": entry.selection.inputs, "target": entry.selection.targets}
-        scenes[name] = lists | {"cameras": entry.cameras}
-    content = {"selection": selection, "scenes": scenes}
+    scenes = {
+        name: {"context": selection.inputs, "target": selection.targets, "cameras": made_for}
+        for name, (selection, made_for) in index.items()
+    }
+    content = {"selection": method, "scenes": scenes}
     path.write_text(json.dumps(content | {"hash": _hash_of(content)}, indent=1))
 
 
@@ -136,14 +125,16 @@ def _hash_of(content: dict[str, Any]) -> str:
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
-def _long_lrm_entry(file: Path, content: dict[str, Any], num_inputs: int) -> tuple[str, Entry]:
+def _long_lrm_entry(
+    file: Path, content: dict[str, Any], num_inputs: int
+) -> tuple[str, tuple[Selection, None]]:
     lists = {name: matched for name in content if (matched := LONG_LRM_LIST.fullmatch(name))}
     for name, matched in lists.items():
         fold, count = map(int, matched.groups())
         if count == num_inputs and fold > 0:
             inputs = _indices(f"{file}, {name}", content[name])
             selection = Selection(inputs, list(range(0, len(content["frames"]), fold)))
-            return str(content.get("scene_name", file.parent.name)), Entry(selection)
+            return str(content.get("scene_name", file.parent.name)), (selection, None)
     raise InputError(
         f"{file} has no list fold_8_kmeans_{num_inputs}_input (its lists: "
         f"{', '.join(lists) or 'none'}): set data.inputs to the number of a list, or use "
