@@ -1,4 +1,4 @@
-"""The coordinate frame of the viewer's pages, and their cameras."""
+"""Cameras of the viewer's pages, and of the frustums in them."""
 
 import math
 from typing import Any
@@ -10,27 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from asysplat.data.normalize import Normalization
-from asysplat.scene import Cameras, Gaussians
-
-
-def page_frame(cameras: Cameras, gaussians: Gaussians | None) -> Normalization:
-    """Return the frame of the pages: input cameras around 0, the farthest at distance 1.
-
-    A browser's near plane, navigation and float32 suit a scene of that size only. If all cameras
-    coincide, the unit is the median distance of the Gaussians.
-    """
-    centers = cameras.centers.double().cpu()
-    world_to_page = torch.eye(4, dtype=torch.float64)
-    world_to_page[:3, 3] = -centers.mean(0)
-    unit = (centers - centers.mean(0)).norm(dim=-1).max().item()
-    # Smaller differences between the centers are rounding.
-    if unit <= 1e-6 * centers.abs().max():
-        unit = 1.0
-        if gaussians is not None:
-            distances = (gaussians.means.double().cpu() - centers.mean(0)).norm(dim=-1)
-            unit = distances.median().item()
-    return Normalization(world_to_page, 1 / unit)
+from asysplat.scene import Cameras
 
 
 def mean_up(cameras: Cameras) -> Float[Tensor, "3"]:
@@ -51,16 +31,6 @@ def quaternion(cameras: Cameras, view: int) -> ndarray:
     """Return a camera's rotation, wxyz."""
     rotation = cameras.cam_to_world[view, :3, :3].numpy()
     return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
-
-
-def distance_along(
-    gaussians: Gaussians, position: Float[Tensor, "3"], forward: Float[Tensor, "3"]
-) -> float:
-    """Return the median depth of the Gaussians within 45 degrees of a direction; 1 without any."""
-    offsets = gaussians.means - position.to(gaussians.means)
-    depths = offsets @ forward.to(gaussians.means)
-    ahead = depths > math.sqrt(0.5) * offsets.norm(dim=-1)
-    return depths[ahead].median().item() if ahead.any() else 1.0
 
 
 def clicked_camera(

@@ -13,6 +13,7 @@ from matplotlib import colormaps
 from numpy import ndarray
 from torch import Tensor
 
+from asysplat.data.normalize import normalize
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import disparity
 from asysplat.export import frame
@@ -62,8 +63,9 @@ class Viewer:
         _check_one_scene("views", views.images.shape[:-4])
         if gaussians is not None:
             _check_one_scene("gaussians", gaussians.opacities.shape[:-1])
-        self._frame = frame.page_frame(views.cameras, gaussians)
-        views = self._frame.apply(Views(views.cameras, views.images).to("cpu"))
+        views = Views(views.cameras, views.images).to("cpu")
+        # A browser's near plane, navigation and float32 suit a scene of about size 1 only.
+        views, _, self._frame = normalize(views, views)
         self._cameras = views.cameras
         self._up = frame.mean_up(self._cameras)
         self._scene: tuple[Gaussians | None, str] = (None, WAITING)
@@ -168,19 +170,19 @@ class Viewer:
         to_near = event.client.camera.near / (ray @ camera.cam_to_world[0, :3, 2])
         view = frame.clicked_camera(self._cameras, FRUSTUM_LENGTH, start, to_near * ray)
         if view is not None:
-            self._move(event.client, view)
-
-    def _move(self, client: Any, view: int) -> None:
-        camera = client.camera
-        with client.atomic():
-            camera.position, camera.look_at, camera.up_direction, camera.fov = self._pose(view)
+            page = event.client.camera
+            with event.client.atomic():
+                page.position, page.look_at, page.up_direction, page.fov = self._pose(view)
 
     def _pose(self, view: int) -> tuple:
-        """Return position, look-at, up (the scene's, with the camera's roll) and field of view."""
+        """Return position, look-at, up (the scene's, with the camera's roll) and field of view.
+
+        Navigation turns around look-at: a point at the median distance of the Gaussians.
+        """
         right, _, forward = self._cameras.cam_to_world[view, :3, :3].unbind(-1)
-        position = self._cameras.centers[view]
-        gaussians, _ = self._scene
-        distance = 1.0 if gaussians is None else frame.distance_along(gaussians, position, forward)
+        position, distance, (gaussians, _) = self._cameras.centers[view], 1.0, self._scene
+        if gaussians is not None:
+            distance = (gaussians.means.cpu() - position).norm(dim=-1).median()
         up = self._up - (self._up @ right) * right
         vectors = (position, position + distance * forward, up)
         return *(vector.numpy() for vector in vectors), frame.field_of_view(self._cameras, view)[0]

@@ -26,9 +26,13 @@ def frames_of(path) -> list[np.ndarray]:
         return [frame.to_ndarray(**options) for frame in container.decode(video=0)]
 
 
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "way.mp4"
+
+
 @pytest.mark.parametrize(("height", "width"), [(32, 48), (33, 47), (1, 1)])
-def test_all_frames_come_back(tmp_path, height, width):
-    path = tmp_path / "way.mp4"
+def test_all_frames_come_back(path, height, width):
     write_video(path, (image(i, height, width) for i in range(21)), fps=24)
     frames = frames_of(path)
     assert len(frames) == 21
@@ -40,8 +44,7 @@ def test_all_frames_come_back(tmp_path, height, width):
             assert np.abs(frame[:, -1].astype(int) - frame[:, -2]).max() < 12  # a copy, not black
 
 
-def test_browsers_play_it(tmp_path):
-    path = tmp_path / "way.mp4"
+def test_browsers_play_it(path):
     write_video(path, [image(i, 64, 64) for i in range(3)], fps=29.97)
     with av.open(path) as container:
         stream = container.streams.video[0]
@@ -55,14 +58,14 @@ def test_browsers_play_it(tmp_path):
 
 
 @pytest.mark.parametrize("color", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.2, 0.7, 0.4), (2, -1, 0.5)])
-def test_colors_are_right_and_clamped(tmp_path, color):
+def test_colors_are_right_and_clamped(path, color):
     color = torch.tensor(color, dtype=torch.float32)[:, None, None]
-    write_video(tmp_path / "way.mp4", [color.expand(3, 16, 16)])
-    found = frames_of(tmp_path / "way.mp4")[0].astype(float)
+    write_video(path, [color.expand(3, 16, 16)])
+    found = frames_of(path)[0].astype(float)
     assert np.abs(found - 255 * color.clamp(0, 1).permute(1, 2, 0).numpy()).max() < 4
 
 
-def test_images_are_not_kept(tmp_path):
+def test_images_are_not_kept(path):
     alive = []
 
     def images():
@@ -73,18 +76,16 @@ def test_images_are_not_kept(tmp_path):
             del made
             assert sum(ref() is not None for ref in alive) <= 1
 
-    write_video(tmp_path / "way.mp4", images())
+    write_video(path, images())
     assert len(alive) == 12
 
 
 @pytest.fixture
-def old(tmp_path):
-    (tmp_path / "way.mp4").write_text("old")
-    return tmp_path / "way.mp4"
-
-
-def assert_untouched(file):
-    assert file.read_text() == "old" and list(file.parent.iterdir()) == [file]
+def old(path):
+    """A file that stays as it is."""
+    path.write_text("old")
+    yield path
+    assert path.read_text() == "old" and list(path.parent.iterdir()) == [path]
 
 
 def interrupted():
@@ -104,7 +105,6 @@ def interrupted():
 def test_what_goes_wrong_leaves_the_old_file(old, images, error, message):
     with pytest.raises(error, match=message):
         write_video(old, images)
-    assert_untouched(old)
 
 
 @pytest.mark.parametrize("size", [0, 4000])
@@ -112,7 +112,6 @@ def test_a_full_disk_leaves_the_old_file(old, size):
     message = r"way\.mp4 cannot be written \(File too large\)"
     with largest_file(size), pytest.raises(InputError, match=message):
         write_video(old, (torch.rand(3, 64, 64) for _ in range(40)))
-    assert_untouched(old)
 
 
 def test_mistakes_are_refused(tmp_path, monkeypatch):

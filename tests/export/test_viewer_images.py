@@ -1,46 +1,16 @@
-"""The frame of the viewer's pages, and their cameras."""
+"""The viewer's cameras and layers, without a page."""
 
 import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
-from asysplat import Views, render
-from asysplat.export.frame import (
-    clicked_camera,
-    distance_along,
-    field_of_view,
-    mean_up,
-    page_camera,
-    page_frame,
-    quaternion,
-)
-
-
-@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e4])
-def test_a_scene_of_any_size_looks_the_same(make_scene, factor):
-    gaussians, cameras = make_scene(count=60, views=4, height=24, width=32, dtype=torch.float32)
-    offset = factor * torch.tensor([30.0, -20, 10])
-    scaled = gaussians.scale_by(factor)
-    scaled = replace(scaled, means=scaled.means + offset)
-    poses = cameras.cam_to_world.clone()
-    poses[:, :3, 3] = factor * poses[:, :3, 3] + offset
-    placed = replace(cameras, cam_to_world=poses)
-    frame = page_frame(placed, scaled)
-    inside = frame.apply(Views(placed, torch.zeros(4, 3, 24, 32))).cameras
-    assert inside.centers.mean(0).norm() < 1e-4
-    assert inside.centers.norm(dim=-1).max() == pytest.approx(1, abs=1e-3)
-    image = render(frame.to_network(scaled), inside).image
-    torch.testing.assert_close(image, render(gaussians, cameras).image, atol=2e-3, rtol=0)
-
-
-def test_cameras_in_one_place_leave_the_unit_to_the_gaussians(make_scene):
-    gaussians, cameras = make_scene(count=60, dtype=torch.float32)
-    assert page_frame(cameras, None).scale == 1
-    frame = page_frame(cameras, gaussians.scale_by(1000.0))
-    assert 2000 < 1 / frame.scale < 6000
+from asysplat import Cameras, Gaussians, render
+from asysplat.export.frame import clicked_camera, field_of_view, mean_up, page_camera, quaternion
+from asysplat.export.viewer import draw_layer
 
 
 def test_up_is_the_mean_of_the_cameras(make_scene):
@@ -51,13 +21,6 @@ def test_up_is_the_mean_of_the_cameras(make_scene):
     poses[1] = poses[0] @ torch.diag(torch.tensor([-1.0, -1, 1, 1]))
     opposed = replace(cameras, cam_to_world=poses).select([0, 1])
     torch.testing.assert_close(mean_up(opposed), -poses[0, :3, 1])
-
-
-def test_distance_along(make_scene):
-    gaussians, _ = make_scene(count=61, dtype=torch.float32)
-    forward, origin = torch.tensor([0.0, 0, 1]), torch.zeros(3)
-    assert distance_along(gaussians, origin, forward) == pytest.approx(3.5, abs=0.1)
-    assert distance_along(gaussians, origin, -forward) == 1
 
 
 def page_of(cameras, view):
@@ -81,10 +44,8 @@ def test_a_page_at_an_input_camera(make_scene):
         torch.testing.assert_close(camera.intrinsics[0], focal)
         torch.testing.assert_close(camera.cam_to_world[0], cameras.cam_to_world[view])
     assert field_of_view(cameras, 0)[1] == pytest.approx(80 / 60)
-
-
-def test_fewer_pixels_keep_the_field_of_view(make_scene):
-    _, cameras = make_scene(height=600, width=800, dtype=torch.float32)
+    # Fewer pixels keep the field of view.
+    cameras = cameras.resized(600, 800)
     camera, in_full = page_camera(page_of(cameras, 0), 30_000)
     assert not in_full and (camera.height, camera.width) == (150, 200)
     expected = 2 * math.atan(75 / camera.intrinsics[0, 1, 1].item())
@@ -107,3 +68,56 @@ def test_a_click_hits_the_first_visible_image(make_scene):
     for x, met in ((0.049, 0), (0.051, None)):
         ray = torch.tensor([0, 0, 0.01])
         assert clicked_camera(cameras, 0.1, torch.tensor([x, 0, 0]), ray) == met
+
+
+@pytest.fixture(scope="module")
+def scene(make_scene):
+    return make_scene(count=60, height=24, width=32, dtype=torch.float32)
+
+
+def bytes_of(image):
+    return (255 * image.clamp(0, 1)).round().byte().numpy()
+
+
+def test_color_and_alpha_are_those_of_the_renderer(scene):
+    rendering = render(*scene)
+    color, alpha = draw_layer(*scene), draw_layer(*scene, layer="alpha")
+    np.testing.assert_array_equal(color, bytes_of(rendering.image[0]).transpose(1, 2, 0))
+    for channel in range(3):
+        np.testing.assert_array_equal(alpha[..., channel], bytes_of(rendering.alpha[0]))
+    assert color.std() > 20 and alpha.std() > 20
+
+
+def test_near_is_bright_and_an_empty_image_of_one_color(scene):
+    focal = torch.tensor([[[20.0, 0, 16], [0, 20, 8], [0, 0, 1]]])
+    gaussians = Gaussians(
+        means=torch.tensor([[-1.0, 0, 2], [2, 0, 4]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        scales=torch.full((2, 3), 0.2),
+        opacities=torch.full((2,), 0.99),
+        sh=torch.zeros(2, 1, 3),
+    )
+    image = draw_layer(gaussians, Cameras(focal, torch.eye(4)[None], 16, 32), layer="depth")
+    assert image.shape == (16, 32, 3) and image.dtype == np.uint8 and np.ptp(image) > 50
+    near, far, nothing = (image[8, column].astype(int).sum() for column in (6, 26, 16))
+    assert near > far > nothing
+    gaussians, camera = scene
+    behind = replace(gaussians, means=gaussians.means * torch.tensor([1, 1, -1.0]))
+    assert np.ptp(draw_layer(behind, camera, layer="depth"), axis=(0, 1)).max() == 0
+
+
+def test_settings_of_the_panel(scene):
+    gaussians, camera = scene
+    least = gaussians.opacities.median().item()
+    kept = gaussians.keep(gaussians.opacities >= least)
+    assert 0 < kept.num_gaussians < gaussians.num_gaussians
+    for settings, expected in (
+        ({"min_opacity": least}, kept),
+        ({"sh_degree": 0}, replace(gaussians, sh=gaussians.sh[:, :1])),
+        ({"size": 0.5}, replace(gaussians, scales=gaussians.scales / 2)),
+    ):
+        drawn = draw_layer(gaussians, camera, **settings)
+        np.testing.assert_array_equal(drawn, draw_layer(expected, camera))
+        assert (drawn != draw_layer(gaussians, camera)).any()
+    alphas = [draw_layer(gaussians, camera, layer="alpha", size=size).mean() for size in (0.5, 1.0)]
+    assert alphas[0] < 0.8 * alphas[1]

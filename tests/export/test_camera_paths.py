@@ -1,0 +1,233 @@
+"""Camera paths: along the cameras' own, and around what they look at."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from asysplat.data.procedural import ProceduralScene
+from asysplat.errors import InputError
+from asysplat.export import orbit, smoothed_path
+from asysplat.scene import Cameras
+
+
+def cameras_at(centers, targets=None, roll=0.0) -> Cameras:
+    """Cameras in a world with z up, that look along y or at targets."""
+    centers = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
+    forward = np.array([0.0, 1, 0]) if targets is None else np.asarray(targets) - centers
+    forward = np.broadcast_to(forward, centers.shape)
+    forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, (0, 0, 1))
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (len(centers), 1, 1))
+    poses[:, :3, :3] = np.stack((right, np.cross(forward, right), forward), 2)
+    poses[:, :3, :3] @= Rotation.from_euler("z", roll).as_matrix()
+    poses[:, :3, 3] = centers
+    intrinsics = torch.tensor([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
+    return Cameras(
+        intrinsics.repeat(len(centers), 1, 1), torch.tensor(poses, dtype=torch.float32), 48, 64
+    )
+
+
+def ring(angles, radius=2.0, height=0.5):
+    angles = np.radians(angles)
+    return np.stack(
+        (radius * np.cos(angles), radius * np.sin(angles), np.full_like(angles, height)), 1
+    )
+
+
+def turned(axis, angles) -> Cameras:
+    """Cameras at one place."""
+    cameras = cameras_at(np.ones((len(angles), 3)))
+    turns = Rotation.from_euler(axis, np.reshape(angles, (-1, 1)), degrees=True).as_matrix()
+    cameras.cam_to_world[:, :3, :3] = torch.tensor(turns, dtype=torch.float32)
+    return cameras
+
+
+HARD = {
+    "one": cameras_at([[1, 2, 3]]),
+    "two": cameras_at([[0, 0, 0], [1, 0, 0]]),
+    "two that face each other": cameras_at([[0, -1, 0], [0, 1, 0]], np.zeros((2, 3))),
+    "three": cameras_at([[0, 0, 0], [1, 0, 0], [1, 1, 0]]),
+    "one place": cameras_at(np.ones((5, 3))),
+    "one place, a turn": turned("y", [0, 20, 40, 60]),
+    "one place, all around": turned("y", list(range(0, 360, 30))),
+    "one place, over the top": turned("x", list(range(0, 181, 30))),
+    "collinear, sideways": cameras_at([[x, 0, 0] for x in range(6)]),
+    "collinear, forwards": cameras_at([[0, y, 0] for y in range(6)]),
+    "collinear, upwards": cameras_at([[0, 0, z] for z in range(6)]),
+    "looking straight down": turned("x", [0.0]),
+    "ups that cancel": cameras_at(ring([0, 180]), np.zeros((2, 3)), roll=math.pi / 2),
+    "pairs at each place": cameras_at(np.repeat(ring(range(0, 90, 15)), 2, 0)),
+    "rounding apart": cameras_at(100 + 1e-6 * np.random.default_rng(0).normal(size=(4, 3))),
+    "outwards": cameras_at(ring(range(0, 360, 30)), 2 * ring(range(0, 360, 30), height=0.25)),
+    "far from the origin": cameras_at(ring(range(0, 360, 30)) + 1e4, np.full((12, 3), 1e4)),
+    "hand-held": ProceduralScene(2, 12, 16).views(list(range(0, 90, 3))).cameras,
+}
+
+
+PATHS = [smoothed_path, orbit]
+
+
+@pytest.mark.parametrize("frames", [1, 2, 25])
+@pytest.mark.parametrize("case", HARD)
+@pytest.mark.parametrize("path", PATHS)
+def test_cameras_can_be_rendered_whatever_is_given(path, case, frames):
+    made = path(HARD[case], frames).validate()
+    assert made.num_views == frames
+    assert (made.height, made.width) == (HARD[case].height, HARD[case].width)
+    assert made.cam_to_world.dtype == torch.float32
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_intrinsics_are_the_mean(path):
+    cameras = cameras_at(ring([0, 10, 20]), [[0, 0, 0]] * 3)
+    cameras.intrinsics[:, 0, 0] = torch.tensor([40.0, 50, 90])
+    made = path(cameras, 4)
+    assert torch.equal(made.intrinsics, cameras.intrinsics.mean(0).expand(4, 3, 3))
+    assert made.intrinsics[0, 0, 0] == 60
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize(
+    ("change", "frames", "message"),
+    [
+        (lambda c: c, 0, "frames is 0"),
+        (lambda c: Cameras.stack([c, c]), 5, r"shape \(2, 3, 3, 3\): expected \[V, 3, 3\]"),
+        (lambda c: c.select(torch.zeros(0, dtype=torch.long)), 5, r"shape \(0, 3, 3\)"),
+        (lambda c: c.map(lambda t: t * torch.nan), 5, "holds NaN"),
+    ],
+)
+def test_mistakes_are_refused(path, change, frames, message):
+    with pytest.raises(InputError, match=message):
+        path(change(cameras_at(ring([0, 10, 20]))), frames)
+
+
+def steps(cameras: Cameras) -> np.ndarray:
+    return cameras.centers.diff(dim=0).norm(dim=-1).numpy()
+
+
+def turns(cameras: Cameras) -> np.ndarray:
+    """Degrees from each camera to the next."""
+    rotations = Rotation.from_matrix(cameras.cam_to_world[:, :3, :3].numpy())
+    return np.degrees((rotations[:-1].inv() * rotations[1:]).magnitude())
+
+
+def test_a_walk_is_smooth_even_and_where_the_cameras_were():
+    rng = np.random.default_rng(0)
+    # Steps of all lengths along half a circle, with tremble.
+    angles = np.sort(rng.uniform(0, 180, 200))
+    angles[[0, -1]] = 0, 180
+    still = cameras_at(ring(angles), np.zeros((200, 3)))
+    trembling = still.centers.double().numpy() + rng.normal(scale=0.01, size=(200, 3))
+    made = smoothed_path(cameras_at(trembling, rng.normal(scale=0.02, size=(200, 3))), 120)
+    distance = made.centers[:, :2].norm(dim=-1)
+    assert (distance - 2).abs().max() < 0.02
+    assert (made.centers[0] - still.centers[0]).norm() < 0.2
+    assert (made.centers[-1] - still.centers[-1]).norm() < 0.2
+    # In spreads and radians.
+    spread = still.centers.std(dim=0, correction=0).norm().item()
+    speed = np.hypot(steps(made) / spread, np.radians(turns(made)))
+    assert speed.max() < 1.05 * speed.min()
+    # The angle between one step and the next is that of the circle.
+    way = torch.nn.functional.normalize(made.centers.diff(dim=0), dim=-1)
+    bends = torch.rad2deg(torch.acos((way[1:] * way[:-1]).sum(-1).clamp(-1, 1)))
+    assert bends.max() < 4 and 1 < bends.mean() < 2
+
+
+def test_few_views_are_passed_through():
+    cameras = cameras_at(ring(range(0, 181, 30)), np.zeros((7, 3)))
+    made = smoothed_path(cameras, 200)
+    nearest = torch.cdist(cameras.centers, made.centers).min(1).values
+    assert nearest[1:-1].max() < 0.03 and nearest.max() < 0.12
+    assert (made.centers[:, :2].norm(dim=-1) - 2).abs().max() < 0.05
+    inwards = -torch.nn.functional.normalize(made.centers, dim=-1)
+    assert (inwards * made.cam_to_world[:, :3, 2]).sum(-1).min() > math.cos(math.radians(2))
+    made = smoothed_path(cameras_at([[0, 0, 0], [1, 0, 0]]), 11)  # a line
+    assert (made.centers[:, 1:] == 0).all()
+    assert (made.centers[:, 0].diff() > 0).all()
+    assert made.centers[0, 0] < 0.05 and made.centers[-1, 0] > 0.95
+
+
+def test_turns_on_the_spot_are_even():
+    made = smoothed_path(turned("y", [0, 5, 50, 60]), 30)
+    assert (made.centers - 1).abs().max() < 1e-6
+    assert turns(made).sum() > 55
+    assert turns(made).max() < 1.1 * turns(made).min()
+    # A whole turn passes the rotation by 180 degrees, where quaternions change their sign.
+    made = smoothed_path(turned("y", list(range(0, 351, 10))), 60)
+    assert 330 < turns(made).sum() < 351
+    assert turns(made).max() < 1.1 * turns(made).mean()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_views_in_a_jumble_are_brought_in_order(seed):
+    cameras = cameras_at(ring(range(0, 150, 10)), np.zeros((15, 3)))
+    order = np.random.default_rng(seed).permutation(15).tolist()
+    ways = [steps(smoothed_path(c, 60)).sum() for c in (cameras, cameras.select(order))]
+    np.testing.assert_allclose(*ways, rtol=1e-3)
+
+
+def test_a_good_order_is_kept():
+    """Neighbors at crossings of the way are nearer than the next view, and are not taken."""
+    angles = np.linspace(0, 2 * np.pi, 61)
+    eight = np.stack((np.sin(angles), np.sin(2 * angles), np.zeros(61)), 1)
+    way = np.append(0, np.linalg.norm(np.diff(eight, axis=0), axis=1).cumsum())
+    times = np.linspace(0, way[-1], 60)
+    evenly = np.stack([np.interp(times, way, column) for column in eight.T], 1)
+    made = smoothed_path(cameras_at(eight), 60)
+    assert np.linalg.norm(made.centers.numpy() - evenly, axis=1).max() < 0.15
+
+
+def assert_looks_at(cameras: Cameras, point, atol=1e-4):
+    ahead = torch.tensor(point) - cameras.centers
+    ahead = torch.nn.functional.normalize(ahead, dim=-1)
+    torch.testing.assert_close(cameras.cam_to_world[:, :3, 2], ahead.float(), rtol=0, atol=atol)
+
+
+def test_cameras_all_around_are_circled():
+    made = orbit(cameras_at(ring(range(0, 360, 20)), np.zeros((18, 3))), 36)
+    assert_looks_at(made, (0.0, 0, 0))
+    torch.testing.assert_close(made.centers[:, :2].norm(dim=-1), torch.full((36,), 2.0))
+    torch.testing.assert_close(made.centers[:, 2], torch.full((36,), 0.5))
+    # Closed: from the last frame to the first it is as far as between any others.
+    around = torch.cat((made.centers, made.centers[:1])).diff(dim=0).norm(dim=-1)
+    torch.testing.assert_close(around, torch.full((36,), 4 * math.sin(math.radians(5))))
+    assert (made.cam_to_world[:, 2, 1] < 0).all()  # upright: down is down
+
+
+@pytest.mark.parametrize("start", [0, 150, 300])
+def test_cameras_on_one_side_are_not_left(start):
+    angles = np.arange(start, start + 81, 10)
+    made = orbit(cameras_at(ring(angles, height=1.5), np.zeros((9, 3))), 40)
+    assert_looks_at(made, (0.0, 0, 0))
+    # Level, though all cameras look down by 37 degrees to the same side.
+    torch.testing.assert_close(made.centers[:, 2], torch.full((40,), 1.5))
+    assert made.cam_to_world[:, 2, 0].abs().max() < 1e-4
+    x, y = made.centers[:, :2].double().numpy().T
+    seen = (np.degrees(np.arctan2(y, x)) - start + 180) % 360 - 180
+    np.testing.assert_allclose((seen.min(), seen.max()), (0, 80), atol=0.1)
+    np.testing.assert_allclose(np.hypot(x, y), 2, rtol=1e-4)
+    # To and fro, without a jump from the last frame to the first.
+    assert np.abs(np.diff(seen, append=seen[0])).max() < 8
+
+
+def test_parallel_axes_swing_in_front_of_the_middle_camera():
+    cameras = cameras_at([[x, 0, 1] for x in (-2, -1, 0, 1, 2)])
+    made = orbit(cameras, 20)
+    assert made.centers[:, 0].abs().max() < 2.1
+    assert made.centers[:, 0].abs().max() > 0.5
+    assert made.cam_to_world[:, 1, 2].min() > math.cos(math.radians(25))
+    torch.testing.assert_close(made.centers[:, 2], torch.ones(20))
+
+
+@pytest.mark.parametrize("case", ["outwards", "one place, all around", "one"])
+def test_where_no_point_is_seen_by_most_the_middle_camera_swings_a_little(case):
+    made = orbit(HARD[case], 20)
+    axes = made.cam_to_world[:, :3, 2]
+    assert (axes @ axes.mT).min() > math.cos(math.radians(10.1))
+    assert (axes @ axes.mT).min() < math.cos(math.radians(9))
+    seen = torch.cat((HARD[case].cam_to_world[:, :3, 2], axes))
+    assert (seen[:-20] @ axes.mT).max() > math.cos(math.radians(0.5))
