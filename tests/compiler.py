@@ -34,11 +34,12 @@ def compiled(kernel, arguments, architecture):
     return compile(source, GPUTarget("cuda", architecture, 32), options)
 
 
-def collect_kernels(monkeypatch, architecture, variant):
+def collect_kernels(monkeypatch, architecture, variant=(), fill=lambda arguments: None):
     """Compile each kernel at its launch instead of running it.
 
     Args:
         variant: the constants that distinguish variants of a kernel.
+        fill: called with the arguments of each launch, to write results.
 
     Returns:
         The compiled kernels by name and variant, filled by later launches.
@@ -51,7 +52,8 @@ def collect_kernels(monkeypatch, architecture, variant):
         arguments = dict(zip(kernel.arg_names, arguments, strict=False)) | others
         name = kernel.fn.__name__, *(arguments.get(constant) for constant in variant)
         if name not in kernels:
-            kernels[name] = compiled(kernel, arguments, architecture)
+            kernels[name] = compiled(kernel, dict(arguments), architecture)
+        fill(arguments)
 
     monkeypatch.setattr(JITFunction, "run", run)
     return kernels

@@ -8,13 +8,8 @@ from compiler import DEVICE, INTERPRETED
 from surfaces import cameras_at, depth_of_plane, four_cameras, slanted_plane, texture
 
 from asysplat.models.prior.plane_sweep import plane_sweep
-from asysplat.models.prior.projections import (
-    Projections,
-    choose_neighbors,
-    inverse_depth_range,
-)
+from asysplat.models.prior.projections import Projections, choose_neighbors, inverse_depth_range
 from asysplat.ops.plane_sweep import reference
-from asysplat.scene import Cameras
 
 FAST = [
     pytest.param("cpu", marks=pytest.mark.skipif(INTERPRETED, reason="for cuda alone")),
@@ -166,27 +161,18 @@ def test_results_scale_with_the_unit_of_length():
     images, _ = slanted_plane(cameras)
     at_one = plane_sweep(images, cameras)
     for scale in (1e-3, 1e4):
-        cam_to_world = cameras.cam_to_world.clone()
-        cam_to_world[..., :3, 3] *= scale
-        scaled = Cameras(cameras.intrinsics, cam_to_world, cameras.height, cameras.width)
+        scaled = cameras.map(torch.clone)
+        scaled.cam_to_world[..., :3, 3] *= scale
         found = plane_sweep(images, scaled)
-        for got, expected in (
-            (found.inverse_depth * scale, at_one.inverse_depth),
-            (found.confidence, at_one.confidence),
-        ):
-            torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-6)
+        inverse = found.inverse_depth * scale
+        torch.testing.assert_close(inverse, at_one.inverse_depth, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(found.confidence, at_one.confidence, rtol=1e-4, atol=1e-6)
 
 
 def test_scenes_of_a_batch_are_independent():
     cameras = four_cameras()
     scenes = [slanted_plane(cameras, seed=seed)[0].float() for seed in range(2)]
-    both = Cameras(
-        cameras.intrinsics.float().repeat(2, 1, 1, 1),
-        cameras.cam_to_world.float().repeat(2, 1, 1, 1),
-        cameras.height,
-        cameras.width,
-    )
-    together = plane_sweep(torch.cat(scenes), both)
+    together = plane_sweep(torch.cat(scenes), cameras.map(lambda t: t.float().repeat(2, 1, 1, 1)))
     for scene, images in enumerate(scenes):
         alone = plane_sweep(images, cameras.to(torch.float32))
         torch.testing.assert_close(together.inverse_depth[scene], alone.inverse_depth[0])

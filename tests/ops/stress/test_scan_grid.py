@@ -1,10 +1,12 @@
-"""Scans over the whole range of steps and rates, and all lengths and sizes, against the loop."""
+"""Scans over the whole range of steps and rates, and all lengths and sizes, against the loop, and
+the gradients of the float64 forms against finite differences."""
 
 import pytest
 import torch
 from scans import (
     EXACT_PATHS,
     RATES,
+    SCANS,
     STEPS,
     assert_exact,
     both_ways,
@@ -57,3 +59,21 @@ def test_every_size(path, batch, channels, head_dim, state, reverse):
     )
     # A gradient of A that is one number may be a sum in which nearly all cancels.
     assert_exact(path, arguments, reverse=reverse, slack=2)
+
+
+# Within a chunk, over its end, and with steps that clear the state.
+CASES = {"short": (5, "0.1"), "long": (66, "0.1"), "forgetful": (66, "3")}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("path", EXACT_PATHS, ids="-".join)
+def test_every_gradient_equals_finite_differences(path, case, reverse):
+    name, backend = path
+    length, steps = CASES[case]
+    arguments = make_arguments(name, length, steps, batch=1, channels=2, head_dim=2, state=2)
+    leaves = [argument.double().requires_grad_() for argument in arguments]
+    assert torch.autograd.gradcheck(
+        lambda *leaves: SCANS[name](*leaves, backend=backend, reverse=reverse),
+        leaves,
+        fast_mode=True,
+    )

@@ -1,4 +1,5 @@
-"""Strided and expanded inputs, other types, and inputs without gradients."""
+"""Strided and expanded inputs, other types, inputs without gradients, and the same bits in every
+run, on any number of threads and in any memory."""
 
 import pytest
 import torch
@@ -6,6 +7,7 @@ from scans import (
     ERROR,
     NAMES,
     SCANS,
+    Result,
     both_ways,
     by_loop,
     make_arguments,
@@ -88,7 +90,34 @@ def test_autocast_changes_nothing(path):
     plain = both_ways(path, leaves)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         y = run(path, leaves)
-    assert torch.equal(y, plain.y)
     grads = torch.autograd.grad(y, leaves, random_grad_output(y))
-    for name, grad, right in zip(NAMES, grads, plain.grads, strict=True):
-        assert torch.equal(grad, right), name
+    assert_same_bits(Result(y, grads), plain)
+
+
+def assert_same_bits(one: Result, other: Result) -> None:
+    for name, value in one.named().items():
+        assert torch.equal(value, other.named()[name]), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+def test_any_number_of_threads_gives_the_same_bits(path, threads, dtype, reverse):
+    arguments = make_arguments(path[0], 131, channels=4, head_dim=16, state=16, dtype=dtype)
+
+    def run(count):
+        threads(count)
+        return both_ways(path, arguments, reverse=reverse)
+
+    one = run(1)
+    for again in (run(1), run(2)):
+        assert_same_bits(again, one)
+
+
+@pytest.mark.parametrize("length", [1, 67])
+def test_every_element_is_written(path, length, reverse):
+    arguments = make_arguments(path[0], length)
+    clean = both_ways(path, arguments, reverse=reverse)
+    torch.use_deterministic_algorithms(True)  # fills torch.empty with NaN
+    try:
+        assert_same_bits(both_ways(path, arguments, reverse=reverse), clean)
+    finally:
+        torch.use_deterministic_algorithms(False)
