@@ -22,8 +22,7 @@ from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.post_optimization import HOW, PostOptimization, Predict
 from asysplat.evaluation.rows import write_csv
-from asysplat.evaluation.scene_results import image_rows, scene_rows, set_results
-from asysplat.evaluation.scenes import measure_scenes
+from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.export import read_gaussians
 from asysplat.interrupts import keep_interrupts
 from asysplat.models.early_exit import EXACT
@@ -73,7 +72,6 @@ def evaluate(options: DictConfig) -> None:
     results |= {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
     results |= set_results(scenes, measure.protocol.mean_over)
     write_csv(target.folder / "evaluation.csv", image_rows(scenes))
-    write_csv(target.folder / "evaluation_scenes.csv", scene_rows(scenes))
     write_json(target.folder / EVALUATION, results)
     print_evaluation(results, list(scenes), target.folder)
 

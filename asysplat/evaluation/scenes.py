@@ -1,17 +1,23 @@
 """Measure all scenes of all test sets; an interrupted evaluation resumes with the next scene."""
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Literal
 
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from torch.utils.data import Dataset
 
 from asysplat.evaluation.figures import comparison_figure
+from asysplat.evaluation.measured_cost import mean_but_longest
 from asysplat.evaluation.post_optimization import PostOptimization, Predict, SceneResult
-from asysplat.evaluation.scene_results import load_result, save_result, scene_rows
+from asysplat.evaluation.rows import ImageRow, average
 from asysplat.files import atomic_write
 from asysplat.rendering import Rendering
+
+Scenes = Mapping[str, Sequence[SceneResult]]  # by test set, the data set's own first
 
 
 def measure_scenes(
@@ -56,21 +62,75 @@ def measure_scenes(
 
             result = measure(sample["scene"], predict, inputs, targets, show)
             result.early_exit.update(early_exit)
-            rows = scene_rows({name: [result]})
-            psnrs = {row["source"]: row["psnr"] for row in rows if row["source"] in result.costs}
-            psnrs = [f"{source.removeprefix('post')}: {psnr:.2f}" for source, psnr in psnrs.items()]
             sentence = f"{name} {result.scene}, PSNR after steps of post-optimization: "
-            bars.console.print(sentence + ", ".join(psnrs), soft_wrap=True, highlight=False)
+            sentence += ", ".join(
+                f"{source[4:]}: {_means(result.rows, 'targets', source, 'images')['psnr']:.2f}"
+                for source in result.costs
+            )
+            bars.console.print(sentence, soft_wrap=True, highlight=False)
             return result
 
         results: dict[str, list[SceneResult]] = {name: [] for name in tests}
         for name, samples in tests.items():
             for index in range(len(samples)):
                 path = scene_folder / f"{name}-{index}.json"
-                result = load_result(path)
-                if result is None:
+                if path.exists():
+                    result = SceneResult(**json.loads(path.read_text()))
+                else:
                     result = measure_scene(name, index)
                     save_result(path, result)
                 results[name].append(result)
                 bars.advance(scenes)
     return results
+
+
+def save_result(path: Path, result: SceneResult) -> None:
+    """Write the result of a scene atomically."""
+    with atomic_write(path) as partial:
+        partial.write_text(json.dumps(asdict(result)))
+
+
+def image_rows(scenes: Scenes) -> list[ImageRow]:
+    """Return the rows of all images."""
+    return [
+        {"set": test_set, "scene": result.scene, **row}
+        for test_set, results in scenes.items()
+        for result in results
+        for row in result.rows
+    ]
+
+
+def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, float]:
+    """Average over each test set; `over`: see `average`.
+
+    Returns:
+        test/<set>/post<steps>/<metric>, of the input views inputs/<set>/post<steps>/psnr,
+        baseline/<set>/<baseline>/<metric>, and cost/gaussians, cost/post<steps>/seconds (the
+        `mean_but_longest`) and /gb (the largest); of further sets under cost/<set>/. With an early
+        exit also early_exit/<set>/<what>.
+    """
+    averages: dict[str, float] = {}
+    main = next(iter(scenes))
+    for test_set, results in scenes.items():
+        rows = image_rows({test_set: results})
+        costs = "cost" if test_set == main else f"cost/{test_set}"
+        averages[f"{costs}/gaussians"] = sum(r.gaussians for r in results) / len(results)
+        for name, share in average([dict(r.early_exit) for r in results], "images").items():
+            averages[f"early_exit/{test_set}/{name}"] = share
+        for source in dict.fromkeys(row["source"] for row in rows):
+            tested = "test" if source in results[0].costs else "baseline"
+            for kind, images in ((tested, "targets"), ("inputs", "inputs")):
+                for name, value in _means(rows, images, source, over).items():
+                    averages[f"{kind}/{test_set}/{source}/{name}"] = value
+        for source in results[0].costs:
+            every = [result.costs[source] for result in results]
+            averages[f"{costs}/{source}/seconds"] = mean_but_longest([c["seconds"] for c in every])
+            if all("gb" in each for each in every):
+                averages[f"{costs}/{source}/gb"] = max(each["gb"] for each in every)
+    return averages
+
+
+def _means(
+    rows: Sequence[ImageRow], images: str, source: str, over: Literal["images", "scenes"]
+) -> dict[str, float]:
+    return average([r for r in rows if (r["images"], r["source"]) == (images, source)], over)

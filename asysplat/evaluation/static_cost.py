@@ -2,7 +2,8 @@
 
 import copy
 import math
-from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
 
 import torch
 from torch import Tensor, UntypedStorage, nn
@@ -21,8 +22,8 @@ def count_parameters(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-def module_flops(net: nn.Module, run: Callable[[], object]) -> int:
-    """Count the FLOPs of one `run()`, which calls `net`, as the paper counts them.
+def module_flops(net: nn.Module, inputs: Any) -> tuple[int, Any]:
+    """Count the FLOPs of `net(inputs)` as the paper counts them; return them and the output.
 
     2 x multiply-adds of Linear, Conv1d and Conv2d modules, 4 operations an element for LayerNorm
     and BatchNorm. Like a profiler of modules, it does not count attention products, scans, RMSNorm,
@@ -35,14 +36,12 @@ def module_flops(net: nn.Module, run: Callable[[], object]) -> int:
         nonlocal total
         total += output.numel() * _flops_per_output(module)
 
-    counted = [module for module in net.modules() if _flops_per_output(module)]
-    hooks = [module.register_forward_hook(count) for module in counted]
-    try:
-        run()
-    finally:
-        for hook in hooks:
-            hook.remove()
-    return total
+    with ExitStack() as hooks:
+        for module in net.modules():
+            if _flops_per_output(module):
+                hooks.callback(module.register_forward_hook(count).remove)
+        output = net(inputs)
+    return total, output
 
 
 def _flops_per_output(module: nn.Module) -> int:
@@ -56,17 +55,6 @@ def _flops_per_output(module: nn.Module) -> int:
     if isinstance(module, (nn.Conv1d, nn.Conv2d)):
         return 2 * module.in_channels // module.groups * math.prod(module.kernel_size)
     return 0
-
-
-def true_flops(run: Callable[[], object]) -> int:
-    """Count the FLOPs of one `run()`: every matrix product, einsum, attention and scan.
-
-    Run it on the meta device, which needs no memory; elsewhere torch's counter may not know the
-    kernel (some releases count attention on a CPU as 0). Other element-wise work is not counted.
-    """
-    with FlopCounterMode(display=False) as counter:
-        run()
-    return counter.get_total_flops()
 
 
 def blank_views(num_views: int, height: int, width: int) -> Views:
@@ -88,30 +76,29 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
         gflops_true (`true_flops`), in 1e9; gaussians, their number; and `activation_gb`.
     """
     on_meta = copy.deepcopy(net).to("meta")
-    with torch.device("meta"):
-        views = blank_views(num_views, height, width)
-    gaussians, modules = [], []
-
-    def forward() -> None:
-        gaussians.append(on_meta(views))
-
-    with torch.no_grad():
-        everything = true_flops(lambda: modules.append(module_flops(on_meta, forward)))
+    with torch.device("meta"), torch.no_grad():
+        flops, gaussians = module_flops(on_meta, blank_views(num_views, height, width))
     return {
         "parameters": count_parameters(net),
         "geometry_share": net.geometry_share(),
-        "gflops": modules[0] / GIGA,
-        "gflops_true": everything / GIGA,
-        "gaussians": gaussians[0].num_gaussians,
+        "gflops": flops / GIGA,
+        "gflops_true": true_flops(net, num_views, height, width) / GIGA,
+        "gaussians": gaussians.num_gaussians,
         "activation_gb": activation_gb(on_meta, num_views, height, width),
     }
 
 
-def forward_flops(net: nn.Module, num_views: int, height: int, width: int) -> int:
-    """Count the `true_flops` of the forward pass of one scene, on the meta device."""
+def true_flops(net: nn.Module, num_views: int, height: int, width: int) -> int:
+    """Count the FLOPs of one scene's forward pass: matrix products, einsums, attention and scans.
+
+    On the meta device, as torch's counter may not know the kernel elsewhere (some releases count
+    attention on a CPU as 0). Other element-wise work is not counted.
+    """
     on_meta = copy.deepcopy(net).to("meta")
-    with torch.device("meta"), torch.no_grad():
-        return true_flops(lambda: on_meta(blank_views(num_views, height, width)))
+    counter = FlopCounterMode(display=False)
+    with torch.device("meta"), torch.no_grad(), counter:
+        on_meta(blank_views(num_views, height, width))
+    return counter.get_total_flops()
 
 
 def activation_gb(net: nn.Module, num_views: int, height: int, width: int) -> float:

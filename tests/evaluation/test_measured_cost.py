@@ -1,14 +1,21 @@
 """Seconds are the mean of all but the longest; memory is the largest peak since each start."""
 
 import mmap
+import re
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
 from asysplat.evaluation import measured_cost
-from asysplat.evaluation.measured_cost import reset_peak_memory
-from asysplat.evaluation.measured_cost import CostMeter, mean_but_longest
+from asysplat.evaluation.measured_cost import (
+    CostMeter,
+    mean_but_longest,
+    peak_memory_gb,
+    reset_peak_memory,
+)
 
 CPU = torch.device("cpu")
 
@@ -56,3 +63,20 @@ def test_no_memory_if_the_peak_cannot_be_reset(monkeypatch):
     work.start()
     work.stop()
     assert set(work.costs("a")) == {"a_seconds"}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_peak_memory_of_the_process():
+    status = Path("/proc/self/status").read_text()
+    kilobytes = int(re.search(r"VmHWM:\s+(\d+) kB", status)[1])
+    # A process may inherit a higher peak from the one that started it; the unit would differ more.
+    assert 0.9 < peak_memory_gb("cpu") / (kilobytes * 1024 / 1e9) < 100
+
+
+@pytest.mark.gpu
+def test_peak_memory_of_a_gpu():
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    x = torch.empty(50_000_000, device="cuda")
+    del x
+    assert peak_memory_gb("cuda") == pytest.approx((before + 2e8) / 1e9, abs=1e-3)

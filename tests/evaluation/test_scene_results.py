@@ -1,15 +1,9 @@
-"""Results of scenes: kept and read again, and put together for each set."""
+"""Results of scenes, put together for each set."""
 
 import pytest
 
 from asysplat.evaluation.post_optimization import SceneResult
-from asysplat.evaluation.scene_results import (
-    image_rows,
-    load_result,
-    save_result,
-    scene_rows,
-    set_results,
-)
+from asysplat.evaluation.scenes import image_rows, set_results
 
 
 def result(scene, psnrs, seconds):
@@ -33,14 +27,6 @@ SCENES = {
 }
 
 
-def test_a_scene_is_read_as_it_was_saved(tmp_path):
-    path = tmp_path / "main-0.json"
-    assert load_result(path) is None
-    save_result(path, SCENES["main"][0])
-    assert load_result(path) == SCENES["main"][0]
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_numbers_of_a_set():
     found = set_results(SCENES, "images")
     assert found["test/main/post0/psnr"] == pytest.approx(25)
@@ -52,20 +38,4 @@ def test_numbers_of_a_set():
     assert (found["cost/post3/gb"], found["cost/gaussians"]) == (9, 100)
     assert found["test/other/post3/psnr"] == 52 and found["cost/other/post3/seconds"] == 8
     assert set_results(SCENES, "scenes")["test/main/post0/psnr"] == pytest.approx(85 / 3)
-
-
-def test_rows_of_images_and_of_scenes():
     assert len(image_rows(SCENES)) == 4 * 2 * 2 + 2 + 4
-    rows = {(row["scene"], row["source"]): row for row in scene_rows(SCENES)}
-    assert len(rows) == 4 * 3
-    assert rows["a", "post3"] == {
-        "set": "main",
-        "scene": "a",
-        "source": "post3",
-        "gaussians": 100,
-        "seconds": 2.0,
-        "gb": 1.0,
-        "inputs/psnr": 13.0,
-        "psnr": 17.0,
-    }
-    assert "seconds" not in rows["a", "mean_color"]

@@ -1,8 +1,17 @@
-"""Costs at the paper's scale, without data or memory."""
+"""Counts of parameters and FLOPs; costs at the paper's scale, without data or memory."""
 
+import pytest
 import torch
+from torch import nn
 
-from asysplat.evaluation.static_cost import activation_gb, blank_views, static_costs
+from asysplat.evaluation.static_cost import (
+    activation_gb,
+    blank_views,
+    count_parameters,
+    module_flops,
+    static_costs,
+    true_flops,
+)
 
 
 def test_full_width_at_32_views_of_256(build):
@@ -30,3 +39,61 @@ def test_activation_memory_is_what_a_forward_pass_saves(build):
     with torch.autograd.graph.saved_tensors_hooks(save, lambda tensor: tensor):
         net(views)
     assert activation_gb(net, 2, 64, 64) == sum(s.nbytes() for s in saved.values()) / 1e9
+
+
+def test_parameters():
+    net = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4), nn.Linear(4, 2, bias=False))
+    net[0].requires_grad_(False)
+    assert count_parameters(net) == (3 * 4 + 4) + 2 * 4 + 4 * 2
+
+
+@pytest.mark.parametrize("device", ["cpu", "meta"])
+@pytest.mark.parametrize(
+    "layer, shape, expected",
+    [
+        (nn.Linear(3, 4), (2, 5, 3), 2 * 10 * 3 * 4),
+        (nn.Conv2d(4, 6, 3, stride=2, padding=1, groups=2), (1, 4, 8, 8), 2 * 16 * 6 * 2 * 9),
+        (nn.Conv2d(8, 8, 3, padding=1, groups=8), (1, 8, 4, 4), 2 * 16 * 8 * 9),
+        (nn.Conv1d(4, 6, 5), (2, 4, 9), 2 * (2 * 5 * 6) * 4 * 5),
+        (nn.Conv1d(4, 4, 5, groups=4), (2, 4, 9), 0),
+        (nn.LayerNorm(7), (2, 3, 7), 4 * 42),
+        (nn.BatchNorm2d(3), (2, 3, 4, 4), 4 * 96),
+        (nn.RMSNorm(7), (2, 3, 7), 0),
+        (nn.GELU(), (2, 3, 7), 0),
+    ],
+)
+def test_module_flops_of_one_layer(layer, shape, expected, device):
+    net = nn.Sequential(layer).to(device)
+    x = torch.ones(shape, device=device)
+    assert module_flops(net, x)[0] == expected
+
+
+class Attention(nn.Module):
+    """Attention among the rows of all images."""
+
+    def __init__(self, width):
+        super().__init__()
+        self.qkv = nn.Linear(width, 3 * width, bias=False)
+
+    def forward(self, views):
+        q, k, v = self.qkv(views.images.flatten(1, 3)).chunk(3, -1)
+        return nn.functional.scaled_dot_product_attention(q, k, v)
+
+
+def test_attention_products_are_in_the_true_count_only():
+    views, height, width = 2, 4, 16
+    with torch.device("meta"):
+        net, inputs = Attention(width), blank_views(views, height, width)
+    tokens = views * 3 * height
+    assert module_flops(net, inputs)[0] == 2 * tokens * width * 3 * width
+    products = 2 * 2 * tokens * tokens * width  # q k^T and its product with v
+    assert true_flops(net, views, height, width) == 2 * tokens * width * 3 * width + products
+
+
+def test_every_use_of_a_shared_module_counts_and_hooks_are_removed():
+    layer = nn.Linear(2, 2)
+    x = torch.ones(1, 2)
+    assert module_flops(nn.Sequential(layer, layer), x)[0] == 2 * 8
+    with pytest.raises(RuntimeError):
+        module_flops(layer, torch.ones(1, 3))
+    assert not layer._forward_hooks

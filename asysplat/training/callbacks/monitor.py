@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from asysplat.evaluation.measured_cost import memory_gb, peak_memory_gb, wait_for
 from asysplat.evaluation.peak import peak_flops
-from asysplat.evaluation.static_cost import forward_flops
+from asysplat.evaluation.static_cost import true_flops
 from asysplat.training.loggers import log_histogram
 from asysplat.training.parts import PARTS
 from asysplat.training.prediction import Prediction
@@ -88,7 +88,7 @@ class TrainingMonitor(Callback):
             if self.flops is None:
                 views = batch["inputs"]
                 size = (views.num_views, views.cameras.height, views.cameras.width)
-                self.flops = PASSES * forward_flops(module.net, *size)
+                self.flops = PASSES * true_flops(module.net, *size)
             seconds, total = module.parts.stop(), now - self.started
             shares = {name: spent / total for name, spent in seconds.items()}
             shares["other"] = max(0.0, 1 - sum(shares.values()))
