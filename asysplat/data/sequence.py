@@ -38,17 +38,9 @@ Load = Callable[[ImageFile], ndarray]
 class ImageSequence(Protocol):
     """Images of one static place, in the order they were taken; `views` reads their pixels."""
 
-    @property
-    def name(self) -> str:
-        """The name, unique within the data set."""
-
-    @property
-    def num_images(self) -> int:
-        """The number of images."""
-
-    @property
-    def cameras(self) -> Cameras:
-        """The cameras of all images, [num_images, ...]."""
+    name: str  # unique within the data set
+    num_images: int
+    cameras: Cameras  # of all images, [num_images, ...]
 
     def views(self, indices: Sequence[int]) -> Views:
         """Return the images at `indices`, in that order: pixels in [0, 1], depths where known."""

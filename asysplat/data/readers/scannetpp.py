@@ -18,7 +18,7 @@ https://github.com/scannetpp/scannetpp (common/scene_release.py, common/utils/ne
 """
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,32 +32,23 @@ from asysplat.data.readers.transforms import read_images
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
 
-
-@dataclass(frozen=True)
-class Part:
-    """The folders that belong to a file of poses, within its camera's folder."""
-
-    images: str
-    masks: str
-    depths: str | None
-    get: str  # how to get the images, for messages
-
-
 EXTRACT = (
     "extract rgb.mkv (or rgb.mp4) with the toolkit's iphone.prepare_iphone_data, or with "
     "ffmpeg -i rgb.mkv -start_number 0 -q:v 1 rgb/frame_%06d.jpg"
 )
 ARKIT = "iphone/pose_intrinsic_imu.json"
+# Of each file of poses: its folders of images, masks and depths, and how to get the images.
 PARTS = {
-    "dslr/nerfstudio/transforms_undistorted.json": Part(
+    "dslr/nerfstudio/transforms_undistorted.json": (
         *("resized_undistorted_images", "resized_undistorted_masks", None),
         "download it, or run the toolkit's dslr.undistort",
     ),
-    "dslr/nerfstudio/transforms.json": Part(
-        *("resized_images", "resized_anon_masks", "render_depth"), "download it"
+    "dslr/nerfstudio/transforms.json": (
+        *("resized_images", "resized_anon_masks", "render_depth"),
+        "download it",
     ),
-    "iphone/nerfstudio/transforms.json": Part("rgb", "rgb_masks", "depth", EXTRACT),
-    ARKIT: Part("rgb", "rgb_masks", "depth", EXTRACT),
+    "iphone/nerfstudio/transforms.json": ("rgb", "rgb_masks", "depth", EXTRACT),
+    ARKIT: ("rgb", "rgb_masks", "depth", EXTRACT),
 }
 # From the scan's world to that of the transforms files, and back.
 TURN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
@@ -92,13 +83,14 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
             f"{', '.join(PARTS)}."
         )
     key = _key(files[0])
-    part, folder = PARTS[key], files[0].parents[key.count("/") - 1]
-    if not (folder / part.images).is_dir():
-        raise InputError(f"{folder / part.images} does not exist: {part.get}.")
+    folder = files[0].parents[key.count("/") - 1]
+    images, masks, depths, how_to_get = PARTS[key]
+    if not (folder / images).is_dir():
+        raise InputError(f"{folder / images} does not exist: {how_to_get}.")
     read = _arkit if key == ARKIT else _transforms
     return PosedScene(
         name=f"{folder.parent.name}-{folder.name}",
-        images=read(files[0], folder, part, bad),
+        images=read(files[0], folder, images, masks, depths, bad),
         read_points=partial(_points, folder / "colmap/points3D.txt"),
     )
 
@@ -111,32 +103,32 @@ def _key(file: Path) -> str:
 def _first(scene: Path, camera: str = "") -> list[Path]:
     """Return the file of poses that the scene stands for; one with images before one without."""
     keys = [key for key in PARTS if key.startswith(camera) and (scene / key).is_file()]
-    keys.sort(key=lambda key: not (scene / key.split("/")[0] / PARTS[key].images).is_dir())
+    keys.sort(key=lambda key: not (scene / key.split("/")[0] / PARTS[key][0]).is_dir())
     return [scene / key for key in keys[:1]]
 
 
-def _transforms(file: Path, folder: Path, part: Part, bad: BadImages) -> list[PosedImage]:
+def _transforms(
+    file: Path, folder: Path, images: str, masks: str, depths: str | None, bad: BadImages
+) -> list[PosedImage]:
     content = common.read_frames(file)
-    downloaded = (folder / part.masks).is_dir()
-    masks = content.get("has_mask", downloaded)
-    if masks and not downloaded:
-        raise InputError(
-            f"{folder / part.masks} does not exist, but {file} has masks: download it."
-        )
-    depths = part.depths and (folder / part.depths).is_dir()
+    downloaded = (folder / masks).is_dir()
+    has_masks = content.get("has_mask", downloaded)
+    if has_masks and not downloaded:
+        raise InputError(f"{folder / masks} does not exist, but {file} has masks: download it.")
+    has_depths = depths and (folder / depths).is_dir()
     frames = []
-    for entry in _good_frames(content, file, folder / part.images):
+    for entry in _good_frames(content, file, folder / images):
         if common.has_path(entry):
             name = f"{Path(entry['file_path']).stem}.png"
             entry = {
                 **entry,
-                "file_path": f"{part.images}/{entry['file_path']}",
-                "mask_path": f"{part.masks}/{name}" if masks else None,
-                "depth_file_path": f"{part.depths}/{name}" if depths else None,
+                "file_path": f"{images}/{entry['file_path']}",
+                "mask_path": f"{masks}/{name}" if has_masks else None,
+                "depth_file_path": f"{depths}/{name}" if has_depths else None,
             }
         frames.append(entry)
-    images = read_images({**content, "frames": frames}, file, bad, folder)
-    return [replace(image, cam_to_world=TURN @ image.cam_to_world) for image in images]
+    posed = read_images({**content, "frames": frames}, file, bad, folder)
+    return [replace(image, cam_to_world=TURN @ image.cam_to_world) for image in posed]
 
 
 def _good_frames(content: dict[str, Any], file: Path, images: Path) -> list[Any]:
@@ -155,20 +147,22 @@ def _good_frames(content: dict[str, Any], file: Path, images: Path) -> list[Any]
     return good
 
 
-def _arkit(file: Path, folder: Path, part: Part, bad: BadImages) -> list[PosedImage]:
+def _arkit(
+    file: Path, folder: Path, images: str, masks: str, depths: str, bad: BadImages
+) -> list[PosedImage]:
     """Read ARKit's poses, by image: camera-to-world with OpenCV axes and intrinsics in pixels."""
     content = common.read_json(file)
     if not isinstance(content, dict):
         raise InputError(f"{file} is no object of frames by name: download it again.")
     masks, depths = (
-        folder / name if (folder / name).is_dir() else None for name in (part.masks, part.depths)
+        folder / name if (folder / name).is_dir() else None for name in (masks, depths)
     )
 
     def read(name: str, entry: Any) -> PosedImage:
         where = f"{file}, {name}"
         if not isinstance(entry, dict):
             raise InputError(f"{where} is {entry!r}: give its intrinsic and aligned_pose.")
-        image = folder / part.images / f"{name}.jpg"
+        image = folder / images / f"{name}.jpg"
         size = image_size(image)
         stored = entry.get("intrinsic")
         matrix = common.array_of(stored)
