@@ -31,8 +31,8 @@ from asysplat import load
 from asysplat.benchmark import timing
 from asysplat.benchmark.compare import DECIBELS, LPIPS_DISTANCE, TIME, Watched
 from asysplat.benchmark.options import CPU, PRECISIONS, check_names, find_device
-from asysplat.benchmark.table import Columns, at, machine_note, make_table, number, spread, text
-from asysplat.benchmark.timing import Measurement, Result, rise_gb, seconds_of, summary
+from asysplat.benchmark.table import Columns, machine_note, make_table, number, spread, text
+from asysplat.benchmark.timing import Measurement, Result, seconds_of, summary
 from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.procedural.scene import split_seed
@@ -42,14 +42,15 @@ from asysplat.errors import InputError, input_error_behind
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.protocol import Protocol
 from asysplat.models.network import Network
-from asysplat.refinement import RefinementSettings, mean_color, merge_to_limit, refine
+from asysplat.refinement import mean_color, merge_to_limit, refine
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.refinement.photographs import Photographs, open_photographs
 from asysplat.rendering import INRIA, render
-from asysplat.report.front import draw_front, pareto_front
+from asysplat.report.front import draw_front
 from asysplat.report.style import FAINT, OURS, STYLE
 from asysplat.scene import Views
 
+WHOLE = {"views", "side", "max_gaussians", "views_at_once", "steps"}  # numbers of a setting
 BASE = "base"  # the setting that each knob changes
 EXACT = "fp64"
 SIZES = {"inputs": 16, "targets": 4}  # most views of a scene, unless its family says otherwise
@@ -74,7 +75,7 @@ TITLES = {
 }
 QUALITIES = {  # higher is better
     "psnr": "PSNR against photographs, dB",
-    "error_decibels": "PSNR against the exact images, dB",
+    "error": "PSNR against the exact images, dB",
 }
 NOTES = """\
 -: not measured; photographs in memory to all held-out views; / base: in the same round, in turns
@@ -102,9 +103,8 @@ class FeedForward:
 
     def __post_init__(self):
         check_names("precision", [self.precision], [*PRECISIONS, EXACT])
-        _check_whole(self, "views", "side", "max_gaussians", "views_at_once")
         if self.convention:
-            check_names("convention", self.convention, [each.name for each in fields(INRIA)])
+            check_names("convention", self.convention, vars(INRIA))
 
     @property
     def trained(self) -> bool:
@@ -120,24 +120,25 @@ class FeedForward:
         dtype = torch.float64 if self.precision == EXACT else torch.float32
         if (device, dtype) != (CPU, torch.float32):
             net = deepcopy(net).to(device, dtype)
-        return partial(self._render, net, dtype)
-
-    @torch.no_grad()
-    def _render(self, net: Network, dtype: torch.dtype, scene: Photographs) -> Tensor:
-        scene = select_inputs(scene, self.views, self.side)
-        inputs, targets = scene.inputs.to(dtype), scene.held_out.to(dtype)
         half = PRECISIONS.get(self.precision) == torch.bfloat16
-        with torch.autocast(inputs.images.device.type, torch.bfloat16, enabled=half):
-            gaussians = net(inputs)
-        gaussians = gaussians.to(dtype)
-        if self.min_opacity > 0:
-            gaussians = gaussians.keep(gaussians.opacities >= self.min_opacity)
-        if self.cell is not None or self.max_gaussians is not None:
-            limit = self.max_gaussians or gaussians.num_gaussians
-            gaussians = merge_to_limit(gaussians, inputs.cameras, self.cell or 1.0, limit)
         options = {"sh_degree": self.sh_degree, "views_at_once": self.views_at_once}
         options |= {"depth": False, "convention": replace(INRIA, **self.convention)}
-        return render(gaussians, targets.cameras, mean_color(inputs), **options).image
+
+        @torch.no_grad()
+        def run(scene: Photographs) -> Tensor:
+            scene = select_inputs(scene, self.views, self.side)
+            inputs, targets = scene.inputs.to(dtype), scene.held_out.to(dtype)
+            with torch.autocast(device.type, torch.bfloat16, enabled=half):
+                gaussians = net(inputs)
+            gaussians = gaussians.to(dtype)
+            if self.min_opacity > 0:
+                gaussians = gaussians.keep(gaussians.opacities >= self.min_opacity)
+            if self.cell is not None or self.max_gaussians is not None:
+                limit = self.max_gaussians or gaussians.num_gaussians
+                gaussians = merge_to_limit(gaussians, inputs.cameras, self.cell or 1.0, limit)
+            return render(gaussians, targets.cameras, mean_color(inputs), **options).image
+
+        return run
 
 
 @dataclass(frozen=True)
@@ -155,8 +156,6 @@ class Refined:
 
     def __post_init__(self):
         check_names("init", [self.init], INITS)
-        _check_whole(self, "views", "side")
-        _check_whole(self, "steps", minimum=0)
         if (self.steps is not None) == (0 < (self.seconds or 0) < math.inf):
             raise InputError(
                 f"steps={self.steps} and seconds={self.seconds}: give one of them, above 0."
@@ -174,31 +173,23 @@ class Refined:
             message = f"{self.refinement} are no settings of a refinement."
             raise InputError(str(input_error_behind(error) or message)) from None
         net = _load_network("shipped", ()) if self.init == "network" else None
-        return partial(self._render, settings, net)
+        limit = {"steps": self.steps, "seconds": self.seconds}
 
-    def _render(
-        self, settings: RefinementSettings, net: Network | None, scene: Photographs
-    ) -> Tensor:
-        scene = select_inputs(scene, self.views, self.side)
-        gaussians = initial_gaussians(self.init, scene, settings.max_gaussians, net)
-        background = mean_color(scene.inputs)
-        if self.steps != 0:
-            limit = {"steps": self.steps, "seconds": self.seconds}
-            gaussians = refine(gaussians, scene.inputs, settings, background=background, **limit)
-        with torch.no_grad():
-            return render(gaussians, scene.held_out.cameras, background, depth=False).image
+        def run(scene: Photographs) -> Tensor:
+            scene = select_inputs(scene, self.views, self.side)
+            gaussians = initial_gaussians(self.init, scene, settings.max_gaussians, net)
+            color = mean_color(scene.inputs)
+            if self.steps != 0:
+                gaussians = refine(gaussians, scene.inputs, settings, background=color, **limit)
+            with torch.no_grad():
+                return render(gaussians, scene.held_out.cameras, color, depth=False).image
+
+        return run
 
 
 FAMILIES = dict.fromkeys(("feed_forward", "networks"), FeedForward)
 FAMILIES |= dict.fromkeys(("refined", "reconstruct"), Refined)
 Setting = FeedForward | Refined
-
-
-def _check_whole(setting: Setting, *names: str, minimum: int = 1) -> None:
-    for name in names:
-        value = getattr(setting, name)
-        if value is not None and (type(value) is not int or value < minimum):
-            raise InputError(f"{name}={value}: give a whole number from {minimum}.")
 
 
 @cache
@@ -222,10 +213,16 @@ def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
             where = f"pareto.{family}.{name}"
             if not isinstance(changes, Mapping):
                 raise InputError(f"{where}={changes} is no setting: give {{name: value}}.")
-            check_names(where, base | changes, [each.name for each in fields(kind)])
+            values = base | changes
+            check_names(where, values, [each.name for each in fields(kind)])
+            for count in WHOLE & values.keys():
+                value, minimum = values[count], int(count != "steps")
+                if value is not None and (type(value) is not int or value < minimum):
+                    message = f"{where}: {count}={value}: give a whole number from {minimum}."
+                    raise InputError(message)
             try:
-                families[family][name] = kind(**(base | changes))
-            except (InputError, TypeError) as error:
+                families[family][name] = kind(**values)
+            except InputError as error:
                 raise InputError(f"{where}: {error}") from error
     if (chosen := config["knobs"]) != "all":
         names = dict.fromkeys(name for settings in families.values() for name in settings)
@@ -307,7 +304,7 @@ def select_inputs(scene: Photographs, views: int | None, side: int | None) -> Ph
     return replace(scene, inputs=inputs, held_out=targets, points=None)
 
 
-def measure_scene(
+def _measure_scene(
     scene: Photographs,
     settings: Mapping[str, Setting],
     renderers: Mapping[str, RenderScene],
@@ -319,15 +316,8 @@ def measure_scene(
 ) -> list[Result]:
     """Measure all settings in turns, those with a limit in seconds once; return a row for each.
 
-    Args:
-        renderers: of each setting.
-        lpips: see `load_lpips`; None: no LPIPS.
-        refinement: a file of conf/refinement.
-        device: of the networks; refinements are on the CPU.
-
-    Raises:
-        InputError: the setting BASE cannot render this scene. Of another that cannot, all
-            numbers are None, and "not_measured" says why.
+    Networks are on the device, refinements on the CPU. A setting other than BASE that cannot render
+    this scene has no numbers, but the reason in "not_measured".
     """
     base = settings[BASE]
     own_device = CPU if isinstance(base, Refined) else device
@@ -335,22 +325,20 @@ def measure_scene(
     scene = replace(scene, **views)
     images, measurements, absent = {}, {}, {}
 
-    def run(name: str) -> None:
-        images[name] = renderers[name](scene)
+    def run(name: str) -> dict[str, float]:
+        def render_scene() -> None:
+            images[name] = renderers[name](scene)
+
+        return {"seconds": seconds_of(render_scene, own_device)}
 
     once = isinstance(base, Refined) and base.seconds is not None
     if once:  # compiles kernels
         replace(base, seconds=None, steps=1).prepare(refinement, CPU)(scene)
     for name in settings:
-        run_once = partial(run, name)
         try:
-            if once:
-                seconds = {"seconds": [seconds_of(run_once, own_device)]}
-                measurements[name] = Measurement(dict, {"peak_gb": None}, seconds)
-            else:
-                costs = {"peak_gb": max(0.0, rise_gb(run_once, own_device))}
-                timer = partial(seconds_of, run_once, own_device)
-                measurements[name] = Measurement(lambda t=timer: {"seconds": t()}, costs)
+            first = run(name)["seconds"]
+            seconds = {"seconds": [first]} if once else {}
+            measurements[name] = Measurement(partial(run, name), seconds=seconds)
         except InputError as error:
             if name == BASE:
                 raise
@@ -361,12 +349,11 @@ def measure_scene(
     rows = []
     for name, setting in settings.items():
         row = {"setting": name, "values": asdict(setting), "not_measured": absent.get(name)}
-        row |= dict.fromkeys(("seconds", "over_base", "peak_gb", "error", "psnr", "ssim", "lpips"))
+        row |= dict.fromkeys(("seconds", "over_base", "error", "psnr", "ssim", "lpips"))
         if name in measurements:
-            timed, image = measurements[name], images[name]
-            own, of_base = (m.seconds["seconds"] for m in (timed, measurements[BASE]))
+            own, of_base = (measurements[n].seconds["seconds"] for n in (name, BASE))
             ratios = [a / b for a, b in zip(own, of_base, strict=True)]
-            row |= {"seconds": summary(own), "over_base": summary(ratios)} | timed.row
+            row |= {"seconds": summary(own), "over_base": summary(ratios)}
             exact = base
             if isinstance(setting, FeedForward):
                 exact = replace(base if setting.trained else setting, precision=EXACT)
@@ -374,19 +361,18 @@ def measure_scene(
                 key = repr(exact)
                 if key not in exact_images:
                     exact_images[key] = exact.prepare(refinement, device)(scene)
-                row["error"] = image_error(image, exact_images[key])
+                row["error"] = {"decibels": decibels(images[name], exact_images[key])}
             if setting.trained:
-                metrics = protocol.image_metrics(image, scene.held_out, lpips)
+                metrics = protocol.image_metrics(images[name], scene.held_out, lpips)
                 row |= {metric: values.mean().item() for metric, values in metrics.items()}
         rows.append(row | ({"noise": NOISE_OF_SECONDS} if once else {}))
     return rows
 
 
-def image_error(image: Tensor, exact: Tensor) -> Result:
-    """Compare images, clamped to [0, 1]: decibels of the mean squared error, and the largest."""
+def decibels(image: Tensor, exact: Tensor) -> float:
+    """Compare images, clamped to [0, 1], by the decibels of their mean squared error."""
     error = image.double().clamp(0, 1) - exact.double().clamp(0, 1)
-    squared = error.square().mean().clamp_min(MIN_SQUARED_ERROR)
-    return {"decibels": -10 * squared.log10().item(), "max": error.abs().max().item()}
+    return -10 * error.square().mean().clamp_min(MIN_SQUARED_ERROR).log10().item()
 
 
 def measure(options: DictConfig, console: Console) -> Result:
@@ -399,9 +385,8 @@ def measure(options: DictConfig, console: Console) -> Result:
 
     Returns:
         "rows": one for each family, scene and setting: "seconds", their ratio to the base's of the
-        same round "over_base", "peak_gb" above what was held before, "error" of the images
-        against the exact ones ("decibels", "max"), and metrics against the photographs; None for
-        what was not measured. "settings": the means, see `summarize`. "not_measured": what, and
+        same round "over_base", "error" of the images against the exact ones in "decibels", and
+        metrics against the photographs; None for what was not measured. "not_measured": what, and
         why.
     """
     config = OmegaConf.to_container(options.pareto, resolve=True)
@@ -427,68 +412,42 @@ def measure(options: DictConfig, console: Console) -> Result:
                 continue
             sizes = {"side": config["side"]} | SIZES | (config[family].get("photographs") or {})
             with console.status(f"{name}: {len(settings)} settings, {family}"):
-                found = measure_scene(open_scene(**sizes), settings, renderers[family], *common)
+                found = _measure_scene(open_scene(**sizes), settings, renderers[family], *common)
             console.print(f"{name}: {family}, {len(found)} settings", highlight=False)
             where = {"family": family, "scene": name, "side": sizes["side"]}
             rows += [where | row for row in found]
     for row in [row for row in rows if row["not_measured"]]:
         absent["{family}, {scene}, {setting}".format(**row)] = row["not_measured"]
-    results = {"protocol": protocol.sentences(), "not_measured": absent}
-    return results | {"rows": rows, "settings": summarize(rows)}
+    return {"protocol": protocol.sentences(), "not_measured": absent, "rows": rows}
 
 
 def summarize(rows: Sequence[Result]) -> list[Result]:
     """Average each setting of each family over the scenes that it was measured on.
 
     Returns:
-        "over_base" is a geometric mean; "lost" is the PSNR below the base's, "most_lost" that of
-        the worst scene; "error_max" and "peak_gb" are the largest; "on_front" whether no other
-        setting of the family has both less seconds and a higher PSNR (a lower error, where there
-        is no PSNR). None for what was measured on no scene.
+        "over_base" is a geometric mean; "lost" is the PSNR below the base's; "busy" whether some
+        scene was measured on a busy machine. None for what was measured on no scene.
     """
     bases = {(row["family"], row["scene"]): row for row in rows if row["setting"] == BASE}
-    means = [
-        {"family": family, "setting": name, **_means(group, bases)}
-        for (family, name), group in _grouped(rows, "family", "setting").items()
-    ]
-    for own in _grouped(means, "family").values():
-        quality = next((name for name in QUALITIES if points(own, name)), None)
-        front = [name for name, *_ in pareto_front(points(own, quality), "higher")]
-        for row in own:
-            row["on_front"] = row["setting"] in front
+    means = []
+    for (family, name), group in _grouped(rows, "family", "setting").items():
+        timed = [row for row in group if row["seconds"]]
+        values = {
+            "seconds": [row["seconds"]["median"] for row in timed],
+            "over_base": [math.log(row["over_base"]["median"]) for row in timed],
+            "psnr": [row["psnr"] for row in timed if row["psnr"] is not None],
+            "lpips": [row["lpips"] for row in timed if row["lpips"] is not None],
+            "error": [row["error"]["decibels"] for row in timed if row["error"]],
+        }
+        values["lost"] = [
+            bases[family, row["scene"]]["psnr"] - row["psnr"] for row in timed if row["psnr"]
+        ]
+        row = {key: fmean(numbers) if numbers else None for key, numbers in values.items()}
+        row["over_base"] = math.exp(row["over_base"]) if timed else None
+        busy = any(row["seconds"]["busy"] for row in timed)
+        row |= {"family": family, "setting": name, "scenes": len(timed), "busy": busy}
+        means.append(row)
     return means
-
-
-def _means(group: Sequence[Result], bases: Mapping[tuple[str, str], Result]) -> Result:
-    timed_rows = [row for row in group if row["seconds"]]
-
-    def values(path: str) -> list[float]:
-        return [value for row in timed_rows if (value := at(row, path)) is not None]
-
-    rows = [row for row in timed_rows if row["psnr"] is not None]
-    lost = [bases[row["family"], row["scene"]]["psnr"] - row["psnr"] for row in rows]
-    means = {
-        "seconds": values("seconds.median"),
-        "psnr": values("psnr"),
-        "lost": lost,
-        "lpips": values("lpips"),
-        "error_decibels": values("error.decibels"),
-        "over_base": list(map(math.log, values("over_base.median"))),
-    }
-    means = {name: fmean(numbers) if numbers else None for name, numbers in means.items()}
-    if means["over_base"] is not None:
-        means["over_base"] = math.exp(means["over_base"])
-    largest = {"most_lost": lost, "error_max": values("error.max"), "peak_gb": values("peak_gb")}
-    largest = {name: max(numbers, default=None) for name, numbers in largest.items()}
-    busy = any(row["seconds"]["busy"] for row in timed_rows)
-    return {"scenes": len(timed_rows), **means, **largest, "busy": busy}
-
-
-def points(rows: Sequence[Result], quality: str | None) -> list[tuple[str, float, float]]:
-    """Return name, seconds and quality of the settings that have both."""
-    names = ("setting", "seconds", quality)
-    found = [tuple(row.get(name) for name in names) for row in rows]
-    return [point for point in found if None not in point]
 
 
 def _grouped(rows: Sequence[Result], *names: str) -> dict[tuple[str, ...], list[Result]]:
@@ -503,37 +462,28 @@ def tables(results: Result) -> list[Table]:
     absent = "\n".join(f"not measured: {k}, {why}" for k, why in results["not_measured"].items())
     notes = "\n".join(filter(None, (machine_note(results), NOTES, absent)))
     scenes = _grouped(results["rows"], "family", "scene").items()
-    families = _grouped(results["settings"], "family").items()
     shown = [make_table(f"{TITLES[name]}, {scene}", ROWS, rows) for (name, scene), rows in scenes]
-    for (name,), rows in families:
+    for (name,), rows in _grouped(summarize(results["rows"]), "family").items():
         shown.append(make_table(f"{TITLES[name]}, means over scenes", MEANS, rows, notes))
     return shown
 
 
 def plot(results: Result) -> Figure:
-    """Plot each quality against seconds: a column for each family, the front drawn."""
-    families = _grouped(results["settings"], "family")
-    shown = [name for name in QUALITIES if points(results["settings"], name)]
+    """Plot the means of each family: PSNR, or the error where there is none, against seconds."""
+    families = _grouped(summarize(results["rows"]), "family")
     with matplotlib.rc_context(STYLE):
-        size = (1.0 + 5.2 * len(families), 0.8 + 4.2 * len(shown))
-        figure = Figure(figsize=size, layout="constrained")
-        grid = figure.subplots(len(shown), len(families), squeeze=False)
-        for column, (family,) in enumerate(families):
-            for axes, quality in zip(grid[:, column], shown, strict=True):
-                axes.set(title=TITLES[family], xlabel="seconds", ylabel=QUALITIES[quality])
-        for column, rows in enumerate(families.values()):
+        figure = Figure(figsize=(1.0 + 5.2 * len(families), 5.0), layout="constrained")
+        grid = figure.subplots(1, len(families), squeeze=False)[0]
+        for axes, ((family,), rows) in zip(grid, families.items(), strict=True):
+            quality = "psnr" if any(row["psnr"] is not None for row in rows) else "error"
+            points = [(row["setting"], row["seconds"], row[quality]) for row in rows]
+            axes.set(title=TITLES[family], xlabel="seconds", ylabel=QUALITIES[quality])
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
             busy = [row["setting"] for row in rows if row["busy"]]
-            for axes, quality in zip(grid[:, column], shown, strict=True):
-                if found := points(rows, quality):
-                    axes.set_xscale("log")
-                    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-                    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-                    axes.xaxis.set_minor_formatter(NullFormatter())
-                    draw_front(axes, found, "higher", OURS, busy)
-                else:
-                    style = {"color": FAINT, "ha": "center", "transform": axes.transAxes}
-                    axes.text(0.5, 0.5, "not measured", **style)
-                    axes.set_axis_off()
+            draw_front(axes, [p for p in points if None not in p], "higher", OURS, busy)
         note = "hollow: measured while the machine was busy; crowded names are left out"
         figure.supxlabel(note, fontsize=9, color=FAINT)
     return figure
@@ -546,21 +496,15 @@ ROWS: Columns = {
     "PSNR": number("psnr", "{:.2f}"),
     "LPIPS": number("lpips", "{:.3f}"),
     "error\ndB": number("error.decibels", "{:.1f}"),
-    "error\nmax": number("error.max", "{:.1e}"),
-    "MB": number("peak_gb", "{:.0f}", unit=1e-3),
 }
 MEANS: Columns = {
     "setting": text("{setting}"),
-    "front": lambda row: "*" if row["on_front"] else "",
     "scenes": text("{scenes}"),
     "ms": number("seconds", "{:.0f}", unit=1e-3),
     "": lambda row: "busy" if row["busy"] else "",
     "/ base": number("over_base", "{:.2f}"),
     "PSNR": number("psnr", "{:.2f}"),
     "PSNR\nlost": number("lost", "{:+.2f}"),
-    "at\nmost": number("most_lost", "{:+.2f}"),
     "LPIPS": number("lpips", "{:.3f}"),
-    "error\ndB": number("error_decibels", "{:.1f}"),
-    "error\nmax": number("error_max", "{:.1e}"),
-    "MB": number("peak_gb", "{:.0f}", unit=1e-3),
+    "error\ndB": number("error", "{:.1f}"),
 }

@@ -1,4 +1,4 @@
-"""Seconds, memory and errors, measured alike in every suite."""
+"""Seconds and errors, measured alike in every suite."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from asysplat.evaluation.measured_cost import memory_before_gb, peak_memory_gb, wait_for
+from asysplat.evaluation.measured_cost import wait_for
 
 Result = dict[str, Any]  # plain values, as JSON has them
 Run = Callable[[], object]
@@ -59,18 +59,6 @@ def seconds_of(run: Run, device: torch.device) -> float:
     start = now(device)
     run()
     return now(device) - start
-
-
-def rise_gb(run: Run, device: torch.device) -> float:
-    """Return the peak memory of a run, warmed up, above what was held before it, in 1e9 bytes.
-
-    It is too small where a process cannot reset its peak: on a CPU without Linux.
-    """
-    run()
-    before = memory_before_gb(device)
-    run()
-    wait_for(device)
-    return peak_memory_gb(device) - before
 
 
 def relative_l2(tensor: Tensor, exact: Tensor) -> float:

@@ -1,14 +1,12 @@
 """The suite on a tiny scene, and what benchmark.py says to a user."""
 
-import os
 import subprocess
 import sys
 from functools import partial
 
 import pytest
-import torch
 
-from asysplat.benchmark.options import CPU, find_suite
+from asysplat.benchmark.options import find_suite
 from asysplat.benchmark.render import (
     CULLING,
     FIELDS,
@@ -26,9 +24,7 @@ from asysplat.benchmark.scenes import (
     pixel_aligned_scene,
     random_scene,
 )
-from asysplat.benchmark.timing import rise_gb
 from asysplat.errors import InputError
-from asysplat.evaluation.measured_cost import CLEAR_PEAK
 from asysplat.rendering import Culling
 
 
@@ -87,14 +83,6 @@ def test_errors_are_those_of_image_and_gradients():
     flipped = flips(other, exact)
     assert flipped.sum() == 1 and flipped[0, 0, 0]
     assert errors(other, exact, flipped)["image_max"] == 0
-
-
-@pytest.mark.skipif(not os.access(CLEAR_PEAK, os.W_OK), reason="peaks cannot be started anew")
-def test_peak_memory_is_the_rise():
-    held = torch.ones(50_000_000)
-    rise = rise_gb(lambda: torch.ones(25_000_000), CPU)
-    assert rise == pytest.approx(0.1, abs=0.02)
-    del held
 
 
 def test_unknown_options_are_named():
