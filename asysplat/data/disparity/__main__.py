@@ -48,13 +48,12 @@ def main(arguments: list[str] | None = None, estimate: Estimate | None = None) -
         layout, scenes = find_scenes(options.path, options.layout)
         refuse_inside(options.folder, options.path, "name a folder elsewhere, or say --beside")
         estimate = estimate or load_depth_anything(options.model, options.download)
-        console = Console(stderr=True)
         for scene in scenes:
             folder = scene / BESIDE if options.beside else map_folder(scene, options.folder)
             if options.beside and not scene.is_dir():
                 raise InputError(f"{scene} is not a folder: use --folder in place of --beside.")
             bad = BadImages(options.on_bad_image)
-            written, kept = write_maps(layout, scene, folder, estimate, bad, console)
+            written, kept = write_maps(layout, scene, folder, estimate, bad)
             print(f"{scene.name}: {written} maps written, {kept} were there: {folder}", flush=True)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -63,12 +62,9 @@ def main(arguments: list[str] | None = None, estimate: Estimate | None = None) -
 
 
 def write_maps(
-    layout: str, scene: Path, folder: Path, estimate: Estimate, bad: BadImages, console: Console
+    layout: str, scene: Path, folder: Path, estimate: Estimate, bad: BadImages
 ) -> tuple[int, int]:
-    """Write the missing maps of one scene.
-
-    Returns:
-        The number of maps written, and of existing maps.
+    """Write the missing maps of one scene; return the numbers of written and of existing maps.
 
     Raises:
         InputError: files that cannot be read or written; the maps written before stay.
@@ -80,17 +76,14 @@ def write_maps(
         raise InputError(
             f"{folder} cannot be created ({error.strerror}): name another folder with --folder."
         ) from error
-    files = {folder / map_name(p.file, scene): p.file for p in posed.images}
-    missing = {file: image for file, image in files.items() if not file.exists()}
-    written = 0
-    for file, image in track(missing.items(), posed.name, console=console, transient=True):
-        pixels = None
-        with bad.collect():
-            pixels = load_image(image)
-        if pixels is not None:
-            write_map(file, shrink(estimate(pixels), *pixels.shape[:2]))
+    images = [image.file for image in posed.images]
+    missing = [image for image in images if not (folder / map_name(image, scene)).exists()]
+    written, kept = 0, len(images) - len(missing)
+    for image in track(missing, posed.name, console=Console(stderr=True), transient=True):
+        for pixels in bad.read_each(load_image, [(image,)]):
+            disparity = shrink(estimate(pixels), *pixels.shape[:2])
+            write_map(folder / map_name(image, scene), disparity)
             written += 1
-    kept = len(files) - len(missing)
     bad.report(str(scene), kept + written)
     return written, kept
 
