@@ -1,4 +1,4 @@
-"""Measure the seconds and the peak memory of repeated work."""
+"""Measure the seconds and the peak memory of work; memory and speed of a device."""
 
 import ctypes
 import gc
@@ -15,6 +15,20 @@ from pathlib import Path
 import torch
 
 GB = 1e9
+TERA = 1e12
+# By torch's name of the device: dense bf16, TF32 and fp32 in TFLOP/s, from NVIDIA's data sheets.
+PEAKS = {
+    "NVIDIA H200": (989.4, 494.7, 66.9),
+    "NVIDIA H100 80GB HBM3": (989.4, 494.7, 66.9),
+    "NVIDIA H100 PCIe": (756.0, 378.0, 51.2),
+    "NVIDIA A100-SXM4-40GB": (312.0, 156.0, 19.5),
+    "NVIDIA A100-SXM4-80GB": (312.0, 156.0, 19.5),
+    "NVIDIA A100 80GB PCIe": (312.0, 156.0, 19.5),
+    "NVIDIA L40S": (362.0, 183.0, 91.6),
+    "NVIDIA RTX A6000": (154.8, 77.4, 38.7),
+    "NVIDIA GeForce RTX 4090": (165.2, 82.6, 82.6),
+    "NVIDIA GeForce RTX 3090": (71.0, 35.6, 35.6),
+}
 STATUS, CLEAR_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")  # Linux alone
 SECONDS = (
     "mean of all measurements but the longest, which is left out as an outlier; "
@@ -60,15 +74,6 @@ class CostMeter:
         self.seconds.append(time.perf_counter() - self._started)
         if self._peak_was_reset:
             self.gb.append(peak_memory_gb(self.device))
-
-    def costs(self, name: str) -> dict[str, float]:
-        """Return <name>_seconds (`mean_but_longest`) and <name>_gb (the largest), if measured."""
-        costs = {}
-        if self.seconds:
-            costs[f"{name}_seconds"] = mean_but_longest(self.seconds)
-        if self.gb:
-            costs[f"{name}_gb"] = max(self.gb)
-        return costs
 
 
 def memory_gb(device: torch.device | str) -> float:
@@ -120,3 +125,17 @@ def peak_memory_gb(device: torch.device | str) -> float:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     bytes_per_unit = 1 if sys.platform == "darwin" else 1024
     return peak * bytes_per_unit / GB
+
+
+def peak_flops(device: torch.device, precision: str) -> float | None:
+    """Return the peak of a device in FLOP/s; None if unknown, and for every CPU.
+
+    Args:
+        precision: Lightning's, such as bf16-mixed or 32-true.
+    """
+    if device.type != "cuda" or torch.cuda.get_device_name(device) not in PEAKS:
+        return None
+    half, tf32, single = PEAKS[torch.cuda.get_device_name(device)]
+    if "16" in precision:
+        return TERA * half
+    return TERA * (single if torch.get_float32_matmul_precision() == "highest" else tf32)

@@ -29,23 +29,17 @@ StepCallback = Callable[[int, Rendering | None], None]
 
 @dataclass
 class SceneResult:
-    """The measurements of one scene.
+    """The measurements of one scene."""
 
-    Args:
-        scene: its name.
-        gaussians: their number.
-        costs: "post<steps>" -> the seconds of the prediction and that many steps together and,
-            where it can be measured, their peak memory, gb.
-        rows: one for each image, with `images` (targets or inputs), `view`, `source` (post<steps>
-            or a baseline) and its metrics.
-        early_exit: the shares that the network's early exit left out, see `Network`.
-    """
-
-    scene: str
-    gaussians: int = 0
+    scene: str  # its name
+    gaussians: int = 0  # their number
+    # "post<steps>" -> the seconds of the prediction and that many steps together and, where it can
+    # be measured, their peak memory, gb.
     costs: dict[str, dict[str, float]] = field(default_factory=dict)
+    # Of each image: `images` (targets or inputs), `view`, `source` (post<steps> or a baseline) and
+    # its metrics.
     rows: list[ImageRow] = field(default_factory=list)
-    early_exit: dict[str, float] = field(default_factory=dict)
+    early_exit: dict[str, float] = field(default_factory=dict)  # shares left out, see `Network`
 
     def add(self, images: str, source: str, values: dict[str, Float[Tensor, "V"]]) -> None:
         """Add a row for each view; `values` has one or more metrics."""

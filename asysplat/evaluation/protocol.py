@@ -3,26 +3,16 @@
 from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_type_hints
 
+import torch
 from lpips import LPIPS
+from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.evaluation import metrics
 from asysplat.evaluation.lpips import lpips_distance
-from asysplat.evaluation.metrics import (
-    SSIM_SIGMA,
-    SSIM_WINDOWS,
-    Alignment,
-    Covariance,
-    Depths,
-    Images,
-    PerView,
-    Window,
-    abs_rel,
-    check_ssim_size,
-    delta1,
-    psnr,
-    ssim,
-)
-from asysplat.scene import Views
+from asysplat.evaluation.metrics import Depths, Images, PerView
+from asysplat.rendering import render
+from asysplat.scene import Gaussians, Views
 
 BACKBONES = {"alex": "AlexNet", "vgg": "VGG16"}
 
@@ -48,11 +38,11 @@ class Protocol:
 
     name: str
     eight_bit: bool
-    ssim_window: Window
-    ssim_covariance: Covariance
+    ssim_window: metrics.Window
+    ssim_covariance: metrics.Covariance
     lpips_net: Literal["alex", "vgg"]
     mean_over: Literal["images", "scenes"]
-    depth_alignment: Alignment
+    depth_alignment: metrics.Alignment
 
     def __post_init__(self):
         hints = get_type_hints(type(self))
@@ -66,11 +56,11 @@ class Protocol:
 
     def check_size(self, height: int, width: int) -> None:
         """Raise InputError if images of this size cannot be measured."""
-        check_ssim_size(height, width, self.ssim_window)
+        metrics.check_ssim_size(height, width, self.ssim_window)
 
     def psnr(self, rendered: Images, targets: Views) -> PerView:
         """Compute the PSNR of each image in dB."""
-        return psnr(self._prepare(rendered, targets), targets.images)
+        return metrics.psnr(self._prepare(rendered, targets), targets.images)
 
     def image_metrics(
         self, rendered: Images, targets: Views, lpips: LPIPS | None
@@ -82,8 +72,8 @@ class Protocol:
         """
         prepared, target = self._prepare(rendered, targets), targets.images
         values = {
-            "psnr": psnr(prepared, target),
-            "ssim": ssim(prepared, target, self.ssim_window, self.ssim_covariance),
+            "psnr": metrics.psnr(prepared, target),
+            "ssim": metrics.ssim(prepared, target, self.ssim_window, self.ssim_covariance),
         }
         if lpips is not None:
             values["lpips"] = lpips_distance(lpips, prepared, target)
@@ -109,24 +99,38 @@ class Protocol:
         if targets.masks is not None:
             target = target.where(targets.masks, 0)
         return {
-            "absrel": abs_rel(depth, target, self.depth_alignment),
-            "delta1": delta1(depth, target, self.depth_alignment),
+            "absrel": metrics.abs_rel(depth, target, self.depth_alignment),
+            "delta1": metrics.delta1(depth, target, self.depth_alignment),
         }
+
+    @torch.no_grad()
+    def view_metrics(
+        self, gaussians: Gaussians, views: Views, background: Tensor, lpips: LPIPS | None
+    ) -> list[dict[str, float]]:
+        """Render [V] views one by one before a background [3]; compute all metrics of each."""
+        rows = []
+        for view in range(views.num_views):
+            target = views.select([view])
+            out = render(gaussians, target.cameras, background)
+            values = self.image_metrics(out.image, target, lpips)
+            values |= self.depth_metrics(out.depth, target)
+            rows.append({name: value.item() for name, value in values.items()})
+        return rows
 
     def sentences(self) -> dict[str, str]:
         """Return the protocol's name and a sentence for each metric."""
-        size = SSIM_WINDOWS[self.ssim_window]
+        size = metrics.SSIM_WINDOWS[self.ssim_window]
         window = f"{self.ssim_window} window {size}x{size}"
         if self.ssim_window == "gaussian":
-            window = f"{window} sigma {SSIM_SIGMA}".replace("gaussian", "Gaussian")
+            window = f"{window} sigma {metrics.SSIM_SIGMA}".replace("gaussian", "Gaussian")
         cut = " and cut to 8 bits" if self.eight_bit else ""
         images = f"RGB in [0, 1], rendering clamped{cut}"
-        mean = "mean over images"
-        if self.mean_over == "scenes":
-            mean = "mean over a scene's images, then over scenes"
-        aligned = "depth not aligned"
-        if self.depth_alignment == "median":
-            aligned = "depth of each view scaled to the true median"
+        by_scene = self.mean_over == "scenes"
+        mean = "mean over a scene's images, then over scenes" if by_scene else "mean over images"
+        aligned = {
+            "none": "depth not aligned",
+            "median": "depth of each view scaled to the true median",
+        }[self.depth_alignment]
         pixels = "the pixels of a view that its mask includes and whose depth is known"
         return {
             "name": self.name,

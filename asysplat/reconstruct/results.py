@@ -16,7 +16,6 @@ from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.rows import average, write_csv
-from asysplat.evaluation.scene import measure_scene
 from asysplat.export import orbit, smoothed_path, write_ply, write_safetensors, write_video
 from asysplat.files import atomic_write
 from asysplat.refinement.photographs import Photographs
@@ -104,8 +103,8 @@ class Results:
         if held_out is not None:
             sets["held_out"] = (held_out, photographs.held_out_files)
         for name, (views, files) in sets.items():
-            metrics = measure_scene(gaussians, views, self._background, self._protocol, self._lpips)
-            numbers = [{m: metrics[m][view] for m in metrics} for view in range(views.num_views)]
+            arguments = gaussians, views, self._background, self._lpips
+            numbers = self._protocol.view_metrics(*arguments)
             results |= _means(name, numbers)
             labels = ({"set": name, "file": file} for file in files)
             rows += [label | row for label, row in zip(labels, numbers, strict=True)]

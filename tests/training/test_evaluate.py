@@ -101,7 +101,7 @@ def test_the_report_has_rows_with_post_optimization(whole, evaluated, composed):
         lambda overrides: composed(*overrides, return_hydra_config=True),
         finished_runs(whole.parents[1]),
     )
-    rows = {r.paper.post_optimization: r for r in filled.rows if r.name.startswith("AsySplat")}
+    rows = {r.post_optimization: r for r in filled.rows if r.name.startswith("AsySplat")}
     for steps in (3, 10):
         values = rows[steps].values
         assert values["dl3dv/psnr"] == [evaluated[f"test/procedural/post{steps}/psnr"]]

@@ -7,8 +7,8 @@ import torch
 from torch import nn
 
 from asysplat.errors import InputError
-from asysplat.evaluation import peak
-from asysplat.evaluation.peak import peak_flops
+from asysplat.evaluation import measured_cost
+from asysplat.evaluation.measured_cost import peak_flops
 from asysplat.training import loggers, parts
 from asysplat.training.callbacks import TrainingMonitor, monitor
 from asysplat.training.callbacks.monitor import gradient_norms, sentence
@@ -120,12 +120,12 @@ def test_gradient_norms_by_part():
 def test_the_peak_is_known_for_listed_gpus(monkeypatch):
     gpu = torch.device("cuda")
     assert peak_flops(CPU, "32-true") is None
-    monkeypatch.setattr(peak.torch.cuda, "get_device_name", lambda _: "NVIDIA H200")
+    monkeypatch.setattr(measured_cost.torch.cuda, "get_device_name", lambda _: "NVIDIA H200")
     assert peak_flops(gpu, "bf16-mixed") == pytest.approx(989.4e12)
     assert peak_flops(gpu, "32-true") == pytest.approx(66.9e12)
-    monkeypatch.setattr(peak.torch, "get_float32_matmul_precision", lambda: "high")
+    monkeypatch.setattr(measured_cost.torch, "get_float32_matmul_precision", lambda: "high")
     assert peak_flops(gpu, "32-true") == pytest.approx(494.7e12)
-    monkeypatch.setattr(peak.torch.cuda, "get_device_name", lambda _: "another")
+    monkeypatch.setattr(measured_cost.torch.cuda, "get_device_name", lambda _: "another")
     assert peak_flops(gpu, "bf16-mixed") is None
 
 

@@ -74,4 +74,7 @@ class Costs(lightning.Callback):
             hook.remove()
         for test_set, meter in zip(trainer.datamodule.tests, self.tests, strict=True):
             prefix = "cost" if test_set == trainer.datamodule.name else f"cost/{test_set}"
-            self.values |= meter.costs(f"{prefix}/inference")
+            if meter.seconds:
+                self.values[f"{prefix}/inference_seconds"] = mean_but_longest(meter.seconds)
+            if meter.gb:
+                self.values[f"{prefix}/inference_gb"] = max(meter.gb)

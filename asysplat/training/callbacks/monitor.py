@@ -9,8 +9,7 @@ import torch
 from lightning import Callback
 from torch import Tensor, nn
 
-from asysplat.evaluation.measured_cost import memory_gb, peak_memory_gb, wait_for
-from asysplat.evaluation.peak import peak_flops
+from asysplat.evaluation.measured_cost import memory_gb, peak_flops, peak_memory_gb, wait_for
 from asysplat.evaluation.static_cost import true_flops
 from asysplat.training.loggers import log_histogram
 from asysplat.training.parts import PARTS
