@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from asysplat.errors import InputError
-from asysplat.rendering.reference.math import rotations
+from asysplat.rendering.reference.project import rotations
 from asysplat.scene import Cameras
 
 ROUNDING = 1e-6  # relative to coordinates, or in radians; smaller differences are rounding

@@ -90,13 +90,11 @@ class ConvBlocks(nn.Module):
 
     def __init__(self, width: int, group_width: int):
         super().__init__()
+        options = {"padding": 1, "groups": width // group_width, "bias": False}
         self.blocks = nn.Sequential()
         for _ in range(2):
-            self.blocks.append(
-                nn.Conv2d(width, width, 3, padding=1, groups=width // group_width, bias=False)
-            )
-            self.blocks.append(nn.BatchNorm2d(width))
-            self.blocks.append(nn.GELU())
+            conv = nn.Conv2d(width, width, 3, **options)
+            self.blocks.extend((conv, nn.BatchNorm2d(width), nn.GELU()))
 
     def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
         maps = rearrange(tokens, "b v h w d -> (b v) d h w")

@@ -117,12 +117,9 @@ def _counts(build: Build, base: Widths, layers: int, samples: np.ndarray) -> np.
 
 
 def _samples(columns: int) -> np.ndarray:
-    """Return as many points as a quadratic has coefficients, in general position.
-
-    They are the base, one and two steps along each axis, and one step along each pair of axes.
-    Numbers of heads are even, so that halves and sixteenths of a width are whole; stages differ in
-    width, since equal ones have no projection between them.
-    """
+    """Return points that determine a quadratic: a base, steps along each axis and pair of axes."""
+    # Even, so that halves and sixteenths of a width are whole, and different: stages of equal width
+    # have no projection between them.
     base = 4.0 + 8 * np.arange(columns)
     axes = 2 * np.eye(columns)
     single = [base + step * axis for axis in axes for step in (1, 2)]

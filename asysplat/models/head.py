@@ -160,20 +160,16 @@ class PhotographHead(GaussianHead):
         pixel = (1 / cameras.intrinsics[..., 0, 0])[..., None, None, None]  # width at distance 1
         sizes = (raw.scales + self.scale_bias).clamp(-5, 3).exp()
         identity = raw.quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+        batch = views.images.shape[:2]
+        small = F.avg_pool2d(views.images.flatten(0, 1), self.stride).unflatten(0, batch)
+        dc = (rearrange(small, "b v c h w -> b v h w 1 c") - 0.5) / SH_C0
         return Gaussians(
             means=origins + distance * directions,
             quats=raw.quats + identity,
             scales=sizes * distance * pixel,
             opacities=raw.opacities,
-            sh=torch.cat((raw.sh[..., :1, :] + self._colors(views), raw.sh[..., 1:, :]), dim=-2),
+            sh=torch.cat((raw.sh[..., :1, :] + dc, raw.sh[..., 1:, :]), dim=-2),
         )
-
-    def _colors(self, views: Views) -> Float[Tensor, "B V h w 1 3"]:
-        """Return the downsampled images as SH of degree 0."""
-        small = F.avg_pool2d(views.images.flatten(0, 1), self.stride).unflatten(
-            0, views.images.shape[:2]
-        )
-        return (rearrange(small, "b v c h w -> b v h w 1 c") - 0.5) / SH_C0
 
 
 class LongLRMHead(GaussianHead):

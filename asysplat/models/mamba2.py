@@ -56,18 +56,16 @@ class Mamba2Direction(nn.Module):
 
     def forward(self, u: Float[Tensor, "B L u"]) -> Float[Tensor, "B L inner"]:
         z, xBC, dt = u.split(self.splits, dim=-1)
-        xBC = F.silu(self._causal_conv(xBC))
+        # Each token with the CONV_KERNEL - 1 tokens before it in scan order.
+        weight, before = self.conv.weight, CONV_KERNEL - 1
+        if self.reverse:
+            weight, before = weight.flip(-1), 0
+        xBC = F.silu(depthwise_conv(xBC, weight, self.conv.bias, before))
         x, B, C = xBC.split((self.splits[0], self.state_size, self.state_size), dim=-1)
         dt = F.softplus(dt.float() + self.dt_bias)
         heads = x.unflatten(-1, (self.splits[2], -1))
         y = ssd(heads, dt, -self.A_log.exp(), B, C, self.D, reverse=self.reverse).flatten(-2)
         return self.norm(y * F.silu(z))
-
-    def _causal_conv(self, x: Tensor) -> Tensor:
-        """Convolve each token with the CONV_KERNEL - 1 tokens before it in scan order."""
-        if self.reverse:
-            return depthwise_conv(x, self.conv.weight.flip(-1), self.conv.bias, before=0)
-        return depthwise_conv(x, self.conv.weight, self.conv.bias, before=CONV_KERNEL - 1)
 
 
 def log_uniform(count: int, low: float, high: float) -> Float[Tensor, " count"]:

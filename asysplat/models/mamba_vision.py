@@ -49,12 +49,8 @@ class MambaVisionMixer(nn.Module):
         self.A_log = nn.Parameter(torch.arange(1.0, state_size + 1).log().repeat(half, 1))
         self.D = nn.Parameter(torch.ones(half))
         self.out = nn.Linear(width, width, bias=False)
-        self.reset_dt()
-
-    def reset_dt(self) -> None:
-        """Initialize steps between 1e-3 and 1e-1 (Gu and Dao 2023, Sec. 3.6)."""
-        with torch.no_grad():
-            self.dt_proj.bias.copy_(inverse_softplus(log_uniform(len(self.D), 1e-3, 1e-1)))
+        with torch.no_grad():  # steps between 1e-3 and 1e-1 (Gu and Dao 2023, Sec. 3.6)
+            self.dt_proj.bias.copy_(inverse_softplus(log_uniform(half, 1e-3, 1e-1)))
 
     @staticmethod
     def _conv(channels: int) -> nn.Conv1d:

@@ -53,15 +53,13 @@ class Network(nn.Module, ABC):
         exact = self.training or self.early_exit == EXACT
         predict = self.predict if exact else self.predict_with_early_exit
         self.early_exit_shares.clear()
-        dims = len(batch)
-        one_batch = views.map(lambda x: x.flatten(0, dims - 1) if dims else x[None])
-        gaussians = predict(one_batch)
+        gaussians = predict(views.map(lambda x: x.reshape(-1, *x.shape[len(batch) :])))
         return gaussians.map(lambda field: field.reshape(*batch, *field.shape[1:]))
 
     def predict(self, views: Views) -> Gaussians:
         """Predict Gaussians [B, N] from views [B, V]; N = V h w, of the head's grid."""
-        pixels, prior = self.pixel_inputs(views)
-        return self.head(self.tokens(pixels), views, prior)
+        prior = None if self.prior is None else self.run_prior(views)
+        return self.head(self.tokens(pixel_features(views, prior)), views, prior)
 
     def predict_with_early_exit(self, views: Views) -> Gaussians:
         """Predict Gaussians [1, N] from views [1, V]; see `EarlyExit`."""
@@ -93,19 +91,14 @@ class Network(nn.Module, ABC):
             skip_layers: layers to skip.
         """
 
-    @abstractmethod
     def geometry_share(self) -> float:
-        """Return the share of parameters outside an appearance branch."""
+        """Return the share of parameters outside an appearance branch: all."""
+        return 1.0
 
     @property
     def pixel_channels(self) -> int:
         """The number of input channels of a tokenizer, for each pixel."""
         return PIXEL_CHANNELS + (0 if self.prior is None else PRIOR_CHANNELS)
-
-    def pixel_inputs(self, views: Views) -> tuple[Float[Tensor, "B V H W c"], Prior | None]:
-        """Return the tokenizers' input for every pixel, and the prior on the head's grid."""
-        prior = None if self.prior is None else self.run_prior(views)
-        return pixel_features(views, prior), prior
 
     def run_prior(self, views: Views) -> Prior:
         """Run the prior, on the head's grid."""
@@ -138,10 +131,10 @@ class Network(nn.Module, ABC):
 
     def check_size(self, height: int, width: int) -> None:
         """Raise InputError unless both sides are multiples of `patch`."""
-        multiple = self.patch
-        if height % multiple or width % multiple:
+        patch = self.patch
+        if height % patch or width % patch:
             raise InputError(
                 f"data.height x data.width is {height}x{width}, but this model takes multiples of "
-                f"{multiple}, its patch: set {-(-height // multiple) * multiple}x"
-                f"{-(-width // multiple) * multiple}, as the paper takes 540 to 544."
+                f"{patch}, its patch: set {-(-height // patch) * patch}x"
+                f"{-(-width // patch) * patch}, as the paper takes 540 to 544."
             )

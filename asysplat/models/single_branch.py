@@ -77,10 +77,6 @@ class SingleBranch(Network):
             tokens, extra = stage(tokens, skip_layers, extra)
         return tokens
 
-    def geometry_share(self) -> float:
-        """Return 1: there is no appearance branch."""
-        return 1.0
-
 
 def build_single_branch(
     stage_widths: Sequence[int],

@@ -78,7 +78,13 @@ class Scan:
         with without_autocast(inputs.x):
             if backend in FAST:
                 check_fast_backend(self.name, backend, inputs.x)
-                return self._by_kernels(inputs, backend, reverse)
+                keep = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+                dtype = inputs.x.dtype
+                tensors = (
+                    tensor.to(dtype if name in "xBC" else torch.float32).contiguous()
+                    for name, tensor in inputs._asdict().items()
+                )
+                return self.run_kernels(backend, *tensors, reverse=reverse, keep=keep)[0]
             backends = {"auto": None, **self.forms, **dict.fromkeys(FAST)}
             form = pick_backend(self.name, backends, backend)
             dtype = torch.promote_types(inputs.x.dtype, torch.float32)
@@ -88,15 +94,6 @@ class Scan:
             x, dt, A, B, C, D = arguments
             flipped = ScanInputs(x.flip(1), dt.flip(1), A, B.flip(1), C.flip(1), D)
             return form(flipped).flip(1).to(inputs.x.dtype)
-
-    def _by_kernels(self, inputs: ScanInputs, backend: str, reverse: bool) -> Tensor:
-        keep = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs)
-        dtypes = (inputs.x.dtype if name in "xBC" else torch.float32 for name in inputs._fields)
-        tensors = (tensor.to(dtype) for tensor, dtype in zip(inputs, dtypes, strict=True))
-        y, _ = self.run_kernels(
-            backend, *(tensor.contiguous() for tensor in tensors), reverse=reverse, keep=keep
-        )
-        return y
 
     def _check(self, inputs: ScanInputs) -> None:
         x, B, axes = inputs.x, inputs.B, self.axes["x"]

@@ -36,15 +36,29 @@ def draw_in_chunks(
     if views_at_once is not None and views_at_once < 1:
         raise InputError(f"render's views_at_once is {views_at_once}: give at least 1, or None.")
     num_views = min(views_at_once or cameras.num_views, cameras.num_views)
+
+    def draw_views(
+        views: slice, inputs: Sequence[Tensor]
+    ) -> tuple[list[Tensor | None], dict[str, int]]:
+        """Draw `views` from their inputs; return images as [B, views, ...], and statistics."""
+        *fields, poses, intrinsics = inputs
+        some = Cameras(intrinsics, poses, cameras.height, cameras.width)
+        counts = None if masks is None else masks[:, views]
+        out = draw(Gaussians(*fields), some, settings, counts)
+        images = (out.image, out.alpha, out.transmittance, out.depth, out.depth_origin)
+        shape = poses.shape[:2]
+        return [None if image is None else image.unflatten(0, shape) for image in images], out.stats
+
     while True:
         try:
             if num_views == cameras.num_views:
                 return draw(gaussians, cameras, settings, masks)
-            chunks = _Chunks(draw, settings, masks, (cameras.height, cameras.width), num_views, {})
+            slices = [slice(i, i + num_views) for i in range(0, cameras.num_views, num_views)]
+            stats: dict[str, int] = {}
             fields = [getattr(gaussians, name) for name in NAMES if name not in PER_VIEW]
             poses = (cameras.cam_to_world, cameras.intrinsics)
-            *images, origins = _Deferred.apply(chunks, *fields, *poses)
-            return RenderOutputs(*images, chunks.stats, origins)
+            *images, origins = _Deferred.apply(draw_views, slices, stats, *fields, *poses)
+            return RenderOutputs(*images, stats, origins)
         except (torch.OutOfMemoryError, MemoryError) as error:
             if num_views <= 1:
                 raise
@@ -57,55 +71,20 @@ def draw_in_chunks(
             )
 
 
-@dataclasses.dataclass(frozen=True)
-class _Chunks:
-    """The arguments for drawing some of the views; each chunk adds to `stats`."""
-
-    draw: Draw
-    settings: RenderSettings
-    masks: Tensor | None
-    size: tuple[int, int]
-    views_at_once: int
-    stats: dict[str, int]
-
-    def slices(self, num_views: int) -> list[slice]:
-        """Split the views."""
-        starts = range(0, num_views, self.views_at_once)
-        return [slice(start, start + self.views_at_once) for start in starts]
-
-    def select(self, tensors: Sequence[Tensor], views: slice) -> list[Tensor]:
-        """Select the inputs for some views."""
-        *fields, poses, intrinsics = tensors
-        return [*fields, poses[:, views], intrinsics[:, views]]
-
-    def draw_views(
-        self, inputs: Sequence[Tensor], views: slice
-    ) -> tuple[list[Tensor | None], dict[str, int]]:
-        """Draw `views` from their `inputs`; return images as [B, views, ...], and statistics."""
-        *fields, poses, intrinsics = inputs
-        masks = None if self.masks is None else self.masks[:, views]
-        cameras = Cameras(intrinsics, poses, *self.size)
-        out = self.draw(Gaussians(*fields), cameras, self.settings, masks)
-        shape = poses.shape[:2]
-        images = (out.image, out.alpha, out.transmittance, out.depth, out.depth_origin)
-        return [None if image is None else image.unflatten(0, shape) for image in images], out.stats
-
-
 class _Deferred(torch.autograd.Function):
     """Saves only the inputs; the backward pass draws each chunk again, with a graph."""
 
     @staticmethod
-    def forward(ctx, chunks: _Chunks, *tensors: Tensor) -> tuple[Tensor | None, ...]:
-        ctx.chunks = chunks
+    def forward(ctx, draw_views, slices, stats, *tensors):
+        ctx.draw_views, ctx.slices = draw_views, slices
         ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
         parts = []
-        for views in chunks.slices(tensors[-1].shape[1]):
-            images, stats = chunks.draw_views(chunks.select(tensors, views), views)
+        for views in slices:
+            images, counts = draw_views(views, _select(tensors, views))
             parts.append(images)
-            for name, count in stats.items():
-                total = 0 if name in NOT_SUMMED else chunks.stats.get(name, 0)
-                chunks.stats[name] = count + total
+            for name, count in counts.items():
+                stats[name] = count + (0 if name in NOT_SUMMED else stats.get(name, 0))
         return tuple(
             None if images[0] is None else torch.cat(images, 1).flatten(0, 1)
             for images in zip(*parts, strict=True)
@@ -114,21 +93,16 @@ class _Deferred(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        chunks, shape = ctx.chunks, ctx.saved_tensors[-1].shape[:2]
-        needed = ctx.needs_input_grad[1:]
+        shape, needed = ctx.saved_tensors[-1].shape[:2], ctx.needs_input_grad[3:]
         totals = [
             torch.zeros_like(tensor) if need else None
             for tensor, need in zip(ctx.saved_tensors, needed, strict=True)
         ]
-        for views in chunks.slices(shape[1]):
-            inputs = [
-                tensor.detach().requires_grad_(need)
-                for tensor, need in zip(
-                    chunks.select(ctx.saved_tensors, views), needed, strict=True
-                )
-            ]
+        for views in ctx.slices:
+            selected = zip(_select(ctx.saved_tensors, views), needed, strict=True)
+            inputs = [tensor.detach().requires_grad_(need) for tensor, need in selected]
             with torch.enable_grad():
-                images, _ = chunks.draw_views(inputs, views)
+                images, _ = ctx.draw_views(views, inputs)
             outputs = [
                 (image, grad.unflatten(0, shape)[:, views])
                 for image, grad in zip(images, grads, strict=True)
@@ -138,4 +112,10 @@ class _Deferred(torch.autograd.Function):
             for name, total, tensor in zip(NAMES, totals, inputs, strict=True):
                 if total is not None and tensor.grad is not None:
                     (total[:, views] if name in PER_VIEW else total).add_(tensor.grad)
-        return (None, *totals)
+        return (None, None, None, *totals)
+
+
+def _select(tensors: Sequence[Tensor], views: slice) -> list[Tensor]:
+    """Select the inputs for some views."""
+    *fields, poses, intrinsics = tensors
+    return [*fields, poses[:, views], intrinsics[:, views]]

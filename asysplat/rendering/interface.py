@@ -1,6 +1,6 @@
 """The arguments and results of a rendering backend."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -9,9 +9,7 @@ from torch import Tensor
 from asysplat.errors import InputError
 
 DEPTHS = ("accumulated", "expected", "median")
-MAX_MAGNITUDE = (
-    1e18  # depths and SH coefficients beyond it are culled: their squares overflow float32
-)
+MAX_MAGNITUDE = 1e18  # of depths and SH coefficients: larger ones are culled, squares overflow
 MIN_SQUARED_DISTANCE = 1e-20  # below the square of any distance that matters, and normal in float32
 MAX_PAIRS = 2**31 - 1  # of splat and tile: what int32 can number
 MAX_SPLATS_PER_TILE = 2**24  # what float32 can count
@@ -81,10 +79,6 @@ class Culling:
     masks: bool = True
     rows: bool = True
     opaque: bool = True
-
-    def disable(self, name: str) -> "Culling":
-        """Return this culling with `name` switched off."""
-        return replace(self, **{name: False})
 
 
 @dataclass(frozen=True)

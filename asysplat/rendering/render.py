@@ -2,14 +2,13 @@
 
 import math
 from dataclasses import dataclass, fields, replace
-from importlib.util import find_spec
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.ops.dispatch import pick_backend
+from asysplat.ops.dispatch import check_device, check_float, fast_backend, pick_backend
 from asysplat.ops.precision import without_autocast
 from asysplat.rendering import cpu, reference
 from asysplat.rendering.chunks import draw_in_chunks
@@ -112,7 +111,7 @@ def render(
         if sh_degree is not None:
             scenes = replace(scenes, sh=scenes.sh[..., : (sh_degree + 1) ** 2, :])
         views = cameras.map(lambda t: _one_batch(t.to(dtype), batch))
-        auto = BACKENDS[_fast_backend(gaussians.means.device, dtype)]
+        auto = BACKENDS[fast_backend(scenes.means, "reference")]
         draw = pick_backend("render", {"auto": auto, **BACKENDS}, backend)
         counts = None if masks is None else _one_batch(masks, batch)
         out = draw_in_chunks(draw, scenes, views, settings, counts, views_at_once)
@@ -121,8 +120,7 @@ def render(
             return images.to(dtype).unflatten(0, (*batch, cameras.num_views))
 
         image, alpha, transmittance = map(shaped, (out.image, out.alpha, out.transmittance))
-        distance = None if out.depth is None else _depth(out, settings).to(dtype)
-        distance = None if distance is None else distance.unflatten(0, alpha.shape[:-2])
+        distance = None if out.depth is None else shaped(_depth(out, settings))
         if masks is not None:
             image = image.where(masks[..., None, :, :], 0)
             alpha, transmittance = alpha.where(masks, 0), transmittance.where(masks, 1)
@@ -140,15 +138,6 @@ def _depth(out: RenderOutputs, settings: RenderSettings) -> Tensor:
     if settings.depth == "accumulated":
         return out.depth + origin * out.alpha
     return out.depth / out.alpha.clamp_min(MIN_ALPHA) + origin * (out.alpha > 0)
-
-
-def _fast_backend(device: torch.device, dtype: torch.dtype) -> str:
-    """Return the name of the fastest backend for the device and dtype."""
-    if dtype == torch.float32 and device.type == "cpu":
-        return "cpu"
-    if dtype == torch.float32 and device.type == "cuda" and find_spec("triton"):
-        return "cuda"
-    return "reference"
 
 
 def _one_batch(tensor: Tensor, batch: tuple[int, ...]) -> Tensor:
@@ -178,17 +167,10 @@ def _check(
             f"of shape {pixels}, one number a pixel."
         )
     named = {f"gaussians.{f.name}": getattr(gaussians, f.name) for f in fields(gaussians)}
-    named["cameras.intrinsics"] = cameras.intrinsics
-    named["cameras.cam_to_world"] = cameras.cam_to_world
+    named |= {f"cameras.{name}": getattr(cameras, name) for name in ("intrinsics", "cam_to_world")}
     if background is not None:
         named["background"] = background
-    device = gaussians.means.device
     for name, tensor in named.items():
-        if tensor.device != device:
-            raise InputError(
-                f"render's {name} is on {tensor.device} and gaussians.means on {device}: "
-                "move both to one device."
-            )
-        if not tensor.is_floating_point():
-            raise InputError(f"render's {name} is {tensor.dtype}: give floating-point numbers.")
+        check_device("render", name, tensor, "gaussians.means", gaussians.means)
+        check_float("render", name, tensor)
     return batch

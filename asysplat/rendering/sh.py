@@ -102,15 +102,11 @@ def sh_rotation(rotation: Float[Tensor, "3 3"], count: int) -> Float[Tensor, "{c
     SH function is a sum of SH functions of its degree, so its values in enough directions determine
     the matrix exactly.
     """
-    directions = _sphere_directions(2 * count).to(rotation)
-    before = sh_basis(directions @ rotation, count)  # along R^-1 d
-    return torch.linalg.pinv(sh_basis(directions, count)) @ before
-
-
-def _sphere_directions(count: int) -> Float[Tensor, "{count} 3"]:
-    """Spread directions nearly evenly over the sphere, on a Fibonacci spiral."""
-    index = torch.arange(count, dtype=torch.float64) + 0.5
-    z = 1 - 2 * index / count
+    # Directions nearly evenly over the sphere, on a Fibonacci spiral.
+    index = torch.arange(2 * count, dtype=torch.float64) + 0.5
+    z = 1 - index / count
     angle = index * torch.pi * (1 + 5**0.5)
     radius = (1 - z * z).sqrt()
-    return torch.stack((radius * angle.cos(), radius * angle.sin(), z), -1)
+    directions = torch.stack((radius * angle.cos(), radius * angle.sin(), z), -1).to(rotation)
+    before = sh_basis(directions @ rotation, count)  # along R^-1 d
+    return torch.linalg.pinv(sh_basis(directions, count)) @ before

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tiny import SIZE as SIZES
 
 from asysplat.models import LongLRMHead, PhotographHead
 from asysplat.rendering import render
@@ -125,16 +126,11 @@ def test_a_distance_of_500_is_rendered():
     assert ((depths > 400) & (depths < 501)).all()
 
 
-@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize("head", [None, *HEADS])
 @pytest.mark.parametrize("model", MODELS)
-def test_every_model_takes_either_head(build, model, head):
-    tiny = ("width=0.125", "state_size=8", "model.head.sh_degree=1")
-    net = build(*tiny, f"model={model}", f"model/head={head}", device="meta")
-    assert type(net.head) is HEADS[head]
+def test_every_model_takes_either_head_and_long_lrm_its_own(build, model, head):
+    choice = [] if head is None else [f"model/head={head}"]
+    net = build(*SIZES, "model.head.sh_degree=1", f"model={model}", *choice, device="meta")
+    own = "longlrm" if model.startswith("longlrm") else "photograph"
+    assert type(net.head) is HEADS[head or own]
     assert net.head.splits[-1] == 12
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_long_lrm_has_its_own_head_and_the_others_ours(build, model):
-    net = build("width=0.125", "state_size=8", f"model={model}", device="meta")
-    assert type(net.head) is (LongLRMHead if model.startswith("longlrm") else PhotographHead)

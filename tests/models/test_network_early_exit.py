@@ -5,7 +5,6 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from test_prior import wall
 from tiny import NETWORK
@@ -28,11 +27,6 @@ def net(build):
     return net
 
 
-def preset(repository, name):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        return instantiate(compose("train", [f"speed={name}"]).speed)
-
-
 @torch.no_grad()
 def predict(net, views, **thresholds):
     net.early_exit = EarlyExit(**thresholds)
@@ -44,9 +38,9 @@ def same_bits(one, other):
     return all(torch.equal(a, b) for a, b in pairs)
 
 
-def test_off_is_exact_and_reports_nothing(net, repository):
+def test_off_is_exact_and_reports_nothing(net, composed):
     exact = predict(net, wall())
-    assert preset(repository, "exact") == EXACT == net.early_exit
+    assert instantiate(composed("speed=exact").speed) == EXACT == net.early_exit
     assert net.early_exit_shares == {}
     assert same_bits(exact, net.predict(wall()))
 
@@ -100,12 +94,12 @@ def test_without_the_network_gaussians_are_those_of_the_prior(net):
     torch.testing.assert_close(*images)
 
 
-def test_presets_skip_where_the_prior_is_confident(net, repository):
+def test_presets_skip_where_the_prior_is_confident(net, composed):
     textured = wall()
     flat = replace(textured, images=torch.full_like(textured.images, 0.4))
     shares = {}
     for name in ("balanced", "fast"):
-        net.early_exit = preset(repository, name)
+        net.early_exit = instantiate(composed(f"speed={name}").speed)
         for scene, views in (("flat", flat), ("textured", textured)):
             with torch.no_grad():
                 net(Views(views.cameras, views.images))
@@ -122,9 +116,8 @@ def test_bad_thresholds_are_refused(name, value):
         EarlyExit(**{name: value})
 
 
-def test_a_bad_override_is_one_sentence(repository):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        config = compose("train", ["speed=fast", "speed.skip_network_above=2.0"])
+def test_a_bad_override_is_one_sentence(composed):
+    config = composed("speed=fast", "speed.skip_network_above=2.0")
     with pytest.raises(Exception, match=r"speed\.skip_network_above=2\.0") as caught:
         instantiate(config.speed)
     assert isinstance(input_error_behind(caught.value), InputError)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from asysplat.ops.simd.kernel import kernel
 from asysplat.ops.simd.products import ROWS, add_product, add_triangle, transpose
+from asysplat.ops.simd.threads import kernel
 from asysplat.ops.simd.vectors import LANES
 
 SIDE = 4 * ROWS

@@ -111,7 +111,7 @@ def test_culling_keeps_the_bits(make_scene):
     masks[..., :9, :9] = False
     images, grads, stats = run(draw_by_cuda, gaussians, cameras, RenderSettings(), masks)
     for name, gain in GAINS.items():
-        settings = RenderSettings(culling=Culling().disable(name))
+        settings = RenderSettings(culling=Culling(**{name: False}))
         other = run(draw_by_cuda, gaussians, cameras, settings, masks)
         assert all(map(torch.equal, [*images, *grads], [*other[0], *other[1]])), name
         assert other[2][gain] != stats[gain], name

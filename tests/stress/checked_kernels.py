@@ -19,7 +19,7 @@ from torch import Tensor
 from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.ops import image_loss, selective_scan, ssd
 from asysplat.ops.simd.gathers import gather_pairs, gather_squares
-from asysplat.ops.simd.kernel import kernel
+from asysplat.ops.simd.threads import kernel
 from asysplat.ops.simd.vectors import load, load_some, store, zeros
 from asysplat.refinement.adam import VisibleAdam
 from asysplat.rendering import Culling
@@ -64,7 +64,7 @@ def scenes() -> Iterator[Callable[[], Result]]:
         masks[..., : height // 2] = True
         options = [{"antialiased": True}, {"depth": "median"}, {"masks": masks}]
         for name in ("ellipse", "extent", "frustum", "rows", "opaque"):
-            options.append({"culling": Culling().disable(name)})
+            options.append({"culling": Culling(**{name: False})})
         for option in options:
             yield partial(both_ways, CPU, *wild_scene(seed, height, width, degree), **option)
 

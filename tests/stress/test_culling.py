@@ -53,7 +53,7 @@ def test_bits_are_the_same_without(fast_backend, name, scene, options):
 @pytest.mark.parametrize("name", NAMES)
 def test_each_kind_saves_work_and_counts_it(fast_backend, name):
     gaussians, cameras = needles()
-    culling = Culling().disable(name)
+    culling = Culling(**{name: False})
     with_it = both_ways(fast_backend, gaussians, cameras, masks=MASKS).stats
     without = both_ways(fast_backend, gaussians, cameras, masks=MASKS, culling=culling).stats
     assert with_it != without

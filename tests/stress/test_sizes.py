@@ -52,7 +52,7 @@ def test_case_17_pairs_that_no_list_can_number_are_refused():
     intrinsics = torch.tensor([[[100.0, 0, 2**19], [0, 100, 0.5], [0, 0, 1]]])
     cameras = Cameras(intrinsics, torch.eye(4)[None], 1, 2**20)
     with pytest.raises(InputError, match=rf"{count * 2**16} pairs.*2147483647.*views_at_once"):
-        render(giants, cameras, backend="cpu", culling=Culling().disable("ellipse"))
+        render(giants, cameras, backend="cpu", culling=Culling(ellipse=False))
 
 
 def test_case_17_too_little_memory_is_met_by_fewer_views(backend, make_scene, monkeypatch):

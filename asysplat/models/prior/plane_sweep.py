@@ -6,13 +6,11 @@ against each other, which gives the confidence. A first sweep at half the resolu
 range of the second: surfaces fill a tenth of the range that the cameras allow.
 """
 
-from dataclasses import dataclass
 from functools import reduce
-from types import ModuleType
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from asysplat.errors import InputError
@@ -59,7 +57,7 @@ class PlaneSweepPrior(nn.Module):
             factor *= 2
         multiple = factor * STRIDE
         small = views.cameras.resized(
-            max(1, height // multiple) * STRIDE, max(1, width // multiple) * STRIDE
+            *(max(1, side // multiple) * STRIDE for side in (height, width))
         )
         images = shrink(views.images, small.height, small.width)
         ranges = None
@@ -127,16 +125,48 @@ def _plane_sweep(
     cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
     projections = Projections.between(cameras)
     chosen = choose_neighbors(cameras, projections, neighbors)
+    shortest = smallest_step(cameras, chosen)
     visible = inverse_depth_range(cameras, projections, chosen)
     if ranges is None:
         ranges = visible
     ranges = torch.where(ranges[..., 1:] > 0, ranges.to(visible), visible)
     kernels = load_backend(backend, images)
-    run = _PlaneSweep(projections, chosen, smallest_step(cameras, chosen), planes, stride, kernels)
+
+    def sweep(
+        images: Float[Tensor, "B V 3 H W"], ranges: Float[Tensor, "B V 2"], aggregations: int
+    ) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V"], Float[Tensor, "B V h w"]]:
+        """Return the inverse depths, the steps between planes, and how far neighbors agree.
+
+        From the second aggregation on, a pixel's costs have its agreement as weight.
+        """
+        height, width = images.shape[-2:]
+        h, w = height // stride, width // stride
+        gray = (images * images.new_tensor(LUMA)[:, None, None]).sum(-3)
+        into = projections.into(chosen, height, width)
+        costs = kernels.cost_volume(gray, chosen, into, ranges, planes, stride)
+        borders = edges(shrink(images, h, w))
+        first, last = ranges[..., None, None, :].unbind(-1)
+        spacing = (last - first) / (planes - 1)
+        steps = torch.maximum(spacing[..., 0, 0], shortest)
+        small = projections.into(chosen, h, w)
+        agreement = images.new_ones(*images.shape[:2], h, w)
+        for _ in range(aggregations):
+            best = kernels.sgm(costs, agreement, borders)
+            inverse = first + best.plane * spacing
+            found = kernels.consistency(inverse, steps, torch.ones_like(inverse), chosen, small)
+            agree, contradict = found.agreeing, found.contradicting
+            agreement = (2 * agree / (agree + contradict + 1)).clamp_max(1)
+        return inverse, steps, agreement * (best.contrast / FULL_CONTRAST).clamp(0, 1)
+
     half = (max(1, side // (2 * stride)) * stride for side in images.shape[-2:])
-    inverse, steps, agreement = run.depths(shrink(images, *half), ranges, aggregations=1)
-    ranges = _narrowed(ranges, inverse, steps, agreement, planes * run.smallest_step)
-    inverse, steps, agreement = run.depths(images, ranges, aggregations=2)
+    inverse, steps, agreement = sweep(shrink(images, *half), ranges, aggregations=1)
+    # Narrow the ranges to the depths that neighbors agree on, unless these are few.
+    observed = observed_range(inverse.flatten(2), agreement.flatten(2) > MIN_AGREEMENT)
+    least = torch.maximum(ranges[..., 0], observed[..., 0] - steps / 2)
+    greatest = torch.maximum(observed[..., 1] + steps / 2, least + planes * shortest)
+    narrowed = torch.stack((least, torch.minimum(ranges[..., 1], greatest)), dim=-1)
+    ranges = torch.where(observed[..., 1:] > 0, narrowed, ranges)
+    inverse, steps, agreement = sweep(images, ranges, aggregations=2)
     others = other_views(images.shape[1], images.shape[0], images.device)
     small = projections.into(others, *inverse.shape[-2:])
     found = kernels.consistency(inverse, steps, agreement, others, small)
@@ -151,62 +181,6 @@ def _plane_sweep(
 def _(images, intrinsics, cam_to_world, stride, planes, neighbors, backend, ranges):
     shape = (*images.shape[:2], images.shape[-2] // stride, images.shape[-1] // stride)
     return tuple(images.new_empty(shape) for _ in range(4))
-
-
-@dataclass(frozen=True)
-class _PlaneSweep:
-    """What both plane sweeps share."""
-
-    projections: Projections
-    chosen: Int[Tensor, "B V K"]
-    smallest_step: Float[Tensor, "B V"]
-    planes: int
-    stride: int
-    kernels: ModuleType
-
-    def depths(
-        self, images: Float[Tensor, "B V 3 H W"], ranges: Float[Tensor, "B V 2"], aggregations: int
-    ) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V"], Float[Tensor, "B V h w"]]:
-        """Return the inverse depths, the steps between planes, and how far neighbors agree.
-
-        From the second aggregation on, a pixel's costs have its agreement as weight.
-        """
-        height, width = images.shape[-2:]
-        h, w = height // self.stride, width // self.stride
-        gray = (images * images.new_tensor(LUMA)[:, None, None]).sum(-3)
-        costs = self.kernels.cost_volume(
-            *(gray, self.chosen, self.projections.into(self.chosen, height, width)),
-            *(ranges, self.planes, self.stride),
-        )
-        borders = edges(shrink(images, h, w))
-        first, last = ranges[..., None, None, :].unbind(-1)
-        spacing = (last - first) / (self.planes - 1)
-        steps = torch.maximum(spacing[..., 0, 0], self.smallest_step)
-        small = self.projections.into(self.chosen, h, w)
-        agreement = images.new_ones(*images.shape[:2], h, w)
-        for _ in range(aggregations):
-            best = self.kernels.sgm(costs, agreement, borders)
-            inverse = first + best.plane * spacing
-            trust = torch.ones_like(inverse)
-            found = self.kernels.consistency(inverse, steps, trust, self.chosen, small)
-            agree, contradict = found.agreeing, found.contradicting
-            agreement = (2 * agree / (agree + contradict + 1)).clamp_max(1)
-        return inverse, steps, agreement * (best.contrast / FULL_CONTRAST).clamp(0, 1)
-
-
-def _narrowed(
-    ranges: Float[Tensor, "B V 2"],
-    inverse: Float[Tensor, "B V h w"],
-    steps: Float[Tensor, "B V"],
-    agreement: Float[Tensor, "B V h w"],
-    shortest: Float[Tensor, "B V"],
-) -> Float[Tensor, "B V 2"]:
-    """Narrow the ranges to the depths that neighbors agree on, unless these are few."""
-    observed = observed_range(inverse.flatten(2), agreement.flatten(2) > MIN_AGREEMENT)
-    least = torch.maximum(ranges[..., 0], observed[..., 0] - steps / 2)
-    greatest = torch.maximum(observed[..., 1] + steps / 2, least + shortest)
-    narrowed = torch.stack((least, torch.minimum(ranges[..., 1], greatest)), dim=-1)
-    return torch.where(observed[..., 1:] > 0, narrowed, ranges)
 
 
 def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbors: int) -> None:

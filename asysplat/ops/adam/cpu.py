@@ -16,8 +16,7 @@ from torch import Tensor
 
 from asysplat.ops.adam.reference import AdamSettings, Rows
 from asysplat.ops.simd.gathers import gather_pairs
-from asysplat.ops.simd.kernel import inline, kernel
-from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.threads import even_bounds, inline, kernel, run_blocks
 from asysplat.ops.simd.vectors import (
     LANES,
     ZERO,

@@ -71,12 +71,11 @@ def _check(rendered: Tensor, target: Tensor, ssim_weight: float, masks: Tensor |
             "every side at least 1."
         )
     reason = f", as rendered has shape {tuple(rendered.shape)}"
-    shapes = {"target": (target, rendered.shape)}
-    if masks is not None:
-        shapes["masks"] = (masks, rendered.shape[:-3] + rendered.shape[-2:])
-    for name, (tensor, shape) in shapes.items():
-        check_shape("image_loss", name, tensor, tuple(shape), reason)
-        check_device("image_loss", name, tensor, "rendered", rendered)
+    mask_shape = rendered.shape[:-3] + rendered.shape[-2:]
+    for name, tensor, shape in (("target", target, rendered.shape), ("masks", masks, mask_shape)):
+        if tensor is not None:
+            check_shape("image_loss", name, tensor, tuple(shape), reason)
+            check_device("image_loss", name, tensor, "rendered", rendered)
     for name, tensor in {"rendered": rendered, "target": target}.items():
         check_float("image_loss", name, tensor, ", 8-bit images divided by 255")
     if not 0 <= ssim_weight <= 1:

@@ -21,8 +21,7 @@ from torch.autograd.function import once_differentiable
 
 from asysplat.ops.image_loss import reference
 from asysplat.ops.image_loss.reference import SIZE, window_weights
-from asysplat.ops.simd.kernel import inline, kernel
-from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.threads import even_bounds, inline, kernel, run_blocks
 from asysplat.ops.simd.vectors import (
     LANES,
     ONE,

@@ -1,17 +1,52 @@
-"""Kernels on as many threads as torch uses."""
+"""CPU kernels: cached on disk, without Python's global lock, on as many threads as torch uses."""
 
+import hashlib
+import inspect
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from pathlib import Path
 from threading import get_ident
 from typing import TypeVar
 
+import numba
 import numpy as np
 import torch
+from numba import njit
 
+HERE = Path(__file__).parent
+PACKAGE = HERE.parent.parent
 Result = TypeVar("Result")
 PER_THREAD = 4  # portions of the work for each thread: the fast threads take more of them
+
+
+def kernel(function: Callable) -> Callable:
+    """Compile a kernel for `run_blocks`; with NUMBA_BOUNDSCHECK=1 it checks every index."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = _cache_folder(before)
+    try:  # without a type checker's wrapper, which cannot be compiled
+        return njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def inline(function: Callable) -> Callable:
+    """Compile a function inline into each kernel that calls it."""
+    return njit(inline="always", error_model="numpy")(inspect.unwrap(function))
+
+
+@cache
+def _cache_folder(parent: str) -> str:
+    """Return the folder for this version of the sources; bounds-checked kernels have their own."""
+    # Numba compares only a kernel's own file, not its parts in other files.
+    paths = [path for folder in ("ops", "rendering") for path in (PACKAGE / folder).rglob("*.py")]
+    sources = b"".join(path.read_bytes() for path in sorted(paths))
+    beside = HERE / "__pycache__"
+    home = Path.home() / ".cache" / "asysplat"
+    root = parent or (beside if os.access(HERE, os.W_OK) else home)
+    checks = "-checked" if numba.config.BOUNDSCHECK else ""
+    return str(Path(root) / f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}{checks}")
 
 
 def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:

@@ -16,7 +16,7 @@ from numba.core.datamodel import models
 from numba.core.typeconv import Conversion
 from numba.extending import intrinsic, lower_cast, overload, register_model
 
-from asysplat.ops.simd.kernel import inline
+from asysplat.ops.simd.threads import inline
 
 LANES = 16  # one vector of AVX-512; two or four of older ones
 HAS_FMA = bool(llvmlite.binding.get_host_cpu_features().get("fma", True))
@@ -27,18 +27,9 @@ ZERO, ONE = np.float32(0), np.float32(1)
 ROUND = np.float32(1.5 * 2**23)
 UNDERFLOW = np.float32(-127)  # all bits of its `exp2` are 0
 # 2^f on [-1/2, 1/2]: the Chebyshev interpolation, relative error 2e-9.
-P0, P1, P2, P3, P4, P5, P6 = (
-    np.float32(c)
-    for c in (
-        1.00000000059202,
-        0.6931472056005139,
-        0.24022646608715542,
-        0.05550328997510684,
-        0.009618519534332742,
-        0.00133998603653958,
-        0.00015337576817951937,
-    )
-)
+P0, P1, P2 = map(np.float32, (1.00000000059202, 0.6931472056005139, 0.24022646608715542))
+P3, P4 = map(np.float32, (0.05550328997510684, 0.009618519534332742))
+P5, P6 = map(np.float32, (0.00133998603653958, 0.00015337576817951937))
 
 
 class Vector(types.Type):
@@ -239,15 +230,22 @@ def _some(context, builder, signature, args):
     return pointer, builder.icmp_signed("<", lanes(0, LANES), splat(builder, few))
 
 
-def _overload(symbol: Callable, emit: Callable[..., ir.Value]) -> None:
-    """Overload an operator or function of two numbers for vectors."""
+def _binary(result: types.Type, emit: Callable[..., ir.Value]):
+    """Return an intrinsic of two vectors."""
 
     @intrinsic
     def compute(typing_context, a, b):
         def generate(context, builder, signature, args):
             return emit(builder, *args)
 
-        return VECTOR(VECTOR, VECTOR), generate
+        return result(VECTOR, VECTOR), generate
+
+    return compute
+
+
+def _overload(symbol: Callable, emit: Callable[..., ir.Value]) -> None:
+    """Overload an operator or function of two numbers for vectors."""
+    compute = _binary(VECTOR, emit)
 
     @overload(symbol)
     def _(a, b):
@@ -264,14 +262,11 @@ _overload(max, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a,
 _overload(min, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 
 
-@intrinsic
-def less(typing_context, a, b):
-    """Return a bit for each number of two vectors, the lowest for the first: 1 if a < b."""
+def _emit_less(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
+    return builder.bitcast(builder.fcmp_ordered("<", a, b), ir.IntType(LANES))
 
-    def generate(context, builder, signature, args):
-        return builder.bitcast(builder.fcmp_ordered("<", *args), ir.IntType(LANES))
 
-    return MASK(VECTOR, VECTOR), generate
+less = _binary(MASK, _emit_less)  # a bit for each number, the lowest for the first: 1 if a < b
 
 
 @intrinsic

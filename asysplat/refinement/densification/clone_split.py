@@ -13,7 +13,7 @@ from torch import Tensor
 
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.rendering.reference.math import rotations
+from asysplat.rendering.reference.project import rotations
 from asysplat.scene import Cameras
 
 DENSIFY_GRAD_THRESHOLD = 2e-4  # mean screen-space gradient, in half images
@@ -29,8 +29,7 @@ class ScreenGradients:
         self._reset()
 
     def _reset(self) -> None:
-        self._sums = torch.zeros(len(self.fields))
-        self._counts = torch.zeros(len(self.fields))
+        self._sums, self._counts = torch.zeros(2, len(self.fields))
 
     @property
     def mean(self) -> Float[Tensor, "N"]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.rendering.reference.math import rotations
+from asysplat.rendering.reference.project import rotations
 from asysplat.scene import Gaussians
 
 REGULARIZER = 0.01  # weight of the mean opacity, and of the mean scale
@@ -67,11 +67,8 @@ def split_opacity_and_scale(
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
     """Compute opacity and scale of n copies that render together as their original (Eq. 9).
 
-    The paper's double sum of binomials is sum_k C(n, k) (-1)^(k+1) o^k / sqrt(k), k = 1 to n.
-
-    Args:
-        opacities, scales: of the originals.
-        counts: copies n >= 1; more than MAX_COPIES count as that many.
+    The paper's double sum of binomials is sum_k C(n, k) (-1)^(k+1) o^k / sqrt(k), k = 1 to n. More
+    copies than MAX_COPIES count as that many; `counts` are >= 1.
     """
     counts, before = counts.clamp(max=MAX_COPIES), opacities.double().clamp(max=1 - 1e-6)
     each = 1 - (1 - before) ** (1 / counts)

@@ -295,9 +295,7 @@ def _empty_like(tensor: Tensor) -> Tensor:
 
 def _starts(counts: np.ndarray) -> np.ndarray:
     """Compute [0, c_0, c_0 + c_1, ...]."""
-    starts = np.zeros(len(counts) + 1, np.int64)
-    np.cumsum(counts, out=starts[1:])
-    return starts
+    return np.concatenate(([0], np.cumsum(counts, dtype=np.int64)))
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -10,7 +10,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from asysplat.ops.simd.kernel import inline
+from asysplat.ops.simd.threads import inline
 from asysplat.ops.simd.vectors import FLOATS, LANES, sum_of, vector_at
 from asysplat.rendering import formulas, sh
 
@@ -53,12 +53,8 @@ def triple(array, start):
 @inline
 def unit_quaternion(quats, start):
     """Read a quaternion from a flat array; return its unit quaternion and 1 / its length."""
-    w, x, y, z = (
-        float(quats[start]),
-        float(quats[start + 1]),
-        float(quats[start + 2]),
-        float(quats[start + 3]),
-    )
+    w, x, y = triple(quats, start)
+    z = float(quats[start + 3])
     inverse = 1 / math.sqrt(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asysplat.ops.simd.kernel import inline, kernel
+from asysplat.ops.simd.threads import inline, kernel
 from asysplat.rendering.cpu.math import (
     compensation,
     covariance,

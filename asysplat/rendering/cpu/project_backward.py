@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from asysplat.ops.simd.kernel import inline, kernel
+from asysplat.ops.simd.threads import inline, kernel
 from asysplat.rendering.cpu.math import (
     covariance,
     covariance_gradient,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asysplat.ops.simd.kernel import inline, kernel
+from asysplat.ops.simd.threads import inline, kernel
 from asysplat.ops.simd.vectors import LANES, ONE, ZERO, exp2, fma
 from asysplat.rendering.cpu import splat as col
 from asysplat.rendering.cpu.math import sum_and_clear, to_bits

@@ -9,7 +9,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from asysplat.ops.simd.kernel import inline
+from asysplat.ops.simd.threads import inline
 from asysplat.ops.simd.vectors import LANES, fma
 from asysplat.rendering.formulas import MAX_CENTER_OFFSET, PIXEL_MARGIN
 

@@ -202,13 +202,8 @@ def _list_tiles(
     box_tiles = torch.zeros(programs, dtype=torch.int32, device=device)
     first_pair = torch.empty_like(counts)
     common = {"splats": splats, "order": order, "counts": counts, "num_visible": len(order)}
-    common |= {
-        "num": frame.num,
-        **frame.grid,
-        "CULL_ELLIPSE": cull_ellipse,
-        "BLOCK": BLOCK,
-        **PROJECT_OPTIONS,
-    }
+    common |= {"num": frame.num, "CULL_ELLIPSE": cull_ellipse, "BLOCK": BLOCK}
+    common |= frame.grid | PROJECT_OPTIONS
     if len(order):
         unused = dict.fromkeys(("ends", "tile_of", "owners", "first_pair"))
         list_tiles[programs](box_tiles=box_tiles, **unused, **common, WRITE=False)

@@ -51,10 +51,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.lists, ctx.options = lists, (convention, median)
         pixels = lists.size**2
         out = packed.new_zeros(len(lists.lengths), packed.shape[1] - 6, pixels)
-        for tiles, splats in _groups(lists, len(packed) - 1):
-            block = _Block(
-                _gather_rows(packed, splats), lists.origins(tiles), lists.size, *ctx.options
-            )
+        for tiles, _, block in _blocks(packed, lists, ctx.options):
             out.index_copy_(0, tiles, block.forward())
         return out
 
@@ -62,24 +59,22 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_output: Tensor) -> tuple[Tensor, None, None, None]:
         (packed,) = ctx.saved_tensors
-        lists = ctx.lists
         grad = torch.zeros_like(packed)
-        for tiles, splats in _groups(lists, len(packed) - 1):
-            block = _Block(
-                _gather_rows(packed, splats), lists.origins(tiles), lists.size, *ctx.options
-            )
+        for tiles, splats, block in _blocks(packed, ctx.lists, ctx.options):
             rows = block.backward(grad_output.index_select(0, tiles))
             # A CPU sums in a fixed order: the same bits every time.
             grad.index_add_(0, splats.flatten(), rows.flatten(0, 1))
         return grad, None, None, None
 
 
-def _groups(lists: Lists, padding: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield tiles [t] and their splats [t, K], about GROUP_ELEMENTS (splat, pixel) pairs at a time.
+def _blocks(
+    packed: Tensor, lists: Lists, options: tuple[Convention, bool]
+) -> Iterator[tuple[Tensor, Tensor, "_Block"]]:
+    """Yield tiles [t], their splats [t, K] and block, about GROUP_ELEMENTS pairs at a time.
 
-    Covers all tiles with splats, longest list first; shorter lists end in `padding`.
+    Covers all tiles with splats, longest list first; shorter lists end in the padding.
     """
-    padded = torch.nn.functional.pad(lists.splats, (0, 1), value=padding)
+    padded = torch.nn.functional.pad(lists.splats, (0, 1), value=len(packed) - 1)
     starts = lists.lengths.cumsum(0) - lists.lengths
     lengths, order = torch.sort(lists.lengths, descending=True, stable=True)
     lengths = lengths.tolist()
@@ -90,12 +85,10 @@ def _groups(lists: Lists, padding: int) -> Iterator[tuple[Tensor, Tensor]]:
         tiles = order[begin : min(begin + size, end)]
         rank = torch.arange(longest, device=tiles.device)
         slots = torch.where(rank < lists.lengths[tiles, None], starts[tiles, None] + rank, -1)
-        yield tiles, padded[slots]
+        splats = padded[slots]
+        rows = packed.index_select(0, splats.flatten()).unflatten(0, splats.shape)
+        yield tiles, splats, _Block(rows, lists.origins(tiles), lists.size, *options)
         begin += size
-
-
-def _gather_rows(packed: Tensor, index: Tensor) -> Tensor:
-    return packed.index_select(0, index.flatten()).unflatten(0, index.shape)
 
 
 def _zero_below(values: Tensor, gate: Tensor, limit: float) -> None:

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from asysplat.ops.plane_sweep import reference
 from asysplat.ops.simd.gathers import gather_pairs
-from asysplat.ops.simd.kernel import kernel
-from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.threads import even_bounds, kernel, run_blocks
 from asysplat.ops.simd.vectors import (
     LANES,
     ONE,

@@ -14,8 +14,7 @@ from asysplat.ops.plane_sweep import reference
 from asysplat.ops.plane_sweep.inputs import CostInputs, prepare
 from asysplat.ops.plane_sweep.reference import BEST, WINDOW
 from asysplat.ops.simd.gathers import gather_squares
-from asysplat.ops.simd.kernel import inline, kernel
-from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.threads import even_bounds, inline, kernel, run_blocks
 from asysplat.ops.simd.vectors import (
     LANES,
     ONE,
@@ -261,12 +260,9 @@ def _merge(first, second, x, cost):
 
 @inline
 def _describe_row(offsets, scales, image, y, sums):
-    """Write the terms that turn sums over patches into correlations, for the pixels of row y.
+    """Write the sum over each patch of row y, and COUNT, both over the deviation of such sums.
 
-    Args:
-        offsets, scales: [W], the sum over a patch and COUNT, divided by the deviation of such sums.
-        image: [H, W].
-        sums: [2, W + WINDOW - 1], written: along columns, of pixels and of squares.
+    `sums` [2, W + WINDOW - 1] is scratch: sums along columns, of pixels and of squares.
     """
     H, W = image.shape
     for x in range(0, W, LANES):

@@ -6,8 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.simd.kernel import inline, kernel
-from asysplat.ops.simd.threads import even_bounds, run_blocks
+from asysplat.ops.simd.threads import even_bounds, inline, kernel, run_blocks
 from asysplat.ops.simd.vectors import (
     LANES,
     ZERO,
@@ -100,14 +99,10 @@ def _begin(weighted, sums, costs, weight):
 
 @inline
 def _extend(old, new, low, far, cost, sums):
-    """Extend the paths by a pixel; write their costs and return the least.
+    """Extend the paths by a pixel; write their costs, add them to `sums`, and return the least.
 
-    Args:
-        old, new: one element more at both ends than there are planes.
-        low: the least of `old`.
-        far: that and the penalty for several planes more or less.
-        cost: of the pixel's planes.
-        sums: of the costs of all paths to the pixel, added to.
+    `old` and `new` have an element more at both ends; `far` is `low`, the least of `old`, and the
+    penalty for several planes more or less.
     """
     lowest = INFINITY + zeros()
     for d in range(0, len(cost), LANES):

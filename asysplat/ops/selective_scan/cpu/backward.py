@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
-from asysplat.ops.simd.kernel import kernel
+from asysplat.ops.simd.threads import kernel
 from asysplat.ops.simd.vectors import (
     LANES,
     ZERO,

@@ -3,7 +3,7 @@
 import numpy as np
 
 from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
-from asysplat.ops.simd.kernel import kernel
+from asysplat.ops.simd.threads import kernel
 from asysplat.ops.simd.vectors import LANES, ZERO, decay2, fma, load, load_some, store, store_some
 
 

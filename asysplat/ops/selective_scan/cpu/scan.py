@@ -65,12 +65,7 @@ def backward(
         saved_state.numpy(),
         _float32(grad_output).numpy(),
         BlockedGradients(
-            x=grad_x.numpy(),
-            dt=grad_dt.numpy(),
-            A=grad_A.numpy(),
-            B=part_B.numpy(),
-            C=part_C.numpy(),
-            D=grad_D.numpy(),
+            *(part.numpy() for part in (grad_x, grad_dt, grad_A, part_B, part_C, grad_D))
         ),
     )
     return ScanInputs(

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asysplat.ops.simd.kernel import inline, kernel
 from asysplat.ops.simd.products import add_product, add_triangle, transpose
+from asysplat.ops.simd.threads import inline, kernel
 from asysplat.ops.simd.vectors import ONE, ZERO, fma
 from asysplat.ops.ssd.cpu.chunk import (
     dot_rows,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.simd.kernel import inline
+from asysplat.ops.simd.threads import inline
 from asysplat.ops.simd.vectors import LANES, ONE, ZERO, decay2, fma, load, total, zeros
 
 

@@ -41,7 +41,7 @@ def forward(
                 saved_state[batch, index] = states
             segment = _segment(inputs, batch, tokens, reverse)
             with _whole_target(y[batch, tokens], len(segment.x)) as out:
-                run_blocks(forward_heads, _one_each(len(states)), segment, states.numpy(), out)
+                run_blocks(forward_heads, np.arange(len(states) + 1), segment, states.numpy(), out)
     return y, saved_state
 
 
@@ -75,7 +75,7 @@ def backward(
             ):
                 run_blocks(
                     backward_heads,
-                    _one_each(groups),
+                    np.arange(groups + 1),
                     segment,
                     saved_state[batch, index].numpy(),
                     _whole_chunks(grad_output[batch, tokens]).numpy(),
@@ -147,8 +147,3 @@ def _whole_target(target: Tensor, length: int) -> Iterator[np.ndarray]:
 def _write(target: Tensor, chunks: Tensor) -> None:
     """Copy the tokens of [c, q, N] to `target`, without the padding."""
     target.copy_(chunks.flatten(0, 1)[: len(target)])
-
-
-def _one_each(count: int) -> np.ndarray:
-    """Return bounds with one head or group for each task."""
-    return np.arange(count + 1)
