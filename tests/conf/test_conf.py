@@ -90,6 +90,8 @@ def test_trains_a_step_at_a_tiny_size(choice):
     loss.backward()
     optimizer.step()
     assert loss.isfinite()
+    # Otherwise processes that train together would wait for the gradient.
+    assert all(p.grad is not None for p in module.parameters() if p.requires_grad)
     changed = zip(before, module.net.head.parameters(), strict=True)
     assert all(not torch.equal(old, new) and new.isfinite().all() for old, new in changed)
 

@@ -110,15 +110,8 @@ def test_the_report_has_rows_with_post_optimization(whole, evaluated, composed):
     assert "evaluate.py" in rows[28].note and not rows[28].values
 
 
-def test_a_checkpoint_by_path_has_the_numbers_of_its_run(whole, evaluated, evaluate, tmp_path):
-    weights = whole / "checkpoints" / "last.ckpt"
-    options = [*MODEL, *VIEWS, *TINY_SCENES, STEPS]
-    folder, results = read_evaluation(evaluate(f"init_path={weights}", *options))
-    assert folder.parent == tmp_path / "evaluate" and (folder / "config.yaml").is_file()
-    assert qualities(results) == qualities(evaluated)
-
-
 def test_an_interrupted_evaluation_resumes(whole, evaluated, evaluate, tmp_path, monkeypatch):
+    """Of a checkpoint by its path, which has the numbers of its run."""
     weights = f"init_path={whole}/checkpoints/last.ckpt"
     command = [weights, *MODEL, *VIEWS, *TINY_SCENES]
     keep = scenes.save_result
@@ -137,7 +130,8 @@ def test_an_interrupted_evaluation_resumes(whole, evaluated, evaluate, tmp_path,
     assert len(kept) == 2
     measured = []
     monkeypatch.setattr(scenes, "save_result", lambda p, r: (measured.append(p.stem), keep(p, r)))
-    _, results = read_evaluation(evaluate(*command, STEPS))
+    folder, results = read_evaluation(evaluate(*command, STEPS))
+    assert folder.parent == tmp_path / "evaluate" and (folder / "config.yaml").is_file()
     assert measured == ["rooms-0", "rooms-1", "outdoors-0", "outdoors-1"]
     assert {path: path.read_bytes() for path in kept} == kept
     assert qualities(results) == qualities(evaluated)

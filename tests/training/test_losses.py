@@ -15,7 +15,6 @@ from asysplat.rendering import Rendering
 from asysplat.scene import Cameras, Gaussians, Views
 from asysplat.training import InputDisparity, Prediction, SplattingLoss
 from asysplat.training.disparity import (
-    disparity_distance,
     normalized_disparity,
     own_depths,
     reference_disparities,
@@ -65,15 +64,6 @@ def test_mean_squared_error():
     expected = (prediction.rendering.image - batch["targets"].images).square().mean()
     torch.testing.assert_close(terms["loss"], 2 * expected)
     assert set(terms) == {"loss", "mse"}
-
-
-def test_disparity_ignores_scale_and_shift():
-    targets = pair()[1]["targets"]
-    everywhere = torch.ones_like(targets.depths, dtype=torch.bool)
-    other = 1 / (3 / targets.depths + 0.2)
-    disparity = 1 / targets.depths
-    assert disparity_distance(other, disparity, everywhere) < 1e-6
-    assert disparity_distance(targets.depths.flip(-1), disparity, everywhere) > 0.1
 
 
 def test_normalized_disparity_by_hand():
@@ -237,36 +227,27 @@ def distances(tmp_path_factory):
     return made
 
 
-def pair_of_images(distance):
-    """Noise twice, its distance, and both as networks take them before any scale."""
+LAYERS = {  # the scale of images, and the weights by the end of their layers; 0: the images'
+    "vgg16": (1 / STD, dict.fromkeys((4, 9, 16, 23, 30), 1 / 5)),
+    "longlrm": (255, {0: 1, 4: 0.3846, 9: 0.2083, 14: 0.2703, 23: 0.1786, 32: 6.6667}),
+}
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_layers_and_weights(distances, name):
+    """Long-LRM's have mean pooling."""
+    (distance, features), (scale, weights) = distances[name], LAYERS[name]
     rendered, target = torch.rand(2, 2, 3, 32, 32), torch.rand(2, 2, 3, 32, 32)
-    return distance(rendered, target), *(x.flatten(0, 1) - MEAN for x in (rendered, target))
-
-
-def test_vgg16s_layers_and_weights(distances):
-    distance, features = distances["vgg16"]
-    found, a, b = pair_of_images(distance)
-    a, b, expected = a / STD, b / STD, 0.0
-    for index, layer in enumerate(features[:30]):
-        a, b = layer(a), layer(b)
-        if index in (3, 8, 15, 22, 29):
-            assert isinstance(layer, torch.nn.ReLU)
-            expected = expected + (a - b).abs().mean() / 5
-    torch.testing.assert_close(found, expected)
-
-
-def test_long_lrms_layers_and_weights(distances):
-    """Blocks of VGG19 with mean pooling that end before layers 4, 9, 14, 23 and 32."""
-    distance, features = distances["longlrm"]
-    found, a, b = pair_of_images(distance)
-    a, b = 255 * a, 255 * b
-    expected, start = (a - b).abs().mean(), 0
-    for end, weight in {4: 0.3846, 9: 0.2083, 14: 0.2703, 23: 0.1786, 32: 6.6667}.items():
+    a, b = (scale * (x.flatten(0, 1) - MEAN) for x in (rendered, target))
+    expected, start = 0.0, 0
+    for end, weight in weights.items():
         for layer in features[start:end]:
-            pools = isinstance(layer, torch.nn.MaxPool2d)
+            pools = name == "longlrm" and isinstance(layer, torch.nn.MaxPool2d)
             a, b = (F.avg_pool2d(x, 2) if pools else layer(x) for x in (a, b))
         expected, start = expected + weight * (a - b).abs().mean(), end
-    torch.testing.assert_close(found, expected / 255)
+        assert not end or name == "longlrm" or isinstance(layer, torch.nn.ReLU)
+    expected = expected / 255 if name == "longlrm" else expected
+    torch.testing.assert_close(distance(rendered, target), expected)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -297,9 +278,3 @@ def test_perceptual_term(distances, name):
     same = Rendering(batch["targets"].images, prediction.rendering.alpha, None, {})
     assert loss(Prediction(prediction.gaussians, same), batch)["perceptual"] == 0
     assert not loss.state_dict() and not list(loss.parameters())
-
-
-def test_with_the_weights_of_imagenet(shared):
-    distance = vgg16(str(shared / "weights"))
-    prediction, batch = pair()
-    assert 0 < distance(prediction.rendering.image, batch["targets"].images) < 10

@@ -72,13 +72,6 @@ def test_gradients_are_clipped(build, algorithm, measure):
     torch.testing.assert_close(measure(grads), torch.tensor(0.5).double(), rtol=1e-5, atol=0)
 
 
-def test_the_matrix_a_of_mamba_vision_does_not_decay(build):
-    module = make_module(build("width=0.125", "state_size=8", device="meta"))
-    matrix = module.net.appearance["stages"][0][0].mixer.A_log
-    steady = module.configure_optimizers()["optimizer"].param_groups[1]["params"]
-    assert matrix.ndim == 2 and any(p is matrix for p in steady)
-
-
 def test_a_branch_that_nothing_reads_is_not_trained(build):
     overrides = ("model/source=fine", "model/links=only_fine_to_coarse", "width=0.125")
     net = make_module(build(*overrides, "state_size=8")).net

@@ -5,7 +5,6 @@ from threading import Barrier, get_ident
 
 import pytest
 import torch
-from test_side_by_side import make_batch, module, state  # noqa: F401
 
 from asysplat.training import parts as module_of_parts
 from asysplat.training.parts import Parts
@@ -49,21 +48,3 @@ def test_seconds_of_parallel_threads_are_averaged(clock):
         clock.wait(7)
     seconds = {name: spent for name, spent in parts.stop().items() if spent}
     assert seconds == {"network": 3, "loss": 7, "data": 0.5}
-
-
-def test_a_step_of_scenes_side_by_side(module):  # noqa: F811
-    """All parts of a step are measured, and measuring does not change the result."""
-    batch, found = make_batch(), []
-    start = {name: buffer.clone() for name, buffer in module.net.named_buffers()}
-    for measured in (True, False):
-        module.net.load_state_dict(start, strict=False)
-        module.zero_grad()
-        if measured:
-            module.parts.start(CPU)
-        module._side_by_side(batch)["loss"].backward()
-        found.append(state(module))
-        if measured:
-            seconds = module.parts.stop()
-    measured = {name for name, spent in seconds.items() if spent > 0}
-    assert measured == {"network", "rendering", "loss", "backward"}
-    assert all(torch.equal(tensor, found[1][name]) for name, tensor in found[0].items())

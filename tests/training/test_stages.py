@@ -48,21 +48,15 @@ def test_the_papers_three_stages(composed):
 def test_every_scale_has_them_and_tests_them_alike(composed, scale):
     config = composed(f"scale={scale}", "data=dl3dv")
     found = stage_configs(config)
-    for name, stage in zip(NAMES, found, strict=True):
-        expected = config.stages[name]
-        assert (stage.data.height, stage.data.width) == (expected.height, expected.width)
-        assert (stage.steps, stage.data.batch_size) == (expected.steps, expected.batch_size)
-        assert stage.learning_rate == expected.learning_rate
-        assert stage.steps % stage.validate_every == 0  # its end is measured
+    assert [stage.stage for stage in found] == NAMES
+    # The end of each is measured.
+    assert all(stage.steps % stage.validate_every == 0 for stage in found)
     tested = [stage.data.test_size for stage in found[:-1]]
     assert tested == [[config.data.height, config.data.width]] * 2
     assert found[-1] is config and config.data.test_size is None
     check_stages(found)
-
-
-def test_one_stage_is_the_run_itself(composed):
-    config = composed("stage=stage1", "earlier_stages=[]")
-    assert stage_configs(config) == [config]
+    alone = composed("stage=stage1", "earlier_stages=[]")
+    assert stage_configs(alone) == [alone]
 
 
 def test_the_hash_covers_all_stages(composed):

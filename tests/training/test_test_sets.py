@@ -9,7 +9,7 @@ import torch
 from hydra.utils import instantiate
 from tiny import NETWORK, QUIET, SCENES, VIEWS
 
-from asysplat.training.callbacks import Costs, Figures, Metrics
+from asysplat.training.callbacks import Figures, Metrics
 from asysplat.training.callbacks.metrics import gather
 from asysplat.training.summary import print_summary
 
@@ -20,7 +20,7 @@ TINY = [*NETWORK, *VIEWS, *SCENES, "paths.run=unused"]
 
 @pytest.fixture(scope="module")
 def measure(composed, tmp_path_factory):
-    """The test of an untrained model: its results, folder and costs."""
+    """The test of an untrained model: its results and folder."""
 
     def run(*overrides):
         config = composed(*TINY, *overrides)
@@ -30,11 +30,10 @@ def measure(composed, tmp_path_factory):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             metrics = Metrics(instantiate(config.metrics), str(folder), backbone_dir=str(folder))
-            costs = Costs()
-            callbacks = [costs, metrics, Figures(str(folder), scenes=2)]
+            callbacks = [metrics, Figures(str(folder), scenes=2)]
             trainer = lightning.Trainer(**QUIET, callbacks=callbacks)
             trainer.test(module, instantiate(config.data), verbose=False)
-        return SimpleNamespace(results=metrics.results, folder=folder, costs=costs.values)
+        return SimpleNamespace(results=metrics.results, folder=folder)
 
     return run
 
@@ -50,7 +49,6 @@ def together(measure):
     return measure(*MORE_SETS)
 
 
-KINDS = ("inference_seconds", "inference_gb")
 ALONE = {
     "procedural": [],
     "rooms": ["data.places=rooms"],
@@ -69,14 +67,6 @@ def test_a_set_has_the_same_numbers_as_alone(measure, together, name):
         for results in (expected, together.results)
     )
     assert among_others == alone
-
-
-def test_a_set_has_its_own_costs(together):
-    costs = together.costs
-    prefixes = ["cost", *(f"cost/{name}" for name in ALONE if name != "procedural")]
-    keys = {f"{prefix}/{kind}" for prefix in prefixes for kind in KINDS}
-    assert set(costs) == keys and all(value > 0 for value in costs.values())
-    assert len({costs[f"{prefix}/inference_seconds"] for prefix in prefixes}) == len(prefixes)
 
 
 def test_only_the_main_set_is_drawn(measure, together):

@@ -66,7 +66,7 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     for step in range(3):
         values = {tag: events.Scalars(tag)[step].value for tag in shares}
         assert sum(values.values()) == pytest.approx(1, abs=1e-5)
-        parts = ("network", "rendering", "backward", "optimizer")
+        parts = ("network", "rendering", "loss", "backward", "optimizer")
         assert all(values[f"time/share_{part}"] > 0 for part in parts)
     assert set(tags["histograms"]) == {
         f"gaussians/{name}" for name in ("opacity", "log10_scale", "log10_depth")
