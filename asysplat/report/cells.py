@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from asysplat.report.compare import LIMITS, check_costs, cost_errors, fits, mean_and_spread
-from asysplat.report.fill import COMPUTED, Costs, FilledRow, FilledTable, Number
+from asysplat.report.fill import COMPUTED
 from asysplat.report.notes import notes, protocol_notes, rho_text
-from asysplat.report.paper import Column
+from asysplat.report.paper import Column, Costs, Number, PaperRow, PaperTable
 from asysplat.report.table import Cell, Grid, Heading, Section, anchor
 
 TITLE = "AsySplat: our numbers beside the paper's"
@@ -36,28 +36,28 @@ COST_CAPTION = (
 NOTHING = Cell("-", "muted")
 
 
-def make_section(filled: FilledTable) -> Section:
+def make_section(filled: PaperTable) -> Section:
     """Build everything that is printed of one table."""
     grids = [_measured_grid(filled)]
     if any(row.costs for row in filled.rows):
         grids.append(_cost_grid(_networks(filled)))
-    title, above = filled.title, protocol_notes(filled)
+    title, above = filled.heading, protocol_notes(filled)
     return Section(title, anchor(title), above, grids, notes(filled))
 
 
-def make_overview(tables: Sequence[FilledTable]) -> Grid:
+def make_overview(tables: Sequence[PaperTable]) -> Grid:
     """Build a line for each table: the rows that ran, and their agreement with the paper."""
     titles = ("Table", "Rows run", "Seeds", "Rank agreement", "Costs that fit")
     return Grid(OVERVIEW, list(map(Heading, titles)), list(map(_overview_line, tables)))
 
 
-def _networks(filled: FilledTable) -> list[FilledRow]:
+def _networks(filled: PaperTable) -> list[PaperRow]:
     """List the rows without post-optimization, which changes no cost of the network."""
-    return [row for row in filled.rows if not row.paper.post_optimization]
+    return [row for row in filled.rows if not row.post_optimization]
 
 
-def _overview_line(filled: FilledTable) -> list[Cell]:
-    ours = [row for row in filled.rows if not row.paper.quoted]
+def _overview_line(filled: PaperTable) -> list[Cell]:
+    ours = [row for row in filled.rows if not row.quoted]
     run = sum(bool(row.seeds) for row in ours)
     counts = sorted({len(row.seeds) for row in ours if row.seeds})  # seeds of the rows that ran
     seeds = " to ".join(dict.fromkeys(str(count) for count in (*counts[:1], *counts[-1:])))
@@ -67,7 +67,7 @@ def _overview_line(filled: FilledTable) -> list[Cell]:
     fitting = f"{verified.count('fits')} of {len(verified)}"
     fitting += f", {unverified} †" * bool(unverified)
     return [
-        Cell(filled.title, link=anchor(filled.title)),
+        Cell(filled.heading, link=anchor(filled.heading)),
         Cell(f"{run} of {len(ours)}", "" if run else "muted"),
         Cell(seeds) if counts else NOTHING,
         Cell(rho_text(filled)),
@@ -75,42 +75,37 @@ def _overview_line(filled: FilledTable) -> list[Cell]:
     ]
 
 
-def _measured_grid(filled: FilledTable) -> Grid:
+def _measured_grid(filled: PaperTable) -> Grid:
     headings = [Heading("Row")]
-    columns = [[Cell(row.name) for row in filled.rows]]
-    for column in filled.paper.columns:
+    columns = [[Cell(row.label) for row in filled.rows]]
+    for column in filled.columns:
         if column.key in COMPUTED:
             continue
         arrow = ARROWS[column.better]
-        if filled.paper.number is not None:
+        if filled.number is not None:
             headings.append(Heading(column.title() + arrow, "paper"))
-            columns.append(_paper_cells(filled.rows, column))
+            numbers = [row.numbers.get(column.key) for row in filled.rows]
+            if any(column.key in row.bounds for row in filled.rows):
+                numbers = [None] * len(numbers)  # none is the best
+            texts = [row.text(column) for row in filled.rows]
+            columns.append(_cells(texts, numbers, column, ["-"] * len(texts)))
         headings.append(Heading(filled.our_title(column) + arrow, "ours"))
-        columns.append(_our_cells(filled.rows, column))
+        values = [row.values.get(column.key) for row in filled.rows]
+        means = [mean_and_spread(own)[0] if own else None for own in values]
+        texts = [_mean_text(own, column) if own else "" for own in values]
+        missing = ["quoted" if row.quoted else "not run" for row in filled.rows]
+        columns.append(_cells(texts, means, column, missing))
     return Grid("Measured", headings, list(map(list, zip(*columns, strict=True))))
 
 
-def _paper_cells(rows: Sequence[FilledRow], column: Column) -> list[Cell]:
-    """Format the paper's numbers; none is the best if it prints bounds instead of numbers."""
-    numbers = [row.paper.numbers.get(column.key) for row in rows]
-    if any(column.key in row.paper.bounds for row in rows):
-        best = [False] * len(rows)
-    else:
-        best = _best(numbers, column)
-    texts = [row.paper.text(column) for row in rows]
-    return [Cell(t, "best" * b) if t else NOTHING for t, b in zip(texts, best, strict=True)]
-
-
-def _our_cells(rows: Sequence[FilledRow], column: Column) -> list[Cell]:
-    all_values = [row.values.get(column.key) for row in rows]
-    means = [mean_and_spread(values)[0] if values else None for values in all_values]
-    cells = []
-    for row, values, best in zip(rows, all_values, _best(means, column), strict=True):
-        if values:
-            cells.append(Cell(_mean_text(values, column), "best" * best))
-        else:
-            cells.append(Cell("quoted" if row.paper.quoted else "not run", "muted"))
-    return cells
+def _cells(
+    texts: Sequence[str], numbers: Sequence[Number | None], column: Column, missing: Sequence[str]
+) -> list[Cell]:
+    """Make the cells of a column: texts, the best of them bold, or what is written for none."""
+    rows = zip(texts, _best(numbers, column), missing, strict=True)
+    return [
+        Cell(text, "best" * best) if text else Cell(other, "muted") for text, best, other in rows
+    ]
 
 
 def _mean_text(values: Sequence[Number], column: Column) -> str:
@@ -133,19 +128,19 @@ def _best(numbers: Sequence[Number | None], column: Column) -> list[bool]:
     return [text == best for text in texts]
 
 
-def _cost_grid(rows: Sequence[FilledRow]) -> Grid:
+def _cost_grid(rows: Sequence[PaperRow]) -> Grid:
     """Build a line for each row and for each other reading of it."""
-    in_paper = {key for row in rows for key in row.paper.numbers}
+    in_paper = {key for row in rows for key in row.numbers}
     columns = []  # key in COSTS, part: a cost that the paper never prints in this table has one
     for key in COSTS:
         parts = ("paper", "ours", "error") if key in LIMITS else ("paper", "ours")
         columns += [(key, part) for part in (parts if key in in_paper else ("",))]
 
-    def line(name: Cell, row: FilledRow, costs: Costs | None, check: str) -> list[Cell]:
-        errors = cost_errors(row.paper, costs) if costs else {}
+    def line(name: Cell, row: PaperRow, costs: Costs | None, check: str) -> list[Cell]:
+        errors = cost_errors(row, costs) if costs else {}
         cells = [name]
         for key, part in columns:
-            numbers = {"paper": row.paper.numbers, "error": errors}.get(part, costs or {})
+            numbers = {"paper": row.numbers, "error": errors}.get(part, costs or {})
             if key not in numbers:
                 cells.append(NOTHING)
             elif part == "error":
@@ -158,9 +153,9 @@ def _cost_grid(rows: Sequence[FilledRow]) -> Grid:
 
     lines = []
     for row in rows:
-        lines.append(line(Cell(row.name), row, row.costs, check_costs(row)))
-        for reading, costs in zip(row.paper.readings, row.reading_costs, strict=False):
-            check = "fits" if fits(row.paper, costs) else "no fit"
+        lines.append(line(Cell(row.label), row, row.costs, check_costs(row)))
+        for reading, costs in zip(row.readings, row.reading_costs, strict=False):
+            check = "fits" if fits(row, costs) else "no fit"
             lines.append(line(Cell(f"or: {reading}", "muted"), row, costs, check))
     headings = [Heading(COSTS[key][0], part) for key, part in columns]
     return Grid(COST_CAPTION, [Heading("Row"), *headings, Heading("Check")], lines)

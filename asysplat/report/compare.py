@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import spearmanr
 
-from asysplat.report.fill import Costs, FilledRow, FilledTable, Number
-from asysplat.report.paper import PaperRow
+from asysplat.report.paper import Costs, Number, PaperRow, PaperTable
 
 # A smaller `signal` may come from the seeds alone: one table in twenty of six equal rows and three
 # seeds exceeds it (the F distribution's 95 % is 3.1 = 1.76 ** 2).
@@ -18,18 +17,13 @@ LIMITS = {"parameters": 0.015, "gflops": 0.03}
 
 
 class RankAgreement(NamedTuple):
-    """The agreement of our order of the rows with the paper's.
+    """The agreement of our order of the rows with the paper's."""
 
-    Args:
-        rho: Spearman's; None below three rows, and where all rows are equal.
-        rows: how many have both numbers.
-        signal: standard deviation between the rows' means, over the one that such means of equal
-            rows would have by their seeds alone: the root of the F statistic, about 1 where rows
-            are equal. None where every row has a single seed.
-    """
-
-    rho: float | None
-    rows: int
+    rho: float | None  # Spearman's; None below three rows, and where all rows are equal
+    rows: int  # that have both numbers
+    # Standard deviation between the rows' means, over the one that such means of equal rows would
+    # have by their seeds alone: the root of the F statistic, about 1 where rows are equal. None
+    # where every row has a single seed.
     signal: float | None
 
 
@@ -38,11 +32,11 @@ def mean_and_spread(values: Sequence[Number]) -> tuple[float, float | None]:
     return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
 
 
-def rank_agreement(filled: FilledTable, column: str) -> RankAgreement:
+def rank_agreement(filled: PaperTable, column: str) -> RankAgreement:
     """Compare the paper's numbers with our means in the column of this key."""
-    both = [row for row in filled.rows if column in row.paper.numbers and row.values.get(column)]
+    both = [row for row in filled.rows if column in row.numbers and row.values.get(column)]
     ours = np.array([np.mean(row.values[column]) for row in both])
-    paper = np.array([row.paper.numbers[column] for row in both])
+    paper = np.array([row.numbers[column] for row in both])
     within = pooled_spread([row.values[column] for row in both])
     signal = None
     if len(both) > 1 and within is not None:
@@ -84,15 +78,15 @@ def fits(row: PaperRow, costs: Costs) -> bool:
     return all(abs(error) <= LIMITS[key] for key, error in cost_errors(row, costs).items())
 
 
-def check_costs(filled: FilledRow) -> str:
+def check_costs(row: PaperRow) -> str:
     """Compare a row's costs with the paper's; only a row of known architecture can be "off"."""
-    if filled.paper.quoted:
+    if row.quoted:
         return "quoted"
-    if filled.costs is None:
+    if row.costs is None:
         return "not computed"
-    if not cost_errors(filled.paper, filled.costs):
+    if not cost_errors(row, row.costs):
         return "not printed"
-    fit = fits(filled.paper, filled.costs)
-    if filled.paper.unverified:
+    fit = fits(row, row.costs)
+    if row.unverified:
         return "unverified, fits" if fit else "unverified, no fit"
     return "fits" if fit else "off"

@@ -1,7 +1,7 @@
 """Fill the paper's tables with our numbers: those of finished runs, and costs, which need none."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -10,15 +10,13 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.evaluation.static_cost import static_costs
-from asysplat.report.paper import Column, PaperRow, PaperTable, our_sets, set_titles
+from asysplat.report.paper import Costs, Number, PaperRow, PaperTable, our_sets, set_titles
 from asysplat.training.runs import Run, config_hash, data_of, find_runs
 from asysplat.training.stages import describe_stage, stage_configs
 
 # Overrides of train.py -> its configuration, the node `hydra` included.
 Compose = Callable[[Sequence[str]], DictConfig]
 Runs = dict[str, list[Run]]  # by config_hash, oldest first
-Number = int | float
-Costs = dict[str, Number]  # see `static_costs`
 
 # Columns that every run measures: their keys in metrics.json, without and with post-optimization.
 MEASURED = {
@@ -34,68 +32,6 @@ OPTIONS = {"batch": "data.batch_size", "train_steps": "steps"}
 COMPUTED = ("parameters", "gflops", "gaussians")
 
 
-@dataclass(frozen=True)
-class FilledRow:
-    """One method with our numbers.
-
-    Args:
-        paper: the row of the paper.
-        costs: at the paper's scale; None if not requested, and for quoted rows.
-        reading_costs: one for each of `paper.readings`, or empty if not requested.
-        values: column key -> measured numbers, one for each seed; a column without any is left out.
-        seeds: of the runs.
-        revisions: of the code of the runs, see `asysplat.training.revision`.
-        note: a remark on this row, such as "seeds still to run: 2".
-    """
-
-    paper: PaperRow
-    costs: Costs | None = None
-    reading_costs: tuple[Costs, ...] = ()
-    values: dict[str, list[Number]] = field(default_factory=dict)
-    seeds: tuple[int, ...] = ()
-    revisions: tuple[str, ...] = ()
-    note: str = ""
-
-    @property
-    def name(self) -> str:
-        return self.paper.name + (" †" if self.paper.unverified else "")
-
-
-@dataclass(frozen=True)
-class FilledTable:
-    """One table of the paper with our rows.
-
-    Args:
-        paper: the table of the paper.
-        rows: in the paper's order.
-        sets: the paper's test set -> ours that is compared with it.
-        metrics: the protocols of our metrics, a sentence for each; several if runs differ.
-        notes: label -> how our numbers were made: Ours (the scale), Not tested (the paper's test
-            sets whose path no run was given), Baselines, Data, Machine, Command; "" if unknown.
-    """
-
-    paper: PaperTable
-    rows: tuple[FilledRow, ...]
-    sets: dict[str, str] = field(default_factory=dict)
-    metrics: tuple[str, ...] = ()
-    notes: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def title(self) -> str:
-        number = self.paper.number
-        return f"{'Ours' if number is None else f'Table {number}'}: {self.paper.title}"
-
-    @property
-    def ranked_column(self) -> Column | None:
-        """Return the column whose order is compared with the paper's."""
-        return next((c for c in self.paper.columns if c.key == self.paper.rank_by), None)
-
-    def our_title(self, column: Column) -> str:
-        """Return the title of our numbers, which names our test set if it is another."""
-        ours = self.sets.get(column.test_set, column.test_set)
-        return column.title(None if ours == column.test_set else ours)
-
-
 def finished_runs(logs: Path) -> Runs:
     """Find all finished runs below a folder."""
     runs: Runs = {}
@@ -106,7 +42,7 @@ def finished_runs(logs: Path) -> Runs:
 
 def fill_table(
     table: PaperTable, overrides: Sequence[str], compose: Compose, runs: Runs
-) -> FilledTable:
+) -> PaperTable:
     """Fill a table with every finished run that has the configuration of one of its rows.
 
     Args:
@@ -120,11 +56,11 @@ def fill_table(
     config = compose(overrides)
     sets = our_sets(table, config.data.name, config.data.test_sets or ())
     seeds = str(config.hydra.sweeper.params.get("seed", config.seed)).split(",")
-    rows: list[FilledRow] = []
+    rows: list[PaperRow] = []
     used: list[Run] = []
     for row in table.rows:
         if row.quoted:
-            rows.append(FilledRow(row))
+            rows.append(row)
             continue
         row_config = compose([*overrides, *row.run])
         row_config = OmegaConf.masked_copy(row_config, [k for k in row_config if k != "hydra"])
@@ -146,19 +82,17 @@ def fill_table(
         "Machine": ", ".join(sorted({run.results.get("run/machine", "") for run in used})),
         "Command": f"python train.py {' '.join(overrides)}",
     }
-    return FilledTable(table, tuple(rows), sets, _metrics(table, config, used), notes)
+    metrics = _metrics(table, config, used)
+    return replace(table, rows=tuple(rows), sets=sets, metrics=metrics, notes=notes)
 
 
-def with_costs(filled: FilledTable, compose: Compose) -> FilledTable:
+def with_costs(filled: PaperTable, compose: Compose) -> PaperTable:
     """Add the costs of every row and its other readings at the paper's scale."""
     rows = []
     for row in filled.rows:
-        paper = row.paper
-        if not paper.quoted and not paper.post_optimization:
-            own, *readings = (
-                _costs(compose, run, paper.views, paper.size)
-                for run in (paper.run, *paper.readings.values())
-            )
+        if not row.quoted and not row.post_optimization:
+            runs = (row.run, *row.readings.values())
+            own, *readings = (_costs(compose, run, row.views, row.size) for run in runs)
             row = replace(row, costs=own, reading_costs=tuple(readings))
         rows.append(row)
     return replace(filled, rows=tuple(rows))
@@ -179,7 +113,7 @@ def _fill_row(
     runs: dict[int, Run],
     seeds: Sequence[int],
     sets: dict[str, str],
-) -> FilledRow:
+) -> PaperRow:
     values: dict[str, list[Number]] = {}
     for column in table.columns:
         if column.key in OPTIONS:
@@ -198,7 +132,7 @@ def _fill_row(
         note = "not run: python evaluate.py run=... adds post-optimization to a finished run"
     used = runs if values else {}
     revisions = tuple(sorted({run.revision for run in used.values()}))
-    return FilledRow(row, None, (), values, tuple(sorted(used)), revisions, note)
+    return replace(row, values=values, seeds=tuple(sorted(used)), revisions=revisions, note=note)
 
 
 def _result_key(column: str, row: PaperRow, sets: dict[str, str]) -> str | None:
@@ -249,7 +183,7 @@ def _folders(runs: Sequence[Run]) -> str:
     return mixed * (len(folders) > 1) + "; ".join(folders)
 
 
-def _untested(sets: dict[str, str], config: DictConfig, rows: Sequence[FilledRow]) -> str:
+def _untested(sets: dict[str, str], config: DictConfig, rows: Sequence[PaperRow]) -> str:
     """List the paper's test sets that the sweep names without a path, and no row has numbers of."""
     tested = {key.partition("/")[0] for row in rows for key in row.values}
     data = OmegaConf.to_container(config.data, resolve=True)

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from asysplat.report.cells import INTRODUCTION, TITLE, make_overview, make_section
-from asysplat.report.fill import FilledTable
+from asysplat.report.paper import PaperTable
 from asysplat.report.plots import make_plots
 from asysplat.report.style import FAINT, INK, OURS, PAPER, STYLE
 
@@ -26,12 +26,12 @@ TEMPLATES = Environment(
 VARIABLES = {INK: "--ink", FAINT: "--faint", OURS: "--ours", PAPER: "--paper"}
 
 
-def render_html(tables: Sequence[FilledTable]) -> str:
+def render_html(tables: Sequence[PaperTable]) -> str:
     """Write the page: an overview that links to a section for each table, with its plots."""
     sections = []
     for filled in tables:
         plots = [
-            (caption, Markup(inline_svg(figure, f"{filled.paper.key}-{number}")))
+            (caption, Markup(inline_svg(figure, f"{filled.key}-{number}")))
             for number, (caption, figure) in enumerate(make_plots(filled))
         ]
         sections.append((make_section(filled), plots))

@@ -4,11 +4,11 @@ import re
 from collections.abc import Sequence
 
 from asysplat.report.cells import INTRODUCTION, TITLE, make_overview, make_section
-from asysplat.report.fill import FilledTable
+from asysplat.report.paper import PaperTable
 from asysplat.report.table import Cell, Grid, Note
 
 
-def render_markdown(tables: Sequence[FilledTable]) -> str:
+def render_markdown(tables: Sequence[PaperTable]) -> str:
     """Write the page: an introduction, an overview, and a section for each table."""
     parts = [f"# {TITLE}", escape(INTRODUCTION)]
     if len(tables) > 1:

@@ -1,18 +1,17 @@
 """Write the notes of a table: how both sides were measured, and how far to trust the order."""
 
 from asysplat.report.compare import CLEAR_SIGNAL, rank_agreement
-from asysplat.report.fill import FilledTable
-from asysplat.report.paper import set_titles
+from asysplat.report.paper import PaperTable, set_titles
 from asysplat.report.table import Note
 
 
-def notes(filled: FilledTable) -> list[Note]:
+def notes(filled: PaperTable) -> list[Note]:
     """Write the notes below a table, from what is compared to the command of our numbers."""
     other_sets = [(key, ours) for key, ours in filled.sets.items() if ours != key]
     substitutes = [f"{set_titles()[key]} by our test set {ours}" for key, ours in other_sets]
     texts = {
-        "Paper": filled.paper.protocol,
-        "Substitutes": "" if filled.paper.number is None else "; ".join(substitutes),
+        "Paper": filled.protocol,
+        "Substitutes": "" if filled.number is None else "; ".join(substitutes),
         "Seeds": _seeds(filled),
         "Order": _order(filled),
         "Revision": _revisions(filled),
@@ -26,13 +25,13 @@ def notes(filled: FilledTable) -> list[Note]:
     return [line for line in lines if line.text]
 
 
-def protocol_notes(filled: FilledTable) -> list[Note]:
+def protocol_notes(filled: PaperTable) -> list[Note]:
     """Write the notes above a table: the protocols of our metrics."""
     mixed = ["runs of several protocols are mixed, see below"] * (len(filled.metrics) > 1)
     return [Note("Metrics", text) for text in (*mixed, *filled.metrics)]
 
 
-def rho_text(filled: FilledTable) -> str:
+def rho_text(filled: PaperTable) -> str:
     """Format Spearman's rho of the column that the table is ranked by."""
     if filled.ranked_column is None:
         return "-"
@@ -42,7 +41,7 @@ def rho_text(filled: FilledTable) -> str:
     return f"{rho:.2f}{'?' if signal is None or signal < CLEAR_SIGNAL else ''} ({rows} rows)"
 
 
-def _seeds(filled: FilledTable) -> str:
+def _seeds(filled: PaperTable) -> str:
     seeds = sorted({seed for row in filled.rows for seed in row.seeds})
     if len(seeds) == 1:
         return f"{seeds[0]} alone, so no spread"
@@ -50,7 +49,7 @@ def _seeds(filled: FilledTable) -> str:
     return f"{text}: mean ± sample standard deviation over them" if seeds else ""
 
 
-def _order(filled: FilledTable) -> str:
+def _order(filled: PaperTable) -> str:
     column = filled.ranked_column
     if column is None:
         return ""
@@ -69,23 +68,23 @@ def _order(filled: FilledTable) -> str:
     )
 
 
-def _remarks(filled: FilledTable) -> list[Note]:
+def _remarks(filled: PaperTable) -> list[Note]:
     """Write remarks on single rows; rows with the same remark share a line."""
     names: dict[str, list[str]] = {}
     for row in filled.rows:
-        if row.paper.quoted or row.note:
-            names.setdefault("quoted" if row.paper.quoted else row.note, []).append(row.name)
+        if row.quoted or row.note:
+            names.setdefault("quoted" if row.quoted else row.note, []).append(row.label)
     shared = [Note(note[0].upper() + note[1:], "; ".join(rows)) for note, rows in names.items()]
-    papers = [row.paper for row in filled.rows]
-    return shared + [Note(f"† {row.name}", row.unverified) for row in papers if row.unverified]
+    unverified = [row for row in filled.rows if row.unverified]
+    return shared + [Note(f"† {row.name}", row.unverified) for row in unverified]
 
 
-def _revisions(filled: FilledTable) -> str:
+def _revisions(filled: PaperTable) -> str:
     """Name the revision of the code; if there are several, the rows of each."""
     rows: dict[str, list[str]] = {}
     for row in filled.rows:
         for revision in row.revisions:
-            rows.setdefault(revision, []).append(row.name)
+            rows.setdefault(revision, []).append(row.label)
     if len(rows) < 2:
         return "".join(rows)
     parts = [f"{revision}: {', '.join(names)}" for revision, names in rows.items()]

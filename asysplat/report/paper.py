@@ -10,6 +10,9 @@ from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
 
+Number = int | float
+Costs = dict[str, Number]  # see `static_costs`
+
 
 @dataclass(frozen=True)
 class Column:
@@ -59,6 +62,14 @@ class PaperRow:
         test_set: of our run, in place of the one that `our_sets` gives; None for that one.
         unverified: why this row's architecture may differ from the paper's; None if it is known.
         readings: the other architectures that the paper's text allows: name -> overrides.
+
+    Ours, once filled:
+        costs: at the paper's scale; None if not requested, and for quoted rows.
+        reading_costs: one for each of `readings`, or empty if not requested.
+        values: column key -> measured numbers, one for each seed; a column without any is left out.
+        seeds: of the runs.
+        revisions: of the code of the runs, see `asysplat.training.revision`.
+        note: a remark on this row, such as "seeds still to run: 2".
     """
 
     name: str
@@ -71,6 +82,16 @@ class PaperRow:
     test_set: str | None = None
     unverified: str | None = None
     readings: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    costs: Costs | None = None
+    reading_costs: tuple[Costs, ...] = ()
+    values: dict[str, list[Number]] = field(default_factory=dict)
+    seeds: tuple[int, ...] = ()
+    revisions: tuple[str, ...] = ()
+    note: str = ""
+
+    @property
+    def label(self) -> str:
+        return self.name + (" †" if self.unverified else "")
 
     @property
     def quoted(self) -> bool:
@@ -94,6 +115,12 @@ class PaperTable:
         protocol: how the paper measured it.
         columns, rows: in the paper's order.
         rank_by: key of the column whose order is compared with the paper's; None without one.
+
+    Ours, once filled:
+        sets: the paper's test set -> ours that is compared with it.
+        metrics: the protocols of our metrics, a sentence for each; several if runs differ.
+        notes: label -> how our numbers were made: Ours (the scale), Not tested (the paper's test
+            sets whose path no run was given), Baselines, Data, Machine, Command; "" if unknown.
     """
 
     key: str
@@ -103,6 +130,23 @@ class PaperTable:
     columns: tuple[Column, ...]
     rows: tuple[PaperRow, ...] = field(repr=False)
     rank_by: str | None = None
+    sets: dict[str, str] = field(default_factory=dict)
+    metrics: tuple[str, ...] = ()
+    notes: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def heading(self) -> str:
+        return f"{'Ours' if self.number is None else f'Table {self.number}'}: {self.title}"
+
+    @property
+    def ranked_column(self) -> Column | None:
+        """Return the column whose order is compared with the paper's."""
+        return next((c for c in self.columns if c.key == self.rank_by), None)
+
+    def our_title(self, column: Column) -> str:
+        """Return the title of our numbers, which names our test set if it is another."""
+        ours = self.sets.get(column.test_set, column.test_set)
+        return column.title(None if ours == column.test_set else ours)
 
     @property
     def test_sets(self) -> list[str]:

@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 
 from asysplat.report.cells import ARROWS
 from asysplat.report.compare import mean_and_spread
-from asysplat.report.fill import COMPUTED, FilledRow, FilledTable, Number
+from asysplat.report.fill import COMPUTED
 from asysplat.report.front import Point, draw_front
-from asysplat.report.paper import Column
+from asysplat.report.paper import Column, Number, PaperRow, PaperTable
 from asysplat.report.style import FAINT, OURS, PAPER, STYLE
 
 # Tables in which one quantity varies: the meaning of the first number in a row's name.
@@ -25,7 +25,7 @@ COSTS = ("gflops", "inference_seconds", "parameters")
 MIN_RANGE = 1.1
 
 
-def make_plots(filled: FilledTable) -> list[tuple[str, Figure]]:
+def make_plots(filled: PaperTable) -> list[tuple[str, Figure]]:
     """Plot what the table does not show; return caption and figure of each plot.
 
     Lines for a table of one ratio; for others a dot for each seed, and quality against cost if the
@@ -35,12 +35,12 @@ def make_plots(filled: FilledTable) -> list[tuple[str, Figure]]:
     if column is None or sum(column.key in row.values for row in filled.rows) < 2:
         return []
     with matplotlib.rc_context(STYLE):
-        if filled.paper.key in RATIOS:
+        if filled.key in RATIOS:
             return [_ratio_plot(filled)]
         return [_seed_plot(filled, column), *_pareto_plot(filled, column)]
 
 
-def _seed_plot(filled: FilledTable, column: Column) -> tuple[str, Figure]:
+def _seed_plot(filled: PaperTable, column: Column) -> tuple[str, Figure]:
     """Plot a line for each row of the table: a dot for each seed, a bar at the mean."""
     rows = filled.rows
     figure = Figure(figsize=(9, 1.1 + 0.32 * len(rows)), layout="constrained")
@@ -52,12 +52,12 @@ def _seed_plot(filled: FilledTable, column: Column) -> tuple[str, Figure]:
         if values:
             ours.plot(mean_and_spread(values)[0], y, color=OURS, **bar)
         else:
-            text = "quoted" if row.paper.quoted else "not run"
+            text = "quoted" if row.quoted else "not run"
             across = ours.get_yaxis_transform()
             ours.text(0.5, y, text, color=FAINT, ha="center", va="center", transform=across)
-        if column.key in row.paper.numbers:
-            paper.plot(row.paper.numbers[column.key], y, color=PAPER, **bar)
-    ours.set_yticks(range(len(rows)), [row.name for row in rows])
+        if column.key in row.numbers:
+            paper.plot(row.numbers[column.key], y, color=PAPER, **bar)
+    ours.set_yticks(range(len(rows)), [row.label for row in rows])
     ours.set_ylim(len(rows) - 0.5, -0.5)
     labels = {"ours": filled.our_title(column), "paper": column.title()}
     for axes, (title, label) in zip((ours, paper), labels.items(), strict=True):
@@ -68,13 +68,13 @@ def _seed_plot(filled: FilledTable, column: Column) -> tuple[str, Figure]:
     return f"{column.kind} of each row: a dot for each seed, a bar at the mean.", figure
 
 
-def _ratio_plot(filled: FilledTable) -> tuple[str, Figure]:
+def _ratio_plot(filled: PaperTable) -> tuple[str, Figure]:
     """Plot a line for each test set, in its first metric."""
     first: dict[str, Column] = {}
-    for column in filled.paper.columns:
+    for column in filled.columns:
         if column.test_set:
             first.setdefault(column.test_set, column)
-    ratios = [int(re.search(r"\d+", row.paper.name)[0]) for row in filled.rows]
+    ratios = [int(re.search(r"\d+", row.name)[0]) for row in filled.rows]
     figure = Figure(figsize=(9, 0.6 + 2.2 * len(first)), layout="constrained")
     grid = figure.subplots(len(first), 2, squeeze=False, sharex=True)
     for (ours, paper), column in zip(grid, first.values(), strict=True):
@@ -86,14 +86,14 @@ def _ratio_plot(filled: FilledTable) -> tuple[str, Figure]:
                 summaries.append((ratio, mean, spread or 0.0))
         ours.errorbar(*np.reshape(summaries, (-1, 3)).T, fmt="o-", color=OURS, capsize=3)
         pairs = zip(ratios, filled.rows, strict=True)
-        points = {x: r.paper.numbers[column.key] for x, r in pairs if column.key in r.paper.numbers}
+        points = {x: r.numbers[column.key] for x, r in pairs if column.key in r.numbers}
         paper.plot(points.keys(), points.values(), "o-", color=PAPER)
         ours.set_ylabel(filled.our_title(column) + ARROWS[column.better])
         paper.set_ylabel(column.title() + ARROWS[column.better])
     grid[0, 0].set_title("ours")
     grid[0, 1].set_title("paper")
     for axes in grid[-1]:
-        axes.set_xlabel(RATIOS[filled.paper.key])
+        axes.set_xlabel(RATIOS[filled.key])
         axes.set_xticks(ratios)
     return (
         "Against the ratio: pale dots are seeds, the line joins the means ± their spread.",
@@ -101,22 +101,22 @@ def _ratio_plot(filled: FilledTable) -> tuple[str, Figure]:
     )
 
 
-def _pareto_plot(filled: FilledTable, quality: Column) -> list[tuple[str, Figure]]:
+def _pareto_plot(filled: PaperTable, quality: Column) -> list[tuple[str, Figure]]:
     """Plot quality against cost; nothing below three rows, or if they cost the same."""
-    columns = {column.key: column for column in filled.paper.columns}
+    columns = {column.key: column for column in filled.columns}
     cost = next((columns[key] for key in COSTS if key in columns), None)
     if cost is None:
         return []
 
     def points(numbers: Sequence[dict[str, Number]]) -> list[Point]:
         return [
-            (row.name, each[cost.key] / cost.unit, float(each[quality.key]))
+            (row.label, each[cost.key] / cost.unit, float(each[quality.key]))
             for row, each in zip(filled.rows, numbers, strict=True)
             if cost.key in each and quality.key in each
         ]
 
     ours = points([_our_numbers(row) for row in filled.rows])
-    paper = points([row.paper.numbers for row in filled.rows])
+    paper = points([row.numbers for row in filled.rows])
     costs = [point[1] for point in ours]
     if len(ours) < 3 or max(costs) / min(costs) < MIN_RANGE:
         return []
@@ -132,7 +132,7 @@ def _pareto_plot(filled: FilledTable, quality: Column) -> list[tuple[str, Figure
     return [(caption, figure)]
 
 
-def _our_numbers(row: FilledRow) -> dict[str, Number]:
+def _our_numbers(row: PaperRow) -> dict[str, Number]:
     """Return the means of a row's measurements, and its network's costs at the paper's scale."""
     means = {key: mean_and_spread(values)[0] for key, values in row.values.items() if values}
     return means | {key: number for key, number in (row.costs or {}).items() if key in COMPUTED}

@@ -51,13 +51,13 @@ def test_costs_of_every_row_are_the_papers_or_flagged(compose, table, monkeypatc
     monkeypatch.setattr(static_cost, "activation_gb", lambda *_: 0.0)
     filled = with_costs(fill_table(load_paper()[table], [], compose, {}), compose)
     for row in filled.rows:
-        if row.paper.quoted or row.paper.post_optimization:
+        if row.quoted or row.post_optimization:
             continue
-        if row.paper.unverified:
+        if row.unverified:
             # One of the readings has the paper's costs.
-            assert len(row.reading_costs) == len(row.paper.readings) > 0
+            assert len(row.reading_costs) == len(row.readings) > 0
             assert check_costs(row).startswith("unverified")
-            assert any(fits(row.paper, costs) for costs in (row.costs, *row.reading_costs))
+            assert any(fits(row, costs) for costs in (row.costs, *row.reading_costs))
         else:
             assert check_costs(row) in ("fits", "not printed")
 
@@ -77,7 +77,7 @@ def logs(compose, tmp_path):
 def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
     (table,) = find_tables("layers")
     filled = fill_table(table, OVERRIDES, compose, finished_runs(logs))
-    rows = {row.paper.run: row for row in filled.rows}
+    rows = {row.run: row for row in filled.rows}
     row = rows[("model=asysplat_7m1t",)]
     assert row.values["dl3dv/psnr"] == [20.0, 21.0]
     assert row.seeds == (0, 2) and row.note == "seeds still to run: 1"
@@ -168,7 +168,7 @@ def test_a_row_of_a_further_test_set_has_its_costs(compose, tmp_path):
     config = compose(["sweeps=more_views", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, costs | {"test/more_views/psnr": 18.0}, 0)
     filled = fill_table(load_paper()["more_views"], [], compose, finished_runs(tmp_path))
-    ours = [row.values for row in filled.rows if not row.paper.quoted]
+    ours = [row.values for row in filled.rows if not row.quoted]
     assert [values["inference_seconds"] for values in ours] == [[0.5], [0.9]]
     assert [values.get("dl3dv/psnr") for values in ours] == [None, [18.0]]
 
@@ -202,7 +202,7 @@ def test_post_optimization_is_not_run_until_evaluation_adds_it(compose, tmp_path
 
     def ours():
         filled = fill_table(table, [], compose, finished_runs(tmp_path))
-        return {row.paper.post_optimization: row for row in filled.rows if "AsySplat" in row.name}
+        return {row.post_optimization: row for row in filled.rows if "AsySplat" in row.name}
 
     assert ours()[0].values["dl3dv/psnr"] == [20.0]
     assert not ours()[10].values and "evaluate.py" in ours()[10].note

@@ -13,7 +13,6 @@ from asysplat.report.compare import (
     rank_agreement,
     spearman,
 )
-from asysplat.report.fill import FilledRow, FilledTable
 from asysplat.report.paper import Column, PaperRow, PaperTable
 
 PSNR = Column("dl3dv/psnr", "PSNR", "higher", "{:.2f}")
@@ -24,15 +23,12 @@ def row(name: str = "row", run: tuple[str, ...] | None = ("model=x",), **paper: 
     return PaperRow(name, paper, run, 32, (256, 256))
 
 
-def filled(paper: list[float], ours: list[list[float]]) -> FilledTable:
+def filled(paper: list[float], ours: list[list[float]]) -> PaperTable:
     rows = tuple(
-        FilledRow(row(psnr=number), values={"dl3dv/psnr": values} if values else {})
+        replace(row(psnr=number), values={"dl3dv/psnr": values} if values else {})
         for number, values in zip(paper, ours, strict=True)
     )
-    table = PaperTable(
-        "t", "1", "title", "protocol", (PSNR,), tuple(r.paper for r in rows), "dl3dv/psnr"
-    )
-    return FilledTable(table, rows)
+    return PaperTable("t", "1", "title", "protocol", (PSNR,), rows, "dl3dv/psnr")
 
 
 def test_mean_and_spread():
@@ -98,10 +94,10 @@ def test_check_costs():
     paper = row(parameters=100e6)
     good, bad = {"parameters": 101e6}, {"parameters": 110e6}
     unverified = replace(paper, unverified="no layers are named")
-    assert check_costs(FilledRow(paper, good)) == "fits"
-    assert check_costs(FilledRow(paper, bad)) == "off"
-    assert check_costs(FilledRow(unverified, good)) == "unverified, fits"
-    assert check_costs(FilledRow(unverified, bad)) == "unverified, no fit"
-    assert check_costs(FilledRow(row(run=None, parameters=1e6))) == "quoted"
-    assert check_costs(FilledRow(paper)) == "not computed"
-    assert check_costs(FilledRow(row(psnr=19.0), good)) == "not printed"
+    assert check_costs(replace(paper, costs=good)) == "fits"
+    assert check_costs(replace(paper, costs=bad)) == "off"
+    assert check_costs(replace(unverified, costs=good)) == "unverified, fits"
+    assert check_costs(replace(unverified, costs=bad)) == "unverified, no fit"
+    assert check_costs(row(run=None, parameters=1e6)) == "quoted"
+    assert check_costs(paper) == "not computed"
+    assert check_costs(replace(row(psnr=19.0), costs=good)) == "not printed"
