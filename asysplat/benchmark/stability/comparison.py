@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -27,25 +27,16 @@ Tensors = dict[str, Tensor]
 Function = Callable[[Tensors], Tensors]
 
 
-@dataclass(frozen=True)
-class StabilityCase:
-    """A row of the results.
+class StabilityCase(NamedTuple):
+    """A row of the results."""
 
-    Args:
-        area: the part of the project.
-        name: the function and the hostile input.
-        precision: one of ALL_PRECISIONS.
-        measure: returns the rest of the row, see `make_row`.
-    """
-
-    area: str
-    name: str
-    precision: str
-    measure: Callable[[], Result]
+    name: str  # the function and the hostile input
+    precision: str  # one of ALL_PRECISIONS
+    measure: Callable[[], Result]  # returns the rest of the row, see `make_row`
 
     def row(self) -> Result:
         """Measure; an exception makes the row red, and the other cases still run."""
-        row = {"area": self.area, "case": self.name, "precision": self.precision}
+        row = {"case": self.name, "precision": self.precision}
         try:
             return row | self.measure()
         except Exception as error:
@@ -53,36 +44,18 @@ class StabilityCase:
 
 
 def make_row(
-    compared: str,
-    tensors: Mapping[str, Tensor],
-    gradients: Collection[str] = (),
-    *,
-    green: bool,
-    **numbers: object,
+    compared: str, results: Mapping[str, Tensor], *, green: bool, **numbers: object
 ) -> Result:
-    """Count the non-finite numbers among the results; any of them makes the row red.
-
-    Args:
-        compared: what the results are compared with, in words.
-        tensors: results by name.
-        gradients: the names of the gradients among them.
-        green: whether all other conditions hold.
-        numbers: other keys of the row.
+    """Count the non-finite numbers among the results and gradients; any makes the row red.
 
     Returns:
-        "compared"; "worst", "error" and "tolerance", None unless given; "nan" and "inf", their
-        numbers in all tensors; "gradients", whether all are finite, None without any; "green".
+        "compared": what the results are compared with; "worst", "error" and "tolerance", None
+        unless among `numbers`; "nan" and "inf", counted in all results; "green".
     """
-    nan = sum(int(tensor.isnan().sum()) for tensor in tensors.values())
-    inf = sum(int(tensor.isinf().sum()) for tensor in tensors.values())
-    finite = all(bool(tensors[name].isfinite().all()) for name in gradients)
+    nan = sum(int(tensor.isnan().sum()) for tensor in results.values())
+    inf = sum(int(tensor.isinf().sum()) for tensor in results.values())
     row = {"compared": compared, "worst": None, "error": None, "tolerance": None} | numbers
-    return row | {
-        "nan": nan,
-        "inf": inf,
-        "gradients": finite if gradients else None,
-        "green": green and nan == inf == 0,
-    }
+    return row | {"nan": nan, "inf": inf, "green": green and nan == inf == 0}
 
 
 def compare_to_reference(
@@ -96,7 +69,6 @@ def compare_to_reference(
     roundings: int = ROUNDINGS,
     exponent: float = 1.0,
     magnitude: float = 0.0,
-    note: str = "",
 ) -> Result:
     """Compare outputs and gradients with float64, each by its L2 norm, and apply RULE.
 
@@ -110,7 +82,6 @@ def compare_to_reference(
         roundings: number of roundings in sequence.
         exponent: the largest argument of an exponential: e^s errs by s roundings.
         magnitude: of an output's numbers; errors of smaller outputs are relative to it.
-        note: an addition to the row's "compared".
 
     Returns:
         See `make_row`. "worst" names the tensor with the largest ratio of error and tolerance;
@@ -124,9 +95,9 @@ def compare_to_reference(
     perturbed = [
         _perturb(exact, inputs, leaves, network, step, seed) for seed in range(PERTURBATIONS)
     ]
-    gradients = [f"gradient of {name}" for name in leaves]
-    total = torch.stack([torch.zeros(()).double(), *(truth[n].norm() for n in gradients)]).norm()
-    numbers = {}
+    gradients = [truth[f"gradient of {name}"].norm() for name in leaves]
+    total = torch.stack([torch.zeros(()).double(), *gradients]).norm()
+    numbers = []
     for name, true in truth.items():
         result, root = results[name], true.numel() ** 0.5
         sensitivity = torch.stack([(other[name] - true).norm() for other in perturbed]).max()
@@ -134,21 +105,18 @@ def compare_to_reference(
         own = exponent * unit(result.dtype) * norm
         if 0 < norm <= NEGLIGIBLE * total and sensitivity >= norm / 2:
             own = unit(result.dtype) * total
-        own = own + smallest_step(result.dtype) * root
-        tolerance = float(sensitivity + share * own)
+        # Products that nearly underflow err by the smallest step between numbers.
+        limits = torch.finfo(result.dtype)
+        tolerance = float(sensitivity + share * (own + limits.tiny * limits.eps * root))
         error = float((result.double() - true).norm())
         ratio = error / tolerance
-        numbers[name] = (math.inf if math.isnan(ratio) else ratio, error, tolerance, norm)
-    worst = max(numbers, key=lambda name: numbers[name][0])
-    ratio, error, tolerance, norm = numbers[worst]
-    relative = {
-        "error": error / (float(norm) or 1.0),
-        "tolerance": tolerance / (float(norm) or 1.0),
-    }
+        numbers.append((math.inf if math.isnan(ratio) else ratio, name, error, tolerance, norm))
+    ratio, worst, error, tolerance, norm = max(numbers, key=lambda number: number[0])
+    norm = float(norm) or 1.0
+    relative = {"error": error / norm, "tolerance": tolerance / norm}
     if not all(map(math.isfinite, relative.values())):
         relative = dict.fromkeys(relative)
-    compared = "float64" + (f"; {note}" if note else "")
-    return make_row(compared, results, gradients, green=ratio <= 1, worst=worst, **relative)
+    return make_row("float64", results, green=ratio <= 1, worst=worst, **relative)
 
 
 def forward_backward(function: Function, inputs: Tensors, leaves: Collection[str]) -> Tensors:
@@ -158,17 +126,16 @@ def forward_backward(function: Function, inputs: Tensors, leaves: Collection[str
             return function(inputs)
     inputs = {n: t.detach().requires_grad_() if n in leaves else t for n, t in inputs.items()}
     outputs = function(inputs)
-    weights = [_weights(output, seed) for seed, output in enumerate(outputs.values())]
+    # Random numbers that every precision represents exactly.
+    random = [torch.Generator().manual_seed(seed) for seed in range(len(outputs))]
+    weights = [
+        torch.randn(output.shape, generator=generator).bfloat16().to(output)
+        for output, generator in zip(outputs.values(), random, strict=True)
+    ]
     own = [inputs[name] for name in leaves]
     grads = torch.autograd.grad(list(outputs.values()), own, weights, materialize_grads=True)
     named = {f"gradient of {name}": grad for name, grad in zip(leaves, grads, strict=True)}
     return {name: output.detach() for name, output in outputs.items()} | named
-
-
-def _weights(output: Tensor, seed: int) -> Tensor:
-    """Draw random numbers that every precision represents exactly."""
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(output.shape, generator=generator).bfloat16().to(output)
 
 
 def _perturb(
@@ -204,8 +171,3 @@ def _perturb(
 def unit(dtype: torch.dtype) -> float:
     """Return half a unit in the last place of 1, the largest error of a rounding."""
     return torch.finfo(dtype).eps / 2
-
-
-def smallest_step(dtype: torch.dtype) -> float:
-    """Return the smallest step between numbers, the error of products that nearly underflow."""
-    return torch.finfo(dtype).tiny * torch.finfo(dtype).eps

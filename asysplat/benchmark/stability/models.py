@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 import torch
-from torch import nn
 from torch.func import functional_call
 
 from asysplat.benchmark.model import make_net
@@ -20,12 +19,12 @@ from asysplat.benchmark.stability.comparison import (
 from asysplat.benchmark.stability.hostile import FIELDS, HostileViews, hostile_views
 from asysplat.benchmark.timing import Result
 from asysplat.models.network import Network
-from asysplat.models.prior import PlaneSweepPrior, Prior
+from asysplat.models.prior import PlaneSweepPrior
 from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.scene import Cameras, Views
 
 MIN_INVERSE_DEPTH = 1e-30  # avoids division by 0 where the plane sweep finds nothing
-WILD = 1e4  # factor of the decoder's weights, as after a failed training
+WILD, WILD_FACTOR = "wild weights", 1e4  # of the decoder, as after a failed training
 # Views for 16 bits.
 HALF = ("black photographs", "noise photographs", "poses kilometers apart")
 HALF += ("fisheye-like focal lengths", "telescopic focal lengths")
@@ -34,27 +33,32 @@ HALF += ("fisheye-like focal lengths", "telescopic focal lengths")
 NETWORK_ROUNDINGS = 1024
 
 
-def plane_sweep_cases() -> Iterator[StabilityCase]:
-    """Yield the cases of the plane sweep, an operator."""
-    for name, hostile in hostile_views().items():
-        run = partial(_measure_depth, _plane_sweep, hostile)
-        yield StabilityCase("operators", f"plane_sweep, {name}", "fp32", run)
+def plane_sweep_cases() -> list[StabilityCase]:
+    """List the cases of the plane sweep, an operator."""
+    return _depth_cases("plane_sweep, ", _plane_sweep, ())
 
 
-def prior_cases(counts: Sequence[int]) -> Iterator[StabilityCase]:
-    """Yield the cases of the prior, also for these numbers of views."""
-    for name, hostile in hostile_views(counts).items():
-        yield StabilityCase("prior", name, "fp32", partial(_measure_depth, _prior, hostile))
+def prior_cases(counts: Sequence[int]) -> list[StabilityCase]:
+    """List the cases of the prior, also for these numbers of views."""
+    return _depth_cases("", _prior, counts)
 
 
-def _measure_depth(function: Function, hostile: HostileViews) -> Result:
-    views = hostile.views()
-    inputs = {
-        "images": views.images[None],
-        "intrinsics": views.cameras.intrinsics[None],
-        "cam_to_world": views.cameras.cam_to_world[None],
-    }
-    return compare_to_reference(function, function, inputs, magnitude=1.0)
+def _depth_cases(prefix: str, function: Function, counts: Sequence[int]) -> list[StabilityCase]:
+    def measure(hostile: HostileViews) -> Result:
+        tensors = _tensors(hostile.views())
+        # In the order in which they are perturbed
+        inputs = {name: tensors[name][None] for name in ("images", "intrinsics", "cam_to_world")}
+        return compare_to_reference(function, function, inputs, magnitude=1.0)
+
+    return [
+        StabilityCase(prefix + name, "fp32", partial(measure, hostile))
+        for name, hostile in hostile_views(counts).items()
+    ]
+
+
+def _tensors(views: Views) -> Tensors:
+    poses, intrinsics = views.cameras.cam_to_world, views.cameras.intrinsics
+    return {"images": views.images, "cam_to_world": poses, "intrinsics": intrinsics}
 
 
 def _cameras(tensors: Tensors) -> Cameras:
@@ -79,63 +83,37 @@ def _prior(tensors: Tensors) -> Tensors:
     }
 
 
-class FixedPrior(nn.Module):
-    """A prior computed before, in the float type of the views.
-
-    The plane of the lowest cost is a discrete choice: another precision's would be another input.
-    """
-
-    def __init__(self, prior: Prior):
-        super().__init__()
-        self.prior = prior
-
-    def forward(self, views: Views, size: tuple[int, int]) -> Prior:
-        return self.prior.to(views.images)
-
-
 def network_cases(
     models: Sequence[str], overrides: Mapping[str, object], counts: Sequence[int]
 ) -> Iterator[StabilityCase]:
-    """Yield the cases of each model.
+    """Yield the cases of each of `models`, files of conf/model, at these numbers of views.
 
-    Args:
-        models: files of conf/model.
-        overrides: of train.py.
-        counts: numbers of views.
+    `overrides` are of train.py.
     """
     for model in models:
         net, _ = make_net(model, overrides, torch.device("cpu"))
-
-        def case(name: str, hostile: HostileViews, precision: str, model=model, net=net, **options):
-            run = partial(_measure_network, net, hostile, precision, **options)
-            return StabilityCase("network", f"{model}, {name}", precision, run)
-
-        for name, hostile in hostile_views(counts).items():
-            yield case(name, hostile, "fp32")
-        yield case("wild weights", HostileViews(), "fp32", wild=True)
-        for precision in ("bf16", "fp16"):
-            for name in HALF:
-                yield case(name, hostile_views()[name], precision)
+        views = hostile_views(counts)
+        cases = [(name, views[name], "fp32") for name in views]
+        cases.append((WILD, HostileViews(), "fp32"))
+        cases += [(name, views[name], precision) for precision in ("bf16", "fp16") for name in HALF]
+        for name, hostile, precision in cases:
+            run = partial(_measure_network, net, hostile, precision, wild=name == WILD)
+            yield StabilityCase(f"{model}, {name}", precision, run)
 
 
-def _measure_network(
-    net: Network, hostile: HostileViews, precision: str, wild: bool = False
-) -> Result:
+def _measure_network(net: Network, hostile: HostileViews, precision: str, wild: bool) -> Result:
     """Compare with the same network in float64; in fp16 without gradients, which underflow."""
     views, net = hostile.views(), copy.deepcopy(net).eval()
     if net.prior is not None:
+        # Computed once: the plane of the lowest cost is a discrete choice, so that another
+        # precision's prior would be another input.
         size = (hostile.side // net.head.stride,) * 2
-        net.prior = FixedPrior(net.prior(views.map(lambda tensor: tensor[None]), size))
+        prior = net.prior(views.map(lambda tensor: tensor[None]), size)
+        del net.prior
+        net.prior = lambda views, _: prior.to(views.images)
     if wild:
-        net.head.decode.weight.data *= WILD
+        net.head.decode.weight.data *= WILD_FACTOR
     weights = {name: parameter.detach() for name, parameter in net.named_parameters()}
-    cameras = views.cameras
-    inputs = {
-        "images": views.images,
-        "cam_to_world": cameras.cam_to_world,
-        "intrinsics": cameras.intrinsics,
-        **weights,
-    }
     dtype = ALL_PRECISIONS[precision]
     half = dtype != torch.float32
 
@@ -149,7 +127,7 @@ def _measure_network(
     return compare_to_reference(
         partial(predict, net, half),
         partial(predict, double, False),
-        inputs,
+        _tensors(views) | weights,
         () if precision == "fp16" else ("images", *weights),
         network=double,
         arithmetic=dtype,

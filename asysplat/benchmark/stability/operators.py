@@ -38,7 +38,7 @@ def operator_cases() -> Iterator[StabilityCase]:
 
     def case(name: str, precision: str, measure: Callable[..., Result], *args: object):
         run = partial(measure, *args, ALL_PRECISIONS[precision])
-        return StabilityCase("operators", name, precision, run)
+        return StabilityCase(name, precision, run)
 
     for precision in ALL_PRECISIONS:
         huge = precision != "fp16"  # fp16 cannot represent such numbers
@@ -57,7 +57,7 @@ def operator_cases() -> Iterator[StabilityCase]:
                 yield case(name, precision, _image_loss, rendered, target)
     for kind in ("0", "1e-18", "1", "1e18", "spread", "some not finite"):
         run = partial(_adam, kind)
-        yield StabilityCase("operators", f"adam, gradients {kind}", "fp32", run)
+        yield StabilityCase(f"adam, gradients {kind}", "fp32", run)
 
 
 def _compare(

@@ -40,7 +40,7 @@ def training_cases(models: Sequence[str], steps: int) -> Iterator[StabilityCase]
         for model in models:
             name = f"{model}, {steps:,} steps on hostile batches"
             run = partial(_measure_training, model, precision, steps)
-            yield StabilityCase("training", name, precision, run)
+            yield StabilityCase(name, precision, run)
 
 
 def _measure_training(model: str, precision: str, steps: int) -> Result:
@@ -73,7 +73,7 @@ def _measure_training(model: str, precision: str, steps: int) -> Result:
     results = {"losses": torch.stack(losses), "norms of gradients": torch.stack(norms)}
     results |= dict(module.named_parameters())
     compared = f"nothing; losses, norms of gradients and weights are finite, {steps:,} steps"
-    return make_row(compared, results, ["norms of gradients"], green=True, steps=steps)
+    return make_row(compared, results, green=True, steps=steps)
 
 
 def hostile_batches(steps: int) -> Iterator[dict[str, Views]]:
@@ -92,7 +92,7 @@ def refinement_cases(steps: int) -> Iterator[StabilityCase]:
     """Yield a refinement of `steps` steps from each of the hostile Gaussians."""
     for name in HOSTILE_GAUSSIANS:
         run = partial(_measure_refinement, name, steps)
-        yield StabilityCase("refinement", f"from Gaussians {name}", "fp32", run)
+        yield StabilityCase(f"from Gaussians {name}", "fp32", run)
 
 
 def _measure_refinement(name: str, steps: int) -> Result:

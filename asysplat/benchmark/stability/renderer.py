@@ -25,13 +25,13 @@ def renderer_cases(counts: Sequence[int]) -> Iterator[StabilityCase]:
     """Yield the cases of hostile Gaussians, then of cameras; `counts` are numbers of views."""
     views = HostileViews()
     for name in HOSTILE_GAUSSIANS:
-        yield StabilityCase("renderer", f"Gaussians {name}", "fp32", partial(measure, views, name))
+        yield StabilityCase(f"Gaussians {name}", "fp32", partial(measure, views, name))
     for name, hostile in hostile_views(counts).items():
         if "photographs" not in name:  # the renderer does not use them
-            yield StabilityCase("renderer", name, "fp32", partial(measure, hostile))
+            yield StabilityCase(name, "fp32", partial(measure, hostile))
     for precision, dtype in (("bf16", torch.bfloat16), ("fp16", torch.float16)):
         run = partial(measure, views, dtype=dtype)
-        yield StabilityCase("renderer", "inputs in half precision", precision, run)
+        yield StabilityCase("inputs in half precision", precision, run)
 
 
 def measure(
@@ -66,4 +66,5 @@ def measure(
     share = inside.double().mean().item()
     note = f"at {share:.1%} of the pixels: at the others rounding decides about a cut-off"
     fast, exact = partial(draw, backend), partial(draw, "reference")
-    return compare_to_reference(fast, exact, inputs, tuple(inputs), note=note)
+    row = compare_to_reference(fast, exact, inputs, tuple(inputs))
+    return row | {"compared": f"{row['compared']}; {note}"}

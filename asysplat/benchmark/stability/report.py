@@ -8,7 +8,6 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
-from rich.text import Text
 
 from asysplat.benchmark.compare import ERROR, Watched
 from asysplat.benchmark.options import check_names
@@ -22,7 +21,6 @@ from asysplat.benchmark.table import NOTHING, Columns, make_table, number, text
 from asysplat.benchmark.timing import Result
 from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
-from asysplat.training.revision import revision
 
 AREAS: dict[str, Callable[[DictConfig], Iterable[StabilityCase]]] = {
     "operators": lambda options: chain(operator_cases(), plane_sweep_cases()),
@@ -35,10 +33,6 @@ AREAS: dict[str, Callable[[DictConfig], Iterable[StabilityCase]]] = {
 WATCHED = Watched(names=("area", "case", "precision"), alike=(), kinds={"error": ERROR})
 
 
-def _color(green: bool) -> Text:
-    return Text("green", "green") if green else Text("RED", "bold red")
-
-
 COLUMNS: Columns = {
     "case": text("{case}"),
     "precision": text("{precision}"),
@@ -47,9 +41,8 @@ COLUMNS: Columns = {
     "tolerance": number("tolerance", "{:.1e}"),
     "NaN": number("nan", "{:,.0f}"),
     "Inf": number("inf", "{:,.0f}"),
-    "gradients": lambda row: {True: "finite", False: "not finite", None: NOTHING}[row["gradients"]],
     "compared with": text("{compared}"),
-    "": lambda row: _color(row["green"]),
+    "": lambda row: "green" if row["green"] else "RED",
 }
 SUMMARY: Columns = {
     "area": text("{area}"),
@@ -58,7 +51,7 @@ SUMMARY: Columns = {
     "error / tolerance, at most": number("share", "{:.2g}"),
     "NaN": number("nan", "{:,.0f}"),
     "Inf": number("inf", "{:,.0f}"),
-    "": lambda row: _color(row["red"] == 0),
+    "": lambda row: "RED" if row["red"] else "green",
 }
 
 
@@ -66,8 +59,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     """Measure every case of the areas `options.stability.areas`, on the CPU.
 
     Returns:
-        "revision" of the code; "rows": see `comparison.make_row`, and "area", "case" and
-        "precision".
+        "rows": see `comparison.make_row`, and "area", "case" and "precision".
 
     Raises:
         InputError: an unknown area or model, a number below 1.
@@ -75,24 +67,24 @@ def measure(options: DictConfig, console: Console) -> Result:
     options = options.stability
     check_names("stability.areas", options.areas, AREAS)
     check_overrides([f"model={model}" for model in options.models])
-    counts = {f"views={list(options.views)}": options.views}
-    counts |= {f"{n}={options[n]}": [options[n]] for n in ("training_steps", "refinement_steps")}
-    for setting, values in counts.items():
+    for name in ("views", "training_steps", "refinement_steps"):
+        values = options[name] if name == "views" else [options[name]]
         if not all(isinstance(value, int) and value >= 1 for value in values):
-            raise InputError(f"stability.{setting} cannot be: give whole numbers from 1.")
-    cases = [case for area in options.areas for case in AREAS[area](options)]
-    rows = [case.row() for case in track(cases, "cases", console=console)]
-    return {"revision": revision(), "rows": rows}
+            setting = f"stability.{name}={options[name]}"
+            raise InputError(f"{setting} cannot be: give whole numbers from 1.")
+    cases = [(area, case) for area in options.areas for case in AREAS[area](options)]
+    cases = track(cases, "cases", console=console)
+    return {"rows": [{"area": area, **case.row()} for area, case in cases]}
 
 
 def verdict(results: Result) -> str | None:
     """Return a sentence if any case is red, else None."""
-    rows, red = results["rows"], _red(results["rows"])
+    rows = results["rows"]
+    red = [f"{r['area']}: {r['case']} ({r['precision']})" for r in rows if not r["green"]]
     if not red:
         return None
-    named = "; ".join(f"{row['area']}: {row['case']} ({row['precision']})" for row in red[:3])
-    more = "; ..." if len(red) > 3 else ""
-    return f"red: {len(red)} of {len(rows)} cases are not stable: {named}{more}"
+    named = "; ".join(red[:3] + ["..."] * (len(red) > 3))
+    return f"red: {len(red)} of {len(rows)} cases are not stable: {named}"
 
 
 def summary(rows: Sequence[Result]) -> list[Result]:
@@ -106,7 +98,7 @@ def summary(rows: Sequence[Result]) -> list[Result]:
     for area in dict.fromkeys(row["area"] for row in rows):
         own = [row for row in rows if row["area"] == area]
         areas.append(
-            {"area": area, "cases": len(own), "red": len(_red(own))}
+            {"area": area, "cases": len(own), "red": sum(not row["green"] for row in own)}
             | {name: sum(row[name] for row in own) for name in ("nan", "inf")}
             | {"share": max((r["error"] / r["tolerance"] for r in own if r["error"]), default=None)}
         )
@@ -115,14 +107,13 @@ def summary(rows: Sequence[Result]) -> list[Result]:
 
 def tables(results: Result) -> list[Table]:
     """Make a table of the areas, and a table of all cases of each area."""
-    rows, red = results["rows"], _red(results["rows"])
-    state = (
-        f"{len(red)} of {len(rows)} cases are RED" if red else f"all {len(rows)} cases are green"
-    )
+    rows, areas = results["rows"], summary(results["rows"])
+    red, count = sum(area["red"] for area in areas), len(rows)
+    state = f"{red} of {count} cases are RED" if red else f"all {count} cases are green"
     machine = ", ".join(f"{key} {value}" for key, value in results["machine"].items())
-    notes = f"{state}\nrevision {results['revision']}; {machine}\n{RULE}"
-    shown = [make_table("Stability", SUMMARY, summary(rows), notes)]
-    for area in dict.fromkeys(row["area"] for row in rows):
+    notes = f"{state}\nrevision {results.get('revision')}; {machine}\n{RULE}"
+    shown = [make_table("Stability", SUMMARY, areas, notes)]
+    for area in [row["area"] for row in areas]:
         own = [row for row in rows if row["area"] == area]
         shown.append(make_table(area.capitalize(), COLUMNS, own, names=3))
     return shown
@@ -134,7 +125,3 @@ def plot(results: Result) -> Figure:
     names = [f"{row['area']}: {row['cases'] - row['red']} of {row['cases']} green" for row in areas]
     shares = {"largest error": [row["share"] or 0.0 for row in areas]}
     return bars(names, shares, "error / tolerance", tolerance=1.0)
-
-
-def _red(rows: Sequence[Result]) -> list[Result]:
-    return [row for row in rows if not row["green"]]
