@@ -22,8 +22,9 @@ def transform(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
     motion = motion.to(gaussians.means.device, torch.float64)
     rotation, translation = motion[:3, :3], motion[:3, 3]
     means = gaussians.means.double() @ rotation.mT + translation
-    turn = torch.tensor(Rotation.from_matrix(rotation.cpu().numpy()).as_quat(scalar_first=True))
-    quats = _quaternion_product(turn.to(motion), gaussians.quats.double())
+    w, x, y, z = Rotation.from_matrix(rotation.cpu().numpy()).as_quat(scalar_first=True)
+    product = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    quats = gaussians.quats.double() @ motion.new_tensor(product).mT
     matrix = sh_rotation(rotation, gaussians.sh.shape[-2])
     return replace(
         gaussians,
@@ -31,12 +32,3 @@ def transform(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
         quats=quats.to(gaussians.quats),
         sh=(matrix @ gaussians.sh.double()).to(gaussians.sh),
     )
-
-
-def _quaternion_product(
-    first: Float[Tensor, "4"], second: Float[Tensor, "*batch 4"]
-) -> Float[Tensor, "*batch 4"]:
-    """Multiply quaternions wxyz: first the rotation by `second`, then by `first`."""
-    w, x, y, z = first.tolist()
-    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
-    return second @ second.new_tensor(rows).mT

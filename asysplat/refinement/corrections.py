@@ -21,23 +21,16 @@ class Corrections:
     def __init__(self, count: int, rates: Rates):
         self._rates = {"exposure": rates.exposure, "poses": rates.poses}
         self._adam = VisibleAdam({n: torch.zeros(count, 2, 3) for n in self._rates}, eps=1e-8)
-        self.enabled = any(self._rates.values())
 
-    def leaves(self, view: int) -> dict[str, Tensor]:
-        """Return the parameters of one image, [1, 2, 3] each, as leaves of a graph."""
-        return {
-            name: tensor[view : view + 1].detach().clone().requires_grad_()
-            for name, tensor in self._adam.parameters.items()
-        }
+    def leaves(self) -> dict[str, Float[Tensor, "V 2 3"]]:
+        """Return the parameters of all images as leaves of a graph; none if both are off."""
+        parameters = self._adam.parameters.items() if any(self._rates.values()) else ()
+        return {name: tensor.detach().requires_grad_() for name, tensor in parameters}
 
     def step(self, view: int, gradients: dict[str, Tensor], factor: float) -> None:
         """Update the parameters of one image, then subtract the mean over all images."""
-        visible = torch.zeros(self._adam.num_rows, dtype=torch.bool)
-        visible[view] = True
-        padded = {name: torch.zeros_like(p) for name, p in self._adam.parameters.items()}
-        for name, gradient in gradients.items():
-            padded[name][view] = gradient[0]
-        self._adam.step(padded, {n: rate * factor for n, rate in self._rates.items()}, visible)
+        visible = torch.arange(self._adam.num_rows) == view
+        self._adam.step(gradients, {n: rate * factor for n, rate in self._rates.items()}, visible)
         for tensor in self._adam.parameters.values():
             tensor -= tensor.mean(0)
 

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from scipy.spatial import cKDTree
-from torch import Tensor, nn
+from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.models.network import Network
@@ -59,7 +59,12 @@ def initial_gaussians(
             raise InputError(
                 f"init=depth: {photographs.name} has no depth maps; choose plane_sweep or points."
             )
-        prior = _run_prior(PlaneSweepPrior() if init == "plane_sweep" else DepthPrior(), views)
+        # Depth maps of PRIOR_MAX_SIDE pixels a side at most, a divisor of the views.
+        stride = -(-longest // PRIOR_MAX_SIDE)
+        small = _resize(views, longest, stride)
+        size = small.cameras.height // stride, small.cameras.width // stride
+        run_prior = PlaneSweepPrior() if init == "plane_sweep" else DepthPrior()
+        prior = run_prior(small.map(lambda tensor: tensor[None]), size)
         gaussians = gaussians_from_prior(views, prior)
         pixels = longest / max(prior.distance.shape[-2:])
     else:
@@ -125,15 +130,6 @@ def sample_colors(points: Float[Tensor, "N 3"], views: Views) -> Float[Tensor, "
         total[visible] += views.images[view, :, row, column].mT
         count[visible] += 1
     return torch.where(count > 0, total / count.clamp_min(1), 0.5)
-
-
-def _run_prior(prior: nn.Module, views: Views) -> Prior:
-    """Compute depth maps of PRIOR_MAX_SIDE pixels a side at most, a divisor of the views."""
-    longest = max(views.cameras.height, views.cameras.width)
-    stride = max(1, -(-longest // PRIOR_MAX_SIDE))
-    views = _resize(views, longest, stride)
-    size = views.cameras.height // stride, views.cameras.width // stride
-    return prior(views.map(lambda tensor: tensor[None]), size)
 
 
 def _resize(views: Views, longest: int, multiple: int) -> Views:

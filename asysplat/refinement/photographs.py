@@ -89,9 +89,8 @@ def open_photographs(
             f"warning: {verdict.sentence}; python -m asysplat.data.check shows it at full size. "
             "The reconstruction goes on."
         )
-    input_views = sequence.views(inputs).validate(str(path))
-    targets = sequence.views(held_out).validate(str(path)) if held_out else input_views
-    input_views, targets, frame = normalize(input_views, targets)
+    both = (sequence.views(index).validate(str(path)) for index in (inputs, held_out or inputs[:1]))
+    input_views, targets, frame = normalize(*both)
     points = None
     if scene.points is not None and len(scene.points):
         pose = frame.world_to_mean

@@ -6,8 +6,9 @@ The paper's post-optimization is the setting `PAPER`.
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import torch
 import torch.nn.functional as F
@@ -23,7 +24,7 @@ from asysplat.refinement.densification.relocate import (
     mcmc_regularizer,
     relocate,
 )
-from asysplat.refinement.densification.spawn import MIN_OPACITY, render_views, spawn_at_errors
+from asysplat.refinement.densification.spawn import MIN_OPACITY, spawn_at_errors
 from asysplat.refinement.fields import Fields, Parameters
 from asysplat.refinement.isotropic import footprints
 from asysplat.refinement.settings import RefinementSettings
@@ -78,7 +79,7 @@ class Refinement:
         self.corrections = Corrections(views.num_views, settings.rates)
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = resize(views, *size) if settings.half_size > 0 else views
-        self._queue: list[int] = []
+        self._view_order = self._random_order()
         self._steps = 0
         self._last_visible = torch.zeros(len(self.fields), dtype=torch.long)
         self._screen_gradients = ScreenGradients(self.fields)
@@ -93,16 +94,19 @@ class Refinement:
     def step(self, share: float) -> float:
         """Take a step at a share of the refinement, in [0, 1]; return its mean squared error."""
         settings, views = self.settings, self._views(share)
-        chosen = self._next_views(settings.views_per_step or self.views.num_views)
-        leaves, factor = self.fields.leaves(), self._rate_factor(share)
-        error, gradients = 0.0, {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
+        chosen = list(islice(self._view_order, settings.views_per_step or views.num_views))
+        leaves, cool_down = self.fields.leaves(), settings.cool_down
+        # Of all rates: 1, then down to `decay` over the cool-down.
+        cooled = max(0.0, (share - 1 + cool_down) / cool_down) if cool_down else 0
+        factor = settings.decay**cooled
+        error, gradients = 0.0, None
         for view in chosen:
             mse, of_view = self._gradients(views.select([view]), view, leaves, factor)
             if settings.densify == "gradient":
                 self._screen_gradients.add(of_view[0], views.cameras.select([view]))
-            for name, gradient in zip(leaves, of_view, strict=True):
-                gradients[name] = gradient if len(chosen) == 1 else gradients[name] + gradient
+            gradients = of_view if gradients is None else list(map(torch.add, gradients, of_view))
             error += mse / len(chosen)
+        gradients = dict(zip(leaves, gradients, strict=True))
         visible = self.fields.step(gradients, settings.rates, factor)
         if settings.densify == "mcmc":
             inject_position_noise(self.fields, factor, self._generator)
@@ -111,48 +115,48 @@ class Refinement:
             self._last_visible[visible] = self._steps
         return error
 
+    @torch.no_grad()
     def densify(self, share: float) -> None:
         """Prune, add or relocate Gaussians, by the method of the settings; share: see `step`."""
-        settings = self.settings
+        settings, views = self.settings, self._views(share)
         if settings.densify == "mcmc":
             relocate(self.fields, self._max_gaussians, settings.growth, self._generator)
         elif settings.densify == "gradient":
             self._screen_gradients.clone_and_split(self._max_gaussians, self._generator)
-        elif settings.densify == "error":
-            self._prune_and_spawn(self._views(share))
-
-    def _prune_and_spawn(self, views: Views) -> None:
-        opacities = self.fields.parameters["logits"].detach().sigmoid()
+        if settings.densify != "error":
+            return
+        opacities = self.fields.parameters["logits"].sigmoid()
         # Every view has been used twice since.
         unseen = self._steps - self._last_visible > 2 * views.num_views
         useful = (opacities > MIN_OPACITY) & ~unseen
         useful[opacities.argmax()] = True  # never prune all
-        limit = min(self._max_gaussians, int((1 + self.settings.growth) * len(self.fields)))
+        limit = min(self._max_gaussians, int((1 + settings.growth) * len(self.fields)))
         rows = torch.nonzero(useful)[:, 0]
         self.fields.keep(rows)
         self._last_visible = self._last_visible[rows]
         count = limit - len(self.fields)
         if count > 0:
             order = torch.randperm(views.num_views, generator=self._generator)
-            views = views.select(order[:VIEWS_PER_ROUND])
-            rendered = render_views(self.gaussians, views, self.background)
-            new = spawn_at_errors(views, *rendered, count, self._generator)
+            views, now = views.select(order[:VIEWS_PER_ROUND]), self.gaussians
+            each = (views.cameras.select([view]) for view in range(views.num_views))
+            outs = [render(now, camera, self.background, depth="median") for camera in each]
+            images, depths = torch.cat([o.image for o in outs]), torch.cat([o.depth for o in outs])
+            new = spawn_at_errors(views, images, depths, count, self._generator)
             self.fields.append(new, self._units(new.means))
-            now = self._last_visible.new_full((new.num_gaussians,), self._steps)
-            self._last_visible = torch.cat((self._last_visible, now))
+            visible = self._last_visible.new_full((new.num_gaussians,), self._steps)
+            self._last_visible = torch.cat((self._last_visible, visible))
 
     def _gradients(
         self, target: Views, view: int, leaves: Parameters, factor: float
     ) -> tuple[float, Sequence[Tensor]]:
         """Render a view and update its corrections; return its MSE and the leaves' gradients."""
-        cameras, correction = target.cameras, {}
-        if self.corrections.enabled:
-            correction = self.corrections.leaves(view)
-            cameras = correct_poses(cameras, correction["poses"])
+        cameras, correction = target.cameras, self.corrections.leaves()
+        if correction:
+            cameras = correct_poses(cameras, correction["poses"][view, None])
         gaussians = self.fields.gaussians(leaves)
         image = render(gaussians, cameras, self.background, depth=False, masks=target.masks).image
         if correction:
-            image = correct_exposure(image, correction["exposure"])
+            image = correct_exposure(image, correction["exposure"][view, None])
         if self.settings.ssim is None:
             loss = F.mse_loss(target.masked(image), target.images)
         else:
@@ -169,19 +173,10 @@ class Refinement:
     def _views(self, share: float) -> Views:
         return self._half_views if share < self.settings.half_size else self.views
 
-    def _rate_factor(self, share: float) -> float:
-        """Return the factor of all rates: 1, then down to `decay` over the cool-down."""
-        cool_down = self.settings.cool_down
-        if cool_down == 0:
-            return 1.0
-        return self.settings.decay ** max(0.0, (share - 1 + cool_down) / cool_down)
-
-    def _next_views(self, count: int) -> list[int]:
-        """Return the next views of a random order; all are used before one is used again."""
-        while len(self._queue) < count:
-            self._queue += torch.randperm(self.views.num_views, generator=self._generator).tolist()
-        chosen, self._queue = self._queue[:count], self._queue[count:]
-        return chosen
+    def _random_order(self) -> Iterator[int]:
+        """Yield views in a random order; all are used before one is used again."""
+        while True:
+            yield from torch.randperm(self.views.num_views, generator=self._generator).tolist()
 
     def _units(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         if self.settings.rates.unit == "scene":
@@ -216,8 +211,7 @@ def refine(
         raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")
     refinement = Refinement(gaussians, views, background, settings, seed)
     if seconds is not None:  # a step with few Gaussians compiles the kernels before the time runs
-        one_view = replace(settings, views_per_step=1)
-        few = gaussians.map(lambda field: field[:10])
+        few, one_view = gaussians.map(lambda field: field[:10]), replace(settings, views_per_step=1)
         small = Refinement(few, views.select([0]), settings=one_view)
         small.step(0.0)
         small.densify(0.0)

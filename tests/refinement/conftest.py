@@ -17,6 +17,11 @@ def room():
 
 
 @pytest.fixture(scope="session")
+def small_room():
+    return ProceduralScene(1, 24, 32, 12, places="rooms").views(range(0, 12, 3))
+
+
+@pytest.fixture(scope="session")
 def start(room):
     """Gaussians at the true surfaces, of a pixel in nine."""
     views = room[0]

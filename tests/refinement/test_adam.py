@@ -215,6 +215,4 @@ def test_mistakes_are_named():
             optimizer.step(gradients, {"means": 1.0, "sh": 1.0}, visible)
     with pytest.raises(InputError, match=r"visible has shape \(5,\): expected \(4,\)"):
         inspect.unwrap(VisibleAdam.step)(optimizer, normal(4), RATES, torch.ones(5) > 0)
-    with pytest.raises(InputError, match="append of quats is missing"):
-        optimizer.append({"means": torch.ones(2, 3)})
     assert_same(everything(optimizer), before)

@@ -6,7 +6,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.refinement.isotropic import isotropic_gaussians
-from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
 MIN_OPACITY = 0.005  # Gaussians below it are pruned (Kerbl et al. 2023)
@@ -52,16 +51,3 @@ def spawn_at_errors(
     sizes = SPAWN_SIZE * z / cameras.intrinsics[view, 0, 0]
     colors = views.images.movedim(1, -1).flatten(0, 2)[sampled]
     return isotropic_gaussians(means, sizes, torch.full_like(z, SPAWN_OPACITY), colors)
-
-
-@torch.no_grad()
-def render_views(
-    gaussians: Gaussians, views: Views, background: Float[Tensor, "3"]
-) -> tuple[Float[Tensor, "V 3 H W"], Float[Tensor, "V H W"]]:
-    """Render images and median depths (where transmittance falls to 1/2), one view at a time."""
-    images, depths = [], []
-    for view in range(views.num_views):
-        out = render(gaussians, views.cameras.select([view]), background, depth="median")
-        images.append(out.image)
-        depths.append(out.depth)
-    return torch.cat(images), torch.cat(depths)
