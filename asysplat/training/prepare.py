@@ -34,7 +34,6 @@ from asysplat.training.stages import (
     StageRecord,
     check_stages,
     describe_stage,
-    results_of_stage,
     resume_point,
     stage_configs,
 )
@@ -126,7 +125,8 @@ class PreparedRun:
         if is_last:
             self.results = shown = self.described | shown
         else:
-            self.results |= results_of_stage(stage.config.stage, new_results)
+            stored = {k: v for k, v in new_results.items() if k.startswith(("test/", "cost/"))}
+            self.results |= {f"{stage.config.stage}/{key}": v for key, v in stored.items()}
         if trainer.is_global_zero:
             if trainer.logger is not None:
                 log_results(trainer.logger, new_results, data)

@@ -113,9 +113,3 @@ def resume_point(checkpoint: Path | None, stages: Sequence[DictConfig]) -> tuple
             "the options of its run to resume it, or init_path= instead to start from it."
         )
     return names.index(stage), record.get("earlier", {})
-
-
-def results_of_stage(name: str, results: Results) -> Results:
-    """Prefix a stage's tests and costs with its name, `stage1/test/...`, as in metrics.json."""
-    kinds = ("test/", "cost/")
-    return {f"{name}/{key}": value for key, value in results.items() if key.startswith(kinds)}

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from torchvision.models import alexnet
 
 from asysplat.errors import InputError
-from asysplat.evaluation.backbones import VGGFeatures, find_backbone
+from asysplat.evaluation.backbones import find_backbone
 from asysplat.evaluation.lpips import load_lpips
 
 ALEXNET = "alexnet-owt-7be5be79.pth"
@@ -107,27 +107,3 @@ def test_a_failed_download_is_an_input_error(hub, monkeypatch, error):
     monkeypatch.setattr("torch.hub.download_url_to_file", fail)
     with pytest.raises(InputError, match=r"alexnet.* could not be downloaded \(.*paths\.download"):
         find_backbone("alexnet", None, download=True)
-
-
-def test_vgg_features_are_the_five_named_activations(shared, hub):
-    if not (shared / "weights" / "vgg16_features_fp16.pth").is_file():
-        pytest.skip("the weights are absent: set ASYSPLAT_SHARED")
-    backbone = find_backbone("vgg16", shared / "weights")
-    features = VGGFeatures("vgg16", backbone, (3, 8, 15, 22, 29), (0.229, 0.224, 0.225))
-    assert not any(parameter.requires_grad for parameter in features.parameters())
-    images = torch.rand(2, 3, 32, 48, requires_grad=True)
-    activations = features(images)
-    shapes = [tuple(a.shape) for a in activations]
-    channels = (64, 128, 256, 512, 512)
-    assert shapes == [(2, c, 32 >> i, 48 >> i) for i, c in enumerate(channels)]
-
-    # ReLU 1_2 by hand; a gradient reaches the images.
-    mean = torch.tensor([0.485, 0.456, 0.406])[:, None, None]
-    std = torch.tensor([0.229, 0.224, 0.225])[:, None, None]
-    x = (images - mean) / std
-    for n in (0, 2):
-        weight, bias = backbone[f"features.{n}.weight"], backbone[f"features.{n}.bias"]
-        x = torch.nn.functional.conv2d(x, weight, bias, padding=1).relu()
-    torch.testing.assert_close(activations[0], x)
-    activations[-1].sum().backward()
-    assert images.grad.abs().sum() > 0

@@ -82,13 +82,6 @@ def test_ssim_equals_scikit_image(window, options, covariance):
     assert found == pytest.approx(expected, abs=1e-5)
 
 
-def test_ssim_depends_on_window_and_covariance():
-    a = 0.5 + 0.05 * torch.rand(1, 3, 24, 31)
-    b = a + 0.02 * torch.randn_like(a)
-    values = {ssim(b, a, w, c).item() for w in SCIKIT for c in ("biased", "sample")}
-    assert len({round(value, 4) for value in values}) == 4
-
-
 def test_smallest_image_of_each_window():
     for window, size in (("gaussian", 11), ("uniform", 7)):
         image = torch.rand(1, 3, size, size)

@@ -264,9 +264,5 @@ def test_weights_are_saved_and_loaded(tmp_path):
     for name, tensor in again.state_dict().items():
         torch.testing.assert_close(tensor, net.state_dict()[name], rtol=1e-3, atol=1e-6)
         assert tensor.dtype == net.state_dict()[name].dtype
-
-
-def test_weights_of_another_model_are_refused(tmp_path):
-    save_weights(torch.nn.Linear(3, 2).state_dict(), tmp_path / "net.safetensors")
-    with pytest.raises(InputError, match=r"bias is \(2,\) there and \(3,\) here"):
-        load_weights(str(tmp_path / "net.safetensors"), torch.nn.Linear(3, 3))
+    with pytest.raises(InputError, match=r"0\.bias is \(2,\) there and \(3,\) here"):
+        load_weights(str(tmp_path / "net.safetensors"), torch.nn.Sequential(torch.nn.Linear(3, 3)))

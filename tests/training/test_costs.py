@@ -5,12 +5,14 @@ from types import SimpleNamespace
 import lightning
 import pytest
 import torch
+from conftest import COSTS
 from tiny import QUIET
 from torch import nn
 from torch.utils.data import DataLoader
 
 from asysplat.evaluation import measured_cost
 from asysplat.evaluation.measured_cost import CostMeter, reset_peak_memory
+from asysplat.training import plan
 from asysplat.training.callbacks import Costs
 
 MB = 1_000_000
@@ -85,3 +87,11 @@ def test_seconds_of_steps_leave_the_longest_out():
     trainer.accumulate_grad_batches = 4
     costs.on_fit_end(trainer, Module(1))
     assert costs.values == {"cost/seconds_per_step": 8.0}
+
+
+def test_what_does_not_fit_is_refused_before_the_first_step(train, monkeypatch, tmp_path):
+    monkeypatch.setattr(plan, "memory_gb", lambda device: 0.001)
+    result = train(COSTS, "steps=1", "validate_every=1", "data.test_sets=null")
+    assert result.returncode != 0 and "Traceback" not in result.stderr
+    assert "and each process has 0.001 GB: set training.checkpoint_layers=true" in result.stderr
+    assert not list(tmp_path.rglob("last.ckpt"))

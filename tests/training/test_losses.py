@@ -58,14 +58,6 @@ def pair(size=32, depths=True):
     return prediction, {"inputs": targets, "targets": targets}
 
 
-def test_mean_squared_error():
-    prediction, batch = pair()
-    terms = make_loss(mse=2.0)(prediction, batch)
-    expected = (prediction.rendering.image - batch["targets"].images).square().mean()
-    torch.testing.assert_close(terms["loss"], 2 * expected)
-    assert set(terms) == {"loss", "mse"}
-
-
 def test_normalized_disparity_by_hand():
     disparity = torch.tensor([[[1.0, 2.0], [4.0, 7.0]]])
     valid = torch.tensor([[[True, True], [True, False]]])
@@ -85,14 +77,16 @@ def test_disparities_come_before_depths():
     assert reference_disparities(replace(views, depths=None)) is None
 
 
-def test_opacity_is_a_term_and_off_by_default():
+def test_mean_squared_error_and_opacity_which_is_off_by_default():
     prediction, batch = pair()
     gaussians = replace(prediction.gaussians, opacities=torch.rand(2048).requires_grad_())
     prediction = Prediction(gaussians, prediction.rendering)
-    terms = make_loss(mse=1.0, opacity=0.1)(prediction, batch)
+    terms = make_loss(mse=2.0, opacity=0.1)(prediction, batch)
+    expected = (prediction.rendering.image - batch["targets"].images).square().mean()
+    torch.testing.assert_close(terms["mse"], expected)
     torch.testing.assert_close(terms["opacity"], gaussians.opacities.mean())
-    torch.testing.assert_close(terms["loss"], terms["mse"] + 0.1 * terms["opacity"])
-    assert "opacity" not in make_loss(mse=1.0)(prediction, batch)
+    torch.testing.assert_close(terms["loss"], 2 * terms["mse"] + 0.1 * terms["opacity"])
+    assert set(make_loss(mse=1.0)(prediction, batch)) == {"loss", "mse"}
 
 
 # Disparities (1, 2, 4) against (1, 2, 3), normalized: (-1, 0, 2) against (-1.5, 0, 1.5), whose

@@ -1,5 +1,7 @@
 """TrainingMonitor: shares, rates and norms of a step."""
 
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier, local
 from types import SimpleNamespace
 
 import pytest
@@ -18,7 +20,9 @@ from asysplat.training.parts import Parts
 CPU = torch.device("cpu")
 
 
-class Clock:
+class Clock(local):
+    """A clock of each thread that only a test advances."""
+
     seconds = 0.0
 
     def perf_counter(self):
@@ -107,6 +111,25 @@ def test_a_step_of_several_micro_batches(clock):
     assert found["time/share_data"] == pytest.approx(2 / 19.5)
     assert found["time/mfu"] == pytest.approx(4 * 6 / 19.5 / 12)
     assert "MFU 10.3%" in sentence(found)
+
+
+def test_seconds_of_parallel_threads_are_averaged(clock):
+    measured, together = Parts(), Barrier(2)
+    with measured("network"):  # before the start
+        clock.wait(1)
+    measured.start(CPU)
+
+    def work(seconds):
+        with measured("network"):
+            together.wait(10)  # so that each has a thread of its own
+            clock.wait(seconds)
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(work, (2, 4)))
+    with measured("loss"):
+        clock.wait(7)
+    seconds = {name: spent for name, spent in measured.stop().items() if spent}
+    assert seconds == {"network": 3, "loss": 7}
 
 
 def test_gradient_norms_by_part():

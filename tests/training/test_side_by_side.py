@@ -124,14 +124,6 @@ def test_a_parameter_that_a_loss_does_not_see():
     assert net["seen"].weight.grad == 1 and net["unseen"].weight.grad == 0
 
 
-def test_copies_hold_no_parameters_of_their_own(module):
-    names = module.state_dict().keys()
-    module._side_by_side(make_batch())
-    assert module.state_dict().keys() == names
-    own = set(module.net.parameters())
-    assert all(set(net.parameters()) == own for net in module._side_by_side.copies)
-
-
 def test_an_error_in_a_scene_is_the_steps():
     def fail(batch, net):
         raise ValueError(batch["scene"][0])

@@ -15,7 +15,7 @@ from tiny import NETWORK, SCENES
 from asysplat.errors import InputError
 from asysplat.training import SplattingModule
 from asysplat.training.runs import config_hash, find_run, find_runs
-from asysplat.training.stages import check_stages, results_of_stage, resume_point, stage_configs
+from asysplat.training.stages import check_stages, resume_point, stage_configs
 
 NAMES = ["stage1", "stage2", "stage3"]
 THREE = ["experiment=three_stages", "paths.run=runs/a"]
@@ -99,12 +99,6 @@ def test_resume_point(composed, tmp_path):
     path.write_text("a text")
     with pytest.raises(InputError, match=r"last\.ckpt cannot be read as a checkpoint to resume"):
         resume_point(path, stages)
-
-
-def test_results_of_a_stage_have_its_prefix():
-    results = {"test/rooms/psnr": 2.0, "cost/peak_gb": 1.0, "baseline/rooms/mean_color/psnr": 0.0}
-    found = results_of_stage("stage1", results | {"protocol/name": "default"})
-    assert found == {"stage1/test/rooms/psnr": 2.0, "stage1/cost/peak_gb": 1.0}
 
 
 TINY = ["experiment=three_stages", *NETWORK, "steps=2", "validate_every=1", "data.inputs=3"]
