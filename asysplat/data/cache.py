@@ -59,7 +59,17 @@ class ImageCache:
         if self._on_disk is None:
             self._on_disk = sum(size for _, size, _ in self._files())
         try:
-            self._on_disk += _write(file, array)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            # Atomic, since another process may be reading.
+            descriptor, partial = tempfile.mkstemp(dir=file.parent)
+            try:
+                with os.fdopen(descriptor, "wb") as handle:
+                    np.save(handle, array)
+                    self._on_disk += handle.tell()
+                os.replace(partial, file)
+            except OSError:
+                os.unlink(partial)
+                raise
         except OSError as error:
             warnings.warn(
                 f"{self.folder} cannot store more images ({error.strerror}): they are decoded "
@@ -96,18 +106,3 @@ def _read(file: Path) -> ndarray | None:
     except (OSError, ValueError, EOFError):
         return None
     return array
-
-
-def _write(file: Path, array: ndarray) -> int:
-    """Write a file, atomically since another process may be reading; return its bytes."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, partial = tempfile.mkstemp(dir=file.parent)
-    try:
-        with os.fdopen(descriptor, "wb") as handle:
-            np.save(handle, array)
-            size = handle.tell()
-        os.replace(partial, file)
-    except OSError:
-        os.unlink(partial)
-        raise
-    return size

@@ -55,20 +55,18 @@ def normalize(inputs: Views, targets: Views) -> tuple[Views, Views, Normalizatio
     poses = inputs.cameras.cam_to_world.double()
     centers = poses[:, :3, 3]
     mean_pose = torch.eye(4, dtype=poses.dtype, device=poses.device)
-    mean_pose[:3, :3] = _mean_rotation(poses[:, :3, :3])
+    forward, down = poses[:, :3, 2].mean(0), poses[:, :3, 1].mean(0)
+    right = torch.linalg.cross(down, forward)
+    # On a full circle the forward axes cancel: use the first camera's axes.
+    if right.norm() < 1e-3:
+        mean_pose[:3, :3] = poses[0, :3, :3]
+    else:
+        forward, right = forward / forward.norm(), right / right.norm()
+        down = torch.linalg.cross(forward, right)
+        mean_pose[:3, :3] = torch.stack((right, down, forward), dim=-1)
     mean_pose[:3, 3] = centers.mean(0)
     radius = (centers - centers.mean(0)).norm(dim=-1).max()
     # Smaller differences between the centers are rounding.
     distinct = radius > 1e-6 * centers.abs().max()
     frame = Normalization(torch.linalg.inv(mean_pose), 1 / radius.item() if distinct else 1.0)
     return frame.apply(inputs), frame.apply(targets), frame
-
-
-def _mean_rotation(rotations: Float[Tensor, "V 3 3"]) -> Float[Tensor, "3 3"]:
-    forward, down = rotations[:, :, 2].mean(0), rotations[:, :, 1].mean(0)
-    right = torch.linalg.cross(down, forward)
-    # On a full circle the forward axes cancel: use the first camera's axes.
-    if right.norm() < 1e-3:
-        return rotations[0]
-    forward, right = forward / forward.norm(), right / right.norm()
-    return torch.stack((right, torch.linalg.cross(forward, right), forward), dim=-1)

@@ -24,20 +24,15 @@ def depths_of_points(points: Points, cameras: Cameras) -> Float[Tensor, "V H W"]
     """
     points = torch.as_tensor(points, dtype=torch.float64)
     exact = cameras.to(torch.float64)
-    views = [exact.select([view]) for view in range(cameras.num_views)]
-    inverse = torch.stack([_nearest(points, view) for view in views])
+    inverse = torch.zeros(cameras.num_views, cameras.height, cameras.width)
+    for view, nearest in enumerate(inverse):  # of every pixel, the greatest inverse depth
+        (pixels,), (depth,), (inside,) = exact.select([view]).project(points)
+        x, y = pixels[inside].long().unbind(-1)
+        index, values = y * cameras.width + x, (1 / depth[inside]).float()
+        nearest.view(-1).scatter_reduce_(0, index, values, "amax")
     nearest = torch.stack([_window_maximum(view) for view in inverse])
     visible = (inverse > 0) & (inverse * (1 + OCCLUSION_MARGIN) >= nearest)
     return torch.where(visible, 1 / inverse, 0).to(cameras.intrinsics)
-
-
-def _nearest(points: Float[Tensor, "P 3"], camera: Cameras) -> Float[Tensor, "H W"]:
-    """Compute the greatest inverse depth in every pixel of one view."""
-    (pixels,), (depth,), (inside,) = camera.project(points)
-    x, y = pixels[inside].long().unbind(-1)
-    inverse = torch.zeros(camera.height * camera.width)
-    inverse = inverse.scatter_reduce(0, y * camera.width + x, (1 / depth[inside]).float(), "amax")
-    return inverse.view(camera.height, camera.width)
 
 
 def _window_maximum(inverse: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:

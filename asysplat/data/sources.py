@@ -1,6 +1,5 @@
 """Sources of tasks: which sequences train, validate and test, and which of their images."""
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -91,18 +90,17 @@ class SceneFolder(Sequence):
         self.root = Path(root).absolute()
         layout, self.paths = find_scenes(root, options.layout)
         self._options = replace(options, layout=layout)
-        self._open: OrderedDict[int, FileSequence] = OrderedDict()
+        self._open: dict[int, FileSequence] = {}
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> FileSequence:
-        if index not in self._open:
-            self._open[index] = open_scene(self.paths[index], self._options)
-        self._open.move_to_end(index)
-        while len(self._open) > MAX_OPEN:
-            self._open.popitem(last=False)
-        return self._open[index]
+        sequence = self._open.pop(index, None) or open_scene(self.paths[index], self._options)
+        self._open[index] = sequence  # the last used is the last
+        if len(self._open) > MAX_OPEN:
+            del self._open[next(iter(self._open))]
+        return sequence
 
     def folders(self, index: int) -> set[str]:
         """Return the folder names between the root and a scene, and its own, without opening it."""

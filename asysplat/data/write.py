@@ -53,12 +53,6 @@ def write_transforms(views: Views, folder: Path) -> None:
             steps = np.where(steps > MAX_STEP, 0, steps).astype(np.uint16)  # beyond it: unknown
             Image.fromarray(steps).save(folder / "depth" / name)
         frames.append(frame | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
-    # Intrinsics shared by all frames are written once, at the top.
-    for name in ("fl_x", "fl_y", "cx", "cy"):
-        if len({frame[name] for frame in frames}) == 1:
-            top[name] = frames[0][name]
-            for frame in frames:
-                del frame[name]
     target.write_text(json.dumps(top | {"frames": frames}, indent=1))
 
 

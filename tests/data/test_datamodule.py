@@ -126,13 +126,6 @@ def test_no_scene_is_evaluated_by_two_processes(scenes, processes):
     assert sum(map(len, having)) == len(set().union(*having)) == scenes
 
 
-def test_another_seed_gives_other_tasks():
-    first, other = TrainingTasks(procedural())[0], TrainingTasks(procedural(seed=6))[0]
-    assert first["scene"] != other["scene"]
-    again = TrainingTasks(procedural())[0]
-    assert torch.equal(first["targets"].images, again["targets"].images)
-
-
 def test_augmented_tasks_are_repeated_by_their_seed():
     plain, varied = (
         TrainingTasks(procedural(augmentation=augmentation))
@@ -141,6 +134,7 @@ def test_augmented_tasks_are_repeated_by_their_seed():
             Augmentation(reverse=0.5, shuffle=0.5, crop=0.5, exposure=0.5, noise=0.02),
         )
     )
+    assert varied[0]["scene"] != TrainingTasks(procedural(seed=6))[0]["scene"]
     orders = set()
     for index in range(6):
         straight, first, again = plain[index], varied[index], varied[index]
@@ -190,22 +184,6 @@ def test_fixed_tasks_stay_loaded_up_to_a_limit(monkeypatch):
     assert [len(sequence.decoded) for sequence in sequences] == [3, 3, 6]
 
 
-def test_evaluation_scenes_are_never_trained_on():
-    data = set_up(procedural())
-    evaluated = {sample["scene"] for split in data.evaluation.values() for sample in split}
-    trained_on = {TrainingTasks(data)[i]["scene"] for i in range(5)}
-    assert len(evaluated) == 2 and not evaluated & trained_on
-
-
-def test_inputs_are_normalized_and_batches_stack():
-    tasks = TrainingTasks(procedural())
-    batch = collate([tasks[0], tasks[1]])
-    centers = batch["inputs"].cameras.centers
-    assert centers.shape == (2, 3, 3)
-    torch.testing.assert_close(centers.norm(dim=-1).amax(1), torch.ones(2))
-    torch.testing.assert_close(centers.mean(1), torch.zeros(2, 3), atol=1e-5, rtol=0)
-
-
 def test_a_test_set_differs_only_in_its_options():
     data = set_up(with_test_sets({"rooms": {"places": "rooms"}, "more_views": {"inputs": 5}}))
     assert list(data.tests) == ["procedural", "rooms", "more_views"]
@@ -222,9 +200,6 @@ def test_a_set_of_one_kind_of_place(places):
     source = ProceduralSource(16, 16, 24, (12, 24), val_scenes=2, test_scenes=3, places=places)
     tasks = source.evaluation("val", 3, 2) + source.evaluation("test", 3, 2)
     tasks += [source.training(3, 2, np.random.default_rng(seed)) for seed in range(3)]
-    # Nothing in a room is as far as 12 m, and the sky is 60 m away.
-    farthest = [task.sequence.views(task.selection.targets).depths.max() for task in tasks]
-    assert all((depth < 12) == (places == "rooms") for depth in farthest)
     seeds = [int(task.sequence.name.removeprefix(f"{places}-")) for task in tasks]
     assert [seed % 3 for seed in seeds] == 2 * [1] + 3 * [2] + 3 * [0]
 

@@ -63,19 +63,6 @@ def test_undistorted_dots_lie_on_a_straight_grid(lens):
     assert np.abs(distort(np.array([20.0, 20.0]), lens) - 20).max() > 2
 
 
-def test_straight_lines_are_straight_after_undistortion():
-    position = distort(pixel_centers(160, 120), BARREL)
-    # The distorted image of a vertical edge at x = 30.5, by fixed-point iteration.
-    straight = pixel_centers(160, 120)
-    for _ in range(30):
-        straight = straight - (distort(straight, BARREL) - pixel_centers(160, 120))
-    assert np.abs(position - pixel_centers(160, 120)).max() > 4
-    photograph = np.clip(straight[..., 0] - 30, 0, 1).astype(np.float32)
-    found = undistort(photograph, BARREL)
-    edges = np.array([np.interp(0.5, row[:60], np.arange(60) + 0.5) for row in found[10:-10]])
-    assert np.abs(edges - 30.5).max() < 0.2
-
-
 def test_nearest_undistortion_mixes_no_values_and_is_zero_outside():
     stored = np.random.default_rng(0).integers(1, 9, (60, 80)).astype(np.float32)
     pincushion = Lens(**WIDE, distortion=(0.3, 0.0, 0.0, 0.0, 0.0))
@@ -139,21 +126,16 @@ def test_depth_keeps_sixteen_bits_and_mask_is_nonzero(tmp_path):
     assert load_mask(tmp_path / "mask.png").tolist() == [[False, True, True]]
 
 
-def test_a_text_file_is_refused(tmp_path):
-    (tmp_path / "text.png").write_text("not an image")
-    with pytest.raises(InputError, match=r"text\.png cannot be read"):
-        image_size(tmp_path / "text.png")
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_a_cut_off_file_is_refused_when_opened(tmp_path, suffix):
     cut = tmp_path / f"cut{suffix}"
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
     Image.fromarray(noise).save(cut)
-    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size // 2])
-    for read in (image_size, load_image):
-        with pytest.raises(InputError, match=rf"cut\{suffix} cannot be read"):
-            read(cut)
+    for damaged in (cut.read_bytes()[: cut.stat().st_size // 2], b"not an image"):
+        cut.write_bytes(damaged)
+        for read in (image_size, load_image):
+            with pytest.raises(InputError, match=rf"cut\{suffix} cannot be read"):
+                read(cut)
 
 
 def test_depth_maps_and_images_are_not_confused(tmp_path):

@@ -53,9 +53,6 @@ class Matches:
     def select(self, index: Bool[Tensor, " M"] | Int[Tensor, " N"] | slice) -> "Matches":
         return Matches(self.indices[index], self.points[index])
 
-    def of(self, pair: tuple[int, int]) -> "Matches":
-        return self.select((self.indices == torch.tensor(pair)).all(-1))
-
 
 def find_matches(sequence: ImageSequence, console: Console | None = None) -> Matches:
     """Match up to MAX_PAIRS pairs of images, spread evenly over the sequence.

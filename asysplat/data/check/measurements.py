@@ -1,19 +1,15 @@
-"""Measure a scene's pixels, camera path, sparse points and depth maps."""
+"""Measure a scene's pixels and depth maps."""
 
 from statistics import fmean
 
 import torch
-from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
-from torch import Tensor
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.check.matches import Matches, epipolar_distances, triangulate
 from asysplat.data.sequence import FileSequence, ImageSequence
-from asysplat.scene import Cameras
 
-POSE_TOLERANCE = 1e-6  # of equal poses: share of the path's extent, and entries of the rotation
 MAX_EPIPOLAR_ERROR = 1.0  # pixels, of a match whose depth is compared
 MIN_RAY_ANGLE = 1.5  # degrees between the rays of such a match
 
@@ -38,37 +34,6 @@ def read_pixels(
                     shares.setdefault(name, []).append(float((values > 0).double().mean()))
     bad.report(sequence.name, len(intact))
     return sequence.with_images(intact), {name: fmean(each) for name, each in shares.items()}
-
-
-def measure_path(
-    cameras: Cameras,
-) -> tuple[float, Float[Tensor, " steps"], Float[Tensor, " steps"], int]:
-    """Measure the path of the cameras, in the order of the images.
-
-    Returns:
-        The longest side of the box around all cameras, and the distance from image to image, in
-        scene units; the rotation from image to image, in degrees; and the number of images with the
-        pose of an earlier image.
-    """
-    centers = cameras.centers.double()
-    rotations = cameras.cam_to_world[:, :3, :3].double()
-    # From the chord, since an arccosine is not precise for small angles.
-    chords = (rotations[1:] - rotations[:-1]).flatten(1).norm(dim=-1)
-    turns = torch.rad2deg(2 * torch.arcsin((chords / 8**0.5).clamp(max=1)))
-    extent = (centers.amax(0) - centers.amin(0)).max()
-    poses = torch.cat((centers / extent.clamp(min=1e-12), rotations.flatten(1)), 1)
-    equal = torch.cdist(poses, poses, compute_mode="donot_use_mm_for_euclid_dist") < POSE_TOLERANCE
-    repeated = int(equal.tril(-1).any(1).sum())
-    return float(extent), (centers[1:] - centers[:-1]).norm(dim=-1), turns, repeated
-
-
-def shared_points(cameras: Cameras, points: Float[Tensor, "P 3"]) -> float:
-    """Return the share of points (float64) inside two images or more, in front of the cameras."""
-    views = torch.zeros(len(points), dtype=torch.int64)
-    for view in range(cameras.num_views):
-        _, _, inside = cameras.select([view]).to(torch.float64).project(points)
-        views += inside[0]
-    return float((views >= 2).double().mean())
 
 
 def compare_depths(sequence: ImageSequence, matches: Matches) -> tuple[float, int]:

@@ -50,9 +50,42 @@ def common_mistakes(names: Sequence[str]) -> list[Mistake]:
     Mistakes with a factor to fit are not listed: see `other_resolution` and `other_focal`.
     """
     resolutions = [other_resolution(factor) for factor in RESOLUTIONS]
+    exchange = "exchange them, and check whether the photographs were turned to stand upright"
+    exchanged = {
+        "cx and cy": lambda focal, center: (focal, center.flip(-1)),
+        "fx and fy": lambda focal, center: (focal.flip(-1), center),
+        "fx and fy, cx and cy": lambda focal, center: (focal.flip(-1), center.flip(-1)),
+    }
+    lenses = [_of_lenses(f"{pair} are exchanged", exchange, exchanged[pair]) for pair in exchanged]
     axes = _swapped_axes()
-    inverses = [_inverse(), *(_inverse(mistake) for mistake in axes)]
-    return [*resolutions, *_swapped_intrinsics(), *axes, *inverses, *_partial(), *_orders(names)]
+    inverse = _of_poses(
+        "world-to-camera matrices were taken for camera-to-world",
+        "invert them",
+        lambda r, c: (r.mT, -(r.mT @ c[..., None])[..., 0]),
+    )
+    both = [
+        Mistake(
+            f"{inverse.name}, and {each.name}",
+            f"{inverse.fix}; then {each.fix}",
+            lambda cameras, correct=each.correct: correct(inverse.correct(cameras)),
+        )
+        for each in axes
+    ]
+    rotations_or_positions = [
+        _of_poses(
+            "the rotations are transposed, the positions are not",
+            "transpose the 3x3 rotations alone",
+            lambda r, c: (r.mT, c),
+        ),
+        _of_poses(
+            "the translations of world-to-camera were taken for positions",
+            "with R of camera-to-world, positions are -R t",
+            lambda r, c: (r, -(r @ c[..., None])[..., 0]),
+        ),
+        _of_poses("the positions are negated", "negate them", lambda r, c: (r, -c)),
+    ]
+    poses = [*axes, inverse, *both, *rotations_or_positions]
+    return [*resolutions, *lenses, *poses, *_orders(names)]
 
 
 def other_resolution(factor: float) -> Mistake:
@@ -74,16 +107,6 @@ def other_focal(factor: float) -> Mistake:
     )
 
 
-def _swapped_intrinsics() -> list[Mistake]:
-    changes = {
-        "cx and cy": lambda focal, center: (focal, center.flip(-1)),
-        "fx and fy": lambda focal, center: (focal.flip(-1), center),
-        "fx and fy, cx and cy": lambda focal, center: (focal.flip(-1), center.flip(-1)),
-    }
-    fix = "exchange them, and check whether the photographs were turned to stand upright"
-    return [_of_lenses(f"{name} are exchanged", fix, change) for name, change in changes.items()]
-
-
 def _swapped_axes() -> list[Mistake]:
     """List all other orders and signs of the three axes.
 
@@ -95,62 +118,31 @@ def _swapped_axes() -> list[Mistake]:
         axes = zip(order, signs, strict=True)
         columns = tuple((EXPECTED if sign > 0 else OPPOSITES)[axis] for axis, sign in axes)
         # Changing all three signs is the same mistake as negating the positions.
-        if columns not in (EXPECTED, OPPOSITES):
-            mistakes.append(_axes(order, signs, columns))
+        if columns in (EXPECTED, OPPOSITES):
+            continue
+        # Column j as read is the correct column order[j], times signs[j].
+        turn = torch.zeros(3, 3, dtype=torch.float64)
+        turn[range(3), order] = torch.tensor(signs, dtype=turn.dtype)
+        mirror = torch.linalg.det(turn).round()
+        exchanged = [axis for column, axis in enumerate(order) if column != axis]
+        if columns in CONVENTIONS:
+            name = f"{CONVENTIONS[columns]} axes were taken for OpenCV's, or the reverse"
+        elif exchanged:
+            letters = " and ".join("xyz"[axis] for axis in sorted(exchanged))
+            name = f"the cameras' axes {letters} are exchanged"
+        else:
+            negative = (axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
+            name = f"the cameras' {' and '.join(negative)} point the wrong way"
+        fix = f"the columns of cam_to_world as read point {', '.join(columns)}; make them "
+        fix += ", ".join(EXPECTED)
+        if mirror < 0:
+            fix += ", and mirror the positions as well, since the world is left-handed"
+
+        def correct(r: Tensor, c: Tensor, turn: Tensor = turn, mirror: Tensor = mirror) -> tuple[Tensor, Tensor]:
+            return mirror * r @ turn, mirror * c
+
+        mistakes.append(_of_poses(name, fix, correct))
     return mistakes
-
-
-def _axes(order: tuple[int, ...], signs: tuple[int, ...], columns: tuple[str, ...]) -> Mistake:
-    # Column j as read is the correct column order[j], times signs[j].
-    turn = torch.zeros(3, 3, dtype=torch.float64)
-    turn[range(3), order] = torch.tensor(signs, dtype=turn.dtype)
-    mirror = torch.linalg.det(turn).round()
-    exchanged = [axis for column, axis in enumerate(order) if column != axis]
-    if columns in CONVENTIONS:
-        name = f"{CONVENTIONS[columns]} axes were taken for OpenCV's, or the reverse"
-    elif exchanged:
-        letters = " and ".join("xyz"[axis] for axis in sorted(exchanged))
-        name = f"the cameras' axes {letters} are exchanged"
-    else:
-        letters = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
-        name = f"the cameras' {letters} point the wrong way"
-    fix = f"the columns of cam_to_world as read point {', '.join(columns)}; make them "
-    fix += ", ".join(EXPECTED)
-    if mirror < 0:
-        fix += ", and mirror the positions as well, since the world is left-handed"
-    return _of_poses(name, fix, lambda r, c: (mirror * r @ turn, mirror * c))
-
-
-def _inverse(axes: Mistake | None = None) -> Mistake:
-    inverse = _of_poses(
-        "world-to-camera matrices were taken for camera-to-world",
-        "invert them",
-        lambda r, c: (r.mT, -(r.mT @ c[..., None])[..., 0]),
-    )
-    if axes is None:
-        return inverse
-    return Mistake(
-        f"{inverse.name}, and {axes.name}",
-        f"{inverse.fix}; then {axes.fix}",
-        lambda cameras: axes.correct(inverse.correct(cameras)),
-    )
-
-
-def _partial() -> list[Mistake]:
-    """List mistakes in the rotations alone or in the positions alone."""
-    return [
-        _of_poses(
-            "the rotations are transposed, the positions are not",
-            "transpose the 3x3 rotations alone",
-            lambda r, c: (r.mT, c),
-        ),
-        _of_poses(
-            "the translations of world-to-camera were taken for positions",
-            "with R of camera-to-world, positions are -R t",
-            lambda r, c: (r, -(r @ c[..., None])[..., 0]),
-        ),
-        _of_poses("the positions are negated", "negate them", lambda r, c: (r, -c)),
-    ]
 
 
 def _orders(names: Sequence[str]) -> list[Mistake]:

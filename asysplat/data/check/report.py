@@ -10,12 +10,7 @@ from rich.console import Console
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.check.matches import Matches, epipolar_distances, find_matches, triangulate
-from asysplat.data.check.measurements import (
-    compare_depths,
-    measure_path,
-    read_pixels,
-    shared_points,
-)
+from asysplat.data.check.measurements import compare_depths, read_pixels
 from asysplat.data.check.mistakes import Mistake, common_mistakes, other_focal, other_resolution
 from asysplat.data.images import Lens, content_hash
 from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
@@ -32,8 +27,7 @@ MIN_RAY_ANGLE = 1.0  # degrees; below it, noise decides on which side two rays m
 MAX_FACTOR = 10.0  # fitted factors lie between 1 / MAX_FACTOR and MAX_FACTOR
 TRIALS = 41  # factors tried, coarsely and then finely
 FIT_STRIDE = 3  # one match in so many is used to fit them
-MAX_LENSES = 3  # printed one by one
-MAX_DAMAGED = 10  # printed one by one
+MAX_LENSES = 3  # printed, the most common ones
 DEPTH_AGREEMENT = (0.8, 1.25)  # median of depth maps over triangulated depths without advice
 
 NO_MISTAKE_FOUND = (
@@ -173,42 +167,26 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
     size = (round(lens.height * scale), round(lens.width * scale))
     sequence, known = read_pixels(FileSequence(scene, SceneOptions(*size)), bad, console)
     matches = find_matches(sequence, console)
-    files = [image.file for image in sequence.scene.images]
-    verdict = diagnose_cameras(sequence.cameras, matches, [str(file) for file in files])
-    rows = [
-        *_describe_files(sequence, known),
-        ("depth maps", _describe_depths(sequence, known, matches, verdict)),
-        *_at_most(MAX_DAMAGED, "left out", bad.errors),
-        *_describe_fit(matches, verdict.fit),
-    ]
-    return Report(sequence, rows, matches, verdict)
-
-
-def _describe_files(sequence: FileSequence, known: dict[str, float]) -> Iterator[tuple[str, str]]:
     images, points = sequence.scene.images, sequence.points
-    identical = len(images) - len({content_hash(image.file) for image in images})
-    same = f", {identical} with the same file as another" if identical else ""
-    yield "images", f"{len(images)}{same}"
-    lenses = Counter(image.lens for image in images).most_common()
-    yield from _at_most(
-        MAX_LENSES, "lens", [f"{count} of {_describe_lens(lens)}" for lens, count in lenses]
-    )
-    extent, steps, turns, repeated = measure_path(sequence.cameras)
-    yield "path", f"{extent:.4g} wide"
-    step = f"{steps.median():.3g} in the median, {steps.max():.3g} at most"
-    yield "a step", f"{step}; {turns.median():.2g}° in the median, {turns.max():.3g}° at most"
-    if repeated:
-        yield "", f"{repeated} images with the pose of an earlier image"
-    shared = points is not None and shared_points(sequence.cameras, torch.tensor(points).double())
-    inside = f"in front of and inside two views or more: {shared:.1%}"
-    yield "points", "none" if points is None else f"{len(points)}, {inside}"
-    yield "masks", f"{known['masks']:.1%} of the pixels are kept" if "masks" in known else "none"
-
-
-def _describe_lens(lens: Lens) -> str:
-    kind = " fisheye" if lens.fisheye else " distorted" if lens.is_distorted else ""
-    numbers = f"fx {lens.fx:.5g}, fy {lens.fy:.5g}, cx {lens.cx:.5g}, cy {lens.cy:.5g}"
-    return f"{lens.width} x {lens.height}{kind}: {numbers}"
+    verdict = diagnose_cameras(sequence.cameras, matches, [str(image.file) for image in images])
+    rows = [("images", str(len(images)))]
+    if identical := len(images) - len({content_hash(image.file) for image in images}):
+        rows.append(("", f"{identical} with the same file as another"))
+    for lens, count in Counter(image.lens for image in images).most_common(MAX_LENSES):
+        kind = " fisheye" if lens.fisheye else " distorted" if lens.is_distorted else ""
+        numbers = f"fx {lens.fx:.5g}, fy {lens.fy:.5g}, cx {lens.cx:.5g}, cy {lens.cy:.5g}"
+        rows.append(("lens", f"{count} of {lens.width} x {lens.height}{kind}: {numbers}"))
+    masks = f"{known['masks']:.1%} of the pixels are kept" if "masks" in known else "none"
+    depths = _describe_depths(sequence, known, matches, verdict)
+    rows += [("points", "none" if points is None else str(len(points)))]
+    rows += [("masks", masks), ("depth maps", depths)]
+    rows += [("left out", sentence) for sentence in bad.errors]
+    rows += [("matches", f"{len(matches)} of {len(matches.pairs)} pairs of images")]
+    if fit := verdict.fit:
+        text = f"{fit.error:.2f} px in the median, {fit.under_1px:.0%} under 1 px"
+        behind = f"; {fit.behind_camera:.0%} lie behind a camera"
+        rows.append(("epipolar error", text + (behind if fit.behind_camera >= 0.01 else "")))
+    return Report(sequence, rows, matches, verdict)
 
 
 def _describe_depths(
@@ -220,21 +198,6 @@ def _describe_depths(
     ratio, points = compare_depths(sequence, matches)
     if points:
         text += f"; {ratio:.3f} of the triangulated depths of {points} points"
-    if verdict.fits and not DEPTH_AGREEMENT[0] < ratio < DEPTH_AGREEMENT[1]:
-        text += f": divide the unit of depth by {ratio:.4g}"
+        if verdict.fits and not DEPTH_AGREEMENT[0] < ratio < DEPTH_AGREEMENT[1]:
+            text += f": divide the unit of depth by {ratio:.4g}"
     return text
-
-
-def _describe_fit(matches: Matches, fit: Fit | None) -> Iterator[tuple[str, str]]:
-    yield "matches", f"{len(matches)} of {len(matches.pairs)} pairs of images"
-    if fit is not None:
-        text = f"{fit.error:.2f} px in the median, {fit.under_1px:.0%} under 1 px"
-        behind = f"; {fit.behind_camera:.0%} lie behind a camera"
-        yield "epipolar error", text + (behind if fit.behind_camera >= 0.01 else "")
-
-
-def _at_most(count: int, name: str, texts: Sequence[str]) -> Iterator[tuple[str, str]]:
-    for text in texts[:count]:
-        yield name, text
-    if len(texts) > count:
-        yield "", f"and {len(texts) - count} more"

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+import torch
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -85,7 +86,7 @@ def _draw_path(report: Report, above: Axes, side: Axes) -> None:
 def _draw_pair(report: Report, pair: tuple[int, int], plots: Sequence[Axes]) -> None:
     sequence = report.sequence
     height, width = sequence.cameras.height, sequence.cameras.width
-    matches = report.matches.of(pair)
+    matches = report.matches.select((report.matches.indices == torch.tensor(pair)).all(-1))
     left_to_right = matches.points[:, 0, 0].argsort()
     matches = matches.select(left_to_right[spread(range(len(matches)), MAX_LINES)])
     lines = epipolar_lines(sequence.cameras.to(torch.float64), matches)

@@ -89,7 +89,14 @@ class ProceduralScene:
             add_clutter(plan, rng)
             polish(plan, rng)
         fov = rng.uniform(*(VARIED_FOV if varied else FOV))
-        self.cameras = _cameras(poses, fov, height, width).to(device)
+        # Centered, with square pixels, and `fov` along the longer side.
+        focal = max(height, width) / 2 / np.tan(np.radians(fov) / 2)
+        matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        intrinsics, cam_to_world = (
+            torch.as_tensor(values, dtype=torch.float32) for values in (matrix, poses)
+        )
+        intrinsics = intrinsics.repeat(num_images, 1, 1)
+        self.cameras = Cameras(intrinsics, cam_to_world, height, width).to(device)
         self._antialiased = varied
         self._world = World(plan, rng, self.cameras.intrinsics.device)
         self._expose()
@@ -144,12 +151,3 @@ class ProceduralScene:
         levels = levels.clamp(min=MIN_LIGHT).log()
         self._gamma = CONTRAST / levels.std()
         self._threshold = self._gamma * levels.mean() - BRIGHTNESS
-
-
-def _cameras(poses: np.ndarray, fov: float, height: int, width: int) -> Cameras:
-    """Return centered cameras with square pixels, and `fov` degrees along the longer side."""
-    focal = max(height, width) / 2 / np.tan(np.radians(fov) / 2)
-    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    intrinsics = torch.as_tensor(matrix, dtype=torch.float32)
-    cam_to_world = torch.as_tensor(poses, dtype=torch.float32)
-    return Cameras(intrinsics.repeat(len(poses), 1, 1), cam_to_world, height, width)

@@ -91,11 +91,7 @@ class World:
     def _surface_color(
         self, points: Points, directions: Points, surface: Surface, widths: PerRay, cone: Cone
     ) -> Points:
-        """Compute the linear color of points, from the directions of rays in one cone.
-
-        Args:
-            widths: of a pixel at each point, meters.
-        """
+        """Compute the linear color of points; `widths` are those of a pixel there, in meters."""
         rows = self._surfaces.index_select(1, surface)
         along_u, along_v, offset, flat, curvature, material = rows.split((3, 3, 2, 3, 1, 16))
         normals = torch.where(curvature > 0, (points - flat) * curvature, flat)
@@ -111,7 +107,13 @@ class World:
         color = albedo(self._lattice, material, uv, footprint) * light
         if self._glossy:
             gloss, shininess = material[-2:]
-            highlight = gloss * self._half_cosine(points, normals, directions) ** shininess
+            # Cosine between the normal and the half vector of eye and light (Blinn, 1977).
+            to_light = self._light - points
+            half = to_light * (to_light * to_light).sum(0).rsqrt()
+            half = half - directions * (directions * directions).sum(0).rsqrt()
+            cosine = (normals * half).sum(0).clamp(min=0)
+            cosine = cosine * (half * half).sum(0).clamp(min=TINY).rsqrt()
+            highlight = gloss * cosine**shininess
             color = color + self._irradiance * (direct * highlight)
         return color
 
@@ -174,11 +176,7 @@ class World:
         )
 
     def _openness(self, points: Points, normals: Points, cone: Cone) -> PerRay:
-        """Compute the share of the ambient light that arrives.
-
-        It depends on the distance from a point above the surface to the nearest object; to the
-        ground, the vertical distance.
-        """
+        """Compute the share of the ambient light that arrives: less near other objects."""
         points = points + OCCLUSION_DISTANCE * normals
         if self._room is not None:
             shell = self._room.distance(points)
@@ -189,13 +187,6 @@ class World:
         gap = torch.minimum(shell, torch.minimum(boxes.distance(points), spheres.distance(points)))
         gap = gap / OCCLUSION_DISTANCE
         return MIN_AMBIENT + (1 - MIN_AMBIENT) * gap.clamp(0, 1)
-
-    def _half_cosine(self, points: Points, normals: Points, directions: Points) -> PerRay:
-        """Return the cosine between normal and half vector of eye and light (Blinn, 1977)."""
-        to_light = self._light - points
-        half = to_light * (to_light * to_light).sum(0).rsqrt()
-        half = half - directions * (directions * directions).sum(0).rsqrt()
-        return (normals * half).sum(0).clamp(min=0) * (half * half).sum(0).clamp(min=TINY).rsqrt()
 
     def _sky_color(self, points: Points) -> Points:
         """Blend from a pale horizon to a blue zenith, with clouds."""
@@ -208,22 +199,17 @@ class World:
 
 
 def _padded_rays(mask: Bool[Tensor, " R"]) -> Index:
-    """Return the indices of the rays in the mask, the last repeated up to a whole block.
-
-    Torch sums the end of a row in another order; padding keeps every ray's rounding the same.
-    """
+    """Return the indices of the rays in the mask, the last repeated up to a whole block."""
     rays = mask.nonzero()[:, 0]
+    # Torch sums the end of a row in another order; padding keeps every ray's rounding the same.
     return torch.cat((rays, rays[-1:].expand(-len(rays) % BLOCK)))
 
 
 def _surface_rows(
     plan: FloorPlan, axes: Float[np.ndarray, "B 3 3"], rng: Generator
 ) -> Float[np.ndarray, "S K"]:
-    """Return a row for each box's three pairs of faces, each sphere, and the walls or the ground.
-
-    Columns: the texture's two axes and its offset; normal and 0 for flat surfaces, center and
-    1 / radius for spheres; the material.
-    """
+    """Return a row for each pair of faces of a box, each sphere, and each wall or the ground."""
+    # The texture's axes and offset; normal and 0, or center and 1 / radius; the material.
     rows = []
 
     def add(u, v, normal, curvature: float, material: Material) -> None:

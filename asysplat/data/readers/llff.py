@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from asysplat.data.bad_images import BadImages
@@ -37,7 +36,26 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     `images_4` and `images_8` that holds one image per row.
     """
     file = scene / POSES
-    rows = _read_rows(file)
+    try:
+        rows = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(
+            f"{file} cannot be read as a NumPy array ({error}): copy or write it again."
+        ) from error
+    if not isinstance(rows, ndarray) or rows.ndim != 2 or rows.shape[1] != COLUMNS:
+        content = rows.shape if isinstance(rows, ndarray) else "no array"
+        raise InputError(f"{file} holds {content}: expected a row of {COLUMNS} numbers per image.")
+    if rows.dtype.kind not in "fiu":
+        raise InputError(f"{file} holds values of type {rows.dtype}: expected numbers.")
+    rows = rows.astype(np.float64)
+    files = {name: images_in(scene / name) for name in FOLDERS}
+    fitting = next((images for images in files.values() if len(images) == len(rows)), None)
+    if fitting is None:
+        counts = ", ".join(f"{len(images)} in {name}/" for name, images in files.items() if images)
+        raise InputError(
+            f"{file} has {len(rows)} rows, but the images there are {counts or 'none'}: "
+            f"give one image per row, in one of {', '.join(FOLDERS)}."
+        )
 
     def read(index: int, image: Path) -> PosedImage:
         where, size = f"{file}, row {index} ({image.name})", image_size(image)
@@ -52,32 +70,5 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         pose[:3] = np.stack((right, down, -backward, center), axis=-1)
         return PosedImage(image, scaled(lens, size, where), rigid(pose, where))
 
-    images = bad.read_each(read, enumerate(_images(file, len(rows))))
+    images = bad.read_each(read, enumerate(fitting))
     return PosedScene(scene.name, images, partial(points_beside, scene, images))
-
-
-def _read_rows(file: Path) -> Float[ndarray, "N 17"]:
-    try:
-        rows = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(
-            f"{file} cannot be read as a NumPy array ({error}): copy or write it again."
-        ) from error
-    if not isinstance(rows, ndarray) or rows.ndim != 2 or rows.shape[1] != COLUMNS:
-        content = rows.shape if isinstance(rows, ndarray) else "no array"
-        raise InputError(f"{file} holds {content}: expected a row of {COLUMNS} numbers per image.")
-    if rows.dtype.kind not in "fiu":
-        raise InputError(f"{file} holds values of type {rows.dtype}: expected numbers.")
-    return rows.astype(np.float64)
-
-
-def _images(file: Path, count: int) -> list[Path]:
-    folders = {name: images_in(file.parent / name) for name in FOLDERS}
-    for images in folders.values():
-        if len(images) == count:
-            return images
-    counts = ", ".join(f"{len(images)} in {name}/" for name, images in folders.items() if images)
-    raise InputError(
-        f"{file} has {count} rows, but the images there are {counts or 'none'}: "
-        f"give one image per row, in one of {', '.join(FOLDERS)}."
-    )

@@ -11,7 +11,6 @@ from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers import common
 from asysplat.data.readers.colmap import points_beside
-from asysplat.data.readers.common import read_text
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -27,10 +26,10 @@ def find_scenes(root: Path) -> list[Path]:
     if not root.is_file():
         return common.folders_with(root, CAMERAS)
     if root.suffix == ".txt":
-        lines = [line.strip() for line in read_text(root).splitlines() if line.strip()]
+        lines = [line.strip() for line in common.read_text(root).splitlines() if line.strip()]
         files = [root.parent / line for line in lines]
         return files if all(file.suffix == ".json" for file in files) else []
-    return [root] if root.suffix == ".json" and '"w2c"' in read_text(root) else []
+    return [root] if root.suffix == ".json" and '"w2c"' in common.read_text(root) else []
 
 
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:
@@ -46,18 +45,15 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         image = file.parent / entry["file_path"]
         size = image_size(image)
         pose = common.inverted(common.rigid(entry.get("w2c"), f"{where}: w2c"))
-        return PosedImage(image, common.scaled(_lens(entry, where), size, where), pose)
+        try:
+            given = (round(entry["w"]), round(entry["h"]))
+            lens = Lens(*given, *(float(entry[name]) for name in ("fx", "fy", "cx", "cy")))
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise InputError(
+                f"{where} needs the numbers w, h, fx, fy, cx and cy in pixels: one is missing or "
+                f"not a number ({error!r})."
+            ) from error
+        return PosedImage(image, common.scaled(lens, size, where), pose)
 
     images = bad.read_each(read, enumerate(common.read_frames(file)["frames"]))
     return PosedScene(file.parent.name, images, partial(points_beside, file.parent, images))
-
-
-def _lens(entry: dict[str, Any], where: str) -> Lens:
-    try:
-        width, height = (round(entry[name]) for name in ("w", "h"))
-        return Lens(width, height, *(float(entry[name]) for name in ("fx", "fy", "cx", "cy")))
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(
-            f"{where} needs the numbers w, h, fx, fy, cx and cy in pixels: one is missing or not a "
-            f"number ({error!r})."
-        ) from error

@@ -17,8 +17,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from numpy import ndarray
 from torch import Tensor
 
 from asysplat.data.bad_images import BadImages
@@ -52,10 +50,40 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     entry = _load(chunk).get(key)
     if entry is None:
         raise InputError(f"{chunk} has no scene {key}: name another chunk.")
-    cameras, images = _checked(entry, scene)
+    cameras, images = entry.get("cameras"), entry.get("images")
+    if not isinstance(cameras, Tensor) or cameras.ndim != 2 or cameras.shape[1] != NUMBERS:
+        kind = tuple(cameras.shape) if isinstance(cameras, Tensor) else type(cameras).__name__
+        raise InputError(f"{scene}: cameras is {kind}: give a tensor [V, {NUMBERS}].")
+    if not isinstance(images, list) or len(images) != len(cameras):
+        kind = len(images) if isinstance(images, list) else type(images).__name__
+        raise InputError(
+            f"{scene} has {len(cameras)} cameras and images is {kind}: give a list of as many."
+        )
+    cameras = cameras.double().numpy()
 
     def read(index: int, image: Any) -> PosedImage:
-        return _read_image(cameras[index], image, f"{scene}, frame {index}")
+        where, camera = f"{scene}, frame {index}", cameras[index]
+        if not isinstance(image, Tensor) or image.dtype != torch.uint8 or image.ndim != 1:
+            raise InputError(f"{where}: its image is no uint8 tensor [bytes]: give a JPEG's bytes.")
+        encoded = EncodedImage(where, image.numpy())
+        width, height = image_size(encoded)
+        fx, fy, cx, cy, *unused = camera[:6].tolist()
+        if not np.isfinite(camera[:6]).all() or min(fx, fy) <= 0:
+            raise InputError(
+                f"{where}: its intrinsics are {camera[:4].tolist()}: give fx, fy > 0, cx and cy in "
+                "widths and heights of the image."
+            )
+        if any(unused):
+            raise InputError(
+                f"{where}: numbers 5 and 6 of its camera are {unused}: they must be 0, so "
+                "undistort the images."
+            )
+        world_to_cam = np.vstack((camera[6:].reshape(3, 4), (0, 0, 0, 1)))
+        return PosedImage(
+            file=encoded,
+            lens=Lens(width, height, fx * width, fy * height, cx * width, cy * height),
+            cam_to_world=inverted(rigid(world_to_cam, f"{where}: its world-to-camera")),
+        )
 
     return PosedScene(key, bad.read_each(read, enumerate(images)))
 
@@ -105,41 +133,3 @@ def _load_once(chunk: Path, modified: int) -> dict[str, dict[str, Any]]:
             f'{chunk} is no list of scenes, each with a "key": give a chunk of pixelSplat\'s form.'
         )
     return {scene["key"]: scene for scene in scenes}
-
-
-def _checked(entry: dict[str, Any], scene: Path) -> tuple[Float[ndarray, "V 18"], list[Any]]:
-    """Return a scene's cameras and images, checked to be equally many."""
-    cameras, images = entry.get("cameras"), entry.get("images")
-    if not isinstance(cameras, Tensor) or cameras.ndim != 2 or cameras.shape[1] != NUMBERS:
-        kind = tuple(cameras.shape) if isinstance(cameras, Tensor) else type(cameras).__name__
-        raise InputError(f"{scene}: cameras is {kind}: give a tensor [V, {NUMBERS}].")
-    if not isinstance(images, list) or len(images) != len(cameras):
-        kind = len(images) if isinstance(images, list) else type(images).__name__
-        raise InputError(
-            f"{scene} has {len(cameras)} cameras and images is {kind}: give a list of as many."
-        )
-    return cameras.double().numpy(), images
-
-
-def _read_image(camera: Float[ndarray, "18"], image: Any, where: str) -> PosedImage:
-    if not isinstance(image, Tensor) or image.dtype != torch.uint8 or image.ndim != 1:
-        raise InputError(f"{where}: its image is no uint8 tensor [bytes]: give a JPEG's bytes.")
-    encoded = EncodedImage(where, image.numpy())
-    width, height = image_size(encoded)
-    fx, fy, cx, cy, *unused = camera[:6].tolist()
-    if not np.isfinite(camera[:6]).all() or min(fx, fy) <= 0:
-        raise InputError(
-            f"{where}: its intrinsics are {camera[:4].tolist()}: give fx, fy > 0, cx and cy in "
-            "widths and heights of the image."
-        )
-    if any(unused):
-        raise InputError(
-            f"{where}: numbers 5 and 6 of its camera are {unused}: they must be 0, so undistort "
-            "the images."
-        )
-    world_to_cam = np.vstack((camera[6:].reshape(3, 4), (0, 0, 0, 1)))
-    return PosedImage(
-        file=encoded,
-        lens=Lens(width, height, fx * width, fy * height, cx * width, cy * height),
-        cam_to_world=inverted(rigid(world_to_cam, f"{where}: its world-to-camera")),
-    )

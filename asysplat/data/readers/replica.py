@@ -35,7 +35,15 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     parameters = next((file for file in files if file.is_file()), None)
     if parameters is None:
         raise InputError(f"{files[1]} does not exist: copy it there from Replica.zip.")
-    lens, depth_unit = _camera(parameters)
+    content = read_json(parameters)
+    camera = content.get("camera") if isinstance(content, dict) else None
+    if not isinstance(camera, dict):
+        raise InputError(f'{parameters} has no "camera": copy it again from Replica.zip.')
+    names = ("w", "h", "fx", "fy", "cx", "cy", "scale")
+    width, height, fx, fy, cx, cy, scale = (number(camera, n, str(parameters)) for n in names)
+    if min(width, height, fx, fy, scale) <= 0:
+        raise InputError(f"{parameters}: w, h, fx, fy and scale of its camera must be above 0.")
+    lens = Lens(round(width), round(height), fx, fy, cx + HALF_A_PIXEL, cy + HALF_A_PIXEL)
     trajectory, results = scene / TRAJECTORY, scene / "results"
     if not trajectory.is_file():
         raise InputError(f"{trajectory} does not exist: name a room's folder.")
@@ -63,21 +71,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
             lens=lens,
             cam_to_world=rigid(pose, f"{trajectory}, row {index + 1}"),
             depth=beside(depth, size, str(image)) if has_depths else None,
-            depth_unit=depth_unit,
+            depth_unit=1 / scale,
         )
 
     return PosedScene(scene.name, bad.read_each(read, enumerate(rows)))
-
-
-def _camera(file: Path) -> tuple[Lens, float]:
-    """Read the lens of all images, and the meters of a depth step."""
-    content = read_json(file)
-    camera = content.get("camera") if isinstance(content, dict) else None
-    if not isinstance(camera, dict):
-        raise InputError(f'{file} has no "camera": copy it again from Replica.zip.')
-    names = ("w", "h", "fx", "fy", "cx", "cy", "scale")
-    width, height, fx, fy, cx, cy, scale = (number(camera, name, str(file)) for name in names)
-    if min(width, height, fx, fy, scale) <= 0:
-        raise InputError(f"{file}: w, h, fx, fy and scale of its camera must be above 0.")
-    lens = Lens(round(width), round(height), fx, fy, cx + HALF_A_PIXEL, cy + HALF_A_PIXEL)
-    return lens, 1 / scale

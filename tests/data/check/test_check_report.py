@@ -163,9 +163,3 @@ def test_poses_sorted_as_strings_are_named(real):
         replace(cameras, cam_to_world=cameras.cam_to_world[order]), matches, names
     )
     assert "sorted by their numbers, the poses as strings" in verdict.sentence
-
-
-def test_too_few_matches_give_no_diagnosis(real):
-    cameras, matches, names = real
-    verdict = diagnose_cameras(cameras, matches.select(slice(0, 50)), names)
-    assert not verdict.fits and "only 50 points" in verdict.sentence

@@ -1,4 +1,4 @@
-"""Epipolar distances, triangulation, paths and points on known answers."""
+"""Epipolar distances and triangulation on known answers."""
 
 from dataclasses import replace
 
@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from asysplat.data.check.matches import Matches, epipolar_distances, epipolar_lines, triangulate
-from asysplat.data.check.measurements import measure_path, shared_points
 from asysplat.scene import Cameras
 
 HEIGHT, WIDTH = 120, 160
@@ -78,24 +77,3 @@ def test_points_behind_have_negative_depth(cameras, points):
     matches, depths = seen(cameras, 0, 1, -points)
     assert depths.max() < 0
     torch.testing.assert_close(triangulate(cameras, matches)[0], depths)
-
-
-def test_a_path_is_measured():
-    poses = torch.eye(4).repeat(5, 1, 1)
-    poses[:, 0, 3] = torch.tensor([0.0, 1, 3, 3, 3])
-    turn = torch.deg2rad(torch.tensor([0.0, 0, 0.5, 30, 0.5]))
-    poses[:, 0, 0], poses[:, 2, 2] = turn.cos(), turn.cos()
-    poses[:, 0, 2], poses[:, 2, 0] = turn.sin(), -turn.sin()
-    cameras = Cameras(torch.eye(3).repeat(5, 1, 1), poses, HEIGHT, WIDTH)
-    extent, steps, turns, repeated = measure_path(cameras)
-    assert (extent, steps.tolist(), repeated) == (3, [1, 2, 0, 0], 1)
-    assert turns.tolist() == pytest.approx([0, 0.5, 29.5, 29.5], rel=1e-4)
-
-
-def test_points_are_counted_where_they_are_seen():
-    poses = torch.eye(4).repeat(3, 1, 1)
-    poses[2, 2, 3] = 5  # its camera stands behind the points
-    lens = torch.tensor([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
-    cameras = Cameras(lens.repeat(3, 1, 1), poses, HEIGHT, WIDTH)
-    points = torch.tensor([[0, 0, 4], [3.1, 0, 4], [3.3, 0, 4], [0, 0, 6]]).double()
-    assert shared_points(cameras, points) == 0.75

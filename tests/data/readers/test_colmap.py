@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from layouts import assert_listed, cut, opener, save_image
 from layouts import colmap as layout
+from layouts import cut, opener, save_image
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens
@@ -180,15 +180,6 @@ def test_a_warning_lists_images_that_are_not_registered(scene, views):
     assert len(posed.images) == 12
 
 
-def test_all_bad_images_are_listed_or_left_out(scene):
-    (scene / "images/4.png").unlink()
-    cut(scene / "images/7.png")
-    edit(scene / "sparse/0/images.txt", lambda text: text.replace(" 10.png", " gone/10.png"))
-    messages = ("gone/10.png does not exist", "4.png does not exist", "7.png cannot be read")
-    (scene / "images/10.png").unlink()
-    assert_listed(opened, scene, *messages[1:], messages[0], total=12)
-
-
 @pytest.mark.parametrize("binary", [False, True])
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("part", [0.35, 0.7, 0.95])
@@ -239,13 +230,6 @@ def test_a_model_without_points_or_images(scene):
     (scene / "sparse/0/images.txt").write_text("")
     with pytest.raises(InputError, match="registers no image"):
         read(scene)
-
-
-def test_points_beside_images_of_the_same_world(scene, views):
-    images = read(scene).images
-    points = colmap.points_beside(scene, images[3:8])
-    np.testing.assert_allclose(points, layout.points_of(views), atol=1e-9)
-    assert colmap.points_beside(scene / "images", images) is None
 
 
 @pytest.mark.parametrize("change", ["moved", "scaled", "turned", "other images"])

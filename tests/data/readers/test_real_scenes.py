@@ -60,14 +60,3 @@ def test_views_and_points_are_read(scene):
         ratio = (depths[both] / views.depths[both]).log()
         assert ratio.abs().median() < 0.03
         assert (ratio > 0.1).float().mean() < 0.05  # occluded points are left out
-
-
-def test_points_are_in_front_of_the_cameras(scene):
-    posed = read(colmap, scene)
-    counts = []
-    for image in posed.images:
-        world_to_cam, lens = np.linalg.inv(image.cam_to_world), image.lens
-        x, y, z = world_to_cam[:3, :3] @ posed.points.T + world_to_cam[:3, 3:]
-        inside = (abs(lens.fx * x / z) < lens.cx) & (abs(lens.fy * y / z) < lens.cy)
-        counts.append(((z > 0) & inside).sum())
-    assert min(counts) > 20
