@@ -16,7 +16,7 @@ from rich.console import Console
 
 from asysplat.benchmark.compare import compare, read_old
 from asysplat.benchmark.options import describe_machine, find_suite
-from asysplat.benchmark.output import write_results
+from asysplat.benchmark.table import write_results
 from asysplat.errors import InputError, input_error_behind
 from asysplat.interrupts import keep_interrupts
 from asysplat.overrides import exit_at_unknown_overrides

@@ -50,8 +50,6 @@ NETWORK, VIEWS, VIEW_SIDE = "asysplat_plane_sweep", 4, 64
 
 
 class Pair(NamedTuple):
-    """A workload and its baseline."""
-
     name: str
     over: str  # what the baseline is
     workload: Run
@@ -135,11 +133,8 @@ class RecordProducts(TorchDispatchMode):
 def measure(options: DictConfig, console: Console) -> Result:
     """Time every workload and its baseline one after the other, in `options.repeats` rounds.
 
-    On one thread, in processor time: other programs on the machine do not count.
-
-    Returns:
-        "rows": of each workload its "seconds", those of its "baseline", and the
-        "ratio" of both in the same round.
+    On one thread, in processor time: other programs on the machine do not count. "rows" have the
+    "seconds", those of the "baseline", and the "ratio" of both in the same round.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -59,9 +59,8 @@ def measure(options: DictConfig, console: Console) -> Result:
 
     Returns:
         "scene": frames, the photographs' and the views' sizes; "open": seconds to open the scene;
-        "loading": frames a second without a cache on disk and with a filled one; "network": frames
-        a second that training would take, without rendering. All with median and interquartile
-        range.
+        "loading": frames a second without a cache on disk and with a filled one; "network": those
+        that training would take, without rendering.
     """
     device, config = find_device(options.device), options.data
     net, size = make_net(MODEL, config.overrides, device)
@@ -100,10 +99,11 @@ def measure(options: DictConfig, console: Console) -> Result:
             time_in_rounds([timed], options.repeats)
     rates = {name: summary([1 / s for s in timed.seconds[name]]) for name in (*CACHES, "network")}
     network = rates["network"]["median"]
-    loading = []
-    for name in CACHES:
-        row = {"cache": name, "frames_per_second": rates[name]}
-        loading.append(row | {"over_network": rates[name]["median"] / network})
+    loading = [
+        {"cache": name, "frames_per_second": rates[name]}
+        | {"over_network": rates[name]["median"] / network}
+        for name in CACHES
+    ]
     scene = {"frames": config.frames, "photographs": list(config.photographs)}
     scene |= {"views": [height, width], "workers": config.num_workers}
     results = {"scene": scene, "open": timed.summary("open")}
@@ -111,27 +111,19 @@ def measure(options: DictConfig, console: Console) -> Result:
 
 
 def tables(results: Result) -> list[Table]:
-    """Show the seconds to open a scene, and the frames a second of each state of the cache."""
-    scene, opened = results["scene"], results["open"]
-    each = opened["median"] / scene["frames"]
+    """Show the frames a second of each state of the cache, and the seconds to open a scene."""
+    scene = results["scene"]
     columns = {
-        "frames": text("{frames}"),
-        "ms, no pixel read": spread("open"),
-        "ms / frame": number("each", "{:.2f}", unit=1e-3),
-    }
-    loading_columns = {
         "cache on disk": text("{cache}"),
         "frames / s": spread("frames_per_second", "{:.0f}", unit=1.0),
         "loading\n/ network": number("over_network", "{:.1f}"),
     }
     photographs, views = ("x".join(map(str, scene[name])) for name in ("photographs", "views"))
-    network = spread("network", "{:.0f}", unit=1.0)(results)
     notes = (
         f"{machine_note(results)}\n"
         f"photographs of {photographs} for views of {views}, by {scene['workers']} workers\n"
-        f"the network alone takes {network} frames / s in training"
+        f"opening a scene of {scene['frames']}: {spread('open')(results)} ms, no pixel read\n"
+        f"the network alone takes {spread('network', '{:.0f}', unit=1.0)(results)} frames / s in "
+        "training"
     )
-    return [
-        make_table("Opening a scene", columns, [scene | {"open": opened, "each": each}]),
-        make_table("Loading training tasks", loading_columns, results["loading"], notes),
-    ]
+    return [make_table("Loading training tasks", columns, results["loading"], notes)]

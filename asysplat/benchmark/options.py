@@ -5,7 +5,8 @@ import platform
 import re
 from collections.abc import Iterable
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
@@ -61,7 +62,4 @@ def describe_machine() -> dict[str, str | int]:
     }
     if torch.cuda.is_available():
         machine["gpu"] = torch.cuda.get_device_name()
-    try:
-        return machine | {"triton": version("triton")}
-    except PackageNotFoundError:
-        return machine
+    return machine | ({"triton": version("triton")} if find_spec("triton") else {})

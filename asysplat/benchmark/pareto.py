@@ -111,11 +111,7 @@ class FeedForward:
         return self.checkpoint is not None
 
     def prepare(self, refinement: DictConfig, device: torch.device) -> RenderScene:
-        """Load the network; return the function that renders a scene on the device.
-
-        Raises:
-            InputError: no such file or override, or weights that do not fit.
-        """
+        """Load the network, if its weights fit; return the function that renders a scene."""
         net = _load_network(self.checkpoint, tuple(self.overrides))
         dtype = torch.float64 if self.precision == EXACT else torch.float32
         if (device, dtype) != (CPU, torch.float32):
@@ -162,11 +158,7 @@ class Refined:
             )
 
     def prepare(self, refinement: DictConfig, device: torch.device) -> RenderScene:
-        """Read the settings; return the function that renders a scene on the CPU.
-
-        Raises:
-            InputError: an unknown setting or one out of range.
-        """
+        """Check the settings; return the function that renders a scene on the CPU."""
         try:
             settings = instantiate(OmegaConf.merge(refinement, dict(self.refinement)))
         except (OmegaConfBaseException, InstantiationException, TypeError, ValueError) as error:
@@ -378,10 +370,8 @@ def decibels(image: Tensor, exact: Tensor) -> float:
 def measure(options: DictConfig, console: Console) -> Result:
     """Render the held-out views of `options.pareto.scenes` with every knob.
 
-    By a network's prediction ("feed_forward"), by untrained networks of other layers
-    ("networks"), by a refinement of so many steps ("refined") or seconds ("reconstruct"). All
-    settings of a family take turns on a scene, in `options.repeats` rounds; those of seconds run
-    once.
+    All settings of a family take turns on a scene, in `options.repeats` rounds; those of seconds
+    run once.
 
     Returns:
         "rows": one for each family, scene and setting: "seconds", their ratio to the base's of the

@@ -1,15 +1,23 @@
-"""The tables of all suites: a column is a heading and a function that writes its cells."""
+"""The tables of all suites, and the files that they are written to.
 
+A column is a heading and a function that writes its cells.
+"""
+
+import json
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from rich.box import ROUNDED
 from rich.table import Table
 
 from asysplat.benchmark.timing import BUSY, Result
+from asysplat.files import atomic_write
 from asysplat.report.markdown import escape
 
 NOTHING = "-"  # for what was not measured
+WIDTH = 100  # characters of a line of JSON, above which a dictionary or list is split
 Write = Callable[[Result], str]
 Columns = Mapping[str, Write]
 
@@ -89,3 +97,40 @@ def error(path: str) -> Write:
         return f"{worst(row, path):.1e}{'*' if smaller else ''}"
 
     return write
+
+
+def dumps(value: Any, indent: str = "") -> str:
+    """Write JSON with each row of a list, and each dictionary of plain values, on one line.
+
+    Raises:
+        ValueError: a number is NaN or infinite.
+    """
+    line = json.dumps(value, allow_nan=False)
+    items = value.values() if isinstance(value, dict) else value
+    if len(line) <= WIDTH or not any(isinstance(item, dict | list) for item in items):
+        return line
+    if isinstance(value, list):
+        rows = [f"{indent} {json.dumps(row)}" for row in value]
+        return "\n".join(["[", ",\n".join(rows), f"{indent}]"])
+    rows = [f"{indent} {json.dumps(k)}: {dumps(v, indent + ' ')}" for k, v in value.items()]
+    return "\n".join(["{", ",\n".join(rows), f"{indent}}}"])
+
+
+def write_results(
+    results: Result, tables: Sequence[Table], figure: Figure | None, path: Path
+) -> list[Path]:
+    """Write <path>.json, <path>.md and, of a figure, <path>.png; return their paths.
+
+    Raises:
+        InputError: a file cannot be written.
+        ValueError: a result is NaN or infinite.
+    """
+    texts = {".json": dumps(results) + "\n", ".md": "\n".join(map(markdown, tables))}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for suffix, content in texts.items():
+        with atomic_write(path.with_suffix(suffix)) as partial:
+            partial.write_text(content)
+    if figure is not None:
+        with atomic_write(path.with_suffix(".png")) as partial:
+            figure.savefig(partial, dpi=150)
+    return [path.with_suffix(s) for s in (*texts, ".png") if s in texts or figure is not None]

@@ -51,8 +51,3 @@ def test_a_workload_that_became_slower_is_named(monkeypatch):
     assert compare(old, old, bench.WATCHED).worse == []
     (worse,) = compare(old, measure(monkeypatch, 8, 32), bench.WATCHED).worse
     assert worse.startswith("slower: 1/once, ratio: ")
-
-
-def test_the_table_has_every_workload(monkeypatch):
-    (table,) = bench.tables(measure(monkeypatch, 1, 1))
-    assert [list(column.cells) for column in table.columns][:2] == [["0", "1"], ["its once"] * 2]

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from asysplat.benchmark.compare import compare
 from asysplat.benchmark.options import find_suite
-from asysplat.benchmark.output import dumps
+from asysplat.benchmark.table import dumps
 
 # Cells as they were published; a suite's later columns may be empty in an older file.
 CELLS = {

@@ -6,22 +6,14 @@ from types import SimpleNamespace
 import pytest
 from matplotlib.figure import Figure
 
+from asysplat.benchmark import compare as kinds
 from asysplat.benchmark import options
-from asysplat.benchmark.compare import (
-    DECIBELS,
-    ERROR,
-    RATE,
-    RATIO,
-    TIME,
-    Watched,
-    compare,
-    read_old,
-)
+from asysplat.benchmark.compare import Watched, compare, read_old
 from asysplat.benchmark.table import make_table, spread, text
 from asysplat.errors import InputError
 
-KINDS = {"seconds": TIME, "rate": RATE, "ratio": RATIO, "wrong": ERROR, "none": ERROR}
-KINDS |= {"psnr": DECIBELS}
+KINDS = {"seconds": kinds.TIME, "rate": kinds.RATE, "ratio": kinds.RATIO}
+KINDS |= dict.fromkeys(("wrong", "none"), kinds.ERROR) | {"psnr": kinds.DECIBELS}
 WATCHED = Watched(("scene", "part"), ("size",), KINDS)
 MACHINE = {"cpu": "one", "cores": 2, "threads": 2, "torch": "2.11"}
 

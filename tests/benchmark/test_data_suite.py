@@ -21,7 +21,7 @@ def test_rows_are_complete_and_consistent(run_suite):
     network = results["network"]["median"]
     for row in results["loading"]:
         assert row["over_network"] == pytest.approx(row["frames_per_second"]["median"] / network)
-    assert [len(table.rows) for table in tables(results)] == [1, 2]
+    assert [len(table.rows) for table in tables(results)] == [2]
 
 
 def test_synthetic_photographs_are_different_files_of_one_scene(tmp_path):

@@ -20,21 +20,13 @@ FOCALS = {"fisheye-like": 0.15, "wide": 0.4, "telescopic": 50.0}  # in image wid
 
 @dataclass(frozen=True)
 class HostileViews:
-    """Views with one or more hostile properties.
+    """Views with one or more hostile properties."""
 
-    Args:
-        images: one of IMAGES.
-        poses: one of POSES.
-        focal: focal length, in image widths.
-        count: number of views.
-        side: pixels along each side.
-    """
-
-    images: str = "noise"
-    poses: str = "on an arc"
-    focal: float = FOCAL
-    count: int = 4
-    side: int = 32
+    images: str = "noise"  # one of IMAGES
+    poses: str = "on an arc"  # one of POSES
+    focal: float = FOCAL  # focal length, in image widths
+    count: int = 4  # views
+    side: int = 32  # pixels along each side
 
     def views(self) -> Views:
         """Make the views [V] of a scene, float32; the same numbers at every call."""

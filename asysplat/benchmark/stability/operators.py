@@ -64,11 +64,10 @@ def _compare(
     operator: Callable, output: str, inputs: Tensors, leaves: tuple[str, ...], **options
 ) -> Result:
     """Compare the default backend of an operator with the reference."""
-
-    def run(backend: str, tensors: Tensors) -> Tensors:
-        return {output: operator(**tensors, backend=backend)}
-
-    fast, exact = partial(run, "auto"), partial(run, "reference")
+    fast, exact = (
+        lambda tensors, backend=backend: {output: operator(**tensors, backend=backend)}
+        for backend in ("auto", "reference")
+    )
     return compare_to_reference(fast, exact, inputs, leaves, **options)
 
 
