@@ -69,7 +69,25 @@ def fill_table(
         # For each seed the newest run, first among those tested on all of the data.
         row_runs = {run.seed: run for run in sorted(same, key=lambda run: run.covers(read))}
         used += row_runs.values()
-        rows.append(_fill_row(row, table, row_config, row_runs, list(map(int, seeds)), sets))
+        values: dict[str, list[Number]] = {}
+        for column in table.columns:
+            if column.key in OPTIONS:
+                numbers = [OmegaConf.select(row_config, OPTIONS[column.key])] if row_runs else []
+            else:
+                key = _result_key(column.key, row, sets)
+                numbers = [row_runs[seed].results.get(key) for seed in sorted(row_runs)]
+                numbers = [number for number in numbers if number is not None]
+            if numbers:
+                values[column.key] = numbers
+        missing = ", ".join(str(seed) for seed in map(int, seeds) if seed not in row_runs)
+        note = f"seeds still to run: {missing}" if values and missing else ""
+        if row.post_optimization and not values:
+            note = "not run: python evaluate.py run=... adds post-optimization to a finished run"
+        row = replace(row, values=values, note=note)
+        if values:
+            revisions = tuple(sorted({run.revision for run in row_runs.values()}))
+            row = replace(row, seeds=tuple(sorted(row_runs)), revisions=revisions)
+        rows.append(row)
     data = config.data
     height, width = data.test_size or (data.height, data.width)
     stages = ", then ".join(describe_stage(stage) for stage in stage_configs(config))
@@ -104,35 +122,6 @@ def _costs(compose: Compose, run: tuple[str, ...], views: int, size: tuple[int, 
     with torch.device("meta"):
         net = instantiate(config.model)
     return static_costs(net, views, *size)
-
-
-def _fill_row(
-    row: PaperRow,
-    table: PaperTable,
-    config: DictConfig,
-    runs: dict[int, Run],
-    seeds: Sequence[int],
-    sets: dict[str, str],
-) -> PaperRow:
-    values: dict[str, list[Number]] = {}
-    for column in table.columns:
-        if column.key in OPTIONS:
-            numbers = [OmegaConf.select(config, OPTIONS[column.key])] if runs else []
-        else:
-            key = _result_key(column.key, row, sets)
-            numbers = [runs[seed].results.get(key) for seed in sorted(runs)]
-            numbers = [number for number in numbers if number is not None]
-        if numbers:
-            values[column.key] = numbers
-    missing = ", ".join(str(seed) for seed in seeds if seed not in runs)
-    note = ""
-    if values and missing:
-        note = f"seeds still to run: {missing}"
-    elif row.post_optimization and not values:
-        note = "not run: python evaluate.py run=... adds post-optimization to a finished run"
-    used = runs if values else {}
-    revisions = tuple(sorted({run.revision for run in used.values()}))
-    return replace(row, values=values, seeds=tuple(sorted(used)), revisions=revisions, note=note)
 
 
 def _result_key(column: str, row: PaperRow, sets: dict[str, str]) -> str | None:

@@ -33,9 +33,8 @@ def protocol_notes(filled: PaperTable) -> list[Note]:
 
 def rho_text(filled: PaperTable) -> str:
     """Format Spearman's rho of the column that the table is ranked by."""
-    if filled.ranked_column is None:
-        return "-"
-    rho, rows, signal = rank_agreement(filled, filled.ranked_column.key)
+    column = filled.ranked_column
+    rho, rows, signal = rank_agreement(filled, column.key) if column else (None, 0, None)
     if rho is None:
         return "-"
     return f"{rho:.2f}{'?' if signal is None or signal < CLEAR_SIGNAL else ''} ({rows} rows)"

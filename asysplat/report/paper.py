@@ -16,21 +16,13 @@ Costs = dict[str, Number]  # see `static_costs`
 
 @dataclass(frozen=True)
 class Column:
-    """One kind of number.
+    """One kind of number."""
 
-    Args:
-        key: "parameters", "gflops", ..., or "<test set>/<metric>" such as "dl3dv/psnr".
-        kind: of number, as printed, such as "PSNR".
-        better: "higher" or "lower"; None if neither is.
-        format: of one number in `unit`, as for str.format.
-        unit: the value of the unit in `kind`, such as 1e6 for (M).
-    """
-
-    key: str
-    kind: str
-    better: str | None
-    format: str
-    unit: float = 1.0
+    key: str  # "parameters", "gflops", ..., or "<test set>/<metric>" such as "dl3dv/psnr"
+    kind: str  # as printed, such as "PSNR"
+    better: str | None  # "higher" or "lower"; None if neither is
+    format: str  # of one number in `unit`, as for str.format
+    unit: float = 1.0  # the value of the unit in `kind`, such as 1e6 for (M)
 
     @property
     def test_set(self) -> str:
@@ -50,44 +42,28 @@ class Column:
 
 @dataclass(frozen=True)
 class PaperRow:
-    """One method of a table.
+    """One method of a table, with our numbers once it is filled."""
 
-    Args:
-        name: as the paper prints it, with what distinguishes it from the table's other rows.
-        numbers: column key -> the paper's number.
-        run: overrides of train.py that give it; None for a method that is only quoted.
-        views, size: input views, height and width for its costs.
-        bounds: column key -> the bound that the paper prints in place of a number: "<1".
-        post_optimization: steps on the Gaussians; such rows need evaluate.py.
-        test_set: of our run, in place of the one that `our_sets` gives; None for that one.
-        unverified: why this row's architecture may differ from the paper's; None if it is known.
-        readings: the other architectures that the paper's text allows: name -> overrides.
-
-    Ours, once filled:
-        costs: at the paper's scale; None if not requested, and for quoted rows.
-        reading_costs: one for each of `readings`, or empty if not requested.
-        values: column key -> measured numbers, one for each seed; a column without any is left out.
-        seeds: of the runs.
-        revisions: of the code of the runs, see `asysplat.training.revision`.
-        note: a remark on this row, such as "seeds still to run: 2".
-    """
-
-    name: str
-    numbers: dict[str, float]
-    run: tuple[str, ...] | None
-    views: int
-    size: tuple[int, int]
+    name: str  # as printed, with what distinguishes it from the table's other rows
+    numbers: dict[str, float]  # column key -> the paper's number
+    run: tuple[str, ...] | None  # overrides of train.py; None for a method that is only quoted
+    views: int  # input views for its costs
+    size: tuple[int, int]  # height and width for its costs
+    # Column key -> the bound that the paper prints in place of a number: "<1"
     bounds: dict[str, str] = field(default_factory=dict)
-    post_optimization: int = 0
-    test_set: str | None = None
-    unverified: str | None = None
+    post_optimization: int = 0  # steps on the Gaussians; such rows need evaluate.py
+    test_set: str | None = None  # of our run, in place of the one that `our_sets` gives
+    unverified: str | None = None  # why its architecture may differ from the paper's
+    # The other architectures that the paper's text allows: name -> overrides
     readings: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    costs: Costs | None = None
-    reading_costs: tuple[Costs, ...] = ()
+
+    costs: Costs | None = None  # at the paper's scale; None if not requested, and for quoted rows
+    reading_costs: tuple[Costs, ...] = ()  # one for each of `readings`, or empty if not requested
+    # Column key -> measured numbers, one for each seed; a column without any is left out
     values: dict[str, list[Number]] = field(default_factory=dict)
-    seeds: tuple[int, ...] = ()
-    revisions: tuple[str, ...] = ()
-    note: str = ""
+    seeds: tuple[int, ...] = ()  # of the runs
+    revisions: tuple[str, ...] = ()  # of the code of the runs, see `asysplat.training.revision`
+    note: str = ""  # a remark on this row, such as "seeds still to run: 2"
 
     @property
     def label(self) -> str:
@@ -106,32 +82,21 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One table of the paper, or one of ours, and the sweep of the same key that reproduces it.
+    """One table of the paper, or one of ours, and the sweep of the same key that reproduces it."""
 
-    Args:
-        key: name of the file in sweeps/.
-        number: in the paper, such as "6b" or "A3"; None for a table of ours.
-        title: what it compares.
-        protocol: how the paper measured it.
-        columns, rows: in the paper's order.
-        rank_by: key of the column whose order is compared with the paper's; None without one.
-
-    Ours, once filled:
-        sets: the paper's test set -> ours that is compared with it.
-        metrics: the protocols of our metrics, a sentence for each; several if runs differ.
-        notes: label -> how our numbers were made: Ours (the scale), Not tested (the paper's test
-            sets whose path no run was given), Baselines, Data, Machine, Command; "" if unknown.
-    """
-
-    key: str
-    number: str | None
-    title: str
-    protocol: str
+    key: str  # name of the file in sweeps/
+    number: str | None  # in the paper, such as "6b" or "A3"; None for a table of ours
+    title: str  # what it compares
+    protocol: str  # how the paper measured it
     columns: tuple[Column, ...]
-    rows: tuple[PaperRow, ...] = field(repr=False)
-    rank_by: str | None = None
-    sets: dict[str, str] = field(default_factory=dict)
-    metrics: tuple[str, ...] = ()
+    rows: tuple[PaperRow, ...] = field(repr=False)  # in the paper's order
+    rank_by: str | None = None  # key of the column whose order is compared with the paper's
+
+    # Of our numbers
+    sets: dict[str, str] = field(default_factory=dict)  # the paper's test set -> ours
+    metrics: tuple[str, ...] = ()  # the protocols, a sentence for each; several if runs differ
+    # Label -> how they were made: Ours (the scale), Not tested (the paper's test sets whose path no
+    # run was given), Baselines, Data, Machine, Command; "" if unknown
     notes: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -154,15 +119,9 @@ class PaperTable:
 
 
 @cache
-def load_paper() -> dict[str, PaperTable]:
-    """Read every table of the paper; by key, in its order."""
-    return {key: _table(key, entry) for key, entry in _read("paper")["tables"].items()}
-
-
-@cache
-def load_ours() -> dict[str, PaperTable]:
-    """Read every table of ours; by key."""
-    return {key: _table(key, entry) for key, entry in _read("ours")["tables"].items()}
+def load_paper(file: str = "paper") -> dict[str, PaperTable]:
+    """Read every table of the paper, or of the file "ours"; by key, in its order."""
+    return {key: _table(key, entry) for key, entry in _read(file)["tables"].items()}
 
 
 def find_tables(names: str | Sequence[str]) -> list[PaperTable]:
@@ -171,7 +130,7 @@ def find_tables(names: str | Sequence[str]) -> list[PaperTable]:
     Raises:
         InputError: a name that no table has, with the nearest ones.
     """
-    tables = load_paper() | load_ours()
+    tables = load_paper() | load_paper("ours")
     names = names.split(",") if isinstance(names, str) else list(names)
     if names == ["all"]:
         return list(tables.values())

@@ -1,7 +1,6 @@
 """Plot filled tables: ours on the left, the paper's on the right."""
 
 import re
-from collections.abc import Sequence
 
 import matplotlib
 import numpy as np
@@ -10,8 +9,8 @@ from matplotlib.figure import Figure
 from asysplat.report.cells import ARROWS
 from asysplat.report.compare import mean_and_spread
 from asysplat.report.fill import COMPUTED
-from asysplat.report.front import Point, draw_front
-from asysplat.report.paper import Column, Number, PaperRow, PaperTable
+from asysplat.report.front import draw_front
+from asysplat.report.paper import Column, PaperTable
 from asysplat.report.style import FAINT, OURS, PAPER, STYLE
 
 # Tables in which one quantity varies: the meaning of the first number in a row's name.
@@ -108,15 +107,15 @@ def _pareto_plot(filled: PaperTable, quality: Column) -> list[tuple[str, Figure]
     if cost is None:
         return []
 
-    def points(numbers: Sequence[dict[str, Number]]) -> list[Point]:
-        return [
-            (row.label, each[cost.key] / cost.unit, float(each[quality.key]))
-            for row, each in zip(filled.rows, numbers, strict=True)
-            if cost.key in each and quality.key in each
-        ]
-
-    ours = points([_our_numbers(row) for row in filled.rows])
-    paper = points([row.numbers for row in filled.rows])
+    ours, paper = [], []
+    for row in filled.rows:
+        means = {key: mean_and_spread(values)[0] for key, values in row.values.items() if values}
+        # The costs of its network at the paper's scale
+        means |= {key: number for key, number in (row.costs or {}).items() if key in COMPUTED}
+        for points, numbers in ((ours, means), (paper, row.numbers)):
+            if cost.key in numbers and quality.key in numbers:
+                values = numbers[cost.key] / cost.unit, float(numbers[quality.key])
+                points.append((row.label, *values))
     costs = [point[1] for point in ours]
     if len(ours) < 3 or max(costs) / min(costs) < MIN_RANGE:
         return []
@@ -130,9 +129,3 @@ def _pareto_plot(filled: PaperTable, quality: Column) -> list[tuple[str, Figure]
         axes.locator_params(nbins=5)
     caption = f"{quality.kind} against {cost.title()}: no row beats those on the line in both."
     return [(caption, figure)]
-
-
-def _our_numbers(row: PaperRow) -> dict[str, Number]:
-    """Return the means of a row's measurements, and its network's costs at the paper's scale."""
-    means = {key: mean_and_spread(values)[0] for key, values in row.values.items() if values}
-    return means | {key: number for key, number in (row.costs or {}).items() if key in COMPUTED}

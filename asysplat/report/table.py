@@ -1,6 +1,7 @@
 """The template data of a table's section: grids of cells and notes, the same for all renderers."""
 
 import re
+from itertools import groupby
 from typing import NamedTuple
 
 
@@ -28,13 +29,10 @@ class Grid(NamedTuple):
 
     def groups(self) -> list[tuple[str, list[int]]]:
         """Group neighboring columns by title: each title and the numbers of its columns."""
-        groups: list[tuple[str, list[int]]] = []
-        for number, heading in enumerate(self.headings):
-            if heading.part and groups and groups[-1][0] == heading.title:
-                groups[-1][1].append(number)
-            else:
-                groups.append((heading.title, [number]))
-        return groups
+        # A column without parts is a group of its own.
+        keys = [(h.title, -1 if h.part else i) for i, h in enumerate(self.headings)]
+        groups = groupby(range(len(keys)), keys.__getitem__)
+        return [(key[0], list(numbers)) for key, numbers in groups]
 
 
 class Note(NamedTuple):

@@ -13,7 +13,7 @@ from hydra import initialize_config_dir
 from asysplat.evaluation import static_cost
 from asysplat.report.compare import check_costs, fits
 from asysplat.report.fill import fill_table, finished_runs, with_costs
-from asysplat.report.paper import find_tables, load_ours, load_paper
+from asysplat.report.paper import find_tables, load_paper
 from asysplat.training.revision import revision
 from asysplat.training.runs import describe_run, find_run
 from asysplat.training.stages import stage_configs
@@ -226,7 +226,7 @@ def test_broken_results_are_ignored(compose, tmp_path, text):
         assert find_run(tmp_path, config) is None
 
 
-@pytest.mark.parametrize("table", load_ours().values(), ids=lambda table: table.key)
+@pytest.mark.parametrize("table", load_paper("ours").values(), ids=lambda table: table.key)
 def test_rows_of_our_tables_are_those_of_their_sweeps(compose, table):
     varied = dict(compose([f"sweeps={table.key}"]).hydra.sweeper.params)
     varied.pop("seed")

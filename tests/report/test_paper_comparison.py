@@ -8,7 +8,6 @@ from asysplat.report.compare import (
     check_costs,
     cost_errors,
     fits,
-    mean_and_spread,
     pooled_spread,
     rank_agreement,
     spearman,
@@ -31,28 +30,10 @@ def filled(paper: list[float], ours: list[list[float]]) -> PaperTable:
     return PaperTable("t", "1", "title", "protocol", (PSNR,), rows, "dl3dv/psnr")
 
 
-def test_mean_and_spread():
-    assert mean_and_spread([1.0, 2.0, 6.0]) == (3.0, pytest.approx(math.sqrt(7)))
-    assert mean_and_spread([4.5]) == (4.5, None)
-
-
 def test_pooled_spread_weighs_by_degrees_of_freedom():
     # Squares within: 2 of 1 degree, 2 of 2 degrees, none of a single seed.
     assert pooled_spread([[0.0, 2.0], [4.0, 5.0, 6.0], [9.0]]) == pytest.approx(math.sqrt(4 / 3))
     assert pooled_spread([[1.0], [2.0]]) is None
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "rho"),
-    [
-        ([1, 2, 3, 4], [10, 20, 30, 40], 1.0),
-        ([1, 2, 3, 4], [4, 3, 2, 1], -1.0),
-        ([1, 2, 3, 4], [1, 3, 2, 4], 0.8),  # 1 - 6 * 2 / (4 * 15)
-        ([1, 2, 2, 4], [1, 2, 3, 4], math.sqrt(0.9)),  # ranks 1 2.5 2.5 4: 4.5 / sqrt(4.5 * 5)
-    ],
-)
-def test_spearman(first, second, rho):
-    assert spearman(np.array(first), np.array(second)) == pytest.approx(rho)
 
 
 def test_spearman_of_two_rows_or_of_equal_rows_is_none():

@@ -132,17 +132,15 @@ def _adam(kind: str) -> Result:
         gradients *= float(kind)
     inputs = {"parameter": normal(ROWS, 3), "gradients": gradients, "rates": uniform(3)}
     inputs = {name: tensor.float() for name, tensor in inputs.items()}
-    exact = partial(_adam_steps, adam_step_reference)
-    return compare_to_reference(partial(_adam_steps, adam_step), exact, inputs)
 
+    def take_steps(step: Callable[..., int], tensors: Tensors) -> Tensors:
+        parameter = tensors["parameter"].clone()
+        mean, square = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        counts = torch.zeros(ROWS, dtype=torch.int32)
+        for gradient in tensors["gradients"]:
+            rows = Rows(parameter, gradient.contiguous(), mean, square, counts, tensors["rates"])
+            step([rows], torch.ones(ROWS, dtype=torch.bool), ADAM)
+        return {"parameter": parameter}
 
-def _adam_steps(step: Callable[..., int], tensors: Tensors) -> Tensors:
-    """Take all steps of Adam; return the final parameter."""
-    parameter = tensors["parameter"].clone()
-    mean, square = torch.zeros_like(parameter), torch.zeros_like(parameter)
-    counts = torch.zeros(ROWS, dtype=torch.int32)
-    visible = torch.ones(ROWS, dtype=torch.bool)
-    for gradient in tensors["gradients"]:
-        rows = Rows(parameter, gradient.contiguous(), mean, square, counts, tensors["rates"])
-        step([rows], visible, ADAM)
-    return {"parameter": parameter}
+    fast, exact = partial(take_steps, adam_step), partial(take_steps, adam_step_reference)
+    return compare_to_reference(fast, exact, inputs)

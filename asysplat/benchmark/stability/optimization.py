@@ -44,10 +44,7 @@ def training_cases(models: Sequence[str], steps: int) -> Iterator[StabilityCase]
 
 
 def _measure_training(model: str, precision: str, steps: int) -> Result:
-    """Train as train.py does, without writing files, and count non-finite numbers.
-
-    The gradients of a non-finite step are dropped, as in a training.
-    """
+    """Train as train.py does, without writing files; non-finite steps are dropped, as there."""
     overrides = [f"model={model}", "scale=laptop", f"steps={steps}", *SMALL]
     config = hydra.compose("train", overrides)
     torch.manual_seed(0)
