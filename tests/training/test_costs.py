@@ -12,8 +12,7 @@ from torch.utils.data import DataLoader
 
 from asysplat.evaluation import measured_cost
 from asysplat.evaluation.measured_cost import CostMeter, reset_peak_memory
-from asysplat.training import plan
-from asysplat.training.callbacks import Costs
+from asysplat.training.callbacks import Costs, costs
 
 MB = 1_000_000
 # The process's other work was under 1 MB; the tolerance is far below a buffer.
@@ -90,7 +89,7 @@ def test_seconds_of_steps_leave_the_longest_out():
 
 
 def test_what_does_not_fit_is_refused_before_the_first_step(train, monkeypatch, tmp_path):
-    monkeypatch.setattr(plan, "memory_gb", lambda device: 0.001)
+    monkeypatch.setattr(costs, "memory_gb", lambda device: 0.001)
     result = train(COSTS, "steps=1", "validate_every=1", "data.test_sets=null")
     assert result.returncode != 0 and "Traceback" not in result.stderr
     assert "and each process has 0.001 GB: set training.checkpoint_layers=true" in result.stderr

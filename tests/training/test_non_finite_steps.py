@@ -12,7 +12,7 @@ from asysplat.data.datamodule import collate
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 from asysplat.training.callbacks import BadScenes, NonFiniteSteps
-from asysplat.training.non_finite import first_non_finite
+from asysplat.training.callbacks.non_finite_steps import first_non_finite
 
 
 def noise(views, size=4, scale=1.0, name="kitchen"):

@@ -1,5 +1,8 @@
 """Drop, count and report steps with non-finite gradients."""
 
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from functools import partial
 from typing import Any
 
 import lightning
@@ -8,9 +11,8 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from asysplat.errors import InputError
-from asysplat.training.non_finite import first_non_finite
 from asysplat.training.random_states import RandomStates, random_states, set_random_states
-from asysplat.training.side_by_side import split
+from asysplat.training.side_by_side import Batch, split
 
 
 class NonFiniteSteps(lightning.Callback):
@@ -89,3 +91,63 @@ class NonFiniteSteps(lightning.Callback):
 
     def on_train_epoch_end(self, trainer: Any, module: Any) -> None:
         module.log("train/non_finite_steps", float(self.count))
+
+
+def first_non_finite(module: lightning.LightningModule, batch: Batch) -> str | None:
+    """Compute a batch's loss and gradients; name the first tensor that is NaN or infinite.
+
+    The order is: inputs, outputs of modules (inner before outer ones), terms of the loss, gradients
+    at those outputs from the last to the first, gradients of parameters. `module` has
+    `compute_terms(batch, net)`, whose "loss" is minimized; it is left as it was.
+    """
+    names: list[str] = []
+
+    def check(name: str, value: Any) -> None:
+        bad = (part for part, tensor in tensors(value) if not tensor.isfinite().all())
+        names.extend(f"{name}{part}" for part in bad)
+
+    def check_output(name: str, _: Any, __: Any, output: Any) -> None:
+        check(f"the output of {name}", output)
+        for part, tensor in tensors(output):
+            if tensor.requires_grad:
+                tensor.register_hook(partial(check, f"the gradient at the output of {name}{part}"))
+
+    for name in ("inputs", "targets"):
+        check(f"the batch's {name}", batch[name])
+    hooks = [
+        part.register_forward_hook(partial(check_output, name))
+        for name, part in module.named_modules()
+        if name
+    ]
+    buffers = [buffer.clone() for buffer in module.buffers()]
+    try:
+        with torch.enable_grad():
+            terms = module.compute_terms(batch, module.net)
+            for name, term in terms.items():
+                check(f"the term {name} of the loss", term)
+            trained = {name: p for name, p in module.named_parameters() if p.requires_grad}
+            grads = torch.autograd.grad(terms["loss"], list(trained.values()), allow_unused=True)
+    finally:
+        for hook in hooks:
+            hook.remove()
+        for buffer, before in zip(module.buffers(), buffers, strict=True):
+            buffer.copy_(before)
+    for name, grad in reversed(list(zip(trained, grads, strict=True))):
+        check(f"the gradient of {name}", grad)
+    return names[0] if names else None
+
+
+def tensors(value: Any, part: str = "") -> Iterator[tuple[str, Tensor]]:
+    """Yield the path, as ".cameras.intrinsics" or "[0]", and value of each nested float tensor."""
+    if isinstance(value, Tensor):
+        if value.is_floating_point():
+            yield part, value
+    elif is_dataclass(value):
+        for field in fields(value):
+            yield from tensors(getattr(value, field.name), f"{part}.{field.name}")
+    elif isinstance(value, Mapping):
+        for key, each in value.items():
+            yield from tensors(each, f"{part}.{key}")
+    elif isinstance(value, list | tuple):
+        for index, each in enumerate(value):
+            yield from tensors(each, f"{part}[{index}]")
