@@ -20,12 +20,10 @@ class BatchSplit:
     accumulated: int
 
     def __str__(self) -> str:
-        def count(number: int, name: str, plural: str = "s") -> str:
-            return f"{number} {name}{plural if number > 1 else ''}"
-
         total = self.processes * self.micro_batch * self.accumulated
-        factors = f"{count(self.processes, 'process', 'es')} x {count(self.micro_batch, 'scene')}"
-        return f"global batch {total} = {factors} x {self.accumulated} accumulated"
+        processes = f"{self.processes} process{'es' * (self.processes > 1)}"
+        scenes = f"{self.micro_batch} scene{'s' * (self.micro_batch > 1)}"
+        return f"global batch {total} = {processes} x {scenes} x {self.accumulated} accumulated"
 
 
 def split_batch(batch_size: int, micro_batch: int | None, processes: int) -> BatchSplit:

@@ -166,11 +166,8 @@ class SceneDataModule(lightning.LightningDataModule):
         return [self._evaluation_loader(scenes) for scenes in self.tests.values()]
 
     def _evaluation_loader(self, scenes: "FixedTasks") -> DataLoader:
-        """Return this process's scenes, one per batch.
-
-        All processes have equally many batches, or they would wait for each other: one with fewer
-        scenes repeats its last.
-        """
+        """Return this process's scenes, one per batch; one with fewer scenes repeats its last."""
+        # Processes with unequally many batches would wait for each other.
         rank, processes = self._process
         turns = range(-(-len(scenes) // processes))
         last = max(range(rank, len(scenes), processes), default=0)

@@ -142,9 +142,15 @@ class FilesSource:
     targets_may_be_inputs: bool = False
 
     def __post_init__(self):
-        self.scenes = self._folder("root")
         self.split_by_scenes = self.test_root is not None
-        self.test_scenes = self._folder("test_root") if self.split_by_scenes else self.scenes
+        folders = []
+        for key in ("root", "test_root") if self.split_by_scenes else ("root",):
+            root = getattr(self, key)
+            try:
+                folders.append(SceneFolder(root, self.options))
+            except InputError as error:
+                raise InputError(f"data.{key}={root}: {error}") from error
+        self.scenes, self.test_scenes = folders[0], folders[-1]
         if (self.selection == "index") != (self.index is not None):
             raise InputError(
                 f"data.selection is {self.selection} and data.index is {self.index}: give both "
@@ -155,13 +161,6 @@ class FilesSource:
                 "data.on_bad_image=skip changes the numbers of the images that data.index names: "
                 "set it to fail, and fix the images."
             )
-
-    def _folder(self, key: str) -> SceneFolder:
-        root = getattr(self, key)
-        try:
-            return SceneFolder(root, self.options)
-        except InputError as error:
-            raise InputError(f"data.{key}={root}: {error}") from error
 
     def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
         sequence = self.scenes[self._training[rng.integers(len(self._training))]]

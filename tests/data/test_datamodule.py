@@ -220,18 +220,6 @@ def test_an_unusable_test_set_is_named(test_sets, message):
         with_test_sets(test_sets).setup()
 
 
-def test_a_test_set_has_a_size_of_its_own():
-    data = set_up(with_test_sets({"wide": {"height": 24, "width": 40}}))
-    images = {name: scenes[0]["inputs"].images for name, scenes in data.tests.items()}
-    assert images["procedural"].shape[-2:] == (16, 16)
-    assert images["wide"].shape[-2:] == (24, 40)
-    checked = []
-    data.check_sizes(lambda *size: checked.append(size))
-    assert set(checked) == {(16, 16), (24, 40)}
-    with pytest.raises(InputError, match=r"^data\.test_sets\.wide: 40 is too wide\.$"):
-        data.check_sizes(refuse(40))
-
-
 def refuse(refused):
     def check(height, width):
         if width == refused:
@@ -251,8 +239,12 @@ def test_tests_may_have_another_size_than_training():
         assert sample["inputs"].images.shape[-2:] == (16, 16)
     for sample, expected in zip(data.tests["procedural"], small.tests["procedural"], strict=True):
         assert_same_cameras(sample, expected)
-    with pytest.raises(InputError, match=r"^data\.test_size: 48 is too wide"):
-        data.check_sizes(refuse(48))
+    checked = []
+    data.check_sizes(lambda *size: checked.append(size))
+    assert set(checked) == {(16, 16), *sizes.values()}
+    for width, where in ((48, "test_size"), (32, "test_sets.wide")):
+        with pytest.raises(InputError, match=rf"^data\.{where}: {width} is too wide\.$"):
+            data.check_sizes(refuse(width))
 
 
 def test_which_test_sets_are_tested(tmp_path):

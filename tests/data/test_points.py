@@ -116,16 +116,13 @@ def make_data(sequence, points: bool) -> SceneDataModule:
     return SceneDataModule("data", OneTask(sequence), **size, **options)
 
 
-def test_points_are_optional():
+def test_points_are_optional_and_a_scene_without_points_is_reported():
     for asked in (True, False):
         data = make_data(SequenceWithPoints(5), points=asked)
         data.setup()
         samples = [TrainingTasks(data)[0], data.evaluation["test"][0]]
         given = [sample["inputs"].point_depths is not None for sample in samples]
         assert given == [asked, asked]
-
-
-def test_a_scene_without_points_is_reported():
     data = make_data(ProceduralScene(3, SIZE, SIZE, num_images=24), points=True)
     with pytest.warns(UserWarning, match="no sparse points of"):
         data.setup()

@@ -82,20 +82,17 @@ def test_training_is_repeated_by_its_seed_and_its_window_is_clipped():
     assert selected.inputs == [0, 3, 5, 8]
 
 
-def test_too_short_a_sequence_is_refused():
+def test_too_short_a_sequence_or_window_is_refused():
     with pytest.raises(InputError, match=r"has 6 images.*data\.inputs and data\.targets.*6"):
         uniform_selection(6, num_inputs=4, num_targets=3)
-    with pytest.raises(InputError, match="has 6 images"):
-        training_selection(6, 4, 3, (8, 9), np.random.default_rng(0))
-
+    for count, window, message in (
+        *((6, (8, 9), "has 6 images"), (50, (6, 20), r"data\.window")),
+        (50, (20, 10), r"data\.window"),
+    ):
+        with pytest.raises(InputError, match=message):
+            training_selection(count, 4, 3, window, np.random.default_rng(0))
     with pytest.raises(InputError, match=r"data\.inputs is 0"):
         uniform_selection(9, num_inputs=0, num_targets=3)
-
-
-@pytest.mark.parametrize("window", [(6, 20), (20, 10)])
-def test_unusable_window_is_named(window):
-    with pytest.raises(InputError, match=r"data\.window"):
-        training_selection(50, 4, 3, window, np.random.default_rng(0))
 
 
 def test_targets_of_training_may_be_inputs():

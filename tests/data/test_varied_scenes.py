@@ -97,23 +97,16 @@ def turn(angles):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_circle_goes_around_and_looks_inward(seed):
-    poses = hand_held_path(np.random.default_rng(seed), 96, 2.0, circle)
-    centers, gaze = poses[:, :2, 3], poses[:, :2, 2]
+def test_paths_turn_and_advance_as_they_are_named(seed):
+    around, ahead, still = (
+        hand_held_path(np.random.default_rng(seed), 96, 2.0, path)
+        for path in (circle, forward, pan)
+    )
+    centers, gaze = around[:, :2, 3], around[:, :2, 2]
     assert 105 < turn(np.arctan2(*centers.T)) < 290
     assert (-(centers * gaze).sum(1) / np.linalg.norm(centers, axis=1) > 0.75).all()
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_forward_path_advances(seed):
-    poses = hand_held_path(np.random.default_rng(seed), 96, 2.0, forward)
-    way = poses[-1, :3, 3] - poses[0, :3, 3]
+    way = ahead[-1, :3, 3] - ahead[0, :3, 3]
     assert 1.4 < np.linalg.norm(way) < 4.2
-    assert (poses[:, :3, 2] @ way / np.linalg.norm(way) > 0.6).all()
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_pan_turns_nearly_on_the_spot(seed):
-    poses = hand_held_path(np.random.default_rng(seed), 96, 2.0, pan)
-    assert 45 < turn(np.arctan2(*poses[:, :2, 2].T)) < 130
-    assert np.ptp(poses[:, :3, 3], axis=0).max() < 1.1
+    assert (ahead[:, :3, 2] @ way / np.linalg.norm(way) > 0.6).all()
+    assert 45 < turn(np.arctan2(*still[:, :2, 2].T)) < 130
+    assert np.ptp(still[:, :3, 3], axis=0).max() < 1.1

@@ -6,7 +6,6 @@ import pytest
 import torch
 from PIL import Image
 
-from asysplat.data import SceneOptions, open_scene
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
@@ -39,15 +38,6 @@ def test_files_follow_the_format(views, tmp_path):
     assert steps.dtype == np.uint16
     depth = steps * content["depth_unit_scale_factor"]
     assert np.abs(depth - views.depths[1].numpy()).max() <= 0.5e-3 + 1e-5
-
-
-def test_the_reader_round_trips(views, tmp_path):
-    write_transforms(views, tmp_path)
-    read = open_scene(tmp_path, SceneOptions(12, 16)).views([0, 1, 2])
-    for name in ("cam_to_world", "intrinsics"):
-        torch.testing.assert_close(getattr(read.cameras, name), getattr(views.cameras, name))
-    torch.testing.assert_close(read.images, views.images, atol=0.51 / 255, rtol=0)
-    torch.testing.assert_close(read.depths, views.depths, atol=0.51e-3, rtol=0)
 
 
 def test_depths_beyond_16_bits_are_unknown(views, tmp_path):

@@ -27,7 +27,13 @@ def find_scenes(root: Path) -> list[Path]:
     Scenes that users made with nerfstudio have a folder `images`.
     """
     folders = folders_with(root, TRANSFORMS, f"{BENCHMARK}/{TRANSFORMS}")
-    return [folder for folder in folders if _is_scene(folder)]
+    scenes = []
+    for folder in folders:
+        content, names = _content(folder), (folder.name, folder.parent.name)
+        hashed = any(re.fullmatch("[0-9a-f]{64}", name) for name in names)
+        if (hashed or not (content / "images").is_dir()) and _images(content) is not None:
+            scenes.append(folder)
+    return scenes
 
 
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:
@@ -62,9 +68,3 @@ def _content(scene: Path) -> Path:
 
 def _images(folder: Path) -> str | None:
     return next((name for name in IMAGES if (folder / name).is_dir()), None)
-
-
-def _is_scene(folder: Path) -> bool:
-    content = _content(folder)
-    hashed = any(re.fullmatch("[0-9a-f]{64}", name) for name in (folder.name, folder.parent.name))
-    return (hashed or not (content / "images").is_dir()) and _images(content) is not None

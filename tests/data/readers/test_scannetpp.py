@@ -171,20 +171,14 @@ def test_a_bad_image_is_named_or_left_out(iphone, damage, message):
     assert_listed(opened, iphone, message)
 
 
-def test_images_that_were_not_extracted_are_refused(iphone):
-    (iphone / "rgb").rename(iphone / "frames")
-    (iphone / "rgb.mkv").write_bytes(b"")
-    with pytest.raises(InputError, match=r"rgb does not exist: extract rgb.mkv .*ffmpeg"):
-        opened(iphone)
-
-
-def test_masks_that_were_not_downloaded_are_refused(dslr):
+def test_incomplete_downloads_are_refused(iphone, dslr):
     edit_json(dslr / UNDISTORTED, lambda content: content.update(has_mask=True))
     with pytest.raises(InputError, match="resized_undistorted_masks does not exist"):
         opened(dslr)
-
-
-def test_a_file_that_is_no_object_is_refused(iphone):
     (iphone / "pose_intrinsic_imu.json").write_text("[]")
     with pytest.raises(InputError, match="is no object of frames"):
+        opened(iphone)
+    (iphone / "rgb").rename(iphone / "frames")
+    (iphone / "rgb.mkv").write_bytes(b"")
+    with pytest.raises(InputError, match=r"rgb does not exist: extract rgb.mkv .*ffmpeg"):
         opened(iphone)
