@@ -140,14 +140,6 @@ def test_the_same_steps_and_seed_give_the_same_bytes(command, photographs, tmp_p
 
 
 @pytest.mark.medium
-def test_max_steps_per_image_is_printed(command, photographs, tmp_path):
-    overrides = ("views=3", "refinement.max_steps_per_image=2", "steps=null", "video.path=none")
-    said = finished(command(photographs, "seconds=600", *overrides))
-    assert "ended after refinement.max_steps_per_image=2" in said
-    assert numbers_of(tmp_path / "run")["steps"] == 6
-
-
-@pytest.mark.medium
 @pytest.mark.parametrize("init", ["network", "depth", "points", "file"])
 def test_inits(command, views, photographs, tmp_path, monkeypatch, init):
     folder = tmp_path / "run"
@@ -179,12 +171,15 @@ def test_a_missing_checkpoint_falls_back_to_the_plane_sweep(command, photographs
 
 
 @pytest.mark.medium
-def test_paths_with_spaces_quotes_and_equal_signs(command, photographs, tmp_path, monkeypatch):
+def test_odd_paths_and_the_end_by_max_steps_per_image(command, photographs, tmp_path):
+    limit = ("refinement.max_steps_per_image=2", "steps=null", "seconds=600")
     for name in ("it's \"a\" \\'scene\\", "a=b, [c]"):
         (tmp_path / name).symlink_to(photographs)
-        said = finished(command(tmp_path / name, "views=3", "steps=1", "video.path=none"))
+        said = finished(command(tmp_path / name, "views=3", "video.path=none", *limit))
         config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
         assert config["path"] == str(tmp_path / name) and "views=3" not in said
+        assert "ended after refinement.max_steps_per_image=2" in said
+        assert numbers_of(tmp_path / "run")["steps"] == 6
 
 
 def test_words_of_the_command(repository, monkeypatch):

@@ -153,17 +153,16 @@ def test_a_tensor_without_a_rate_stays_and_may_start_later(dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_elements_of_a_row_may_have_their_own_rates(dtype):
-    whole = VisibleAdam(normal(dtype=dtype))
-    parts = {"sh_0": whole.parameters["sh"][:, :1], "sh_rest": whole.parameters["sh"][:, 1:]}
-    parts = VisibleAdam({name: part.clone() for name, part in parts.items()})
-    rates = torch.full((16, 1), 5e-5)
+    whole, rates = VisibleAdam(normal(dtype=dtype)), torch.full((16, 1), 5e-5)
     rates[0] = 1e-3
+    sh = whole.parameters["sh"]
+    parts = VisibleAdam({"first": sh[:, :1].clone(), "rest": sh[:, 1:].clone()})
     for _ in range(4):
         seen, gradients = torch.rand(NUM) < 0.7, random_gradients(dtype=dtype)
         whole.step(gradients, {"sh": rates}, seen)
-        split = {"sh_0": gradients["sh"][:, :1], "sh_rest": gradients["sh"][:, 1:]}
-        parts.step(split, {"sh_0": rates[0], "sh_rest": 5e-5}, seen)
-    together = torch.cat((parts.parameters["sh_0"], parts.parameters["sh_rest"]), 1)
+        split = {"first": gradients["sh"][:, :1], "rest": gradients["sh"][:, 1:]}
+        parts.step(split, {"first": 1e-3, "rest": 5e-5}, seen)
+    together = torch.cat(tuple(parts.parameters.values()), 1)
     torch.testing.assert_close(whole.parameters["sh"], together, rtol=1e-6, atol=1e-7)
 
 

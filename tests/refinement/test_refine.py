@@ -12,6 +12,7 @@ import torch
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
 from asysplat.refinement import PAPER, Rates, Refinement, RefinementSettings, mean_color, refine
+from asysplat.refinement.corrections import correct_poses
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.views import resize
@@ -66,14 +67,9 @@ def test_input_and_held_out_views_improve(room, start, kind):
     added = {"error": (1000, 1500), "mcmc": (1, 1500), "gradient": (1, 1500), "none": (0, 0)}
     assert added[kind][0] <= more <= added[kind][1]
     assert found.sh.shape[1] == 4
-
-
-@pytest.mark.medium
-def test_spawned_gaussians_improve_held_out_views(room, start):
-    views, held = room
-    with_more = refine(start, views, RefinementSettings(densify="error"), steps=80)
-    without = refine(start, views, RefinementSettings(densify="none"), steps=80)
-    assert quality(with_more, held) >= quality(without, held) + 0.5
+    if kind == "error":
+        without = refine(start, views, RefinementSettings(densify="none"), steps=80)
+        assert quality(found, held) >= quality(without, held) + 0.5
 
 
 @pytest.mark.medium
@@ -147,35 +143,23 @@ def test_one_view_and_few_gaussians(kind, count):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_fully_masked_views_and_cameras_at_one_position(kind):
-    views, settings = small_views(3), RefinementSettings(densify=kind)
-    masked = replace(views, masks=torch.zeros(3, 12, 15, dtype=torch.bool))
-    refine(small_scene(), masked, settings, steps=6).validate()
-    views.cameras.cam_to_world[:, :3, 3] = 0
-    refine(small_scene(), views, settings, steps=6).validate()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_scenes_of_any_unit(kind, scale):
-    """In the smallest all is nearer than the renderer draws."""
-    views = small_views()
-    views.cameras.cam_to_world[:, :3, 3] *= scale
-    found = refine(small_scene().scale_by(scale), views, RefinementSettings(densify=kind), steps=12)
-    assert found.validate().num_gaussians >= 1
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_one_is_left_if_all_are_pruned(kind):
-    """Behind all cameras, and too faint."""
-    hidden, faint = small_scene(), small_scene()
-    hidden.means[:, 2] *= -1
-    faint.opacities[:] = torch.linspace(1e-5, MIN_OPACITY / 2, 20)
-    options = {"rounds": 30, "until": 1.0, "rates": Rates(opacities=0.0)}
-    settings = RefinementSettings(densify=kind, **options)
-    for start in (hidden, faint):
-        found = refine(start, small_views(), settings, steps=20).validate()
-        assert found.num_gaussians >= 1
+@pytest.mark.parametrize("case", ["masked", "one position", "tiny", "huge", "hidden", "faint"])
+def test_unusual_scenes_keep_a_gaussian(kind, case):
+    """Tiny: all is nearer than the renderer draws; hidden and faint: all may be pruned."""
+    start, views, settings = small_scene(), small_views(3), RefinementSettings(densify=kind)
+    if case == "masked":
+        views = replace(views, masks=torch.zeros(3, 12, 15, dtype=torch.bool))
+    elif case == "one position":
+        views.cameras.cam_to_world[:, :3, 3] = 0
+    elif case in ("tiny", "huge"):
+        scale = 1e-6 if case == "tiny" else 1e6
+        views.cameras.cam_to_world[:, :3, 3] *= scale
+        start = start.scale_by(scale)
+    else:
+        settings = replace(settings, rounds=30, until=1.0, rates=Rates(opacities=0.0))
+        start.means[:, 2] *= -1 if case == "hidden" else 1
+        start.opacities[:] = 0.5 if case == "hidden" else torch.linspace(1e-5, MIN_OPACITY / 2, 20)
+    assert refine(start, views, settings, steps=20).validate().num_gaussians >= 1
 
 
 def test_faint_and_invisible_gaussians_are_pruned():
@@ -201,21 +185,17 @@ def padded(gaussians):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_limit_below_the_initial_number_adds_none(kind):
-    settings = RefinementSettings(densify=kind, max_gaussians=5, rounds=3)
-    assert refine(small_scene(), small_views(), settings, steps=8).num_gaussians == 20
-
-
-@pytest.mark.parametrize("kind", ["error", "mcmc"])
-@pytest.mark.parametrize(("limit", "expected"), [(40, 40), (10**6, 2 * 12 * 15 // 8)])
-def test_the_limit_and_growth(kind, limit, expected):
-    """Two images of 12 x 15 pixels: at most one Gaussian for 8 pixels."""
+@pytest.mark.parametrize(("limit", "most"), [(5, 20), (40, 40), (10**6, 2 * 12 * 15 // 8)])
+def test_the_limit_and_growth(kind, limit, most):
+    """From 20 Gaussians and two images of 12 x 15 pixels: at most one for 8 pixels."""
     options = {"rounds": 9, "growth": 0.25, "until": 1.0}
     settings = RefinementSettings(densify=kind, max_gaussians=limit, **options)
     _, records = watched(small_scene(), small_views(), settings, steps=20)
     counts = [progress.gaussians for progress in records]
-    assert counts[0] == 20 and max(counts) == counts[-1] == expected
-    assert all(b <= 1.25 * a for a, b in pairwise(counts))
+    assert counts[0] == 20 and max(counts) <= most
+    if kind in ("error", "mcmc"):
+        assert max(counts) == most and (limit == 5 or counts[-1] == most)
+        assert all(b <= 1.25 * a for a, b in pairwise(counts))
 
 
 @pytest.mark.parametrize("growth", [0.0, 0.25])
@@ -259,17 +239,15 @@ def test_rates_cool_down_at_the_end():
     assert steps == pytest.approx(expected, rel=0.02)
 
 
-def test_watch_is_called_after_each_step_and_may_stop():
-    seen = []
-
-    def watch(progress, refinement):
-        assert progress.gaussians == len(refinement.fields)
-        seen.append((progress.step, progress.share))
-        return progress.step == 3
-
-    settings = RefinementSettings(densify="none")
-    refine(small_scene(), small_views(), settings, steps=10, watch=watch)
-    assert seen == [(1, 0.1), (2, 0.2), (3, 0.3)]
+def test_watch_may_stop():
+    settings, small, records = RefinementSettings(densify="none"), small_scene(), []
+    stop = lambda now, _: records.append(now) or now.step == 3  # noqa: E731
+    refine(small, small_views(), settings, steps=10, watch=stop)
+    assert [(now.step, now.share, now.gaussians) for now in records] == [
+        (1, 0.1, 20),
+        (2, 0.2, 20),
+        (3, 0.3, 20),
+    ]
 
 
 def test_the_psnr_is_that_before_the_last_steps():
@@ -343,6 +321,29 @@ def test_the_unit_of_means(unit):
     refinement.densify(0.9)
     units = refinement.fields.units[20:]
     assert len(units) > 0 and (units == 1).all() == (unit == "scene")
+
+
+def test_exposure_and_pose_corrections_improve_held_out_views(room, start):
+    """Of four inputs, one is too dark and one too bright; their positions are a little wrong."""
+    inputs, held = room[0].select([0, 3, 6, 9]), replace(room[1], images=0.7 * room[1].images)
+    poses, shift = inputs.cameras.cam_to_world.clone(), torch.tensor([0.03, -0.02, 0.01])
+    poses[1, :3, 3] += shift
+    poses[3, :3, 3] -= shift
+    images = inputs.images * torch.tensor([0.7, 0.49, 0.7, 1])[:, None, None, None]
+    wrong = Views(replace(inputs.cameras, cam_to_world=poses), images)
+    found = []
+    for rates in (Rates(), Rates(exposure=0.03, poses=3e-3)):
+        settings = RefinementSettings(rates, densify="none", half_size=0.0, sh_degree=0)
+        last, states = watched(start, wrong, settings, lambda _, state: state, steps=80)
+        found.append((quality(last, held), states[-1].corrections.leaves()))
+    (before, none), (after, learned) = found
+    assert not none and after > before + 1.5
+    gains = learned["exposure"][:, 0].mean(1)
+    assert gains[1] < -0.1 < gains[0] and gains[2] < 0.1 < gains[3]
+    assert all(tensor.mean(0).abs().max() < 1e-6 for tensor in learned.values())
+    corrected = correct_poses(wrong.cameras, learned["poses"]).centers
+    errors = (corrected - inputs.cameras.centers).norm(dim=-1)
+    assert (errors < 0.75 * shift.norm()).all()
 
 
 def test_mistakes_are_refused():
