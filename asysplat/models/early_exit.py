@@ -32,11 +32,5 @@ class EarlyExit:
                     "skip nothing."
                 )
 
-    def decide(self, confidence: float) -> tuple[bool, bool]:
-        """Return whether a scene of this mean confidence skips the network, and the layers."""
-        thresholds = (self.skip_network_above, self.skip_layers_above)
-        network, layers = (limit is not None and confidence >= limit for limit in thresholds)
-        return network, layers
-
 
 EXACT = EarlyExit()

@@ -105,7 +105,8 @@ class GaussianHead(nn.Module, ABC):
             else:
                 expected = self.depth_fraction(prior.distance).clamp(1e-4, 0.99).logit()
                 bound = MAX_DEPTH_CORRECTION * (1 - (1 - CONFIDENT_FACTOR) * prior.confidence)
-                bound = torch.where(prior.has_depth, bound, MAX_DEPTH_WITHOUT_PRIOR)
+                has_depth = (prior.confidence > 0).flatten(1).any(-1)[:, None, None, None]
+                bound = torch.where(has_depth, bound, MAX_DEPTH_WITHOUT_PRIOR)
                 depth_logit = (expected + bounded(depth_logit[..., 0], bound))[..., None]
                 opacities = prior.opacity.logit() + bounded(opacities, MAX_OPACITY_CORRECTION)
                 scales = bounded(scales, MAX_SIZE_CORRECTION)

@@ -70,7 +70,9 @@ class Network(nn.Module, ABC):
                 "decides for one: give one scene at a time, or set speed=exact."
             )
         prior = self.run_prior(views)
-        skip_network, skip_layers = self.early_exit.decide(prior.confidence.mean().item())
+        confidence, speed = prior.confidence.mean().item(), self.early_exit
+        thresholds = (speed.skip_network_above, speed.skip_layers_above)
+        skip_network, skip_layers = (limit and confidence >= limit for limit in thresholds)
         if skip_network:
             self.early_exit_shares |= {"network": 1.0, "layers": 1.0}
             gaussians = self.head(None, views, prior)

@@ -34,8 +34,7 @@ def predict(net, views, **thresholds):
 
 
 def same_bits(one, other):
-    pairs = [(getattr(one, f.name), getattr(other, f.name)) for f in fields(one)]
-    return all(torch.equal(a, b) for a, b in pairs)
+    return all(map(torch.equal, vars(one).values(), vars(other).values()))
 
 
 def test_off_is_exact_and_reports_nothing(net, composed):

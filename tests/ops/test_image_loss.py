@@ -176,17 +176,13 @@ def test_other_layouts_and_types():
 
 def test_mistakes_are_named():
     rendered, target = images("noise", 3, 20, 20)
+    few = torch.ones(3, 20, dtype=torch.bool)
     wrong = {
         r"rendered has shape \(20, 20\): expected \[..., 3, H, W\]": (rendered[0], target[0]),
         r"target has shape \(3, 20, 19\): expected \(3, 20, 20\)": (rendered, target[..., 1:]),
         "target is torch.uint8: give floating": (rendered, target.byte()),
         "ssim_weight=1.5: give a number from 0 to 1": (rendered, target, 1.5),
-        r"masks has shape \(3, 20\): expected \(20, 20\)": (
-            rendered,
-            target,
-            0.2,
-            torch.ones(3, 20, dtype=torch.bool),
-        ),
+        r"masks has shape \(3, 20\): expected \(20, 20\)": (rendered, target, 0.2, few),
     }
     for sentence, args in wrong.items():
         with pytest.raises(InputError, match=sentence):

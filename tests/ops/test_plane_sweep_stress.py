@@ -38,16 +38,13 @@ def estimate(cameras, backend, images=None):
     return found
 
 
-@pytest.mark.parametrize("views", [1, 2, 5])
-def test_no_depth_without_parallax(backend, views):
-    found = estimate(cameras_at([(0.3, -2.0, 1.0)] * views), backend)
-    assert not found.confidence.any() and not found.inverse_depth.any()
+NO_OVERLAP = [cameras_at([(0, 0, 1)]), turned(cameras_at([(0, 0, -1)]), 180)]
+NO_DEPTH = {f"{n} at one place": [cameras_at([(0.3, -2.0, 1.0)] * n)] for n in (1, 2, 5)}
 
 
-def test_no_depth_of_points_in_one_view_alone(backend):
-    ahead = cameras_at([(0.0, 0.0, 1.0)])
-    behind = turned(cameras_at([(0.0, 0.0, -1.0)]), 180)
-    found = estimate(joined(ahead, behind), backend)
+@pytest.mark.parametrize("parts", [*NO_DEPTH.values(), NO_OVERLAP], ids=[*NO_DEPTH, "no overlap"])
+def test_no_depth_without_parallax_or_overlap(backend, parts):
+    found = estimate(joined(*parts), backend)
     assert not found.confidence.any() and not found.inverse_depth.any()
 
 

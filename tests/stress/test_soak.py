@@ -1,4 +1,10 @@
-"""Long runs on real scenes, as they are, and with bounds checks in poisoned memory: make slow."""
+"""Long runs on real scenes, as they are, and with bounds checks in poisoned memory: make slow.
+
+As a program, refine a scene: every gradient is finite, and the result is drawn the same again.
+
+python tests/stress/test_soak.py path/to/scene 1000
+NUMBA_BOUNDSCHECK=1 python tests/stress/test_soak.py path/to/scene 1000, with memory poisoned too
+"""
 
 import json
 import os
@@ -6,14 +12,39 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import pytest
+from backends import FAST, assert_same_bits, both_ways
+from poison import FILLS, poisoned
 
+from asysplat import Gaussians, Views, open_photographs, refine, render
+from asysplat.evaluation.baselines import BASELINES
+from asysplat.evaluation.metrics import psnr
+from asysplat.refinement import RefinementSettings
+from asysplat.refinement.init import initial_gaussians
+
+SIDE = 256  # pixels
 SCENES = ("fern", "fox", "mydesk", "hololens-000")
 CHECKS = {"NUMBA_BOUNDSCHECK": "1"}
 POISON = {"GLIBC_TUNABLES": "glibc.malloc.perturb=128"}
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(7200)]
-both_ways = pytest.mark.parametrize("checked", [False, True], ids=["as it is", "checked"])
+plain_and_checked = pytest.mark.parametrize("checked", [False, True], ids=["plain", "checked"])
+
+
+def soak(views: Views, start: Gaussians, steps: int) -> Gaussians:
+    non_finite = []
+
+    def watch(_, refinement) -> bool:
+        non_finite.append(refinement.fields.optimizer.non_finite)
+        return False
+
+    found = refine(start, views, steps=steps, watch=watch).validate()
+    assert len(non_finite) == steps and non_finite[-1] == 0
+    runs = [both_ways(FAST[0], found, views.cameras.map(lambda t: t[:2])) for _ in range(2)]
+    assert_same_bits(*runs)
+    assert runs[0].stats == runs[1].stats
+    return found
 
 
 def run(command: list[str], cwd: Path, extra: dict[str, str]) -> str:
@@ -28,19 +59,33 @@ def run(command: list[str], cwd: Path, extra: dict[str, str]) -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
-@both_ways
+@plain_and_checked
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_thousand_steps_of_all_fields(shared, repository, scene, checked):
-    script = "tests/stress/soak.py"
-    print(
-        run([script, str(shared / "data" / scene), "1000"], repository, CHECKS if checked else {})
-    )
+    command = [__file__, str(shared / "data" / scene), "1000"]
+    print(run(command, repository, CHECKS if checked else {}))
 
 
-@both_ways
+@plain_and_checked
 def test_training_for_three_hundred_steps(shared, repository, tmp_path, checked):
     overrides = ["data=files", f"data.root={shared / 'data' / 'mydesk'}", "data.cache.folder=null"]
     command = ["train.py", *overrides, "steps=300", "validate_every=100", f"paths.logs={tmp_path}"]
     folder = run(command, repository, CHECKS | POISON if checked else {}).removeprefix("run: ")
     numbers = json.loads((Path(folder) / "metrics.json").read_text())
     assert numbers["test/files/psnr"] > numbers["baseline/files/mean_color/psnr"] + 1
+
+
+if __name__ == "__main__":
+    scene, steps = sys.argv[1], int(sys.argv[2])
+    checked = numba.config.BOUNDSCHECK
+    with poisoned(FILLS[0] if checked else None):
+        photographs = open_photographs(scene, SIDE, SIDE, held_out_every=None)
+        views = photographs.inputs
+        start = initial_gaussians("plane_sweep", photographs, RefinementSettings().max_gaussians)
+        end = soak(views, start, steps)
+        images = [render(gaussians, views.cameras).image for gaussians in (start, end)]
+    flat = BASELINES["mean_color"](views, views)
+    before, after, flat = (psnr(image, views.images).mean().item() for image in (*images, flat))
+    kind = " with checks, in poisoned memory" if checked else ""
+    print(f"{scene}: {steps} steps{kind}, {before:.2f} to {after:.2f} dB, flat {flat:.2f} dB")
+    assert after > before + 1 and after > flat + 1

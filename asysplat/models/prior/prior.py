@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from asysplat.models.prior.projections import Projections
@@ -47,11 +47,6 @@ class Prior(TensorRecord):
     distance: Float[Tensor, "B V h w"]
     confidence: Float[Tensor, "B V h w"]
     opacity: Float[Tensor, "B V h w"]
-
-    @property
-    def has_depth(self) -> Bool[Tensor, "B 1 1 1"]:
-        """Return which scenes have a known depth anywhere."""
-        return (self.confidence > 0).flatten(1).any(dim=-1)[:, None, None, None]
 
     @classmethod
     def of_estimate(cls, depth: DepthEstimate, views: Views, size: tuple[int, int]) -> "Prior":
