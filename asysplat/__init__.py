@@ -1,21 +1,9 @@
 """Feed-forward 3D Gaussian splatting of long image sequences with asymmetric branches.
 
-The paper's symbols, as the code names and shapes them:
-
-    V            number of input views           views, [..., V, 3, H, W]
-    H, W         image height and width          height, width
-    p_c, p_f     coarse and fine patch size      patch_coarse, patch_fine (16, 8)
-    d_c, d_s     width of the coarse tokens      stage_widths (192, 512, 896), one a network
-                                                 stage; d_c is the first
-    d_f          width of the fine tokens        fine_width (256)
-    N_b, N_a     Mamba, attention layers         layers ("4m4s"), in each network stage
-    N_v          MambaVision layers              appearance_layers (2), in each network stage
-    p_g          side of the attention grid      grid (2)
-    r_s          MLP ratio                       stage_ratios (1, 2, 3), one a network stage
-    C, F         coarse, fine tokens             coarse, fine, [B, V, h, w, d]
-    N            number of Gaussians             V H W (p_f / p_c)^2
-    z            numbers that make a Gaussian    59 = 3 position + 4 quaternion + 3 scale
-                                                      + 1 opacity + 48 spherical harmonics
+photographs = asysplat.open_photographs("my_scene", height=128, width=128, views=8)
+gaussians = asysplat.load("shipped")(photographs.inputs)
+gaussians = asysplat.refine(gaussians, photographs.inputs, seconds=10.0)
+asysplat.write_gaussians("scene.ply", photographs.frame.to_world(gaussians))
 """
 
 from importlib import import_module

@@ -13,15 +13,13 @@ from rich.progress import track
 from rich.table import Table
 
 from asysplat.benchmark.compare import RATE, Watched
-from asysplat.benchmark.model import Workload, make_net, make_views
-from asysplat.benchmark.options import CPU, find_device
-from asysplat.benchmark.table import machine_note, make_table, number, spread, text
+from asysplat.benchmark.options import CPU
+from asysplat.benchmark.table import machine_note, make_table, spread, text
 from asysplat.benchmark.timing import Measurement, Result, seconds_of, summary, time_in_rounds
 from asysplat.data import ImageCache, ProceduralScene, SceneOptions, files_data, open_scene
 from asysplat.data.readers.common import opencv_from_opengl
 
 NO_CACHE, FILLED = CACHES = ("none", "filled")
-MODEL = "asysplat_4m4s"
 WATCHED = Watched(names=("cache",), alike=(), kinds={"frames_per_second": RATE}, rows="loading")
 RENDERED = (135, 240)  # height, width of the procedural views; enlarged to the photographs' size
 RENDERED_VIEWS = 8
@@ -59,21 +57,18 @@ def measure(options: DictConfig, console: Console) -> Result:
 
     Returns:
         "scene": frames, the photographs' and the views' sizes; "open": seconds to open the scene;
-        "loading": frames a second without a cache on disk and with a filled one; "network": those
-        that training would take, without rendering.
+        "loading": frames a second without a cache on disk and with a filled one.
     """
-    device, config = find_device(options.device), options.data
-    net, size = make_net(MODEL, config.overrides, device)
-    height, width = size["height"], size["width"]
-    workload = Workload(net, "fp32", make_views(size["inputs"], height, width, device))
-    frames = size["inputs"] + config.targets  # of a training task
+    config = options.data
+    height, width = config.views
+    frames = config.inputs + config.targets  # of a training task
     count = max(1, config.frames // frames)
     with TemporaryDirectory() as folder:
         root = write_photographs(Path(folder) / "scene", config.frames, *config.photographs)
 
         def loading(cache: ImageCache | None) -> float:
             data = files_data(
-                **size,
+                **{"height": height, "width": width, "inputs": config.inputs},
                 root=str(root),
                 window=[frames, 128],
                 name="benchmark",
@@ -92,22 +87,16 @@ def measure(options: DictConfig, console: Console) -> Result:
                 times = {"open": seconds_of(open_views, CPU), NO_CACHE: loading(None)}
                 loading(ImageCache(fresh))  # fills it
                 times[FILLED] = loading(ImageCache(fresh))
-                return times | {"network": seconds_of(workload.step, device) / frames}
+                return times
 
         timed = Measurement(seconds)
         with console.status(f"{options.repeats} rounds"):
             time_in_rounds([timed], options.repeats)
-    rates = {name: summary([1 / s for s in timed.seconds[name]]) for name in (*CACHES, "network")}
-    network = rates["network"]["median"]
-    loading = [
-        {"cache": name, "frames_per_second": rates[name]}
-        | {"over_network": rates[name]["median"] / network}
-        for name in CACHES
-    ]
+    rates = {name: summary([1 / s for s in timed.seconds[name]]) for name in CACHES}
+    loading = [{"cache": name, "frames_per_second": rate} for name, rate in rates.items()]
     scene = {"frames": config.frames, "photographs": list(config.photographs)}
     scene |= {"views": [height, width], "workers": config.num_workers}
-    results = {"scene": scene, "open": timed.summary("open")}
-    return results | {"network": rates["network"], "loading": loading}
+    return {"scene": scene, "open": timed.summary("open"), "loading": loading}
 
 
 def tables(results: Result) -> list[Table]:
@@ -116,14 +105,11 @@ def tables(results: Result) -> list[Table]:
     columns = {
         "cache on disk": text("{cache}"),
         "frames / s": spread("frames_per_second", "{:.0f}", unit=1.0),
-        "loading\n/ network": number("over_network", "{:.1f}"),
     }
     photographs, views = ("x".join(map(str, scene[name])) for name in ("photographs", "views"))
     notes = (
         f"{machine_note(results)}\n"
         f"photographs of {photographs} for views of {views}, by {scene['workers']} workers\n"
-        f"opening a scene of {scene['frames']}: {spread('open')(results)} ms, no pixel read\n"
-        f"the network alone takes {spread('network', '{:.0f}', unit=1.0)(results)} frames / s in "
-        "training"
+        f"opening a scene of {scene['frames']}: {spread('open')(results)} ms, no pixel read"
     )
     return [make_table("Loading training tasks", columns, results["loading"], notes)]

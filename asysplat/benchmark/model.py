@@ -23,8 +23,7 @@ from asysplat.benchmark.plot import bars
 from asysplat.benchmark.scenes import on_an_arc, random_scene
 from asysplat.benchmark.table import machine_note, make_table, number, spread, text
 from asysplat.benchmark.timing import Measurement, Result, Run, now, seconds_of, time_in_rounds
-from asysplat.evaluation.measured_cost import GB, memory_gb
-from asysplat.evaluation.static_cost import activation_gb, count_parameters
+from asysplat.evaluation.static_cost import count_parameters
 from asysplat.models.network import Network
 from asysplat.models.tokenizer import Tokenizer
 from asysplat.overrides import check_overrides
@@ -49,8 +48,7 @@ PARTS = (*COMPONENTS, OTHERS)
 OPERATORS = ("ssd", "selective_scan", "grid_attention")
 LAYER_CODES = {inspect.unwrap(kind.forward).__code__ for k in COMPONENTS.values() for kind in k}
 OPERATOR_CODES = {inspect.unwrap(getattr(ops, name)).__code__: name for name in OPERATORS}
-MAX_FILLED = 0.75  # of the memory, by the estimate of a step
-NOTES = "step: forward and backward; -: not measured, or would not fit into memory"
+NOTES = "step: forward and backward; -: not measured"
 
 
 @dataclass(frozen=True)
@@ -78,19 +76,6 @@ class Workload:
             means = [getattr(gaussians, field.name).float().mean() for field in fields(gaussians)]
         sum(means).backward()
         self.net.zero_grad(set_to_none=True)
-
-    @property
-    def step_gb(self) -> float:
-        """Estimate the memory of a step: activations, parameters and their gradients."""
-        cameras = self.views.cameras
-        self.net.train()
-        with self._autocast("cpu"):
-            activations = activation_gb(self.net, cameras.num_views, cameras.height, cameras.width)
-        return activations + 2 * 4 * count_parameters(self.net) / GB
-
-    @property
-    def step_fits(self) -> bool:
-        return self.step_gb < MAX_FILLED * memory_gb(self.device)
 
     def _autocast(self, device: str) -> torch.autocast:
         dtype = PRECISIONS[self.precision]
@@ -149,7 +134,7 @@ def measure(options: DictConfig, console: Console) -> Result:
 
     Returns:
         "rows": one for each network, number of views and precision, times in seconds. A step that
-        is not measured, or would not fit into memory, is None.
+        is not measured is None.
     """
     device, config = find_device(options.device), options.model
     check_names("model.precisions", config.precisions, PRECISIONS)
@@ -163,7 +148,7 @@ def measure(options: DictConfig, console: Console) -> Result:
             row |= {"height": size["height"], "width": size["width"]}
             for precision in config.precisions:
                 workload = Workload(net, precision, views)
-                timer = partial(_seconds, workload, config.steps and workload.step_fits)
+                timer = partial(_seconds, workload, config.steps)
                 measurements.append(Measurement(timer, row | {"precision": precision}))
     with console.status(f"{options.repeats} rounds"):
         time_in_rounds(measurements, options.repeats)

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from asysplat.benchmark import timing
 from asysplat.benchmark.compare import ERROR, TIME, Watched
-from asysplat.benchmark.options import CPU
+from asysplat.benchmark.options import CPU, check_names
 from asysplat.benchmark.plot import time_against_error
-from asysplat.benchmark.scenes import SCENES, SMALLER, Scene, find_scenes
+from asysplat.benchmark.scenes import SCENES, SMALLER, Scene
 from asysplat.benchmark.table import error, machine_note, make_table, number, spread, text
 from asysplat.benchmark.timing import Measurement, Result, now, relative_l2
 from asysplat.rendering import Culling, render
@@ -125,7 +125,9 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": one for each scene, backend and culling that is off, times in seconds.
     """
-    names = track(find_scenes(options.scenes), "scenes", console=console)
+    names = list(SCENES) if options.scenes == "all" else options.scenes
+    check_names("scenes", names, SCENES)
+    names = track(names, "scenes", console=console)
     return {"rows": [row for name in names for row in _measure_scene(name, options.repeats)]}
 
 

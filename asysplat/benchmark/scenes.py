@@ -1,12 +1,11 @@
 """Procedural scenes to measure renderers on: nothing to download, the same on every machine."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from asysplat.benchmark.options import check_names
 from asysplat.scene import Cameras, Gaussians
 
 Sample = Callable[..., Tensor]
@@ -122,10 +121,3 @@ SMALLER = {  # scenes that float64 can afford: errors are measured on these inst
     "4M": partial(pixel_aligned_scene, 354, 135, 240),
     "131kx16": partial(_scene_on_an_arc, 2),
 }
-
-
-def find_scenes(names: str | Sequence[str]) -> list[str]:
-    """Return the names of scenes: one, several, or "all"; raise InputError for unknown ones."""
-    names = [names] if isinstance(names, str) else list(names)
-    check_names("scenes", names, [*SCENES, "all"])
-    return list(SCENES) if "all" in names else names

@@ -219,7 +219,7 @@ class FilesSource:
     def _index_tasks(self, inputs: int) -> list[Task]:
         index = read_index(self.index, inputs)
         tasks = [
-            Task(each, selection_of(index, self.index, each.name, each.cameras, inputs))
+            Task(each, selection_of(index, self.index, each.name, each.num_images, inputs))
             for each in self._tests
             if each.name in index
         ]

@@ -1,7 +1,5 @@
 """Measure the seconds and the peak memory of work; memory and speed of a device."""
 
-import ctypes
-import gc
 import os
 import re
 import resource
@@ -9,7 +7,6 @@ import statistics
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -97,18 +94,6 @@ def reset_peak_memory(device: torch.device | str) -> bool:
     except OSError:
         return False
     return True
-
-
-def memory_before_gb(device: torch.device | str) -> float:
-    """Return freed memory to the system, reset the peak, and return the memory in use now.
-
-    Without this, work that reuses freed memory would not raise the peak.
-    """
-    gc.collect()
-    with suppress(OSError, AttributeError):  # only glibc has it
-        ctypes.CDLL(None).malloc_trim(0)
-    reset_peak_memory(device)
-    return peak_memory_gb(device)
 
 
 def peak_memory_gb(device: torch.device | str) -> float:

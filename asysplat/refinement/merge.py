@@ -73,8 +73,17 @@ def _cell_ids(
     means: Float[Tensor, "N 3"], cells: Float[Tensor, "N"]
 ) -> tuple[Int[Tensor, "N"], int]:
     """Return the id of each mean's cell, from 0, and the number of cells."""
-    level = cells.double().log2().round()[:, None]
+    level = cells.double().log2().round()
     offsets = means.double() - means.double().amin(0)
-    rows = torch.cat((level, (offsets / 2**level).floor()), 1)
-    unique, ids = rows.unique(dim=0, return_inverse=True)
-    return ids, len(unique)
+    position = (offsets / (2**level)[:, None]).floor()
+    ids, count = _ranks(level)
+    for axis in position.unbind(-1):
+        # By ranks, as three positions may not fit into one integer.
+        along, length = _ranks(axis)
+        ids, count = _ranks(ids * length + along)
+    return ids, count
+
+
+def _ranks(values: Tensor) -> tuple[Int[Tensor, "N"], int]:
+    unique, ranks = values.unique(return_inverse=True)
+    return ranks, len(unique)

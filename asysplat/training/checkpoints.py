@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file, save
-from torch import Tensor, nn
+from safetensors.torch import load_file
+from torch import nn
 
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
@@ -190,14 +190,6 @@ def load_weights(path: str | None, module: nn.Module) -> None:
 def weights_file(path: str) -> Path:
     """Return the file that `init_path` names."""
     return SHIPPED if path == "shipped" else Path(path)
-
-
-def save_weights(weights: Mapping[str, Tensor], path: Path) -> None:
-    """Write the state dict of a module in half precision, as a .safetensors file to ship."""
-    halves = {n: t.half() if t.is_floating_point() else t for n, t in weights.items()}
-    halves = {name: tensor.contiguous() for name, tensor in halves.items()}
-    with atomic_write(path) as partial:
-        partial.write_bytes(save(halves))
 
 
 def atomic_save(values: Any, path: Path) -> None:

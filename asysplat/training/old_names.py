@@ -19,6 +19,8 @@ CLASSES = {
     "asysplat.reconstruction.Settings": "asysplat.refinement.RefinementSettings",
     "asysplat.training.Reconstruction": "asysplat.training.SplattingModule",
     "asysplat.training.ReconstructionLoss": "asysplat.training.SplattingLoss",
+    "asysplat.training.tensorboard.make_logger": "lightning.pytorch.loggers.TensorBoardLogger",
+    "asysplat.training.loggers.make_wandb_logger": "lightning.pytorch.loggers.WandbLogger",
     "asysplat.training.callbacks.Pictures": "asysplat.training.callbacks.Figures",
     "asysplat.training.callbacks.Progress": "asysplat.training.callbacks.TrainingProgressBar",
     "asysplat.training.callbacks.SkipNonFiniteSteps": "asysplat.training.callbacks.NonFiniteSteps",

@@ -82,7 +82,10 @@ class Stage:
             print(f"not as before: {difference}")
         resumes = has_checkpoints(folder)
         cut_events(folder, notes["event_files"] if resumes else {})
-        logger = instantiate(config.logger)
+        try:
+            logger = instantiate(config.logger)
+        except InstantiationException as error:  # of an optional package
+            raise InputError(f"logger: {error.__cause__}") from error
         if logger is not None and not resumes:
             log_choices(logger, config)
 

@@ -18,11 +18,6 @@ EVENTS = "events.out.tfevents.*"
 HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
 
 
-def make_logger(folder: Path | str) -> TensorBoardLogger:
-    """Make a logger of a run."""
-    return TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
-
-
 def event_files(loggers: Sequence[Logger]) -> dict[str, int]:
     """Flush all events to disk; return the name and bytes of each file of events."""
     sizes = {}

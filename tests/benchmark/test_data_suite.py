@@ -8,19 +8,15 @@ from asysplat.data.images import content_hash
 
 pytestmark = pytest.mark.medium
 
-OVERRIDES = {"scale": "laptop", "width": 0.125, "state_size": 8}
-
 
 def test_rows_are_complete_and_consistent(run_suite):
-    small = {"frames": 24, "photographs": [36, 64], "overrides": OVERRIDES, "num_workers": 0}
+    small = {"frames": 24, "photographs": [36, 64], "num_workers": 0}
     results = run_suite("data", {"data": small})
     assert results["scene"]["frames"] == 24
     assert results["scene"]["photographs"] == [36, 64]
     assert results["open"]["median"] > 0
     assert [row["cache"] for row in results["loading"]] == list(CACHES)
-    network = results["network"]["median"]
-    for row in results["loading"]:
-        assert row["over_network"] == pytest.approx(row["frames_per_second"]["median"] / network)
+    assert all(row["frames_per_second"]["median"] > 0 for row in results["loading"])
     assert [len(table.rows) for table in tables(results)] == [2]
 
 

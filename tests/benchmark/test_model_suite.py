@@ -3,7 +3,6 @@
 import pytest
 from hydra import initialize_config_dir
 
-from asysplat.benchmark import model as suite
 from asysplat.benchmark.model import (
     COMPONENTS,
     OPERATORS,
@@ -82,15 +81,6 @@ def test_gradients_are_taken_away_again(workload):
     workload.step()
     assert all(parameter.grad is None for parameter in workload.net.parameters())
     assert not workload.forward().means.requires_grad
-
-
-def test_a_step_that_does_not_fit_is_left_out(workload, monkeypatch):
-    needed = workload.step_gb
-    assert workload.step_fits and needed > 0
-    workload.forward()  # in evaluation mode, in which the network would keep less
-    assert workload.step_gb == needed
-    monkeypatch.setattr(suite, "memory_gb", lambda device: needed / 2)
-    assert not workload.step_fits
 
 
 def test_unknown_overrides_are_named(conf):

@@ -5,6 +5,8 @@ import sys
 from functools import partial
 
 import pytest
+from omegaconf import OmegaConf
+from rich.console import Console
 
 from asysplat.benchmark.options import find_suite
 from asysplat.benchmark.render import (
@@ -13,17 +15,12 @@ from asysplat.benchmark.render import (
     errors,
     find_backends,
     flips,
+    measure,
     prepare,
     run,
     run_exact,
 )
-from asysplat.benchmark.scenes import (
-    SCENES,
-    SMALLER,
-    find_scenes,
-    pixel_aligned_scene,
-    random_scene,
-)
+from asysplat.benchmark.scenes import SCENES, SMALLER, pixel_aligned_scene, random_scene
 from asysplat.errors import InputError
 from asysplat.rendering import Culling
 
@@ -90,11 +87,7 @@ def test_unknown_options_are_named():
     with pytest.raises(InputError, match=rf"^suite=rendr is unknown: choose from {known}\.$"):
         find_suite("rendr")
     with pytest.raises(InputError, match=r"^scenes=D is unknown: .*A, B, C, 524k, 4M"):
-        find_scenes(["A", "D"])
-    with pytest.raises(InputError, match=r"^scenes=.* unknown"):
-        find_scenes([])
-    assert find_scenes("all") == list(SCENES)
-    assert find_scenes(["C", "A"]) == ["C", "A"] and find_scenes("4M") == ["4M"]
+        measure(OmegaConf.create({"scenes": ["A", "D"]}), Console(quiet=True))
 
 
 @pytest.mark.medium

@@ -6,15 +6,17 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from lightning.pytorch.loggers import wandb
+from lightning_utilities.core.imports import RequirementCache
 from torch import nn
 
-from asysplat.errors import InputError
 from asysplat.evaluation import measured_cost
 from asysplat.evaluation.measured_cost import peak_flops
-from asysplat.training import loggers, parts
+from asysplat.training import parts
 from asysplat.training.callbacks import TrainingMonitor, monitor
 from asysplat.training.callbacks.monitor import gradient_norms, sentence
-from asysplat.training.loggers import make_wandb_logger
 from asysplat.training.parts import Parts
 
 CPU = torch.device("cpu")
@@ -152,7 +154,7 @@ def test_the_peak_is_known_for_listed_gpus(monkeypatch):
     assert peak_flops(gpu, "bf16-mixed") is None
 
 
-def test_error_without_wandb(monkeypatch, tmp_path):
-    monkeypatch.setattr(loggers, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install 'asysplat\[wandb\]', or use logger="):
-        make_wandb_logger(tmp_path, "asysplat", "run", offline=True)
+def test_error_without_wandb(monkeypatch, composed):
+    monkeypatch.setattr(wandb, "_WANDB_AVAILABLE", RequirementCache("wandb>=1000"))
+    with pytest.raises(InstantiationException, match=r"wandb.* not met"):
+        instantiate(composed("logger=wandb", "paths.run=unused").logger)

@@ -11,7 +11,6 @@ from asysplat.benchmark.model import make_net
 from asysplat.benchmark.stability.comparison import (
     ALL_PRECISIONS,
     ROUNDINGS,
-    Function,
     StabilityCase,
     Tensors,
     compare_to_reference,
@@ -33,17 +32,10 @@ HALF += ("fisheye-like focal lengths", "telescopic focal lengths")
 NETWORK_ROUNDINGS = 1024
 
 
-def plane_sweep_cases() -> list[StabilityCase]:
-    """List the cases of the plane sweep, an operator."""
-    return _depth_cases("plane_sweep, ", _plane_sweep, ())
+def depth_cases(plane_sweep: bool, counts: Sequence[int] = ()) -> list[StabilityCase]:
+    """List the cases of the plane sweep or of the prior, also for these numbers of views."""
+    prefix, function = ("plane_sweep, ", _plane_sweep) if plane_sweep else ("", _prior)
 
-
-def prior_cases(counts: Sequence[int]) -> list[StabilityCase]:
-    """List the cases of the prior, also for these numbers of views."""
-    return _depth_cases("", _prior, counts)
-
-
-def _depth_cases(prefix: str, function: Function, counts: Sequence[int]) -> list[StabilityCase]:
     def measure(hostile: HostileViews) -> Result:
         tensors = _tensors(hostile.views())
         # In the order in which they are perturbed

@@ -1,7 +1,6 @@
 """The suite: measure every case, and show which are red."""
 
 from collections.abc import Callable, Iterable, Sequence
-from itertools import chain
 
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
@@ -13,7 +12,7 @@ from asysplat.benchmark.compare import ERROR, Watched
 from asysplat.benchmark.options import check_names
 from asysplat.benchmark.plot import bars
 from asysplat.benchmark.stability.comparison import RULE, StabilityCase
-from asysplat.benchmark.stability.models import network_cases, plane_sweep_cases, prior_cases
+from asysplat.benchmark.stability.models import depth_cases, network_cases
 from asysplat.benchmark.stability.operators import operator_cases
 from asysplat.benchmark.stability.optimization import refinement_cases, training_cases
 from asysplat.benchmark.stability.renderer import renderer_cases
@@ -23,8 +22,8 @@ from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
 
 AREAS: dict[str, Callable[[DictConfig], Iterable[StabilityCase]]] = {
-    "operators": lambda options: chain(operator_cases(), plane_sweep_cases()),
-    "prior": lambda options: prior_cases(options.views),
+    "operators": lambda options: [*operator_cases(), *depth_cases(plane_sweep=True)],
+    "prior": lambda options: depth_cases(False, options.views),
     "renderer": lambda options: renderer_cases(options.views),
     "network": lambda options: network_cases(options.models, options.overrides, options.views),
     "training": lambda options: training_cases(options.models, options.training_steps),

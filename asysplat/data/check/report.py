@@ -184,8 +184,8 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
     rows += [("matches", f"{len(matches)} of {len(matches.pairs)} pairs of images")]
     if fit := verdict.fit:
         text = f"{fit.error:.2f} px in the median, {fit.under_1px:.0%} under 1 px"
-        behind = f"; {fit.behind_camera:.0%} lie behind a camera"
-        rows.append(("epipolar error", text + (behind if fit.behind_camera >= 0.01 else "")))
+        share_behind = f"; {fit.behind_camera:.0%} lie behind a camera"
+        rows.append(("epipolar error", text + (share_behind if fit.behind_camera >= 0.01 else "")))
     return Report(sequence, rows, matches, verdict)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from asysplat.data.readers import find_scenes, open_scene
 from asysplat.data.selection import SELECTIONS, named_selection
-from asysplat.data.selection.index import camera_hash, write_index
+from asysplat.data.selection.index import write_index
 from asysplat.data.selection.views import Selection
 from asysplat.data.sequence import SceneOptions
 from asysplat.data.write import refuse_inside
@@ -25,19 +25,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--inputs", type=int, default=32)
     parser.add_argument("--targets", type=int, default=8, help="of every_8th and uniform")
     options = parser.parse_args(arguments)
-    index: dict[str, tuple[Selection, str]] = {}
+    index: dict[str, Selection] = {}
     try:
         layout, scenes = find_scenes(options.root, options.layout)
         refuse_inside(options.index, options.root, "name a file outside of it")
         for scene in scenes:
             sequence = open_scene(scene, SceneOptions(1, 1, layout))  # reads cameras, no pixels
-            name, cameras = sequence.name, sequence.cameras
+            name = sequence.name
             if name in index:
                 raise InputError(f"{options.root} holds two scenes called {name}: rename one.")
             counts = (options.inputs, options.targets)
-            selection = named_selection(options.selection, cameras, *counts, "test")
-            index[name] = selection, camera_hash(cameras)
-        write_index(options.index, options.selection, index)
+            index[name] = named_selection(options.selection, sequence.cameras, *counts, "test")
+        write_index(options.index, index)
     except InputError as error:
         sys.exit(f"error: {error}")
     print(f"{options.index}: {len(index)} scenes")

@@ -29,9 +29,6 @@ class TrainingProgressBar(ProgressBar):
     def disable(self) -> None:
         self.enabled = False
 
-    def enable(self) -> None:
-        self.enabled = True
-
     def on_train_start(self, trainer: Any, module: Any) -> None:
         self._open()
         step = trainer.global_step
