@@ -7,9 +7,7 @@ from asysplat.benchmark.model import (
     COMPONENTS,
     OPERATORS,
     OTHERS,
-    Workload,
     make_net,
-    make_views,
     tables,
 )
 from asysplat.benchmark.options import CPU
@@ -42,13 +40,6 @@ def measured(run_model):
     return results, {(row["model"], row["views"]): row for row in results["rows"]}
 
 
-@pytest.fixture
-def workload(conf):
-    """A network and two views."""
-    net, _ = make_net("asysplat_4m4s", OVERRIDES, CPU)
-    return Workload(net, "bf16", make_views(2, 32, 64, CPU))
-
-
 def test_rows_are_complete_and_consistent(measured):
     results, rows = measured
     assert set(rows) == {(name, views) for name in NAMES for views in VIEWS}
@@ -75,12 +66,6 @@ def test_components_are_those_of_the_model(measured):
         for operator, component in scans.items():
             within = row["components"][component]["seconds"]["median"]
             assert row["operators"][operator]["median"] < within
-
-
-def test_gradients_are_taken_away_again(workload):
-    workload.step()
-    assert all(parameter.grad is None for parameter in workload.net.parameters())
-    assert not workload.forward().means.requires_grad
 
 
 def test_unknown_overrides_are_named(conf):

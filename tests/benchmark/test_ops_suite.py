@@ -3,13 +3,10 @@
 import math
 
 import pytest
-import torch
 
-from asysplat.benchmark.ops import PASSES, SCANS, SLANT, make_inputs, make_path, make_rows
+from asysplat.benchmark.ops import PASSES, SCANS, make_rows
 from asysplat.benchmark.options import CPU, PRECISIONS, check_names, find_device
-from asysplat.benchmark.scenes import DISTANCE
 from asysplat.errors import InputError
-from asysplat.scene import Cameras
 
 pytestmark = pytest.mark.medium
 
@@ -82,18 +79,6 @@ def test_ratios_are_those_of_the_times(rows):
             assert row["loop_tokens"] == LOOP_TOKENS
 
 
-def test_errors_are_relative():
-    sizes = {"batch": 1, "length": 5, "channels": 3, "state": 2}
-    path = make_path("selective_scan", sizes, "reference", torch.float32, CPU)
-    output, gradients = path.exact()
-    wrong = 2 * output, {name: 4 * grad for name, grad in gradients.items()}
-    errors = path.errors(wrong)
-    assert errors["forward"] == pytest.approx(1 / 2, abs=1e-5)
-    assert errors["gradients"] == pytest.approx(
-        dict.fromkeys(["x", "dt", "A", "B", "C", "D"], 3 / 4), abs=1e-5
-    )
-
-
 def test_unknown_options_are_named():
     with pytest.raises(InputError, match=r"^ops\.precisions=fp8 is unknown: .*fp32, bf16"):
         check_names("ops.precisions", ["fp32", "fp8"], PRECISIONS)
@@ -108,19 +93,3 @@ def test_a_wrong_size_is_an_error():
     sizes = TINY["grid_attention"] | {"grid": 0}
     with pytest.raises(InputError, match="grid=0"):
         list(make_rows("grid_attention", sizes, sizes, ["fp32"], LOOP_TOKENS, CPU))
-
-
-def test_the_plane_sweep_finds_the_wall():
-    sizes = TINY["plane_sweep"] | {"batch": 2, "planes": 24, "neighbors": 3}
-    tensors = make_inputs("plane_sweep", sizes)
-    assert tensors["images"].min() >= 0 and tensors["images"].max() <= 1
-    inverse_depths = make_path("plane_sweep", sizes, "cpu", torch.float32, CPU).forward()
-    assert torch.equal(inverse_depths[0], inverse_depths[1])
-    cameras = Cameras(tensors["intrinsics"], tensors["cam_to_world"], 24, 32).resized(12, 16)
-    # Along rays of z = 1: the wall is at z = DISTANCE + SLANT x.
-    rotations = cameras.cam_to_world[..., None, None, :3, :3]
-    rays = (rotations @ cameras.pixel_directions()[..., None])[..., 0]
-    x, _, z = cameras.centers.unbind(-1)
-    missing = (DISTANCE + SLANT * x - z)[..., None, None]
-    depth = missing / (rays[..., 2] - SLANT * rays[..., 0])
-    assert (inverse_depths * depth - 1).abs().median() < 0.03

@@ -8,11 +8,9 @@ from rich.console import Console
 from asysplat import load
 from asysplat.benchmark import pareto
 from asysplat.benchmark.data import write_photographs
-from asysplat.benchmark.options import CPU
 from asysplat.benchmark.pareto import (
     BASE,
     FAMILIES,
-    decibels,
     find_families,
     find_scenes,
     plot,
@@ -22,8 +20,7 @@ from asysplat.benchmark.pareto import (
 )
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
-from asysplat.refinement import RefinementSettings, mean_color, refine
-from asysplat.refinement.init import initial_gaussians
+from asysplat.refinement import mean_color
 from asysplat.rendering import render
 
 SIDE = 32
@@ -146,43 +143,6 @@ def test_a_row_is_what_the_network_and_the_renderer_give(measured, room):
         gaussians, background = load()(scene.inputs), mean_color(scene.inputs)
         image = render(gaussians, scene.held_out.cameras, background, depth=False).image
     assert row["psnr"] == pytest.approx(psnr(image, scene.held_out.images).mean().item(), abs=1e-4)
-
-
-@pytest.mark.parametrize("steps", [0, 2])
-def test_a_refined_image_is_that_of_so_many_steps(make_options, shared_folder, steps):
-    scene = find_scenes(["mine"], shared_folder / "data")[0]["mine"](SIDE, 8, 2)
-    setting = pareto.Refined(None, None, steps=steps, refinement={"densify": "none"})
-    image = setting.prepare(make_options("pareto", {}).refinement, CPU)(scene)
-    settings, background = RefinementSettings(densify="none"), mean_color(scene.inputs)
-    gaussians = initial_gaussians("plane_sweep", scene, settings.max_gaussians)
-    if steps:
-        gaussians = refine(gaussians, scene.inputs, settings, steps=steps, background=background)
-    with torch.no_grad():
-        expected = render(gaussians, scene.held_out.cameras, background, depth=False).image
-    torch.testing.assert_close(image, expected, rtol=0, atol=1e-5)
-
-
-def test_knobs_leave_gaussians_out(make_pareto, room, monkeypatch):
-    options, rendered = make_pareto(), []
-
-    def count(gaussians, *args, **kwargs):
-        least = gaussians.opacities.min().item()
-        rendered.append((gaussians.num_gaussians, least, kwargs["sh_degree"]))
-        return render(gaussians, *args, **kwargs)
-
-    monkeypatch.setattr(pareto, "render", count)
-    families = find_families(OmegaConf.to_container(options.pareto, resolve=True))
-    for name in (BASE, "fewer"):
-        families["feed_forward"][name].prepare(options.refinement, CPU)(room)
-    assert rendered[0][0] == 3 * SIDE**2 and rendered[0][2] is None
-    assert 0 < rendered[1][0] <= 500 and rendered[1][1] >= 0.05 and rendered[1][2] == 0
-
-
-def test_equal_images_have_no_infinite_error():
-    same = torch.rand(1, 3, 4, 4)
-    assert decibels(same, same) == pytest.approx(200)
-    exact = torch.full((1, 3, 4, 4), 0.9).double()
-    assert decibels(torch.full((1, 3, 4, 4), 1.5), exact) == pytest.approx(20)
 
 
 def test_a_folder_of_photographs_is_a_scene(shared_folder):

@@ -8,10 +8,7 @@ from torch.nn.functional import max_pool2d
 from asysplat.data import ProceduralSource
 from asysplat.data.procedural import ProceduralScene, split_seed
 from asysplat.data.procedural.edges import SAMPLES, average_samples, edge_pixels, sample_directions
-from asysplat.data.procedural.floor_plan import FloorPlan
 from asysplat.data.procedural.path import circle, forward, hand_held_path, pan
-from asysplat.data.procedural.textures import Material
-from asysplat.data.procedural.world import World
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SEEDS = range(6)
@@ -66,30 +63,6 @@ def test_edge_pixels_match_their_coverage():
     assert len(SAMPLES) == 4 and set(found.tolist()) == {0, 0.25, 0.5, 0.75, 1}
     assert (found - covered).abs().max() < 0.26
     assert (found - covered).abs().mean() < 0.5 * (light[0, edges] - covered).abs().mean()
-
-
-@pytest.mark.parametrize("gloss", [0.0, 1.0])
-def test_gloss_is_brightest_in_the_mirror_direction(gloss):
-    """The floor of a room right between eye and lamp, which are equally high."""
-    gray = Material((0.5, 0.5, 0.5), (0.5, 0.5, 0.5), gloss=gloss, shininess=30.0)
-    plan = FloorPlan(
-        walk=np.zeros((1, 2)),
-        light=np.array([2.0, 0.0, 2.0]),
-        irradiance=np.ones(3),
-        falloff=3.0,
-        ambient=0.1 * np.ones(3),
-        shell=[gray] * 6,
-        room=(np.array([-4.0, -4.0, 0.0]), np.array([4.0, 4.0, 4.0])),
-    )
-    plan.add_box((3.5, 3.5, 0.2), (0.2, 0.2, 0.2), 0.0, gray)
-    plan.add_sphere((-3.5, 3.5, 0.2), 0.2, gray)
-    world = World(plan, np.random.default_rng(0), torch.device("cpu"))
-    mirrored, aside, back = (
-        world.trace(eye[:, None], -eye[:, None], pixel=0.01)[0].mean()
-        for eye in torch.tensor([[-2.0, 0.0, 2.0], [0.0, 2.0, 2.0], [2.0, 0.5, 2.0]])
-    )
-    torch.testing.assert_close(aside, back, rtol=0.02, atol=0)
-    assert (mirrored > 1.5 * aside) == bool(gloss)
 
 
 def turn(angles):

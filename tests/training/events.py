@@ -20,12 +20,14 @@ def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
 
 
 def steps(folder: Path, kind: str) -> dict[str, list[int]]:
-    """Steps by tag, of "scalars", "images" or "tensors"."""
+    """Steps by tag, of "scalars", "images" or "histograms"."""
     events = _events(folder)
-    read = {"scalars": events.Scalars, "images": events.Images, "tensors": events.Tensors}[kind]
+    read = {"scalars": events.Scalars, "images": events.Images, "histograms": events.Histograms}[
+        kind
+    ]
     return {tag: [event.step for event in read(tag)] for tag in events.Tags()[kind]}
 
 
 def _events(folder: Path) -> EventAccumulator:
-    everything = {"scalars": 0, "images": 0, "tensors": 0}
+    everything = {"scalars": 0, "images": 0, "histograms": 0}
     return EventAccumulator(str(folder / "tensorboard"), size_guidance=everything).Reload()

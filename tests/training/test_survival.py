@@ -78,7 +78,7 @@ def check_same(whole, killed):
     for name in ("curve.csv", "metrics.csv"):
         assert rows(whole / name) == rows(killed / name) != []
     assert events.scalars(whole) == events.scalars(killed) != {}
-    for kind in ("scalars", "images", "tensors"):
+    for kind in ("scalars", "images", "histograms"):
         assert events.steps(whole, kind) == events.steps(killed, kind) != {}
     assert (killed / "checkpoints" / "previous.ckpt").exists()
 
