@@ -1,4 +1,4 @@
-"""Photographs on disk: seconds to open a scene, and frames a second beside training."""
+"""Photographs on disk: seconds to open a scene, and images loaded per second."""
 
 import json
 from functools import partial

@@ -1,4 +1,4 @@
-"""Every path of the operators: time beside the sequential loop; error."""
+"""Every backend of the operators: time, also relative to the sequential loop, and error."""
 
 import math
 from collections.abc import Iterator, Mapping

@@ -29,7 +29,7 @@ class EvaluationTarget:
 
 
 def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarget:
-    """Find what the options of evaluate.py, and the overrides of its command, name.
+    """Find the target of evaluate.py from its options and the overrides of its command.
 
     Raises:
         InputError: none of run, init_path and scene is given, or several are; files do not exist;

@@ -114,7 +114,7 @@ def scattered_gaussians(cameras: Cameras) -> Gaussians:
 
 
 def hostile_gaussians(name: str, gaussians: Gaussians, cameras: Cameras) -> Gaussians:
-    """Change Gaussians as HOSTILE_GAUSSIANS[name] says."""
+    """Change Gaussians in the way `name`, one of HOSTILE_GAUSSIANS."""
     return replace(gaussians, **HOSTILE_GAUSSIANS[name](gaussians, cameras))
 
 
