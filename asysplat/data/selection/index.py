@@ -42,7 +42,9 @@ def read_index(path: Path | str, num_inputs: int) -> dict[str, Selection]:
         raise InputError(f'{path} is no index: give {{"scene": {{"context": [], "target": []}}}}.')
     if isinstance(content.get("frames"), list):
         return dict([_long_lrm_entry(path, content, num_inputs)])
-    scenes = content.get("scenes", content)  # as our command wrote them once
+    # Our command once wrote the scenes beside a hash.
+    old = "hash" in content and isinstance(content.get("scenes"), dict)
+    scenes = content["scenes"] if old else content
     index = {}
     for name, stored in scenes.items():
         if stored is not None:
