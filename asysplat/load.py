@@ -16,7 +16,7 @@ from asysplat.errors import InputError
 from asysplat.models.network import Network
 from asysplat.overrides import CONF, check_overrides
 from asysplat.training.checkpoints import load_weights
-from asysplat.training.old_names import read_config
+from asysplat.training.run_config import read_config
 
 
 def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> Network:

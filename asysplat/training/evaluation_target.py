@@ -7,8 +7,8 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from asysplat.errors import InputError
-from asysplat.training.old_names import read_config
 from asysplat.training.ranges import check_ranges
+from asysplat.training.run_config import read_config
 from asysplat.training.runs import RESULTS, content_of, describe_run, find_runs, hash_of
 
 OWN_OPTIONS = ("run", "scene", "steps")  # the others are train.py's

@@ -5,10 +5,7 @@ Whoever renames a class of conf/, a configuration key or a key of metrics.json a
 
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
-
-from omegaconf import DictConfig, OmegaConf
 
 FORMAT = 3  # of the files of a run; raise it with every line that is added below
 
@@ -58,11 +55,6 @@ RESULTS = {  # parts of the keys of metrics.json, as regular expressions
 CALLBACKS = {old.rpartition(".")[2]: new.rpartition(".")[2] for old, new in CLASSES.items()}
 
 
-def read_config(path: Path) -> DictConfig:
-    """Read the config.yaml of a run, under today's names."""
-    return OmegaConf.create(upgrade_config(OmegaConf.to_container(OmegaConf.load(path))))
-
-
 def upgrade_config(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return a resolved configuration under today's names; `prefix`: its path within the whole."""
     upgraded = {}
@@ -73,7 +65,7 @@ def upgrade_config(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any
         if isinstance(value, Mapping):
             value = upgrade_config(value, f"{path}.")
         elif key == "_target_":
-            value = CLASSES.get(value, value)
+            value = CLASSES.get(str(value), value)
         upgraded[KEYS.get(path, key)] = value
     return upgraded
 

@@ -17,8 +17,9 @@ from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
 from asysplat.data.build import tested_sets
 from asysplat.training.checkpoints import weights_file
-from asysplat.training.old_names import FORMAT, read_config, upgrade_results
+from asysplat.training.old_names import FORMAT, upgrade_results
 from asysplat.training.revision import revision
+from asysplat.training.run_config import read_config
 from asysplat.training.stages import stage_configs
 
 RESULTS = "metrics.json"

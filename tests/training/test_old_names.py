@@ -16,7 +16,8 @@ from omegaconf import OmegaConf
 
 from asysplat import load
 from asysplat.report.fill import finished_runs
-from asysplat.training.old_names import CLASSES, KEYS, read_config
+from asysplat.training.old_names import CLASSES, KEYS
+from asysplat.training.run_config import read_config
 from asysplat.training.runs import config_hash, find_run
 
 OLD_RUN = Path(__file__).parent / "old_run"

@@ -1,0 +1,57 @@
+"""Read the configuration of a run, which may come from another machine and must not run code."""
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from asysplat.errors import InputError
+from asysplat.overrides import CONF
+from asysplat.training.old_names import upgrade_config
+
+
+def read_config(path: Path) -> DictConfig:
+    """Read the config.yaml of a run, under today's names.
+
+    Hydra imports and calls whatever a `_target_` names, so only those of conf/ are accepted.
+
+    Raises:
+        InputError: the file cannot be read, has a `_target_` that no file of conf/ has, or an
+            interpolation, which could hide one.
+    """
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(path))
+    except (OSError, UnicodeError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
+        reason = str(error).split("\n")[0]
+        raise InputError(f"{path} cannot be read ({reason}): copy the run again.") from error
+    if not isinstance(content, dict) or not content:
+        raise InputError(f"{path} is not the configuration of a run: copy the run again.")
+    content = upgrade_config(content)
+    _check_targets(path, content)
+    return OmegaConf.create(content)
+
+
+def _check_targets(path: Path, node: Any, key: str = "") -> None:
+    if isinstance(node, str) and "${" in node:
+        raise InputError(f"{path}: {key} is {node!r}: a run's configuration has no interpolations.")
+    if isinstance(node, list):
+        node = dict(enumerate(node))
+    for name, value in node.items() if isinstance(node, dict) else ():
+        inner = f"{key}.{name}".removeprefix(".")
+        if name == "_target_" and str(value) not in _known_targets():
+            raise InputError(
+                f"{path}: {inner} is {value!r}, which no file of conf/ names: a run may build only "
+                "those classes; if it is one of yours, name it in a file of conf/."
+            )
+        _check_targets(path, value, inner)
+
+
+@cache
+def _known_targets() -> set[str]:
+    """Return every `_target_` of conf/."""
+    files = CONF.rglob("*.yaml")
+    return {name for file in files for name in re.findall(r"_target_: *(\S+)", file.read_text())}

@@ -1,0 +1,66 @@
+"""The configuration of a run from another machine builds the classes of conf/ and no others."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from asysplat import load
+from asysplat.errors import InputError
+from asysplat.training.run_config import read_config
+
+OLD_RUN = Path(__file__).parent / "old_run"
+TARGETS = "os.system subprocess.run builtins.eval builtins.exec builtins.__import__ pickle.loads"
+TARGETS += " sympy.sympify torch.load joblib.load numpy.load shutil.rmtree runpy.run_path"
+TARGETS += " importlib.import_module hydra.utils.get_method hydra.utils.instantiate torch.hub.load"
+TARGETS += " asysplat.training.checkpoints.torch.load asysplat.load omegaconf.OmegaConf.load"
+TARGETS += " lightning.pytorch.cli.LightningCLI path:os.system"
+TARGETS += " torch.nn.Identity.__init__.__globals__"
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Write a run folder with another configuration; return its checkpoint."""
+    content = yaml.safe_load((OLD_RUN / "config.yaml").read_text())
+
+    def write(change):
+        change(content)
+        (tmp_path / "config.yaml").write_text(yaml.safe_dump(content))
+        (tmp_path / "checkpoints").mkdir()
+        return (tmp_path / "checkpoints" / "last.ckpt").absolute()
+
+    return write
+
+
+@pytest.mark.parametrize("key", ["head", "prior", "_args_"])
+@pytest.mark.parametrize("target", TARGETS.split())
+def test_no_other_class_is_built(run, tmp_path, target, key):
+    called = {"_target_": target, "a": f"open({str(tmp_path / 'written')!r}, 'w')"}
+    file = run(lambda content: content["model"].update({key: [called]}))
+    file.touch()
+    with pytest.raises(InputError, match="no file of conf/ names"):
+        load(str(file))
+    assert not (tmp_path / "written").exists()
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("${oc.decode:'{_target_: os.system}'}", "no interpolations"),
+        ("\\${oc.decode:'{_target_: os.system}'}", "no interpolations"),
+        ({"_target_": "${model.name}"}, "no interpolations|no file of conf/"),
+        ({"_target_": ["os.system"]}, "no file of conf/"),
+        ({"_target_": {"a": 1}}, "no file of conf/"),
+    ],
+)
+def test_a_target_cannot_be_hidden(run, value, message):
+    file = run(lambda content: content["model"].update(head=value))
+    with pytest.raises(InputError, match=message):
+        read_config(file.parents[1] / "config.yaml")
+
+
+@pytest.mark.parametrize("content", ["[1, 2]", "a: {", "1", "", "a: !!python/object:os.system {}"])
+def test_a_damaged_file_is_named(tmp_path, content):
+    (tmp_path / "config.yaml").write_text(content)
+    with pytest.raises(InputError, match=r"config\.yaml"):
+        read_config(tmp_path / "config.yaml")
