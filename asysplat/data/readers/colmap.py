@@ -5,8 +5,6 @@ MipNeRF-360, Tanks&Temples and Deep Blending are published in this layout.
 https://colmap.github.io/format.html
 """
 
-import re
-import struct
 import warnings
 from collections.abc import Sequence
 from functools import partial
@@ -20,6 +18,7 @@ from numpy import ndarray
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers import common
+from asysplat.data.readers.colmap_model import read_model
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -53,7 +52,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     model = _find_model(scene)
     if model is None:
         raise InputError(f"{scene} has no COLMAP model: expected one in {', '.join(MODELS)}.")
-    colmap = _read(model)
+    colmap = read_model(model)
     registered = [image for image in colmap.images.values() if image.has_pose]
     registered.sort(key=lambda image: common.natural_order(Path(image.name)))
     folder = _images_folder(scene, model, [image.name for image in registered])
@@ -81,7 +80,7 @@ def points_beside(scene: Path, posed: Sequence[PosedImage]) -> Points | None:
     """
     if (model := _find_model(scene)) is None:
         return None
-    colmap = _read(model)
+    colmap = read_model(model)
     images = {Path(image.name).name: image for image in colmap.images.values() if image.has_pose}
     posed = [image for image in posed if image.file.name in images]
     if not posed:
@@ -100,68 +99,6 @@ def _find_model(scene: Path) -> Path | None:
     return next((m for m in models if any((m / kind).is_file() for kind in kinds)), None)
 
 
-def _read(model: Path) -> pycolmap.Reconstruction:
-    colmap, binary = pycolmap.Reconstruction(), (model / "cameras.bin").is_file()
-    for file in model.glob("*.bin"):
-        _check_lengths(file)
-    try:
-        (colmap.read_binary if binary else colmap.read_text)(model)
-    # Damaged files make COLMAP raise anything from IndexError to MemoryError, with a C++ trace.
-    except Exception as error:
-        reason = str(error).split("\n")[0]
-        raise InputError(
-            f"{model} is not a complete COLMAP model ({reason}): copy its cameras, images and "
-            "points3D files again."
-        ) from error
-    if binary:
-        # COLMAP invents cameras beyond the file's end.
-        expected = 8 + sum(24 + 8 * len(camera.params) for camera in colmap.cameras.values())
-        size = (model / "cameras.bin").stat().st_size
-        if size != expected:
-            raise InputError(
-                f"{model / 'cameras.bin'} has {size} bytes and its cameras take {expected}: it is "
-                "cut short or damaged, so copy it again."
-            )
-    else:
-        _check_count(model / "images.txt", colmap.num_images())
-        _check_count(model / "points3D.txt", colmap.num_points3D())
-    return colmap
-
-
-def _check_lengths(file: Path) -> None:
-    """Check the file's length against its counts: COLMAP loops for ever in a file cut short."""
-    stored = file.read_bytes()
-    try:
-        (count,) = struct.unpack_from("<Q", stored)
-        end = 8
-        if 8 * count > len(stored):
-            raise ValueError(f"its header gives {count} entries")
-        for _ in range(count if file.name == "images.bin" else 0):
-            end = stored.index(b"\0", end + 64) + 1  # after numbers and the name
-            end += 8 + 24 * struct.unpack_from("<Q", stored, end)[0]
-        for _ in range(count if file.name == "points3D.bin" else 0):
-            end += 51 + 8 * struct.unpack_from("<Q", stored, end + 43)[0]
-        if end > len(stored):
-            raise ValueError(f"its entries take {end} bytes")
-    except (struct.error, ValueError) as error:
-        raise InputError(
-            f"{file} has {len(stored)} bytes, but {error}: it is cut short or damaged, so copy it "
-            "again."
-        ) from error
-
-
-def _check_count(file: Path, count: int) -> None:
-    """Check the number of entries against the file's header; COLMAP accepts any number of lines."""
-    with file.open(encoding="utf-8", errors="replace") as lines:
-        header = "".join(line for _, line in zip(range(4), lines, strict=False))
-    expected = re.search(r"^# Number of \w+: (\d+)", header, re.MULTILINE)
-    if expected and int(expected[1]) != count:
-        raise InputError(
-            f"{file} holds {count} entries and its header gives {expected[1]}: it is cut short, so "
-            "copy it again, or correct the header."
-        )
-
-
 def _cam_to_world(image: pycolmap.Image, model: Path) -> Float[ndarray, "4 4"]:
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()
@@ -169,7 +106,7 @@ def _cam_to_world(image: pycolmap.Image, model: Path) -> Float[ndarray, "4 4"]:
 
 
 def _points(colmap: pycolmap.Reconstruction | Path) -> Points | None:
-    model = _read(colmap) if isinstance(colmap, Path) else colmap
+    model = read_model(colmap) if isinstance(colmap, Path) else colmap
     points = sorted(model.points3D.items())
     return np.array([point.xyz for _, point in points]) if points else None
 

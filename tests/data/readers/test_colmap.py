@@ -247,3 +247,56 @@ def test_points_of_another_world_are_ignored(scene, change):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert colmap.points_beside(scene, images) is None
+
+
+def contradict(folder, way):
+    """Make points and images disagree: points are removed, or have other numbers."""
+    file = folder / "sparse/0/points3D.txt"
+    lines = file.read_text().splitlines()
+    comments, points = lines[:2], lines[3:]
+    if way == "removed":
+        points = points[::2]
+    if way == "renumbered":
+        points = [f"{1000 + int(line.split()[0])} {line.split(' ', 1)[1]}" for line in points]
+    if way == "tracks":  # of images that do not exist
+        points = [" ".join([*line.split()[:8], "99", "0"]) for line in points]
+    file.write_text("\n".join((*comments, *points)) + "\n")
+    return len(points)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("way", ["removed", "renumbered", "tracks"])
+def test_points_that_contradict_the_images_are_read_without_their_tracks(scene, way, binary):
+    model, expected = scene / "sparse/0", cameras_of(read(scene))
+    if binary:
+        text = shutil.copytree(scene, scene.parent / "text")
+        stored = (as_binary(scene, old=True) / "sparse/0/points3D.bin").read_bytes()
+        count = contradict(text, way)
+        entries = [stored[8 + 59 * row : 67 + 59 * row] for row in range(72)]
+        if way == "removed":
+            entries = entries[::2]
+        if way == "renumbered":
+            entries = [(1000 + row).to_bytes(8, "little") + e[8:] for row, e in enumerate(entries)]
+        if way == "tracks":
+            entries = [e[:51] + (99).to_bytes(4, "little") + e[55:] for e in entries]
+        stored = count.to_bytes(8, "little") + b"".join(entries)
+        (model / "points3D.bin").write_bytes(stored)
+    else:
+        count = contradict(scene, way)
+    with warnings.catch_warnings(record=True) as caught:
+        posed = read(scene)
+        assert len(posed.points) == count
+    if way != "removed":  # which COLMAP itself reads
+        assert "contradict each other" in str(caught[0].message)
+    np.testing.assert_allclose(cameras_of(posed), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["rigs.bin", "frames.bin", "images.bin", "points3D.bin"])
+def test_counts_beyond_the_file_are_refused_at_once(scene, name):
+    file = as_binary(scene) / "sparse/0" / name
+    stored = bytearray(file.read_bytes())
+    start = {"rigs.bin": 12, "frames.bin": 8 + 64, "images.bin": 72 + 6, "points3D.bin": 51}[name]
+    stored[start : start + 4] = b"\xff\xff\xff\x7f"
+    file.write_bytes(stored)
+    with pytest.raises(InputError, match=f"{name} has {len(stored)} bytes"):
+        read(scene)
