@@ -12,6 +12,9 @@ from torch.nn.functional import normalize
 
 from asysplat.scene import Cameras
 
+MAX_SIDE = 16384  # pixels of a page
+MIN_FOV = 1e-3  # radians
+
 
 def mean_up(cameras: Cameras) -> Float[Tensor, "3"]:
     """Return the mean up direction, a unit vector; the first camera's where they cancel."""
@@ -49,15 +52,19 @@ def clicked_camera(
 
 
 def page_camera(page: Any, max_pixels: int) -> tuple[Cameras, bool]:
-    """Return the camera of viser's CameraHandle, and whether it has all pixels of the page."""
-    height, width = max(page.image_height, 1), max(page.image_width, 1)
-    focal = height / 2 / math.tan(page.fov / 2)
+    """Return the camera of viser's CameraHandle, and whether it has all pixels of the page.
+
+    Raises:
+        InputError: the page sent numbers that are no camera.
+    """
+    height, width = (min(max(side, 1), MAX_SIDE) for side in (page.image_height, page.image_width))
+    focal = height / 2 / math.tan(min(max(page.fov, MIN_FOV), math.pi - MIN_FOV) / 2)
     cam_to_world = torch.eye(4)
     rotation = Rotation.from_quat(page.wxyz, scalar_first=True).as_matrix()
     cam_to_world[:3, :3] = torch.from_numpy(rotation)
     cam_to_world[:3, 3] = torch.from_numpy(page.position)
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    cameras = Cameras(intrinsics[None], cam_to_world[None], height, width)
+    cameras = Cameras(intrinsics[None], cam_to_world[None], height, width).validate("page")
     factor = math.sqrt(min(1, max_pixels / (height * width)))
     if factor == 1:
         return cameras, True

@@ -1,8 +1,12 @@
 """A viewer in the browser: the server renders each open page's camera."""
 
 import math
+import re
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from threading import Event, Thread
 from typing import Any
 
@@ -20,6 +24,7 @@ from asysplat.export import frame
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 
+OWN_PAGES = re.compile(r"https?://(127\.0\.0\.1|localhost)(:\d+)?")
 LAYERS = ("color", "depth", "alpha")
 FRUSTUM_LENGTH = 0.1  # in the page's unit
 MAX_SAMPLES = 10_000  # pixels from which the range of disparities is computed
@@ -71,7 +76,8 @@ class Viewer:
         self._scene: tuple[Gaussians | None, str] = (None, WAITING)
         self._version = object()
         self._closed = Event()
-        self._server = viser.ViserServer("127.0.0.1", port, label="asysplat", verbose=False)
+        with _own_pages_only():
+            self._server = viser.ViserServer("127.0.0.1", port, label="asysplat", verbose=False)
         self._add_panel()
         self._add_cameras(views.images)
         if gaussians is not None:
@@ -232,6 +238,20 @@ class Viewer:
         milliseconds = 1000 * (time.perf_counter() - start)
         self._text.content = f"{size} in {milliseconds:.0f} ms\n\n{text}"
         return in_full
+
+
+@contextmanager
+def _own_pages_only() -> Iterator[None]:
+    """Let servers that start in this context refuse connections of pages from other sites."""
+    from websockets.asyncio import server
+
+    serve = server.serve
+    # Programs send no origin; viser has no option for it.
+    server.serve = partial(serve, origins=[OWN_PAGES, None])
+    try:
+        yield
+    finally:
+        server.serve = serve
 
 
 @torch.no_grad()

@@ -19,6 +19,7 @@ from asysplat.export.frame import quaternion
 from asysplat.export.viewer import LAYERS, MAX_PIXELS, Viewer, draw_layer
 
 pytest.importorskip("viser", minversion="1.1")
+from websockets.exceptions import InvalidStatus
 from wire import TOLERANCE, open_page
 
 
@@ -96,6 +97,15 @@ def test_pages_come_and_go_and_show_the_rendering_of_their_cameras(scene, viewer
         first.picture_like(draw_layer(gaussians, views.cameras.select([2])))
         viewer.close()
         assert not viewer._thread.is_alive()
+
+
+@pytest.mark.parametrize("origin", ["http://example.org", "http://127.0.0.1.example.org", "null"])
+def test_pages_of_other_sites_are_refused(viewer, origin):
+    with pytest.raises(InvalidStatus, match="403"), open_page(viewer, origin):
+        pass
+    with open_page(viewer, viewer.url) as page:
+        page.stand(viewer._cameras, 0)
+        until(viewer._server.get_clients)
 
 
 def test_the_panel_changes_the_rendering(scene, viewer):

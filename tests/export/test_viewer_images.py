@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from asysplat import Cameras, Gaussians, render
+from asysplat.errors import InputError
 from asysplat.export.frame import clicked_camera, field_of_view, mean_up, page_camera, quaternion
 from asysplat.export.viewer import draw_layer
 
@@ -50,6 +51,26 @@ def test_a_page_at_an_input_camera(make_scene):
     assert not in_full and (camera.height, camera.width) == (150, 200)
     expected = 2 * math.atan(75 / camera.intrinsics[0, 1, 1].item())
     assert expected == pytest.approx(field_of_view(cameras, 0)[0])
+
+
+@pytest.mark.parametrize("size", [(10**12, 1), (1, 10**12), (10**12, 10**12), (0, -5)])
+@pytest.mark.parametrize("fov", [0.0, 1.0, math.pi, 1e30, -1e30])
+def test_a_page_of_any_size_takes_a_bounded_image(make_scene, size, fov):
+    _, cameras = make_scene(dtype=torch.float32)
+    page = page_of(cameras, 0)
+    page.image_height, page.image_width, page.fov = *size, fov
+    camera, _ = page_camera(page, 30_000)
+    assert camera.height * camera.width <= 60_000
+    camera.validate()
+
+
+@pytest.mark.parametrize("field", ["fov", "position", "wxyz"])
+def test_a_page_that_is_no_camera_is_refused(make_scene, field):
+    _, cameras = make_scene(dtype=torch.float32)
+    page = page_of(cameras, 0)
+    setattr(page, field, np.full(np.shape(getattr(page, field)), np.nan))
+    with pytest.raises((InputError, ValueError)):
+        page_camera(page, 30_000)
 
 
 def test_a_click_hits_the_first_visible_image(make_scene):

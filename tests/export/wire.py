@@ -16,10 +16,11 @@ TOLERANCE = 6  # of 255, on average: what JPEG may change
 
 
 @contextmanager
-def open_page(viewer):
-    """Open a page at the viewer."""
+def open_page(viewer, origin=None):
+    """Open a page at the viewer, which came from `origin`."""
     address = viewer.url.replace("http", "ws")
-    with connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as socket:
+    protocols = [f"viser-v{viser.__version__}"]
+    with connect(address, origin=origin, subprotocols=protocols, max_size=None) as socket:
         yield WirePage(socket)
 
 
