@@ -18,7 +18,7 @@ from asysplat.benchmark.compare import compare, read_old
 from asysplat.benchmark.options import describe_machine, find_suite
 from asysplat.benchmark.table import write_results
 from asysplat.errors import InputError, input_error_behind
-from asysplat.interrupts import keep_interrupts
+from asysplat.interrupts import handle_signals
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.training.revision import revision
 
@@ -63,7 +63,7 @@ def benchmark(options: DictConfig) -> bool:
 
 
 if __name__ == "__main__":
-    keep_interrupts()
+    handle_signals()
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     exit_at_unknown_overrides("benchmark")
     main()

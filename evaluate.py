@@ -24,7 +24,7 @@ from asysplat.evaluation.post_optimization import HOW, PostOptimization, Predict
 from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.export import read_gaussians
-from asysplat.interrupts import keep_interrupts
+from asysplat.interrupts import handle_signals
 from asysplat.models.early_exit import EXACT
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.rendering import render
@@ -129,7 +129,7 @@ def open_gaussians(path: str, data: SceneDataModule, device: torch.device) -> Pr
 
 
 if __name__ == "__main__":
-    keep_interrupts()
+    handle_signals()
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     exit_at_unknown_overrides("evaluate")
     main()

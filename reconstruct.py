@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat import load
 from asysplat.errors import InputError, input_error_behind
 from asysplat.export import read_gaussians
-from asysplat.interrupts import keep_interrupts
+from asysplat.interrupts import handle_signals
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
@@ -111,8 +111,7 @@ def as_overrides(words: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # pycolmap would print a stack trace
-    keep_interrupts()
+    handle_signals()
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     sys.argv[1:] = as_overrides(sys.argv[1:])
     exit_at_unknown_overrides("reconstruct")

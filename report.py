@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from asysplat.errors import InputError
+from asysplat.interrupts import handle_signals
 from asysplat.overrides import check_overrides, exit_at_unknown_overrides
 from asysplat.report.fill import fill_table, finished_runs, with_costs
 from asysplat.report.html import render_html
@@ -61,5 +62,6 @@ def compose_train(overrides: Sequence[str]) -> DictConfig:
 
 
 if __name__ == "__main__":
+    handle_signals()
     exit_at_unknown_overrides("report")
     main()

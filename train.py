@@ -16,7 +16,7 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from asysplat.interrupts import keep_interrupts
+from asysplat.interrupts import handle_signals
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.training.messages import error_sentence, exit_with_message
 from asysplat.training.prepare import PreparedRun, Stage, prepare_run
@@ -82,7 +82,7 @@ def train_in_sweep(config: DictConfig) -> float | None:
 
 
 if __name__ == "__main__":
-    keep_interrupts()
+    handle_signals()
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     exit_at_unknown_overrides("train")
     OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)

@@ -1,9 +1,10 @@
-"""Atomic writes: to a temporary file, which is then moved into place."""
+"""Writing that loses nothing: atomic writes, folders of their own, space that is checked before."""
 
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain, count
 from pathlib import Path
 from uuid import uuid4
 
@@ -41,3 +42,35 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         ) from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def new_folder(path: Path, room: int) -> Path:
+    """Create a folder that was not there: `path`, or else `path`-2, -3, ...
+
+    Args:
+        path: of the folder.
+        room: bytes that must be free on its disk.
+
+    Raises:
+        InputError: the folder cannot be created, or its disk is too full.
+    """
+    candidates = chain([path], (path.with_name(f"{path.name}-{n}") for n in count(2)))
+    for folder in candidates:
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise InputError(
+                f"{folder} cannot be created ({error.strerror}): set paths.logs to a folder that "
+                "you may write to."
+            ) from error
+        free = shutil.disk_usage(folder).free
+        if free < room:
+            folder.rmdir()
+            raise InputError(
+                f"{folder} has {free / 1e6:.0f} MB of free space, and the results may take "
+                f"{room / 1e6:.0f} MB: free some, or set paths.logs to a folder on another disk."
+            )
+        return folder
+    raise AssertionError

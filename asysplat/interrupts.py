@@ -1,10 +1,32 @@
-"""Keep KeyboardInterrupts that Python would ignore."""
+"""Signals of scripts: Ctrl-C, the end of a terminal session, and those of a scheduler."""
 
+import os
 import signal
+import stat
 import sys
 import threading
+from types import FrameType
 
 DELAY = 0.01  # seconds until the callback has returned
+
+
+def handle_signals() -> None:
+    """Set the signal handlers of a script; call it after its imports.
+
+    SIGTERM ends the process without the stack trace that pycolmap would print. SIGHUP, of a
+    terminal that was closed, counts as SIGTERM unless it is ignored (`nohup`). Interrupts are kept.
+    """
+    keep_interrupts()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, _hang_up)
+
+
+def _hang_up(number: int, frame: FrameType | None) -> None:
+    for stream in (1, 2):
+        if stat.S_ISCHR(os.fstat(stream).st_mode):  # to write to a closed terminal is an error
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def keep_interrupts() -> None:
