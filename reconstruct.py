@@ -17,7 +17,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat import load
-from asysplat.errors import InputError, input_error_behind
+from asysplat.errors import InputError, input_error_behind, plain_warnings
 from asysplat.export import read_gaussians
 from asysplat.interrupts import handle_signals
 from asysplat.overrides import exit_at_unknown_overrides
@@ -34,6 +34,7 @@ from asysplat.training.ranges import check_ranges
 def main(config: DictConfig) -> None:
     for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)
+    plain_warnings()
     try:
         reconstruct(config)
     except KeyboardInterrupt:

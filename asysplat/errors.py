@@ -1,4 +1,6 @@
-"""The error that is shown to users."""
+"""Messages to users: the error of invalid input, and plain warnings."""
+
+import warnings
 
 
 class InputError(ValueError):
@@ -21,3 +23,8 @@ def input_error_behind(error: BaseException) -> InputError | None:
         return None
     # Data-loader workers prepend their traceback.
     return InputError(str(seen).rpartition(f"{InputError.__module__}.InputError: ")[2])
+
+
+def plain_warnings() -> None:
+    """Print warnings as one line, without their line of code."""
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"

@@ -59,7 +59,9 @@ def new_folder(path: Path, room: int) -> Path:
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
-            continue
+            if folder.is_dir():
+                continue
+            raise InputError(f"{folder} is a file: set paths.logs to another folder.") from None
         except OSError as error:
             raise InputError(
                 f"{folder} cannot be created ({error.strerror}): set paths.logs to a folder that "

@@ -12,6 +12,8 @@ from torch import Tensor
 from asysplat.evaluation.backbones import find_backbone
 from asysplat.ops.precision import without_autocast
 
+MIN_SIDE = 32  # pixels
+
 
 def load_lpips(
     net: Literal["alex", "vgg"], backbone_dir: Path | None, download: bool = False
@@ -49,7 +51,7 @@ def lpips_distance(
     rendered: Float[Tensor, "*batch V 3 H W"],
     target: Float[Tensor, "*batch V 3 H W"],
 ) -> Float[Tensor, "*batch V"]:
-    """Compute LPIPS of each image in [0, 1] (`rendered` is clamped), at least 32x32 pixels.
+    """Compute LPIPS of each image in [0, 1] (`rendered` is clamped), of MIN_SIDE pixels or more.
 
     Images are compared one by one: VGG needs 1.5 GB for a pair of 540x960, AlexNet 0.2 GB.
     """

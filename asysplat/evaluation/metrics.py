@@ -79,7 +79,7 @@ def check_ssim_size(height: int, width: int, window: Window) -> None:
     if min(height, width) < size:
         raise InputError(
             f"SSIM needs images of at least {size}x{size} pixels, these have {height}x{width}: "
-            "raise data.height and data.width."
+            "give larger ones (height and width)."
         )
 
 

@@ -1,5 +1,6 @@
 """Define protocols: named options of the metrics, which their numbers depend on."""
 
+import warnings
 from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_type_hints
 
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.evaluation import metrics
-from asysplat.evaluation.lpips import lpips_distance
+from asysplat.evaluation.lpips import MIN_SIDE, lpips_distance
 from asysplat.evaluation.metrics import Depths, Images, PerView
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
@@ -55,8 +56,14 @@ class Protocol:
                 )
 
     def check_size(self, height: int, width: int) -> None:
-        """Raise InputError if images of this size cannot be measured."""
+        """Raise InputError if images of this size cannot be measured; warn if LPIPS cannot be."""
         metrics.check_ssim_size(height, width, self.ssim_window)
+        if min(height, width) < MIN_SIDE:
+            warnings.warn(
+                f"images of {height}x{width} are measured without LPIPS, which needs "
+                f"{MIN_SIDE}x{MIN_SIDE} pixels.",
+                stacklevel=2,
+            )
 
     def psnr(self, rendered: Images, targets: Views) -> PerView:
         """Compute the PSNR of each image in dB."""
@@ -75,7 +82,7 @@ class Protocol:
             "psnr": metrics.psnr(prepared, target),
             "ssim": metrics.ssim(prepared, target, self.ssim_window, self.ssim_covariance),
         }
-        if lpips is not None:
+        if lpips is not None and min(target.shape[-2:]) >= MIN_SIDE:
             values["lpips"] = lpips_distance(lpips, prepared, target)
         return values
 

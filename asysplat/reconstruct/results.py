@@ -1,5 +1,9 @@
 """The result folder of a reconstruction: scene files, metrics, figures, a video."""
 
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,7 +21,7 @@ from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.rows import average, write_csv
 from asysplat.export import orbit, smoothed_path, write_ply, write_safetensors, write_video
-from asysplat.files import atomic_write
+from asysplat.files import atomic_write, new_folder
 from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.refine import RefinementProgress
 from asysplat.rendering import Rendering, render
@@ -25,6 +29,8 @@ from asysplat.scene import Gaussians
 from asysplat.training.summary import write_json
 
 CAMERA_PATHS = {"own": smoothed_path, "orbit": orbit}
+BYTES_PER_GAUSSIAN = 2 * 4 * 62  # of scene.ply and scene.safetensors, at most
+OTHER_BYTES = 20_000_000  # of figures and the video
 SHEET_ROWS = 4  # views in a contact sheet
 TABLE_ROWS = ("held_out", "inputs", "baseline/nearest_view", "baseline/mean_color")
 
@@ -54,27 +60,31 @@ class Results:
     def save_start(
         self, gaussians: Gaussians, photographs: Photographs, background: Float[Tensor, "3"]
     ) -> None:
-        """Write start.png: renderings before the refinement. Photographs and background are kept.
+        """Create the folder and write start.png: renderings before the refinement.
+
+        Photographs and background are kept.
 
         Raises:
-            InputError: the folder cannot be created or written to.
+            InputError: images too small to measure; the folder cannot be created or written to, or
+                its disk has no room for the results.
         """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"{self.folder} cannot be created ({error.strerror}): set paths.logs to a folder "
-                "that you may write to."
-            ) from error
+        cameras = photographs.inputs.cameras
+        self._protocol.check_size(cameras.height, cameras.width)
+        count = max(gaussians.num_gaussians, self._config.refinement.max_gaussians)
+        self.folder = new_folder(self.folder, OTHER_BYTES + count * BYTES_PER_GAUSSIAN)
         self._photographs, self._background = photographs, background
         self._save_contact_sheet("start.png", gaussians)
         print(f"figure: {self.folder / 'start.png'}")
 
     def save(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
-        """Write the scene files, then the configuration, figures, metrics and the video."""
+        """Write the scene files, then the configuration, figures, metrics and the video.
+
+        Raises:
+            InputError: a file cannot be written; the scene is elsewhere then, see `save_ply`.
+        """
         photographs, background = self._photographs, self._background
         world = photographs.frame.to_world(gaussians)
-        write_ply(self.folder / "scene.ply", world)
+        save_ply(self.folder / "scene.ply", world)
         color = " ".join(f"{value:.6f}" for value in background.tolist())
         write_safetensors(self.folder / "scene.safetensors", world, {"background": color})
         OmegaConf.save(self._config, self.folder / "config.yaml", resolve=True)
@@ -132,6 +142,40 @@ class Results:
         figure = comparison_figure(inputs, views, Rendering(**tensors, stats={}))
         with atomic_write(self.folder / name) as path:
             figure.savefig(path, dpi=110)
+
+
+def save_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write a scene; where that fails, write it elsewhere, as the refinement took long.
+
+    It is tried in the folders for temporary files and of the user, in `path` without view-dependent
+    colors, and in the folders that the user types, where there is a terminal.
+
+    Raises:
+        InputError: the scene is not at `path`, or not complete; the message names its place.
+    """
+    failure = None
+    for place, scene in _attempts(path, gaussians):
+        try:
+            write_ply(place, scene)
+        except InputError as error:
+            failure = failure or error
+            continue
+        if failure is None:
+            return
+        left_out = ", without view-dependent colors" if scene is not gaussians else ""
+        raise InputError(f"{failure} The scene was written to {place}{left_out}.")
+    raise failure
+
+
+def _attempts(path: Path, gaussians: Gaussians) -> Iterator[tuple[Path, Gaussians]]:
+    yield path, gaussians
+    name = f"{path.parent.name}-{path.name}"
+    for folder in (Path(tempfile.gettempdir()), Path.home()):
+        yield folder / name, gaussians
+    yield path, replace(gaussians, sh=gaussians.sh[:, :1])
+    while sys.stdin.isatty():
+        folder = input(f"The disks are full. Folder to write {name} to (Ctrl-C to give up): ")
+        yield Path(folder).expanduser() / name, gaussians
 
 
 def _means(name: str, rows: list[dict[str, float]]) -> dict[str, float]:

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from asysplat.errors import input_error_behind
+from asysplat.errors import input_error_behind, plain_warnings
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -16,7 +16,7 @@ def quiet_lightning() -> None:
     """Hide Lightning's tips and deprecations; print other warnings without their line of code."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning")
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
+    plain_warnings()
 
 
 @contextmanager
