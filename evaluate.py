@@ -118,7 +118,9 @@ def open_gaussians(path: str, data: SceneDataModule, device: torch.device) -> Pr
             "of that scene as data.root."
         )
     sample = scenes[0]
-    gaussians = sample["frame"].to_network(read_gaussians(path)).to(device)
+    scene = getattr(scenes.tasks[0].sequence, "scene", None)  # of files
+    gaussians = read_gaussians(path, scene and scene.origin)
+    gaussians = sample["frame"].to_network(gaussians).to(device)
     if not render(gaussians, sample["inputs"].cameras.to(device), depth=False).alpha.any():
         raise InputError(
             f"scene={path} has {gaussians.num_gaussians} Gaussians, and none is visible in the "

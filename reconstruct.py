@@ -90,7 +90,7 @@ def initialize(config: DictConfig, photographs: Photographs, max_gaussians: int)
             print(f"warning: {error} Starting with init=plane_sweep.")
             init = "plane_sweep"
     if init not in INITS and Path(init).suffix:
-        gaussians = photographs.frame.to_network(read_gaussians(init))
+        gaussians = photographs.frame.to_network(read_gaussians(init, photographs.origin))
     else:
         gaussians = initial_gaussians(init, photographs, max_gaussians, network)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")

@@ -30,6 +30,10 @@ from asysplat.data.images import (
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 
+# A scene is moved if its cameras are this far from the origin, in units and in their extent.
+FAR = 100.0
+MIN_EXTENT = 1e-9  # of their distance from the origin: less is rounding
+MAX_DISTANCE = 1e8  # at which that can still be one position
 Points = Float[ndarray, "P 3"]
 Load = Callable[[ImageFile], ndarray]
 
@@ -96,16 +100,48 @@ class PosedScene:
         name: unique within the data set.
         images: in the order they were taken.
         read_points: reads sparse points of the scene's surfaces; None where the files have none.
+        origin: of the poses and points, in the coordinates of the files; see `near_origin`.
     """
 
     name: str
     images: list[PosedImage]
     read_points: Callable[[], Points | None] | None = None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @cached_property
     def points(self) -> Points | None:
         """Sparse points, read at the first access: they may take longer than all the rest."""
-        return self.read_points() if self.read_points else None
+        points = self.read_points() if self.read_points else None
+        return None if points is None else points - self.origin
+
+
+def near_origin(scene: PosedScene) -> PosedScene:
+    """Move a scene that is far from the origin, such as a geo-referenced one, to its cameras' mean.
+
+    Float32 would not resolve its poses. The mean is rounded to whole units.
+
+    Raises:
+        InputError: float64 does not resolve the poses either.
+    """
+    centers = np.array([image.cam_to_world[:3, 3] for image in scene.images]).reshape(-1, 3)
+    if any(scene.origin) or not np.isfinite(centers).all() or not len(centers):
+        return scene
+    distance, extent = np.abs(centers).max(), np.ptp(centers, axis=0).max()
+    if distance > MAX_DISTANCE and extent < MIN_EXTENT * distance:
+        raise InputError(
+            f"{scene.name}: the cameras are {distance:.3g} units from the origin and at most "
+            f"{extent:.3g} from each other, which float64 does not resolve: subtract an offset "
+            "from their positions."
+        )
+    if distance < FAR or distance < FAR * extent or extent < MIN_EXTENT * distance:
+        return scene
+    origin = centers.mean(0).round()
+    images = []
+    for image in scene.images:
+        pose = image.cam_to_world.astype(np.float64)
+        pose[:3, 3] -= origin
+        images.append(replace(image, cam_to_world=pose))
+    return replace(scene, images=images, origin=tuple(origin.tolist()))
 
 
 class FileSequence:
@@ -117,7 +153,8 @@ class FileSequence:
     """
 
     def __init__(self, scene: PosedScene, options: SceneOptions):
-        self.scene, self.name, self.options = scene, scene.name, options
+        self.scene = scene = near_origin(scene)
+        self.name, self.options = scene.name, options
         self.num_images = len(scene.images)
         images, (height, width) = scene.images, (options.height, options.width)
         intrinsics = np.array([resized_intrinsics(image.lens, height, width) for image in images])

@@ -1,10 +1,13 @@
 """Read and write Gaussians in the format of the file's suffix."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from asysplat.errors import InputError
-from asysplat.export.ply import read_ply, write_ply
+from asysplat.export.ply import read_offset, read_ply, write_ply
 from asysplat.export.splat import read_splat
 from asysplat.export.tensors import read_safetensors, write_safetensors
 from asysplat.scene import Gaussians
@@ -17,13 +20,37 @@ READERS = {
 WRITERS = {".ply": write_ply, ".safetensors": write_safetensors}
 
 
-def read_gaussians(path: str | Path) -> Gaussians:
+def read_gaussians(path: str | Path, origin: Sequence[float] | None = None) -> Gaussians:
     """Read a scene from a .ply, .splat or .safetensors file, in float32.
+
+    Args:
+        path: of the file.
+        origin: of the coordinates of the means; None: the file's own, whose offset (see
+            `write_ply`) is left out.
 
     Raises:
         InputError: another suffix, or see the format's reader.
     """
-    return _by_suffix(READERS, path, "read")(path)
+    gaussians = _by_suffix(READERS, path, "read")(path)
+    if origin is None:
+        return gaussians
+    shift = torch.tensor(_offset(Path(path)), dtype=torch.float64)
+    shift -= torch.tensor(origin, dtype=torch.float64)
+    return replace(gaussians, means=(gaussians.means.double() + shift).float())
+
+
+def _offset(path: Path) -> list[float]:
+    """Read the offset of a file of Gaussians; 0 where it has none."""
+    text = ""
+    if path.suffix.lower() == ".ply":
+        text = read_offset(path)
+    elif path.suffix.lower() == ".safetensors":
+        text = read_safetensors(path)[1].get("offset", "")
+    try:
+        x, y, z = map(float, text.split())
+    except ValueError:
+        return [0.0, 0.0, 0.0]
+    return [x, y, z]
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:

@@ -4,6 +4,7 @@ A vertex is a Gaussian with float32 properties: the mean, an unused normal, SH (
 other degrees of red, of green and of blue), the opacity's logit, log scales, a quaternion wxyz.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +20,23 @@ from asysplat.scene import Gaussians
 MEAN, NORMAL, COLOR = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
 SCALE, ROTATION = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
 REST_COUNTS = (0, 9, 24, 45)  # of properties f_rest_*, for SH of degree 0 to 3
+MAX_HEADER = 65536  # bytes in which an offset is searched
+OFFSET = "comment offset"
 MAX_OPACITY = 1 - 1e-7  # the logit of 1 is infinite
 
 
-def write_ply(path: str | Path, gaussians: Gaussians) -> None:
+def write_ply(
+    path: str | Path, gaussians: Gaussians, offset: Sequence[float] = (0.0, 0.0, 0.0)
+) -> None:
     """Write one scene, without batch dimension, as binary little-endian PLY.
 
     Quaternions are normalized, and an opacity of 1 is written as 1 - 1e-7.
+
+    Args:
+        path: of the file.
+        gaussians: [N].
+        offset: to be added to the means, which float32 may not resolve: written as a comment,
+            `comment offset X Y Z`, if it is not 0.
 
     Raises:
         InputError: invalid Gaussians, or a file that cannot be written.
@@ -44,7 +55,9 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     table = torch.cat(columns, 1).numpy().astype("<f4", copy=False)
     rest = _rest(3 * (gaussians.sh.shape[1] - 1))
     names = [*MEAN, *NORMAL, *COLOR, *rest, "opacity", *SCALE, *ROTATION]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"{OFFSET} {' '.join(map(repr, offset))}"] * any(offset)
+    header += [f"element vertex {len(table)}"]
     header += [*(f"property float {name}" for name in names), "end_header\n"]
     with atomic_write(path) as partial, open(partial, "wb") as file:
         file.write("\n".join(header).encode())
@@ -93,6 +106,13 @@ def read_ply(path: str | Path) -> Gaussians:
         sh=torch.cat((color[:, None], rest.unflatten(1, (3, count // 3)).mT), 1),
     )
     return gaussians.validate(f"{path}: Gaussians")
+
+
+def read_offset(path: str | Path) -> str:
+    """Read the offset of a PLY file, see `write_ply`; "" where it has none."""
+    with open(path, "rb") as file:
+        header = file.read(MAX_HEADER).partition(b"end_header")[0].decode("latin-1")
+    return next((line[len(OFFSET) :] for line in header.split("\n") if line.startswith(OFFSET)), "")
 
 
 def _rest(count: int) -> list[str]:

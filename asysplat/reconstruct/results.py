@@ -2,7 +2,7 @@
 
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -84,9 +84,11 @@ class Results:
         """
         photographs, background = self._photographs, self._background
         world = photographs.frame.to_world(gaussians)
-        save_ply(self.folder / "scene.ply", world)
+        save_ply(self.folder / "scene.ply", world, photographs.origin)
         color = " ".join(f"{value:.6f}" for value in background.tolist())
-        write_safetensors(self.folder / "scene.safetensors", world, {"background": color})
+        offset = " ".join(map(repr, photographs.origin))
+        metadata = {"background": color, "offset": offset}
+        write_safetensors(self.folder / "scene.safetensors", world, metadata)
         OmegaConf.save(self._config, self.folder / "config.yaml", resolve=True)
         self._save_contact_sheet("contact.png", gaussians)
         self._save_metrics(gaussians, progress)
@@ -99,6 +101,8 @@ class Results:
                 for frame in range(path.num_views)
             )
             write_video(self.folder / "path.mp4", images, video.fps)
+        if any(photographs.origin):
+            print(f"add the offset in its header, {offset}, for the coordinates of the photographs")
         print(f"scene: {self.folder / 'scene.ply'}")
 
     def _save_metrics(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
@@ -144,7 +148,7 @@ class Results:
             figure.savefig(path, dpi=110)
 
 
-def save_ply(path: Path, gaussians: Gaussians) -> None:
+def save_ply(path: Path, gaussians: Gaussians, offset: Sequence[float]) -> None:
     """Write a scene; where that fails, write it elsewhere, as the refinement took long.
 
     It is tried in the folders for temporary files and of the user, in `path` without view-dependent
@@ -156,7 +160,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
     failure = None
     for place, scene in _attempts(path, gaussians):
         try:
-            write_ply(place, scene)
+            write_ply(place, scene, offset)
         except InputError as error:
             failure = failure or error
             continue

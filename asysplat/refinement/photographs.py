@@ -32,6 +32,7 @@ class Photographs:
     held_out_files: list[str]
     frame: Normalization  # the network's frame, in the world of the files
     points: Float[Tensor, "P 3"] | None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of that world, see `near_origin`
 
 
 def open_photographs(
@@ -64,6 +65,8 @@ def open_photographs(
             "give at least 1 pixel, 2 views, and held_out_every of 2 or more, or null."
         )
     scene = open_scene(path, SceneOptions(ANY_SIZE, ANY_SIZE, layout, on_bad_image)).scene
+    if any(scene.origin):
+        say(f"the scene is far from the origin: its new origin is {scene.origin} of the files.")
     if width is None:
         lens = scene.images[0].lens
         width = max(1, round(height * lens.width / lens.height))
@@ -98,4 +101,5 @@ def open_photographs(
         points = ((points @ pose[:3, :3].mT + pose[:3, 3]) * frame.scale).float()
     held_out_files = [files[index] for index in held_out]
     targets = targets if held_out else None
-    return Photographs(scene.name, input_views, targets, input_files, held_out_files, frame, points)
+    files = input_files, held_out_files
+    return Photographs(scene.name, input_views, targets, *files, frame, points, scene.origin)
