@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from asysplat.errors import InputError
+from asysplat.files import atomic_write, make_folder
 from asysplat.interrupts import handle_signals
 from asysplat.overrides import check_overrides, exit_at_unknown_overrides
 from asysplat.report.fill import fill_table, finished_runs, with_costs
@@ -35,7 +36,8 @@ def main(options: DictConfig) -> None:
 
 def report(options: DictConfig) -> None:
     """Fill the tables, print them, write report.md and report.html."""
-    tables = find_tables(options.table)
+    tables, folder = find_tables(options.table), Path(options.output)
+    make_folder(folder, "output")
     overrides = [*sweep_overrides(HydraConfig.get().overrides.task), *options.overrides]
     check_overrides(overrides)
     runs = finished_runs(Path(options.logs))
@@ -44,10 +46,10 @@ def report(options: DictConfig) -> None:
         filled = [with_costs(table, compose_train) for table in track(filled, "counting costs")]
     console = Console()
     render_terminal(filled, console)
-    folder = Path(options.output)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "report.md").write_text(render_markdown(filled))
-    (folder / "report.html").write_text(render_html(filled))
+    with atomic_write(folder / "report.md") as partial:
+        partial.write_text(render_markdown(filled))
+    with atomic_write(folder / "report.html") as partial:
+        partial.write_text(render_html(filled))
     console.print(f"page: {folder / 'report.html'}", soft_wrap=True)
 
 

@@ -16,6 +16,7 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from asysplat.files import make_folder
 from asysplat.interrupts import handle_signals
 from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.training.messages import error_sentence, exit_with_message
@@ -81,9 +82,19 @@ def train_in_sweep(config: DictConfig) -> float | None:
         raise CompactHydraException(sentence) from None
 
 
+def logs_of(overrides: list[str]) -> Path:
+    """Return paths.logs of a command, whose folder Hydra writes to before `main`."""
+    given = (
+        word.partition("=")[2] for word in reversed(overrides) if word.startswith("paths.logs=")
+    )
+    return Path(next(given, "logs"))
+
+
 if __name__ == "__main__":
     handle_signals()
     os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
     exit_at_unknown_overrides("train")
+    with exit_with_message("stopped."):
+        make_folder(logs_of(sys.argv), "paths.logs")
     OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
     main()

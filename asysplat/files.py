@@ -1,5 +1,6 @@
 """Writing that loses nothing: atomic writes, folders of their own, space that is checked before."""
 
+import errno
 import os
 import shutil
 from collections.abc import Iterator
@@ -44,6 +45,23 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def make_folder(path: Path, option: str) -> None:
+    """Create a folder if there is none.
+
+    Raises:
+        InputError: it cannot be created or written to; the message names the option that sets it.
+    """
+    reason = None
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror
+    if reason is None and not os.access(path, os.W_OK):
+        reason = os.strerror(errno.EACCES)
+    if reason is not None:
+        raise InputError(f"{path} cannot be written to ({reason}): set {option} to another folder.")
+
+
 def new_folder(path: Path, room: int) -> Path:
     """Create a folder that was not there: `path`, or else `path`-2, -3, ...
 
@@ -54,19 +72,13 @@ def new_folder(path: Path, room: int) -> Path:
     Raises:
         InputError: the folder cannot be created, or its disk is too full.
     """
-    candidates = chain([path], (path.with_name(f"{path.name}-{n}") for n in count(2)))
-    for folder in candidates:
+    make_folder(path.parent, "paths.logs")
+    for folder in chain([path], (path.with_name(f"{path.name}-{n}") for n in count(2))):
         try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            if folder.is_dir():
-                continue
-            raise InputError(f"{folder} is a file: set paths.logs to another folder.") from None
-        except OSError as error:
-            raise InputError(
-                f"{folder} cannot be created ({error.strerror}): set paths.logs to a folder that "
-                "you may write to."
-            ) from error
+            folder.mkdir()  # of two processes, one succeeds
+        except OSError:
+            make_folder(folder, "paths.logs")  # raises unless there is one
+            continue
         free = shutil.disk_usage(folder).free
         if free < room:
             folder.rmdir()

@@ -15,6 +15,7 @@ from torch import Tensor
 from asysplat.errors import InputError
 
 ORTHONORMAL_TOLERANCE = 1e-3
+MAX_FIELD_OF_VIEW = 20  # image side over focal length: 169 degrees
 
 Record = TypeVar("Record", bound="TensorRecord")
 
@@ -159,8 +160,8 @@ class Cameras(TensorRecord):
         """Return self if all numbers are usable.
 
         Raises:
-            InputError: NaN or infinity, a focal length <= 0, a rotation that is not orthonormal, or
-                a last row other than 0 0 0 1; it names the field and the view.
+            InputError: NaN or infinity, a focal length <= 0 or not in pixels, a rotation that is
+                not orthonormal, or a last row other than 0 0 0 1; it names the field and the view.
         """
         _check_finite(f"{name}.intrinsics", self.intrinsics, 2)
         _check_finite(f"{name}.cam_to_world", self.cam_to_world, 2)
@@ -169,6 +170,12 @@ class Cameras(TensorRecord):
             f"{name}.intrinsics",
             (focal > 0).all(-1),
             "has a focal length <= 0: give fx and fy in pixels, both positive",
+        )
+        _check_all(
+            f"{name}.intrinsics",
+            (MAX_FIELD_OF_VIEW * focal > focal.new_tensor([self.width, self.height])).all(-1),
+            f"has a focal length below 1/{MAX_FIELD_OF_VIEW} of the image: give fx, fy, cx and cy "
+            "in pixels; multiply normalized ones by the image's width and height",
         )
         rotation = self.cam_to_world[..., :3, :3]
         identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
@@ -211,8 +218,13 @@ class Views(TensorRecord):
     disparities: Float[Tensor, "*batch V H W"] | None = None
 
     def __post_init__(self):
+        if not isinstance(self.cameras, Cameras):
+            raise InputError(
+                f"Views.cameras is a {type(self.cameras).__name__}: give Views(cameras, images)."
+            )
         batch = self.cameras.intrinsics.shape[:-2]
         size = (self.cameras.height, self.cameras.width)
+        _check_float("Views.images (RGB in [0, 1])", self.images)
         _check_exact("Views.images", self.images, (*batch, 3, *size))
         for name in ("depths", "masks", "point_depths", "disparities"):
             if getattr(self, name) is not None:
@@ -332,7 +344,14 @@ class Gaussians(TensorRecord):
         return self
 
 
+def _check_float(name: str, tensor: Tensor) -> None:
+    if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+        found = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
+        raise InputError(f"{name} is {found}: give a torch tensor of floating-point numbers.")
+
+
 def _check_shape(name: str, tensor: Tensor, last: tuple[int, ...]) -> None:
+    _check_float(name, tensor)
     if tensor.ndim <= len(last) or tuple(tensor.shape[-len(last) :]) != last:
         expected = ", ".join(map(str, last))
         raise InputError(f"{name} has shape {tuple(tensor.shape)}: expected [..., V, {expected}].")

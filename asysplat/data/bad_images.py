@@ -9,6 +9,7 @@ from asysplat.errors import InputError
 
 Policy = Literal["fail", "skip"]
 MIN_IMAGES = 2  # in a scene
+MAX_LISTED = 50  # errors in a message
 
 
 class BadImages:
@@ -53,8 +54,9 @@ class BadImages:
         Raises:
             InputError: there are errors and the policy is "fail", or too few images are left.
         """
-        listed = "".join(f"\n  {error}" for error in self.errors)
         bad, total = len(self.errors), left + len(self.errors)
+        listed = "".join(f"\n  {error}" for error in self.errors[:MAX_LISTED])
+        listed += f"\n  and {bad - MAX_LISTED} more" if bad > MAX_LISTED else ""
         if bad and self.policy == "fail":
             raise InputError(
                 f"{scene}: {bad} of {total} images cannot be used; fix them, or leave them out "

@@ -14,7 +14,7 @@ from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.measured_cost import mean_but_longest
 from asysplat.evaluation.post_optimization import PostOptimization, Predict, SceneResult
 from asysplat.evaluation.rows import ImageRow, average
-from asysplat.files import atomic_write
+from asysplat.files import atomic_write, make_folder
 from asysplat.rendering import Rendering
 
 Scenes = Mapping[str, Sequence[SceneResult]]  # by test set, the data set's own first
@@ -41,8 +41,8 @@ def measure_scenes(
         scene_folder: the results of single scenes are read from it and written to it.
         early_exit: the shares that the last prediction left out, see `Network`.
     """
-    scene_folder.mkdir(parents=True, exist_ok=True)
-    (folder / "figures").mkdir(exist_ok=True)
+    make_folder(scene_folder, "paths.logs")
+    make_folder(folder / "figures", "paths.logs")
     main, last = next(iter(tests)), measure.steps[-1]
     columns = (TextColumn("{task.description:8}"), BarColumn(bar_width=20), MofNCompleteColumn())
     with Progress(*columns, TimeElapsedColumn()) as bars:

@@ -41,6 +41,8 @@ def read_vertices(path: Path) -> ndarray:
             row = np.dtype([(key, byte_order + kind) for key, kind in types.items()])
             if name == "vertex":
                 break
+            if count > path.stat().st_size:
+                raise _truncated(path, count, "fewer bytes", f"rows of {name}")
             if byte_order:
                 file.seek(count * row.itemsize, 1)
             else:
@@ -99,8 +101,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
     return byte_order, elements
 
 
-def _truncated(path: Path, count: int, found: str) -> InputError:
+def _truncated(path: Path, count: int, found: str, kind: str = "vertices") -> InputError:
     return InputError(
-        f"{path} is cut off: its header declares {count} vertices, but {found} follow; copy it "
-        "again."
+        f"{path} is cut off: its header declares {count} {kind}, but {found} follow; copy it again."
     )

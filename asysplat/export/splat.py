@@ -30,6 +30,8 @@ def read_splat(path: str | Path) -> Gaussians:
             "no .splat file; copy it again."
         )
     rows = np.fromfile(path, ROW)
+    if not (rows["quat"] != 128).any(1).all():
+        raise InputError(f"{path} has a rotation of 0: repair or remove that Gaussian.")
     rgba = torch.from_numpy(rows["rgba"] / np.float32(255))
     gaussians = Gaussians(
         means=torch.tensor(rows["mean"]),

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.errors import InputError
 from asysplat.models.early_exit import EXACT, EarlyExit
@@ -45,10 +46,12 @@ class Network(nn.Module, ABC):
         """Predict Gaussians [..., N] from views [..., V].
 
         Raises:
-            InputError: image sides that are no multiples of `patch`; early exit for a
-                network without a prior, or for several scenes at a time.
+            InputError: image sides that are no multiples of `patch`; outside of training, invalid
+                views; early exit for a network without a prior, or for several scenes at a time.
         """
         self.check_size(views.cameras.height, views.cameras.width)
+        if not self.training and not (views.images.is_meta or is_fake(views.images)):
+            views.validate("the network's views")  # in training the data module does
         batch = views.images.shape[:-4]
         exact = self.training or self.early_exit == EXACT
         predict = self.predict if exact else self.predict_with_early_exit
@@ -136,7 +139,8 @@ class Network(nn.Module, ABC):
         patch = self.patch
         if height % patch or width % patch:
             raise InputError(
-                f"data.height x data.width is {height}x{width}, but this model takes multiples of "
+                f"the images have {height}x{width} pixels, but this model takes multiples of "
                 f"{patch}, its patch: set {-(-height // patch) * patch}x"
-                f"{-(-width // patch) * patch}, as the paper takes 540 to 544."
+                f"{-(-width // patch) * patch} (data.height, data.width), as the paper takes "
+                "540 to 544."
             )

@@ -22,6 +22,9 @@ class VisibleAdam:
         betas: decay of the running averages of a gradient and of its square, in [0, 1).
         eps: > 0, added to the root of the latter.
 
+    Raises:
+        InputError: a tensor that is not of type float32 or float64.
+
     Attributes:
         non_finite: number of visible rows not updated so far, for a NaN or infinite gradient.
     """
@@ -33,6 +36,12 @@ class VisibleAdam:
         eps: float = 1e-15,
     ):
         self.parameters = dict(parameters)
+        for name, tensor in self.parameters.items():
+            if tensor.dtype not in (torch.float32, torch.float64):
+                raise InputError(
+                    f"VisibleAdam got {name} of type {tensor.dtype}: give float32 or float64; half "
+                    "precision would lose small steps."
+                )
         self.non_finite = 0
         self._settings = AdamSettings(*betas, eps)
         self._state = {name: _zero_state(tensor) for name, tensor in self.parameters.items()}

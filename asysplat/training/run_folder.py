@@ -8,6 +8,7 @@ from pathlib import Path
 from lightning.pytorch.utilities import rank_zero_only
 
 from asysplat.errors import InputError
+from asysplat.files import make_folder
 from asysplat.training.checkpoints import LAST, has_checkpoints, newest_folder
 from asysplat.training.runs import RESULTS
 
@@ -39,7 +40,7 @@ def locked(folder: Path) -> Iterator[None]:
     if rank_zero_only.rank != 0:
         yield
         return
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, "paths.logs")
     with open(folder / LOCK, "w") as file:
         try:
             # Not flock: the loaders of a killed run would hold it for seconds.

@@ -30,6 +30,8 @@ def test_global_tokens_are_part_of_the_sequence_and_are_read(build):
     for block in (layer for stage in net.stages for layer in stage.layers):
         block.register_forward_pre_hook(lambda _, inputs: shapes.append(inputs[0].shape))
     views = blank_views(3, 32, 48).map(lambda tensor: torch.rand(tensor.shape))
+    views.cameras.intrinsics[:] = torch.tensor([[50.0, 0, 24], [0, 50, 16], [0, 0, 1]])
+    views.cameras.cam_to_world[:] = torch.eye(4)
     gaussians = net(views)
     assert shapes[0][1:4] == (1, 1, 2 + 3 * 4 * 6) and shapes[-1][1:4] == (1, 1, 2 + 3 * 2 * 3)
     sum(field.sum() for field in (gaussians.means, gaussians.sh, gaussians.opacities)).backward()

@@ -5,7 +5,6 @@ does not pass a check raises an InputError.
 """
 
 import json
-import math
 import os
 import re
 from dataclasses import replace
@@ -22,6 +21,9 @@ from asysplat.scene import ORTHONORMAL_TOLERANCE
 
 DEPTH = 3  # levels below the named folder that are searched; DL3DV has parts and hashes
 SUFFIXES = (".png", ".jpg", ".jpeg")
+MAX_NUMBER = 1e300
+MAX_FOCAL, MAX_CENTER = 1000.0, 100.0  # in longer sides of the image
+MAX_DISTORTION = 1e3  # coefficients
 MILLIMETERS = 0.001  # meters: the usual unit of stored depths
 
 
@@ -63,7 +65,8 @@ def read_json(file: Path) -> Any:
         raise InputError(f"{file} is empty: write it again.")
     try:
         return json.loads(text)
-    except json.JSONDecodeError as error:
+    # Also numbers of too many digits and nesting that is too deep.
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is not JSON ({error}): repair or write it again.") from error
 
 
@@ -90,8 +93,8 @@ def frame_label(file: Path, index: int, entry: Any) -> str:
 def number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     """Return the number under `key`, or `default` where there is none."""
     value = settings.get(key, default)
-    if not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: {key} is {value!r}: give a finite number.")
+    if not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
+        raise InputError(f"{where}: {key} is {repr(value)[:80]}: give a finite number.")
     return float(value)
 
 
@@ -106,16 +109,18 @@ def scaled(lens: Lens, size: tuple[int, int], where: str) -> Lens:
     """Scale a lens to an image of another size and the same field of view.
 
     Raises:
-        InputError: intrinsics that are not finite or focal lengths <= 0, or an image of other
-            proportions.
+        InputError: intrinsics of no lens, or an image of other proportions.
     """
-    numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    if not (min(lens.fx, lens.fy) > 0 and all(map(math.isfinite, numbers))):
-        raise InputError(
-            f"{where} has intrinsics {', '.join(f'{number:g}' for number in numbers)}: "
-            "give finite numbers, and focal lengths > 0 in pixels."
-        )
     (width, height), given = size, (lens.width, lens.height)
+    numbers, longest = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion), max(given)
+    usable = 0 < min(lens.fx, lens.fy) <= max(lens.fx, lens.fy) < MAX_FOCAL * longest
+    usable &= max(abs(lens.cx), abs(lens.cy)) < MAX_CENTER * longest
+    if not (usable and all(abs(number) < MAX_DISTORTION for number in lens.distortion)):
+        raise InputError(
+            f"{where} has intrinsics {', '.join(f'{number:g}' for number in numbers)}: give focal "
+            f"lengths in pixels, above 0 and below {MAX_FOCAL:g} image sides, a principal point "
+            f"within {MAX_CENTER:g} of them, and distortions below {MAX_DISTORTION:g}."
+        )
     # To a pixel of the smaller one, whose size was rounded.
     if min(given) < 1 or not same_proportions(*sorted((size, given))):
         raise InputError(

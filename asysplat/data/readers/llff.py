@@ -38,7 +38,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     file = scene / POSES
     try:
         rows = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # a damaged header makes NumPy raise errors of the tokenizer, too
         raise InputError(
             f"{file} cannot be read as a NumPy array ({error}): copy or write it again."
         ) from error
