@@ -10,6 +10,11 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: who waits must not spin
 
+from asysplat.overrides import exit_at_unknown_overrides
+
+if __name__ == "__main__":
+    exit_at_unknown_overrides("benchmark")
+
 import hydra
 from omegaconf import DictConfig
 from rich.console import Console
@@ -19,7 +24,6 @@ from asysplat.benchmark.options import describe_machine, find_suite
 from asysplat.benchmark.table import write_results
 from asysplat.errors import InputError, input_error_behind
 from asysplat.interrupts import handle_signals
-from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.training.revision import revision
 
 
@@ -64,6 +68,4 @@ def benchmark(options: DictConfig) -> bool:
 
 if __name__ == "__main__":
     handle_signals()
-    os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
-    exit_at_unknown_overrides("benchmark")
     main()

@@ -3,10 +3,14 @@
 python evaluate.py run=last
 """
 
-import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+
+from asysplat.overrides import exit_at_unknown_overrides
+
+if __name__ == "__main__":
+    exit_at_unknown_overrides("evaluate")
 
 import hydra
 import lightning
@@ -26,7 +30,6 @@ from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.export import read_gaussians
 from asysplat.interrupts import handle_signals
 from asysplat.models.early_exit import EXACT
-from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 from asysplat.training.checkpoints import load_weights
@@ -132,6 +135,4 @@ def open_gaussians(path: str, data: SceneDataModule, device: torch.device) -> Pr
 
 if __name__ == "__main__":
     handle_signals()
-    os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
-    exit_at_unknown_overrides("evaluate")
     main()

@@ -4,15 +4,22 @@ python reconstruct.py my_scene
 """
 
 import os
-import re
 import signal
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: idle threads must not spin
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # while modules load there is nothing to clean up
 
+from asysplat.overrides import as_overrides, exit_at_unknown_overrides
+
+if __name__ == "__main__":
+    sys.argv[1:] = as_overrides(sys.argv[1:])
+    exit_at_unknown_overrides("reconstruct")
+
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
@@ -20,7 +27,6 @@ from asysplat import load
 from asysplat.errors import InputError, input_error_behind, plain_warnings
 from asysplat.export import read_gaussians
 from asysplat.interrupts import handle_signals
-from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
 from asysplat.refinement import mean_color, refine
@@ -51,10 +57,13 @@ def reconstruct(config: DictConfig) -> None:
         raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
     check_ranges(OmegaConf.masked_copy(config, "speed"))
     limit = read_limit(config)
+    if config.view and find_spec("viser") is None:
+        raise InputError("view=true needs viser: pip install 'asysplat[viewer]', or leave it out.")
     settings = instantiate(config.refinement)
     results = Results(Path(config.paths.run), config)
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
     photographs = open_photographs(config.path, **{name: config[name] for name in names})
+    print(describe(config, photographs, limit))
     gaussians = initialize(config, photographs, settings.max_gaussians)
     background = mean_color(photographs.inputs)
     results.save_start(gaussians, photographs, background)
@@ -67,12 +76,30 @@ def reconstruct(config: DictConfig) -> None:
         display.show(gaussians)
 
 
+def describe(config: DictConfig, photographs: Photographs, limit: dict[str, float]) -> str:
+    """Write a line of what is used, of what there is, and of the options that change it."""
+    inputs, held_out = photographs.inputs, len(photographs.held_out_files)
+    (name, value), most = next(iter(limit.items())), config.refinement.max_gaussians
+    return (
+        f"{inputs.num_views} of {photographs.total} photographs are fitted (views=), {held_out} "
+        f"measure the result (held_out_every=), {inputs.cameras.height} pixels high (height=), at "
+        f"most {most:,} Gaussians (refinement.max_gaussians=), {value:g} {name} ({name}=); all of "
+        "these: quality=preview or best"
+    )
+
+
 def read_limit(config: DictConfig) -> dict[str, float]:
     """Read the limit of the refinement: steps, or else seconds."""
+    given = {override.partition("=")[0] for override in HydraConfig.get().overrides.task}
+    if {"steps", "seconds"} <= given and None not in (config.steps, config.seconds):
+        raise InputError(
+            f"seconds={config.seconds} and steps={config.steps}: give one of them; steps are "
+            "repeatable, seconds are not."
+        )
     name = "seconds" if config.steps is None else "steps"
     value, kinds = config[name], int if name == "steps" else int | float
     if not isinstance(value, kinds) or isinstance(value, bool) or not value > 0:
-        raise InputError(f"{name}={value}: give a number above 0; steps take priority.")
+        raise InputError(f"{name}={value}: give a number above 0.")
     return {name: value if name == "steps" else float(value)}
 
 
@@ -100,20 +127,6 @@ def initialize(config: DictConfig, photographs: Photographs, max_gaussians: int)
     return gaussians
 
 
-def as_overrides(words: list[str]) -> list[str]:
-    """Rewrite the first word as path=..., and --view as view=true."""
-    view = ["view=true"] if "--view" in words else []
-    words = [word for word in words if word != "--view"]
-    if words and not words[0].startswith("-") and ("=" not in words[0] or Path(words[0]).exists()):
-        # Hydra unescapes a backslash only before a quote.
-        quoted = re.sub(r"(\\+)(?='|$)", r"\1\1", words[0]).replace("'", "\\'")
-        words[0] = f"path='{quoted}'"
-    return words + view
-
-
 if __name__ == "__main__":
     handle_signals()
-    os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
-    sys.argv[1:] = as_overrides(sys.argv[1:])
-    exit_at_unknown_overrides("reconstruct")
     main()

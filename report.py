@@ -7,6 +7,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from asysplat.overrides import exit_at_unknown_overrides
+
+if __name__ == "__main__":
+    exit_at_unknown_overrides("report")
+
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -16,7 +21,7 @@ from rich.progress import track
 from asysplat.errors import InputError
 from asysplat.files import atomic_write, make_folder
 from asysplat.interrupts import handle_signals
-from asysplat.overrides import check_overrides, exit_at_unknown_overrides
+from asysplat.overrides import check_overrides
 from asysplat.report.fill import fill_table, finished_runs, with_costs
 from asysplat.report.html import render_html
 from asysplat.report.markdown import render_markdown
@@ -65,5 +70,4 @@ def compose_train(overrides: Sequence[str]) -> DictConfig:
 
 if __name__ == "__main__":
     handle_signals()
-    exit_at_unknown_overrides("report")
     main()

@@ -3,10 +3,14 @@
 python train.py model=asysplat_4m4s scale=laptop
 """
 
-import os
 import sys
 import traceback
 from pathlib import Path
+
+from asysplat.overrides import exit_at_unknown_overrides
+
+if __name__ == "__main__":
+    exit_at_unknown_overrides("train")
 
 import hydra
 import lightning
@@ -18,7 +22,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from asysplat.files import make_folder
 from asysplat.interrupts import handle_signals
-from asysplat.overrides import exit_at_unknown_overrides
 from asysplat.training.messages import error_sentence, exit_with_message
 from asysplat.training.prepare import PreparedRun, Stage, prepare_run
 from asysplat.training.revision import revision
@@ -92,8 +95,6 @@ def logs_of(overrides: list[str]) -> Path:
 
 if __name__ == "__main__":
     handle_signals()
-    os.environ.setdefault("ASYSPLAT_SHARED", str(Path(__file__).parents[1] / "shared"))
-    exit_at_unknown_overrides("train")
     with exit_with_message("stopped."):
         make_folder(logs_of(sys.argv), "paths.logs")
     OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)

@@ -8,30 +8,21 @@ asysplat.write_gaussians("scene.ply", photographs.frame.to_world(gaussians))
 
 from importlib import import_module
 
-from asysplat.export import read_gaussians, write_gaussians
-from asysplat.rendering import render
-from asysplat.scene import Cameras, Gaussians, Views
-
-# Imported when first asked for: they bring Hydra, image readers and plots along.
+# Imported when first used, since torch takes seconds.
 LATER = {
+    "Cameras": "asysplat.scene",
+    "Gaussians": "asysplat.scene",
+    "Views": "asysplat.scene",
     "load": "asysplat.load",
     "mean_color": "asysplat.refinement",
     "open_photographs": "asysplat.refinement.photographs",
+    "read_gaussians": "asysplat.export",
     "refine": "asysplat.refinement",
+    "render": "asysplat.rendering",
+    "write_gaussians": "asysplat.export",
 }
 
-__all__ = [
-    "Cameras",
-    "Gaussians",
-    "Views",
-    "load",
-    "mean_color",
-    "open_photographs",
-    "read_gaussians",
-    "refine",
-    "render",
-    "write_gaussians",
-]
+__all__ = list(LATER)
 
 
 def __getattr__(name: str) -> object:

@@ -49,5 +49,6 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
         net = instantiate(config.model)
         net.early_exit = instantiate(config.speed)
         net.check_early_exit(net.early_exit)
-    load_weights(checkpoint, nn.ModuleDict({"net": net}))  # named as in a checkpoint
+    weights = nn.ModuleDict({"net": net})  # named as in a checkpoint
+    load_weights(checkpoint, weights, option="checkpoint")
     return net.eval()

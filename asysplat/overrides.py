@@ -2,6 +2,8 @@
 
 import contextlib
 import difflib
+import os
+import re
 import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -55,8 +57,23 @@ def check_overrides(overrides: Iterable[str], script: str = "train") -> None:
                 raise InputError(f"stage={stage} is unknown: choose {', '.join(others)} or {last}.")
 
 
+def as_overrides(words: list[str]) -> list[str]:
+    """Rewrite the first word as path=..., and --view as view=true."""
+    view = ["view=true"] if "--view" in words else []
+    words = [word for word in words if word != "--view"]
+    if words and not words[0].startswith("-") and ("=" not in words[0] or Path(words[0]).exists()):
+        # Hydra unescapes a backslash only before a quote.
+        quoted = re.sub(r"(\\+)(?='|$)", r"\1\1", words[0]).replace("'", "\\'")
+        words[0] = f"path='{quoted}'"
+    return words + view
+
+
 def exit_at_unknown_overrides(script: str) -> None:
-    """Run `check_overrides` on this process's command line; exit with the message on an error."""
+    """Run `check_overrides` on this process's command line; exit with the message on an error.
+
+    Scripts call it before they import torch, which takes seconds.
+    """
+    os.environ.setdefault("ASYSPLAT_SHARED", str(CONF.parents[1] / "shared"))
     given = get_args_parser().parse_args()
     if given.config_dir or given.config_name or given.config_path or given.shell_completion:
         return  # other configuration files, or no run
@@ -140,6 +157,10 @@ def _hint(key: str, known: Collection[str], script: str) -> str:
 def _nearest(key: str, known: Collection[str]) -> str | None:
     """Return the option that is spelled like `key`, in whole or from one of its dots on."""
     name = key.rpartition(".")[2]
+    top = [path for path in known if "." not in path]
+    top += [str(folder.relative_to(CONF)) for folder in CONF.rglob("*") if folder.is_dir()]
+    if nearest := difflib.get_close_matches(key, top, 1, MIN_SIMILARITY):
+        return nearest[0]
     if name in known:  # at the top: steps for trainer.steps
         return name
     ends: dict[str, str] = {}

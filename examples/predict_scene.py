@@ -7,30 +7,19 @@ import sys
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 
-from asysplat import render
+from asysplat import load, render
 from asysplat.data import ProceduralScene
+from asysplat.data.normalize import normalize
 from asysplat.evaluation.figures import comparison_figure
-
-CONF = Path(__file__).resolve().parents[1] / "conf"
-
-
-def build(*overrides: str) -> torch.nn.Module:
-    """Build the network that `python train.py` would train with these overrides."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return instantiate(compose("train", list(overrides)).model)
 
 
 @torch.no_grad()
 def main(checkpoint: Path | None, figure: Path) -> None:
-    net = build("model=asysplat_4m4s", "scale=laptop").eval()
-    if checkpoint is not None:
-        state = torch.load(checkpoint, weights_only=True)["state_dict"]
-        net.load_state_dict({k.removeprefix("net."): v for k, v in state.items() if "net." in k})
+    net = load("shipped" if checkpoint is None else str(checkpoint))
     scene = ProceduralScene(seed=5, height=64, width=64)
     inputs, targets = scene.views(range(0, 48, 6)), scene.views([9, 21, 33])
+    inputs, targets, _ = normalize(inputs, targets)
     gaussians = net(inputs)
     rendering = render(gaussians, targets.cameras, background=torch.full((3,), 0.5))
     comparison_figure(inputs, targets, rendering).savefig(figure, dpi=120)

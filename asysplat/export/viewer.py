@@ -1,7 +1,11 @@
-"""A viewer in the browser: the server renders each open page's camera."""
+"""A viewer in the browser: the server renders each open page's camera.
+
+python -m asysplat.export.viewer scene.ply [PHOTOGRAPHS]
+"""
 
 import math
 import re
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,12 +25,15 @@ from asysplat.data.normalize import normalize
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import disparity
 from asysplat.export import frame
+from asysplat.export.gaussians import read_gaussians
+from asysplat.refinement.photographs import open_photographs
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 
 OWN_PAGES = re.compile(r"https?://(127\.0\.0\.1|localhost)(:\d+)?")
 LAYERS = ("color", "depth", "alpha")
 FRUSTUM_LENGTH = 0.1  # in the page's unit
+FRUSTUM_HEIGHT = 128  # pixels of its image, in the command
 MAX_SAMPLES = 10_000  # pixels from which the range of disparities is computed
 WAITING = "Waiting for the first rendering; kernels may have to compile, for minutes."
 POLL_SECONDS = 0.01  # between two checks for changes
@@ -295,3 +302,38 @@ def _check_one_scene(name: str, batch: tuple[int, ...]) -> None:
         raise InputError(
             f"The viewer's {name} have the batch dimensions {tuple(batch)}: give one scene's."
         )
+
+
+def main(words: list[str]) -> None:
+    """Show a file of Gaussians, among the photographs of a folder if there is one."""
+    if not 1 <= len(words) <= 2:
+        sys.exit("usage: python -m asysplat.export.viewer scene.ply [PHOTOGRAPHS]")
+    try:
+        if len(words) == 2:
+            photographs = open_photographs(words[1], height=FRUSTUM_HEIGHT)
+            gaussians = read_gaussians(words[0], photographs.origin)
+            views, gaussians = photographs.inputs, photographs.frame.to_network(gaussians)
+        else:
+            gaussians = read_gaussians(words[0])
+            views = _view_of(gaussians)
+        with Viewer(views, gaussians) as viewer:
+            print(f"viewer: {viewer.url}, until Ctrl-C")
+            viewer.wait()
+    except InputError as error:
+        sys.exit(f"error: {error}")
+
+
+def _view_of(gaussians: Gaussians) -> Views:
+    """Make a gray view that has most Gaussians in it, with y down as COLMAP's worlds often have."""
+    center = gaussians.means.median(0).values
+    radius = (gaussians.means - center).norm(dim=-1).median()
+    pose = torch.eye(4)
+    pose[:3, 3] = center - torch.tensor([0.0, 0.0, 3.0]) * radius
+    side = FRUSTUM_HEIGHT
+    intrinsics = torch.tensor([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])
+    cameras = Cameras(intrinsics[None], pose[None], side, side)
+    return Views(cameras, torch.full((1, 3, side, side), 0.5))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

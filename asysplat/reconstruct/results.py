@@ -103,6 +103,10 @@ class Results:
             write_video(self.folder / "path.mp4", images, video.fps)
         if any(photographs.origin):
             print(f"add the offset in its header, {offset}, for the coordinates of the photographs")
+        print(f"figure: {self.folder / 'contact.png'}")
+        if self._has_video:
+            print(f"video: {self.folder / 'path.mp4'}")
+        print(f"viewer: python -m asysplat.export.viewer {self.folder / 'scene.ply'}")
         print(f"scene: {self.folder / 'scene.ply'}")
 
     def _save_metrics(self, gaussians: Gaussians, progress: RefinementProgress) -> None:

@@ -18,6 +18,7 @@ from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
+MATCHED_SIDE = 400  # pixels of the shorter side, to check the cameras
 ANY_SIZE = 8  # pixels a side: to read cameras, before the size is known
 
 
@@ -32,6 +33,7 @@ class Photographs:
     held_out_files: list[str]
     frame: Normalization  # the network's frame, in the world of the files
     points: Float[Tensor, "P 3"] | None
+    total: int = 0  # photographs of the scene
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of that world, see `near_origin`
 
 
@@ -67,8 +69,11 @@ def open_photographs(
     scene = open_scene(path, SceneOptions(ANY_SIZE, ANY_SIZE, layout, on_bad_image)).scene
     if any(scene.origin):
         say(f"the scene is far from the origin: its new origin is {scene.origin} of the files.")
+    lens = scene.images[0].lens
     if width is None:
-        lens = scene.images[0].lens
+        if height > lens.height:
+            say(f"height={height}: the photographs have {lens.height} pixels, which are used.")
+            height = lens.height
         width = max(1, round(height * lens.width / lens.height))
     sequence = FileSequence(scene, SceneOptions(height, width))
     indices = list(range(sequence.num_images))
@@ -85,9 +90,12 @@ def open_photographs(
     held_out = spread(held_out, min(max_held_out, len(held_out))) if held_out else []
     files = [str(image.file) for image in scene.images]
     input_files = [files[index] for index in inputs]
-    chosen = sequence.with_images([scene.images[index] for index in inputs])
-    verdict = diagnose_cameras(chosen.cameras, find_matches(chosen), input_files)
-    if not verdict.fits:
+    # All photographs: neighbors among the inputs may be too far apart to match.
+    share = MATCHED_SIDE / min(lens.height, lens.width)
+    size = (max(1, round(min(1.0, share) * side)) for side in (lens.height, lens.width))
+    matched = FileSequence(scene, SceneOptions(*size))
+    verdict = diagnose_cameras(matched.cameras, find_matches(matched), files)
+    if not verdict.fits and verdict.fit is not None:  # else too few points match to tell
         say(
             f"warning: {verdict.sentence}; python -m asysplat.data.check shows it at full size. "
             "The reconstruction goes on."
@@ -102,4 +110,5 @@ def open_photographs(
     held_out_files = [files[index] for index in held_out]
     targets = targets if held_out else None
     files = input_files, held_out_files
-    return Photographs(scene.name, input_views, targets, *files, frame, points, scene.origin)
+    total, origin = len(indices), scene.origin
+    return Photographs(scene.name, input_views, targets, *files, frame, points, total, origin)

@@ -162,23 +162,27 @@ def check_checkpoint(path: Path | None, module: nn.Module) -> None:
     )
 
 
-def load_weights(path: str | None, module: nn.Module) -> None:
+def load_weights(path: str | None, module: nn.Module, option: str = "init_path") -> None:
     """Load weights, but neither optimizer nor schedule.
 
     Args:
         path: a .ckpt or .safetensors file, "shipped" for the model in checkpoints/, or None.
         module: to load into.
+        option: that named the path, for messages.
 
     Raises:
-        InputError: there is no such file, or it does not fit.
+        InputError: there is no such file, it is damaged, or it does not fit.
     """
     if path is None:
         return
     file = weights_file(path)
     if not file.is_file():
         raise InputError(
-            f"init_path={path} does not exist: name a .ckpt or .safetensors file, or shipped."
+            f"{option}={path} does not exist: name a .ckpt or .safetensors file, or shipped."
         )
+    damage = None if file.suffix == ".safetensors" else _damage(file)
+    if damage is not None:
+        raise InputError(f"{option}={path} {damage}: copy it again, or name another file.")
     check_checkpoint(file, module)
     if file.suffix == ".safetensors":
         weights = load_file(file)

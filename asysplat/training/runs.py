@@ -147,6 +147,8 @@ def find_runs(logs: Path) -> Iterator[Run]:
     """Yield every finished run below `logs`, oldest first; warn of results that are damaged."""
     paths = sorted(logs.rglob(RESULTS), key=lambda path: (path.stat().st_mtime, path))
     for path in paths:
+        if path.with_name("scene.ply").exists():  # a reconstruction
+            continue
         try:
             results = json.loads(path.read_text())
             hash_now = _config_hash_now(path.parent, results)

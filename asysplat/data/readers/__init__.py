@@ -29,9 +29,11 @@ from asysplat.data.readers import (
     scannetpp,
     transforms,
 )
+from asysplat.data.readers.common import SUFFIXES, images_in
 from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.errors import InputError
 
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 # In this order: the first layout that fits a folder reads it.
 READERS = (long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, llff, posed, colmap)
 LAYOUTS: dict[str, ModuleType] = {reader.__name__.rpartition(".")[2]: reader for reader in READERS}
@@ -52,10 +54,26 @@ def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]
             return name, scenes
     if not root.exists():
         raise InputError(f"{root} does not exist: name a scene, or a folder of scenes.")
+    bare = _bare_photographs(root) if layout == "auto" else None
+    if bare is not None:
+        raise InputError(
+            f"{root} has {bare} without camera poses: find them first, for example with colmap "
+            "automatic_reconstructor --workspace_path my_scene --image_path my_scene/images, and "
+            "name the folder of images/ and sparse/."
+        )
     raise InputError(
         f"{root} holds no scene of layout {layout}: data/README.md lists the files of each "
         f"layout; the layouts are {', '.join(LAYOUTS)}."
     )
+
+
+def _bare_photographs(root: Path) -> str | None:
+    """Describe photographs or a video without poses; None where there are neither."""
+    if root.is_file():
+        kinds = dict.fromkeys(VIDEOS, "a video") | dict.fromkeys(SUFFIXES, "one photograph")
+        return kinds.get(root.suffix.lower())
+    count = len(images_in(root)) or len(images_in(root / "images"))
+    return f"{count} photographs" if count else None
 
 
 def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
