@@ -1,11 +1,13 @@
 import errno
 import os
+import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from full_disk import largest_file
 
 from asysplat.errors import InputError
-from asysplat.files import atomic_write
+from asysplat.files import atomic_write, new_folder
 
 
 @pytest.fixture
@@ -77,3 +79,21 @@ def test_links_and_permissions_stay(old, tmp_path):
         partial.write_text("new")
     assert link.is_symlink() and old.read_text() == "new"
     assert old.stat().st_mode & 0o777 == 0o640
+
+
+def test_folders_of_many_at_once_are_different(tmp_path):
+    with ThreadPoolExecutor(8) as pool:
+        folders = list(pool.map(lambda _: new_folder(tmp_path / "logs" / "run", 1), range(40)))
+    assert len(set(folders)) == 40 and tmp_path / "logs" / "run-40" in folders
+
+
+def test_no_folder_without_room_for_the_results(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=5_000_000))
+    with pytest.raises(InputError, match=r"run has 5 MB of free space, .* may take 6 MB"):
+        new_folder(tmp_path / "run", 6_000_000)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(InputError, match=r"cannot be written to .*: set paths.logs"):
+            new_folder(path, 1)

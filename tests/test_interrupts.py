@@ -1,6 +1,7 @@
 """An interruption at a moment at which Python can raise nothing."""
 
 import ctypes
+import signal
 import subprocess
 import sys
 import textwrap
@@ -49,3 +50,19 @@ def test_other_errors_are_printed_as_before(monkeypatch):
     keep_interrupts()
     ctypes.CFUNCTYPE(None)(lambda: 1 / 0)()
     assert [one.exc_type for one in told] == [ZeroDivisionError]
+
+
+@pytest.mark.parametrize("nohup", [False, True])
+def test_a_closed_terminal_ends_the_process_like_sigterm(repository, nohup):
+    script = f"""
+        import os, signal, time
+        from asysplat.interrupts import handle_signals
+
+        signal.signal(signal.SIGHUP, signal.SIG_IGN if {nohup} else signal.SIG_DFL)
+        handle_signals()
+        signal.raise_signal(signal.SIGHUP)
+        time.sleep(0.2)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    done = subprocess.run(command, cwd=repository, capture_output=True, timeout=50)
+    assert done.returncode == (0 if nohup else -signal.SIGTERM) and not done.stderr

@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import cv2
 import pytest
 import torch
 import yaml
+from full_disk import largest_file
 from safetensors import safe_open
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
@@ -23,6 +25,8 @@ from scipy.spatial.transform import Rotation
 from asysplat import read_gaussians, render
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.write import write_transforms
+from asysplat.errors import InputError
+from asysplat.reconstruct.results import save_ply
 
 SIZE = 48
 LAYOUTS = Path(__file__).parent / "data" / "readers"  # writers of them
@@ -53,6 +57,7 @@ def command(run_script, tmp_path):
         keys = [override.split("=")[0] for override in overrides]
         tiny = [option for option in TINY if option.split("=")[0] not in keys]
         words = [] if path is None else [path]
+        shutil.rmtree(folder, ignore_errors=True)  # else the next one is run-2
         return run_script("reconstruct.py", *words, *overrides, *tiny, f"paths.run={folder}")
 
     folder = tmp_path / "run"
@@ -203,6 +208,7 @@ REFUSED = {
     "init=swep": "init=swep: choose network, plane_sweep, points, depth, or a",
     "init=absent.ply": "absent.ply",
     "init=points": "has no sparse points; choose plane_sweep",
+    "seconds=5 steps=3": "seconds=5 and steps=3: give one of them",
     "steps=null seconds=null": "seconds=None: give a number above 0",
     "steps=null seconds=0": "seconds=0: give a number above 0",
     "steps=null seconds=-3": "seconds=-3: give a number above 0",
@@ -257,6 +263,37 @@ def test_logs_that_cannot_be_written(command, photographs, tmp_path):
     check_refusal(command(photographs), str(tmp_path / "run"))
 
 
+@pytest.mark.medium
+def test_small_photographs_are_measured_without_lpips(command, photographs, tmp_path, shared):
+    small = (
+        "height=24",
+        "views=4",
+        "steps=2",
+        "video.path=none",
+        f"paths.weights={shared}/weights",
+    )
+    result = command(photographs, *small)
+    assert "height" in finished(result) and "lpips" not in str(numbers_of(tmp_path / "run"))
+
+
+def test_a_scene_is_kept_where_the_disk_is_full(make_scene, tmp_path, monkeypatch):
+    scene, _ = make_scene(count=40, degree=3, dtype=torch.float32)
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "other"))
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    (tmp_path / "home").mkdir()
+    (tmp_path / "run").mkdir()
+    path = tmp_path / "run" / "scene.ply"
+    lost = tmp_path / "lost" / "scene.ply"
+    with pytest.raises(InputError, match=r"written to \S+home/lost-scene\.ply\."):
+        save_ply(lost, scene, (0.0, 0.0, 0.0))
+    assert read_gaussians(tmp_path / "home" / "lost-scene.ply").num_gaussians == 40
+    with largest_file(5000), pytest.raises(InputError, match="without view-dependent colors"):
+        save_ply(path, scene, (0.0, 0.0, 0.0))
+    assert read_gaussians(path).sh.shape[1] == 1
+    save_ply(path, scene, (0.0, 0.0, 0.0))
+    assert read_gaussians(path).sh.shape[1] == 16
+
+
 @pytest.fixture
 def process(repository, photographs, tmp_path):
     """The script in an interpreter of its own, which takes SIGINT as in a terminal."""
@@ -294,15 +331,13 @@ def test_interrupts_leave_complete_files_or_none(process, tmp_path, times):
         running.send_signal(number)
         _, errors = running.communicate(timeout=200)
         assert "Traceback" not in errors and running.returncode in (0, 1, -number), errors
-        for name in ("scene.ply", "scene.safetensors"):
-            file = tmp_path / "run" / name
-            if file.exists():
-                assert read_gaussians(file).num_gaussians > 0
-                file.unlink()
+        for file in tmp_path.glob("run*/scene.*"):
+            assert read_gaussians(file).num_gaussians > 0
+            file.unlink()
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("times", [1, 2])
 def test_the_first_interrupt_saves_and_the_second_stops(process, tmp_path, times, number):
     running = process("seconds=600")

@@ -1,6 +1,9 @@
 """The values that pass between the rooms: shapes, numbers, and what they refuse."""
 
 import re
+import subprocess
+import sys
+import textwrap
 
 import pytest
 import torch
@@ -151,3 +154,38 @@ def test_masked_pixels_are_neither_error_nor_gradient():
     (views.masked(rendered) - views.images).square().sum().backward()
     assert torch.equal((rendered.grad != 0).all(1), mask)
     assert torch.equal((rendered.grad == 0).all(1), ~mask)
+
+
+FROM_OUTSIDE = {
+    "Views(images, cameras)": "give Views(cameras, images)",
+    "Views(cameras, images.byte())": "is torch.uint8: give a torch tensor of floating-point",
+    "Views(cameras, images.numpy())": "is ndarray: give a torch tensor",
+    "Views(cameras, 255 * images + 2)": "divide 8-bit images by 255",
+    "Views(cameras.resized(100, 100).resized(4, 4), images)": "",
+    "Views(replace(cameras, intrinsics=cameras.intrinsics / 400), images)": "normalized ones",
+    "Views(replace(cameras, cam_to_world=-cameras.cam_to_world), images)": "not orthonormal",
+}
+
+
+def test_views_from_outside_are_checked(repository):
+    """In a process without the types' checks of the tests."""
+    script = """
+        import sys, torch
+        from dataclasses import replace
+        from asysplat import Cameras, Views
+        from asysplat.errors import InputError
+        matrix = torch.tensor([[5.0, 0, 2], [0, 5, 2], [0, 0, 1]])
+        cameras, images = Cameras(matrix[None], torch.eye(4)[None], 4, 4), torch.rand(1, 3, 4, 4)
+        for text in sys.argv[1:]:
+            try:
+                eval(text).validate()
+                print()
+            except InputError as error:
+                print(error)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script), *FROM_OUTSIDE]
+    done = subprocess.run(command, cwd=repository, capture_output=True, text=True, timeout=100)
+    sentences = done.stdout.splitlines()
+    assert len(sentences) == len(FROM_OUTSIDE), done.stderr
+    for sentence, expected in zip(sentences, FROM_OUTSIDE.values(), strict=True):
+        assert expected in sentence and bool(expected) == bool(sentence)

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.errors import InputError
 from asysplat.models.prior.prior import DepthEstimate, Prior, fill_unknown, other_views
@@ -190,6 +191,8 @@ def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbors
             f"plane_sweep's images have shape {tuple(images.shape)}: expected {expected}, the "
             "cameras' number and size."
         )
+    if images.is_cpu and not is_fake(images):  # on a GPU it would wait for the device
+        cameras.validate("plane_sweep's cameras")
     if stride < 1 or cameras.height % stride or cameras.width % stride:
         raise InputError(
             f"plane_sweep got stride={stride} for images of {cameras.height}x{cameras.width}: give "
