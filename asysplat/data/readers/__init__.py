@@ -13,6 +13,8 @@ tests/data/readers/layouts/NAME.py. A data set in a known layout needs no code: 
 conf/data/mipnerf360.yaml.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -33,10 +35,24 @@ from asysplat.data.readers.common import SUFFIXES, images_in
 from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.errors import InputError
 
+MAX_NAME = 200  # characters of a path in a message
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 # In this order: the first layout that fits a folder reads it.
 READERS = (long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, llff, posed, colmap)
 LAYOUTS: dict[str, ModuleType] = {reader.__name__.rpartition(".")[2]: reader for reader in READERS}
+
+
+@contextmanager
+def _file_errors(path: Path) -> Iterator[None]:
+    """Raise an InputError for a path that the system refuses: too long, unreadable, a loop."""
+    try:
+        yield
+    except OSError as error:
+        name = str(error.filename or path)
+        raise InputError(
+            f"{name[:MAX_NAME]}{'...' * (len(name) > MAX_NAME)} cannot be read ({error.strerror}): "
+            f"repair the files of {path}."
+        ) from error
 
 
 def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]]:
@@ -49,7 +65,8 @@ def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]
         raise InputError(f"data.layout={layout}: expected auto or one of {', '.join(LAYOUTS)}.")
     root = Path(root).absolute()
     for name in LAYOUTS if layout == "auto" else (layout,):
-        scenes = LAYOUTS[name].find_scenes(root)
+        with _file_errors(root):
+            scenes = LAYOUTS[name].find_scenes(root)
         if scenes:
             return name, scenes
     if not root.exists():
@@ -92,7 +109,8 @@ def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
             raise InputError(f"{path} holds {len(scenes)} scenes: name one, such as {scenes[0]}.")
         path = scenes[0]
     bad = BadImages(options.on_bad_image)
-    posed = LAYOUTS[layout].read_scene(path, bad)
+    with _file_errors(path):
+        posed = LAYOUTS[layout].read_scene(path, bad)
     if options.disparities is not None:
         posed = with_disparities(posed, path, Path(options.disparities))
     sequence = FileSequence(posed, options)

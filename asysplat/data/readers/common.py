@@ -111,13 +111,15 @@ def scaled(lens: Lens, size: tuple[int, int], where: str) -> Lens:
     Raises:
         InputError: intrinsics of no lens, or an image of other proportions.
     """
-    (width, height), given = size, (lens.width, lens.height)
+    # Of JSON, integers may be too large for a float.
+    (width, height), given = size, tuple(min(side, 10**9) for side in (lens.width, lens.height))
     numbers, longest = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion), max(given)
     usable = 0 < min(lens.fx, lens.fy) <= max(lens.fx, lens.fy) < MAX_FOCAL * longest
     usable &= max(abs(lens.cx), abs(lens.cy)) < MAX_CENTER * longest
     if not (usable and all(abs(number) < MAX_DISTORTION for number in lens.distortion)):
+        found = ", ".join(f"{min(number, MAX_NUMBER):g}" for number in numbers)
         raise InputError(
-            f"{where} has intrinsics {', '.join(f'{number:g}' for number in numbers)}: give focal "
+            f"{where} has intrinsics {found}: give focal "
             f"lengths in pixels, above 0 and below {MAX_FOCAL:g} image sides, a principal point "
             f"within {MAX_CENTER:g} of them, and distortions below {MAX_DISTORTION:g}."
         )
@@ -147,7 +149,7 @@ def array_of(stored: Any) -> Float[ndarray, "..."]:
     """Convert nested lists to float64; empty where they are no numbers or ragged."""
     try:
         return np.array(stored, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return np.empty(0)
 
 

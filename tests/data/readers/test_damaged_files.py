@@ -1,0 +1,105 @@
+"""Mutants of every file that is read: a sentence or numbers that can be used, and at once.
+
+pytest -m slow -k damaged runs 10,000 of them.
+"""
+
+import random
+import time
+import traceback
+import warnings
+from collections import Counter
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+from test_layouts import NAMES
+
+from asysplat import read_gaussians, write_gaussians
+from asysplat.data import SceneOptions, open_scene
+from asysplat.errors import InputError
+
+SECONDS = 5.0
+FEW = 40  # mutants of each kind in the fast test
+MANY = 1500
+BYTES = (b"\x00", b"\xff" * 8, b"9" * 400, b"-1", b"nan", b"1e400", b"[" * 3000, b"\x80", b"", b'"')
+
+
+def mutate(stored: bytes, numbers: random.Random) -> bytes:
+    """Change, insert, repeat or cut bytes."""
+    start = numbers.randrange(len(stored) + 1)
+    if numbers.random() < 0.3:  # where headers are
+        start = numbers.randrange(min(len(stored), 200) + 1)
+    end = min(len(stored), start + numbers.choice((0, 1, 2, 8, 100)))
+    way = numbers.randrange(4)
+    if way == 0:
+        return stored[:start]
+    if way == 1:
+        return stored[:start] + numbers.choice(BYTES) + stored[end:]
+    if way == 2:
+        return stored[:start] + numbers.randbytes(end - start) + stored[end:]
+    return stored[:end] + stored[start:]
+
+
+def attack(file: Path, read, count: int, seed: str, tally: Counter) -> list[str]:
+    """Read mutants of a file; return what went wrong."""
+    stored, numbers, wrong = file.read_bytes(), random.Random(seed), []
+    for index in range(count):
+        file.write_bytes(mutate(stored, numbers))
+        started = time.monotonic()
+        try:
+            read()
+            tally["read"] += 1
+        except InputError:
+            tally["refused"] += 1
+        except Exception as error:
+            trace = traceback.extract_tb(error.__traceback__)[-1]
+            wrong.append(f"{file.name} {index}: {error!r:.200} at {trace.filename}:{trace.lineno}")
+        if time.monotonic() - started > SECONDS:
+            wrong.append(f"{file.name} {index}: {time.monotonic() - started:.1f} s")
+    file.write_bytes(stored)
+    return wrong
+
+
+def attack_scene(layout: str, views, folder: Path, count: int) -> tuple[list[str], Counter]:
+    root, wrong, tally = import_module(f"layouts.{layout}").write(views, folder), [], Counter()
+
+    def read() -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            sequence = open_scene(root, SceneOptions(24, 32))
+            sequence.views(range(2)).validate()
+            points = sequence.points
+            assert points is None or torch.as_tensor(points).isfinite().all()
+
+    files = sorted(path for path in Path(folder).rglob("*") if path.is_file())
+    kinds = {path.suffix: path for path in files}  # one image of many
+    for file in {path for path in files if path.suffix not in (".png", ".jpg")} | {*kinds.values()}:
+        wrong += attack(file, read, max(1, count // len(files)), f"{layout}{file.name}", tally)
+    return wrong, tally
+
+
+def attack_gaussians(suffix: str, scene, folder: Path, count: int) -> tuple[list[str], Counter]:
+    file, tally = folder / f"scene{suffix}", Counter()
+    if suffix == ".splat":
+        file.write_bytes(random.Random(0).randbytes(32 * 20))
+    else:
+        write_gaussians(file, scene)
+    return attack(file, lambda: read_gaussians(file).validate(), count, suffix, tally), tally
+
+
+@pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("layout", NAMES)
+def test_damaged_scenes(layout, few, tmp_path, count):
+    wrong, tally = attack_scene(layout, few, tmp_path / "scene", count)
+    print(f"{layout}: {dict(tally)}")
+    assert wrong == []
+
+
+@pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("suffix", [".ply", ".splat", ".safetensors"])
+def test_damaged_gaussians(suffix, make_scene, tmp_path, count):
+    scene, _ = make_scene(count=20, degree=1, dtype=torch.float32)
+    wrong, tally = attack_gaussians(suffix, scene, tmp_path, count)
+    print(f"{suffix}: {dict(tally)}")
+    assert wrong == []
