@@ -51,4 +51,6 @@ def locked(folder: Path) -> Iterator[None]:
             ) from None
         except OSError:
             pass  # a network disk without locks
+        for partial in folder.rglob("checkpoints/.next.*.ckpt"):  # of a write that was killed
+            partial.unlink()
         yield
