@@ -79,12 +79,12 @@ def reconstruct(config: DictConfig) -> None:
 def describe(config: DictConfig, photographs: Photographs, limit: dict[str, float]) -> str:
     """Write a line of what is used, of what there is, and of the options that change it."""
     inputs, held_out = photographs.inputs, len(photographs.held_out_files)
-    (name, value), most = next(iter(limit.items())), config.refinement.max_gaussians
+    (name, value), gaussians = next(iter(limit.items())), config.refinement.max_gaussians
     return (
         f"{inputs.num_views} of {photographs.total} photographs are fitted (views=), {held_out} "
         f"measure the result (held_out_every=), {inputs.cameras.height} pixels high (height=), at "
-        f"most {most:,} Gaussians (refinement.max_gaussians=), {value:g} {name} ({name}=); all of "
-        "these: quality=preview or best"
+        f"most {gaussians:,} Gaussians (refinement.max_gaussians=), {value:g} {name} ({name}=); "
+        "all of these: quality=preview or best"
     )
 
 

@@ -179,7 +179,9 @@ class Cameras(TensorRecord):
         )
         rotation = self.cam_to_world[..., :3, :3]
         identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
-        error = (rotation @ rotation.mT - identity).abs().amax((-1, -2))
+        # Not a matrix product, which autocast would round to half precision.
+        product = (rotation[..., :, None, :] * rotation[..., None, :, :]).sum(-1)
+        error = (product - identity).abs().amax((-1, -2))
         proper = (error < ORTHONORMAL_TOLERANCE) & (torch.linalg.det(rotation) > 0)
         _check_all(
             f"{name}.cam_to_world",

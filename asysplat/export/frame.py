@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from asysplat.scene import Cameras
+from asysplat.scene import MAX_FIELD_OF_VIEW, Cameras
 
 MAX_SIDE = 16384  # pixels of a page
-MIN_FOV = 1e-3  # radians
+MIN_FOV, MAX_FOV = 1e-3, 2.9  # radians
 
 
 def mean_up(cameras: Cameras) -> Float[Tensor, "3"]:
@@ -58,7 +58,8 @@ def page_camera(page: Any, max_pixels: int) -> tuple[Cameras, bool]:
         InputError: the page sent numbers that are no camera.
     """
     height, width = (min(max(side, 1), MAX_SIDE) for side in (page.image_height, page.image_width))
-    focal = height / 2 / math.tan(min(max(page.fov, MIN_FOV), math.pi - MIN_FOV) / 2)
+    focal = height / 2 / math.tan(min(max(page.fov, MIN_FOV), MAX_FOV) / 2)
+    width = max(1, min(width, int(MAX_FIELD_OF_VIEW * focal) - 1))
     cam_to_world = torch.eye(4)
     rotation = Rotation.from_quat(page.wxyz, scalar_first=True).as_matrix()
     cam_to_world[:3, :3] = torch.from_numpy(rotation)

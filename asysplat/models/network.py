@@ -139,7 +139,7 @@ class Network(nn.Module, ABC):
         patch = self.patch
         if height % patch or width % patch:
             raise InputError(
-                f"the images have {height}x{width} pixels, but this model takes multiples of "
+                f"the images are {height}x{width}, but this model takes multiples of "
                 f"{patch}, its patch: set {-(-height // patch) * patch}x"
                 f"{-(-width // patch) * patch} (data.height, data.width), as the paper takes "
                 "540 to 544."

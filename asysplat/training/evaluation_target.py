@@ -41,7 +41,7 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
             f"{' and '.join(given) or 'nothing'} is given to evaluate: give one of run=last, "
             "init_path=shipped and scene=scene.ply."
         )
-    if options.scene is not None and "root" not in options.data:
+    if options.scene is not None and not any(each.startswith("data") for each in overrides):
         raise InputError(
             f"scene={options.scene} is measured on photographs of the same scene: add data=files "
             "data.root=my_scene."

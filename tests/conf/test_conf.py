@@ -19,7 +19,7 @@ CONF, SWEEPS = ROOT / "conf", ROOT / "sweeps"
 GROUPS = [
     (str(path.parent.relative_to(CONF)), path.stem)
     for path in sorted(CONF.rglob("*.yaml"))
-    if path.parent not in (CONF, CONF / "refinement")
+    if path.parent not in (CONF, CONF / "refinement", CONF / "quality")
 ]
 # Shared parts of the files that use them.
 PARTS = {("model", "asysplat"), ("model", "blocks"), ("model", "one_branch")}
@@ -55,6 +55,14 @@ def test_refinement_files_equal_the_defaults_of_the_code():
     for name, expected in (("default", RefinementSettings()), ("paper", PAPER)):
         config = compose_train(f"refinement={name}", script="reconstruct")
         assert instantiate(config.refinement) == expected
+
+
+def test_qualities_raise_everything_together():
+    names = ("preview", "good", "best")
+    configs = [compose_train(f"quality={name}", script="reconstruct") for name in names]
+    for key in ("height", "views", "seconds", "refinement.max_gaussians"):
+        values = [OmegaConf.select(config, key) for config in configs]
+        assert values == sorted(set(values)), key
 
 
 @pytest.mark.medium
@@ -104,7 +112,7 @@ def test_trains_a_step_at_a_tiny_size(choice):
 def test_first_comment_is_the_command(path):
     comments = [line for line in path.read_text().splitlines()[:2] if line.startswith("# ")]
     scripts = {name: f"{name}.py" for name in ("report", "benchmark", "evaluate", "reconstruct")}
-    scripts["refinement"] = "reconstruct.py"  # a folder
+    scripts |= dict.fromkeys(("refinement", "quality"), "reconstruct.py")  # folders
     script = scripts.get(path.stem, scripts.get(path.parent.stem, "train.py"))
     assert any(f"python {script}" in comment for comment in comments)
 
