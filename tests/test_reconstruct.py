@@ -310,7 +310,7 @@ def process(repository, photographs, tmp_path):
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+            preexec_fn=as_in_a_terminal,
         )
 
     started = []
@@ -318,6 +318,12 @@ def process(repository, photographs, tmp_path):
     for one in started:
         one.kill()
         one.wait()
+
+
+def as_in_a_terminal():
+    """Handle signals as a terminal's processes do, however the tests were started."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.mark.medium
