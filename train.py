@@ -25,7 +25,7 @@ from asysplat.interrupts import handle_signals
 from asysplat.training.messages import error_sentence, exit_with_message
 from asysplat.training.prepare import PreparedRun, Stage, prepare_run
 from asysplat.training.revision import revision
-from asysplat.training.run_folder import run_folder
+from asysplat.training.run_folder import job_name, run_folder
 from asysplat.training.runs import find_run
 
 
@@ -98,4 +98,5 @@ if __name__ == "__main__":
     with exit_with_message("stopped."):
         make_folder(logs_of(sys.argv), "paths.logs")
     OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
+    OmegaConf.register_new_resolver("job_name", job_name, replace=True)
     main()

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.report.paper import Costs, Number, PaperRow, PaperTable, our_sets, set_titles
-from asysplat.training.runs import Run, config_hash, data_of, find_runs
+from asysplat.training.runs import Run, config_hash, data_of, differences, find_runs
 from asysplat.training.stages import describe_stage, stage_configs
 
 # Overrides of train.py -> its configuration, the node `hydra` included.
@@ -26,6 +26,7 @@ MEASURED = {
     "inference_gb": ("cost/inference_gb", "cost/post{}/gb"),
 }
 BASELINES = {"mean_color": "mean color", "nearest_view": "nearest view, copied"}
+SIMILAR = 16  # options, at most, that the run named beside a row without one may have differently
 # Columns that are options of a run.
 OPTIONS = {"batch": "data.batch_size", "train_steps": "steps"}
 # Columns that need no run: they are printed with the costs, at the paper's scale.
@@ -65,7 +66,8 @@ def fill_table(
         row_config = compose([*overrides, *row.run])
         row_config = OmegaConf.masked_copy(row_config, [k for k in row_config if k != "hydra"])
         read = data_of(row_config)
-        same = [run for run in runs.get(config_hash(row_config), []) if run.agrees(read)]
+        same_options = runs.get(config_hash(row_config), [])
+        same = [run for run in same_options if run.agrees(read)]
         # For each seed the newest run, first among those tested on all of the data.
         row_runs = {run.seed: run for run in sorted(same, key=lambda run: run.covers(read))}
         used += row_runs.values()
@@ -79,8 +81,9 @@ def fill_table(
                 numbers = [number for number in numbers if number is not None]
             if numbers:
                 values[column.key] = numbers
+        unlike = _nearest_run(row_config, same_options, runs) if not row_runs else ""
         missing = ", ".join(str(seed) for seed in map(int, seeds) if seed not in row_runs)
-        note = f"seeds still to run: {missing}" if values and missing else ""
+        note = f"seeds still to run: {missing}" if values and missing else unlike
         if row.post_optimization and not values:
             note = "not run: python evaluate.py run=... adds post-optimization to a finished run"
         row = replace(row, values=values, note=note)
@@ -102,6 +105,19 @@ def fill_table(
     }
     metrics = _metrics(table, config, used)
     return replace(table, rows=tuple(rows), sets=sets, metrics=metrics, notes=notes)
+
+
+def _nearest_run(config: DictConfig, same_options: Sequence[Run], runs: Runs) -> str:
+    """Write why the run that is most like a row is not the row's; "" without one like it."""
+    if same_options:
+        return f"not run on this data; on other data: {same_options[-1].folder}"
+    unlike = [(differences(found[-1], config), found[-1].folder) for found in runs.values()]
+    unlike = [(options, folder) for options, folder in unlike if 0 < len(options) <= SIMILAR]
+    if not unlike:
+        return ""
+    options, folder = min(unlike, key=lambda each: len(each[0]))
+    texts = [f"{key}={of_run} ({wanted})" for key, (of_run, wanted) in options.items()]
+    return f"not run; {folder} has other options than the row (in brackets): {', '.join(texts)}"
 
 
 def with_costs(filled: PaperTable, compose: Compose) -> PaperTable:

@@ -16,6 +16,7 @@ from torch import nn
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
 from asysplat.training.old_names import upgrade_checkpoint
+from asysplat.training.run_config import flat_options
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_plane_sweep.safetensors"
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # of a run, to resume from
@@ -108,22 +109,13 @@ def config_diff(notes: Mapping[str, Any], config: Mapping[str, Any], revision: s
 
     `notes` are the checkpoint's, see `read_notes`, and `revision` is that of the code.
     """
-    before, now = (_flat(options) for options in (notes.get("hyper_parameters", {}), config))
+    before, now = (flat_options(options) for options in (notes.get("hyper_parameters", {}), config))
     keys = [key for key in before.keys() & now.keys() if before[key] != now[key]]
     keys = [key for key in sorted(keys) if not key.startswith(WITHOUT_EFFECT)]
     differences = [f"{key}={now[key]}, it was {before[key]}" for key in keys]
     if notes.get("revision", revision) != revision:
         differences.append(f"the code is {revision}, it was {notes['revision']}")
     return differences
-
-
-def _flat(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values of nested options by their dotted keys."""
-    flat = {}
-    for key, value in options.items():
-        nested = isinstance(value, Mapping)
-        flat |= _flat(value, f"{prefix}{key}.") if nested else {prefix + key: value}
-    return flat
 
 
 def check_checkpoint(path: Path | None, module: nn.Module) -> None:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-FORMAT = 3  # of the files of a run; raise it with every line that is added below
+FORMAT = 4  # of the files of a run; raise it with every line that is added below
 
 CLASSES = {
     "asysplat.models.SceneSkips": "asysplat.models.EarlyExit",
@@ -16,7 +16,8 @@ CLASSES = {
     "asysplat.reconstruction.Settings": "asysplat.refinement.RefinementSettings",
     "asysplat.training.Reconstruction": "asysplat.training.SplattingModule",
     "asysplat.training.ReconstructionLoss": "asysplat.training.SplattingLoss",
-    "asysplat.training.tensorboard.make_logger": "lightning.pytorch.loggers.TensorBoardLogger",
+    "asysplat.training.tensorboard.make_logger": "asysplat.training.tensorboard.TensorBoard",
+    "lightning.pytorch.loggers.TensorBoardLogger": "asysplat.training.tensorboard.TensorBoard",
     "asysplat.training.loggers.make_wandb_logger": "lightning.pytorch.loggers.WandbLogger",
     "asysplat.training.callbacks.Pictures": "asysplat.training.callbacks.Figures",
     "asysplat.training.callbacks.Progress": "asysplat.training.callbacks.TrainingProgressBar",

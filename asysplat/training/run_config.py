@@ -1,6 +1,7 @@
 """Read the configuration of a run, which may come from another machine and must not run code."""
 
 import re
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -55,3 +56,12 @@ def _known_targets() -> set[str]:
     """Return every `_target_` of conf/."""
     files = CONF.rglob("*.yaml")
     return {name for file in files for name in re.findall(r"_target_: *(\S+)", file.read_text())}
+
+
+def flat_options(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values of nested options by their dotted keys."""
+    flat = {}
+    for key, value in options.items():
+        nested = isinstance(value, Mapping)
+        flat |= flat_options(value, f"{prefix}{key}.") if nested else {prefix + key: value}
+    return flat

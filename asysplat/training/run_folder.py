@@ -1,7 +1,9 @@
 """Choose the folder of a run and lock it."""
 
 import fcntl
-from collections.abc import Iterator
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from asysplat.training.checkpoints import LAST, has_checkpoints, newest_folder
 from asysplat.training.runs import RESULTS
 
 LOCK = ".lock"  # in the folder of each run
+MAX_NAME = 120  # characters; file systems allow 255 bytes
 
 
 def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
@@ -32,6 +35,23 @@ def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
         return new
     run = folder.parent if (folder.parent / LOCK).exists() else folder  # of an earlier stage
     return new if not has_checkpoints(folder) or (run / RESULTS).exists() else str(run)
+
+
+def job_name(overrides: Sequence[str], params: Mapping[str, str] | None) -> str:
+    """Name a job of a sweep by its options that vary, for `hydra.sweep.subdir` of conf/train.yaml.
+
+    Args:
+        overrides: of the job.
+        params: of `hydra.sweeper.params`; the command has more. A scheduler's processes do not have
+            the command: without any known to vary, all options are named.
+    """
+    command = dict(word.partition("=")[::2] for word in sys.argv[1:])
+    given = {**(params or {}), **command}
+    swept = {key for key, value in given.items() if re.match(r"[^\[{'\"]*[,(]", str(value))}
+    options = dict(override.partition("=")[::2] for override in overrides)
+    named = {key: options[key] for key in options if key in swept} or options
+    words = (f"{key.rpartition('/')[2]}={value.rpartition('/')[2]}" for key, value in named.items())
+    return re.sub(r"[^\w=,.+-]", "", ",".join(words))[:MAX_NAME]
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import reduce
+from functools import cache, reduce
 from operator import getitem
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from asysplat.data.build import tested_sets
 from asysplat.training.checkpoints import weights_file
 from asysplat.training.old_names import FORMAT, upgrade_results
 from asysplat.training.revision import revision
-from asysplat.training.run_config import read_config
+from asysplat.training.run_config import flat_options, read_config
 from asysplat.training.stages import stage_configs
 
 RESULTS = "metrics.json"
@@ -58,13 +58,23 @@ class Run:
 def config_hash(config: DictConfig, earlier: Sequence[DictConfig] | None = None) -> str:
     """Hash the resolved configuration, without the seed and the keys that change no number.
 
-    These are NOT_HASHED, the number of loader processes, and further test sets. Of the test root,
-    disparities and a checkpoint to start from, only whether they are given is hashed. Runs of one
-    hash, seed and `data_of` have the same numbers. Missing values (`???`) are allowed.
+    See `hashed_options`. Runs of one hash, seed and `data_of` have the same numbers.
+    """
+    return hash_of(hashed_options(config, earlier))
+
+
+def hashed_options(
+    config: DictConfig, earlier: Sequence[DictConfig] | None = None
+) -> dict[str, Any]:
+    """Return the resolved options of a run that change its numbers, other than its seed.
+
+    Left out are NOT_HASHED, the number of loader processes, and further test sets. Of the test
+    root, disparities and a checkpoint to start from, only whether they are given is returned.
+    Missing values (`???`) are allowed.
 
     Args:
         config: of a run.
-        earlier: of its stages before the last, which are hashed too; None: `stage_configs`.
+        earlier: of its stages before the last, whose hashes are returned; None: `stage_configs`.
     """
     earlier = stage_configs(config)[:-1] if earlier is None else earlier
     config = config.copy()
@@ -85,7 +95,7 @@ def config_hash(config: DictConfig, earlier: Sequence[DictConfig] | None = None)
         reduce(getitem, groups, resolved).pop(name, None)
     stages = enumerate(earlier)
     resolved["stages"] = [config_hash(stage, earlier[:index]) for index, stage in stages]
-    return hash_of(resolved)
+    return resolved
 
 
 def data_of(config: DictConfig) -> dict[str, str]:
@@ -172,6 +182,25 @@ def _config_hash_now(folder: Path, results: Mapping[str, Any]) -> str:
             stages = config.get("earlier_stages") or ()
             return config_hash(config, [read_config(folder / s / "config.yaml") for s in stages])
     return results["run/config_hash"]
+
+
+def differences(run: Run, config: DictConfig) -> dict[str, tuple[Any, Any]]:
+    """Return the options that a run and a configuration have with other values: (run, config).
+
+    Keys are dotted, those with fewer dots first; empty if the run's configuration is not readable.
+    """
+    before = _options_of(run.folder)
+    now = flat_options(hashed_options(config, ()))
+    keys = sorted(before.keys() & now.keys(), key=lambda key: (key.count("."), key))
+    return {key: (before[key], now[key]) for key in keys if before[key] != now[key]}
+
+
+@cache
+def _options_of(folder: Path) -> dict[str, Any]:
+    try:
+        return flat_options(hashed_options(read_config(folder / "config.yaml"), ()))
+    except (OSError, ValueError, KeyError, AttributeError):
+        return {}
 
 
 def find_run(logs: Path, config: DictConfig) -> Run | None:

@@ -16,6 +16,20 @@ CHOICES = (
 )
 EVENTS = "events.out.tfevents.*"
 HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
+FIRST = ("train", "val", "test")  # groups of cards
+
+
+class TensorBoard(TensorBoardLogger):
+    """Lightning's logger, with the cards of FIRST before others: TensorBoard sorts by name."""
+
+    def log_metrics(self, metrics: Mapping[str, int | float], step: int | None = None) -> None:
+        super().log_metrics({_numbered(name): value for name, value in metrics.items()}, step)
+
+
+def _numbered(name: str) -> str:
+    """Put a number before the names of FIRST: 1_train/loss."""
+    group = name.partition("/")[0]
+    return f"{FIRST.index(group) + 1}_{name}" if group in FIRST else name
 
 
 def event_files(loggers: Sequence[Logger]) -> dict[str, int]:

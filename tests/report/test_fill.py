@@ -9,6 +9,7 @@ from pathlib import Path
 import hydra
 import pytest
 from hydra import initialize_config_dir
+from omegaconf import OmegaConf
 
 from asysplat.evaluation import static_cost
 from asysplat.report.compare import check_costs, fits
@@ -85,6 +86,21 @@ def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
     baselines = "procedural: mean color 13.00 dB, nearest view, copied 16.00 dB"
     assert filled.notes["Baselines"] == baselines
     assert filled.notes["Command"] == "python train.py sweeps=layers steps=7"
+
+
+def test_a_row_without_a_run_names_the_one_most_like_it(compose, tmp_path):
+    config = compose(["geometry_ratio=0.5", "steps=7"])
+    write_run(tmp_path / "ratio", config, {"test/procedural/psnr": 20.0}, 0)
+    config.paths.run = str(tmp_path / "ratio")
+    OmegaConf.save(config, tmp_path / "ratio" / "config.yaml", resolve=True)
+    (table,) = find_tables("geometry_ratio")
+    rows = fill_table(table, OVERRIDES, compose, finished_runs(tmp_path)).rows
+    note = next(row.note for row in rows if row.name == "50%")
+    assert note.startswith(f"not run; {tmp_path / 'ratio'} has other options than the row")
+    assert "parameter_budget=1.0 (0.98)" in note and "model.patch_fine=16 (8)" in note
+    (table,) = find_tables("layers")
+    rows = fill_table(table, ["scale=paper"], compose, finished_runs(tmp_path)).rows
+    assert not any(row.note for row in rows)  # they differ in too much
 
 
 def test_one_run_fills_every_table_with_its_configuration(compose, logs, tmp_path):

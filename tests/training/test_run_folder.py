@@ -3,12 +3,13 @@
 import multiprocessing
 import os
 import signal
+import sys
 import time
 
 import pytest
 
 from asysplat.errors import InputError
-from asysplat.training.run_folder import locked, run_folder
+from asysplat.training.run_folder import job_name, locked, run_folder
 
 FORK = multiprocessing.get_context("fork")
 
@@ -39,6 +40,16 @@ def test_all_else_starts_in_a_folder_of_its_own(cut_off, tmp_path):
     assert run_folder(str(best), logs, "fresh") == "fresh"
     (cut_off.parents[1] / "metrics.json").touch()  # more steps of a run that has its results
     assert run_folder("last", logs, "fresh") == "fresh"
+
+
+def test_a_job_is_named_by_the_options_that_vary(monkeypatch):
+    command = ["-m", "model/head=longlrm,pixel", "data.root=/a,/b c", "test_sets=[x,y]", "steps=8"]
+    monkeypatch.setattr(sys, "argv", ["train.py", *command])
+    options = ["model/head=longlrm", "data.root=/b c", "test_sets=[x,y]", "steps=8", "seed=2"]
+    assert job_name(options, {"seed": "range(3)"}) == "head=longlrm,data.root=bc,seed=2"
+    monkeypatch.setattr(sys, "argv", ["a scheduler's"])
+    assert job_name(options, None) == "head=longlrm,data.root=bc,test_sets=x,y,steps=8,seed=2"
+    assert len(job_name([f"key_{number}=value" for number in range(99)], None)) <= 120
 
 
 def hold(folder, pipe):

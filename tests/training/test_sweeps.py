@@ -37,9 +37,12 @@ def test_an_interrupted_sweep_runs_only_what_is_missing(train, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("metrics.json")}
     assert len(before) < 3
 
-    result = train(*SWEEP, "seed=0,1,2")
+    result = train.alone(*SWEEP, "seed=0,1,2")
     assert result.returncode == 0, result.stderr
     assert result.stdout.count("finished already") == len(before)
+    table = result.stdout.rpartition("test scenes: procedural")[2]
+    cells = [row.split("│")[1].strip() for row in table.splitlines() if "│" in row]
+    assert cells[:3] == ["0", "1", "2"] and "not finished" not in table
     assert finished_seeds(tmp_path) == [0, 1, 2]
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
@@ -64,11 +67,16 @@ def test_a_run_of_another_revision_is_named_and_repeated_with_rerun(train, finis
 
 
 def test_a_failure_is_named_and_the_others_go_on(train, tmp_path):
-    result = train(*SWEEP, "seed=0", "data.height=40,32", "data.width=32")
+    result = train.alone(*SWEEP, "seed=0", "data.height=40,32", "data.width=32")
     assert result.returncode != 0
     assert "failed: job 0" in result.stderr and "set 48x32" in result.stderr
     assert "Traceback" not in result.stderr
     assert finished_seeds(tmp_path) == [0]
+    rows = [row.split("│") for row in result.stdout.splitlines() if "│" in row]
+    (failed,) = [row for row in rows if row[1].strip() == "40"]
+    assert failed[2].strip() == "not"  # finished
+    (folder,) = tmp_path.rglob("metrics.json")
+    assert folder.parent.name == "1_data.height=32"
 
 
 @pytest.mark.parametrize(

@@ -57,8 +57,10 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     events.Reload()
     tags = events.Tags()
     scalars = set(tags["scalars"])
-    names = {"train/psnr", "train/learning_rate", "val/psnr", "test/procedural/psnr"}
-    assert names | {"cost/parameters"} <= scalars
+    names = ("1_train/psnr", "1_train/learning_rate", "2_val/psnr", "3_test/procedural/psnr")
+    assert {*names, "cost/parameters", "baseline/procedural/mean_color/psnr"} <= scalars
+    groups = sorted({tag.partition("/")[0] for tag in scalars if "/" in tag})
+    assert groups[:3] == ["1_train", "2_val", "3_test"]  # the order of TensorBoard's cards
     for name in ("time/share_data", "gradient/geometry", "gradient/head", "memory/peak_gb"):
         assert [event.step for event in events.Scalars(name)] == [1, 3, 5]
     shares = [tag for tag in scalars if tag.startswith("time/share_")]

@@ -1,0 +1,81 @@
+"""Print a table at the end of a sweep."""
+
+import atexit
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.table import Column, Table
+
+from asysplat.training.runs import Run, find_run
+from asysplat.training.summary import BASELINES, METRICS
+
+Job = tuple[dict[str, str], DictConfig, Run | None]  # overrides, configuration, its finished run
+
+
+class SweepTable(Callback):
+    """Prints the jobs of a sweep after the last: the options that vary and the test's metrics.
+
+    It reads what Hydra and the runs write to disk, so that jobs of every launcher are in it.
+    """
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        # on_multirun_end is not called if a job fails
+        atexit.register(self._print, config)
+
+    def _print(self, config: DictConfig) -> None:
+        jobs = read_jobs(Path(config.hydra.sweep.dir), Path(config.paths.logs))
+        if any(run is not None for *_, run in jobs):
+            Console().print(sweep_table(jobs))
+
+
+def read_jobs(folder: Path, logs: Path) -> list[Job]:
+    """Read the jobs of the sweep in `folder`, in their order, and find their runs below `logs`."""
+    jobs = []
+    for path in sorted(folder.glob("*/.hydra"), key=_number):
+        words = [word.partition("=") for word in OmegaConf.load(path / "overrides.yaml")]
+        config = OmegaConf.load(path / "config.yaml")
+        jobs.append(({key: value for key, _, value in words}, config, find_run(logs, config)))
+    return jobs
+
+
+def _number(path: Path) -> int:
+    """Return the number of the job whose folder has `path`."""
+    return int(path.parent.name.partition("_")[0])
+
+
+def sweep_table(jobs: Sequence[Job]) -> Table:
+    """Make a table of the jobs, and of the baselines if all jobs were tested on the same scenes."""
+    keys = dict.fromkeys(key for overrides, *_ in jobs for key in overrides)
+    varied = [key for key in keys if len({overrides.get(key) for overrides, *_ in jobs}) > 1]
+    names = sorted({config.data.name for _, config, _ in jobs})
+    protocols = sorted({config.metrics.name for _, config, _ in jobs})
+    title = f"test scenes: {', '.join(names)}, metrics: {', '.join(protocols)}"
+    headings = (*varied, "size", "geometry", *METRICS.values())
+    table = Table(*(Column(heading, overflow="fold") for heading in headings), title=title)
+    for overrides, config, run in jobs:
+        results = {} if run is None else run.results
+        size = "not finished" if run is None else ""
+        if "cost/parameters" in results:
+            size = f"{results['cost/parameters'] / 1e6:.2f}M"
+        share = results.get("cost/geometry_share")
+        table.add_row(
+            *(overrides.get(key, "") for key in varied),
+            size,
+            "" if share is None else f"{share:.1%}",
+            *_metrics(results, f"test/{config.data.name}"),
+        )
+    found = [run.results for *_, run in jobs if run is not None]
+    for label, prefix in BASELINES.items() if len(names) == 1 else ():
+        space = [""] * (len(varied) + 1)
+        cells = _metrics(found[-1], prefix.format(names[0]))
+        table.add_row(label, *space, *cells)
+    return table
+
+
+def _metrics(results: dict[str, Any], prefix: str) -> list[str]:
+    values = (results.get(f"{prefix}/{name}") for name in METRICS)
+    return ["" if value is None else f"{value:.3f}" for value in values]
