@@ -12,7 +12,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
 from torch import nn
 
-from asysplat.errors import InputError
+from asysplat.errors import InputError, input_error_behind
 from asysplat.models.network import Network
 from asysplat.overrides import CONF, check_overrides
 from asysplat.training.checkpoints import load_weights
@@ -40,7 +40,16 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
                 f"{checkpoint} has no {config_path}, which describes its model: leave it in the "
                 "folder of its run."
             )
-        net = instantiate(read_config(config_path).model)
+        model = read_config(config_path).get("model")
+        try:
+            net = instantiate(model)
+            if not isinstance(net, Network):
+                raise InputError(f"it is a {type(net).__name__}, not a network")
+        except Exception as error:  # of many kinds
+            reason = input_error_behind(error) or repr(error.__cause__ or error).split("\\n")[0]
+            raise InputError(
+                f"{config_path}: model cannot be built ({reason}): copy the run again."
+            ) from error
     else:
         check_overrides(overrides)
         initialized = GlobalHydra.instance().is_initialized()

@@ -180,6 +180,9 @@ def load_weights(path: str | None, module: nn.Module, option: str = "init_path")
         weights = load_file(file)
     else:
         weights = torch.load(file, map_location="cpu", weights_only=True)["state_dict"]
+    for name, tensor in weights.items():
+        if not tensor.isfinite().all():
+            raise InputError(f"{option}={path}: {name} has NaN or infinity: name another file.")
     module.load_state_dict(weights)
 
 

@@ -11,12 +11,18 @@ from collections import Counter
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from PIL import Image
 from test_layouts import NAMES
+from torch import nn
 
-from asysplat import read_gaussians, write_gaussians
+from asysplat import load, read_gaussians, write_gaussians
 from asysplat.data import SceneOptions, open_scene
+from asysplat.data.images import load_image
 from asysplat.errors import InputError
 
 SECONDS = 5.0
@@ -88,6 +94,26 @@ def attack_gaussians(suffix: str, scene, folder: Path, count: int) -> tuple[list
     return attack(file, lambda: read_gaussians(file).validate(), count, suffix, tally), tally
 
 
+def attack_run(model, folder: Path, count: int) -> tuple[list[str], Counter]:
+    """Mutate the checkpoint and the configuration of a run."""
+    file, tally = folder / "checkpoints" / "last.ckpt", Counter()
+    file.parent.mkdir()
+    OmegaConf.save({"model": model}, folder / "config.yaml")
+    weights = nn.ModuleDict({"net": instantiate(model)}).state_dict()
+    torch.save({"state_dict": weights}, file)
+    wrong = []
+    for path in (file, folder / "config.yaml"):
+        wrong += attack(path, lambda: load(str(file)), count // 2, path.name, tally)
+    return wrong, tally
+
+
+def attack_image(suffix: str, folder: Path, count: int) -> tuple[list[str], Counter]:
+    file, tally = folder / f"image{suffix}", Counter()
+    pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(file)
+    return attack(file, lambda: load_image(file), count, suffix, tally), tally
+
+
 @pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("layout", NAMES)
 def test_damaged_scenes(layout, few, tmp_path, count):
@@ -102,4 +128,21 @@ def test_damaged_gaussians(suffix, make_scene, tmp_path, count):
     scene, _ = make_scene(count=20, degree=1, dtype=torch.float32)
     wrong, tally = attack_gaussians(suffix, scene, tmp_path, count)
     print(f"{suffix}: {dict(tally)}")
+    assert wrong == []
+
+
+@pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_damaged_images(suffix, tmp_path, count):
+    wrong, tally = attack_image(suffix, tmp_path, count)
+    print(f"{suffix}: {dict(tally)}")
+    assert wrong == []
+
+
+@pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+def test_damaged_runs(composed, tmp_path, count):
+    sizes = ["model=asysplat_4m4s", "model.layers=1m1s", "width=0.0625", "state_size=4"]
+    model = OmegaConf.to_container(composed(*sizes).model, resolve=True)
+    wrong, tally = attack_run(OmegaConf.create(model), tmp_path, count)
+    print(f"run: {dict(tally)}")
     assert wrong == []
