@@ -26,7 +26,7 @@ from asysplat import read_gaussians, render
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
-from asysplat.reconstruct.results import save_ply
+from asysplat.reconstruct.results import save_ply, subject
 
 SIZE = 48
 LAYOUTS = Path(__file__).parent / "data" / "readers"  # writers of them
@@ -363,3 +363,12 @@ def test_the_first_interrupt_saves_and_the_second_stops(process, tmp_path, times
     else:
         assert running.returncode == 1 and errors.endswith("stopped.\n"), errors
         assert not list((tmp_path / "run").glob(".*"))
+
+
+def test_the_subject_of_an_orbit_is_where_the_views_see_a_surface(make_scene):
+    scene, cameras = make_scene(count=400, views=5, dtype=torch.float32)
+    plane = torch.rand(400, 2, generator=torch.Generator().manual_seed(0)) * 6 - 3
+    means = torch.cat((plane, torch.full((400, 1), 2.5)), -1)
+    opaque = torch.full_like(scene.opacities, 0.99)
+    flat = replace(scene, means=means, scales=torch.full_like(means, 0.3), opacities=opaque)
+    assert subject(flat, cameras)[2].item() == pytest.approx(2.5, abs=0.2)

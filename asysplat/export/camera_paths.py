@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.rendering.reference.project import rotations
@@ -98,15 +99,17 @@ def _rigid(states: Float[ndarray, "T 7"]) -> Float[ndarray, "T 4 4"]:
     return poses
 
 
-def orbit(cameras: Cameras, frames: int) -> Cameras:
-    """Build a closed path around the focus point, at the cameras' mean height and distance.
+def orbit(cameras: Cameras, frames: int, focus: Float[Tensor, "3"] | None = None) -> Cameras:
+    """Build a closed path around the focus point, at the cameras' mean height.
 
     A full circle if the cameras are all around, else to and fro within their arc, as other sides of
-    the scene are unobserved.
+    the scene are unobserved. It is as far from the point as nine in ten cameras are at most, so
+    that what they show is in frame.
 
     Args:
         cameras: [V], without batch dimension.
         frames: number of video frames.
+        focus: the subject; None: where the optical axes meet, which may be behind it.
 
     Returns:
         [frames] upright cameras that look at the point, with the mean intrinsics.
@@ -117,14 +120,14 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
     poses = _checked_poses(cameras, frames)
     vectors = _pose_vectors(poses)
     middle = int(_lengths(vectors - vectors.mean(0)).argmin())
-    focus = _focus(poses, cameras, middle)
+    focus = _focus(poses, cameras, middle) if focus is None else focus.cpu().double().numpy()
     visible = _visible(focus, poses, cameras)
     visible[middle] = True
     up = _up(poses, middle)
     offsets = poses[visible, :3, 3] - focus
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
-    radius = max(_lengths(flat).mean(), _lengths(offsets).mean() / MAX_STEEPNESS)
+    radius = max(np.quantile(_lengths(flat), 0.9), _lengths(offsets).mean() / MAX_STEEPNESS)
     direction = poses[middle, :3, 3] - focus
     x = direction - (direction @ up) * up
     if np.linalg.norm(x) < ROUNDING * np.linalg.norm(direction):

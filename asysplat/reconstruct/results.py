@@ -25,10 +25,10 @@ from asysplat.files import atomic_write, new_folder
 from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.refine import RefinementProgress
 from asysplat.rendering import Rendering, render
-from asysplat.scene import Gaussians
+from asysplat.scene import Cameras, Gaussians
 from asysplat.training.summary import write_json
 
-CAMERA_PATHS = {"own": smoothed_path, "orbit": orbit}
+CAMERA_PATHS = ("own", "orbit")
 BYTES_PER_GAUSSIAN = 2 * 4 * 62  # of scene.ply and scene.safetensors, at most
 OTHER_BYTES = 20_000_000  # of figures and the video
 SHEET_ROWS = 4  # views in a contact sheet
@@ -95,7 +95,11 @@ class Results:
         if self._has_video:
             video = self._config.video
             frames = max(1, round(video.seconds * video.fps))
-            path = CAMERA_PATHS[video.path](photographs.inputs.cameras, frames)
+            cameras = photographs.inputs.cameras
+            if video.path == "orbit":
+                path = orbit(cameras, frames, subject(gaussians, cameras))
+            else:
+                path = smoothed_path(cameras, frames)
             images = (
                 render(gaussians, path.select([frame]), background, depth=False).image[0]
                 for frame in range(path.num_views)
@@ -150,6 +154,19 @@ class Results:
         figure = comparison_figure(inputs, views, Rendering(**tensors, stats={}))
         with atomic_write(self.folder / name) as path:
             figure.savefig(path, dpi=110)
+
+
+@torch.no_grad()
+def subject(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "3"]:
+    """Compute the median of the surface points at the centers of the views of one scene [V]."""
+    rows, columns = cameras.height // 3, cameras.width // 3
+    points = []
+    for view in range(cameras.num_views):
+        camera = cameras.select([view])
+        depths = render(gaussians, camera).depth.flatten(0, -3)[0]
+        depth = depths[rows : 2 * rows + 1, columns : 2 * columns + 1].median()
+        points.append(camera.centers[0] + depth * camera.cam_to_world[0, :3, 2])
+    return torch.stack(points).median(0).values
 
 
 def save_ply(path: Path, gaussians: Gaussians, offset: Sequence[float]) -> None:

@@ -231,3 +231,15 @@ def test_where_no_point_is_seen_by_most_the_middle_camera_swings_a_little(case):
     assert (axes @ axes.mT).min() < math.cos(math.radians(9))
     seen = torch.cat((HARD[case].cam_to_world[:, :3, 2], axes))
     assert (seen[:-20] @ axes.mT).max() > math.cos(math.radians(0.5))
+
+
+def test_an_orbit_around_a_subject_in_front_of_where_the_axes_meet():
+    cameras = cameras_at(ring(range(0, 81, 10)), np.zeros((9, 3)))
+    cameras.cam_to_world[4, :3, 3] *= 1.5  # one is far away
+    focus = torch.tensor([0.3, 0.3, 0.4])
+    made = orbit(cameras, 20, focus)
+    assert_looks_at(made, focus.tolist())
+    distances = (cameras.centers - focus)[:, :2].norm(dim=-1)
+    radius = torch.quantile(distances, 0.9)
+    torch.testing.assert_close((made.centers - focus)[:, :2].norm(dim=-1), radius.expand(20))
+    assert distances.mean() < radius < distances.max()
