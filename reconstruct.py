@@ -6,8 +6,10 @@ python reconstruct.py my_scene
 import os
 import signal
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: idle threads must not spin
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # while modules load there is nothing to clean up
@@ -29,11 +31,11 @@ from asysplat.export import read_gaussians
 from asysplat.interrupts import handle_signals
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
-from asysplat.refinement import mean_color, refine
+from asysplat.refinement import RefinementSettings, mean_color, refine
 from asysplat.refinement.init import INITS, best_init, initial_gaussians
 from asysplat.refinement.photographs import Photographs, open_photographs
 from asysplat.scene import Gaussians
-from asysplat.training.ranges import check_ranges
+from asysplat.training.ranges import check_ranges, is_number
 
 
 @hydra.main(config_path="conf", config_name="reconstruct", version_base="1.3")
@@ -56,6 +58,8 @@ def reconstruct(config: DictConfig) -> None:
     if OmegaConf.is_missing(config, "path"):
         raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
     check_ranges(OmegaConf.masked_copy(config, "speed"))
+    if not is_number(config.last_fit) or not 0 <= config.last_fit <= 1:
+        raise InputError(f"last_fit={config.last_fit}: give a number from 0 to 1.")
     limit = read_limit(config)
     if config.view and find_spec("viser") is None:
         raise InputError("view=true needs viser: pip install 'asysplat[viewer]', or leave it out.")
@@ -73,6 +77,10 @@ def reconstruct(config: DictConfig) -> None:
         if display.last.step >= settings.max_steps(photographs.inputs.num_views):
             print(f"ended after refinement.max_steps_per_image={settings.max_steps_per_image}")
         results.save(gaussians, display.last)
+        if config.last_fit and photographs.held_out is not None and not display.stopped:
+            gaussians = fit_to_all(gaussians, photographs, settings, config.last_fit, options)
+            results.save_scene(gaussians)
+        results.save_video(gaussians)
         display.show(gaussians)
 
 
@@ -86,6 +94,22 @@ def describe(config: DictConfig, photographs: Photographs, limit: dict[str, floa
         f"most {gaussians:,} Gaussians (refinement.max_gaussians=), {value:g} {name} ({name}=); "
         "all of these: quality=preview or best"
     )
+
+
+def fit_to_all(
+    gaussians: Gaussians,
+    photographs: Photographs,
+    settings: RefinementSettings,
+    share: float,
+    options: dict[str, Any],
+) -> Gaussians:
+    """Refine Gaussians on all photographs for a share of the limit, without new Gaussians."""
+    views = photographs.all_views()
+    print(f"last fit: {views.num_views} photographs, the held-out ones too, after the measurement")
+    settings = replace(settings, half_size=0.0, densify="none", cool_down=1.0)
+    for name in {"steps", "seconds"} & options.keys():
+        options = options | {name: type(options[name])(max(1, share * options[name]))}
+    return refine(gaussians, views, settings, **options)
 
 
 def read_limit(config: DictConfig) -> dict[str, float]:

@@ -108,6 +108,23 @@ def test_the_result_folder(command, views, photographs, tmp_path):
 
 
 @pytest.mark.medium
+def test_a_last_fit_has_the_held_out_photographs_and_leaves_the_metrics(
+    command, views, photographs, tmp_path
+):
+    errors, metrics = {}, {}
+    held_out = views.select([0, 8])
+    for share in (0, 1):
+        finished(command(photographs, f"last_fit={share}", "video.path=none"))
+        folder = tmp_path / "run"
+        metrics[share] = numbers_of(folder) | {"seconds": None}
+        gaussians = read_gaussians(folder / "scene.ply")
+        image = render(gaussians, held_out.cameras, held_out.images.mean((0, 2, 3))).image
+        errors[share] = (image - held_out.images).square().mean()
+    assert metrics[0] == metrics[1]
+    assert errors[1] < 0.7 * errors[0]
+
+
+@pytest.mark.medium
 @pytest.mark.parametrize("unit", [1.0, 0.1, 1e3])
 def test_the_scene_is_in_the_world_of_the_files(command, views, tmp_path, unit):
     turn = torch.eye(4, dtype=torch.float64)
@@ -215,6 +232,7 @@ REFUSED = {
     "steps=null seconds=long": "seconds=long: give a number above 0",
     "steps=0": "steps=0: give a number above 0",
     "steps=0.5": "steps=0.5: give a number above 0",
+    "last_fit=2": "last_fit=2: give a number from 0 to 1",
     "video.path=spiral": "video.path=spiral: choose own, orbit or none",
     "height=0": "height=0, width=None",
     "refinement.until=2.5": "refinement.until=2.5: give 0 to 1",

@@ -76,22 +76,32 @@ class Results:
         self._save_contact_sheet("start.png", gaussians)
         print(f"figure: {self.folder / 'start.png'}")
 
-    def save(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
-        """Write the scene files, then the configuration, figures, metrics and the video.
+    def save_scene(self, gaussians: Gaussians) -> None:
+        """Write the scene files.
 
         Raises:
             InputError: a file cannot be written; the scene is elsewhere then, see `save_ply`.
         """
-        photographs, background = self._photographs, self._background
-        world = photographs.frame.to_world(gaussians)
-        save_ply(self.folder / "scene.ply", world, photographs.origin)
-        color = " ".join(f"{value:.6f}" for value in background.tolist())
-        offset = " ".join(map(repr, photographs.origin))
-        metadata = {"background": color, "offset": offset}
+        world, origin = self._photographs.frame.to_world(gaussians), self._photographs.origin
+        save_ply(self.folder / "scene.ply", world, origin)
+        color = " ".join(f"{value:.6f}" for value in self._background.tolist())
+        metadata = {"background": color, "offset": " ".join(map(repr, origin))}
         write_safetensors(self.folder / "scene.safetensors", world, metadata)
+
+    def save(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
+        """Write the scene files, then the configuration, a contact sheet and metrics.
+
+        Raises:
+            InputError: see `save_scene`.
+        """
+        self.save_scene(gaussians)
         OmegaConf.save(self._config, self.folder / "config.yaml", resolve=True)
         self._save_contact_sheet("contact.png", gaussians)
         self._save_metrics(gaussians, progress)
+
+    def save_video(self, gaussians: Gaussians) -> None:
+        """Write the video, and print where the results are."""
+        photographs, background = self._photographs, self._background
         if self._has_video:
             video = self._config.video
             frames = max(1, round(video.seconds * video.fps))
@@ -106,6 +116,7 @@ class Results:
             )
             write_video(self.folder / "path.mp4", images, video.fps)
         if any(photographs.origin):
+            offset = " ".join(map(repr, photographs.origin))
             print(f"add the offset in its header, {offset}, for the coordinates of the photographs")
         print(f"figure: {self.folder / 'contact.png'}")
         if self._has_video:

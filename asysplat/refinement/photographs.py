@@ -1,7 +1,7 @@
 """The photographs of one scene, as input and held-out views."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -35,6 +35,18 @@ class Photographs:
     points: Float[Tensor, "P 3"] | None
     total: int = 0  # photographs of the scene
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of that world, see `near_origin`
+
+    def all_views(self) -> Views:
+        """Return the inputs and the held-out views as one, without depths."""
+        parts = [views for views in (self.inputs, self.held_out) if views is not None]
+        masks = [views.masks for views in parts]
+        cameras = replace(
+            self.inputs.cameras,
+            intrinsics=torch.cat([views.cameras.intrinsics for views in parts]),
+            cam_to_world=torch.cat([views.cameras.cam_to_world for views in parts]),
+        )
+        images = torch.cat([views.images for views in parts])
+        return Views(cameras, images, masks=None if None in masks else torch.cat(masks))
 
 
 def open_photographs(
