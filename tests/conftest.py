@@ -76,7 +76,8 @@ def _run_script(name: str, *overrides: str) -> subprocess.CompletedProcess:
         sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
 
     deterministic = torch.get_deterministic_debug_mode()
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGCHLD)
+    handlers = {number: signal.getsignal(number) for number in numbers}
     with (
         pytest.MonkeyPatch.context() as patch,
         mock.patch.dict(os.environ),

@@ -6,6 +6,7 @@ import random
 import re
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import events
@@ -108,6 +109,22 @@ def test_a_killed_run_ends_with_the_same_bits_and_logs(
     finished(train("name=whole", *options, "ckpt_path=last"))
     assert events.scalars(whole) == before
     check_same(whole, folder_of(train, "killed"))
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("seconds", [0, 0.01, 0.05])
+def test_two_interrupts_of_all_processes_end_without_an_abort(train, seconds):
+    options = [*OPTIONS, "steps=1000", "validate_every=1000"]
+    process, output = start_or_resume(train, "interrupted", *options)
+    wait_for(lambda: list(train.logs.glob("interrupted/*/checkpoints/previous.ckpt")), process)
+    os.killpg(process.pid, signal.SIGINT)
+    time.sleep(seconds)
+    with suppress(ProcessLookupError):  # it has ended already
+        os.killpg(process.pid, signal.SIGINT)
+    process.join()
+    text = output.read_text()
+    assert process.exitcode == 1 and "stopped; to go on, add ckpt_path=" in text, text
+    assert "Traceback" not in text and "terminate called" not in text
 
 
 @pytest.mark.medium
