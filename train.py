@@ -21,7 +21,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.files import make_folder
-from asysplat.interrupts import handle_signals
+from asysplat.interrupts import handle_signals, interrupt_once
 from asysplat.training.messages import error_sentence, exit_with_message
 from asysplat.training.prepare import PreparedRun, Stage, prepare_run
 from asysplat.training.revision import revision
@@ -95,6 +95,7 @@ def logs_of(overrides: list[str]) -> Path:
 
 if __name__ == "__main__":
     handle_signals()
+    interrupt_once()
     with exit_with_message("stopped."):
         make_folder(logs_of(sys.argv), "paths.logs")
     OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)

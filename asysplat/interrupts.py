@@ -8,6 +8,7 @@ import threading
 from types import FrameType
 
 DELAY = 0.01  # seconds until the callback has returned
+_interrupted = False  # by _interrupt
 
 
 def handle_signals() -> None:
@@ -29,6 +30,19 @@ def _hang_up(number: int, frame: FrameType | None) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
+def interrupt_once() -> None:
+    """Raise KeyboardInterrupt at the first Ctrl-C only, as training then saves and ends."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    global _interrupted
+    if not _interrupted:
+        _interrupted = True
+        raise KeyboardInterrupt
+
+
 def keep_interrupts() -> None:
     """Repeat a KeyboardInterrupt that Python can only print.
 
@@ -40,10 +54,13 @@ def keep_interrupts() -> None:
 
     def repeat(ignored: "sys.UnraisableHookArgs") -> None:
         nonlocal timer
+        global _interrupted
         if not isinstance(ignored.exc_value, KeyboardInterrupt):
             previous(ignored)
+            return
+        _interrupted = False
         # No thread can start at the end of the process.
-        elif not (timer and timer.is_alive()) and not sys.is_finalizing():
+        if not (timer and timer.is_alive()) and not sys.is_finalizing():
             timer = threading.Timer(DELAY, signal.pthread_kill, (main, signal.SIGINT))
             timer.start()
 

@@ -19,15 +19,18 @@ SWALLOWED = {
 
 @pytest.mark.parametrize("case", SWALLOWED)
 @pytest.mark.parametrize("kept", [True, False])
-def test_an_interrupt_that_python_would_ignore_arrives(repository, case, kept):
+@pytest.mark.parametrize("once", [True, False])
+def test_an_interrupt_that_python_would_ignore_arrives(repository, case, kept, once):
     script = f"""
         import ctypes, signal, sys, time
-        from asysplat.interrupts import keep_interrupts
+        from asysplat.interrupts import interrupt_once, keep_interrupts
 
         def interrupted():
             signal.raise_signal(signal.SIGINT)
 
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        if {once}:
+            interrupt_once()
         if {kept}:
             keep_interrupts()
         try:

@@ -25,23 +25,16 @@ def exit_with_message(stopped: str) -> Iterator[None]:
     """End the process with the sentence `stopped` at Ctrl-C, or that of `error_sentence`."""
     try:
         yield
-    except SystemExit:  # Lightning's, at Ctrl-C
-        _ignore_signals()
-        raise
-    except KeyboardInterrupt:
-        _ignore_signals()
-        sys.exit(stopped)
-    except Exception as error:
+    except BaseException as error:
+        # A second Ctrl-C would abort the interpreter, a lost loader print a traceback.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        if isinstance(error, KeyboardInterrupt):
+            sys.exit(stopped)
         sentence = error_sentence(error)
         if sentence is None:
             raise
         sys.exit(f"error: {sentence}")
-
-
-def _ignore_signals() -> None:
-    """Let the process end: a second Ctrl-C would abort it, a lost loader print a traceback."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
 
 
 def error_sentence(error: BaseException) -> str | None:

@@ -62,6 +62,7 @@ def read_model(model: Path) -> pycolmap.Reconstruction:
 def _read(model: Path, binary: bool) -> pycolmap.Reconstruction:
     colmap = pycolmap.Reconstruction()
     (colmap.read_binary if binary else colmap.read_text)(model)
+    [image.name for image in colmap.images.values()]  # raises UnicodeDecodeError
     return colmap
 
 

@@ -189,6 +189,13 @@ def test_a_model_cut_short_is_refused(scene, binary, name, part):
         read(scene)
 
 
+def test_names_that_are_not_text_are_refused(scene):
+    file = scene / "sparse/0/images.txt"
+    file.write_bytes(file.read_bytes().replace(b"1.png", b"\xff.png"))
+    with pytest.raises(InputError, match="is not a complete COLMAP model"):
+        colmap.read_scene(scene, BadImages())
+
+
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("content", [b"", b"\xff" * 500, b"not a model\n" * 40])
 def test_damaged_files_are_refused(scene, name, content):
