@@ -129,14 +129,14 @@ def _write_without_tracks(
             (folder / file.name).write_bytes(stored[:8] + b"".join(parts))
             continue
         if file.name in ("images.txt", "points3D.txt"):
-            lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
+            lines = file.read_bytes().decode("latin-1").split("\n")
             comments = [line for line in lines if line.startswith("#")]
             lines = [line for line in lines if not line.startswith("#")]
             if file.name == "images.txt":  # every second line has matches
                 lines = [line for image in lines[::2] for line in (image, "")]
             else:
                 lines = [" ".join(line.split()[:POINT_FIELDS]) for line in lines]
-            (folder / file.name).write_text("\n".join((*comments, *lines)), encoding="utf-8")
+            (folder / file.name).write_bytes("\n".join((*comments, *lines)).encode("latin-1"))
             continue
         (folder / file.name).write_bytes(file.read_bytes())
 
