@@ -7,9 +7,10 @@ import sys
 
 import pytest
 from hydra._internal.utils import get_args_parser
+from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
-from asysplat.overrides import check_overrides
+from asysplat.overrides import CONF, check_overrides
 
 KNOWN = [
     [],
@@ -112,3 +113,15 @@ def test_every_printed_command_names_what_is_there(repository):
         if script == "reconstruct":  # its photographs, and --view
             words = [word for word in words if word not in ("my_scene", "--view")]
         check_overrides(get_args_parser().parse_args(words).overrides, script)
+
+
+@pytest.mark.parametrize("script", ["train", "reconstruct", "evaluate", "report", "benchmark"])
+def test_help_is_a_page_of_options_that_exist(run_script, composed, script):
+    lines = run_script(f"{script}.py", "--help").stdout.strip().splitlines()
+    assert lines[0].startswith(f"python {script}.py ") and len(lines) < 20
+    words = [line.split()[0].partition("=")[0] for line in lines[2:-2] if "=" in line.split(" ")[0]]
+    assert len(words) >= 4
+    config = composed(script=script)
+    for word in words:
+        known = OmegaConf.select(config, word, throw_on_missing=False, default=config)
+        assert known is not config or (CONF / word).is_dir(), word

@@ -146,3 +146,16 @@ def test_damaged_runs(composed, tmp_path, count):
     wrong, tally = attack_run(OmegaConf.create(model), tmp_path, count)
     print(f"run: {dict(tally)}")
     assert wrong == []
+
+
+@pytest.mark.parametrize("kind", ["a link to itself", "a link to its folder", "60000 x 1 pixels"])
+def test_links_and_sizes_that_no_scene_has(kind, few, tmp_path):
+    root = import_module("layouts.transforms").write(few, tmp_path / "scene")
+    image = min(path for path in root.rglob("*.png") if "depth" not in str(path))
+    image.unlink()
+    if kind == "60000 x 1 pixels":
+        Image.new("RGB", (60_000, 1)).save(image)
+    else:
+        image.symlink_to(image if "itself" in kind else root)
+    with pytest.raises(InputError, match=r"cannot be (read|used)"):
+        open_scene(root, SceneOptions(24, 32)).views([0])
