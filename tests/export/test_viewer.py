@@ -108,6 +108,22 @@ def test_pages_of_other_sites_are_refused(viewer, origin):
         until(viewer._server.get_clients)
 
 
+def test_pictures_do_not_pile_up_for_a_page_that_does_not_read(viewer):
+    noise = np.random.default_rng(0).integers(0, 256, (800, 800, 3), dtype=np.uint8)
+    last, count = np.full((8, 8, 3), 200, np.uint8), 120
+    with open_page(viewer) as page:
+        page.stand(viewer._cameras, 0)
+        until(viewer._server.get_clients)
+        (client,) = viewer._server.get_clients().values()
+        for image in (*[noise] * count, last):  # 60 MB, more than sockets hold
+            client.scene.set_background_image(image, format="jpeg", jpeg_quality=90)
+            client.flush()
+        sent = 0
+        while page.picture().shape != last.shape:
+            sent += 1
+        assert sent < count / 2
+
+
 def test_the_panel_changes_the_rendering(scene, viewer):
     gaussians, cameras = inside(viewer, scene[0])
     camera = cameras.select([1])
