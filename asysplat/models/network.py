@@ -141,6 +141,5 @@ class Network(nn.Module, ABC):
             raise InputError(
                 f"the images are {height}x{width}, but this model takes multiples of "
                 f"{patch}, its patch: set {-(-height // patch) * patch}x"
-                f"{-(-width // patch) * patch} (data.height, data.width), as the paper takes "
-                "540 to 544."
+                f"{-(-width // patch) * patch} (height x width), as the paper takes 540 to 544."
             )

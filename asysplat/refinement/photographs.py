@@ -73,10 +73,13 @@ def open_photographs(
     Raises:
         InputError: fewer than two input views; see `open_scene`.
     """
-    if height < 1 or (width is not None and width < 1) or views < 2 or (held_out_every or 2) < 2:
+    counts = (height, width or 1, views, held_out_every or 2, max_held_out)
+    whole = all(isinstance(count, int) for count in counts)
+    if not whole or min(counts[:2]) < 1 or min(counts[2:4]) < 2 or max_held_out < 1 or width == 0:
         raise InputError(
-            f"height={height}, width={width}, views={views} and held_out_every={held_out_every}: "
-            "give at least 1 pixel, 2 views, and held_out_every of 2 or more, or null."
+            f"height={height}, width={width}, views={views}, held_out_every={held_out_every} and "
+            f"max_held_out={max_held_out}: give whole numbers, at least 1 pixel, 2 views, 1 "
+            "held-out view, and held_out_every of 2 or more, or null."
         )
     scene = open_scene(path, SceneOptions(ANY_SIZE, ANY_SIZE, layout, on_bad_image)).scene
     if any(scene.origin):

@@ -61,8 +61,7 @@ def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]
     Raises:
         InputError: an unknown layout, or no scene.
     """
-    if layout not in ("auto", *LAYOUTS):
-        raise InputError(f"data.layout={layout}: expected auto or one of {', '.join(LAYOUTS)}.")
+    _check_layout(layout)
     root = Path(root).absolute()
     for name in LAYOUTS if layout == "auto" else (layout,):
         with _file_errors(root):
@@ -79,9 +78,14 @@ def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]
             "name the folder of images/ and sparse/."
         )
     raise InputError(
-        f"{root} holds no scene of layout {layout}: data/README.md lists the files of each "
-        f"layout; the layouts are {', '.join(LAYOUTS)}."
+        f"{root} holds no photographs with camera poses, in layout {layout}: data/README.md "
+        f"lists the files of each layout; the layouts are {', '.join(LAYOUTS)}."
     )
+
+
+def _check_layout(layout: str) -> None:
+    if layout not in ("auto", *LAYOUTS):
+        raise InputError(f"layout={layout}: expected auto or one of {', '.join(LAYOUTS)}.")
 
 
 def _bare_photographs(root: Path) -> str | None:
@@ -103,6 +107,7 @@ def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
         InputError: files that cannot be used, or fewer than two images.
     """
     path, layout = Path(scene).absolute(), options.layout
+    _check_layout(layout)
     if layout == "auto":
         layout, scenes = find_scenes(path)
         if len(scenes) != 1:

@@ -40,7 +40,7 @@ def test_other_text_and_json_files_are_no_scenes(scene, tmp_path):
     (tmp_path / "notes.txt").write_text("cameras.txt")
     (tmp_path / "other.json").write_text('{"frames": []}')
     for name in ("notes.txt", "other.json"):
-        with pytest.raises(InputError, match="holds no scene of layout long_lrm"):
+        with pytest.raises(InputError, match="camera poses, in layout long_lrm"):
             find_scenes(tmp_path / name, "long_lrm")
 
 

@@ -178,7 +178,7 @@ def test_a_broken_file_is_refused(scene, change, message):
 
 
 def test_a_missing_or_unreadable_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="holds no scene"):
+    with pytest.raises(InputError, match="holds no photographs"):
         open_scene(tmp_path)
     for text, message in (("", "is empty"), ("{", "is not JSON"), ("[]", "no list")):
         (tmp_path / "transforms.json").write_text(text)
