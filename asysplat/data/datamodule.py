@@ -52,6 +52,7 @@ class SceneDataModule(lightning.LightningDataModule):
         on_bad_scene: where the files of a training scene cannot be used: "fail", or "skip" to draw
             another scene. A batch's `bad_scenes` lists the errors.
         micro_batch: the most scenes that a process holds at a time; None: all of its share.
+        growth_steps: optimizer steps in which the window of the training tasks grows.
 
     Raises:
         InputError: a task that cannot be loaded. `setup` tries one training task, and all of the
@@ -73,6 +74,7 @@ class SceneDataModule(lightning.LightningDataModule):
     points: bool = False
     on_bad_scene: Policy = "fail"
     micro_batch: int | None = None
+    growth_steps: int = 0
 
     def __post_init__(self):
         super().__init__()
@@ -118,6 +120,15 @@ class SceneDataModule(lightning.LightningDataModule):
             except InputError as error:
                 where = "data.test_size" if name == self.name else f"data.test_sets.{name}"
                 raise InputError(f"{where}: {error}") from error
+
+    def check_views(self, check: Callable[[int], None]) -> None:
+        """Call `check(inputs)` for every set; its InputError names the set."""
+        check(self.inputs)
+        for name, tasks in self.tests.items():
+            try:
+                check(tasks[0]["inputs"].num_views)
+            except InputError as error:
+                raise InputError(f"data.test_sets.{name}: {error}") from error
 
     def split(self, processes: int) -> BatchSplit:
         """Divide the scenes of an optimizer step among processes."""
@@ -185,6 +196,7 @@ class TrainingTasks(Dataset):
         self.source, self.seed, self.augmentation = data.source, data.seed, data.augmentation
         self.inputs, self.targets, self.points = data.inputs, data.targets, data.points
         self.draws = MAX_DRAWS if data.on_bad_scene == "skip" else 1
+        self.growing_tasks = data.growth_steps * data.batch_size
 
     def __getitem__(self, index: int) -> Sample:
         errors: list[str] = []
@@ -192,15 +204,16 @@ class TrainingTasks(Dataset):
             # (seed, index, 0) gives what (seed, index) gives.
             rng = np.random.default_rng((self.seed, index, len(errors)))
             try:
-                return self._sample(rng) | {"bad_scenes": errors}
+                return self._sample(rng, index) | {"bad_scenes": errors}
             except (InputError, OSError) as error:
                 errors.append(str(error).partition("\n")[0])
                 if len(errors) == self.draws:
                     row = f"{MAX_DRAWS} training scenes in a row cannot be used, the last because "
                     raise InputError(f"{row if self.draws > 1 else ''}{error}") from error
 
-    def _sample(self, rng: np.random.Generator) -> Sample:
-        task = self.source.training(self.inputs, self.targets, rng)
+    def _sample(self, rng: np.random.Generator, index: int) -> Sample:
+        grown = min(1.0, index / self.growing_tasks) if self.growing_tasks else 1.0
+        task = self.source.training(self.inputs, self.targets, rng, grown)
         inputs = self.augmentation.order(task.selection.inputs, rng)
         share = self.augmentation.share(rng)
         task = Task(task.sequence, Selection(inputs, task.selection.targets))

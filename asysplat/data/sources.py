@@ -31,8 +31,13 @@ class Task:
 class Source(Protocol):
     """Where the data module gets its tasks."""
 
-    def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
-        """Draw a random training task; the same state of `rng` gives the same task."""
+    def training(
+        self, inputs: int, targets: int, rng: np.random.Generator, grown: float = 1.0
+    ) -> Task:
+        """Draw a random training task; the same state of `rng` gives the same task.
+
+        `grown` is the share, in [0, 1], by which the window has grown from its first size.
+        """
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
         """Return the fixed tasks of a split; no task trains on any of their targets."""
@@ -48,6 +53,7 @@ class ProceduralSource:
         height, width: size of every view, in pixels.
         num_images: length of each camera path.
         window: least and greatest number of consecutive images that a training task is drawn from.
+        first_window: those of the first task; None: `window`.
         val_scenes, test_scenes: number of scenes of each split.
         places: content of the scenes: both, rooms or outdoors.
         varied: whether training scenes are varied; see ProceduralScene.
@@ -61,10 +67,13 @@ class ProceduralSource:
     test_scenes: int
     places: str = "both"
     varied: bool = False
+    first_window: Sequence[int] | None = None
 
-    def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
+    def training(
+        self, inputs: int, targets: int, rng: np.random.Generator, grown: float = 1.0
+    ) -> Task:
         scene = self._scene("train", int(rng.integers(2**31)))
-        window = tuple(self.window)
+        window = views.grown_window(self.first_window, self.window, grown)
         return Task(scene, views.training_selection(self.num_images, inputs, targets, window, rng))
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
@@ -120,6 +129,7 @@ class FilesSource:
     Args:
         root, test_root: one scene, or a folder of scenes.
         window: least and greatest number of consecutive images that a training task is drawn from.
+        first_window: those of the first task; None: `window`.
         selection: how the images of a test are chosen: every_8th, kmeans (the paper's tests),
             first_96 (its ablations), uniform, or index.
         index: with selection=index, the file that names the images; scenes that it does not name
@@ -140,6 +150,7 @@ class FilesSource:
     index: str | None = None
     val_scenes: int = 8
     targets_may_be_inputs: bool = False
+    first_window: Sequence[int] | None = None
 
     def __post_init__(self):
         self.split_by_scenes = self.test_root is not None
@@ -162,12 +173,19 @@ class FilesSource:
                 "set it to fail, and fix the images."
             )
 
-    def training(self, inputs: int, targets: int, rng: np.random.Generator) -> Task:
+    def training(
+        self, inputs: int, targets: int, rng: np.random.Generator, grown: float = 1.0
+    ) -> Task:
         sequence = self.scenes[self._training[rng.integers(len(self._training))]]
         count = sequence.num_images
         images = range(count) if self.split_by_scenes else views.training_images(count)
         drawn = views.training_selection(
-            len(images), inputs, targets, tuple(self.window), rng, self.targets_may_be_inputs
+            len(images),
+            inputs,
+            targets,
+            views.grown_window(self.first_window, self.window, grown),
+            rng,
+            self.targets_may_be_inputs,
         )
         chosen = Selection([images[i] for i in drawn.inputs], [images[i] for i in drawn.targets])
         return Task(sequence, chosen)

@@ -331,3 +331,25 @@ def test_no_scene_can_be_read(folders, tmp_path):
     data = files_data(val_scenes=1, **folders, **OPTIONS, on_bad_scene="skip")
     with pytest.raises(InputError, match=r"^10 training scenes in a row cannot be used, .*/train/"):
         TrainingTasks(data)[0]
+
+
+def test_the_window_grows_step_by_step(monkeypatch):
+    """From 6 images at the first of 10 steps, of 2 tasks each, to 24."""
+    source = ProceduralSource(
+        16, 16, 24, (24, 24), val_scenes=1, test_scenes=1, first_window=(6, 6)
+    )
+    tasks, spans, draw = (
+        TrainingTasks(procedural(source=source, growth_steps=10)),
+        [],
+        source.training,
+    )
+
+    def record(*given):
+        task = draw(*given)
+        spans.append(task.selection.inputs[-1] - task.selection.inputs[0] + 1)
+        return task
+
+    monkeypatch.setattr(ProceduralSource, "training", lambda _, *given: record(*given))
+    for index in (0, 10, 20, 40):
+        tasks[index]
+    assert spans == [6, 15, 24, 24]

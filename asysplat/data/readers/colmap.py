@@ -69,6 +69,15 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     return PosedScene(scene.name, images, partial(_points, model))
 
 
+def read_poses(model: Path) -> list[tuple[str, Float[ndarray, "4 4"]]]:
+    """Read name and pose of every registered image of a model, whose images may be absent.
+
+    Poses are camera-to-world with OpenCV axes.
+    """
+    images = read_model(model).images.values()
+    return [(image.name, _cam_to_world(image, model)) for image in images if image.has_pose]
+
+
 def points_beside(scene: Path, posed: Sequence[PosedImage]) -> Points | None:
     """Read the sparse points of a model beside images whose poses were read elsewhere.
 

@@ -10,6 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Float
+from numpy import ndarray
+
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers import common
@@ -95,6 +98,19 @@ def read_images(
     if all(re.search(r"\d", image.file.stem) for image in images):
         images.sort(key=lambda image: common.natural_order(image.file))
     return images
+
+
+def read_poses(file: Path) -> list[tuple[str, Float[ndarray, "4 4"]]]:
+    """Read file_path and pose of every entry of a `transforms.json`, whose images may be absent.
+
+    Poses are camera-to-world with OpenCV axes.
+    """
+    poses = []
+    for index, entry in enumerate(common.read_frames(file)["frames"]):
+        where = common.frame_label(file, index, entry)
+        pose = common.rigid(entry.get("transform_matrix"), f"{where}: transform_matrix")
+        poses.append((entry["file_path"], common.opencv_from_opengl(pose)))
+    return poses
 
 
 def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: str) -> Lens:

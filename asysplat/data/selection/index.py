@@ -7,6 +7,7 @@ https://github.com/arthurhero/Long-LRM/tree/main/data/example_data
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,21 @@ LONG_LRM_FILE = "opencv_cameras.json"
 LONG_LRM_LIST = re.compile(r"fold_(\d+)_kmeans_(\d+)_input")
 
 
-def read_index(path: Path | str, num_inputs: int) -> dict[str, Selection]:
-    """Read an index of either form: scene -> selection.
+@dataclass(frozen=True)
+class Entry:
+    """A scene's inputs and targets; a number stands for every so many images as targets."""
+
+    inputs: list[int]
+    targets: list[int] | int
+
+
+def read_index(path: Path | str, num_inputs: int) -> dict[str, Entry]:
+    """Read an index of either form: scene -> entry.
 
     pixelSplat's: {scene: {"context": [...], "target": [...]} or null}; scenes that are null are
-    left out, and a target may be an input. Long-LRM's: a scene's own opencv_cameras.json with a
-    list `fold_8_kmeans_32_input`, where every 8th image is a target; for many scenes, their folder.
+    left out, and a target may be an input. Long-LRM's: a list of {"scene_name": ...,
+    "fold_8_kmeans_32_input": [...]}, where every 8th image is a target; or a scene's own
+    opencv_cameras.json with such a list; or the folder of many scenes.
 
     Raises:
         InputError: neither form, or a list for another number of inputs.
@@ -38,6 +48,8 @@ def read_index(path: Path | str, num_inputs: int) -> dict[str, Selection]:
             )
         return dict(_long_lrm_entry(file, read_frames(file), num_inputs) for file in files)
     content = read_json(path)
+    if isinstance(content, list) and content and all(isinstance(each, dict) for each in content):
+        return dict(_long_lrm_entry(path, each, num_inputs) for each in content)
     if not isinstance(content, dict):
         raise InputError(f'{path} is no index: give {{"scene": {{"context": [], "target": []}}}}.')
     if isinstance(content.get("frames"), list):
@@ -51,12 +63,12 @@ def read_index(path: Path | str, num_inputs: int) -> dict[str, Selection]:
             entry = stored if isinstance(stored, dict) else {}
             where = f"{path}, scene {name}"
             lists = (_indices(f"{where}, {key}", entry.get(key)) for key in ("context", "target"))
-            index[name] = Selection(*lists)
+            index[name] = Entry(*lists)
     return index
 
 
 def selection_of(
-    index: Mapping[str, Selection], path: Path | str, scene: str, num_images: int, num_inputs: int
+    index: Mapping[str, Entry], path: Path | str, scene: str, num_images: int, num_inputs: int
 ) -> Selection:
     """Return the selection of a scene in the index that was read from `path`.
 
@@ -64,12 +76,16 @@ def selection_of(
         InputError: the index was made for another number of inputs, or names an image that the
             scene lacks.
     """
-    selection, where = index[scene], f"{path}, scene {scene}"
-    if len(selection.inputs) != num_inputs:
+    entry, where = index[scene], f"{path}, scene {scene}"
+    if len(entry.inputs) != num_inputs:
         raise InputError(
-            f"{where} has {len(selection.inputs)} inputs and data.inputs is {num_inputs}: set one "
+            f"{where} has {len(entry.inputs)} inputs and data.inputs is {num_inputs}: set one "
             "to the other."
         )
+    step = entry.targets if isinstance(entry.targets, int) else None
+    selection = Selection(
+        entry.inputs, entry.targets if step is None else list(range(0, num_images, step))
+    )
     last = max(selection.inputs + selection.targets)
     if last >= num_images:
         raise InputError(
@@ -91,16 +107,15 @@ def write_index(path: Path, index: Mapping[str, Selection]) -> None:
     path.write_text(json.dumps(scenes, indent=1))
 
 
-def _long_lrm_entry(file: Path, content: dict[str, Any], num_inputs: int) -> tuple[str, Selection]:
+def _long_lrm_entry(file: Path, content: dict[str, Any], num_inputs: int) -> tuple[str, Entry]:
     lists = {name: matched for name in content if (matched := LONG_LRM_LIST.fullmatch(name))}
+    scene = str(content.get("scene_name", file.parent.name))
     for name, matched in lists.items():
         fold, count = map(int, matched.groups())
         if count == num_inputs and fold > 0:
-            inputs = _indices(f"{file}, {name}", content[name])
-            selection = Selection(inputs, list(range(0, len(content["frames"]), fold)))
-            return str(content.get("scene_name", file.parent.name)), selection
+            return scene, Entry(_indices(f"{file}, scene {scene}, {name}", content[name]), fold)
     raise InputError(
-        f"{file} has no list fold_8_kmeans_{num_inputs}_input (its lists: "
+        f"{file}, scene {scene} has no list fold_8_kmeans_{num_inputs}_input (its lists: "
         f"{', '.join(lists) or 'none'}): set data.inputs to the number of a list, or use "
         "data.selection=kmeans."
     )

@@ -10,7 +10,8 @@ from threadpoolctl import threadpool_limits
 from asysplat.data.selection.views import Selection, Split, check_held_out, paper_split
 from asysplat.scene import Cameras
 
-DECIMALS = 4  # of features of length 1: above float noise, below the differences between cameras
+DECIMALS = 5  # of positions and directions,
+FLOAT_NOISE = 1e-6  # relative, of distances: both are below the differences between cameras
 
 
 def kmeans_selection(
@@ -31,25 +32,25 @@ def kmeans_selection(
 
 
 def pose_features(cameras: Cameras) -> Float[ndarray, "V 6"]:
-    """Return positions and viewing directions, scaled to equal weight.
+    """Return positions, relative to their mean, and viewing directions of length 1.
 
-    Positions are relative to their mean, in units of their root mean square; directions have length
-    1. Rounded, so that float noise makes no difference.
+    As in Long-LRM (data/dataset.py): positions are in the units of the data. Rounded, relative to
+    their extent, so that float noise makes no difference.
     """
     poses = cameras.cam_to_world.double().cpu().numpy()
     offsets = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
-    length = np.sqrt((offsets**2).sum(-1).mean())
-    # Positions of cameras in one place differ by rounding alone, and are left unscaled.
-    if length > 1e-6 * np.abs(poses[:, :3, 3]).max():
-        offsets = offsets / length
-    features = np.concatenate([offsets, poses[:, :3, 2]], axis=1)
-    return features.round(DECIMALS) + 0.0  # without -0
+    extent = np.abs(offsets).max()
+    # Positions of cameras in one place differ by rounding alone.
+    same = extent <= 1e-6 * np.abs(poses[:, :3, 3]).max()
+    unit = 1.0 if same else 10.0 ** np.floor(np.log10(extent))
+    offsets = np.zeros_like(offsets) if same else (offsets / unit).round(DECIMALS) * unit
+    return np.concatenate([offsets, poses[:, :3, 2].round(DECIMALS)], axis=1) + 0.0  # without -0
 
 
 def nearest_to_centers(features: Float[ndarray, "V d"], count: int) -> list[int]:
-    """Choose `count` different rows, each near a center of k-means; sorted.
+    """Choose `count` different rows, each nearest to a center of k-means; sorted.
 
-    Matches centers and rows greedily by distance; of equally near rows, the first is taken.
+    Of rows whose distances differ by float noise, the first is taken.
     """
     from sklearn.cluster import KMeans  # slow to import
 
@@ -59,12 +60,10 @@ def nearest_to_centers(features: Float[ndarray, "V d"], count: int) -> list[int]
         # With fewer different rows than centers, some centers coincide and take the next rows.
         warnings.filterwarnings("ignore", message="Number of distinct clusters")
         centers = model.fit(features).cluster_centers_
-    distances = np.linalg.norm(features[:, None] - centers, axis=-1).round(DECIMALS)
-    rows, free = [], set(range(count))
-    # Row-major, and stable: of equal distances the first row comes first.
-    for position in np.argsort(distances, axis=None, kind="stable"):
-        row, center = divmod(int(position), count)
-        if center in free and row not in rows:
-            free.remove(center)
-            rows.append(row)
+    distances = np.linalg.norm(features[:, None] - centers, axis=-1)
+    noise = FLOAT_NOISE * distances.max()
+    rows: list[int] = []
+    for distance in distances.T:
+        distance[rows] = np.inf
+        rows.append(int((distance <= distance.min() + noise).argmax()))
     return sorted(rows)

@@ -76,6 +76,13 @@ def training_selection(
     return Selection(inputs, sorted(rng.choice(candidates, num_targets, replace=False).tolist()))
 
 
+def grown_window(first: Sequence[int] | None, last: Sequence[int], grown: float) -> tuple[int, int]:
+    """Return the window at a share of its growth from `first` to `last` (None: always `last`)."""
+    if first is None:
+        return tuple(last)
+    return tuple(round(a + grown * (b - a)) for a, b in zip(first, last, strict=True))
+
+
 def held_out(num_images: int, split: Split) -> list[int]:
     """Return images 0, 8, 16, ... for test (paper, Suppl. A), 4, 12, 20, ... for val."""
     return list(range(HELD_OUT_START[split], num_images, HELD_OUT_STEP))
