@@ -3,6 +3,7 @@
 python reconstruct.py my_scene
 """
 
+import math
 import os
 import signal
 import sys
@@ -68,7 +69,7 @@ def reconstruct(config: DictConfig) -> None:
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
     photographs = open_photographs(config.path, **{name: config[name] for name in names})
     print(describe(config, photographs, limit))
-    gaussians = initialize(config, photographs, settings.max_gaussians)
+    gaussians = initialize(config, photographs, settings.max_gaussians or sys.maxsize)
     background = mean_color(photographs.inputs)
     results.save_start(gaussians, photographs, background)
     with RefinementDisplay(photographs.inputs, config.view) as display:
@@ -91,8 +92,8 @@ def describe(config: DictConfig, photographs: Photographs, limit: dict[str, floa
     return (
         f"{inputs.num_views} of {photographs.total} photographs are fitted (views=), {held_out} "
         f"measure the result (held_out_every=), {inputs.cameras.height} pixels high (height=), at "
-        f"most {gaussians:,} Gaussians (refinement.max_gaussians=), {value:g} {name} ({name}=); "
-        "all of these: quality=preview or best"
+        f"most {gaussians or math.inf:,} Gaussians (refinement.max_gaussians=), {value:g} {name} "
+        f"({name}=); all of these: quality=preview or best"
     )
 
 
@@ -106,7 +107,7 @@ def fit_to_all(
     """Refine Gaussians on all photographs for a share of the limit, without new Gaussians."""
     views = photographs.all_views()
     print(f"last fit: {views.num_views} photographs, the held-out ones too, after the measurement")
-    settings = replace(settings, half_size=0.0, densify="none", cool_down=1.0)
+    settings = replace(settings, half_size=0.0, densify="none", every=None, cool_down=1.0)
     for name in {"steps", "seconds"} & options.keys():
         options = options | {name: type(options[name])(max(1, share * options[name]))}
     return refine(gaussians, views, settings, **options)

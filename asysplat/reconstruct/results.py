@@ -70,7 +70,7 @@ class Results:
         """
         cameras = photographs.inputs.cameras
         self._protocol.check_size(cameras.height, cameras.width)
-        count = max(gaussians.num_gaussians, self._config.refinement.max_gaussians)
+        count = max(gaussians.num_gaussians, self._config.refinement.max_gaussians or 0)
         self.folder = new_folder(self.folder, OTHER_BYTES + count * BYTES_PER_GAUSSIAN)
         self._photographs, self._background = photographs, background
         self._save_contact_sheet("start.png", gaussians)

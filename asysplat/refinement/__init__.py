@@ -2,15 +2,23 @@
 
 from asysplat.refinement.merge import merge_to_limit
 from asysplat.refinement.refine import Refinement, RefinementProgress, refine
-from asysplat.refinement.settings import PAPER, Rates, RefinementSettings
+from asysplat.refinement.settings import (
+    PAPER,
+    PUBLISHED_3DGS,
+    Rates,
+    RefinementSettings,
+    StepSchedule,
+)
 from asysplat.refinement.views import mean_color
 
 __all__ = [
     "PAPER",
+    "PUBLISHED_3DGS",
     "Rates",
     "Refinement",
     "RefinementProgress",
     "RefinementSettings",
+    "StepSchedule",
     "mean_color",
     "merge_to_limit",
     "refine",

@@ -92,6 +92,10 @@ class VisibleAdam:
             self.parameters[name] = tensor[index]
             self._state[name] = {part: value[index] for part, value in self._state[name].items()}
 
+    def reset(self, name: str) -> None:
+        """Give a tensor a new optimizer state."""
+        self._state[name] = _zero_state(self.parameters[name])
+
     @torch.no_grad()
     def append(self, parameters: Mapping[str, Float[Tensor, "M ..."]]) -> None:
         """Add rows at the end of every tensor, with a new optimizer state."""

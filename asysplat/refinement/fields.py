@@ -1,5 +1,6 @@
 """Gaussians as unconstrained parameters of an optimizer."""
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -10,6 +11,7 @@ from asysplat.refinement.adam import VisibleAdam
 from asysplat.refinement.settings import Rates
 from asysplat.scene import Gaussians
 
+MAX_SH_DEGREE = 3
 Parameters = dict[str, Tensor]
 
 
@@ -52,16 +54,39 @@ class Fields:
             sh=parameters["sh"],
         )
 
-    def step(self, gradients: Parameters, rates: Rates, factor: float) -> Bool[Tensor, "N"]:
-        """Update the visible Gaussians (with a gradient of the opacity); return their mask."""
+    def step(
+        self,
+        gradients: Parameters,
+        rates: Rates,
+        factor: float,
+        means_alone: bool = False,
+        sh_degree: int = MAX_SH_DEGREE,
+    ) -> Bool[Tensor, "N"]:
+        """Update the visible Gaussians (with a gradient of the opacity); return their mask.
+
+        Args:
+            gradients: of the parameters.
+            rates, factor: learning rates, and a factor of all, or of the means alone.
+            sh_degree: coefficients of higher degrees are not updated.
+        """
         visible = gradients["logits"] != 0
         bands = torch.full((self.count, 1), rates.sh * rates.sh_rest)
         bands[0] = rates.sh
+        bands[(sh_degree + 1) ** 2 :] = 0
         by_name = {"offsets": rates.means, "quats": rates.quats, "log_scales": rates.scales}
         by_name |= {"logits": rates.opacities, "sh": bands}
-        scaled = {name: rate * factor for name, rate in by_name.items()}
+        scaled = {
+            name: rate * (factor if name == "offsets" or not means_alone else 1)
+            for name, rate in by_name.items()
+        }
         self.optimizer.step(gradients, scaled, visible)
         return visible
+
+    def reset_opacities(self, greatest: float) -> None:
+        """Lower all opacities to at most `greatest`, and forget what the optimizer knew of them."""
+        logits = self.parameters["logits"]
+        logits.clamp_(max=math.log(greatest / (1 - greatest)))
+        self.optimizer.reset("logits")
 
     def keep(self, index: Int[Tensor, "M"]) -> None:
         """Keep the rows of `index`."""

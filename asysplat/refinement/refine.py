@@ -4,6 +4,7 @@ The paper's post-optimization is the setting `PAPER`.
 """
 
 import math
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -18,14 +19,14 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.ops.image_loss import image_loss
 from asysplat.refinement.corrections import Corrections, correct_exposure, correct_poses
-from asysplat.refinement.densification.clone_split import ScreenGradients
+from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY, ScreenGradients
 from asysplat.refinement.densification.relocate import (
     inject_position_noise,
     mcmc_regularizer,
     relocate,
 )
 from asysplat.refinement.densification.spawn import MIN_OPACITY, spawn_at_errors
-from asysplat.refinement.fields import Fields, Parameters
+from asysplat.refinement.fields import MAX_SH_DEGREE, Fields, Parameters
 from asysplat.refinement.isotropic import footprints
 from asysplat.refinement.settings import RefinementSettings
 from asysplat.refinement.views import mean_color, resize
@@ -84,7 +85,9 @@ class Refinement:
         self._last_visible = torch.zeros(len(self.fields), dtype=torch.long)
         self._screen_gradients = ScreenGradients(self.fields)
         pixels = views.images[:, 0].numel()
-        self._max_gaussians = min(settings.max_gaussians, pixels // PIXELS_PER_GAUSSIAN)
+        limit = pixels // PIXELS_PER_GAUSSIAN
+        allowed = settings.max_gaussians
+        self._max_gaussians = sys.maxsize if allowed is None else min(allowed, limit)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -107,7 +110,12 @@ class Refinement:
             gradients = of_view if gradients is None else list(map(torch.add, gradients, of_view))
             error += mse / len(chosen)
         gradients = dict(zip(leaves, gradients, strict=True))
-        visible = self.fields.step(gradients, settings.rates, factor)
+        degree = (
+            MAX_SH_DEGREE if settings.every is None else self._steps // settings.every.sh_degree
+        )
+        visible = self.fields.step(
+            gradients, settings.rates, factor, settings.decay_means_alone, degree
+        )
         if settings.densify == "mcmc":
             inject_position_noise(self.fields, factor, self._generator)
         self._steps += 1
@@ -122,7 +130,8 @@ class Refinement:
         if settings.densify == "mcmc":
             relocate(self.fields, self._max_gaussians, settings.growth, self._generator)
         elif settings.densify == "gradient":
-            self._screen_gradients.clone_and_split(self._max_gaussians, self._generator)
+            reset = settings.every is not None and self._steps > settings.every.opacity_reset
+            self._screen_gradients.clone_and_split(self._max_gaussians, self._generator, reset)
         if settings.densify != "error":
             return
         opacities = self.fields.parameters["logits"].sigmoid()
@@ -145,6 +154,10 @@ class Refinement:
             self.fields.append(new, self._units(new.means))
             visible = self._last_visible.new_full((new.num_gaussians,), self._steps)
             self._last_visible = torch.cat((self._last_visible, visible))
+
+    def reset_opacities(self) -> None:
+        """Lower all opacities, so that those that are not needed are pruned (Kerbl et al. 2023)."""
+        self.fields.reset_opacities(MAX_RESET_OPACITY)
 
     def _gradients(
         self, target: Views, view: int, leaves: Parameters, factor: float
@@ -220,10 +233,13 @@ def refine(
     step, rounds, share = 0, 0, 0.0
     clock = time.perf_counter()
     while share < 1:
-        due = int(share / settings.until * (settings.rounds + 1)) if share < settings.until else 0
+        due = rounds_until(step, share, settings) if share < settings.until else 0
         if due > rounds:
             refinement.densify(share)
             rounds = due
+        every = settings.every
+        if every and step and step % every.opacity_reset == 0 and share < settings.until:
+            refinement.reset_opacities()
         errors.append(refinement.step(share))
         step += 1
         passed = time.perf_counter() - clock
@@ -234,3 +250,10 @@ def refine(
         if watch is not None and watch(progress, refinement):
             break
     return refinement.gaussians
+
+
+def rounds_until(step: int, share: float, settings: RefinementSettings) -> int:
+    """Return the number of rounds of densification that are due by now."""
+    if settings.every is None:
+        return int(share / settings.until * (settings.rounds + 1))
+    return max(0, (step - settings.every.first_round) // settings.every.round + 1)

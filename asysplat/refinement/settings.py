@@ -34,6 +34,22 @@ class Rates:
 
 
 @dataclass(frozen=True)
+class StepSchedule:
+    """What happens every so many steps, not at shares of the refinement (Kerbl et al. 2023)."""
+
+    round: int = 100  # of densification
+    first_round: int = 500
+    opacity_reset: int = 3000  # to at most MAX_RESET_OPACITY
+    sh_degree: int = 1000  # raised by one, from 0
+
+    def __post_init__(self):
+        """Check the ranges."""
+        for name, value in vars(self).items():
+            if value < 1:
+                raise InputError(f"refinement.every.{name}={value}: give at least 1.")
+
+
+@dataclass(frozen=True)
 class RefinementSettings:
     """Settings of a refinement: the default is ours, `PAPER` the paper's post-optimization.
 
@@ -49,11 +65,14 @@ class RefinementSettings:
     # "error": spawn Gaussians at pixels with a large error; "mcmc": relocate dead ones (Kheradmand
     # et al. 2024); "gradient": clone and split by screen-space gradients (Kerbl et al. 2023).
     densify: Densify = "error"
-    max_gaussians: int = 150_000  # lower if all input images have fewer than 8 pixels for each
+    # Lower if all input images have fewer than 8 pixels for each; None: no limit
+    max_gaussians: int | None = 150_000
     rounds: int = 12  # of densification
     until: float = 0.6  # initial share of the refinement with densification
     growth: float = 0.15  # added in a round, as a share of all, beside replacements of pruned ones
+    every: StepSchedule | None = None  # of densification "gradient"; None: `rounds`, evenly
     decay: float = 0.05  # factor of all rates at the end of the cool-down
+    decay_means_alone: bool = False  # not of the other rates
     cool_down: float = 0.5  # last share of the refinement
     # Steps with each input image that end it, whatever time is left: more would fit noise.
     max_steps_per_image: int | None = 400
@@ -65,9 +84,10 @@ class RefinementSettings:
         choices = get_args(Densify)
         self._check("densify", self.densify in choices, f"choose {', '.join(choices)}")
         self._check("sh_degree", self.sh_degree in (None, 0, 1, 2, 3), "choose 0, 1, 2, 3 or null")
-        self._check("max_gaussians", self.max_gaussians >= 1, "give at least 1")
         self._check("rounds", self.rounds >= 0, "give at least 0")
-        for name in ("views_per_step", "max_steps_per_image"):
+        steps = self.every is None or self.densify == "gradient"
+        self._check("every", steps, "set densify=gradient, or every=null")
+        for name in ("views_per_step", "max_steps_per_image", "max_gaussians"):
             value = getattr(self, name)
             self._check(name, value is None or value >= 1, "give at least 1, or null")
 
@@ -91,5 +111,21 @@ PAPER = RefinementSettings(
     half_size=0.0,
     densify="none",
     cool_down=0.0,
+    max_steps_per_image=None,
+)
+
+# 3DGS as published (Kerbl et al. 2023; graphdeco-inria/gaussian-splatting, arguments/__init__.py).
+# Its extent of a scene is 1.1 times the distance of the farthest camera, our unit.
+PUBLISHED_3DGS = RefinementSettings(
+    Rates(means=1.76e-4, unit="scene", quats=1e-3, scales=5e-3, opacities=0.05, sh=2.5e-3),
+    sh_degree=3,
+    half_size=0.0,
+    densify="gradient",
+    max_gaussians=None,
+    until=0.5,
+    every=StepSchedule(),
+    decay=0.01,
+    decay_means_alone=True,
+    cool_down=1.0,
     max_steps_per_image=None,
 )

@@ -8,6 +8,7 @@ import torch
 
 from asysplat.refinement.densification.clone_split import (
     DENSIFY_GRAD_THRESHOLD,
+    MAX_SCALE,
     SPLIT_FACTOR,
     SPLIT_SCALE,
     ScreenGradients,
@@ -368,6 +369,20 @@ def test_the_limit_and_the_largest_gradients_first():
     with_gradients(fields, 4, 2, 0).clone_and_split(7, generator())
     assert len(fields) == 7
     torch.testing.assert_close(fields.gaussians().means[-1], before.means[4])
+
+
+def test_large_gaussians_are_pruned_after_an_opacity_reset():
+    """Too large in the world, or in the image: three deviations in more than 20 pixels."""
+    start = gaussians(size=0.01)
+    start.scales[1, 2] = 2 * MAX_SCALE
+    start.means[4, 2] = 0.04  # 30 pixels at focal length 40
+    kept = [0, 2, 3, 5]
+    for prune_large, expected in ((True, start.means[kept]), (False, start.means)):
+        fields = fields_of(start)
+        screen = ScreenGradients(fields)
+        screen.add(torch.full((6, 3), 1e-9), camera())
+        screen.clone_and_split(100, generator(), prune_large)
+        torch.testing.assert_close(fields.gaussians().means, expected)
 
 
 def test_transparent_gaussians_are_pruned_but_one():

@@ -2,6 +2,7 @@
 
 import inspect
 import math
+import sys
 from dataclasses import fields as fields_of
 from dataclasses import replace
 from itertools import pairwise
@@ -11,8 +12,18 @@ import torch
 
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
-from asysplat.refinement import PAPER, Rates, Refinement, RefinementSettings, mean_color, refine
+from asysplat.refinement import (
+    PAPER,
+    PUBLISHED_3DGS,
+    Rates,
+    Refinement,
+    RefinementSettings,
+    StepSchedule,
+    mean_color,
+    refine,
+)
 from asysplat.refinement.corrections import correct_poses
+from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.views import resize
@@ -237,6 +248,56 @@ def test_rates_cool_down_at_the_end():
     steps = torch.stack(colors).diff(dim=0).abs().amax(1).tolist()
     expected = [1e-4 * 0.1 ** max(0, (step / 40 - 0.5) / 0.5) for step in range(1, 40)]
     assert steps == pytest.approx(expected, rel=0.02)
+
+
+def test_the_schedule_of_3dgs():
+    """Rounds and opacity resets at their steps, in the first half; SH degree by degree."""
+    every = StepSchedule(round=4, first_round=6, opacity_reset=10, sh_degree=8)
+    settings = replace(PUBLISHED_3DGS, every=every)
+    views, rounds, resets = small_views(), [], []
+
+    class Recorded(Refinement):
+        def densify(self, share):
+            rounds.append(self._steps)
+
+        def reset_opacities(self):
+            super().reset_opacities()
+            resets.append((self._steps, self.gaussians.opacities.max().item()))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys.modules[refine.__module__], "Refinement", Recorded)
+        _, records = watched(
+            small_scene(), views, settings, lambda _, now: now.gaussians.sh, steps=48
+        )
+    assert rounds == [6, 10, 14, 18, 22]
+    assert [step for step, _ in resets] == [10, 20]
+    assert all(highest == pytest.approx(MAX_RESET_OPACITY, rel=1e-3) for _, highest in resets)
+    highest = [
+        3 if b[:, 9:].any() else 2 if b[:, 4:].any() else int(b[:, 1:].any()) for b in records
+    ]
+    assert highest == [0] * 8 + [1] * 8 + [2] * 8 + [3] * 24
+
+
+def test_only_the_rate_of_means_decays_in_3dgs():
+    """With a constant gradient, a step of Adam is as long as its rate."""
+    views = small_views(1)
+    views.images[:] = 1
+    half = torch.tensor([0.5])
+    one = isotropic_gaussians(torch.tensor([[0.0, 0, 3]]), half, half, torch.zeros(1, 3))
+    rates = Rates(means=1e-9, unit="scene", quats=0.0, scales=0.0, opacities=0.0, sh=1e-4)
+    settings = replace(PUBLISHED_3DGS, rates=rates)
+    _, colors = watched(one, views, settings, lambda _, now: now.gaussians.sh[0, 0], steps=20)
+    steps = torch.stack(colors).diff(dim=0).abs().amax(1)
+    torch.testing.assert_close(steps, torch.full((19,), 1e-4), rtol=0.02, atol=0)
+
+
+def test_3dgs_has_no_limit():
+    start, views = small_scene(), small_views()
+    assert Refinement(start, views, settings=PUBLISHED_3DGS)._max_gaussians > 10**9
+    with pytest.raises(InputError, match=r"refinement\.every=.*densify=gradient, or every=null"):
+        replace(PUBLISHED_3DGS, densify="error")
+    with pytest.raises(InputError, match=r"refinement\.every\.round=0: give at least 1"):
+        StepSchedule(round=0)
 
 
 def test_watch_may_stop():

@@ -1,8 +1,7 @@
 """Densification of 3DGS: clone and split Gaussians with large screen-space gradients.
 
 "3D Gaussian Splatting for Real-Time Radiance Field Rendering", Kerbl et al. 2023, Sec. 5.2, with
-the constants of its code. Left out: the opacity reset every 3,000 steps, as few refinements take
-that many.
+the constants of its code.
 """
 
 from dataclasses import replace
@@ -19,6 +18,9 @@ from asysplat.scene import Cameras
 DENSIFY_GRAD_THRESHOLD = 2e-4  # mean screen-space gradient, in half images
 SPLIT_SCALE = 0.011  # scale above which a Gaussian is split: 1 % of the scene extent of 1.1
 SPLIT_FACTOR = 1.6  # by which the two halves are smaller
+MAX_SCALE = 0.11  # above it a Gaussian is pruned, after the first opacity reset: 10 % of the extent
+MAX_RADIUS = 20.0  # likewise, in pixels of any image: three standard deviations
+MAX_RESET_OPACITY = 0.01
 
 
 class ScreenGradients:
@@ -29,7 +31,7 @@ class ScreenGradients:
         self._reset()
 
     def _reset(self) -> None:
-        self._sums, self._counts = torch.zeros(2, len(self.fields))
+        self._sums, self._counts, self._radii = torch.zeros(3, len(self.fields))
 
     @property
     def mean(self) -> Float[Tensor, "N"]:
@@ -45,23 +47,35 @@ class ScreenGradients:
         """
         visible = gradients.any(dim=1)
         pose, intrinsics = cameras.cam_to_world[0], cameras.intrinsics[0]
-        means = self.fields.gaussians().means[visible]
+        gaussians = self.fields.gaussians()
+        means, scales = gaussians.means[visible], gaussians.scales[visible].amax(-1)
         across = (gradients[visible] / self.fields.units[visible, None]) @ pose[:3, :2]
         depth = (means - pose[:3, 3]) @ pose[:3, 2]
         half = gradients.new_tensor([cameras.width / 2, cameras.height / 2])
         screen = across * depth[:, None] / intrinsics.diagonal()[:2] * half
         self._sums[visible] += screen.norm(dim=1)
         self._counts[visible] += 1
+        radii = 3 * scales * intrinsics[0, 0] / depth
+        self._radii[visible] = torch.maximum(self._radii[visible], radii)
 
     @torch.no_grad()
-    def clone_and_split(self, max_gaussians: int, generator: torch.Generator) -> None:
+    def clone_and_split(
+        self, max_gaussians: int, generator: torch.Generator, prune_large: bool = False
+    ) -> None:
         """Clone small and split large Gaussians with large gradients; prune transparent ones.
 
         A clone has the position of its original. Gaussians are added up to the limit, those with
         the largest gradients first. Afterwards the gradients are reset.
+
+        Args:
+            max_gaussians: the limit.
+            generator: of random numbers.
+            prune_large: prune those above MAX_SCALE or MAX_RADIUS too.
         """
         fields, gaussians = self.fields, self.fields.gaussians()
         opaque = gaussians.opacities > MIN_OPACITY
+        if prune_large:
+            opaque &= (gaussians.scales.amax(1) <= MAX_SCALE) & (self._radii <= MAX_RADIUS)
         opaque[gaussians.opacities.argmax()] = True  # never prune all
         gradients = torch.where(opaque, self.mean, 0)
         room = max(0, max_gaussians - int(opaque.sum()))
