@@ -7,7 +7,9 @@ from asysplat.models.early_exit import EarlyExit
 from asysplat.models.head import GaussianHead, LongLRMHead, PhotographHead
 from asysplat.models.mamba2 import BiMamba2
 from asysplat.models.mamba_vision import MambaVision
+from asysplat.models.mvsplat import MVSplat
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, PointsPrior
+from asysplat.models.prune import Prune
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.single_branch import SingleBranch, build_single_branch
 from asysplat.models.source import CoarseSource, FineSource, MergedSource
@@ -24,12 +26,14 @@ __all__ = [
     "FullAttention",
     "GaussianHead",
     "LongLRMHead",
+    "MVSplat",
     "MambaVision",
     "MergedSource",
     "NoLink",
     "PhotographHead",
     "PlaneSweepPrior",
     "PointsPrior",
+    "Prune",
     "SingleBranch",
     "SparseAttention",
     "StageShape",

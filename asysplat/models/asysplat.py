@@ -10,7 +10,7 @@ from asysplat.errors import InputError
 from asysplat.models.geometry_ratio import solve_widths
 from asysplat.models.layers import Layers
 from asysplat.models.mamba2 import BiMamba2
-from asysplat.models.network import Network
+from asysplat.models.network import TokenNetwork
 from asysplat.models.shapes import StageShape, Widths
 from asysplat.models.stage import Component, Stage
 from asysplat.models.tokenizer import Tokenizer
@@ -18,7 +18,7 @@ from asysplat.models.tokenizer import Tokenizer
 APPEARANCE_MLP_RATIO = 4
 
 
-class AsySplat(Network):
+class AsySplat(TokenNetwork):
     """The heavy geometry branch on coarse tokens, the light appearance branch on fine ones.
 
     Every component is a callable that builds a module, so that a configuration can replace it.
@@ -34,7 +34,7 @@ class AsySplat(Network):
         source: component that merges the branches.
         head: component that decodes Gaussians.
         patch_coarse, patch_fine: p_c, p_f; the first a multiple of the second.
-        prior: of Network.
+        prior: of TokenNetwork.
 
     Raises:
         InputError: an unusable layer mix, patch sizes that do not divide, unequal stage counts.

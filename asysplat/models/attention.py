@@ -1,6 +1,7 @@
 """Attention blocks: full and sparse self-attention over all views, cross-attention within a view.
 
-All are pre-norm with an MLP, bias-free, and apply RMSNorm to queries and keys (paper, Suppl. A).
+All are pre-norm with an MLP, bias-free, and apply RMSNorm to queries and keys (paper, Suppl. A),
+except that full attention also exists without this norm: other systems have none.
 """
 
 import torch.nn.functional as F
@@ -39,28 +40,33 @@ class QueryKeyNorm(nn.Module):
 class SelfAttention(nn.Module):
     """x + o(attn(qkv(LN x))), then x + MLP(LN x), over the tokens at the same grid place."""
 
-    def __init__(self, shape: StageShape, grid: int = 1):
+    def __init__(self, shape: StageShape, grid: int = 1, qk_norm: bool = True):
         super().__init__()
         self.grid, self.head_dim = grid, shape.head_dim
         self.norm = nn.LayerNorm(shape.width, bias=False)
         self.qkv = nn.Linear(shape.width, 3 * shape.width, bias=False)
-        self.qk_norm = QueryKeyNorm(shape.head_dim)
+        self.qk_norm = QueryKeyNorm(shape.head_dim) if qk_norm else None
         self.out = nn.Linear(shape.width, shape.width, bias=False)
         self.mlp_norm = nn.LayerNorm(shape.width, bias=False)
         self.mlp = MLP(shape.width, shape.mlp_ratio)
 
     def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:
         q, k, v = self.qkv(self.norm(tokens)).unflatten(-1, (3, -1, self.head_dim)).unbind(-3)
-        q, k = self.qk_norm(q, k)
+        if self.qk_norm is not None:
+            q, k = self.qk_norm(q, k)
         tokens = tokens + self.out(grid_attention(q, k, v, self.grid).flatten(-2))
         return tokens + self.mlp(self.mlp_norm(tokens))
 
 
 class FullAttention(SelfAttention):
-    """The letter t: every token attends to all tokens of all views."""
+    """The letter t: every token attends to all tokens of all views.
 
-    def __init__(self, shape: StageShape):
-        super().__init__(shape, grid=1)
+    Args:
+        qk_norm: whether to apply RMSNorm to queries and keys.
+    """
+
+    def __init__(self, shape: StageShape, qk_norm: bool = True):
+        super().__init__(shape, grid=1, qk_norm=qk_norm)
 
 
 class SparseAttention(nn.Module):

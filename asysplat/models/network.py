@@ -1,5 +1,6 @@
 """The base of every network from views to Gaussians."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection
 from dataclasses import replace
@@ -14,6 +15,7 @@ from asysplat.models.early_exit import EXACT, EarlyExit
 from asysplat.models.head import GaussianHead
 from asysplat.models.layers import Layers
 from asysplat.models.prior import PRIOR_CHANNELS, Prior
+from asysplat.models.prune import Prune
 from asysplat.models.shapes import Widths
 from asysplat.models.tokenizer import PIXEL_CHANNELS, pixel_features
 from asysplat.ops.precision import without_autocast
@@ -23,50 +25,132 @@ from asysplat.scene import Gaussians, Views
 class Network(nn.Module, ABC):
     """Views -> Gaussians: checks sizes, takes any leading batch dimensions.
 
+    Args:
+        patch: pixels along a side of its largest patches; image sides must be multiples of it.
+        prior: views and the size of the head's grid -> `Prior`; or None.
+        prune: selects among the predicted Gaussians; None keeps all.
+    """
+
+    view_counts = (1, math.inf)  # least and greatest number of input views
+
+    def __init__(self, patch: int, prior: nn.Module | None = None, prune: Prune | None = None):
+        super().__init__()
+        self.patch, self.prior, self.prune = patch, prior, prune
+        self.early_exit: EarlyExit = EXACT
+        self.early_exit_shares: dict[str, float] = {}
+
+    def forward(self, views: Views, prune: bool = True) -> Gaussians:
+        """Predict Gaussians [..., N] from views [..., V]; all of them if not `prune`.
+
+        Raises:
+            InputError: image sides that are no multiples of `patch`, or a number of views outside
+                `view_counts`; outside of training, invalid views; early exit for a network without
+                a prior, or for several scenes at a time.
+        """
+        self.check_size(views.cameras.height, views.cameras.width)
+        self.check_views(views.num_views)
+        if not self.training:
+            self.check_early_exit(self.early_exit)
+            if not (views.images.is_meta or is_fake(views.images)):
+                views.validate("the network's views")  # in training the data module does
+        batch = views.images.shape[:-4]
+        self.early_exit_shares.clear()
+        gaussians = self.predict(views.map(lambda x: x.reshape(-1, *x.shape[len(batch) :])))
+        if prune:
+            gaussians = self.select(gaussians)
+        return gaussians.map(lambda field: field.reshape(*batch, *field.shape[1:]))
+
+    def select(self, gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians [B, N] that `prune` keeps."""
+        return gaussians if self.prune is None else self.prune(gaussians)
+
+    @abstractmethod
+    def predict(self, views: Views) -> Gaussians:
+        """Predict Gaussians [B, N] from views [B, V]."""
+
+    def geometry_share(self) -> float:
+        """Return the share of parameters outside an appearance branch: all."""
+        return 1.0
+
+    @property
+    def pixel_channels(self) -> int:
+        """The number of input channels of a tokenizer, for each pixel."""
+        return PIXEL_CHANNELS + (0 if self.prior is None else PRIOR_CHANNELS)
+
+    def run_prior(self, views: Views) -> Prior:
+        """Run the prior, on the head's grid."""
+        height, width = (s // self.head.stride for s in (views.cameras.height, views.cameras.width))
+        with torch.no_grad(), without_autocast(views.images):
+            return self.prior(views, (height, width))
+
+    def describe(self) -> str:
+        """Return the number of parameters, in a line."""
+        return f"{sum(p.numel() for p in self.parameters()) / 1e6:.2f}M parameters"
+
+    def checkpoint_layers(self, checkpointing: bool) -> None:
+        """Switch activation checkpointing of all layers on or off; see `Layers`."""
+        for module in self.modules():
+            if isinstance(module, Layers):
+                module.checkpointing = checkpointing
+
+    def check_early_exit(self, early_exit: EarlyExit) -> None:
+        """Raise InputError for early exit without a prior, whose confidence it depends on."""
+        if early_exit != EXACT and self.prior is None:
+            raise InputError(
+                "speed: this model has no prior, whose confidence early exit needs: set "
+                "speed=exact, or model/prior=plane_sweep."
+            )
+
+    def check_size(self, height: int, width: int) -> None:
+        """Raise InputError unless both sides are multiples of `patch`."""
+        patch = self.patch
+        if height % patch or width % patch:
+            raise InputError(
+                f"the images are {height}x{width}, but this model takes multiples of "
+                f"{patch}, its patch: set {-(-height // patch) * patch}x"
+                f"{-(-width // patch) * patch} (height x width), as the paper takes 540 to 544."
+            )
+
+    def check_views(self, count: int) -> None:
+        """Raise InputError unless `count` input views are in `view_counts`."""
+        least, greatest = self.view_counts
+        if not least <= count <= greatest:
+            raise InputError(
+                f"data.inputs: this model takes {least} to {greatest} input views and got {count}: "
+                f"set data.inputs={least if count < least else greatest}, or take another model."
+            )
+
+
+class TokenNetwork(Network):
+    """A network of tokens, which a head decodes to a grid of Gaussians for each view.
+
     Outside of training it exits early at the thresholds of `early_exit`, by default never;
     `early_exit_shares` has the shares that the last prediction skipped, of the network (0 or 1) and
     of its layers.
 
     Args:
         widths: of the network.
-        patch: pixels along a side of its largest patches; image sides must be multiples of it.
-        prior: views and the size of the head's grid -> `Prior`; or None.
+        patch, prior, prune: of Network.
     """
 
     head: GaussianHead
     skippable_layers: Collection[nn.Module] = ()  # layers that early exit may skip
 
-    def __init__(self, widths: Widths, patch: int, prior: nn.Module | None):
-        super().__init__()
-        self.widths, self.patch, self.prior = widths, patch, prior
-        self.early_exit: EarlyExit = EXACT
-        self.early_exit_shares: dict[str, float] = {}
-
-    def forward(self, views: Views) -> Gaussians:
-        """Predict Gaussians [..., N] from views [..., V].
-
-        Raises:
-            InputError: image sides that are no multiples of `patch`; outside of training, invalid
-                views; early exit for a network without a prior, or for several scenes at a time.
-        """
-        self.check_size(views.cameras.height, views.cameras.width)
-        if not self.training and not (views.images.is_meta or is_fake(views.images)):
-            views.validate("the network's views")  # in training the data module does
-        batch = views.images.shape[:-4]
-        exact = self.training or self.early_exit == EXACT
-        predict = self.predict if exact else self.predict_with_early_exit
-        self.early_exit_shares.clear()
-        gaussians = predict(views.map(lambda x: x.reshape(-1, *x.shape[len(batch) :])))
-        return gaussians.map(lambda field: field.reshape(*batch, *field.shape[1:]))
+    def __init__(
+        self, widths: Widths, patch: int, prior: nn.Module | None, prune: Prune | None = None
+    ):
+        super().__init__(patch, prior, prune)
+        self.widths = widths
 
     def predict(self, views: Views) -> Gaussians:
         """Predict Gaussians [B, N] from views [B, V]; N = V h w, of the head's grid."""
+        if not (self.training or self.early_exit == EXACT):
+            return self.predict_with_early_exit(views)
         prior = None if self.prior is None else self.run_prior(views)
         return self.head(self.tokens(pixel_features(views, prior)), views, prior)
 
     def predict_with_early_exit(self, views: Views) -> Gaussians:
         """Predict Gaussians [1, N] from views [1, V]; see `EarlyExit`."""
-        self.check_early_exit(self.early_exit)
         if len(views.images) != 1:
             raise InputError(
                 f"speed: the network got {len(views.images)} scenes at a time, but early exit "
@@ -96,50 +180,10 @@ class Network(nn.Module, ABC):
             skip_layers: layers to skip.
         """
 
-    def geometry_share(self) -> float:
-        """Return the share of parameters outside an appearance branch: all."""
-        return 1.0
-
-    @property
-    def pixel_channels(self) -> int:
-        """The number of input channels of a tokenizer, for each pixel."""
-        return PIXEL_CHANNELS + (0 if self.prior is None else PRIOR_CHANNELS)
-
-    def run_prior(self, views: Views) -> Prior:
-        """Run the prior, on the head's grid."""
-        height, width = (s // self.head.stride for s in (views.cameras.height, views.cameras.width))
-        with torch.no_grad(), without_autocast(views.images):
-            return self.prior(views, (height, width))
-
     def describe(self) -> str:
         """Return the number of parameters and the widths, in a line."""
-        total = sum(p.numel() for p in self.parameters())
         stages = "/".join(map(str, self.widths.stages))
         return (
-            f"{total / 1e6:.2f}M parameters, {self.geometry_share():.1%} of them for geometry; "
+            f"{super().describe()}, {self.geometry_share():.1%} of them for geometry; "
             f"stages {stages} wide, heads {self.widths.head_dim}"
         )
-
-    def checkpoint_layers(self, checkpointing: bool) -> None:
-        """Switch activation checkpointing of all layers on or off; see `Layers`."""
-        for module in self.modules():
-            if isinstance(module, Layers):
-                module.checkpointing = checkpointing
-
-    def check_early_exit(self, early_exit: EarlyExit) -> None:
-        """Raise InputError for early exit without a prior, whose confidence it depends on."""
-        if early_exit != EXACT and self.prior is None:
-            raise InputError(
-                "speed: this model has no prior, whose confidence early exit needs: set "
-                "speed=exact, or model/prior=plane_sweep."
-            )
-
-    def check_size(self, height: int, width: int) -> None:
-        """Raise InputError unless both sides are multiples of `patch`."""
-        patch = self.patch
-        if height % patch or width % patch:
-            raise InputError(
-                f"the images are {height}x{width}, but this model takes multiples of "
-                f"{patch}, its patch: set {-(-height // patch) * patch}x"
-                f"{-(-width // patch) * patch} (height x width), as the paper takes 540 to 544."
-            )

@@ -8,13 +8,14 @@ from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.models.attention import SparseAttention
-from asysplat.models.network import Network
+from asysplat.models.network import TokenNetwork
+from asysplat.models.prune import Prune
 from asysplat.models.shapes import Widths
 from asysplat.models.stage import Component, Stage
 from asysplat.models.tokenizer import Tokenizer
 
 
-class SingleBranch(Network):
+class SingleBranch(TokenNetwork):
     """Tokens of one patch size through all stages; every pixel gives a Gaussian.
 
     Args:
@@ -26,7 +27,7 @@ class SingleBranch(Network):
         head: component that decodes Gaussians.
         patch: side of a token's patch before any merge.
         global_tokens: number of learned tokens that come first in the sequence and have no place.
-        prior: of Network.
+        prior, prune: of TokenNetwork.
 
     Raises:
         InputError: lists of unequal length, an unusable layer mix, or global tokens with sparse
@@ -44,8 +45,9 @@ class SingleBranch(Network):
         patch: int = 8,
         global_tokens: int = 0,
         prior: nn.Module | None = None,
+        prune: Prune | None = None,
     ):
-        super().__init__(widths, patch * 2 ** sum(merges), prior)
+        super().__init__(widths, patch * 2 ** sum(merges), prior, prune)
         self.tokenizer = Tokenizer(patch, widths.stages[0], self.pixel_channels)
         shapes = widths.stage_shapes(stage_ratios, stage_layers=stage_layers, merges=merges)
         self.stages = nn.ModuleList(
@@ -97,10 +99,15 @@ def build_single_branch(
     Raises:
         InputError: a geometry_ratio or a budget.
     """
+    refuse_ratio(geometry_ratio, parameter_budget)
+    widths = Widths(tuple(stage_widths), head_dim, head_dim).scaled(width)
+    return SingleBranch(widths, **components)
+
+
+def refuse_ratio(geometry_ratio: float | None, parameter_budget: float) -> None:
+    """Raise InputError unless both have the values of a model without two branches."""
     if geometry_ratio is not None or parameter_budget != 1:
         raise InputError(
             f"geometry_ratio={geometry_ratio} and parameter_budget={parameter_budget} have no "
             "meaning for a model of one branch: leave them out, or take an asysplat_* model."
         )
-    widths = Widths(tuple(stage_widths), head_dim, head_dim).scaled(width)
-    return SingleBranch(widths, **components)

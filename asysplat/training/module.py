@@ -73,11 +73,11 @@ class SplattingModule(lightning.LightningModule):
         """Predict the Gaussians of the inputs, by `net` if given; render them at the targets."""
         net = self.net if net is None else net
         with self.parts("network"):
-            gaussians = net(batch["inputs"])
+            gaussians = net(batch["inputs"], prune=False)
         targets, background = batch["targets"], self.background_for(batch)
         with self.parts("rendering"):
-            options = {"masks": targets.masks, "views_at_once": self.views_at_once}
-            rendering = render(gaussians, targets.cameras, background, depth=depth, **options)
+            options = {"masks": targets.masks, "views_at_once": self.views_at_once, "depth": depth}
+            rendering = render(net.select(gaussians), targets.cameras, background, **options)
         return Prediction(gaussians, rendering)
 
     def background_for(self, batch: Batch) -> Tensor:

@@ -8,7 +8,10 @@ from asysplat.scene import Gaussians
 
 @dataclass(frozen=True)
 class Prediction:
-    """Gaussians predicted from the input views, and their rendering at the target cameras."""
+    """Gaussians predicted from the input views, and their rendering at the target cameras.
+
+    The Gaussians are those before pruning, which the terms of the loss are of, as in Long-LRM.
+    """
 
     gaussians: Gaussians
     rendering: Rendering

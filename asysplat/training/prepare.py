@@ -67,6 +67,7 @@ class Stage:
         config, net, folder = self.config, module.net, Path(self.config.paths.run)
         net.check_early_exit(early_exit)
         data.check_sizes(net.check_size)
+        data.check_views(net.check_views)
         data.check_sizes(instantiate(config.metrics).check_size)
         check_checkpoint(self.checkpoint, module)
         load_weights(self.weights, module)

@@ -61,6 +61,7 @@ def check_stages(stages: Sequence[DictConfig]) -> None:
             with torch.device("meta"):
                 net = instantiate(stage.model)
             net.check_size(stage.data.height, stage.data.width)
+            net.check_views(stage.data.inputs)
         except InputError as error:
             raise InputError(f"{stage.stage}: {error}") from error
     if (stages[-1].get("callbacks") or {}).get("checkpoints") is None:

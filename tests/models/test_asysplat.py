@@ -39,6 +39,7 @@ PARAMETERS = {
     "asysplat_0m8a": 105.72,
     "single_branch": 94.29,
     "two_branch": 90.26,
+    "gs_lrm": 306.50,
     "longlrm": 141.92,
     "longlrm_18": 103.00,
     "longlrm_24": 98.89,
@@ -127,7 +128,7 @@ def test_one_gaussian_per_output_pixel_at_its_ray(build):
 
 def test_untrained_colors_are_those_of_the_images(build):
     views = make_views()
-    dc = build("model=asysplat_4m4s", *TINY)(views).sh[..., 0, :] * 0.28209479 + 0.5
+    dc = build("model/head=photograph", *TINY)(views).sh[..., 0, :] * 0.28209479 + 0.5
     images = torch.nn.functional.avg_pool2d(views.images.flatten(0, 1), 2)
     expected = images.permute(0, 2, 3, 1).reshape(2, -1, 3)
     assert (dc - expected).abs().mean() < 0.02

@@ -22,7 +22,7 @@ NEVER = 1.0  # a confidence that no scene reaches
 @pytest.fixture
 def net(build):
     """A network of three stages with two layers each, whose head corrects the prior visibly."""
-    net = build(*NETWORK).eval()
+    net = build("model=asysplat_plane_sweep", *NETWORK).eval()
     torch.nn.init.normal_(net.head.decode.weight, std=0.05)
     return net
 

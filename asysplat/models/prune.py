@@ -1,0 +1,50 @@
+"""Prune predicted Gaussians by opacity, as Long-LRM does at its last resolution."""
+
+from dataclasses import dataclass
+
+import torch
+
+from asysplat.errors import InputError
+from asysplat.scene import Gaussians
+
+
+@dataclass(frozen=True)
+class Prune:
+    """Keep the most opaque Gaussians, and a few of the others, so that those learn too.
+
+    The published settings are 0.6 and 0.1 (arthurhero/Long-LRM,
+    configs/dl3dv_i540_32input_8target.yaml). There the others are drawn at random; here they are
+    evenly spaced by opacity, so that the same views give the same Gaussians.
+
+    Args:
+        prune_ratio: share of the Gaussians to drop, in [0, 1).
+        random_ratio: share of the kept ones that is not chosen by opacity, in [0, 1].
+
+    Raises:
+        InputError: a ratio out of range.
+    """
+
+    prune_ratio: float
+    random_ratio: float = 0.0
+
+    def __post_init__(self):
+        if not (0 <= self.prune_ratio < 1 and 0 <= self.random_ratio <= 1):
+            raise InputError(
+                f"model.prune: prune_ratio={self.prune_ratio} must be in [0, 1) and "
+                f"random_ratio={self.random_ratio} in [0, 1]."
+            )
+
+    def __call__(self, gaussians: Gaussians) -> Gaussians:
+        """Select among Gaussians [B, N], the same number in each scene."""
+        count = gaussians.num_gaussians
+        kept = max(1, int(count * (1 - self.prune_ratio)))
+        if kept == count:
+            return gaussians
+        others = int(kept * self.random_ratio)
+        opaque = kept - others
+        order = gaussians.opacities.argsort(dim=-1, descending=True, stable=True)
+        steps = torch.arange(others, device=order.device)
+        ranks = opaque + steps * (count - opaque) // max(1, others)
+        chosen = torch.cat((order[:, :opaque], order[:, ranks]), -1)
+        rows = torch.arange(len(chosen), device=chosen.device)[:, None]
+        return gaussians.map(lambda field: field[rows, chosen])
