@@ -1,10 +1,10 @@
-"""Measure a model or a file of Gaussians, before and after the paper's post-optimization.
+"""Measure a model or files of Gaussians, before and after the paper's post-optimization.
 
 python evaluate.py run=last
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from asysplat.overrides import exit_at_unknown_overrides
@@ -19,24 +19,29 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, ListConfig, OmegaConf
+from rich.progress import track
 from torch import nn
 
 from asysplat.data import SceneDataModule
+from asysplat.data.datamodule import FixedTasks, Sample
 from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.post_optimization import HOW, PostOptimization, Predict
 from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
-from asysplat.export import read_gaussians
+from asysplat.export import write_safetensors
+from asysplat.export.scene_folder import check_visible, find_files, origin_of
+from asysplat.files import make_folder
 from asysplat.interrupts import handle_signals
 from asysplat.models.early_exit import EXACT
-from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 from asysplat.training.checkpoints import load_weights
 from asysplat.training.evaluation_target import find_target
 from asysplat.training.messages import exit_with_message, quiet_lightning
 from asysplat.training.runs import EVALUATION
 from asysplat.training.summary import print_evaluation, write_json
+
+Predictor = Callable[[Sample], Predict]  # of the scene of a sample
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
@@ -60,20 +65,26 @@ def evaluate(options: DictConfig) -> None:
     data = instantiate(config.data)
     data.setup()
     data.check_sizes(measure.protocol.check_size)
-    if options.scene is None:
-        (predict, early_exit), tests = open_network(config, data, fabric), data.tests
+    tests, early_exit, described = data.tests, {}, target.described
+    if options.scenes is None:
+        predictor, early_exit = open_network(config, data, fabric)
     else:
-        predict, early_exit = open_gaussians(options.scene, data, fabric.device), {}
         tests = {data.name: data.tests[data.name]}
+        predictor, found = open_scenes(Path(options.scenes), tests[data.name], fabric.device)
+        described = described | found
 
     folders = target.folder, target.scene_folder
-    scenes = measure_scenes(tests, predict, measure, fabric.device, *folders, early_exit)
+    scenes = measure_scenes(tests, predictor, measure, fabric.device, *folders, early_exit)
+    if options.write_scenes is not None:
+        write_scenes(Path(options.write_scenes), tests[data.name], predictor, fabric.device)
 
     if options.run is None:  # a run has one
         OmegaConf.save(options, target.folder / "config.yaml", resolve=True)
-    results = target.described | {"evaluation/post_optimization": HOW}
+    results = described | {"evaluation/post_optimization": HOW}
     results |= {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
     results |= set_results(scenes, measure.protocol.mean_over)
+    if options.scenes is not None:  # reading a file is no prediction
+        results = {k: v for k, v in results.items() if not k.startswith("cost/post0/")}
     write_csv(target.folder / "evaluation.csv", image_rows(scenes))
     write_json(target.folder / EVALUATION, results)
     print_evaluation(results, list(scenes), target.folder)
@@ -95,10 +106,11 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
 
 def open_network(
     config: DictConfig, data: SceneDataModule, fabric: lightning.Fabric
-) -> tuple[Predict, Mapping[str, float]]:
+) -> tuple[Predictor, Mapping[str, float]]:
     """Load a model; return its prediction of a scene, and what its last early exit left out."""
     net = instantiate(config.model)
     data.check_sizes(net.check_size)
+    data.check_views(net.check_views)
     load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
     net.to(fabric.device).eval()
     net.early_exit = instantiate(config.get("speed")) or EXACT  # absent in the oldest runs
@@ -109,28 +121,56 @@ def open_network(
         with torch.no_grad(), fabric.autocast():
             return net(Views.stack([inputs])).map(lambda tensor: tensor[0].float())
 
-    return predict, net.early_exit_shares
+    return lambda sample: predict, net.early_exit_shares
 
 
-def open_gaussians(path: str, data: SceneDataModule, device: torch.device) -> Predict:
-    """Read the Gaussians of the data's one scene, of which its input views must show some."""
-    scenes = data.tests[data.name]
-    if len(scenes) != 1:
-        raise InputError(
-            f"scene={path} is one scene, and the data has {len(scenes)} to test: name the folder "
-            "of that scene as data.root."
-        )
-    sample = scenes[0]
-    scene = getattr(scenes.tasks[0].sequence, "scene", None)  # of files
-    gaussians = read_gaussians(path, scene and scene.origin)
-    gaussians = sample["frame"].to_network(gaussians).to(device)
-    if not render(gaussians, sample["inputs"].cameras.to(device), depth=False).alpha.any():
-        raise InputError(
-            f"scene={path} has {gaussians.num_gaussians} Gaussians, and none is visible in the "
-            f"input views of {sample['scene']}: name the file of that scene, in the world and the "
-            "units of its cameras."
-        )
-    return lambda inputs: gaussians
+def open_scenes(
+    path: Path, tests: FixedTasks, device: torch.device
+) -> tuple[Predictor, dict[str, float]]:
+    """Read and check the Gaussians of every scene of the data; return what reads one again.
+
+    Returns:
+        The scene's Gaussians in the frame of its sample, as a prediction; tested/scenes, their
+        number, and, if cameras were fitted, tested/residual, the largest (see `SceneFile.read`).
+    """
+    files = find_files(path, [task.sequence for task in tests.tasks])
+
+    def read(sample: Sample) -> tuple[Gaussians, float | None]:
+        gaussians, residual = files[sample["scene"]].read()
+        return sample["frame"].to_network(gaussians).to(device, torch.float32), residual
+
+    residuals = []
+    for index in track(range(len(tests)), "checking scenes"):
+        sample = tests[index]
+        gaussians, residual = read(sample)
+        cameras = sample["targets"].cameras.to(device)
+        check_visible(gaussians, cameras, files[sample["scene"]], residual is not None)
+        residuals += [] if residual is None else [residual]
+    described = {"tested/scenes": len(tests)}
+    if residuals:
+        described["tested/residual"] = max(residuals)
+        print(f"{len(residuals)} scenes fitted by cameras, residual {max(residuals):.2%} at most")
+
+    def predictor(sample: Sample) -> Predict:
+        gaussians = read(sample)[0]
+        return lambda inputs: gaussians
+
+    return predictor, described
+
+
+def write_scenes(
+    folder: Path, tests: FixedTasks, predictor: Predictor, device: torch.device
+) -> None:
+    """Write the Gaussians of every test scene, in the data's world, as <scene>.safetensors."""
+    make_folder(folder, "write_scenes")
+    for index in range(len(tests)):
+        sample, sequence = tests[index], tests.tasks[index].sequence
+        gaussians = predictor(sample)(sample["inputs"].to(device)).to(torch.float64)
+        path, offset = folder / f"{sample['scene']}.safetensors", origin_of(sequence)
+        metadata = {"offset": " ".join(map(repr, offset))}
+        # In float64, which comes back from the world to the very same float32.
+        write_safetensors(path, sample["frame"].to_world(gaussians), metadata, torch.float64)
+    print(f"scenes: {folder}")
 
 
 if __name__ == "__main__":

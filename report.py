@@ -27,6 +27,7 @@ from asysplat.report.html import render_html
 from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import find_tables
 from asysplat.report.terminal import render_terminal
+from asysplat.training.systems import find_systems
 
 OWN_OPTIONS = ("table", "costs", "overrides", "logs", "output")
 
@@ -45,8 +46,9 @@ def report(options: DictConfig) -> None:
     make_folder(folder, "output")
     overrides = [*sweep_overrides(HydraConfig.get().overrides.task), *options.overrides]
     check_overrides(overrides)
-    runs = finished_runs(Path(options.logs))
-    filled = [fill_table(table, overrides, compose_train, runs) for table in tables]
+    logs = Path(options.logs)
+    runs, systems = finished_runs(logs), list(find_systems(logs))
+    filled = [fill_table(table, overrides, compose_train, runs, systems) for table in tables]
     if options.costs:
         filled = [with_costs(table, compose_train) for table in track(filled, "counting costs")]
     console = Console()

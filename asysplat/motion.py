@@ -1,4 +1,4 @@
-"""Rigid motions of Gaussians."""
+"""Rigid motions of Gaussians, and similarities fitted to points."""
 
 from dataclasses import replace
 
@@ -32,3 +32,25 @@ def transform(gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
         quats=quats.to(gaussians.quats),
         sh=(matrix @ gaussians.sh.double()).to(gaussians.sh),
     )
+
+
+def fit_similarity(
+    source: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]
+) -> tuple[Float[Tensor, "4 4"], float]:
+    """Fit the rigid motion, and the scale applied after it, that take points to their targets.
+
+    Least squares in float64 (Umeyama 1991, Eq. 40 to 43); points on a line leave the rotation open.
+
+    Args:
+        source, target: not all in one place.
+    """
+    source, target = source.double(), target.double()
+    centered, wanted = source - source.mean(0), target - target.mean(0)
+    left, values, right = torch.linalg.svd(wanted.mT @ centered)
+    signs = torch.tensor([1.0, 1.0, 1.0]).to(source)
+    signs[2] = torch.linalg.det(left @ right).sign()  # no mirroring
+    scale = (values * signs).sum() / centered.square().sum()
+    motion = torch.eye(4).to(source)
+    motion[:3, :3] = left * signs @ right
+    motion[:3, 3] = target.mean(0) / scale - motion[:3, :3] @ source.mean(0)
+    return motion, scale.item()

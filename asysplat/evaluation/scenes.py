@@ -1,10 +1,10 @@
 """Measure all scenes of all test sets; an interrupted evaluation resumes with the next scene."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -22,7 +22,7 @@ Scenes = Mapping[str, Sequence[SceneResult]]  # by test set, the data set's own 
 
 def measure_scenes(
     tests: Mapping[str, Dataset],
-    predict: Predict,
+    predictor: Callable[[dict[str, Any]], Predict],
     measure: PostOptimization,
     device: torch.device,
     folder: Path,
@@ -34,7 +34,9 @@ def measure_scenes(
     Args:
         tests: by test set, the data set's own first, its scenes: their name, `scene`, and `inputs`
             and `targets`.
-        predict, measure: see `PostOptimization`.
+        predictor: returns the `predict` of a scene, whose costs are measured; see
+            `PostOptimization`.
+        measure: measures a scene.
         device: that computes.
         folder: for figures/evaluation-post<steps>.png: the first scene at the first and the last
             of the steps.
@@ -60,7 +62,7 @@ def measure_scenes(
                     with atomic_write(path) as partial:
                         comparison_figure(inputs, targets, rendering).savefig(partial, dpi=100)
 
-            result = measure(sample["scene"], predict, inputs, targets, show)
+            result = measure(sample["scene"], predictor(sample), inputs, targets, show)
             result.early_exit.update(early_exit)
             sentence = f"{name} {result.scene}, PSNR after steps of post-optimization: "
             sentence += ", ".join(

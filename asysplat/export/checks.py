@@ -18,8 +18,8 @@ def existing(path: str | Path) -> Path:
     return path
 
 
-def as_written(gaussians: Gaussians) -> Gaussians:
-    """Convert one scene to float32, on the CPU and without gradients.
+def as_written(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:
+    """Convert one scene to `dtype`, on the CPU and without gradients.
 
     Raises:
         InputError: a batch dimension, no Gaussians, or see `Gaussians.validate`.
@@ -31,4 +31,4 @@ def as_written(gaussians: Gaussians) -> Gaussians:
         )
     if gaussians.num_gaussians == 0:
         raise InputError("Gaussians has no Gaussians: give at least one to write.")
-    return gaussians.map(torch.Tensor.detach).to("cpu", torch.float32).validate()
+    return gaussians.map(torch.Tensor.detach).to("cpu", dtype).validate()

@@ -13,30 +13,35 @@ from asysplat.export.tensors import read_safetensors, write_safetensors
 from asysplat.scene import Gaussians
 
 READERS = {
-    ".ply": read_ply,
-    ".splat": read_splat,
-    ".safetensors": lambda path: read_safetensors(path)[0],
+    ".ply": lambda path, dtype: read_ply(path).to(dtype),
+    ".splat": lambda path, dtype: read_splat(path).to(dtype),
+    ".safetensors": lambda path, dtype: read_safetensors(path, dtype)[0],
 }
 WRITERS = {".ply": write_ply, ".safetensors": write_safetensors}
 
 
-def read_gaussians(path: str | Path, origin: Sequence[float] | None = None) -> Gaussians:
-    """Read a scene from a .ply, .splat or .safetensors file, in float32.
+def read_gaussians(
+    path: str | Path,
+    origin: Sequence[float] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> Gaussians:
+    """Read a scene from a .ply, .splat or .safetensors file.
 
     Args:
         path: of the file.
         origin: of the coordinates of the means; None: the file's own, whose offset (see
             `write_ply`) is left out.
+        dtype: of the result; only .safetensors may hold more than float32.
 
     Raises:
         InputError: another suffix, or see the format's reader.
     """
-    gaussians = _by_suffix(READERS, path, "read")(path)
+    gaussians = _by_suffix(READERS, path, "read")(path, dtype)
     if origin is None:
         return gaussians
     shift = torch.tensor(_offset(Path(path)), dtype=torch.float64)
     shift -= torch.tensor(origin, dtype=torch.float64)
-    return replace(gaussians, means=(gaussians.means.double() + shift).float())
+    return replace(gaussians, means=(gaussians.means.double() + shift).to(dtype))
 
 
 def _offset(path: Path) -> list[float]:

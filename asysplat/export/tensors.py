@@ -3,6 +3,7 @@
 from dataclasses import fields
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
@@ -15,21 +16,26 @@ NAMES = tuple(field.name for field in fields(Gaussians))
 
 
 def write_safetensors(
-    path: str | Path, gaussians: Gaussians, metadata: dict[str, str] | None = None
+    path: str | Path,
+    gaussians: Gaussians,
+    metadata: dict[str, str] | None = None,
+    dtype: torch.dtype = torch.float32,
 ) -> None:
-    """Write one scene's means, quats, scales, opacities and sh in float32, and metadata.
+    """Write one scene's means, quats, scales, opacities and sh, and metadata.
 
     Raises:
         InputError: invalid Gaussians, or a file that cannot be written.
     """
-    gaussians = as_written(gaussians)
+    gaussians = as_written(gaussians, dtype)
     content = save({name: getattr(gaussians, name).contiguous() for name in NAMES}, metadata)
     with atomic_write(path) as partial:
         partial.write_bytes(content)
 
 
-def read_safetensors(path: str | Path) -> tuple[Gaussians, dict[str, str]]:
-    """Read a scene in float32 and its metadata, as written by `write_safetensors`.
+def read_safetensors(
+    path: str | Path, dtype: torch.dtype = torch.float32
+) -> tuple[Gaussians, dict[str, str]]:
+    """Read a scene and its metadata, as written by `write_safetensors`.
 
     Raises:
         InputError: no such file, a missing field, or invalid Gaussians.
@@ -37,7 +43,7 @@ def read_safetensors(path: str | Path) -> tuple[Gaussians, dict[str, str]]:
     path = existing(path)
     try:
         with safe_open(path, "pt") as file:
-            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name).to(dtype) for name in file.keys()}  # noqa: SIM118
             metadata = file.metadata() or {}
     except SafetensorError as error:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Find what evaluate.py measures: a finished run, a checkpoint or a file of Gaussians."""
+"""Find what evaluate.py measures: a finished run, a checkpoint or files of Gaussians."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +9,10 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from asysplat.errors import InputError
 from asysplat.training.ranges import check_ranges
 from asysplat.training.run_config import read_config
-from asysplat.training.runs import RESULTS, content_of, describe_run, find_runs, hash_of
+from asysplat.training.runs import RESULTS, describe_run, find_runs, hash_of
+from asysplat.training.systems import describe_system
 
-OWN_OPTIONS = ("run", "scene", "steps")  # the others are train.py's
+OWN_OPTIONS = ("run", "scenes", "system", "steps", "write_scenes")  # the others are train.py's
 
 
 @dataclass(frozen=True)
@@ -32,31 +33,37 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
     """Find the target of evaluate.py from its options and the overrides of its command.
 
     Raises:
-        InputError: none of run, init_path and scene is given, or several are; files do not exist;
-            options that do not go with a run; a value that is missing or out of range.
+        InputError: none of run, init_path and scenes is given, or several are; files do not exist;
+            options that do not go together; a value that is missing or out of range.
     """
-    given = [name for name in ("run", "init_path", "scene") if options[name] is not None]
+    given = [name for name in ("run", "init_path", "scenes") if options[name] is not None]
     if len(given) != 1:
         raise InputError(
             f"{' and '.join(given) or 'nothing'} is given to evaluate: give one of run=last, "
-            "init_path=shipped and scene=scene.ply."
+            "init_path=shipped and scenes=FOLDER."
         )
-    if options.scene is not None and not any(each.startswith("data") for each in overrides):
+    if options.scenes is None and options.system is not None:
         raise InputError(
-            f"scene={options.scene} is measured on photographs of the same scene: add data=files "
-            "data.root=my_scene."
+            f"system={options.system} names the system that made scenes=...: give both, or neither."
+        )
+    if options.write_scenes is not None:
+        _check_new(Path(options.write_scenes), options)
+    if options.scenes is not None and not any(each.startswith("data") for each in overrides):
+        raise InputError(
+            f"scenes={options.scenes} is measured on photographs of the same scenes: add "
+            "data=files data.root=my_scenes."
         )
     if options.run is not None:
         return _target_of_run(options, overrides)
     config = options.copy()
     with open_dict(config):
-        del config["run"], config["scene"]
+        for name in set(OWN_OPTIONS) - {"steps"}:  # another option in train.py
+            del config[name]
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
-    # `steps` is another option in train.py.
     check_ranges(OmegaConf.masked_copy(config, [key for key in config if key != "steps"]))
     described = _describe(config, options)
-    stem = Path(options.scene or options.init_path).stem
+    stem = Path(options.scenes or options.init_path).stem
     folder = Path(options.paths.logs) / "evaluate" / f"{stem}-{hash_of(described)[:8]}"
     return EvaluationTarget(config, folder, described)
 
@@ -97,6 +104,20 @@ def _describe(config: DictConfig, options: DictConfig) -> dict[str, str | int]:
     described = describe_run(config)
     described = {f"evaluation/{k.removeprefix('run/')}": v for k, v in described.items()}
     described["evaluation/steps"] = str(options.steps)
-    if options.scene is not None:
-        described["evaluation/scene"] = content_of(options.scene)
+    if options.scenes is not None:
+        described |= describe_system(config, Path(options.scenes), options.system)
     return described
+
+
+def _check_new(folder: Path, options: DictConfig) -> None:
+    """Check that there is something to write to `folder`, and nothing there yet."""
+    if options.scenes is not None:
+        raise InputError(
+            f"write_scenes={folder} writes what a model predicts, and scenes={options.scenes} are "
+            "files: leave one out."
+        )
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            f"write_scenes={folder} exists and is not an empty folder: name a new one, nothing is "
+            "overwritten."
+        )

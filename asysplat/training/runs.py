@@ -28,7 +28,8 @@ EVALUATION = "evaluation.json"  # added to a run by evaluate.py
 # is divided.
 NOT_HASHED = (
     *("name", "ckpt_path", "rerun", "paths", "callbacks", "logger"),
-    *("stage", "stages", "earlier_stages", "selections", "more_inputs", "replica_size"),
+    *("stage", "stages", "earlier_stages", "selections", "more_inputs", "replica_size", "farthest"),
+    *("allow_missing_losses", "training.loss.allow_missing"),
     *("data.root", "data.index", "data.cache", "data.test_sets"),
     *(f"trainer.{name}" for name in ("devices", "num_nodes", "strategy")),
     *("data.micro_batch", "training.checkpoint_layers", "training.views_at_once"),
@@ -90,6 +91,10 @@ def hashed_options(
     speed = resolved.get("speed") or {}
     if not any(value for key, value in speed.items() if key != "_target_"):
         resolved.pop("speed", None)  # exact, as every run was before the option existed
+    data = resolved["data"]
+    if data.get("first_window") is None:  # as every run was before the options existed
+        data.pop("first_window", None)
+        data.pop("growth_steps", None)
     for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)
@@ -107,20 +112,21 @@ def data_of(config: DictConfig) -> dict[str, str]:
     """
     data = OmegaConf.to_container(config.data, resolve=True)
     described = {
-        "run/data/root": _name(data.get("root")),
-        "run/data/test_root": _name(data.get("test_root")),
+        "run/data/root": name_of(data.get("root")),
+        "run/data/test_root": name_of(data.get("test_root")),
         "run/data/index": content_of(data.get("index")),
         "run/init_path": content_of(config.init_path and weights_file(config.init_path)),
     }
     test_sets = tested_sets(data["test_sets"], data["name"], on_disk="root" in data)
     for name, options in test_sets.items():
         options = dict(options or {})
-        options |= {"root": _name(options.get("root")), "index": content_of(options.get("index"))}
+        options |= {"root": name_of(options.get("root")), "index": content_of(options.get("index"))}
         described[f"run/test_sets/{name}"] = hash_of(options)
     return {key: value for key, value in described.items() if value is not None}
 
 
-def _name(path: str | Path | None) -> str | None:
+def name_of(path: str | Path | None) -> str | None:
+    """Return the last name of a path; None if it is not given."""
     return None if path in (None, MISSING) else Path(os.path.abspath(path)).name
 
 
@@ -132,7 +138,7 @@ def content_of(path: str | Path | None) -> str | None:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()[:16]
     except OSError:
-        return _name(path)
+        return name_of(path)
 
 
 def hash_of(values: Any) -> str:

@@ -128,3 +128,12 @@ def test_files_that_are_cut_off_are_refused(written, size):
     written.write_bytes(written.read_bytes()[:size])
     with pytest.raises(InputError, match=r"scene\.safetensors cannot be read as safetensors"):
         read_safetensors(written)
+
+
+def test_float64_in_safetensors(make_scene, tmp_path):
+    scene, _ = make_scene(degree=1)
+    write_safetensors(tmp_path / "scene.safetensors", scene, dtype=torch.float64)
+    read = read_gaussians(tmp_path / "scene.safetensors", (0.0, 0.0, 0.0), torch.float64)
+    for field in fields(Gaussians):
+        assert torch.equal(getattr(read, field.name), getattr(scene, field.name))
+    assert read_gaussians(tmp_path / "scene.safetensors").means.dtype == torch.float32

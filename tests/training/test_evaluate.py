@@ -3,25 +3,21 @@
 import csv
 import json
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from conftest import COSTS, TINY_SCENES, finished
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 from tiny import SIZE, VIEWS
 from tiny import STEPS as TRAINING
 
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.write import write_transforms
 from asysplat.evaluation import scenes
-from asysplat.export import write_gaussians
+from asysplat.export import read_gaussians, write_gaussians
+from asysplat.motion import transform
 from asysplat.report.fill import fill_table, finished_runs
 from asysplat.report.paper import load_paper
-from asysplat.scene import Views
-from asysplat.training.checkpoints import load_weights
 
 pytestmark = pytest.mark.medium
 
@@ -157,29 +153,88 @@ def photographs(tmp_path_factory) -> Path:
 ON_DISK = ["data=files", "data.cache.folder=null", "data.window=[12,24]", "data.val_scenes=1"]
 
 
-def test_a_file_of_gaussians_in_the_worlds_units(whole, photographs, evaluate, tmp_path):
-    """What a network predicts, brought to the world and written, measures as the network does."""
+@pytest.fixture(scope="module")
+def written(whole, photographs, tmp_path_factory, run_script) -> tuple[Path, dict]:
+    """The folder of what the model predicts of that scene, and the model's numbers."""
+    folder = tmp_path_factory.mktemp("written")
+    given = [f"init_path={whole}/checkpoints/last.ckpt", f"write_scenes={folder}/ours"]
     data = [*ON_DISK, f"data.root={photographs}", *VIEWS, "steps=[0,2]"]
-    weights = whole / "checkpoints" / "last.ckpt"
-    folder, expected = read_evaluation(evaluate(f"init_path={weights}", *MODEL, *data))
-    config = OmegaConf.load(folder / "config.yaml")
-    module = torch.nn.ModuleDict({"net": instantiate(config.model)})
-    load_weights(str(weights), module)
-    loaded = instantiate(config.data)
-    loaded.setup()
-    sample = loaded.tests["files"][0]
-    with torch.no_grad():
-        gaussians = module.net.eval()(Views.stack([sample["inputs"]])).map(lambda t: t[0])
-    path = tmp_path / "scene.ply"
-    write_gaussians(path, sample["frame"].to_world(gaussians))
-    _, found = read_evaluation(evaluate(f"scene={path}", "metrics=longlrm", *data))
-    assert qualities(found) == pytest.approx(qualities(expected), abs=0.01)
+    _, results = read_evaluation(
+        run_script("evaluate.py", *given, *MODEL, *data, f"paths.logs={folder}")
+    )
+    return folder / "ours", results
 
-    behind = replace(gaussians, means=gaussians.means - torch.tensor([0.0, 0.0, 1000.0]))
-    write_gaussians(path, sample["frame"].to_world(behind))
-    assert "none is visible in the input views" in refusal(evaluate(f"scene={path}", *data))
-    synthetic = evaluate(f"scene={path}", *VIEWS, *TINY_SCENES)
+
+def shown(results: dict) -> dict:
+    """The qualities with as many digits as are printed."""
+    return {key: f"{value:.3f}" for key, value in qualities(results).items()}
+
+
+def test_what_a_model_writes_measures_as_the_model(written, photographs, evaluate, tmp_path):
+    """Bit for bit as safetensors, and as PLY to the digits that are printed."""
+    ours, expected = written
+    (file,) = ours.iterdir()
+    assert file.name == f"{photographs.name}.safetensors"
+    data = [*ON_DISK, f"data.root={photographs}", *VIEWS, "metrics=longlrm"]
+    folder, found = read_evaluation(evaluate(f"scenes={ours}", *data, "steps=[0,2]"))
+    assert {"test/files/post0/psnr", "test/files/post2/ssim"} <= qualities(found).keys()
+    assert qualities(found) == qualities(expected)
+    assert found["evaluation/system"] == "ours" and found["tested/scenes"] == 1
+    assert "cost/post0/seconds" not in found and found["cost/post2/seconds"] > 0
+    assert folder.name.startswith("ours-") and (folder / "evaluation.csv").is_file()
+
+    scene = tmp_path / "scene.ply"
+    write_gaussians(scene, read_gaussians(file))
+    _, found = read_evaluation(evaluate(f"scenes={scene}", *data, "steps=[0,2]", "system=PLY"))
+    assert shown(found) == shown(expected) and found["evaluation/system"] == "PLY"
+    assert qualities(found) == pytest.approx(qualities(expected), abs=1e-4)
+
+
+def test_another_systems_coordinates(written, photographs, evaluate, tmp_path):
+    """With its cameras it is measured as in the data's; without, it is refused."""
+    ours, expected = written
+    (file,) = ours.iterdir()
+    motion = torch.eye(4).double()
+    motion[:3, :3] = torch.tensor([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]])
+    motion[:3, 3] = torch.tensor([4000.0, 0, -2000])
+    system = tmp_path / "other"
+    system.mkdir()
+    moved = transform(read_gaussians(file), motion).scale_by(2.5)
+    write_gaussians(system / f"{photographs.name}.ply", moved)
+    data = [f"scenes={system}", *ON_DISK, f"data.root={photographs}", *VIEWS, "steps=0"]
+    said = refusal(evaluate(*data))
+    assert "other coordinates than the data: put its cameras beside it" in said
+    assert not list(tmp_path.rglob("evaluation"))  # before any scene is measured
+
+    content = json.loads((photographs / "transforms.json").read_text())
+    for frame in content["frames"]:
+        pose = motion @ torch.tensor(frame["transform_matrix"]).double()
+        pose[:3, 3] *= 2.5
+        frame["transform_matrix"] = pose.tolist()
+    (system / f"{photographs.name}.cameras.json").write_text(json.dumps(content))
+    result = evaluate(*data, "metrics=longlrm")
+    _, found = read_evaluation(result)
+    assert "1 scenes fitted by cameras, residual 0.00% at most" in result.stdout
+    assert found["tested/residual"] < 1e-5
+    for key in ("test/files/post0/psnr", "inputs/files/post0/psnr"):
+        assert found[key] == pytest.approx(expected[key], abs=1e-3)
+
+
+def test_files_that_do_not_fit_the_data(written, photographs, evaluate, tmp_path):
+    ours, _ = written
+    data = [*ON_DISK, f"data.root={photographs}", *VIEWS]
+    (tmp_path / "lego.ply").touch()
+    assert "lego.ply is named as no scene of the data" in refusal(
+        evaluate(f"scenes={tmp_path}", *data)
+    )
+    assert "is not an empty folder: name a new one" in refusal(
+        evaluate("init_path=shipped", f"write_scenes={ours}", *data)
+    )
+    (tmp_path / "lego.ply").rename(tmp_path / f"{photographs.name}.ply")
+    assert f"{photographs.name}.ply" in refusal(evaluate(f"scenes={tmp_path}", *data))  # empty
+    synthetic = evaluate(f"scenes={next(ours.iterdir())}", *VIEWS, *TINY_SCENES)
     assert "is one scene, and the data has 2" in refusal(synthetic)
+    assert not list(tmp_path.rglob("evaluation*.*"))
 
 
 def refusal(result) -> str:
@@ -195,11 +250,14 @@ REFUSED = {
     "no run": (["run=nowhere"], "run=nowhere has no metrics.json"),
     "no runs": (["run=last"], "run=last found no finished run in"),
     "no weights": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
-    "no file": (["scene=none.ply", "data.test_scenes=1"], "none.ply is not a file"),
+    "no file": (["scenes=none.ply", "data.test_scenes=1"], "none.ply is not a file"),
+    "no data": (["scenes=none.ply"], "is measured on photographs of the same scenes: add data="),
+    "a name of nothing": (["init_path=shipped", "system=x"], "system=x names the system that made"),
+    "files to write": (["scenes=a", "data=files", "write_scenes=b"], "are files: leave one out"),
     "no folder": (["init_path=shipped", "data=files"], "add data.root=..."),
     "another model": (
         ["init_path=shipped", "width=0.125"],
-        "asysplat_plane_sweep.safetensors does not fit this model, ",
+        "the shipped weights do not fit this model, ",
     ),
     "steps that do not increase": (["init_path=shipped", "steps=[3,3]"], "above the one before"),
     "a size out of range": (["init_path=shipped", "data.height=0"], "data.height=0: give a whole"),

@@ -1,0 +1,199 @@
+"""Read what another system made of the scenes of a data set: a file of Gaussians for each."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from asysplat.data.readers import colmap, transforms
+from asysplat.data.sequence import MIN_EXTENT, FileSequence, ImageSequence
+from asysplat.errors import InputError
+from asysplat.export.gaussians import READERS, read_gaussians
+from asysplat.motion import fit_similarity, transform
+from asysplat.rendering import render
+from asysplat.scene import Cameras, Gaussians
+
+CAMERAS = ".cameras.json"  # beside <scene>.ply, a transforms.json; or a COLMAP model in
+MODEL = "sparse/0"  # the folder <scene>/
+MAX_RESIDUAL = 0.1  # of the fit of cameras, as a share of their spread
+MAX_NAMES = 5  # of the data's scenes, in a message
+# A view shows nothing if it has Gaussians in a smaller share of its pixels, at a height and width
+# of COVERAGE_SIZE; half of the views must show something.
+MIN_COVERAGE, COVERAGE_SIZE = 0.01, 64
+VISIBLE = 0.05  # alpha of a pixel that has Gaussians
+NamedPoses = list[tuple[str, Float[ndarray, "4 4"]]]
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """A file of Gaussians and the data's images of its scene."""
+
+    path: Path
+    sequence: ImageSequence
+
+    def read(self) -> tuple[Gaussians, float | None]:
+        """Read the Gaussians in float64 in the data's world, to which their cameras are fitted.
+
+        Returns:
+            The Gaussians; the root mean square residual of the fit, as a share of the spread of the
+            cameras, or None without cameras: the file is then in the data's world.
+
+        Raises:
+            InputError: damaged files; cameras that do not fit.
+        """
+        cameras = self._cameras()
+        if cameras is None:
+            return read_gaussians(self.path, origin_of(self.sequence), torch.float64), None
+        where, poses = cameras
+        source, target = self._matched(where, poses)
+        origin = source[:, :3, 3].mean(0)  # float32 may not resolve the file's own coordinates
+        source[:, :3, 3] -= origin
+        points, spread = _points(target)
+        motion, scale = fit_similarity(_points(source)[0], points)
+        fitted = _points(source)[0] @ motion[:3, :3].mT + motion[:3, 3]
+        residual = (scale * fitted - points).square().sum(-1).mean().sqrt().item() / spread
+        if not residual <= MAX_RESIDUAL:
+            raise InputError(
+                f"{where}: its {len(source)} cameras differ from those of {self.sequence.name} by "
+                f"{residual:.0%} of their spread, after rotation, translation and scale; at most "
+                f"{MAX_RESIDUAL:.0%} is accepted: give the cameras of the same images, with the "
+                "axes of their format."
+            )
+        gaussians = read_gaussians(self.path, origin.tolist(), torch.float64)
+        return transform(gaussians, motion).scale_by(scale), residual
+
+    def _cameras(self) -> tuple[Path, NamedPoses] | None:
+        """Read the cameras beside the file, if there are any: where, and names and poses."""
+        file = self.path.with_name(self.path.stem + CAMERAS)
+        if file.is_file():
+            return file, transforms.read_poses(file)
+        model = self.path.with_name(self.path.stem) / MODEL
+        return (model, colmap.read_poses(model)) if model.is_dir() else None
+
+    def _matched(
+        self, where: Path, poses: NamedPoses
+    ) -> tuple[Float[Tensor, "V 4 4"], Float[Tensor, "V 4 4"]]:
+        """Match poses to the data's by the names of their images, without folder and suffix."""
+        images = self.sequence.scene.images if isinstance(self.sequence, FileSequence) else ()
+        given = [(PurePosixPath(name).stem, pose) for name, pose in poses]
+        own = [(PurePosixPath(str(image.file)).stem, image.cam_to_world) for image in images]
+        unique = [_unique(named) for named in (given, own)]
+        names = sorted(unique[0].keys() & unique[1].keys())
+        stacked = (np.array([named[name] for name in names], dtype=np.float64) for named in unique)
+        source, target = (torch.tensor(stack).reshape(len(names), 4, 4) for stack in stacked)
+        distances = [poses[:, :3, 3].norm().item() for poses in (source, target)]
+        spreads = [_points(poses)[1] for poses in (source, target)]
+        # Also where there is no camera, and the spread of none is NaN.
+        if not all(s > MIN_EXTENT * d for s, d in zip(spreads, distances, strict=True)):
+            raise InputError(
+                f"{where} has {len(names)} of the {len(own)} images of {self.sequence.name}, by "
+                "their file names, in one place or none: give cameras of two or more, in different "
+                "places, so that rotation, translation and scale can be fitted."
+            )
+        return source, target
+
+
+def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, SceneFile]:
+    """Find the file of every scene of the data, by the scene's name.
+
+    Args:
+        scenes: a folder with a file for each scene, named as the scene; or the file of the only
+            scene, under any name.
+        sequences: the data's scenes.
+
+    Raises:
+        InputError: not exactly one file for every scene, or a file of no scene.
+    """
+    option, own = f"scenes={scenes}", {sequence.name: sequence for sequence in sequences}
+    kinds = f"{', '.join(READERS)}"
+    some = ", ".join(sorted(own)[:MAX_NAMES]) + ", ..." * (len(own) > MAX_NAMES)
+    if scenes.is_file():
+        if len(own) != 1:
+            raise InputError(
+                f"{option} is one scene, and the data has {len(own)} to test: name the folder of "
+                "that scene as data.root, or a folder with a file for each scene."
+            )
+        return {name: SceneFile(scenes, sequence) for name, sequence in own.items()}
+    if not scenes.is_dir():
+        raise InputError(f"{option} is not a file and no folder: name an existing one.")
+    files = sorted(path for path in scenes.iterdir() if path.suffix.lower() in READERS)
+    if not files:
+        raise InputError(f"{option} has no scene ({kinds}): write one for each of {some}.")
+    found: dict[str, Path] = {}
+    for path in files:
+        if path.stem in found:
+            raise InputError(
+                f"{option} has two files of one scene, {found[path.stem].name} and {path.name}: "
+                "remove one."
+            )
+        if path.stem not in own:
+            raise InputError(
+                f"{path} is named as no scene of the data: rename or remove it; the scenes are "
+                f"{some}."
+            )
+        found[path.stem] = path
+    missing = sorted(own.keys() - found.keys())
+    if missing:
+        raise InputError(
+            f"{option} has no file of {len(missing)} of the {len(own)} scenes, {', '.join(missing)}"
+            f": add them ({kinds}), or leave these scenes out of the data."
+        )
+    return {name: SceneFile(found[name], sequence) for name, sequence in own.items()}
+
+
+def check_visible(gaussians: Gaussians, cameras: Cameras, file: SceneFile, fitted: bool) -> None:
+    """Check that at least half of the views show Gaussians.
+
+    Args:
+        gaussians, cameras: in one frame.
+        file: of the Gaussians, for the message.
+        fitted: whether they were moved there by the file's cameras.
+
+    Raises:
+        InputError: they do not.
+    """
+    with torch.no_grad():
+        views = cameras.resized(COVERAGE_SIZE, COVERAGE_SIZE)
+        alpha = render(gaussians, views, depth=False).alpha
+    empty = ((alpha > VISIBLE).float().mean((-1, -2)) < MIN_COVERAGE).sum().item()
+    if 2 * empty > cameras.num_views:
+        name = file.path.stem
+        advice = (
+            "give the cameras of this very file"
+            if fitted
+            else f"put its cameras beside it, {name}{CAMERAS} or {name}/{MODEL}"
+        )
+        raise InputError(
+            f"{file.path}: {empty} of {cameras.num_views} test views of {file.sequence.name} show "
+            "none of its Gaussians, which looks as if they were in other coordinates than the "
+            f"data: {advice}."
+        )
+
+
+def origin_of(sequence: ImageSequence) -> tuple[float, float, float]:
+    """Return the origin of the data's world, in the coordinates of its files."""
+    return sequence.scene.origin if isinstance(sequence, FileSequence) else (0.0, 0.0, 0.0)
+
+
+def _unique(named: NamedPoses) -> dict[str, Float[ndarray, "4 4"]]:
+    """Return the poses whose name no other has, by name."""
+    counts = Counter(name for name, _ in named)
+    return {name: pose for name, pose in named if counts[name] == 1}
+
+
+def _points(poses: Float[Tensor, "V 4 4"]) -> tuple[Float[Tensor, "P 3"], float]:
+    """Return each camera's center and a point on each of its axes, and the spread of the centers.
+
+    The points are as far from the centers as these are from their mean, by root mean square. So two
+    cameras determine a similarity, and cameras on a line, too.
+    """
+    centers = poses[:, :3, 3]
+    spread = (centers - centers.mean(0)).square().sum(-1).mean().sqrt().item()
+    tips = centers[:, None] + spread * poses[:, :3, :3].mT
+    return torch.cat((centers, tips.flatten(0, 1))), spread

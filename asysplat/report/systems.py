@@ -1,0 +1,98 @@
+"""Fill rows of other systems with what evaluate.py measured of their scenes."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from omegaconf import DictConfig
+
+from asysplat.report.paper import Number, PaperRow, PaperTable
+from asysplat.training.runs import Run
+from asysplat.training.systems import SYSTEM, TESTED, options_of_test
+
+
+def system_rows(
+    table: PaperTable, config: DictConfig, sets: Mapping[str, str], systems: Sequence[Run]
+) -> tuple[list[PaperRow], list[Run]]:
+    """Fill the quoted rows of a table; add a row for every other system that was measured as it is.
+
+    A system has a row's name up to the first comma; case and signs do not count. Only a table that
+    quotes a system gets further rows.
+
+    Args:
+        config: of the table's runs: what is tested.
+        sets: the paper's test sets -> ours.
+        systems: evaluations, oldest first.
+
+    Returns:
+        The table's rows, those of runs unchanged, and the evaluations that were used.
+    """
+    names = {_letters(row.name) for row in table.rows if row.quoted}
+    others = {_letters(run.results[SYSTEM]): run.results[SYSTEM] for run in systems}
+    further = [
+        PaperRow(label, {}, None, table.rows[0].views, table.rows[0].size)
+        for key, label in others.items()
+        if names and key not in names
+    ]
+    rows, used = [], []
+    for row in (*table.rows, *further):
+        if row.quoted:
+            own = [run for run in systems if _letters(run.results[SYSTEM]) == _letters(row.name)]
+            row, agreeing = _fill(row, table, config, sets, own)
+            used += agreeing
+        if row.values or row.numbers or not row.quoted:
+            rows.append(row)
+    return rows, used
+
+
+def _fill(
+    row: PaperRow,
+    table: PaperTable,
+    config: DictConfig,
+    sets: Mapping[str, str],
+    systems: Sequence[Run],
+) -> tuple[PaperRow, list[Run]]:
+    """Fill a row with a system's evaluations; where none agrees with the table, note why."""
+    values: dict[str, list[Number]] = {}
+    used: list[Run] = []
+    unlike = ""
+    for column in table.columns:
+        paper_set, _, metric = column.key.partition("/")
+        if not metric:
+            continue
+        wanted = options_of_test(config, row.test_set or sets[paper_set])
+        newest: dict[int, Run] = {}  # by seed
+        for run in systems:
+            of_run = {key: run.results.get(f"{TESTED}{key}", wanted[key]) for key in wanted}
+            if others := [f"{k}={v} ({wanted[k]})" for k, v in of_run.items() if v != wanted[k]]:
+                unlike = f"measured with other options than the table's (in brackets): {run.folder}"
+                unlike += f" has {', '.join(others)}"
+            elif run.results.get(f"test/{wanted['data']}/post0/{metric}") is not None:
+                newest[run.seed] = run
+        runs = [newest[seed] for seed in sorted(newest)]
+        if runs:
+            values[column.key] = [r.results[f"test/{wanted['data']}/post0/{metric}"] for r in runs]
+        used += [run for run in runs if run not in used]
+    if not used:
+        return replace(row, note=unlike), []
+    note = "measured: " + "; ".join(dict.fromkeys(map(_describe, used)))
+    note += "; the paper's numbers are quoted" * bool(row.numbers)
+    seeds = tuple(sorted({run.seed for run in used}))
+    revisions = tuple(sorted({run.revision for run in used}))
+    return replace(row, values=values, seeds=seeds, revisions=revisions, note=note), used
+
+
+def _describe(run: Run) -> str:
+    """Write what an evaluation was made on."""
+    tested = {k.removeprefix(TESTED): v for k, v in run.results.items() if k.startswith(TESTED)}
+    text = f"{tested['scenes']} scenes of {tested['data']} data, {tested['inputs']} input views of "
+    text += f"{tested['height']}x{tested['width']}, metrics {tested['metrics.name']}, "
+    text += f"seed {run.seed}, {run.folder}"
+    if "residual" in tested:
+        text += f", cameras fitted with a residual of {tested['residual']:.1%} at most"
+    return text
+
+
+def _letters(name: str) -> str:
+    """Return the letters and digits of a name up to its first comma, in lower case."""
+    return re.sub(r"[^a-z0-9]", "", name.partition(",")[0].lower())

@@ -1,0 +1,79 @@
+"""Evaluations of other systems' scenes: what they were measured on, and where they are on disk."""
+
+import glob
+import json
+import os
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from asysplat.training.old_names import upgrade_results
+from asysplat.training.runs import EVALUATION, Run, content_of, hash_of, name_of
+
+SYSTEM = "evaluation/system"
+TESTED = "tested/"
+# Options of the data that choose the images of a test, and their size.
+IMAGES = ("inputs", "targets", "height", "width", "selection")
+IMAGES += ("num_images", "test_scenes", "places")  # of procedural scenes
+
+
+def describe_system(config: DictConfig, scenes: Path, system: str | None) -> dict[str, Any]:
+    """Describe the scenes of a system, and what they are measured on, for evaluation.json.
+
+    Args:
+        config: of train.py.
+        scenes: a folder of files of Gaussians, or one file.
+        system: its name; None: that of the folder or file.
+    """
+    absolute = Path(os.path.abspath(scenes))
+    name = absolute.stem if absolute.is_file() else absolute.name
+    folder, stem = (scenes.parent, glob.escape(scenes.stem)) if scenes.is_file() else (scenes, "*")
+    files = [*folder.glob(f"{stem}.*"), *folder.glob(f"{stem}/*/*/*")]  # with their cameras
+    content = {str(path.relative_to(folder)): content_of(path) for path in files if path.is_file()}
+    tested = options_of_test(config, config.data.name)
+    return {
+        SYSTEM: name if system is None else str(system),
+        "evaluation/scenes": hash_of(content),
+        **{f"{TESTED}{key}": value for key, value in tested.items()},
+    }
+
+
+def options_of_test(config: DictConfig, test_set: str) -> dict[str, Any]:
+    """Return the options that the numbers of a test set depend on, whatever is measured on it.
+
+    They are the data, its images and their size, and the metrics; missing values are left out.
+    """
+    data = OmegaConf.to_container(config.data, resolve=True)
+    changes = (data["test_sets"] or {}).get(test_set) or {}
+    if data.get("test_size"):
+        data["height"], data["width"] = data["test_size"]
+    data["root"] = data.get("test_root") or data.get("root")
+    data |= changes
+    options = {key: value for key, value in data.items() if key in IMAGES}
+    options["data"] = test_set if "root" in changes else data["name"]
+    options["root"] = name_of(data["root"])
+    options["index"] = content_of(data.get("index"))
+    metrics = OmegaConf.to_container(config.metrics, resolve=True)
+    options |= {f"metrics.{key}": value for key, value in metrics.items() if key != "_target_"}
+    return {key: value for key, value in options.items() if value not in (None, MISSING)}
+
+
+def find_systems(logs: Path) -> Iterator[Run]:
+    """Yield every finished evaluation of another system below `logs`, oldest first."""
+    paths = sorted(logs.rglob(EVALUATION), key=lambda path: (path.stat().st_mtime, path))
+    for path in paths:
+        try:
+            results: Mapping[str, Any] = json.loads(path.read_text())
+            if SYSTEM not in results:
+                continue
+            described = (
+                results[f"evaluation/{key}"] for key in ("config_hash", "seed", "revision")
+            )
+            run = Run(path.parent, *described, upgrade_results(results))
+        except (ValueError, KeyError, TypeError):
+            warnings.warn(f"{path} is not a finished evaluation: it is left out.", stacklevel=2)
+            continue
+        yield run

@@ -1,0 +1,233 @@
+"""Folders with a file of Gaussians for each scene: names, cameras beside them, what is refused."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from asysplat.data import ProceduralScene, SceneOptions, open_scene
+from asysplat.data.write import write_transforms
+from asysplat.errors import InputError
+from asysplat.export import write_gaussians
+from asysplat.export.scene_folder import SceneFile, check_visible, find_files
+from asysplat.motion import transform
+from asysplat.scene import Gaussians
+
+SCALE = 0.3  # of the other system's units
+AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's from OpenCV's
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    """A scene on disk, of 12 images."""
+    folder = tmp_path_factory.mktemp("data") / "room"
+    write_transforms(ProceduralScene(3, 24, 32, num_images=12).views(range(12)), folder)
+    return open_scene(folder, SceneOptions(24, 32))
+
+
+@pytest.fixture(scope="module")
+def world(sequence) -> Gaussians:
+    """A Gaussian in front of every camera, in the data's world."""
+    poses = sequence.cameras.cam_to_world
+    count = len(poses)
+    return Gaussians(
+        means=poses[:, :3, 3] + poses[:, :3, 2],
+        quats=torch.randn(count, 4, generator=torch.Generator().manual_seed(0)),
+        scales=torch.tensor([0.3, 0.2, 0.1]).repeat(count, 1),
+        opacities=torch.full((count,), 0.9),
+        sh=torch.randn(count, 4, 3, generator=torch.Generator().manual_seed(1)),
+    )
+
+
+@pytest.fixture(scope="module")
+def other() -> torch.Tensor:
+    """The motion to another system's world, far from the origin."""
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = torch.tensor(Rotation.from_euler("xyz", [0.4, -1.0, 2.0]).as_matrix())
+    motion[:3, 3] = torch.tensor([5.0, -30.0, 2.0])
+    return motion
+
+
+@pytest.fixture
+def file(tmp_path, sequence, world, other) -> SceneFile:
+    """The Gaussians in the other system's world."""
+    path = tmp_path / "room.v2.ply"
+    write_gaussians(path, transform(world, other).scale_by(SCALE))
+    return SceneFile(path, sequence)
+
+
+def other_poses(sequence, other) -> list[tuple[str, np.ndarray]]:
+    """The cameras in the other system's world, under names of its own folder and format."""
+    poses = other.numpy() @ sequence.cameras.cam_to_world.double().numpy()
+    poses[:, :3, 3] *= SCALE
+    return [(f"frames/{index:05d}.jpg", pose) for index, pose in enumerate(poses)]
+
+
+def write_json(file: SceneFile, poses) -> None:
+    frames = [{"file_path": n, "transform_matrix": (pose @ AXES).tolist()} for n, pose in poses]
+    file.path.with_name("room.v2.cameras.json").write_text(json.dumps({"frames": frames}))
+
+
+def write_colmap(file: SceneFile, poses) -> None:
+    model = file.path.with_name("room.v2") / "sparse/0"
+    model.mkdir(parents=True)
+    lines = []
+    for index, (name, pose) in enumerate(poses, 1):
+        inverse = np.linalg.inv(pose)
+        x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat()
+        lines += [" ".join(map(str, (index, w, x, y, z, *inverse[:3, 3], 1, name))), ""]
+    (model / "cameras.txt").write_text("1 PINHOLE 32 24 30 30 16 12\n")
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    (model / "points3D.txt").write_text("")
+
+
+@pytest.mark.parametrize("write", [write_json, write_colmap])
+@pytest.mark.parametrize("images", [range(12), range(3, 5)], ids=["all", "two"])
+def test_cameras_bring_gaussians_to_the_datas_world(file, sequence, world, other, write, images):
+    poses = other_poses(sequence, other)
+    write(file, [*(poses[index] for index in images), ("of/another.png", np.eye(4))])
+    found, residual = file.read()
+    assert 0 <= residual < 1e-5
+    for name in ("means", "scales", "sh"):
+        expected = getattr(world, name).double()
+        torch.testing.assert_close(getattr(found, name), expected, atol=1e-4, rtol=1e-4)
+    turns = [torch.nn.functional.normalize(each.quats.double(), dim=-1) for each in (found, world)]
+    torch.testing.assert_close((turns[0] * turns[1]).sum(-1).abs(), torch.ones(12).double())
+    check_visible(found.to(torch.float32), sequence.cameras, file, fitted=True)
+
+
+def test_without_cameras_the_world_is_the_datas(file, sequence, world):
+    write_gaussians(file.path, world)
+    found, residual = file.read()
+    assert residual is None
+    torch.testing.assert_close(found.means, world.means.double())
+    check_visible(found.to(torch.float32), sequence.cameras, file, fitted=False)
+
+
+def test_other_coordinates_are_noticed(file, sequence):
+    found, _ = file.read()
+    message = (
+        r"room\.v2\.ply: 12 of 12 test views of room show none of its Gaussians, which looks as if "
+        r"they were in other coordinates than the data: put its cameras beside it, "
+        r"room\.v2\.cameras\.json or room\.v2/sparse/0\."
+    )
+    with pytest.raises(InputError, match=message):
+        check_visible(found.to(torch.float32), sequence.cameras, file, fitted=False)
+    with pytest.raises(InputError, match="give the cameras of this very file"):
+        check_visible(found.to(torch.float32), sequence.cameras, file, fitted=True)
+
+
+def test_noisy_cameras_have_a_residual(file, sequence, other):
+    noise = np.random.default_rng(0)
+    poses = other_poses(sequence, other)
+    spread = np.std([pose[:3, 3] for _, pose in poses], axis=0)
+    for _, pose in poses:
+        pose[:3, 3] += 0.03 * np.sqrt((spread**2).sum() / 3) * noise.standard_normal(3)
+    write_json(file, poses)
+    assert 0.01 < file.read()[1] < 0.05
+
+
+REFUSED = {
+    "other images": (
+        lambda poses: [(name, poses[-index - 1][1]) for index, (name, _) in enumerate(poses)],
+        r"its 12 cameras differ from those of room by \d+% of their spread",
+    ),
+    "OpenCV's axes": (
+        lambda poses: [(name, pose @ AXES) for name, pose in poses],
+        "give the cameras of the same images, with the axes of their format",
+    ),
+    "one image": (lambda poses: poses[:1], "has 1 of the 12 images of room"),
+    "none of the names": (
+        lambda poses: [(f"x{name[7:]}", pose) for name, pose in poses],
+        "has 0 of the 12 images of room",
+    ),
+    "names that several have": (
+        lambda poses: [*poses, *((f"more/{name}", pose) for name, pose in poses)],
+        "has 0 of the 12 images of room",
+    ),
+    "one place": (
+        lambda poses: [(name, np.diag([1.0, 1, 1, 1])) for name, _ in poses],
+        "in one place or none: give cameras of two or more",
+    ),
+    "mirrored": (lambda poses: [(n, p * [-1, 1, 1, 1]) for n, p in poses], "is not a rotation"),
+    "no image": (lambda poses: [(7, poses[0][1])], "has no file_path"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_cameras_that_do_not_fit(file, sequence, other, case):
+    change, message = REFUSED[case]
+    write_json(file, change(other_poses(sequence, other)))
+    with pytest.raises(InputError, match=message) as raised:
+        file.read()
+    assert "cameras.json" in str(raised.value)
+
+
+def test_damaged_files(file, sequence, other):
+    file.path.write_bytes(file.path.read_bytes()[:-10])
+    with pytest.raises(InputError, match=r"room\.v2\.ply"):
+        file.read()
+    file.path.with_name("room.v2.cameras.json").write_text("{")
+    with pytest.raises(InputError, match=r"room\.v2\.cameras\.json is not JSON"):
+        file.read()
+
+
+def test_procedural_scenes_have_no_names_of_images(file, sequence, other):
+    write_json(file, other_poses(sequence, other))
+    procedural = replace(file, sequence=ProceduralScene(3, 24, 32, num_images=12))
+    with pytest.raises(InputError, match="has 0 of the 0 images of procedural-3"):
+        procedural.read()
+
+
+@pytest.fixture(scope="module")
+def sequences():
+    return [ProceduralScene(seed, 8, 8, num_images=4) for seed in range(7)]
+
+
+NAMES = [f"procedural-{seed}" for seed in range(7)]
+WRONG = {
+    "no folder": (None, "scenes=.* is not a file and no folder"),
+    "no scenes": (["notes.txt"], r"has no scene \(\.ply, \.splat, \.safetensors\): write one for"),
+    "a file of no scene": (
+        [*(f"{name}.ply" for name in NAMES), "lego.ply"],
+        r"lego\.ply is named as no scene of the data: .* procedural-4, \.\.\.\.",
+    ),
+    "missing scenes": (
+        [f"{name}.splat" for name in NAMES[2:]],
+        "has no file of 2 of the 7 scenes, procedural-0, procedural-1: add them",
+    ),
+    "two files of a scene": (
+        [*(f"{name}.ply" for name in NAMES), "procedural-3.safetensors"],
+        r"two files of one scene, procedural-3\.ply and procedural-3\.safetensors: remove one",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_files_and_scenes_that_do_not_go_together(sequences, tmp_path, case):
+    files, message = WRONG[case]
+    folder = tmp_path / "system"
+    if files is not None:
+        folder.mkdir()
+        for name in files:
+            (folder / name).touch()
+    with pytest.raises(InputError, match=message):
+        find_files(folder, sequences)
+
+
+def test_every_scene_has_its_file(sequences, tmp_path):
+    for name in NAMES:
+        (tmp_path / f"{name}.PLY").touch()
+        (tmp_path / f"{name}.cameras.json").touch()
+    (tmp_path / "procedural-0").mkdir()
+    found = find_files(tmp_path, sequences)
+    assert {name: file.path.name for name, file in found.items()} == {n: f"{n}.PLY" for n in NAMES}
+    assert all(file.sequence.name == name for name, file in found.items())
+    only = tmp_path / f"{NAMES[1]}.PLY"
+    assert find_files(only, sequences[:1])[NAMES[0]].path == only
+    with pytest.raises(InputError, match=re.escape("is one scene, and the data has 7 to test")):
+        find_files(only, sequences)
