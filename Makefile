@@ -5,7 +5,7 @@ ENV := .venv/.ready
 PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist worksteal
 
 demo: $(ENV) ## train a small model on synthetic scenes, test it and draw its renderings
-	.venv/bin/python train.py name=demo
+	.venv/bin/python train.py model=asysplat_plane_sweep name=demo
 	@echo "to run commands of your own: source .venv/bin/activate"
 
 quick: style ## style, and the fast tests

@@ -18,6 +18,8 @@ from asysplat.overrides import CONF, check_overrides
 from asysplat.training.checkpoints import load_weights
 from asysplat.training.run_config import read_config
 
+SHIPPED_MODEL = "model=asysplat_plane_sweep"
+
 
 def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> Network:
     """Load a network in evaluation mode: `load("shipped")(views)`.
@@ -26,7 +28,7 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
         checkpoint: "shipped" for the model that comes with the project; a .ckpt file in the folder
             of its run, whose config.yaml describes the model; a .safetensors file with the layout
             of the shipped model; None: without training.
-        overrides: of train.py, which change its default model and its early exit (`speed=fast`);
+        overrides: of train.py, which change the shipped model and its early exit (`speed=fast`);
             a run's model ignores them.
 
     Raises:
@@ -51,6 +53,8 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
                 f"{config_path}: model cannot be built ({reason}): copy the run again."
             ) from error
     else:
+        if not any(override.startswith("model=") for override in overrides):
+            overrides = [SHIPPED_MODEL, *overrides]
         check_overrides(overrides)
         initialized = GlobalHydra.instance().is_initialized()
         with nullcontext() if initialized else initialize_config_dir(str(CONF), version_base="1.3"):

@@ -25,7 +25,9 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def find_backbone(
-    name: Literal["alexnet", "vgg16", "vgg19"], backbone_dir: Path | None, download: bool = False
+    name: Literal["alexnet", "vgg16", "vgg19"],
+    backbone_dir: Path | str | None,
+    download: bool = False,
 ) -> dict[str, Tensor] | None:
     """Load torchvision's ImageNet weights of a network's convolutions.
 
@@ -40,7 +42,7 @@ def find_backbone(
     """
     candidates = sorted(_hub_cache().glob(HUB_FILES[name]))
     if backbone_dir is not None:
-        candidates.append(backbone_dir / f"{name}_features_fp16.pth")
+        candidates.append(Path(backbone_dir) / f"{name}_features_fp16.pth")
     path = next((candidate for candidate in candidates if candidate.is_file()), None)
     if path is not None:
         return _features(name, _read(name, path), path)

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.report.paper import Costs, Number, PaperRow, PaperTable, our_sets, set_titles
+from asysplat.report.systems import system_rows
 from asysplat.training.runs import Run, config_hash, data_of, differences, find_runs
 from asysplat.training.stages import describe_stage, stage_configs
 
@@ -42,7 +43,11 @@ def finished_runs(logs: Path) -> Runs:
 
 
 def fill_table(
-    table: PaperTable, overrides: Sequence[str], compose: Compose, runs: Runs
+    table: PaperTable,
+    overrides: Sequence[str],
+    compose: Compose,
+    runs: Runs,
+    systems: Sequence[Run] = (),
 ) -> PaperTable:
     """Fill a table with every finished run that has the configuration of one of its rows.
 
@@ -52,24 +57,25 @@ def fill_table(
             a given path must have the same name as the run's.
         compose: returns train.py's configuration.
         runs: to select from.
+        systems: evaluations of other systems, see `system_rows`.
     """
     overrides = [f"sweeps={table.key}", *overrides]
     config = compose(overrides)
     sets = our_sets(table, config.data.name, config.data.test_sets or ())
     seeds = str(config.hydra.sweeper.params.get("seed", config.seed)).split(",")
     rows: list[PaperRow] = []
-    used: list[Run] = []
-    for row in table.rows:
+    given, used = system_rows(table, config, sets, systems)
+    for row in given:
         if row.quoted:
             rows.append(row)
             continue
-        row_config = compose([*overrides, *row.run])
-        row_config = OmegaConf.masked_copy(row_config, [k for k in row_config if k != "hydra"])
-        read = data_of(row_config)
-        same_options = runs.get(config_hash(row_config), [])
-        same = [run for run in same_options if run.agrees(read)]
-        # For each seed the newest run, first among those tested on all of the data.
-        row_runs = {run.seed: run for run in sorted(same, key=lambda run: run.covers(read))}
+        row_config, same_options, row_runs = _runs_of(compose([*overrides, *row.run]), runs)
+        note = _nearest_run(row_config, same_options, runs) if not row_runs else ""
+        if row.also and not row_runs:
+            also = _runs_of(compose([*overrides, *row.run, *row.also]), runs)
+            if also[-1]:
+                row_config, same_options, row_runs = also
+                note = f"runs with {' '.join(row.also)}"
         used += row_runs.values()
         values: dict[str, list[Number]] = {}
         for column in table.columns:
@@ -81,9 +87,9 @@ def fill_table(
                 numbers = [number for number in numbers if number is not None]
             if numbers:
                 values[column.key] = numbers
-        unlike = _nearest_run(row_config, same_options, runs) if not row_runs else ""
         missing = ", ".join(str(seed) for seed in map(int, seeds) if seed not in row_runs)
-        note = f"seeds still to run: {missing}" if values and missing else unlike
+        if values and missing:
+            note = "; ".join(filter(None, (note, f"seeds still to run: {missing}")))
         if row.post_optimization and not values:
             note = "not run: python evaluate.py run=... adds post-optimization to a finished run"
         row = replace(row, values=values, note=note)
@@ -100,11 +106,24 @@ def fill_table(
         "Not tested": _untested(sets, config, rows),
         "Baselines": _baselines(sets, used),
         "Data": _folders(used),
-        "Machine": ", ".join(sorted({run.results.get("run/machine", "") for run in used})),
+        "Machine": ", ".join(sorted({run.results.get("run/machine", "") for run in used} - {""})),
         "Command": f"python train.py {' '.join(overrides)}",
     }
     metrics = _metrics(table, config, used)
     return replace(table, rows=tuple(rows), sets=sets, metrics=metrics, notes=notes)
+
+
+def _runs_of(config: DictConfig, runs: Runs) -> tuple[DictConfig, list[Run], dict[int, Run]]:
+    """Return a row's configuration, all runs with its options, and those on its data by seed.
+
+    For each seed that is the newest run, first among those tested on all of the data.
+    """
+    config = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    read = data_of(config)
+    same_options = runs.get(config_hash(config), [])
+    same = [run for run in same_options if run.agrees(read)]
+    by_seed = {run.seed: run for run in sorted(same, key=lambda run: run.covers(read))}
+    return config, same_options, by_seed
 
 
 def _nearest_run(config: DictConfig, same_options: Sequence[Run], runs: Runs) -> str:

@@ -72,7 +72,7 @@ def _remarks(filled: PaperTable) -> list[Note]:
     names: dict[str, list[str]] = {}
     for row in filled.rows:
         if row.quoted or row.note:
-            names.setdefault("quoted" if row.quoted else row.note, []).append(row.label)
+            names.setdefault(row.note or "quoted", []).append(row.label)
     shared = [Note(note[0].upper() + note[1:], "; ".join(rows)) for note, rows in names.items()]
     unverified = [row for row in filled.rows if row.unverified]
     return shared + [Note(f"† {row.name}", row.unverified) for row in unverified]

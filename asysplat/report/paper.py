@@ -46,13 +46,14 @@ class PaperRow:
 
     name: str  # as printed, with what distinguishes it from the table's other rows
     numbers: dict[str, float]  # column key -> the paper's number
-    run: tuple[str, ...] | None  # overrides of train.py; None for a method that is only quoted
+    run: tuple[str, ...] | None  # overrides of train.py; None for another system, which is quoted
     views: int  # input views for its costs
     size: tuple[int, int]  # height and width for its costs
     # Column key -> the bound that the paper prints in place of a number: "<1"
     bounds: dict[str, str] = field(default_factory=dict)
     post_optimization: int = 0  # steps on the Gaussians; such rows need evaluate.py
     test_set: str | None = None  # of our run, in place of the one that `our_sets` gives
+    also: tuple[str, ...] = ()  # overrides of other runs that fill the row where `run` has none
     unverified: str | None = None  # why its architecture may differ from the paper's
     # The other architectures that the paper's text allows: name -> overrides
     readings: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -197,5 +198,6 @@ def _row(row: dict, table: dict) -> PaperRow:
         post_optimization=row.get("post_optimization", 0),
         test_set=row.get("test_set"),
         unverified=row.get("unverified"),
+        also=tuple(row.get("also", ())),
         readings={r["name"]: tuple(r["run"]) for r in row.get("readings", ())},
     )

@@ -147,6 +147,12 @@ def check_checkpoint(path: Path | None, module: nn.Module) -> None:
     ]
     if not lines:
         return
+    if path == SHIPPED:
+        raise InputError(
+            f"the shipped weights do not fit this model, {len(lines)} of {len(names)} differ: they "
+            "are of model=asysplat_plane_sweep at scale=laptop; give these options, and none that "
+            "changes the network."
+        )
     raise InputError(
         f"{path} does not fit this model, {len(lines)} of {len(names)} weights differ: "
         f"{', '.join(lines[:5])}{', ...' if len(lines) > 5 else ''}; give the options that "

@@ -21,13 +21,14 @@ class SplattingLoss(nn.Module):
     network; Long-LRM's is the mean opacity, which removes useless Gaussians.
 
     Args:
-        mse, perceptual, depth, ssim, opacity: weights of the terms; 0 turns a term off. With a
-            warning, the perceptual term is also off if its network is not on this machine, and the
-            depth term if the data has neither disparities nor depths.
+        mse, perceptual, depth, ssim, opacity: weights of the terms; 0 turns a term off.
         perceptual_term, depth_term: constructors, called if the term's weight is not 0.
+        allow_missing: turn off, with a warning, the perceptual term if its network is not on this
+            machine, and the depth term if the data has neither disparities nor depths.
 
     Raises:
-        InputError: all terms are off.
+        InputError: all terms are off, or one is missing and that is not allowed; the depth term at
+            the first batch.
     """
 
     def __init__(
@@ -37,13 +38,19 @@ class SplattingLoss(nn.Module):
         depth: float,
         ssim: float = 0.0,
         opacity: float = 0.0,
-        perceptual_term: Callable[[], PerceptualDistance | None] = vgg16,
+        perceptual_term: Callable[[], PerceptualDistance] = vgg16,
         depth_term: Callable[[], RenderedDisparity | InputDisparity] = RenderedDisparity,
+        allow_missing: bool = True,
     ):
         super().__init__()
         self.mse, self.perceptual, self.depth = mse, perceptual, depth
         self.ssim, self.opacity = ssim, opacity
-        distance = perceptual_term() if perceptual else None
+        self.allow_missing = allow_missing
+        distance = None
+        try:
+            distance = perceptual_term() if perceptual else None
+        except FileNotFoundError as error:
+            self._report_missing(f"training.loss.perceptual={perceptual:g}: {error}")
         # A list hides the frozen network from checkpoints.
         self._perceptual_term = [] if distance is None else [distance]
         self._depth_term = depth_term() if depth else None
@@ -53,7 +60,7 @@ class SplattingLoss(nn.Module):
                 "weight above 0, and for perceptual alone its network (paths.download=true fetches "
                 "it)."
             )
-        self._warned_of_depth = False
+        self._depth_checked = False
 
     @property
     def needs_depth(self) -> bool:
@@ -76,11 +83,16 @@ class SplattingLoss(nn.Module):
             depth = self._depth_term(prediction, batch)
             if depth is not None:
                 terms["depth"] = depth
-            elif not self._warned_of_depth:
-                self._warned_of_depth = True
-                warnings.warn(
-                    "the data has no depths: training goes on without the depth term; python -m "
-                    "asysplat.data.disparity estimates some.",
-                    stacklevel=2,
+            elif not self._depth_checked:
+                self._report_missing(
+                    f"training.loss.depth={self.depth:g}: the data has neither disparities nor "
+                    "depths; python -m asysplat.data.disparity estimates disparities"
                 )
+            self._depth_checked = True
         return {"loss": sum(getattr(self, name) * term for name, term in terms.items()), **terms}
+
+    def _report_missing(self, reason: str) -> None:
+        """Warn that the training goes on without a term, or refuse to."""
+        if not self.allow_missing:
+            raise InputError(f"{reason}, and allow_missing_losses=true trains without this term.")
+        warnings.warn(f"{reason}. Training goes on without this term.", stacklevel=4)

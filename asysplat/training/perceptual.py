@@ -1,8 +1,6 @@
 """Perceptual distances of images, by frozen networks."""
 
-import warnings
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 import torch.nn.functional as F
@@ -39,7 +37,7 @@ class PerceptualDistance(nn.Module):
             return distance
 
 
-def vgg16(backbone_dir: str | None = None, download: bool = False) -> PerceptualDistance | None:
+def vgg16(backbone_dir: str | None = None, download: bool = False) -> PerceptualDistance:
     """Build the mean over VGG16's ReLU 1_2, 2_2, 3_3, 4_3 and 5_3 (Johnson et al. 2016).
 
     Images are normalized with ImageNet's mean and standard deviation.
@@ -48,12 +46,10 @@ def vgg16(backbone_dir: str | None = None, download: bool = False) -> Perceptual
         backbone_dir: folder that may hold the network's weights.
         download: whether to download missing weights.
 
-    Returns:
-        None, with a warning, if the weights are not on this machine.
+    Raises:
+        FileNotFoundError: the weights are not on this machine; it says how to fetch them.
     """
     backbone = _backbone("vgg16", backbone_dir, download)
-    if backbone is None:
-        return None
     features = VGGFeatures("vgg16", backbone, taps=(3, 8, 15, 22, 29), std=IMAGENET_STD)
     return PerceptualDistance(features, weights=[1 / 5] * 5, image_weight=0.0)
 
@@ -62,7 +58,7 @@ LONG_LRM_WEIGHTS = (0.3846, 0.2083, 0.2703, 0.1786, 6.6667)  # 1/2.6, 1/4.8, 1/3
 LONG_LRM_SCALE = 255.0
 
 
-def longlrm(backbone_dir: str | None = None, download: bool = False) -> PerceptualDistance | None:
+def longlrm(backbone_dir: str | None = None, download: bool = False) -> PerceptualDistance:
     """Build Long-LRM's distance (its public code's model/loss.py and configs/7m1t_tm.yaml).
 
     The weighted sum of Chen and Koltun 2017 over the images and VGG19's ReLU 1_2, 2_2, 3_2, 4_2 and
@@ -75,20 +71,17 @@ def longlrm(backbone_dir: str | None = None, download: bool = False) -> Perceptu
     missing network are as for `vgg16`.
     """
     backbone = _backbone("vgg19", backbone_dir, download)
-    if backbone is None:
-        return None
     std = (1 / LONG_LRM_SCALE,) * 3
     features = VGGFeatures("vgg19", backbone, taps=(3, 8, 13, 22, 31), std=std, mean_pooling=True)
     scaled = [weight / LONG_LRM_SCALE for weight in LONG_LRM_WEIGHTS]
     return PerceptualDistance(features, scaled, image_weight=1.0)
 
 
-def _backbone(name: str, backbone_dir: str | None, download: bool) -> dict[str, Tensor] | None:
-    backbone = find_backbone(name, None if backbone_dir is None else Path(backbone_dir), download)
+def _backbone(name: str, backbone_dir: str | None, download: bool) -> dict[str, Tensor]:
+    backbone = find_backbone(name, backbone_dir, download)
     if backbone is None:
-        warnings.warn(
-            f"{name.upper()} is neither in torch's hub cache nor in paths.weights: "
-            "training goes on without the perceptual term; paths.download=true fetches it.",
-            stacklevel=3,
+        raise FileNotFoundError(
+            f"{name.upper()} is neither in torch's hub cache nor in paths.weights; "
+            "paths.download=true fetches it"
         )
     return backbone

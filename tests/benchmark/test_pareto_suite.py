@@ -242,7 +242,7 @@ MISTAKES = {
     ),
     "weights": (
         knob("feed_forward", {"overrides": ["model.layers=8m"]}),
-        r"does not fit this model",
+        r"not fit this model",
     ),
     "a refinement": (
         knob("refined", {"refinement": {"half_size": 2.0}}),

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from tiny import SCENES, SIZE, VIEWS
 
 from asysplat.data.datamodule import TrainingTasks, collate
-from asysplat.refinement import PAPER, RefinementSettings
+from asysplat.refinement import PAPER, PUBLISHED_3DGS, RefinementSettings
 from asysplat.report.paper import find_tables
 
 ROOT = Path(__file__).parents[2]
@@ -51,8 +51,9 @@ def test_composes_and_builds_its_model(group):
 
 def test_refinement_files_equal_the_defaults_of_the_code():
     names = {path.stem for path in (CONF / "refinement").glob("*.yaml")}
-    assert names == {"default", "paper"}
-    for name, expected in (("default", RefinementSettings()), ("paper", PAPER)):
+    coded = {"default": RefinementSettings(), "paper": PAPER, "3dgs": PUBLISHED_3DGS}
+    assert names == coded.keys()
+    for name, expected in coded.items():
         config = compose_train(f"refinement={name}", script="reconstruct")
         assert instantiate(config.refinement) == expected
 

@@ -86,12 +86,67 @@ def test_every_set_that_a_table_prints_is_tested(sweep):
     assert first in {None, "dl3dv", "realestate10k"} | test_sets
 
 
+COMMANDS = [
+    "",
+    "geometry_ratio=0.5",
+    "geometry_ratio=0.9 scale=gpu",
+    "scale=paper data=dl3dv",
+    "data=dl3dv",
+    "experiment=ablation",
+    "experiment=three_stages",
+    "experiment=three_stages scale=paper data=dl3dv",
+    "experiment=two_views data=realestate10k",
+    *(f"experiment=geometry_{ratio} scale=paper data=dl3dv" for ratio in (50, 60, 70, 80)),
+    *(f"sweeps={sweep} scale=paper data=dl3dv" for sweep in PAPER),
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_of_the_paper_compose_its_network(compose_train, command):
+    """Without a model: asysplat_4m4s, without a prior, with the head that its rivals have."""
+    config = compose_train(*command.split(), *(PLACES if "data=" in command else ()))
+    assert config.hydra.runtime.choices.model == "asysplat_4m4s"
+    assert config.model.layers == "4m4s" and config.model.prior is None
+    assert config.model.head._target_ == "asysplat.models.LongLRMHead"
+    assert (config.model.patch_coarse, config.model.patch_fine) == (16, 8)
+    if "scale=paper" in command:
+        assert config.model.head.farthest == 500 and not config.training.loss.allow_missing
+        assert (config.training.loss.perceptual, config.training.loss.depth) == (0.5, 0.01)
+        assert config.training.loss.ssim == config.training.loss.opacity == 0
+
+
+@pytest.mark.parametrize("sweep", PAPER)
+def test_all_rows_of_a_table_have_one_head(compose_train, sweep):
+    """But for MVSplat, whose head is that of its volume."""
+    rows = [row for row in load_paper()[sweep].rows if not row.quoted and row.name != "MVSplat"]
+    heads = [compose_train(f"sweeps={sweep}", *row.run).model.head for row in rows]
+    assert heads == heads[:1] * len(rows)
+
+
+def test_long_lrm_is_as_published(compose_train):
+    """arthurhero/Long-LRM, configs/7m1t_tm.yaml and dl3dv_i540_32input_8target.yaml."""
+    options = ["scale=paper", "data=dl3dv", *PLACES, "stage=stage3"]
+    config = compose_train(*options, "model=longlrm")
+    loss = config.training.loss
+    assert (loss.mse, loss.perceptual, loss.opacity, loss.depth) == (1.0, 1.0, 0.1, 0.01)
+    assert loss.depth_term._target_ == "asysplat.training.InputDisparity"
+    assert loss.perceptual_term._target_ == "asysplat.training.perceptual.longlrm"
+    assert config.training.background == [1, 1, 1] and config.trainer.gradient_clip_val == 10
+    assert (config.model.prune.prune_ratio, config.model.prune.random_ratio) == (0.6, 0.1)
+    assert compose_train(*options[:-1], "model=longlrm").model.prune.prune_ratio == 0
+
+
 def test_table_5_takes_the_frames_of_an_index(compose_train):
     overrides = ["sweeps=two_views", "scale=paper", "data=realestate10k", *PLACES]
     config = compose_train(*overrides, "data.index=index.json")
     assert (config.metrics.name, config.data.inputs) == ("pixelsplat", 2)
     assert (config.data.selection, config.data.index) == ("index", "index.json")
-    assert config.data.test_size == [256, 256]
+    assert (config.stage, config.earlier_stages, config.data.test_size) == ("stage1", [], None)
+    assert (config.data.height, config.data.width) == (256, 256)
+    # MVSplat's config/dataset/view_sampler_dataset_specific_config/bounded_re10k.yaml.
+    assert (config.data.first_window, config.data.window) == ([26, 46], [46, 193])
+    assert config.data.growth_steps / config.steps == 150_000 / 300_000
+    assert compose_train("data=realestate10k", *PLACES).data.first_window is None
     assert compose_train("data=realestate10k", *PLACES).data.selection == "every_8th"
 
 

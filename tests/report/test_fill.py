@@ -88,8 +88,26 @@ def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
     assert filled.notes["Command"] == "python train.py sweeps=layers steps=7"
 
 
+def test_a_sweep_over_one_option_fills_its_table(compose, tmp_path):
+    """python train.py -m geometry_ratio=0.5,0.9, without `sweeps=geometry_ratio`."""
+    for ratio in (0.5, 0.9):
+        config = compose([f"geometry_ratio={ratio}", *OVERRIDES])
+        write_run(tmp_path / str(ratio), config, {"test/procedural/psnr": 20 + ratio}, 0)
+    (table,) = find_tables("geometry_ratio")
+    runs = finished_runs(tmp_path)
+    rows = {row.name: row for row in fill_table(table, OVERRIDES, compose, runs).rows}
+    assert {name: row.values["dl3dv/psnr"] for name, row in rows.items() if row.values} == {
+        "50%": [20.5],
+        "90%": [20.9],
+    }
+    assert rows["50%"].note.startswith("runs with geometry_ratio=0.5 parameter_budget=1.0")
+    assert rows["50%"].note.endswith("seeds still to run: 1, 2")
+    # Other steps are another table.
+    assert not any(row.values for row in fill_table(table, ["steps=8"], compose, runs).rows)
+
+
 def test_a_row_without_a_run_names_the_one_most_like_it(compose, tmp_path):
-    config = compose(["geometry_ratio=0.5", "steps=7"])
+    config = compose(["geometry_ratio=0.5", "steps=8"])
     write_run(tmp_path / "ratio", config, {"test/procedural/psnr": 20.0}, 0)
     config.paths.run = str(tmp_path / "ratio")
     OmegaConf.save(config, tmp_path / "ratio" / "config.yaml", resolve=True)
@@ -97,7 +115,7 @@ def test_a_row_without_a_run_names_the_one_most_like_it(compose, tmp_path):
     rows = fill_table(table, OVERRIDES, compose, finished_runs(tmp_path)).rows
     note = next(row.note for row in rows if row.name == "50%")
     assert note.startswith(f"not run; {tmp_path / 'ratio'} has other options than the row")
-    assert "parameter_budget=1.0 (0.98)" in note and "model.patch_fine=16 (8)" in note
+    assert "parameter_budget=1.0 (0.98)" in note and "steps=8 (7)" in note
     (table,) = find_tables("layers")
     rows = fill_table(table, ["scale=paper"], compose, finished_runs(tmp_path)).rows
     assert not any(row.note for row in rows)  # they differ in too much

@@ -96,7 +96,7 @@ BY_HAND = 2 * 0.5**2 / 2 / 3
 
 
 def test_rendered_disparity_by_hand():
-    """The pixels at every second place count, and those alone."""
+    """With a Gaussian for 2 x 2 pixels, those at every second place count, and those alone."""
     depth = torch.full((1, 4, 4), 5.0)
     target = torch.full((1, 4, 4), 9.0)
     depth[:, ::2, ::2], target[:, ::2, ::2] = torch.tensor(DEPTHS), torch.tensor(TARGET)
@@ -105,7 +105,7 @@ def test_rendered_disparity_by_hand():
     prediction = Prediction(gaussians_at(torch.ones(4, 3)), one_view(depth))
     loss = make_loss(depth=1.0)
     assert loss.needs_depth
-    terms = loss(prediction, {"inputs": None, "targets": views})
+    terms = loss(prediction, {"inputs": views, "targets": views})
     torch.testing.assert_close(terms["depth"].item(), BY_HAND)
     terms["loss"].backward()
     assert depth.grad[:, ::2, ::2].abs().sum() > 0 and (depth.grad[:, 1::2] == 0).all()
@@ -184,7 +184,9 @@ def test_data_without_depth_turns_the_term_off_with_one_warning(reading):
         warnings.simplefilter("always")
         for _ in range(3):
             assert "depth" not in loss(prediction, batch)
-    assert ["no depths" in str(warning.message) for warning in caught] == [True]
+    assert ["neither disparities nor depths" in str(warning.message) for warning in caught] == [
+        True
+    ]
 
 
 @pytest.mark.parametrize(("term", "name"), [(vgg16, "VGG16"), (longlrm, "VGG19")])
@@ -193,6 +195,20 @@ def test_a_missing_backbone_turns_the_term_off_with_a_warning(tmp_path, monkeypa
     with pytest.warns(UserWarning, match=f"{name} is neither .* paths.weights"):
         loss = make_loss(mse=1.0, perceptual=0.5, perceptual_term=lambda: term(str(tmp_path)))
     assert set(loss(*pair())) == {"loss", "mse"}
+
+
+def test_missing_terms_are_refused_where_they_are_not_allowed(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    message = r"perceptual=0.5: VGG19 .* paths.download=true .* allow_missing_losses=true"
+    with pytest.raises(InputError, match=message):
+        term = {"perceptual_term": lambda: longlrm(str(tmp_path))}
+        make_loss(mse=1.0, perceptual=0.5, allow_missing=False, **term)
+    loss = make_loss(mse=1.0, depth=0.01, allow_missing=False)
+    with pytest.raises(InputError, match=r"depth=0.01: .* asysplat.data.disparity estimates"):
+        loss(*pair(depths=False))
+    # A scene without depths after one that has them does not end a training.
+    loss = make_loss(mse=1.0, depth=0.01, allow_missing=False)
+    assert "depth" in loss(*pair()) and "depth" not in loss(*pair(depths=False))
 
 
 NETWORKS = {"vgg16": (vgg16, torchvision_vgg16), "longlrm": (longlrm, torchvision_vgg19)}

@@ -22,7 +22,7 @@ TARGETS = 4
 
 @pytest.fixture(scope="module")
 def module(composed):
-    config = composed()
+    config = composed("model=asysplat_plane_sweep")
     built = instantiate(config.training, net=instantiate(config.model))
     load_weights("shipped", built)
     return built.eval()

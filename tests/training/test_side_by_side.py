@@ -29,7 +29,9 @@ def make_batch(scenes=SCENES):
 @pytest.fixture
 def module(build):
     torch.manual_seed(0)
-    module = make_module(build("width=0.125", "state_size=8", "model.layers=1m1s"))
+    module = make_module(
+        build("width=0.125", "state_size=8", "model.layers=1m1s", "model/head=photograph")
+    )
     module.loss = SplattingLoss(mse=1.0, perceptual=0.0, depth=0.1)
     return module
 

@@ -32,7 +32,7 @@ def test_the_files_of_a_run(whole):
     assert expected <= {key.removeprefix("cost/") for key in numbers if key.startswith("cost/")}
     assert "window 11x11" in numbers["protocol/ssim"] and numbers["protocol/name"] == "default"
     assert "all measurements but the longest" in numbers["protocol/seconds"]
-    assert numbers["cost/gaussians"] == 3 * 32 * 32
+    assert numbers["cost/gaussians"] == 3 * 16 * 16
     assert numbers["cost/gflops_true"] > numbers["cost/gflops"] > 0
 
     with (folder / "metrics.csv").open() as file:
@@ -96,7 +96,7 @@ def test_without_some_callbacks_the_rest_is_there(train, names, tmp_path, monkey
     monkeypatch.setenv("ASYSPLAT_SHARED", str(tmp_path))
     logged = "monitor" not in names
     options = ["callbacks.monitor.every=2" if logged else "logger=none"]
-    options += ["speed.skip_layers_above=1e-6"]
+    options += ["model=asysplat_plane_sweep", "speed.skip_layers_above=1e-6"]
     options += [COSTS] * ("costs" not in names)
     removed = ["callbacks.figures=null" if n == "figures" else f"~callbacks.{n}" for n in names]
     result = train(*removed, *options)
@@ -132,7 +132,7 @@ def test_without_some_callbacks_the_rest_is_there(train, names, tmp_path, monkey
 @pytest.mark.medium
 def test_bfloat16_with_the_perceptual_term_and_a_protocol_by_name(train, shared):
     options = ["training.loss.perceptual=0.5", f"paths.shared={shared}", "metrics=longlrm"]
-    result = train("trainer.precision=bf16-mixed", "steps=2", *options)
+    result = train("trainer.precision=bf16-mixed", "steps=2", "model/head=photograph", *options)
     folder = finished(result)
     numbers = metrics(folder)
     assert numbers["test/procedural/psnr"] > numbers["baseline/procedural/mean_color/psnr"]
