@@ -4,7 +4,6 @@ from urllib.error import URLError
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torchvision.models import alexnet
 
@@ -44,7 +43,7 @@ def hub(tmp_path, monkeypatch):
     return tmp_path / "hub" / "checkpoints"
 
 
-def test_it_is_downloaded_once_and_only_if_requested(requests, hub, tmp_path):
+def test_a_backbone_is_downloaded_once_and_only_if_requested(requests, hub, tmp_path):
     assert load_lpips("alex", None) is None
     assert load_lpips("vgg", tmp_path) is None
     assert find_backbone("alexnet", None) is None
@@ -56,7 +55,7 @@ def test_it_is_downloaded_once_and_only_if_requested(requests, hub, tmp_path):
     assert found["features.0.weight"].shape == (64, 3, 11, 11)
 
 
-def test_hub_cache_comes_first_and_features_are_fp32(requests, hub, tmp_path):
+def test_the_hub_cache_comes_first_and_features_are_fp32(requests, hub, tmp_path):
     write_alexnet(tmp_path / "alexnet_features_fp16.pth", 2.0, torch.float16)
     found = find_backbone("alexnet", tmp_path, download=True)
     assert found["features.0.bias"].dtype == torch.float32 and not requests
@@ -69,23 +68,19 @@ def test_hub_cache_comes_first_and_features_are_fp32(requests, hub, tmp_path):
     )
 
 
-@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut short"])
-def test_error_of_a_broken_file(hub, content):
-    (hub / "vgg16-397923af.pth").write_bytes(content)
-    with pytest.raises(InputError, match=r"vgg16-397923af\.pth cannot be read"):
-        find_backbone("vgg16", None)
+def test_broken_files_and_files_with_other_content_are_refused(hub):
+    for content in (b"", b"not a checkpoint", b"PK\x03\x04 cut short"):
+        (hub / ALEXNET).write_bytes(content)
+        with pytest.raises(InputError, match=r"7be5be79\.pth cannot be read"):
+            find_backbone("alexnet", None)
+    for content in ([1, 2], {"features.0.weight": torch.zeros(1)}):
+        torch.save(content, hub / ALEXNET)
+        with pytest.raises(InputError, match=r"7be5be79\.pth has no features\.0\.weight of shape"):
+            find_backbone("alexnet", None)
 
 
-@pytest.mark.parametrize("content", [[1, 2], {"features.0.weight": torch.zeros(1)}])
-def test_error_of_a_file_with_other_content(hub, content):
-    torch.save(content, hub / ALEXNET)
-    with pytest.raises(InputError, match=r"7be5be79\.pth has no features\.0\.weight of shape"):
-        find_backbone("alexnet", None)
-
-
-def test_the_option_reaches_every_user_of_backbones(repository):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        config = compose("train", ["paths.download=true", "paths.run=unused"])
+def test_the_option_to_download_reaches_every_user_of_backbones(composed):
+    config = composed("paths.download=true", "paths.run=unused")
 
     def users(node):
         if isinstance(node, dict):

@@ -39,27 +39,24 @@ def test_mean_color_is_of_all_inputs_of_the_scene():
     torch.testing.assert_close(found, expected[:, None, :, None, None].expand_as(found))
 
 
-def test_nearest_by_center_then_by_direction():
+def test_the_nearest_view_is_that_of_the_nearest_center_then_of_the_direction():
     inputs = make_views([[0, 0, 0], [4, 0, 0], [4, 0, 0]], [0, 0, 90])
     targets = make_views([[1, 0, 0], [3, 0, 0], [3, 0, 0], [4, 9, 0]], [0, 10, 80, 50])
     assert nearest(inputs, targets) == [0, 1, 2, 2]
+    coincident = make_views([[5, 0, 0]] * 3, [0, 60, 120])
+    assert nearest(coincident, make_views([[0, 0, 0], [0, 7, 0]], [100, 20])) == [2, 0]
+    single = make_views([[5, 0, 0]], [0])
+    assert nearest(single, make_views([[0, 0, 0]], [180])) == [0]
 
 
-def test_the_rule_weighs_distance_by_spread_and_angle_by_pi():
+def test_the_nearest_view_weighs_distance_by_spread_and_angle_by_pi():
     # Spread 10. Input 0: 4/10 + 0. Input 1: 0 + yaw/180: the winner changes at a yaw of 72.
     target = make_views([[4, 0, 0]], [0])
     assert nearest(make_views([[0, 0, 0], [4, 0, 0], [10, 0, 0]], [0, 71, 180]), target) == [1]
     assert nearest(make_views([[0, 0, 0], [4, 0, 0], [10, 0, 0]], [0, 73, 180]), target) == [0]
 
 
-def test_coincident_centers_are_distinguished_by_direction():
-    inputs = make_views([[5, 0, 0]] * 3, [0, 60, 120])
-    assert nearest(inputs, make_views([[0, 0, 0], [0, 7, 0]], [100, 20])) == [2, 0]
-    single = make_views([[5, 0, 0]], [0])
-    assert nearest(single, make_views([[0, 0, 0]], [180])) == [0]
-
-
-def test_batched_choice_equals_scene_by_scene():
+def test_the_nearest_views_of_a_batch_are_those_of_each_scene():
     def scenes(count):
         views = [
             make_views(torch.randn(count, 3).tolist(), (360 * torch.rand(count)).tolist())

@@ -22,7 +22,7 @@ def test_disparity_of_an_unknown_depth_is_0():
     torch.testing.assert_close(found, torch.tensor([[0.0, 2.0], [0.5, 0.25]]))
 
 
-def test_a_row_for_each_view_and_true_depth_where_known():
+def test_the_comparison_has_a_row_for_each_view_and_true_depths_where_known():
     for depths, columns in ((True, 6), (False, 5)):
         views, rendering = scene(depths)
         axes = comparison_figure(views, views, rendering).axes
@@ -45,15 +45,11 @@ def test_masked_pixels_are_blank_and_not_in_the_color_range():
             values = image.get_array()
             assert values.mask[:, :4].all() and (values[:, 4:] == value).all()
         assert row[4].images[0].get_clim() == row[5].images[0].get_clim() == (0, 0.5)
+    nothing = replace(views, masks=torch.zeros_like(masks))
+    comparison_figure(nothing, nothing, rendering).canvas.draw()
 
 
-def test_a_fully_masked_view_can_be_drawn():
-    views, rendering = scene()
-    views = replace(views, masks=torch.zeros(2, 16, 16, dtype=torch.bool))
-    comparison_figure(views, views, rendering).canvas.draw()
-
-
-def test_curve_has_every_validation():
+def test_the_learning_curve_has_every_validation():
     rows = [
         {"step": s, "minutes": s / 10, "psnr": 15 + s, "nearest_view/psnr": 16} for s in range(3)
     ]

@@ -27,7 +27,7 @@ SCENES = {
 }
 
 
-def test_numbers_of_a_set():
+def test_results_of_a_set_are_means_over_its_scenes():
     found = set_results(SCENES, "images")
     assert found["test/main/post0/psnr"] == pytest.approx(25)
     assert found["test/main/post3/psnr"] == pytest.approx(27)

@@ -14,7 +14,7 @@ from asysplat.evaluation.static_cost import (
 )
 
 
-def test_full_width_at_32_views_of_256(build):
+def test_static_costs_at_the_papers_scale_are_the_papers(build):
     costs = static_costs(build("model=asysplat_4m4s", "scale=paper", device="meta"), 32, 256, 256)
     assert abs(costs["gflops"] / 2033 - 1) < 0.005  # paper, Table 6c
     assert costs["gflops_true"] > 1.2 * costs["gflops"]
@@ -41,7 +41,7 @@ def test_activation_memory_is_what_a_forward_pass_saves(build):
     assert activation_gb(net, 2, 64, 64) == sum(s.nbytes() for s in saved.values()) / 1e9
 
 
-def test_parameters():
+def test_parameters_include_frozen_ones_and_no_buffers():
     net = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4), nn.Linear(4, 2, bias=False))
     net[0].requires_grad_(False)
     assert count_parameters(net) == (3 * 4 + 4) + 2 * 4 + 4 * 2
@@ -62,7 +62,7 @@ def test_parameters():
         (nn.GELU(), (2, 3, 7), 0),
     ],
 )
-def test_module_flops_of_one_layer(layer, shape, expected, device):
+def test_module_flops_of_each_layer(layer, shape, expected, device):
     net = nn.Sequential(layer).to(device)
     x = torch.ones(shape, device=device)
     assert module_flops(net, x)[0] == expected
