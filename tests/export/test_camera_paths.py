@@ -50,14 +50,12 @@ HARD = {
     "one": cameras_at([[1, 2, 3]]),
     "two": cameras_at([[0, 0, 0], [1, 0, 0]]),
     "two that face each other": cameras_at([[0, -1, 0], [0, 1, 0]], np.zeros((2, 3))),
-    "three": cameras_at([[0, 0, 0], [1, 0, 0], [1, 1, 0]]),
     "one place": cameras_at(np.ones((5, 3))),
     "one place, a turn": turned("y", [0, 20, 40, 60]),
     "one place, all around": turned("y", list(range(0, 360, 30))),
     "one place, over the top": turned("x", list(range(0, 181, 30))),
     "collinear, sideways": cameras_at([[x, 0, 0] for x in range(6)]),
     "collinear, forwards": cameras_at([[0, y, 0] for y in range(6)]),
-    "collinear, upwards": cameras_at([[0, 0, z] for z in range(6)]),
     "looking straight down": turned("x", [0.0]),
     "ups that cancel": cameras_at(ring([0, 180]), np.zeros((2, 3)), roll=math.pi / 2),
     "pairs at each place": cameras_at(np.repeat(ring(range(0, 90, 15)), 2, 0)),
@@ -66,23 +64,21 @@ HARD = {
     "far from the origin": cameras_at(ring(range(0, 360, 30)) + 1e4, np.full((12, 3), 1e4)),
     "hand-held": ProceduralScene(2, 12, 16).views(list(range(0, 90, 3))).cameras,
 }
+every_path = pytest.mark.parametrize("path", [smoothed_path, orbit])
 
 
-PATHS = [smoothed_path, orbit]
-
-
-@pytest.mark.parametrize("frames", [1, 2, 25])
+@every_path
 @pytest.mark.parametrize("case", HARD)
-@pytest.mark.parametrize("path", PATHS)
-def test_cameras_can_be_rendered_whatever_is_given(path, case, frames):
-    made = path(HARD[case], frames).validate()
-    assert made.num_views == frames
-    assert (made.height, made.width) == (HARD[case].height, HARD[case].width)
-    assert made.cam_to_world.dtype == torch.float32
+def test_paths_can_be_rendered_whatever_cameras_are_given(path, case):
+    for frames in (1, 2, 25):
+        made = path(HARD[case], frames).validate()
+        assert made.num_views == frames
+        assert (made.height, made.width) == (HARD[case].height, HARD[case].width), frames
+        assert made.cam_to_world.dtype == torch.float32, frames
 
 
-@pytest.mark.parametrize("path", PATHS)
-def test_intrinsics_are_the_mean(path):
+@every_path
+def test_intrinsics_of_a_path_are_the_mean(path):
     cameras = cameras_at(ring([0, 10, 20]), [[0, 0, 0]] * 3)
     cameras.intrinsics[:, 0, 0] = torch.tensor([40.0, 50, 90])
     made = path(cameras, 4)
@@ -90,19 +86,17 @@ def test_intrinsics_are_the_mean(path):
     assert made.intrinsics[0, 0, 0] == 60
 
 
-@pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize(
-    ("change", "frames", "message"),
-    [
-        (lambda c: c, 0, "frames is 0"),
-        (lambda c: Cameras.stack([c, c]), 5, r"shape \(2, 3, 3, 3\): expected \[V, 3, 3\]"),
-        (lambda c: c.select(torch.zeros(0, dtype=torch.long)), 5, r"shape \(0, 3, 3\)"),
-        (lambda c: c.map(lambda t: t * torch.nan), 5, "holds NaN"),
-    ],
-)
-def test_mistakes_are_refused(path, change, frames, message):
-    with pytest.raises(InputError, match=message):
-        path(change(cameras_at(ring([0, 10, 20]))), frames)
+@every_path
+def test_paths_refuse_no_frames_and_invalid_cameras(path):
+    cameras = cameras_at(ring([0, 10, 20]))
+    for given, frames, message in (
+        (cameras, 0, "frames is 0"),
+        (Cameras.stack([cameras, cameras]), 5, r"shape \(2, 3, 3, 3\): expected \[V, 3, 3\]"),
+        (cameras.select(torch.zeros(0, dtype=torch.long)), 5, r"shape \(0, 3, 3\)"),
+        (cameras.map(lambda t: t * torch.nan), 5, "holds NaN"),
+    ):
+        with pytest.raises(InputError, match=message):
+            path(given, frames)
 
 
 def steps(cameras: Cameras) -> np.ndarray:
@@ -115,7 +109,7 @@ def turns(cameras: Cameras) -> np.ndarray:
     return np.degrees((rotations[:-1].inv() * rotations[1:]).magnitude())
 
 
-def test_a_walk_is_smooth_even_and_where_the_cameras_were():
+def test_a_smoothed_walk_is_even_and_where_the_cameras_were():
     rng = np.random.default_rng(0)
     # Steps of all lengths along half a circle, with tremble.
     angles = np.sort(rng.uniform(0, 180, 200))
@@ -137,7 +131,7 @@ def test_a_walk_is_smooth_even_and_where_the_cameras_were():
     assert bends.max() < 4 and 1 < bends.mean() < 2
 
 
-def test_few_views_are_passed_through():
+def test_smoothed_paths_pass_through_few_views():
     cameras = cameras_at(ring(range(0, 181, 30)), np.zeros((7, 3)))
     made = smoothed_path(cameras, 200)
     nearest = torch.cdist(cameras.centers, made.centers).min(1).values
@@ -151,7 +145,7 @@ def test_few_views_are_passed_through():
     assert made.centers[0, 0] < 0.05 and made.centers[-1, 0] > 0.95
 
 
-def test_turns_on_the_spot_are_even():
+def test_smoothed_turns_on_the_spot_are_even():
     made = smoothed_path(turned("y", [0, 5, 50, 60]), 30)
     assert (made.centers - 1).abs().max() < 1e-6
     assert turns(made).sum() > 55
@@ -162,15 +156,16 @@ def test_turns_on_the_spot_are_even():
     assert turns(made).max() < 1.1 * turns(made).mean()
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_views_in_a_jumble_are_brought_in_order(seed):
+def test_smoothed_paths_bring_views_in_a_jumble_in_order():
     cameras = cameras_at(ring(range(0, 150, 10)), np.zeros((15, 3)))
-    order = np.random.default_rng(seed).permutation(15).tolist()
-    ways = [steps(smoothed_path(c, 60)).sum() for c in (cameras, cameras.select(order))]
-    np.testing.assert_allclose(*ways, rtol=1e-3)
+    expected = steps(smoothed_path(cameras, 60)).sum()
+    for seed in range(3):
+        jumble = cameras.select(np.random.default_rng(seed).permutation(15).tolist())
+        way = steps(smoothed_path(jumble, 60)).sum()
+        np.testing.assert_allclose(way, expected, rtol=1e-3, err_msg=f"seed {seed}")
 
 
-def test_a_good_order_is_kept():
+def test_smoothed_paths_keep_a_good_order():
     """Neighbors at crossings of the way are nearer than the next view, and are not taken."""
     angles = np.linspace(0, 2 * np.pi, 61)
     eight = np.stack((np.sin(angles), np.sin(2 * angles), np.zeros(61)), 1)
@@ -187,7 +182,7 @@ def assert_looks_at(cameras: Cameras, point, atol=1e-4):
     torch.testing.assert_close(cameras.cam_to_world[:, :3, 2], ahead.float(), rtol=0, atol=atol)
 
 
-def test_cameras_all_around_are_circled():
+def test_an_orbit_circles_what_cameras_all_around_look_at():
     made = orbit(cameras_at(ring(range(0, 360, 20)), np.zeros((18, 3))), 36)
     assert_looks_at(made, (0.0, 0, 0))
     torch.testing.assert_close(made.centers[:, :2].norm(dim=-1), torch.full((36,), 2.0))
@@ -199,7 +194,7 @@ def test_cameras_all_around_are_circled():
 
 
 @pytest.mark.parametrize("start", [0, 150, 300])
-def test_cameras_on_one_side_are_not_left(start):
+def test_an_orbit_stays_on_the_side_of_the_cameras(start):
     angles = np.arange(start, start + 81, 10)
     made = orbit(cameras_at(ring(angles, height=1.5), np.zeros((9, 3))), 40)
     assert_looks_at(made, (0.0, 0, 0))
@@ -214,7 +209,7 @@ def test_cameras_on_one_side_are_not_left(start):
     assert np.abs(np.diff(seen, append=seen[0])).max() < 8
 
 
-def test_parallel_axes_swing_in_front_of_the_middle_camera():
+def test_an_orbit_of_parallel_cameras_swings_in_front_of_the_middle_one():
     cameras = cameras_at([[x, 0, 1] for x in (-2, -1, 0, 1, 2)])
     made = orbit(cameras, 20)
     assert made.centers[:, 0].abs().max() < 2.1
@@ -224,7 +219,7 @@ def test_parallel_axes_swing_in_front_of_the_middle_camera():
 
 
 @pytest.mark.parametrize("case", ["outwards", "one place, all around", "one"])
-def test_where_no_point_is_seen_by_most_the_middle_camera_swings_a_little(case):
+def test_an_orbit_swings_a_little_where_no_point_is_seen_by_most(case):
     made = orbit(HARD[case], 20)
     axes = made.cam_to_world[:, :3, 2]
     assert (axes @ axes.mT).min() > math.cos(math.radians(10.1))

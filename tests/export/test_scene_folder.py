@@ -100,7 +100,7 @@ def test_cameras_bring_gaussians_to_the_datas_world(file, sequence, world, other
     check_visible(found.to(torch.float32), sequence.cameras, file, fitted=True)
 
 
-def test_without_cameras_the_world_is_the_datas(file, sequence, world):
+def test_gaussians_without_cameras_are_in_the_datas_world(file, sequence, world):
     write_gaussians(file.path, world)
     found, residual = file.read()
     assert residual is None
@@ -108,7 +108,7 @@ def test_without_cameras_the_world_is_the_datas(file, sequence, world):
     check_visible(found.to(torch.float32), sequence.cameras, file, fitted=False)
 
 
-def test_other_coordinates_are_noticed(file, sequence):
+def test_check_visible_refuses_gaussians_in_other_coordinates(file, sequence):
     found, _ = file.read()
     message = (
         r"room\.v2\.ply: 12 of 12 test views of room show none of its Gaussians, which looks as if "
@@ -121,7 +121,7 @@ def test_other_coordinates_are_noticed(file, sequence):
         check_visible(found.to(torch.float32), sequence.cameras, file, fitted=True)
 
 
-def test_noisy_cameras_have_a_residual(file, sequence, other):
+def test_noisy_cameras_beside_a_scene_have_a_residual(file, sequence, other):
     noise = np.random.default_rng(0)
     poses = other_poses(sequence, other)
     spread = np.std([pose[:3, 3] for _, pose in poses], axis=0)
@@ -131,43 +131,30 @@ def test_noisy_cameras_have_a_residual(file, sequence, other):
     assert 0.01 < file.read()[1] < 0.05
 
 
-REFUSED = {
-    "other images": (
-        lambda poses: [(name, poses[-index - 1][1]) for index, (name, _) in enumerate(poses)],
-        r"its 12 cameras differ from those of room by \d+% of their spread",
-    ),
-    "OpenCV's axes": (
-        lambda poses: [(name, pose @ AXES) for name, pose in poses],
-        "give the cameras of the same images, with the axes of their format",
-    ),
-    "one image": (lambda poses: poses[:1], "has 1 of the 12 images of room"),
-    "none of the names": (
-        lambda poses: [(f"x{name[7:]}", pose) for name, pose in poses],
-        "has 0 of the 12 images of room",
-    ),
-    "names that several have": (
-        lambda poses: [*poses, *((f"more/{name}", pose) for name, pose in poses)],
-        "has 0 of the 12 images of room",
-    ),
-    "one place": (
-        lambda poses: [(name, np.diag([1.0, 1, 1, 1])) for name, _ in poses],
-        "in one place or none: give cameras of two or more",
-    ),
-    "mirrored": (lambda poses: [(n, p * [-1, 1, 1, 1]) for n, p in poses], "is not a rotation"),
-    "no image": (lambda poses: [(7, poses[0][1])], "has no file_path"),
-}
+def test_cameras_that_do_not_fit_the_images_are_refused(file, sequence, other):
+    poses = other_poses(sequence, other)
+    names, matrices = zip(*poses, strict=True)
+    for given, message in (
+        (zip(names, matrices[::-1], strict=True), r"12 cameras differ from those of room by \d+%"),
+        ([(name, pose @ AXES) for name, pose in poses], "with the axes of their format"),
+        (poses[:1], "has 1 of the 12 images of room"),
+        ([(f"x{name[7:]}", pose) for name, pose in poses], "has 0 of the 12 images of room"),
+        ([*poses, *((f"more/{n}", p) for n, p in poses)], "has 0 of the 12 images of room"),
+        ([(name, np.eye(4)) for name in names], "in one place or none: give cameras of two or"),
+        ([(name, pose * [-1, 1, 1, 1]) for name, pose in poses], "is not a rotation"),
+        ([(7, matrices[0])], "has no file_path"),
+    ):
+        write_json(file, given)
+        with pytest.raises(InputError, match=message) as raised:
+            file.read()
+        assert "cameras.json" in str(raised.value)
+    write_json(file, poses)
+    procedural = replace(file, sequence=ProceduralScene(3, 24, 32, num_images=12))
+    with pytest.raises(InputError, match="has 0 of the 0 images of procedural-3"):
+        procedural.read()
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_cameras_that_do_not_fit(file, sequence, other, case):
-    change, message = REFUSED[case]
-    write_json(file, change(other_poses(sequence, other)))
-    with pytest.raises(InputError, match=message) as raised:
-        file.read()
-    assert "cameras.json" in str(raised.value)
-
-
-def test_damaged_files(file, sequence, other):
+def test_damaged_gaussians_and_cameras_are_named(file):
     file.path.write_bytes(file.path.read_bytes()[:-10])
     with pytest.raises(InputError, match=r"room\.v2\.ply"):
         file.read()
@@ -176,50 +163,37 @@ def test_damaged_files(file, sequence, other):
         file.read()
 
 
-def test_procedural_scenes_have_no_names_of_images(file, sequence, other):
-    write_json(file, other_poses(sequence, other))
-    procedural = replace(file, sequence=ProceduralScene(3, 24, 32, num_images=12))
-    with pytest.raises(InputError, match="has 0 of the 0 images of procedural-3"):
-        procedural.read()
-
-
 @pytest.fixture(scope="module")
 def sequences():
     return [ProceduralScene(seed, 8, 8, num_images=4) for seed in range(7)]
 
 
 NAMES = [f"procedural-{seed}" for seed in range(7)]
-WRONG = {
-    "no folder": (None, "scenes=.* is not a file and no folder"),
-    "no scenes": (["notes.txt"], r"has no scene \(\.ply, \.splat, \.safetensors\): write one for"),
-    "a file of no scene": (
-        [*(f"{name}.ply" for name in NAMES), "lego.ply"],
-        r"lego\.ply is named as no scene of the data: .* procedural-4, \.\.\.\.",
-    ),
-    "missing scenes": (
-        [f"{name}.splat" for name in NAMES[2:]],
-        "has no file of 2 of the 7 scenes, procedural-0, procedural-1: add them",
-    ),
-    "two files of a scene": (
-        [*(f"{name}.ply" for name in NAMES), "procedural-3.safetensors"],
+PLY = [f"{name}.ply" for name in NAMES]
+WRONG = [
+    (["notes.txt"], r"has no scene \(\.ply, \.splat, \.safetensors\): write one for"),
+    ([*PLY, "lego.ply"], r"lego\.ply is named as no scene of the data: .* procedural-4, \.\.\.\."),
+    (PLY[2:], "has no file of 2 of the 7 scenes, procedural-0, procedural-1: add them"),
+    (
+        [*PLY, "procedural-3.safetensors"],
         r"two files of one scene, procedural-3\.ply and procedural-3\.safetensors: remove one",
     ),
-}
+]
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_files_and_scenes_that_do_not_go_together(sequences, tmp_path, case):
-    files, message = WRONG[case]
-    folder = tmp_path / "system"
-    if files is not None:
+def test_find_files_refuses_files_that_are_not_those_of_the_scenes(sequences, tmp_path):
+    with pytest.raises(InputError, match=r"scenes=.* is not a file and no folder"):
+        find_files(tmp_path / "absent", sequences)
+    for number, (files, message) in enumerate(WRONG):
+        folder = tmp_path / str(number)
         folder.mkdir()
         for name in files:
             (folder / name).touch()
-    with pytest.raises(InputError, match=message):
-        find_files(folder, sequences)
+        with pytest.raises(InputError, match=message):
+            find_files(folder, sequences)
 
 
-def test_every_scene_has_its_file(sequences, tmp_path):
+def test_find_files_gives_every_scene_its_file(sequences, tmp_path):
     for name in NAMES:
         (tmp_path / f"{name}.PLY").touch()
         (tmp_path / f"{name}.cameras.json").touch()

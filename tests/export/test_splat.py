@@ -11,7 +11,7 @@ def row(mean=(1, 2, 3), scale=(0.1, 0.2, 0.3), rgba=(255, 51, 0, 204), quat=(128
     return np.array([*mean, *scale], "<f4").tobytes() + bytes(rgba) + bytes(quat)
 
 
-def test_every_field(tmp_path):
+def test_read_splat_reads_every_field(tmp_path):
     file = tmp_path / "two.splat"
     file.write_bytes(row() + row(mean=(4, 5, 6), scale=(0, 1, 1), rgba=(0, 0, 0, 0)))
     read = read_splat(file)
@@ -25,23 +25,19 @@ def test_every_field(tmp_path):
     assert 0 < read.opacities[1] < 1e-30 and 0 < read.scales[1, 0] < 1e-30
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
+def test_damaged_splat_files_are_refused(tmp_path):
+    for content, message in (
         (b"", "has 0 bytes"),
         (row()[:-1], "has 31 bytes: expected a multiple of 32"),
         (row() + row(mean=(1, np.nan, 3)), r"Gaussians\.means\[1\] holds NaN"),
         (row(scale=(np.inf, 1, 1)), r"Gaussians\.scales\[0\] holds NaN or infinity"),
-    ],
-)
-def test_damaged_files_are_refused(tmp_path, content, message):
-    (tmp_path / "bad.splat").write_bytes(content)
-    with pytest.raises(InputError, match=rf"bad\.splat.*{message}"):
-        read_splat(tmp_path / "bad.splat")
+    ):
+        (tmp_path / "bad.splat").write_bytes(content)
+        with pytest.raises(InputError, match=rf"bad\.splat.*{message}"):
+            read_splat(tmp_path / "bad.splat")
 
 
-def test_a_real_plant(shared):
-    """Its numbers are those of the README that came with it."""
+def test_read_splat_of_a_real_plant_gives_the_numbers_of_its_readme(shared):
     plant = read_splat(shared / "data" / "splats" / "plant.splat")
     assert plant.num_gaussians == 113_648
     center = torch.tensor([0.02, 0.01, 0.02])

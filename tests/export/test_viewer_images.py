@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -35,7 +36,7 @@ def page_of(cameras, view):
     )
 
 
-def test_a_page_at_an_input_camera(make_scene):
+def test_a_page_at_an_input_camera_has_its_view(make_scene):
     _, cameras = make_scene(views=3, height=60, width=80, dtype=torch.float32)
     focal = torch.tensor([[70.0, 0, 40], [0, 70, 30], [0, 0, 1]])
     cameras = replace(cameras, intrinsics=focal.repeat(3, 1, 1))
@@ -53,24 +54,21 @@ def test_a_page_at_an_input_camera(make_scene):
     assert expected == pytest.approx(field_of_view(cameras, 0)[0])
 
 
-@pytest.mark.parametrize("size", [(10**12, 1), (1, 10**12), (10**12, 10**12), (0, -5)])
-@pytest.mark.parametrize("fov", [0.0, 1.0, math.pi, 1e30, -1e30])
-def test_a_page_of_any_size_takes_a_bounded_image(make_scene, size, fov):
-    _, cameras = make_scene(dtype=torch.float32)
-    page = page_of(cameras, 0)
-    page.image_height, page.image_width, page.fov = *size, fov
-    camera, _ = page_camera(page, 30_000)
-    assert camera.height * camera.width <= 60_000
-    camera.validate()
+def test_a_page_of_any_size_takes_a_bounded_image(make_scene):
+    page = page_of(make_scene(dtype=torch.float32)[1], 0)
+    sizes, fields_of_view = [10**12, 1, -5], [0.0, 1.0, math.pi, 1e30, -1e30]
+    for page.image_height, page.image_width, page.fov in product(sizes, sizes, fields_of_view):
+        camera, _ = page_camera(page, 30_000)
+        assert camera.height * camera.width <= 60_000, vars(page)
+        camera.validate()
 
 
-@pytest.mark.parametrize("field", ["fov", "position", "wxyz"])
-def test_a_page_that_is_no_camera_is_refused(make_scene, field):
-    _, cameras = make_scene(dtype=torch.float32)
-    page = page_of(cameras, 0)
-    setattr(page, field, np.full(np.shape(getattr(page, field)), np.nan))
-    with pytest.raises((InputError, ValueError)):
-        page_camera(page, 30_000)
+def test_a_page_that_is_no_camera_is_refused(make_scene):
+    for field in ("fov", "position", "wxyz"):
+        page = page_of(make_scene(dtype=torch.float32)[1], 0)
+        setattr(page, field, np.full(np.shape(getattr(page, field)), np.nan))
+        with pytest.raises((InputError, ValueError)):
+            page_camera(page, 30_000)
 
 
 def test_a_click_hits_the_first_visible_image(make_scene):
@@ -109,7 +107,7 @@ def test_color_and_alpha_are_those_of_the_renderer(scene):
     assert color.std() > 20 and alpha.std() > 20
 
 
-def test_near_is_bright_and_an_empty_image_of_one_color(scene):
+def test_drawn_depth_is_bright_where_near_and_of_one_color_where_empty(scene):
     focal = torch.tensor([[[20.0, 0, 16], [0, 20, 8], [0, 0, 1]]])
     gaussians = Gaussians(
         means=torch.tensor([[-1.0, 0, 2], [2, 0, 4]]),
@@ -127,7 +125,7 @@ def test_near_is_bright_and_an_empty_image_of_one_color(scene):
     assert np.ptp(draw_layer(behind, camera, layer="depth"), axis=(0, 1)).max() == 0
 
 
-def test_settings_of_the_panel(scene):
+def test_settings_of_the_panel_change_what_is_drawn(scene):
     gaussians, camera = scene
     least = gaussians.opacities.median().item()
     kept = gaussians.keep(gaussians.opacities >= least)
