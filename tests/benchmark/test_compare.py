@@ -40,9 +40,7 @@ CHANGES = {  # of a row: the sentence on what is worse, and on what is better
     "as exact": ({"wrong": {"x": 1.9e-6, "y": 0.0}}, "", ""),
     "worse images": ({"psnr": 29.8}, "less exact: a, psnr: 29.8 dB, was 30 dB", ""),
     "within the noise of the row": ({"psnr": 29.8, "noise": {"psnr": 0.3}}, "", ""),
-    "a higher rate": ({"rate": summary(11.0)}, "", "faster: a, rate: 11 / s, was 8 / s"),
     "a lower rate": ({"rate": summary(5.0)}, "slower: a, rate: 5 / s, was 8 / s", ""),
-    "still no error": ({"none": 0.0}, "", ""),
     "an error where there was none": ({"none": 1e-3}, "less exact: a, none: 0.001, was 0", ""),
     "better images": ({"psnr": 30.2}, "", "more exact: a, psnr: 30.2 dB, was 30 dB"),
 }
@@ -83,22 +81,20 @@ def test_seconds_of_another_machine_are_not_compared():
     assert "ratio" in comparison.worse[0]
 
 
-FILES = {
-    "none": (None, r"^compare=.*old\.json cannot be read"),
-    "no JSON": ("{", r"cannot be read"),
-    "no results": ("[1]", r"has no results"),
-    "another suite": ('{"machine": {}, "suite": "ops"}', r"is of suite=ops: name a file of"),
-}
-
-
-@pytest.mark.parametrize("case", FILES)
-def test_files_that_cannot_be_compared_are_refused(case, tmp_path):
-    content, says = FILES[case]
-    if content is not None:
-        (tmp_path / "old.json").write_text(content)
-    with pytest.raises(InputError, match=says):
-        read_old(str(tmp_path / "old.json"), tmp_path / "made.json")
-    assert read_old(None, tmp_path / "made.json") is None
+def test_files_that_cannot_be_compared_are_refused(tmp_path):
+    old, new = tmp_path / "old.json", tmp_path / "made.json"
+    refused = {
+        None: r"^compare=.*old\.json cannot be read",
+        "{": "cannot be read",
+        "[1]": "has no results",
+        '{"machine": {}, "suite": "ops"}': "is of suite=ops: name a file of",
+    }
+    for content, says in refused.items():
+        if content is not None:
+            old.write_text(content)
+        with pytest.raises(InputError, match=says):
+            read_old(str(old), new)
+    assert read_old(None, new) is None
 
 
 @pytest.fixture

@@ -5,23 +5,15 @@ import math
 import pytest
 import torch
 
-from asysplat.benchmark.scenes import (
-    ARC,
-    DISTANCE,
-    on_an_arc,
-    pixel_aligned_scene,
-    random_scene,
-)
+from asysplat.benchmark.scenes import ARC, DISTANCE, on_an_arc, pixel_aligned_scene, random_scene
 
 
-@pytest.mark.parametrize(
-    ("make", "count", "expected"), [(random_scene, 500, 500), (pixel_aligned_scene, 20, 800)]
-)
-def test_scenes_are_valid_and_visible(make, count, expected):
+@pytest.mark.parametrize("make, count, num", [(random_scene, 9, 9), (pixel_aligned_scene, 20, 800)])
+def test_scenes_are_valid_and_visible(make, count, num):
     gaussians, cameras = make(count, 54, 96)
     gaussians.validate()
     cameras.validate()
-    assert gaussians.num_gaussians == expected
+    assert gaussians.num_gaussians == num
     assert (cameras.num_views, cameras.height, cameras.width) == (1, 54, 96)
     _, _, inside = cameras.project(gaussians.means)
     assert inside.float().mean() > 0.6
