@@ -122,11 +122,10 @@ def random_gradient(name: str, output: Tensor) -> Tensor:
     return torch.randn(output.shape, generator=generator, dtype=torch.float64)
 
 
-def assert_same_bits(one: Result, other: Result) -> None:
-    for name, output in one.outputs.items():
-        assert torch.equal(output, other.outputs[name]), name
-    for name, grad in one.grads.items():
-        assert torch.equal(grad, other.grads[name]), name
+def assert_same_bits(one: Result, other: Result, case: str = "") -> None:
+    for own, others in ((one.outputs, other.outputs), (one.grads, other.grads)):
+        for name, value in own.items():
+            assert torch.equal(value, others[name]), f"{case}{name}"
 
 
 def assert_close(

@@ -1,7 +1,7 @@
 """All kernels for CPUs with bounds checks, over random scenes and sequences, in memory as it comes
 and in poisoned memory: the same bits and the same statistics.
 
-The test runs this file as a program: NUMBA_BOUNDSCHECK=1 python tests/stress/test_checked.py
+The tests run this file as a program: NUMBA_BOUNDSCHECK=1 python tests/stress/test_checked.py
 """
 
 import os
@@ -73,10 +73,14 @@ def scenes() -> Iterator[Callable[[], Result]]:
             yield partial(both_ways, CPU, *wild_scene(seed, height, width, degree), **option)
 
 
-def sequences() -> Iterator[Callable[[], Result]]:
-    cases = [(ssd, size) for size in SSD_SIZES] + [(selective_scan, size) for size in SCAN_SIZES]
-    for (scan, size), state, reverse in product(cases, STATES, (False, True)):
-        yield partial(scanned, scan, size, state, reverse)
+def ssds() -> Iterator[Callable[[], Result]]:
+    for size, state, reverse in product(SSD_SIZES, STATES, (False, True)):
+        yield partial(scanned, ssd, size, state, reverse)
+
+
+def selective_scans() -> Iterator[Callable[[], Result]]:
+    for size, state, reverse in product(SCAN_SIZES, STATES, (False, True)):
+        yield partial(scanned, selective_scan, size, state, reverse)
 
 
 def scanned(scan, size: tuple[int, ...], state: int, reverse: bool) -> Result:
@@ -180,18 +184,29 @@ def _step_out(which, numbers, rows):
         store(rows, 0, gather_pairs(numbers.reshape(2, 8, 2), zeros() + ONE, zeros() + EIGHT)[0])
 
 
+GROUPS = {f.__name__: f for f in (selective_scans, sweeps, losses, optimizers, ssds, scenes)}
+
+
 @pytest.mark.medium
 @pytest.mark.skipif(INTERPRETED, reason="kernels for GPUs are interpreted there")
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is poisoned by glibc")
-def test_kernels_with_bounds_checks_and_in_poisoned_memory():
+@pytest.mark.parametrize(
+    "groups",
+    [
+        ("selective_scans", "sweeps", "losses", "optimizers"),
+        pytest.param(("ssds", "scenes"), marks=pytest.mark.slow),  # a minute of compiling
+    ],
+    ids="-".join,
+)
+def test_kernels_with_bounds_checks_and_in_poisoned_memory(groups):
     done = subprocess.run(
-        [sys.executable, __file__],
+        [sys.executable, __file__, *groups],
         env={**os.environ, "NUMBA_BOUNDSCHECK": "1"},
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("the same bits") == 5
+    assert done.stdout.count("the same bits") == len(groups)
 
 
 if __name__ == "__main__":
@@ -202,9 +217,8 @@ if __name__ == "__main__":
         except IndexError:
             continue
         raise AssertionError(f"step {which} out of an array went unseen")
-    for cases in (sequences, sweeps, losses, optimizers, scenes):
-        runs = list(cases())
+    for name in sys.argv[1:] or GROUPS:
+        runs = list(GROUPS[name]())
         for run in runs:
             check_in_all_memories(run)
-        name = f"{len(runs)} {cases.__name__}, {len(FILLS) + 1} memories"
-        print(f"{name}: the same bits and statistics", flush=True)
+        print(f"{len(runs)} {name}, {len(FILLS) + 1} memories: the same bits", flush=True)

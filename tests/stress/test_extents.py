@@ -1,4 +1,4 @@
-"""Points, giants and needles: cases 3, 5, 7 and 8."""
+"""Points, giants and needles."""
 
 import math
 
@@ -22,9 +22,10 @@ def one(scales, quat=(1.0, 0, 0, 0), mean=(0.01, 0.02, 3.0), opacity=0.8):
     )
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("scales", [(0.0, 0, 0), (0.0, 0.1, 0.2), (0.0, 0.0, 0.1)], ids=str)
-def test_case_03_scale_zero_has_finite_gradients(backend, make_scene, scales, antialiased):
+@pytest.mark.parametrize(
+    "scales, antialiased", [((0.0, 0, 0), False), ((0.0, 0, 0), True), ((0.0, 0.1, 0.2), True)]
+)
+def test_scale_zero_has_finite_gradients(backend, make_scene, scales, antialiased):
     gaussians, cameras = make_scene(views=2, dtype=torch.float32)
     gaussians.scales[:] = torch.tensor(scales)
     result = both_ways(backend, gaussians, cameras, antialiased=antialiased)
@@ -36,7 +37,7 @@ def test_case_03_scale_zero_has_finite_gradients(backend, make_scene, scales, an
     assert_close(backend, result, exact, slack=2)
 
 
-def test_case_05_a_huge_scale_covers_the_screen(backend, make_scene):
+def test_a_huge_scale_covers_the_screen(backend, make_scene):
     _, cameras = make_scene(views=2, dtype=torch.float32)
     result = both_ways(backend, one((1e10, 1e10, 1e10)), cameras)
     expected = torch.full((2, 13, 17), float(torch.tensor(0.8)), dtype=backend.dtype)
@@ -45,7 +46,7 @@ def test_case_05_a_huge_scale_covers_the_screen(backend, make_scene):
     assert (result.grads["opacities"] != 0).all() and (result.grads["sh"] != 0).all()
 
 
-def test_case_07_a_needle_at_45_degrees_has_the_right_conic(backend, make_scene):
+def test_a_needle_at_45_degrees_has_the_right_conic(backend, make_scene):
     """Along its diagonal it has its opacity, and across it the width of the dilation alone."""
     _, cameras = make_scene(height=32, width=32, dtype=torch.float32)
     cameras = facing(cameras)
@@ -65,8 +66,8 @@ def test_case_07_a_needle_at_45_degrees_has_the_right_conic(backend, make_scene)
         assert relative_error(result.grads[name], exact.grads[name]) <= 1e-2, name
 
 
-@pytest.mark.parametrize("spread", [1e7, 1e3, 1.0], ids="longest {:.0e}".format)
-def test_case_08_no_alpha_exceeds_the_opacity(backend, make_scene, spread):
+@pytest.mark.parametrize("longest", [1e7, 1.0])
+def test_no_alpha_exceeds_the_opacity(backend, make_scene, longest):
     """A negative exponent would: it is a sum of squares."""
     _, cameras = make_scene(height=16, width=16, dtype=torch.float32)
     count = 50
@@ -74,7 +75,7 @@ def test_case_08_no_alpha_exceeds_the_opacity(backend, make_scene, spread):
     needles = Gaussians(
         means=torch.rand(count, 1, 3, generator=generator) + torch.tensor([-0.5, -0.5, 2]),
         quats=torch.randn(count, 1, 4, generator=generator),
-        scales=torch.tensor([spread, 1e-4, 1e-4]).expand(count, 1, 3),
+        scales=torch.tensor([longest, 1e-4, 1e-4]).expand(count, 1, 3),
         opacities=torch.full((count, 1), 0.5),
         sh=torch.zeros(count, 1, 1, 3),
     )

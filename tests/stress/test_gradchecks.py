@@ -1,7 +1,7 @@
-"""Gradients against finite differences, and every backend against the reference, in every mode:
-cases 4 and 25."""
+"""Gradients against finite differences, and every backend against the reference, in every mode."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -11,29 +11,22 @@ from asysplat.rendering import INRIA, render
 from asysplat.scene import Cameras, Gaussians
 
 
-@dataclass(frozen=True)
-class Mode:
-    """Args:
-    options: of `render`.
-    degree: of SH.
-    scale: of the Gaussians, beside `make_scene`'s.
-    """
-
-    options: dict = field(default_factory=dict)
-    degree: int = 1
-    scale: float = 5.0
+class Mode(NamedTuple):
+    options: dict  # of `render`
+    degree: int = 1  # of SH
+    scale: float = 5.0  # of the Gaussians, beside `make_scene`'s
 
 
 # So wide a dilation that small splats still reach every pixel; half of the opacity is left.
 FLOOR = replace(INRIA, eps2d=8.0, compensation_min=0.25)
 MODES = {
-    "expected": Mode(),
+    "expected": Mode({}),
     "accumulated": Mode({"depth": "accumulated"}),
     "median": Mode({"depth": "median"}),
     "antialiased": Mode({"antialiased": True}),
     "antialiased, below the floor": Mode({"antialiased": True, "convention": FLOOR}, scale=0.2),
     "antialiased, above the floor": Mode({"antialiased": True, "convention": FLOOR}),
-    "degree 3": Mode(degree=3),
+    "degree 3": Mode({}, degree=3),
 }
 
 
@@ -51,7 +44,7 @@ def soft_scene(make_scene, mode: Mode, dtype=torch.float64) -> tuple[Gaussians, 
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_case_25_every_gradient_equals_finite_differences(make_scene, mode):
+def test_every_gradient_equals_finite_differences(make_scene, mode):
     mode = MODES[mode]
     gaussians, cameras = soft_scene(make_scene, mode)
     leaves = [getattr(gaussians, name) for name in FIELDS]
@@ -69,15 +62,15 @@ def test_case_25_every_gradient_equals_finite_differences(make_scene, mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_case_25_every_gradient_equals_that_of_the_reference(fast_backend, make_scene, mode):
+def test_every_gradient_equals_that_of_the_reference(fast_backend, make_scene, mode):
     mode = MODES[mode]
     gaussians, cameras = soft_scene(make_scene, mode, torch.float32)
     result = both_ways(fast_backend, gaussians, cameras, **mode.options)
     assert_close(fast_backend, result, both_ways(EXACT, gaussians, cameras, **mode.options))
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1e-3, 1e-2, 0.1], ids="{:g} pixels".format)
-def test_case_04_the_floor_of_the_compensation(backend, make_scene, scale):
+@pytest.mark.parametrize("scale", [1e-4, 0.1], ids="{:g} pixels".format)
+def test_the_floor_of_the_compensation(backend, make_scene, scale):
     """Under it the opacity stays at the floor, and scales move nothing but the ellipse."""
     gaussians, cameras = make_scene(count=1, dtype=torch.float32)
     gaussians.means[:] = torch.tensor([0.0, 0, 2])

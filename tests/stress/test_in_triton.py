@@ -1,4 +1,4 @@
-"""Run tests of "cuda" again, in processes in which Triton interprets its kernels on a CPU.
+"""Run tests of "cuda" again, in a process in which Triton interprets its kernels on a CPU.
 
 The interpreter is slow, so of the stress cases these are some of each kind. All of them:
 TRITON_INTERPRET=1 pytest tests/stress
@@ -11,43 +11,44 @@ import sys
 import pytest
 from backends import INTERPRETED
 
+# Small cases of each kernel: the renderer's, those of both scans and those of the plane sweep.
+KERNELS = ("rendering/test_cuda.py", "ops/test_cuda_scans.py", "ops/test_plane_sweep.py")
+LARGE = "blobs or wide or mixed or huge_step"
 # The cases of each file here, as an expression of pytest's -k.
-SOME = {
-    "bad_input": "",
-    "boundary_band": "random and depth",
-    "culled": "case_06 and inf and True or case_09 and quaternion or case_14 and median"
-    " or case_32 and (NaN and not sh or opacities and near or means and 1e38)",
-    "extents": "not case_08",
+STRESS = {
+    "boundary_band": "depth",
+    "culled": "reason and True or length or nothing and median or poison",
+    "extents": "not alpha",
     "gradchecks": "",
-    "memory_and_types": "strided or bfloat16-None",
-    "needles": "1e6",
+    "memory_and_types": "strided or bfloat16",
+    "needles": "needles",
     "opacities": "not gsplat",
-    "places": "not case_12 and not case_13 or 1e+06 or 0.01",
+    "places": "",
     "properties": "cropping",
-    "sizes": "case_15 and not 4096",
+    "sizes": "odd and not 4096",
     "threads_and_order": "equal_depths",
 }
-CASES = [f"test_{name}.py and ({SOME[name] or 'test'})" for name in SOME]
-# Each in a process, of a minute at most.
-RUNS = [
-    ("stress", " or ".join(CASES[:3])),
-    ("stress", " or ".join(CASES[3:])),
-    ("rendering/test_cuda.py", "test"),
-    ("ops/test_cuda_scans.py", "test"),
-    ("ops/test_plane_sweep.py", "cuda"),
-]
+CASES = " or ".join(f"test_{name}.py and ({STRESS[name] or 'test'})" for name in STRESS)
 
 
 @pytest.mark.medium
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
-@pytest.mark.parametrize("path, cases", RUNS)
-def test_cases_in_the_interpreter(repository, path, cases):
+@pytest.mark.parametrize(
+    "paths, cases",
+    [
+        pytest.param(KERNELS, f"cuda and not ({LARGE})", id="every kernel"),
+        pytest.param(KERNELS, f"cuda and ({LARGE})", marks=pytest.mark.slow, id="large"),
+        pytest.param(("stress",), CASES, marks=pytest.mark.slow, id="stress"),
+    ],
+)
+def test_cases_in_the_interpreter(repository, paths, cases):
     pytest.importorskip("triton")
-    command = ["-m", "pytest", "-p", "no:cacheprovider", str(repository / "tests" / path)]
+    files = [str(repository / "tests" / path) for path in paths]
     done = subprocess.run(
-        [sys.executable, *command, "-k", cases],
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *files, "-k", cases],
         env={**os.environ, "TRITON_INTERPRET": "1"},
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stdout
+    assert " passed" in done.stdout or "[100%]" in done.stdout

@@ -48,13 +48,7 @@ def one_each(longest: float, offset: float) -> tuple[Gaussians, Cameras]:
 
 
 @pytest.mark.parametrize(
-    "longest, offset",
-    [
-        pytest.param(1e3, 0.0, id="needles"),
-        pytest.param(0.0, 1e4, id="offset 1e4"),
-        pytest.param(0.0, 1e6, id="offset 1e6"),
-        pytest.param(1e3, 1e6, id="needles at 1e6"),
-    ],
+    "longest, offset", [(1e3, 0.0), (0.0, 1e4), (1e3, 1e6)], ids=["needles", "far", "far needles"]
 )
 def test_alpha_is_40_times_nearer_than_by_the_textbook(fast_backend, longest, offset):
     gaussians, cameras = one_each(longest, offset)
@@ -69,5 +63,4 @@ def test_alpha_is_40_times_nearer_than_by_the_textbook(fast_backend, longest, of
         float(torch.quantile((value.double() - exact).abs()[seen], 0.99))
         for value in (alpha, naive)
     )
-    print(f"\n{fast_backend}: alpha error at p99 {ours:.1e}, textbook {theirs:.1e}")
     assert ours * 40 <= theirs

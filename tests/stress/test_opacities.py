@@ -1,4 +1,4 @@
-"""Opacities at and beyond the cut-offs: cases 20 to 23."""
+"""Opacities at the cut-offs."""
 
 import math
 from dataclasses import replace
@@ -8,8 +8,7 @@ import torch
 from backends import EXACT, assert_close, both_ways, random_gradient
 
 from asysplat.benchmark.scenes import random_scene
-from asysplat.errors import InputError
-from asysplat.rendering import CONVENTIONS, INRIA, render
+from asysplat.rendering import CONVENTIONS, INRIA
 from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Cameras, Gaussians
 
@@ -32,9 +31,8 @@ def stack(opacities, dtype=torch.float32):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("opacity", [0.9, 0.985, 1.0])
-@pytest.mark.parametrize("count", [2, 50])
-def test_case_20_stacks_of_opaque_splats(backend, count, opacity, convention):
+@pytest.mark.parametrize("count, opacity", [(2, 1.0), (50, 0.9), (50, 1.0)])
+def test_stacks_of_opaque_splats(backend, count, opacity, convention):
     """1 / (1 - alpha) does not blow up, and what lies behind the stop has no gradient."""
     gaussians, cameras = stack([opacity] * count)
     convention = CONVENTIONS[convention]
@@ -55,7 +53,7 @@ def test_case_20_stacks_of_opaque_splats(backend, count, opacity, convention):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_case_21_a_single_opaque_gaussian_is_drawn(backend, convention):
+def test_a_single_opaque_gaussian_is_drawn(backend, convention):
     gaussians, cameras = stack([1.0])
     convention = CONVENTIONS[convention]
     result = both_ways(backend, gaussians, cameras, convention=convention)
@@ -66,14 +64,7 @@ def test_case_21_a_single_opaque_gaussian_is_drawn(backend, convention):
     assert (result.grads["sh"] != 0).all() and (result.grads["means"] != 0).any()
 
 
-@pytest.mark.parametrize("opacity", [1.0 + 1e-6, 1.5, 0.0, -0.5])
-def test_case_22_opacities_out_of_range_are_refused(backend, opacity):
-    gaussians, cameras = stack([0.5, opacity, 0.5])
-    with pytest.raises(InputError, match=r"opacities\[1\] lies outside \(0, 1\]"):
-        render(gaussians, cameras, backend=backend.name, validate=True)
-
-
-def test_case_22_opacity_at_the_cut_off_is_exact(backend):
+def test_opacity_at_the_cut_off_is_exact(backend):
     """At 1/255 one pixel shows, at the next number below it none."""
     row, column = CENTER
     at = torch.tensor(INRIA.alpha_min, dtype=backend.dtype)
@@ -88,7 +79,7 @@ def test_case_22_opacity_at_the_cut_off_is_exact(backend):
         assert (result.grads["opacities"] != 0).sum() == pixels
 
 
-def test_case_23_both_passes_take_identical_decisions(backend):
+def test_both_passes_take_identical_decisions(backend):
     """Where colors are not clamped, an image is linear in them: gradient times colors is gradient
     times image. A pixel that one pass draws and the other does not adds more than 1/255 to the
     difference."""

@@ -1,4 +1,4 @@
-"""Gaussians at the camera, at its near plane and far from the origin: cases 10 to 13."""
+"""Gaussians at the camera, at its near plane and far from the origin."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from asysplat.rendering import INRIA
 from asysplat.rendering.sh import sh_basis
 
 
-def test_case_10_no_direction_shows_the_dc_color(backend, make_scene):
+def test_no_direction_shows_the_dc_color(backend, make_scene):
     """At 1e-12 from the camera's center its direction is lost; near is 0, or it were culled."""
     gaussians, cameras = make_scene(count=1, degree=3, dtype=torch.float32)
     cameras = facing(cameras)
@@ -26,9 +26,8 @@ def test_case_10_no_direction_shows_the_dc_color(backend, make_scene):
     assert_close(backend, result, exact, names=("opacities", "sh"))
 
 
-@pytest.mark.parametrize("aside", [0.01, 1.0, 100.0], ids="x = {:g}".format)
-@pytest.mark.parametrize("scale", [1e-3, 1.0], ids="scale {:g}".format)
-def test_case_11_just_past_the_near_plane(backend, make_scene, aside, scale):
+@pytest.mark.parametrize("aside, scale", [(0.01, 1.0), (1.0, 1.0), (100.0, 1e-3)])
+def test_just_past_the_near_plane(backend, make_scene, aside, scale):
     gaussians, cameras = make_scene(dtype=torch.float32)
     gaussians.means[0] = torch.tensor([aside, -0.5 * aside, INRIA.near * 1.001])
     gaussians.scales[0] = scale
@@ -37,8 +36,7 @@ def test_case_11_just_past_the_near_plane(backend, make_scene, aside, scale):
     assert_close(backend, result, both_ways(EXACT, gaussians, facing(cameras)), slack=5)
 
 
-@pytest.mark.parametrize("offset", [1e5, 1e6, 1e7], ids="{:.0e}".format)
-def test_case_12_far_from_the_origin(backend, make_scene, offset):
+def test_far_from_the_origin_no_bit_changes(backend, make_scene):
     """On whole numbers, which float32 holds at 1e7 too: the scene is the same, and so is every bit
     of the images and of the gradients."""
     gaussians, cameras = make_scene(count=40, views=2, dtype=torch.float32)
@@ -46,15 +44,15 @@ def test_case_12_far_from_the_origin(backend, make_scene, offset):
     gaussians.means.round_()
     cameras.cam_to_world[..., :3, 3].mul_(64).round_()
     near = both_ways(backend, gaussians, cameras)
-    gaussians.means.add_(offset)
-    cameras.cam_to_world[..., :3, 3].add_(offset)
+    gaussians.means.add_(1e7)
+    cameras.cam_to_world[..., :3, 3].add_(1e7)
     far = both_ways(backend, gaussians, cameras)
     assert (near.alpha > 0.3).any()
     assert_same_bits(far, near)
 
 
-@pytest.mark.parametrize("factor", [1e-4, 1e-2, 8.0, 1e4], ids="{:g}".format)
-def test_case_13_the_unit_of_length_does_not_matter(backend, make_scene, factor):
+@pytest.mark.parametrize("factor", [1e-4, 1e4])
+def test_the_unit_of_length_does_not_matter(backend, make_scene, factor):
     gaussians, cameras = make_scene(views=2)
     before = both_ways(backend, gaussians, cameras, depth=False)
     cameras.cam_to_world[:, :3, 3] *= factor
@@ -63,7 +61,7 @@ def test_case_13_the_unit_of_length_does_not_matter(backend, make_scene, factor)
         backend, gaussians.scale_by(factor), cameras, depth=False, convention=convention
     )
     torch.testing.assert_close(after.image, before.image, rtol=0, atol=1e-6)
-    for name in ("quats", "opacities", "sh", "intrinsics", "background"):
-        assert relative_error(after.grads[name], before.grads[name]) <= 1e-5, name
-    for name in ("means", "scales"):
-        assert relative_error(factor * after.grads[name], before.grads[name]) <= 1e-5, name
+    for name, grad in before.grads.items():
+        if name != "cam_to_world":
+            own = after.grads[name] * (factor if name in ("means", "scales") else 1)
+            assert relative_error(own, grad) <= 1e-5, name
