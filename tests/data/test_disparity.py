@@ -150,7 +150,7 @@ def test_training_reads_the_maps(command, scene, tmp_path):
     every_second = (..., slice(None, None, 2), slice(None, None, 2))
     found, expected = depth[every_second], targets.disparities[every_second]
     distance = disparity_distance(found, expected, torch.ones_like(found, dtype=torch.bool))
-    ones = torch.ones(1, 4)
+    ones = torch.ones(2 * 8 * 8, 4)  # every second pixel of two inputs
     gaussians = Gaussians(ones[:, :3], ones, ones[:, :3], ones[:, 0], ones[:, None, :3])
     torch.testing.assert_close(
         RenderedDisparity()(Prediction(gaussians, rendering), batch), distance

@@ -108,14 +108,19 @@ def change(file, **tensors):
         ({"sh": torch.zeros(12, 5, 3)}, r"Gaussians\.sh has 5 coefficients"),
         ({"means": torch.full((12, 3), torch.nan)}, r"Gaussians\.means\[0\] holds NaN"),
         ({"opacities": torch.full((12,), 2.0)}, r"Gaussians\.opacities\[0\] lies outside"),
-        ({"opacities": torch.zeros(0)}, r"has opacities of shape .*\[N\]"),
-        ({"opacities": torch.ones(2, 12)}, r"has opacities of shape .*\[N\]"),
     ],
 )
 def test_safetensors_that_hold_no_scene_are_refused(written, tensors, message):
     change(written, **tensors)
     with pytest.raises(InputError, match=rf"scene\.safetensors.*{message}"):
         read_safetensors(written)
+
+
+def test_safetensors_of_none_or_of_several_scenes_are_refused(written, scene):
+    for bad in (scene.keep(scene.opacities > 2), scene.stack([scene, scene])):
+        change(written, **{f.name: getattr(bad, f.name) for f in fields(Gaussians)})
+        with pytest.raises(InputError, match=r"scene\.safetensors has opacities of shape .*\[N\]"):
+            read_safetensors(written)
 
 
 def test_safetensors_that_are_cut_off_are_refused(written):

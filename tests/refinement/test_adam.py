@@ -40,17 +40,11 @@ def assert_same(one, other):
         assert torch.equal(tensor, other[name]), name
 
 
-def torchs_adam(parameters, rates, **options):
+def torchs_adam(parameters, **options):
     """In float64, on copies of the parameters, which it also returns."""
     copies = {name: t.detach().double().clone().requires_grad_() for name, t in parameters.items()}
-    groups = [{"params": [copies[name]], "lr": rate} for name, rate in rates.items()]
+    groups = [{"params": [copies[name]], "lr": rate} for name, rate in RATES.items()]
     return torch.optim.Adam(groups, **{"eps": 1e-15, **options}), copies
-
-
-def torchs_step(adam, copies, gradients, rows=slice(None)):
-    for name, tensor in copies.items():
-        tensor.grad = gradients[name][rows].double()
-    adam.step()
 
 
 def run_steps(optimizer, steps=5, dtype=torch.float32):
@@ -60,10 +54,16 @@ def run_steps(optimizer, steps=5, dtype=torch.float32):
         optimizer.step(random_gradients(optimizer.num_rows, dtype), RATES, seen)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("runs", [False, True])
-@pytest.mark.parametrize("options", [{}, {"betas": (0.0, 0.5), "eps": 1e-3}], ids=str)
-def test_each_row_as_with_its_own_adam_of_torch(dtype, runs, options):
+@pytest.mark.parametrize(
+    "dtype, runs, options",
+    [
+        (torch.float32, False, {}),
+        (torch.float32, True, {"betas": (0.0, 0.5), "eps": 1e-3}),
+        (torch.float64, False, {"betas": (0.0, 0.5), "eps": 1e-3}),
+    ],
+    ids=str,
+)
+def test_each_row_moves_as_with_its_own_adam_of_torch(dtype, runs, options):
     """Each group of rows has its own times; there may be whole vectors and blocks of a group."""
     ours = VisibleAdam(normal(dtype=dtype), **options)
     groups = torch.arange(NUM) * 4 // NUM if runs else torch.randint(4, (NUM,))
@@ -71,14 +71,16 @@ def test_each_row_as_with_its_own_adam_of_torch(dtype, runs, options):
     theirs = {}
     for group in range(3):  # the last is never seen
         rows = {name: tensor[groups == group] for name, tensor in ours.parameters.items()}
-        theirs[group] = torchs_adam(rows, RATES, **options)
-    for step in range(50):
+        theirs[group] = torchs_adam(rows, **options)
+    for step in range(30):
         gradients = random_gradients(dtype=dtype)
         seen = torch.zeros(NUM, dtype=torch.bool)
         for group, (adam, copies) in theirs.items():
             if step % (3 * group + 1) == 0:
                 seen |= groups == group
-                torchs_step(adam, copies, gradients, groups == group)
+                for name, tensor in copies.items():
+                    tensor.grad = gradients[name][groups == group].double()
+                adam.step()
         for name, gradient in gradients.items():
             gradient[~seen] = torch.nan  # is not looked at
             assert gradient.shape == ours.parameters[name].shape
@@ -96,9 +98,9 @@ def test_each_row_as_with_its_own_adam_of_torch(dtype, runs, options):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_rows_with_a_non_finite_gradient_are_not_updated(dtype):
-    ours, clean = (VisibleAdam(normal(dtype=dtype)) for _ in range(2))
-    for name, tensor in clean.parameters.items():
-        tensor.copy_(ours.parameters[name])
+    begin = normal(dtype=dtype)
+    ours = VisibleAdam({name: tensor.clone() for name, tensor in begin.items()})
+    clean = VisibleAdam(begin)
     gradients, seen = random_gradients(dtype=dtype), torch.rand(NUM) < 0.5
     seen[[0, 17, 18, NUM - 1]] = True
     seen[40] = False
@@ -203,7 +205,7 @@ def test_rows_are_kept_copied_and_appended(dtype):
     assert optimizer.num_rows == 0
 
 
-def test_mistakes_are_named():
+def test_gradients_that_are_missing_or_of_another_shape_change_nothing():
     optimizer = VisibleAdam(normal(4))
     before, visible = everything(optimizer), torch.ones(4, dtype=torch.bool)
     for sentence, gradients in {

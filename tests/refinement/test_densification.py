@@ -16,7 +16,6 @@ from asysplat.refinement.densification.clone_split import (
 from asysplat.refinement.densification.relocate import (
     MAX_COPIES,
     NOISE,
-    REGULARIZER,
     inject_position_noise,
     mcmc_regularizer,
     relocate,
@@ -57,7 +56,7 @@ def wrong_in(views, view, rows, columns):
     return rendered
 
 
-def test_position_color_and_size(small_room):
+def test_spawned_gaussians_have_position_color_and_size_of_wrong_pixels(small_room):
     rows, columns = slice(10, 14), slice(20, 28)
     rendered = wrong_in(small_room, 2, rows, columns)
     found = spawn_at_errors(small_room, rendered, small_room.depths, 40, generator()).validate()
@@ -79,7 +78,7 @@ def test_position_color_and_size(small_room):
     assert len(torch.unique(row * 32 + column)) == 40  # each pixel once
 
 
-def test_samples_are_proportional_to_errors(small_room):
+def test_spawning_samples_pixels_in_proportion_to_their_errors(small_room):
     rendered = small_room.images.clone()
     rendered[0, :, :, :16] += 0.3
     rendered[0, :, :, 16:] += 0.1
@@ -94,7 +93,7 @@ def test_samples_are_proportional_to_errors(small_room):
     assert abs(left.float().mean().item() - 3 / 7) <= 0.06
 
 
-def test_none_without_an_error_or_at_the_background(small_room):
+def test_nothing_is_spawned_without_an_error_or_at_the_background(small_room):
     images, depths = small_room.images, small_room.depths
     rendered, none = wrong_in(small_room, 1, slice(4, 6), slice(4, 6)), torch.zeros_like(depths)
     below = depths.clone()
@@ -109,7 +108,7 @@ def test_none_without_an_error_or_at_the_background(small_room):
         assert found.num_gaussians == count and found.sh.shape == (count, 1, 3)
 
 
-def test_masked_pixels_are_not_sampled(small_room):
+def test_nothing_is_spawned_at_masked_pixels(small_room):
     masks = torch.ones_like(small_room.depths, dtype=torch.bool)
     masks[:, :, 8:] = False
     views = replace(small_room, masks=masks)
@@ -120,7 +119,7 @@ def test_masked_pixels_are_not_sampled(small_room):
     assert not spawn_at_errors(nothing, rendered, small_room.depths, 9, generator()).num_gaussians
 
 
-def test_the_same_generator_draws_the_same(small_room, threads):
+def test_spawning_repeats_for_a_generator_on_any_number_of_threads(small_room, threads):
     views = Views(small_room.cameras.resized(150, 200), torch.rand(4, 3, 150, 200))
     found = []
     for count, seed in ((1, 0), (2, 0), (1, 1)):
@@ -146,8 +145,8 @@ def double_sum(opacity, count):
     return opacity / total
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 10, MAX_COPIES])
-def test_any_number_of_copies_as_in_equation_9(count):
+@pytest.mark.parametrize("count", [1, 2, MAX_COPIES])
+def test_opacities_and_scales_of_copies_follow_equation_9(count):
     opacities, scales = torch.linspace(0.3, 0.99, 7), torch.rand(7, 3)
     found, sizes = split_opacity_and_scale(opacities, scales, torch.full((7,), count))
     exact = (1 - (1 - opacities.double()) ** (1 / count)).float().clamp_min(MIN_OPACITY)
@@ -156,16 +155,16 @@ def test_any_number_of_copies_as_in_equation_9(count):
     torch.testing.assert_close(sizes, scales * factors[:, None], rtol=1e-4, atol=0)
     if count == 1:
         torch.testing.assert_close((found, sizes), (opacities, scales))
-    # More than MAX_COPIES count as that many.
-    one = torch.tensor([0.9, 1.0]), torch.ones(2, 3)
-    most = split_opacity_and_scale(*one, torch.full((2,), MAX_COPIES))
-    more = split_opacity_and_scale(*one, torch.full((2,), 1000))
-    assert torch.equal(more[0], most[0]) and torch.equal(more[1], most[1])
-    assert more[0].isfinite().all() and (more[1] > 0).all() and more[1].isfinite().all()
+    if count == MAX_COPIES:  # more count as that many
+        opacities[0] = 1.0
+        most = split_opacity_and_scale(opacities, scales, torch.full((7,), count))
+        more = split_opacity_and_scale(opacities, scales, torch.full((7,), 1000))
+        assert torch.equal(more[0], most[0]) and torch.equal(more[1], most[1])
+        assert more[0].isfinite().all() and (more[1] > 0).all() and more[1].isfinite().all()
 
 
 @pytest.mark.parametrize("dead", [1, 40])
-def test_the_image_stays_when_dead_gaussians_move(scene, dead):
+def test_the_image_stays_where_dead_gaussians_move(scene, dead):
     gaussians, cameras = scene
     gaussians.opacities[:dead] = MIN_OPACITY / 2
     fields = fields_of(gaussians)
@@ -240,7 +239,7 @@ def test_live_gaussians_are_sampled_by_opacity():
     assert abs(share - (0.75 * 2000 + 50) / 2100) <= 0.03
 
 
-def test_without_live_gaussians_all_stay():
+def test_relocation_without_live_gaussians_moves_none():
     start, faint = torch.rand(6, 3), torch.full((6,), 1e-6)
     start = isotropic_gaussians(start, torch.ones(6), faint, torch.rand(6, 3))
     fields = fields_of(start)
@@ -284,14 +283,11 @@ def test_noise_moves_only_means_of_faint_gaussians(scene):
     assert torch.equal(fields.gaussians().means, after.means)
 
 
-def test_the_regularizer_is_of_the_mean_opacity_and_scale(scene):
-    gaussians = scene[0].map(lambda field: field.requires_grad_())
-    value = mcmc_regularizer(gaussians)
-    value.backward()
-    expected = REGULARIZER * (gaussians.opacities.mean() + gaussians.scales.mean())
-    torch.testing.assert_close(value, expected)
-    torch.testing.assert_close(gaussians.opacities.grad, torch.full((80,), REGULARIZER / 80))
-    torch.testing.assert_close(gaussians.scales.grad, torch.full((80, 3), REGULARIZER / 240))
+def test_the_mcmc_regularizer_is_a_hundredth_of_mean_opacity_and_scale():
+    two = isotropic_gaussians(
+        torch.zeros(2, 3), torch.tensor([1.0, 2.0]), torch.tensor([0.2, 0.6]), torch.rand(2, 3)
+    )
+    assert mcmc_regularizer(two).item() == pytest.approx(0.01 * (0.4 + 1.5))
 
 
 def camera():
@@ -363,7 +359,7 @@ def test_large_gaussians_are_split_in_two_smaller_ones():
     assert 0.8 < away.std() / (2 * SPLIT_SCALE) < 1.2
 
 
-def test_the_limit_and_the_largest_gradients_first():
+def test_cloning_stops_at_the_limit_and_takes_the_largest_gradients_first():
     fields = fields_of(gaussians())
     before = fields.gaussians()
     with_gradients(fields, 4, 2, 0).clone_and_split(7, generator())

@@ -55,7 +55,7 @@ def test_gaussians_of_a_prior_are_at_the_surface_points(small_room):
 
 
 @pytest.mark.parametrize("size", [(4, 5), (3, 7), (8, 10), (20, 11), (1, 1)], ids=str)
-def test_a_prior_of_any_size(size):
+def test_a_prior_of_any_size_gives_a_gaussian_a_pixel_in_the_images_colors(size):
     """Of fewer pixels than the photographs, of more, and of such as do not divide them."""
     views = front_views(height=8, width=10)
     distance = torch.full((1, 1, *size), 2.0)
@@ -72,7 +72,7 @@ def test_a_prior_of_any_size(size):
     )
 
 
-def test_masked_pixels_get_no_gaussian():
+def test_masked_pixels_of_a_prior_give_no_gaussian():
     views = front_views(height=8, width=10)
     masks = torch.ones(1, 8, 10, dtype=torch.bool)
     masks[0, 0, 0] = False  # a quarter of the first block
@@ -81,10 +81,9 @@ def test_masked_pixels_get_no_gaussian():
     prior = Prior(distance, distance, distance / 4)
     every = gaussians_from_prior(views, prior)
     some = gaussians_from_prior(replace(views, masks=masks), prior)
-    expected = every.keep(
-        torch.tensor([i not in (0, 11, 12, 13, 14, 16, 17, 18, 19) for i in range(20)])
-    )
-    assert torch.equal(some.means, expected.means) and torch.equal(some.sh, expected.sh)
+    rows = torch.ones(4, 5, dtype=torch.bool)
+    rows[0, 0] = rows[2, 1:] = rows[3, 1:] = False
+    assert_equal(some, every.keep(rows.flatten()))
     none = gaussians_from_prior(replace(views, masks=torch.zeros_like(masks)), prior)
     assert torch.equal(none.means, every.means)
 
@@ -103,8 +102,8 @@ def test_footprints_are_the_smallest_over_visible_views():
     assert (found > 0).all() and (found < 1e-30).all()
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_invariance_to_the_scene_unit(scale):
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_gaussians_from_points_scale_with_the_scene_unit(scale):
     places = [(0.0, 0, 0), (0.5, 0.1, 0)]
     torch.manual_seed(3)
     views, plain = front_views(places, scale=scale), front_views(places)
@@ -141,7 +140,7 @@ def test_invalid_points_are_refused():
             gaussians_from_points(points, front_views())
 
 
-def test_colors_are_the_mean_of_unmasked_pixels():
+def test_sampled_colors_are_the_mean_of_unmasked_pixels():
     views = front_views(places=[(0.0, 0, 0), (1.0, 0, 0)])
     points = torch.tensor([[0.5, 0.1, 2.0], [-1.9, -1.5, 2.0], [0.0, 0, -1]])
     # In the first view (6.25, 4.25) and (0.25, 0.25); in the second (3.75, 4.25) and outside.
@@ -176,7 +175,7 @@ def assert_equal(one, other):
     assert all(torch.equal(getattr(one, name), getattr(other, name)) for name in fields)
 
 
-def test_means_are_weighted_by_opacity():
+def test_merged_means_and_colors_are_weighted_by_opacity():
     means = torch.tensor([[0.0, 0, 0], [0.1, 0.2, 0.3]])
     sizes, opacities = torch.tensor([2.0, 8.0]), torch.tensor([0.6, 0.2])
     both = isotropic_gaussians(means, sizes, opacities, torch.eye(3)[:2])
@@ -194,20 +193,19 @@ def test_merged_gaussians_cover_their_cell():
     torch.testing.assert_close(one.scales, torch.full((1, 3), SPREAD * 1.1))
 
 
-@pytest.mark.parametrize("opacity", [1e-30, 1e-8, 0.01, 0.9, 1.0])
-def test_opacities_keep_a_gradient(opacity):
+@pytest.mark.parametrize("opacity", [1e-30, 0.01, 1.0])
+def test_merged_opacities_keep_a_gradient(opacity):
     few = repeated(some(1), 3)
     few.opacities[:] = opacity
     one = merge_cells(few, torch.full((3,), 0.01)).validate()
-    exact = 1 - (1 - opacity) ** 3
-    expected = min(max(exact, MIN_OPACITY), MAX_OPACITY)
+    expected = min(max(1 - (1 - opacity) ** 3, MIN_OPACITY), MAX_OPACITY)
     torch.testing.assert_close(one.opacities, torch.tensor([expected]))
     for name in ("means", "quats", "scales", "sh"):
         torch.testing.assert_close(getattr(one, name), getattr(few, name)[:1])
 
 
-@pytest.mark.parametrize("angle", [0.0, 3.1415, 3.1416, 3.2, 6.28], ids=str)
-def test_the_mean_of_similar_rotations(angle):
+@pytest.mark.parametrize("angle", [0.0, 3.1415, 3.1416, 6.28], ids=str)
+def test_merging_similar_rotations_takes_their_mean(angle):
     """Half a turn has w = 0, on both sides of which w changes its sign; q and -q are one turn."""
     angles = torch.tensor([angle - 0.01, angle, angle + 0.01])
     both = repeated(some(1), 3)
@@ -230,7 +228,7 @@ def test_cells_are_powers_of_2_and_tile_the_space():
     assert sorted(mixed.means[:, 0].tolist()) == [1, 2.5, 3.5, 5, 6.5, 7.5]
 
 
-def test_invariance_to_translation_and_order():
+def test_merging_does_not_depend_on_translation_and_order():
     gaussians, cells, order = some(300), torch.rand(300) + 0.1, torch.randperm(300)
     gaussians.means[:] = (gaussians.means * 1024).round() / 1024  # so that the sum is exact
     expected = merge_cells(gaussians, cells)
@@ -251,19 +249,19 @@ def test_cell_ids_do_not_overflow():
     assert merge_cells(few, torch.tensor([1e-37, 1e-37, 1.0, 1.0])).num_gaussians == 3
 
 
-@pytest.mark.parametrize("most", [1, 2, 7, 50, 199, 200, 1000])
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_the_limit(most, scale):
+def test_merging_ends_just_below_the_limit_and_inside_the_scene(scale):
     gaussians = some(200, scale)
-    few = merge_to_limit(gaussians, camera(), 1e-3, most).validate()
-    assert few.num_gaussians <= most
-    assert few.num_gaussians >= min(most, 200) // 5
-    assert few.num_gaussians == 200 or most < 200
     low, high = gaussians.means.amin(0), gaussians.means.amax(0)
-    assert ((few.means >= low - 1e-5 * scale) & (few.means <= high + 1e-5 * scale)).all()
+    for most in (1, 2, 50, 199, 200, 1000):
+        few = merge_to_limit(gaussians, camera(), 1e-3, most).validate()
+        assert min(most, 200) // 5 <= few.num_gaussians <= most, most
+        assert few.num_gaussians == 200 or most < 200, most
+        inside = (few.means >= low - 1e-5 * scale) & (few.means <= high + 1e-5 * scale)
+        assert inside.all(), most
 
 
-def test_the_size_of_cells_below_the_limit():
+def test_cells_below_the_limit_have_the_pixels_that_are_asked_for():
     gaussians = some(400)
     merged = [merge_to_limit(gaussians, camera(), pixels, 400) for pixels in (0.1, 2.0, 8.0, 64.0)]
     counts = [each.num_gaussians for each in merged]
@@ -273,7 +271,7 @@ def test_the_size_of_cells_below_the_limit():
     assert_equal(merged[2], expected)
 
 
-@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("count", [1, 5])
 def test_equal_positions_merge_to_one(count):
     alike = repeated(some(1), count)
     assert merge_to_limit(alike, camera(), 1.0, 1).validate().num_gaussians == 1
@@ -281,16 +279,17 @@ def test_equal_positions_merge_to_one(count):
     assert merge_to_limit(alike, camera(), 1.0, 1).validate().num_gaussians == 1
 
 
-def test_the_same_bits_again(threads):
+def test_merging_gives_the_same_bits_on_any_number_of_threads(threads):
     gaussians = some(40_000)
-    threads(1)
-    first = merge_to_limit(gaussians, camera(), 1.0, 5000)
-    for _ in range(2):
-        threads(2)
-        assert_equal(merge_to_limit(gaussians, camera(), 1.0, 5000), first)
+    found = []
+    for count in (1, 2, 2):
+        threads(count)
+        found.append(merge_to_limit(gaussians, camera(), 1.0, 5000))
+    assert_equal(found[1], found[0])
+    assert_equal(found[2], found[0])
 
 
-def test_nan_is_refused():
+def test_merging_refuses_nan():
     gaussians = some(5)
     gaussians.means[3, 1] = torch.nan
     with pytest.raises(InputError, match=r"merge_to_limit's gaussians.means\[3\] holds NaN"):

@@ -55,31 +55,34 @@ def damage(image) -> None:
     image.write_bytes(data)
 
 
-def test_a_good_scene_fits_one_screen(check, scene, tmp_path):
+@pytest.fixture
+def no_figure(monkeypatch):
+    """Figures take longer than all else."""
+    monkeypatch.setattr("asysplat.data.check.__main__.save_figure", lambda *_: "check.png")
+
+
+def test_the_report_of_a_good_scene_fits_one_screen_and_overwrites_nothing(check, scene, tmp_path):
+    folder = tmp_path / "elsewhere/walk"
+    folder.mkdir(parents=True)
+    (folder / "check.png").write_text("mine")
     before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
-    code, out, err = check(scene)
+    code, out, err = check(scene, "--out", tmp_path / "elsewhere")
     assert code == 0 and not err
     assert len(out.splitlines()) < 24
     for text in (
         *("walk, layout transforms", f"{COUNT} of {WIDTH} x {HEIGHT}", "known at 100.0%"),
         *("The cameras fit the images.", "masks           none", "points          none"),
+        "elsewhere/walk/check-2.png",
     ):
         assert text in out
     assert {path: path.stat().st_mtime_ns for path in scene.rglob("*")} == before
-    with Image.open(tmp_path / "check/walk/check.png") as figure:
+    assert (folder / "check.png").read_text() == "mine"
+    assert sorted(path.name for path in folder.iterdir()) == ["check-2.png", "check.png"]
+    with Image.open(folder / "check-2.png") as figure:
         assert min(figure.size) > 500 and len(figure.getcolors(2**20)) > 1000
 
 
-def test_nothing_is_overwritten(check, scene, tmp_path):
-    folder = tmp_path / "elsewhere/walk"
-    folder.mkdir(parents=True)
-    (folder / "check.png").write_text("mine")
-    code, out, _ = check(scene, "--out", tmp_path / "elsewhere")
-    assert code == 0 and "elsewhere/walk/check-2.png" in out
-    assert (folder / "check.png").read_text() == "mine"
-    assert sorted(path.name for path in folder.iterdir()) == ["check-2.png", "check.png"]
-
-
+@pytest.mark.usefixtures("no_figure")
 def test_a_mistake_exits_with_1_and_its_fix(check, scene):
     def unflip(content):
         for frame in content["frames"]:
@@ -92,7 +95,8 @@ def test_a_mistake_exits_with_1_and_its_fix(check, scene):
     assert "OpenGL axes were taken for OpenCV's" in out and "right, up, backward" in out
 
 
-def test_all_damaged_files_are_listed(check, scene):
+@pytest.mark.usefixtures("no_figure")
+def test_all_damaged_files_and_a_wrong_depth_unit_are_reported(check, scene):
     damage(scene / "images/00003.png")
     damage(scene / "images/00007.png")
     (scene / "images/00009.png").unlink()
@@ -100,48 +104,32 @@ def test_all_damaged_files_are_listed(check, scene):
     assert code == 2 and "Traceback" not in err
     assert err.startswith("error: walk: 3 of 12 images cannot be used")
     assert all(name in err for name in ("00003.png", "00007.png", "00009.png"))
+    edit(scene, lambda content: content.update(depth_unit_scale_factor=0.01))
     code, out, err = check(scene, "--on-bad-image", "skip")
     assert code == 0 and out.count("left out") == 3
     assert all(name in out for name in ("00003.png", "00007.png", "00009.png"))
-    assert "images          9 " in out
+    assert "images          9 " in out and "divide the unit of depth by 9.9" in out
 
 
-def test_a_wrong_depth_unit_is_reported(check, scene):
-    edit(scene, lambda content: content.update(depth_unit_scale_factor=0.01))
-    code, out, _ = check(scene)
-    assert code == 0 and "divide the unit of depth by 9.9" in out
-
-
-def blank(scene) -> None:
+def test_the_first_of_many_scenes_are_checked_also_without_a_point_to_match(check, scene):
     for image in (scene / "images").iterdir():
         Image.new("RGB", (WIDTH, HEIGHT), (90, 90, 90)).save(image)
-
-
-def test_images_without_a_point_to_match(check, scene):
-    blank(scene)
-    code, out, _ = check(scene)
-    assert code == 1 and "Only 0 points were matched" in out
-    assert "11 with the same file as another" in out
-
-
-def test_the_first_of_many_scenes(check, scene):
-    blank(scene)
     for name in "bcde":
         shutil.copytree(scene, scene.parent / name)
-    _, out, _ = check(scene.parent)
+    code, out, _ = check(scene.parent)
+    assert code == 1 and "Only 0 points were matched" in out
+    assert "11 with the same file as another" in out
     assert "checking 3 of 5 scenes; name one of them to check another" in out
     assert [name for name in "bcde" if f"{name}, layout" in out] == ["b", "c", "d"]
 
 
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
+@pytest.mark.usefixtures("scene")
+def test_errors_of_the_check_are_one_line(check):
+    for arguments, message in (
         (("nowhere",), "nowhere does not exist"),
         (("data/walk", "--out", "data/walk/check"), "lies in the data set"),
         (("data", "--layout", "transforms", "--out", "data"), "lies in the data set"),
-    ],
-)
-def test_errors_are_one_line(check, scene, arguments, message):
-    code, _, err = check(*arguments)
-    assert code == 2 and message in err
-    assert err.startswith("error: ") and err.count("\n") == 1
+    ):
+        code, _, err = check(*arguments)
+        assert code == 2 and message in err
+        assert err.startswith("error: ") and err.count("\n") == 1
