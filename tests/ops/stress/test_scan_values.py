@@ -18,33 +18,34 @@ MAX = torch.finfo(torch.float32).max
 PER_TOKEN = ("y", "x", "dt", "B", "C")
 
 
-@pytest.mark.parametrize("zero", [*NAMES, "y", NAMES])
-def test_zeros(path, zero, reverse):
-    arguments = make_arguments(path[0], 70)
+def scaled(path, names, factor):
+    """Multiply the named arguments, or "y", the gradient of the output."""
+    arguments = make_arguments(path[0], 131)
     grad_output = random_grad_output(arguments[0])
     for name, tensor in zip((*NAMES, "y"), (*arguments, grad_output), strict=True):
-        if name in zero:
-            tensor.zero_()
-    assert_exact(path, arguments, grad_output, reverse)
+        if name in names:
+            tensor.mul_(factor)
+    return arguments, grad_output
 
 
-@pytest.mark.parametrize("steps", [1e-8, 1e-4, 0.1, 1e3])
+@pytest.mark.parametrize("zero", [*NAMES, "y", NAMES])
+def test_zeros(path, zero):
+    assert_exact(path, *scaled(path, zero, 0))
+
+
+@pytest.mark.parametrize("steps", [1e-8, 0.1, 1e3])
 def test_constants(path, steps, reverse):
     x, dt, A, B, C, D = (torch.ones_like(a) for a in make_arguments(path[0], 131))
     assert_exact(path, (x, steps * dt, -0.5 * A, B, C, D), torch.ones_like(x), reverse)
 
 
-@pytest.mark.parametrize("huge", ["x", "B", "C", "D", "y", "xB", "xC", "BC", "xy", "By"])
-def test_huge_numbers(path, huge, reverse):
+@pytest.mark.parametrize("huge", ["x", "D", "y", "xB", "xC", "BC", "xy", "By"])
+def test_huge_numbers(path, huge):
     """Two factors of 1e18 at once, as much as float32 can hold."""
-    arguments = make_arguments(path[0], 131)
-    grad_output = random_grad_output(arguments[0])
-    for name, tensor in zip((*NAMES, "y"), (*arguments, grad_output), strict=True):
-        if name in huge:
-            tensor.mul_(HUGE)
-    exact = by_loop(path, arguments, grad_output, reverse).named()
+    arguments, grad_output = scaled(path, huge, HUGE)
+    exact = by_loop(path, arguments, grad_output).named()
     assert max(value.abs().max() for value in exact.values()) < MAX / 4
-    assert_exact(path, arguments, grad_output, reverse)
+    assert_exact(path, arguments, grad_output)
 
 
 def test_huge_tokens_before_the_state_is_cleared(path, reverse):
