@@ -30,7 +30,7 @@ def make_views(count=3) -> Views:
     )
 
 
-@pytest.mark.parametrize("share", [0.77, 0.8, 0.93, 0.995])
+@pytest.mark.parametrize("share", [0.77, 0.995])
 def test_a_crop_keeps_directions_and_content(share):
     """The direction through each pixel of the crop is that of the position it shows."""
     views = make_views()
@@ -49,9 +49,8 @@ def test_a_crop_keeps_directions_and_content(share):
     assert center_crop(views, 1.0) is views
 
 
-@pytest.mark.parametrize("share", [0.6, 0.77])  # no center on a border between pixels
-def test_a_crop_takes_the_nearest_depths_and_masks(share):
-    views = make_views()
+def test_a_crop_takes_the_nearest_depths_and_masks():
+    views, share = make_views(), 0.6  # no center on a border between pixels
     crop = center_crop(views, share)
     x = (crop.images[0, 0, 20] * WIDTH).floor().long()
     y = (crop.images[0, 1, :, 40] * HEIGHT).floor().long()
@@ -64,7 +63,7 @@ def test_a_crop_takes_the_nearest_depths_and_masks(share):
     assert torch.equal(bare.images, crop.images)
 
 
-def test_orders_follow_their_probabilities():
+def test_orders_of_inputs_follow_their_probabilities():
     inputs = [3, 5, 8, 13, 21, 34]
     rng = np.random.default_rng(0)
     both = Augmentation(reverse=0.5, shuffle=0.5)
@@ -77,7 +76,7 @@ def test_orders_follow_their_probabilities():
     assert Augmentation(reverse=1.0).order(inputs, rng) == inputs[::-1]
 
 
-def test_shares_fill_their_range_and_follow_the_seed():
+def test_shares_of_crops_fill_their_range_and_follow_the_seed():
     crops = Augmentation(crop=0.77)
     rng = np.random.default_rng(0)
     shares = [crops.share(rng) for _ in range(200)]
@@ -123,20 +122,16 @@ def test_flicker_and_noise_change_inputs_only():
     assert 0 < min(noises) < 0.005 and 0.015 < max(noises) < 0.0205
 
 
-def test_images_stay_in_range_and_are_unchanged_by_default():
+def test_augmented_images_stay_in_range_and_are_unchanged_by_default():
     views = make_views()
     strong = Augmentation(exposure=1.0, white_balance=1.0, flicker=1.0, noise=1.0)
-    for seed in range(5):
-        inputs, targets = strong.expose(views, views, np.random.default_rng(seed))
-        inputs.validate(), targets.validate()
+    for each in strong.expose(views, views, np.random.default_rng(0)):
+        each.validate()
     inputs, targets = Augmentation().expose(views, views, np.random.default_rng(0))
     assert torch.equal(inputs.images, views.images) and torch.equal(targets.images, views.images)
 
 
-@pytest.mark.parametrize(
-    "option", [{"reverse": 1.5}, {"shuffle": -0.1}, {"crop": 0.0}, {"noise": 2.0}]
-)
-def test_invalid_options_are_errors(option):
-    (name,) = option
-    with pytest.raises(InputError, match=rf"data\.augmentation\.{name} is"):
-        Augmentation(**option)
+def test_options_of_augmentation_out_of_range_are_refused():
+    for name, value in {"reverse": 1.5, "shuffle": -0.1, "crop": 0.0, "noise": 2.0}.items():
+        with pytest.raises(InputError, match=rf"data\.augmentation\.{name} is"):
+            Augmentation(**{name: value})

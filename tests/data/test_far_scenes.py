@@ -34,7 +34,7 @@ def network_poses(scene):
     return normalize(views, views)[0].cameras.cam_to_world
 
 
-@pytest.mark.parametrize("offset", [(5e5, 5.4e6, 300.0), (4e6,) * 3, (0, -2e7, 0), (1e4, 0, 0)])
+@pytest.mark.parametrize("offset", [(5e5, 5.4e6, 300.0), (0, -2e7, 0), (1e4, 0, 0)])
 def test_a_geo_referenced_scene_is_the_same_to_the_network(offset):
     expected, found = network_poses(scene_at((0, 0, 0))), network_poses(scene_at(offset))
     assert (found - expected).abs().max() < 2e-6
@@ -45,22 +45,20 @@ def test_a_geo_referenced_scene_is_the_same_to_the_network(offset):
     assert subset.scene.origin == moved.origin
 
 
-@pytest.mark.parametrize("offset", [(0, 0, 0), (3, -2, 50)])
-def test_other_scenes_keep_their_bits(offset):
-    scene = scene_at(offset)
+def test_scenes_near_the_origin_keep_their_bits():
+    scene = scene_at((3, -2, 50))
     assert near_origin(scene) is scene and scene.origin == (0, 0, 0)
     still = replace(scene, images=[scene.images[0]] * 3)
     assert near_origin(still) is still
 
 
-@pytest.mark.parametrize("offset", [1e20, 1e30])
-def test_poses_that_float64_does_not_resolve_are_refused(offset):
+def test_poses_that_float64_does_not_resolve_are_refused():
     with pytest.raises(InputError, match=r"scene: the cameras are 1e.* which float64 does not"):
-        near_origin(scene_at((offset,) * 3))
+        near_origin(scene_at((1e20,) * 3))
 
 
 @pytest.mark.parametrize("name", ["scene.ply", "scene.safetensors"])
-def test_files_are_read_around_another_origin(make_scene, tmp_path, name):
+def test_files_of_gaussians_are_read_around_another_origin(make_scene, tmp_path, name):
     gaussians, _ = make_scene(count=9, dtype=torch.float32)
     offset, file = (500004.0, 5399999.0, 300.0), tmp_path / name
     if name == "scene.ply":

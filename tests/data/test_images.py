@@ -74,11 +74,11 @@ def test_nearest_undistortion_mixes_no_values_and_is_zero_outside():
     assert undistort(stored, Lens(**WIDE, distortion=(0.0,) * 5)) is stored
 
 
-@pytest.mark.parametrize("height, width", [(40, 60), (60, 40), (64, 64), (150, 300)])
-def test_content_and_intrinsics_move_together(height, width):
+@pytest.mark.parametrize("height, width", [(40, 60), (60, 40), (150, 300)])
+def test_resized_content_and_intrinsics_move_together(height, width):
     lens = Lens(**WIDE)
     matrix = resized_intrinsics(lens, height, width)
-    for point in [(0.1, 0.05, 1.0), (-0.2, -0.1, 1.2), (0.15, -0.12, 0.9)]:
+    for point in [(0.1, 0.05, 1.0), (-0.2, -0.1, 1.2)]:
         x, y, z = point
         before = np.array([lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy])
         image = blob(pixel_centers(160, 120), before).astype(np.float32)
@@ -110,7 +110,7 @@ def test_transparent_pixels_become_white(tmp_path):
     assert np.abs(loaded[0, 0].astype(int) - (244, 224, 204)).max() <= 1
 
 
-def test_exif_orientation_is_not_applied(tmp_path):
+def test_load_image_does_not_apply_exif_orientation(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.new("RGB", (20, 10)).save(tmp_path / "a.jpg", exif=exif)

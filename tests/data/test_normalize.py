@@ -90,7 +90,7 @@ def test_a_full_circle_of_cameras_has_a_frame():
     torch.testing.assert_close(inputs.cameras.cam_to_world[0, :3, :3], torch.eye(3))
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_to_world_keeps_the_renderings(make_scene, degree):
     """The data set's world lies far from the frame of networks, turned and in other units."""
     gaussians, _ = make_scene(count=40, degree=degree)

@@ -1,7 +1,6 @@
 """Scenes on disk: which train and which test, opened when needed."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -10,36 +9,10 @@ from asysplat.data import FilesSource, SceneOptions, sources
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.selection.kmeans import kmeans_selection
 from asysplat.data.selection.views import Selection, held_out
-from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 
 IMAGES = 24
 SIZE = SceneOptions(8, 8)
-
-
-def procedural(seed: int) -> ProceduralScene:
-    return ProceduralScene(seed, SIZE.height, SIZE.width, num_images=IMAGES)
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """A folder with the scenes s0 to s7."""
-    root = tmp_path_factory.mktemp("scenes")
-    for seed in range(8):
-        write_transforms(procedural(seed).views(range(IMAGES)), root / f"s{seed}")
-    return root
-
-
-@pytest.fixture
-def folder(written, tmp_path):
-    """Make a folder with copies of some of the scenes."""
-
-    def copy(name, *seeds):
-        for seed in seeds:
-            shutil.copytree(written / f"s{seed}", tmp_path / name / f"s{seed}")
-        return str(tmp_path / name)
-
-    return copy
 
 
 @pytest.fixture
@@ -75,7 +48,7 @@ def test_images_that_test_or_validate_are_not_trained_on(folder):
     assert images(drawn(source)) == set(range(IMAGES)) - held
 
 
-def test_a_folder_without_scenes(tmp_path, written):
+def test_folders_without_scenes_are_refused(tmp_path, written):
     with pytest.raises(InputError, match=r"data\.root"):
         FilesSource(str(tmp_path), SIZE, (12, 24))
     with pytest.raises(InputError, match=r"data\.test_root=.*nowhere"):
@@ -121,7 +94,7 @@ def test_a_test_root_leaves_scenes_to_train_on(folder):
         drawn(source)
 
 
-def test_targets_may_be_inputs(folder):
+def test_targets_of_training_are_inputs_only_where_allowed(folder):
     root = folder("one", 3)
     shared = [
         any(
@@ -133,11 +106,11 @@ def test_targets_may_be_inputs(folder):
     assert shared == [False, True]
 
 
-def test_the_selection_is_that_of_the_test(folder):
+def test_the_selection_is_that_of_the_test_and_no_tested_image_is_trained_on(folder):
     root = folder("two", 3, 4)
     source = FilesSource(root, SIZE, (12, 24), selection="kmeans")
     for task in source.evaluation("test", 4, 2):
-        cameras = procedural(int(task.sequence.name[1:])).cameras
+        cameras = ProceduralScene(int(task.sequence.name[1:]), 8, 8, IMAGES).cameras
         assert task.selection == kmeans_selection(cameras, 4, 2, "test")
         assert task.selection.targets == [0, 8, 16]
     assert not images(drawn(source)) & {0, 8, 16}
@@ -170,7 +143,7 @@ def test_an_index_names_the_scenes_and_frames_of_the_test(folder, index):
     assert not names(drawn(source)) & {"s2", "s5"}
 
 
-def test_an_index_that_does_not_fit(folder, index):
+def test_an_index_that_does_not_fit_the_scenes_is_refused(folder, index):
     root = folder("one", 2)
     entry = {"context": [3, 20], "target": [9]}
     options = {"selection": "index", "index": index(s2=entry, s7=entry, s9=entry)}

@@ -11,7 +11,7 @@ from asysplat.data.procedural.edges import SAMPLES, average_samples, edge_pixels
 from asysplat.data.procedural.path import circle, forward, hand_held_path, pan
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-SEEDS = range(6)
+SEEDS = range(3)
 
 
 def test_only_training_scenes_are_varied():

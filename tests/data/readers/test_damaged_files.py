@@ -7,7 +7,6 @@ import random
 import time
 import traceback
 import warnings
-from collections import Counter
 from importlib import import_module
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from asysplat.data.images import load_image
 from asysplat.errors import InputError
 
 SECONDS = 5.0
-FEW = 40  # mutants of each kind in the fast test
+FEW = 24  # mutants of each kind in the fast test
 MANY = 1500
 BYTES = (b"\x00", b"\xff" * 8, b"9" * 400, b"-1", b"nan", b"1e400", b"[" * 3000, b"\x80", b"", b'"')
 
@@ -47,7 +46,7 @@ def mutate(stored: bytes, numbers: random.Random) -> bytes:
     return stored[:end] + stored[start:]
 
 
-def attack(file: Path, read, count: int, seed: str, tally: Counter) -> list[str]:
+def attack(file: Path, read, count: int, seed: str) -> list[str]:
     """Read mutants of a file; return what went wrong."""
     stored, numbers, wrong = file.read_bytes(), random.Random(seed), []
     for index in range(count):
@@ -55,9 +54,8 @@ def attack(file: Path, read, count: int, seed: str, tally: Counter) -> list[str]
         started = time.monotonic()
         try:
             read()
-            tally["read"] += 1
         except InputError:
-            tally["refused"] += 1
+            pass
         except Exception as error:
             trace = traceback.extract_tb(error.__traceback__)[-1]
             wrong.append(f"{file.name} {index}: {error!r:.200} at {trace.filename}:{trace.lineno}")
@@ -67,8 +65,8 @@ def attack(file: Path, read, count: int, seed: str, tally: Counter) -> list[str]
     return wrong
 
 
-def attack_scene(layout: str, views, folder: Path, count: int) -> tuple[list[str], Counter]:
-    root, wrong, tally = import_module(f"layouts.{layout}").write(views, folder), [], Counter()
+def attack_scene(layout: str, views, folder: Path, count: int) -> list[str]:
+    root, wrong = import_module(f"layouts.{layout}").write(views, folder), []
 
     def read() -> None:
         with warnings.catch_warnings():
@@ -81,75 +79,55 @@ def attack_scene(layout: str, views, folder: Path, count: int) -> tuple[list[str
     files = sorted(path for path in Path(folder).rglob("*") if path.is_file())
     kinds = {path.suffix: path for path in files}  # one image of many
     for file in {path for path in files if path.suffix not in (".png", ".jpg")} | {*kinds.values()}:
-        wrong += attack(file, read, max(1, count // len(files)), f"{layout}{file.name}", tally)
-    return wrong, tally
+        wrong += attack(file, read, max(1, count // len(files)), f"{layout}{file.name}")
+    return wrong
 
 
-def attack_gaussians(suffix: str, scene, folder: Path, count: int) -> tuple[list[str], Counter]:
-    file, tally = folder / f"scene{suffix}", Counter()
+many_mutants = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+
+
+@many_mutants
+@pytest.mark.parametrize("layout", NAMES)
+def test_damaged_scenes_are_refused_or_usable(layout, few, tmp_path, count):
+    assert attack_scene(layout, few, tmp_path / "scene", count) == []
+
+
+@many_mutants
+@pytest.mark.parametrize("suffix", [".ply", ".splat", ".safetensors"])
+def test_damaged_gaussians_are_refused_or_usable(suffix, make_scene, tmp_path, count):
+    file = tmp_path / f"scene{suffix}"
     if suffix == ".splat":
         file.write_bytes(random.Random(0).randbytes(32 * 20))
     else:
-        write_gaussians(file, scene)
-    return attack(file, lambda: read_gaussians(file).validate(), count, suffix, tally), tally
+        write_gaussians(file, make_scene(count=20, degree=1, dtype=torch.float32)[0])
+    assert attack(file, lambda: read_gaussians(file).validate(), count, suffix) == []
 
 
-def attack_run(model, folder: Path, count: int) -> tuple[list[str], Counter]:
-    """Mutate the checkpoint and the configuration of a run."""
-    file, tally = folder / "checkpoints" / "last.ckpt", Counter()
-    file.parent.mkdir()
-    OmegaConf.save({"model": model}, folder / "config.yaml")
-    weights = nn.ModuleDict({"net": instantiate(model)}).state_dict()
-    torch.save({"state_dict": weights}, file)
-    wrong = []
-    for path in (file, folder / "config.yaml"):
-        wrong += attack(path, lambda: load(str(file)), count // 2, path.name, tally)
-    return wrong, tally
-
-
-def attack_image(suffix: str, folder: Path, count: int) -> tuple[list[str], Counter]:
-    file, tally = folder / f"image{suffix}", Counter()
+@many_mutants
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_damaged_images_are_refused_or_usable(suffix, tmp_path, count):
+    file = tmp_path / f"image{suffix}"
     pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(file)
-    return attack(file, lambda: load_image(file), count, suffix, tally), tally
+    assert attack(file, lambda: load_image(file), count, suffix) == []
 
 
-@pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("layout", NAMES)
-def test_damaged_scenes(layout, few, tmp_path, count):
-    wrong, tally = attack_scene(layout, few, tmp_path / "scene", count)
-    print(f"{layout}: {dict(tally)}")
-    assert wrong == []
-
-
-@pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("suffix", [".ply", ".splat", ".safetensors"])
-def test_damaged_gaussians(suffix, make_scene, tmp_path, count):
-    scene, _ = make_scene(count=20, degree=1, dtype=torch.float32)
-    wrong, tally = attack_gaussians(suffix, scene, tmp_path, count)
-    print(f"{suffix}: {dict(tally)}")
-    assert wrong == []
-
-
-@pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_damaged_images(suffix, tmp_path, count):
-    wrong, tally = attack_image(suffix, tmp_path, count)
-    print(f"{suffix}: {dict(tally)}")
-    assert wrong == []
-
-
-@pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
-def test_damaged_runs(composed, tmp_path, count):
+@many_mutants
+def test_damaged_runs_are_refused_or_usable(composed, tmp_path, count):
+    """Mutants of the checkpoint and the configuration of a run."""
     sizes = ["model=asysplat_4m4s", "model.layers=1m1s", "width=0.0625", "state_size=4"]
     model = OmegaConf.to_container(composed(*sizes).model, resolve=True)
-    wrong, tally = attack_run(OmegaConf.create(model), tmp_path, count)
-    print(f"run: {dict(tally)}")
-    assert wrong == []
+    checkpoint, config = tmp_path / "checkpoints/last.ckpt", tmp_path / "config.yaml"
+    checkpoint.parent.mkdir()
+    OmegaConf.save({"model": model}, config)
+    weights = nn.ModuleDict({"net": instantiate(model)}).state_dict()
+    torch.save({"state_dict": weights}, checkpoint)
+    for file in (checkpoint, config):
+        assert attack(file, lambda: load(str(checkpoint)), count // 2, file.name) == []
 
 
 @pytest.mark.parametrize("kind", ["a link to itself", "a link to its folder", "60000 x 1 pixels"])
-def test_links_and_sizes_that_no_scene_has(kind, few, tmp_path):
+def test_links_and_sizes_that_no_image_has_are_refused(kind, few, tmp_path):
     root = import_module("layouts.transforms").write(few, tmp_path / "scene")
     image = min(path for path in root.rglob("*.png") if "depth" not in str(path))
     image.unlink()
