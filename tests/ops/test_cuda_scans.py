@@ -44,7 +44,7 @@ OWN = {"y": 2, "x": 2, "dt": 2, "A": 0, "B": None, "C": None, "D": 0}
 @kernel
 @pytest.mark.parametrize("name", SCANS)
 @pytest.mark.parametrize("reverse", [False, True])
-@pytest.mark.parametrize("chunks, more", [(0, 1), (1, -1), (1, 0), (1, 1), (3, 5)])
+@pytest.mark.parametrize("chunks, more", [(0, 1), (1, 0), (3, 5)])
 def test_output_and_gradients_equal_the_reference(name, chunks, more, reverse):
     check(name, arguments(name, chunks * CHUNKS[name] + more), reverse)
 
@@ -83,11 +83,7 @@ def test_mixed_steps_and_rates(name):
     tensors[1] = 10 ** (torch.rand_like(tensors[1]) * 11 - 8)
     tensors[2] = -(10 ** (torch.rand_like(tensors[2]) * 8 - 4))
     check(name, tensors)
-
-
-@kernel
-@pytest.mark.parametrize("name", SCANS)
-def test_a_huge_step_leaves_small_decays_exact(name):
+    # A huge step leaves small decays exact.
     tensors = arguments(name, CHUNKS[name] + 3, channels=2)
     tensors[1] *= 1e-3
     tensors[1][:, 1] = 1e12
@@ -124,13 +120,8 @@ def test_sizes_that_kernels_cannot_take(name, sizes, message):
 @pytest.mark.parametrize("reverse", [False, True])
 def test_long_sequences_equal_the_chunked_form_and_repeat(name, reverse):
     tensors = arguments(name, 10_007, channels=28, head_dim=64, state=256 if name == "ssd" else 16)
+    half = [t.bfloat16() if i in (0, 3, 4) else t for i, t in enumerate(tensors)]
     check(name, tensors, reverse, backend="chunked")
-    check(
-        name,
-        [t.bfloat16() if i in (0, 3, 4) else t for i, t in enumerate(tensors)],
-        reverse,
-        tolerance=1e-2,
-        backend="chunked",
-    )
+    check(name, half, reverse, tolerance=1e-2, backend="chunked")
     first, again = (run(name, tensors, "cuda", reverse) for _ in range(2))
     assert all(map(torch.equal, first, again))

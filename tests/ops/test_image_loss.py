@@ -10,8 +10,8 @@ from asysplat.evaluation.metrics import ssim
 from asysplat.ops import image_loss
 
 # Around the window's size, a vector's and a band's.
-SIZES = [(11, 11), (12, 29), (26, 16), (37, 53), (64, 17), (75, 40), (139, 33), (20, 300)]
-SMALL = [(1, 1), (1, 40), (10, 10), (3, 17), (10, 30), (70, 9)]
+SIZES = [(11, 11), (12, 29), (26, 16), (64, 17), (139, 33), (20, 300)]
+SMALL = [(1, 1), (10, 30), (70, 9)]
 VALUE, GRADIENT = 1e-6, 1e-5  # of the kernel against float64, the latter relative in L2
 
 
@@ -50,39 +50,36 @@ def test_the_kernel_computes_the_reference(size, kind):
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_gradients_of_the_reference_are_finite_differences(weight):
-    rendered, target = (image.double() for image in images("alike", 2, 3, 13, 12))
-    rendered.requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: image_loss(x, target, weight), rendered)
-
-
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_the_loss_is_l1_and_the_published_ssim(backend):
+def test_the_loss_is_l1_and_the_published_ssim(weight):
     rendered, target = images("alike", 2, 2, 3, 24, 31)
     rendered = rendered.clamp(0, 1)
     l1, similarity = (rendered - target).abs().mean((-3, -2, -1)), ssim(rendered, target)
-    for weight in (0.0, 0.2, 1.0):
-        expected = (1 - weight) * l1 + weight * (1 - similarity)
+    expected = (1 - weight) * l1 + weight * (1 - similarity)
+    for backend in ("reference", "cpu"):
         loss = image_loss(rendered, target, weight, backend=backend)
-        torch.testing.assert_close(loss, expected, rtol=0, atol=1e-5)
+        torch.testing.assert_close(loss, expected, rtol=0, atol=1e-5, msg=backend)
+    rendered, target = (image.double() for image in images("alike", 3, 12, 13))
+    rendered.requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda x: image_loss(x, target, weight), rendered, fast_mode=True
+    )
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("size", SMALL, ids=str)
-def test_an_image_without_a_window_has_the_loss_l1(size, weight):
+def test_an_image_without_a_window_has_the_loss_l1(size):
     rendered, target = images("noise", 3, *size)
-    loss, grad = both_ways(rendered, target, weight)
-    torch.testing.assert_close(loss, (rendered - target).abs().mean())
-    torch.testing.assert_close(grad, (rendered - target).sign() / rendered.numel())
-    assert_close((loss, grad), both_ways(rendered, target, weight, dtype=torch.float64))
+    for weight in (0.0, 0.2, 1.0):
+        loss, grad = both_ways(rendered, target, weight)
+        torch.testing.assert_close(loss, (rendered - target).abs().mean())
+        torch.testing.assert_close(grad, (rendered - target).sign() / rendered.numel())
+        assert_close((loss, grad), both_ways(rendered, target, weight, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("size", [(40, 30), (7, 5)], ids=str)
 def test_identical_images_have_no_loss_and_no_gradient(size):
     _, target = images("flat", 2, 3, *size)
     loss, grad = both_ways(target, target)
-    assert torch.equal(loss, torch.zeros(2))
-    assert (grad == 0).all()
+    assert (loss == 0).all() and (grad == 0).all()
 
 
 def test_constant_images():
@@ -110,14 +107,11 @@ def test_masked_pixels_take_the_targets_values(dtype):
 
 def test_images_of_a_batch_are_independent():
     rendered, target = images("noise", 2, 2, 3, 40, 33)
-    together = both_ways(rendered, target)
-    assert together[0].shape == (2, 2)
-    for i in range(2):
-        for j in range(2):
-            alone = both_ways(rendered[i, j], target[i, j])
-            assert alone[0].shape == ()
-            assert torch.equal(together[0][i, j], alone[0])
-            assert torch.equal(together[1][i, j], alone[1])
+    loss, grad = both_ways(rendered, target)
+    assert loss.shape == (2, 2)
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        alone = both_ways(rendered[i, j], target[i, j])
+        assert torch.equal(loss[i, j], alone[0]) and torch.equal(grad[i, j], alone[1]), (i, j)
 
 
 def test_any_number_of_threads_gives_the_same_bits(threads):
@@ -149,8 +143,6 @@ def test_gradients_on_demand():
     assert not image_loss(rendered, target).requires_grad
     rendered.requires_grad_()
     target.requires_grad_()
-    with torch.no_grad():
-        assert not image_loss(rendered, target).requires_grad
     loss = image_loss(rendered, target)
     weights = torch.tensor([1.0, -3.0])
     first, of_target = torch.autograd.grad(
@@ -162,12 +154,10 @@ def test_gradients_on_demand():
 
 
 def test_other_layouts_and_types():
-    rendered, target = images("noise", 2, 20, 30, 3)
-    pair = rendered.movedim(-1, -3), target.movedim(-1, -3)
-    strided = both_ways(*pair)
+    pair = [image.movedim(-1, -3) for image in images("noise", 2, 20, 30, 3)]
     whole = both_ways(*(image.contiguous() for image in pair))
-    assert all(map(torch.equal, strided, whole))
-    half = tuple(image.bfloat16() for image in pair)
+    assert all(map(torch.equal, both_ways(*pair), whole))
+    half = [image.bfloat16() for image in pair]
     assert torch.equal(image_loss(*half), image_loss(*(image.float() for image in half)))
     with torch.autocast("cpu", dtype=torch.bfloat16):
         inside = image_loss(*pair, backend="reference")

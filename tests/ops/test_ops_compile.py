@@ -23,8 +23,7 @@ KERNELS = {
 @pytest.mark.parametrize("name", SCANS)
 @pytest.mark.parametrize(
     "architecture, dtype",
-    [(80, torch.float32), (90, torch.bfloat16)],
-    ids=["sm_80-fp32", "sm_90-bf16"],
+    [pytest.param(80, torch.float32, marks=pytest.mark.slow), (90, torch.bfloat16)],
 )
 def test_all_kernels_of_scans_compile(monkeypatch, name, architecture, dtype):
     scan = import_module("asysplat.ops.selective_scan.cuda.scan")
@@ -40,7 +39,7 @@ def test_all_kernels_of_scans_compile(monkeypatch, name, architecture, dtype):
     assert all(kernel.asm["cubin"] for kernel in kernels.values())
 
 
-@pytest.mark.parametrize("architecture", [80, 90], ids="sm_{}".format)
+@pytest.mark.parametrize("architecture", [pytest.param(80, marks=pytest.mark.slow), 90])
 def test_all_kernels_of_the_plane_sweep_compile(monkeypatch, architecture):
     from asysplat.ops.plane_sweep import cuda
 

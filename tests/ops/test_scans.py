@@ -5,8 +5,6 @@ import torch
 from scans import SCANS, make_arguments
 from torch.utils.flop_counter import FlopCounterMode
 
-from asysplat.errors import InputError
-
 per_scan = pytest.mark.parametrize("name", SCANS)
 
 
@@ -17,12 +15,6 @@ def test_one_token_is_the_formula(name):
     expand = (..., None) if name == "ssd" else (...,)
     weight = (dt * gain[..., None])[expand] + (D[:, None] if name == "ssd" else D)
     torch.testing.assert_close(SCANS[name](x, dt, A, B, C, D, backend="reference"), weight * x)
-
-
-@per_scan
-def test_unknown_backend(name):
-    with pytest.raises(InputError, match="backend='fast'"):
-        SCANS[name](*make_arguments(name, 7), backend="fast")
 
 
 @per_scan
@@ -52,7 +44,6 @@ def test_no_state_is_saved_without_gradients(name):
     y, saved_state = operator("cpu", *arguments, False, True)
     without, nothing = operator("cpu", *arguments, False, False)
     assert torch.equal(without, y) and saved_state.numel() > 0 and nothing.numel() == 0
-    assert torch.equal(SCANS[name](*arguments), y)
 
 
 @per_scan

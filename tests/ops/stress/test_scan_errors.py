@@ -53,12 +53,14 @@ def test_one_argument_of_another_kind(scan, kind):
 
 
 @per_scan
-def test_no_tokens_and_float64_for_kernels(scan):
+def test_no_tokens_and_backends_that_cannot_run(scan):
     x, dt, A, B, C, D = arguments = make_arguments(scan, 7)
     empty = (x[:, :0], dt[:, :0], A, B[:, :0], C[:, :0], D)
     assert_refused(scan, empty, "x has shape .*: every side must be at least 1")
     double = [argument.double() for argument in arguments]
     for backend in ("cpu", "cuda"):
         assert_refused(scan, double, rf"backend '{backend}' .* x is float64", backend)
+    with pytest.raises(InputError, match="backend='fast'"):
+        SCANS[scan](*arguments, backend="fast")
     expected = SCANS[scan](*double, backend="reference")
     torch.testing.assert_close(SCANS[scan](*double), expected)
