@@ -36,26 +36,19 @@ def test_all_views_agree_on_a_wall():
     assert (found.agreeing == found.containing).all()
 
 
-def test_other_views_contradict_a_depth_that_is_too_near():
-    found = check_wall(halved=[3])
+def test_views_contradict_a_depth_that_is_too_near_as_much_as_they_are_trusted(monkeypatch):
+    trust = torch.ones(1, 4, 24, 32, dtype=torch.float64)
+    found = check_wall(halved=[3], trust=trust)
     assert (found.contradicting[:, 3][:, 4:-4, 12:-12] == 3).all()
     assert not found.agreeing[:, 3].any()
     # The near surface of the fourth view occludes the wall: it does not contradict the others.
     assert (found.agreeing[:, :3][INNER] == 2).all() and not found.contradicting[:, :3].any()
-
-
-def test_views_count_as_much_as_they_are_trusted():
-    trust = torch.ones(1, 4, 24, 32, dtype=torch.float64)
+    monkeypatch.setattr(reference, "PIXELS_AT_ONCE", 1)
+    assert all(map(torch.equal, check_wall(halved=[3], trust=trust), found))
     trust[:, 0] = 0.25
     found = check_wall(halved=[3], trust=trust)
     assert (found.contradicting[:, 3][:, 4:-4, 12:-12] == 2.25).all()
     assert (found.agreeing[:, 1][:, 4:-4, 12:-12] == 1.25).all()
-
-
-def test_chunks_give_the_same_counts(monkeypatch):
-    expected = check_wall(halved=[1])
-    monkeypatch.setattr(reference, "PIXELS_AT_ONCE", 1)
-    assert all(map(torch.equal, check_wall(halved=[1]), expected))
 
 
 @pytest.mark.parametrize("views", [1, 2, 5])
@@ -85,7 +78,7 @@ def test_the_second_sweep_has_planes_where_surfaces_are():
     assert error.median() < 0.02
 
 
-@pytest.mark.parametrize("size", [(12, 18), (6, 9), (4, 6), (12, 6), (5, 7), (1, 1)], ids=str)
+@pytest.mark.parametrize("size", [(12, 18), (6, 9), (5, 7), (1, 1)], ids=str)
 def test_smaller_images_are_means_over_areas(size):
     images = torch.rand(2, 3, 12, 18, dtype=torch.float64)
     torch.testing.assert_close(shrink(images, *size), F.interpolate(images, size, mode="area"))

@@ -34,16 +34,9 @@ def test_ssd_of_mamba_ssm():
 def test_ssd_in_the_mamba2_of_transformers():
     transformers = pytest.importorskip("transformers")
     modeling = pytest.importorskip("transformers.models.mamba2.modeling_mamba2")
-    config = transformers.Mamba2Config(
-        hidden_size=16,
-        expand=2,
-        head_dim=8,
-        num_heads=4,
-        n_groups=1,
-        state_size=6,
-        chunk_size=32,
-        num_hidden_layers=1,
-    )
+    sizes = {"hidden_size": 16, "expand": 2, "head_dim": 8, "num_heads": 4, "n_groups": 1}
+    sizes |= {"state_size": 6, "chunk_size": 32, "num_hidden_layers": 1}
+    config = transformers.Mamba2Config(**sizes)
     mixer = modeling.Mamba2Mixer(config, layer_idx=0)
     for parameter in (mixer.A_log, mixer.D, mixer.dt_bias):
         torch.nn.init.uniform_(parameter)

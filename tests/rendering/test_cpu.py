@@ -27,7 +27,7 @@ assert "zmm" not in next(iter(rasterize.inspect_asm().values()))
 """
 
 
-@pytest.mark.medium
+@pytest.mark.slow  # it compiles all kernels
 @pytest.mark.skipif(sys.platform != "linux", reason="names the instructions of an x86 processor")
 def test_without_avx512_it_is_as_exact(tmp_path):
     if "x86_64" not in os.uname().machine:

@@ -26,9 +26,18 @@ def keep_one_pair(arguments):
             value.fill_(0)
 
 
-@pytest.mark.parametrize("architecture", [80, 90], ids="sm_{}".format)
+OTHER = {"depth": "median", "antialiased": True, "sh_degree": 0}
+
+
 @pytest.mark.parametrize(
-    "options", [{}, {"depth": "median", "antialiased": True, "sh_degree": 0}], ids=str
+    "architecture, options",
+    [
+        (90, {}),
+        pytest.param(80, {}, marks=pytest.mark.slow),
+        pytest.param(80, OTHER, marks=pytest.mark.slow),
+        pytest.param(90, OTHER, marks=pytest.mark.slow),
+    ],
+    ids=str,
 )
 def test_all_kernels_compile(make_scene, monkeypatch, architecture, options):
     launched = collect_kernels(monkeypatch, architecture, fill=keep_one_pair)
