@@ -21,11 +21,11 @@ def never():
 
 @pytest.fixture
 def scene(tmp_path):
-    write_transforms(ProceduralScene(seed=1, height=24, width=32).views(range(3)), tmp_path / "s")
+    write_transforms(ProceduralScene(1, 24, 32).views(range(3)), tmp_path / "s")
     return tmp_path / "s"
 
 
-def test_arrays_are_made_once(tmp_path):
+def test_cached_arrays_are_made_once(tmp_path):
     array = numbers(100)
     cache = ImageCache(tmp_path / "cache")
     assert np.array_equal(cache.get("ab", lambda: array, to_disk=True), array)

@@ -1,6 +1,7 @@
 """`python -m asysplat.data.disparity`: its maps, and the training that reads them."""
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -104,7 +105,7 @@ def test_maps_are_inside_the_data_only_with_beside(command, scene, tmp_path):
     assert read.disparities.max() == LEVELS
 
 
-def test_a_damaged_image(command, scene, tmp_path):
+def test_damaged_images_get_no_map(command, scene, tmp_path):
     image = sorted((scene / "images").iterdir())[4]
     data = image.read_bytes()
     image.write_bytes(data[:300] + bytes(200) + data[500:])
@@ -115,7 +116,7 @@ def test_a_damaged_image(command, scene, tmp_path):
         assert command(scene, "--on-bad-image", "skip")[0] == 0
 
 
-def test_a_map_of_another_image_is_an_error(command, scene, tmp_path):
+def test_a_map_of_another_image_is_refused(command, scene, tmp_path):
     command(scene)
     sequence = open_scene(scene, SceneOptions(HEIGHT, WIDTH, disparities=tmp_path / "maps"))
     image = sequence.scene.images[2].file
@@ -124,12 +125,6 @@ def test_a_map_of_another_image_is_an_error(command, scene, tmp_path):
     with pytest.raises(InputError, match=r"is 40 x 20 and .* 32 x 24: delete it, and estimate"):
         sequence.views([2])
     assert sequence.views([1]).disparities is not None
-
-
-def test_a_non_finite_estimate_is_an_error(command, scene, tmp_path):
-    code, _, said = command(scene, estimate=lambda photograph: red(photograph) * np.nan)
-    assert code == 2 and "would hold NaN or infinity" in said
-    assert not list(map_folder(scene, tmp_path / "maps").iterdir())
 
 
 def test_training_reads_the_maps(command, scene, tmp_path):
@@ -158,21 +153,25 @@ def test_training_reads_the_maps(command, scene, tmp_path):
     assert distance > 0.1
 
 
-def test_maps_keep_the_proportions():
+def test_maps_and_network_inputs_keep_the_proportions():
     assert shrink(np.zeros((518, 924), np.float32), 540, 960).shape == (272, 484)
     assert shrink(np.zeros((518, 700), np.float32), 20, 27).shape == (20, 27)
     assert network_size(540, 960, 14) == (518, 924) and network_size(960, 540, 14) == (924, 518)
 
 
-def test_missing_transformers_is_an_error(command, scene, monkeypatch):
+def test_missing_transformers_and_non_finite_estimates_are_errors(
+    command, scene, tmp_path, monkeypatch
+):
+    code, _, said = command(scene, estimate=lambda photograph: red(photograph) * np.nan)
+    assert code == 2 and "would hold NaN or infinity" in said
+    assert not list(map_folder(scene, tmp_path / "maps").iterdir())
     monkeypatch.setitem(sys.modules, "transformers", None)
     code, _, said = command(scene, estimate=None)
     assert code == 2 and "pip install 'asysplat[disparity]'" in said
 
 
-@pytest.fixture(scope="module")
-def tiny_model(tmp_path_factory):
-    """A folder with a tiny Depth Anything of random weights."""
+def test_depth_anything_by_way_of_transformers_writes_maps(command, scene, tmp_path):
+    """With random weights of a tiny network."""
     transformers = pytest.importorskip("transformers", reason="needs transformers")
     backbone = transformers.Dinov2Config(
         **{"hidden_size": 12, "num_hidden_layers": 4, "num_attention_heads": 2, "mlp_ratio": 1},
@@ -183,20 +182,12 @@ def tiny_model(tmp_path_factory):
         **{"backbone_config": backbone, "reassemble_hidden_size": 12, "patch_size": 14},
         **{"neck_hidden_sizes": [4, 4, 4, 4], "fusion_hidden_size": 4, "head_hidden_size": 4},
     )
-    folder = tmp_path_factory.mktemp("model")
-    transformers.DepthAnythingForDepthEstimation(config).save_pretrained(folder)
-    return folder
-
-
-def test_depth_anything_by_way_of_transformers(command, scene, tiny_model, tmp_path):
-    code, out, said = command(scene, "--model", str(tiny_model), estimate=None)
+    model = tmp_path / "model"
+    transformers.DepthAnythingForDepthEstimation(config).save_pretrained(model)
+    code, out, said = command(scene, "--model", str(model), estimate=None)
     assert code == 0 and f"{FRAMES} maps written" in out, said
     read = open_scene(scene, SceneOptions(HEIGHT, WIDTH, disparities=tmp_path / "maps")).views([0])
     assert read.disparities.unique().numel() > 100
-
-
-def test_a_missing_model_is_an_error(command, scene, tmp_path):
-    pytest.importorskip("transformers", reason="needs transformers")
     code, _, said = command(scene, "--model", str(tmp_path), estimate=None)
     assert code == 2 and f"--model {tmp_path} cannot be loaded" in said
 
@@ -204,16 +195,14 @@ def test_a_missing_model_is_an_error(command, scene, tmp_path):
 class Network(torch.nn.Module):
     """Returns its red input."""
 
-    class config:
-        patch_size = 14
+    config = SimpleNamespace(patch_size=14)
 
     def forward(self, pixel_values):
         self.given = pixel_values
-        return type("Found", (), {"predicted_depth": pixel_values[:, 0]})
+        return SimpleNamespace(predicted_depth=pixel_values[:, 0])
 
 
-def test_the_network_gets_normalized_patches():
-    """Whole patches, normalized as ImageNet's, and its answer as it is."""
+def test_the_network_gets_whole_patches_normalized_as_imagenet_s():
     network = Network()
     photograph = np.full((100, 150, 3), (255, 0, 128), np.uint8)
     found = DepthAnything(network, torch.device("cpu"))(photograph)

@@ -127,7 +127,7 @@ def test_depth_keeps_sixteen_bits_and_mask_is_nonzero(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_a_cut_off_file_is_refused_when_opened(tmp_path, suffix):
+def test_a_cut_off_image_is_refused_when_opened(tmp_path, suffix):
     cut = tmp_path / f"cut{suffix}"
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
     Image.fromarray(noise).save(cut)

@@ -20,7 +20,7 @@ def views() -> Views:
     return views
 
 
-def test_files_follow_the_format(views, tmp_path):
+def test_written_transforms_follow_the_format(views, tmp_path):
     write_transforms(views, tmp_path)
     content = json.loads((tmp_path / "transforms.json").read_text())
     assert (content["w"], content["h"]) == (16, 12)
@@ -48,13 +48,10 @@ def test_depths_beyond_16_bits_are_unknown(views, tmp_path):
     assert np.asarray(Image.open(tmp_path / "depth" / "00000.png")).max() == 0
 
 
-def test_nothing_is_overwritten(views, tmp_path):
+def test_write_transforms_overwrites_nothing_and_refuses_batches(views, tmp_path):
     (tmp_path / "transforms.json").write_text("{}")
     with pytest.raises(InputError, match=r"transforms\.json exists"):
         write_transforms(views, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["transforms.json"]
-
-
-def test_batches_are_refused(views, tmp_path):
     with pytest.raises(InputError, match="one by one"):
-        write_transforms(Views.stack([views, views]), tmp_path)
+        write_transforms(Views.stack([views, views]), tmp_path / "batch")
+    assert [path.name for path in tmp_path.iterdir()] == ["transforms.json"]
