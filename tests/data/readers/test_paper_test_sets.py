@@ -3,7 +3,6 @@
 import json
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from layouts import colmap, dl3dv, realestate10k, replica, scannetpp
 
@@ -33,13 +32,11 @@ def published(views, tmp_path_factory):
 
 
 @pytest.fixture
-def tests_of(repository, published):
+def tests_of(composed, published):
     """Name -> its first scene, as a command's overrides have them."""
 
     def make(*overrides):
-        with initialize_config_dir(str(repository / "conf"), version_base=None):
-            config = compose("train", ["data=dl3dv", *TINY, *published, *overrides])
-        data = instantiate(config.data)
+        data = instantiate(composed("data=dl3dv", *TINY, *published, *overrides).data)
         data.setup()
         return {name: tasks[0] for name, tasks in data.tests.items()}
 
@@ -50,7 +47,7 @@ def counts(sample):
     return sample["inputs"].num_views, sample["targets"].num_views
 
 
-def test_the_zero_shot_sets_of_tables_2_and_3(tests_of):
+def test_tables_2_and_3_test_their_zero_shot_sets(tests_of):
     tests = tests_of("sweeps=state_of_the_art", "replica_size.height=16", "replica_size.width=22")
     assert list(tests) == ["dl3dv", "tanks_and_temples", "mipnerf360", "deep_blending", "replica"]
     assert tests["dl3dv"]["scene"] == dl3dv.HASH
@@ -62,12 +59,12 @@ def test_the_zero_shot_sets_of_tables_2_and_3(tests_of):
     assert tests["replica"]["targets"].depths.shape[-2:] == (16, 22)
 
 
-def test_the_depths_of_table_a2(tests_of):
+def test_table_a2_tests_sets_with_depths(tests_of):
     tests = tests_of("sweeps=mamba_ratio")
     assert list(tests) == ["dl3dv", "mipnerf360", "scannetpp"]
     assert (tests["scannetpp"]["targets"].depths > 0).any()
 
 
-def test_the_index_of_table_5(tests_of):
+def test_table_5_tests_the_views_of_its_index(tests_of):
     tests = tests_of("sweeps=two_views", "test_sets=[realestate10k]", "data.inputs=3")
     assert counts(tests["realestate10k"]) == (2, 3) and counts(tests["dl3dv"]) == (3, 2)

@@ -27,7 +27,7 @@ def read(layout, folder):
     return scene
 
 
-def test_both_readers_give_the_same_cameras(scene):
+def test_a_layouts_reader_and_colmaps_give_the_same_cameras(scene):
     own, model = (
         {image.file: image for image in read(layout, scene).images}
         for layout in (SCENES[scene.name], colmap)
@@ -48,7 +48,7 @@ def test_both_readers_give_the_same_cameras(scene):
     np.testing.assert_allclose(intrinsics(own), intrinsics(model), rtol=1e-5)
 
 
-def test_views_and_points_are_read(scene):
+def test_points_of_real_scenes_agree_with_their_depths(scene):
     sequence = open_scene(scene, SceneOptions(64, 64))
     views = sequence.views(range(0, sequence.num_images, 10)).validate()
     assert views.images.std() > 0.05

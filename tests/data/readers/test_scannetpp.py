@@ -41,10 +41,7 @@ def test_the_undistorted_dslr_stands_for_a_scene(few, iphone, dslr):
     # Poses without images come last.
     (dslr / "resized_undistorted_images").rename(dslr / "elsewhere")
     assert scannetpp.find_scenes(dslr) == [dslr / "nerfstudio/transforms.json"]
-
-
-def test_other_files_and_folders_hold_no_scene(dslr, tmp_path):
-    other = tmp_path / "transforms.json"
+    other = scene.parent / "transforms.json"
     other.write_text("{}")
     assert scannetpp.find_scenes(other) == []
     with pytest.raises(InputError, match="holds 0 scenes"):
@@ -139,31 +136,25 @@ def test_sparse_points_are_read(dslr):
 THIRD = "frame_000002"
 
 
-def set_arkit(**values):
-    def damage(iphone):
-        edit_json(iphone / "pose_intrinsic_imu.json", lambda content: content[THIRD].update(values))
+NAN = (np.eye(4) * np.nan).tolist()
+NO_FOCAL_LENGTH = np.diag([0.0, 1, 1]).tolist()
 
-    return damage
+
+def edit_arkit(change):
+    return lambda iphone: edit_json(iphone / "pose_intrinsic_imu.json", change)
+
+
+def set_arkit(**values):
+    return edit_arkit(lambda content: content[THIRD].update(values))
 
 
 @table(
     {
         "no pose": (set_arkit(aligned_pose=None), f"{THIRD}: aligned_pose is not 4x4"),
-        "nan": (
-            set_arkit(aligned_pose=(np.eye(4) * np.nan).tolist()),
-            f"{THIRD}: aligned_pose holds NaN",
-        ),
+        "nan": (set_arkit(aligned_pose=NAN), f"{THIRD}: aligned_pose holds NaN"),
         "intrinsic": (set_arkit(intrinsic=[[1, 2], [3]]), f"{THIRD}: intrinsic is"),
-        "focal length": (
-            set_arkit(intrinsic=np.diag([0.0, 1, 1]).tolist()),
-            f"{THIRD}: intrinsic is",
-        ),
-        "no entry": (
-            lambda iphone: edit_json(
-                iphone / "pose_intrinsic_imu.json", lambda content: content.update({THIRD: None})
-            ),
-            f"{THIRD} is None",
-        ),
+        "focal length": (set_arkit(intrinsic=NO_FOCAL_LENGTH), f"{THIRD}: intrinsic is"),
+        "no entry": (edit_arkit(lambda content: content.update({THIRD: None})), f"{THIRD} is None"),
     }
 )
 def test_a_bad_image_is_named_or_left_out(iphone, damage, message):

@@ -1,5 +1,6 @@
 import json
 import math
+import shutil
 
 import cv2
 import numpy as np
@@ -50,7 +51,7 @@ def scene(tmp_path):
     return write
 
 
-def test_the_json_file_may_have_another_name(scene):
+def test_transforms_may_have_another_name(scene):
     folder = scene()
     (folder / "transforms.json").rename(folder / "transforms_train.json")
     sequence = open_scene(folder / "transforms_train.json")
@@ -99,7 +100,7 @@ def test_images_follow_their_numbers_if_all_have_one(scene, names, suffix, order
     assert open_scene(folder).cameras.centers[:, 0].tolist() == order
 
 
-def test_depths_and_masks(scene):
+def test_depths_are_scaled_by_their_unit_and_masks_are_read(scene):
     def change(content):
         content["frames"][0] |= {"depth_file_path": "depth.png", "mask_path": "mask.png"}
 
@@ -142,7 +143,6 @@ def drop(*keys):
 
 BROKEN = {
     "no frames": (drop("frames"), r'transforms\.json has no list "frames"'),
-    "empty frames": (set_scene(frames=[]), r"has 0 usable image"),
     "one frame": (lambda content: content["frames"].__delitem__(slice(1, None)), "has 1 usable"),
     "no path": (set_frame(file_path=None), r"frame 2 has no file_path"),
     "no pose": (set_frame(transform_matrix=None), r"frame 2 \(images/2\.png\).*not 4x4"),
@@ -172,22 +172,21 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("change, message", BROKEN.values(), ids=BROKEN.keys())
-def test_a_broken_file_is_refused(scene, change, message):
+def test_broken_transforms_are_refused(scene, change, message):
     with pytest.raises(InputError, match=message):
         open_scene(scene(change))
 
 
-def test_a_missing_or_unreadable_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="holds no photographs"):
-        open_scene(tmp_path)
-    for text, message in (("", "is empty"), ("{", "is not JSON"), ("[]", "no list")):
-        (tmp_path / "transforms.json").write_text(text)
-        with pytest.raises(InputError, match=rf"transforms\.json.*{message}"):
-            open_scene(tmp_path)
-
-
-def test_images_of_two_sizes_are_both_named(scene):
+def test_missing_transforms_and_images_of_two_sizes_are_refused(scene):
     folder = scene()
     Image.new("RGB", (30, 16)).save(folder / "images/2.png")
     with pytest.raises(InputError, match=r"0\.png is 24 x 16 and .*2\.png is 30 x 16"):
+        open_scene(folder)
+    for text, message in (("", "is empty"), ("{", "is not JSON"), ("[]", "no list")):
+        (folder / "transforms.json").write_text(text)
+        with pytest.raises(InputError, match=rf"transforms\.json.*{message}"):
+            open_scene(folder)
+    (folder / "transforms.json").unlink()
+    shutil.rmtree(folder / "images")
+    with pytest.raises(InputError, match="holds no photographs"):
         open_scene(folder)
