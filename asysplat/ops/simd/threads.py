@@ -14,26 +14,43 @@ import numba
 import numpy as np
 import torch
 from numba import njit
+from numba.core.caching import UserProvidedCacheLocator
 
-HERE = Path(__file__).parent
-PACKAGE = HERE.parent.parent
+PACKAGE = Path(__file__).parents[2]
 Result = TypeVar("Result")
 PER_THREAD = 4  # portions of the work for each thread: the fast threads take more of them
 
 
 def kernel(function: Callable) -> Callable:
     """Compile a kernel for `run_blocks`; with NUMBA_BOUNDSCHECK=1 it checks every index."""
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _cache_folder(before)
+    config = numba.config
+    before = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
+    config.CACHE_DIR = _cache_folder(config.CACHE_DIR)
+    config.CACHE_LOCATOR_CLASSES = f"{__name__}.{CacheBySources.__name__}"
     try:  # without a type checker's wrapper, which cannot be compiled
         return njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = before
 
 
 def inline(function: Callable) -> Callable:
     """Compile a function inline into each kernel that calls it."""
     return njit(inline="always", error_model="numpy")(inspect.unwrap(function))
+
+
+class CacheBySources(UserProvidedCacheLocator):
+    """Numba's cache of compiled kernels, which copies of the same sources share."""
+
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file: str) -> str:
+        """Return a kernel's folder; outside of the package it is Numba's, by the file's path."""
+        if not Path(py_file).is_relative_to(PACKAGE):
+            return super().get_suitable_cache_subpath(py_file)
+        return "-".join(Path(py_file).relative_to(PACKAGE).parent.parts)
+
+    def get_source_stamp(self) -> str:
+        """Return what changes with a kernel's file."""
+        return hashlib.sha256(Path(self._py_file).read_bytes()).hexdigest()
 
 
 @cache
@@ -42,11 +59,19 @@ def _cache_folder(parent: str) -> str:
     # Numba compares only a kernel's own file, not its parts in other files.
     paths = [path for folder in ("ops", "rendering") for path in (PACKAGE / folder).rglob("*.py")]
     sources = b"".join(path.read_bytes() for path in sorted(paths))
-    beside = HERE / "__pycache__"
-    home = Path.home() / ".cache" / "asysplat"
-    root = parent or (beside if os.access(HERE, os.W_OK) else home)
     checks = "-checked" if numba.config.BOUNDSCHECK else ""
-    return str(Path(root) / f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}{checks}")
+    name = f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}{checks}"
+    return str(Path(parent or _home_cache() or Path(__file__).parent / "__pycache__") / name)
+
+
+def _home_cache() -> Path | None:
+    """Return the user's cache folder; None where it cannot be written to."""
+    folder = Path.home() / ".cache" / "asysplat"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return folder if os.access(folder, os.W_OK) else None
 
 
 def run_blocks(kernel: Callable[..., Result], bounds: np.ndarray, *args: object) -> list[Result]:
