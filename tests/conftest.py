@@ -9,6 +9,8 @@ import subprocess
 import sys
 import warnings
 from contextlib import redirect_stderr, redirect_stdout
+from copy import deepcopy
+from functools import cache
 from pathlib import Path
 from unittest import mock
 
@@ -17,6 +19,7 @@ import torch
 from compiler import INTERPRETED
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from asysplat.scene import Cameras, Gaussians
 
@@ -45,22 +48,35 @@ def composed():
     """The configuration of a script, train.py unless named, with these overrides."""
 
     def config(*overrides: str, script: str = "train", **options):
-        with initialize_config_dir(str(REPO / "conf"), version_base=None):
-            return compose(script, list(overrides), **options)
+        # A copy, which takes a twentieth of the time of composing.
+        return deepcopy(compose_once(script, overrides, *options.items()))
 
     return config
 
 
+@cache
+def compose_once(script: str, overrides: tuple[str, ...], *options: tuple[str, object]):
+    with initialize_config_dir(str(REPO / "conf"), version_base=None):
+        return compose(script, list(overrides), **dict(options))
+
+
 @pytest.fixture(scope="session")
-def build(composed):
+def build():
     """The network that `train.py` would build for these overrides."""
+    return build_network
 
-    def network(*overrides: str, device: str = "cpu") -> torch.nn.Module:
-        config = composed(*overrides)
-        with torch.device(device):
-            return instantiate(config.model)
 
-    return network
+def build_network(*overrides: str, device: str = "cpu") -> torch.nn.Module:
+    model = compose_once("train", overrides).model
+    return (
+        on_meta(OmegaConf.to_yaml(model, resolve=True)) if device == "meta" else instantiate(model)
+    )
+
+
+@cache
+def on_meta(model: str) -> torch.nn.Module:
+    with torch.device("meta"):
+        return instantiate(OmegaConf.create(model))
 
 
 @pytest.fixture(scope="session")

@@ -1,10 +1,10 @@
 """The configuration of every sweep on the paper's data, against the paper's protocol."""
 
+from functools import partial
 from itertools import product
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from asysplat.data.batches import split_batch
@@ -44,13 +44,9 @@ HOW = {
 }
 
 
-@pytest.fixture
-def compose_train():
-    def run(*overrides):
-        return compose("train", list(overrides), return_hydra_config=True)
-
-    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
-        yield run
+@pytest.fixture(scope="session")
+def compose_train(composed):
+    return partial(composed, return_hydra_config=True)
 
 
 def test_every_table_is_listed():
@@ -103,11 +99,14 @@ COMMANDS = [
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_of_the_paper_compose_its_network(compose_train, command):
-    """Without a model: asysplat_4m4s, without a prior, with the head that its rivals have."""
+    """Without a model: asysplat_4m4s, without a prior, with the head of the scale."""
     config = compose_train(*command.split(), *(PLACES if "data=" in command else ()))
     assert config.hydra.runtime.choices.model == "asysplat_4m4s"
     assert config.model.layers == "4m4s" and config.model.prior is None
-    assert config.model.head._target_ == "asysplat.models.LongLRMHead"
+    large = "scale=gpu" in command or "scale=paper" in command
+    head = config.model.head
+    assert head._target_.endswith(".LongLRMHead" if large else ".PhotographHead")
+    assert head.sh_degree == 3  # 59 numbers
     assert (config.model.patch_coarse, config.model.patch_fine) == (16, 8)
     if "scale=paper" in command:
         assert config.model.head.farthest == 500 and not config.training.loss.allow_missing

@@ -6,6 +6,7 @@ from hydra.errors import InstantiationException
 from tiny import NETWORK as TINY
 
 from asysplat.errors import InputError, input_error_behind
+from asysplat.models import LongLRMHead
 from asysplat.models.stage import parse_layer_mix
 from asysplat.scene import Cameras, Views
 
@@ -48,10 +49,11 @@ PARAMETERS = {
 
 
 @pytest.mark.parametrize("model", PARAMETERS)
-def test_parameters_at_full_width(build, model):
+def test_parameters_and_head_at_full_width(build, model):
     net = build("scale=paper", f"model={model}", device="meta")
     millions = sum(p.numel() for p in net.parameters()) / 1e6
     assert round(millions, 2) == PARAMETERS[model]
+    assert type(net.head) is LongLRMHead  # one for all; at laptop scale tests/conf trains ours
 
 
 def test_geometry_share_of_the_paper(build):
@@ -60,9 +62,7 @@ def test_geometry_share_of_the_paper(build):
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize(
-    ("width", "ratio"), [(0.125, 0.5), (0.125, 0.95), (0.25, 0.7), (1.0, 0.3), (1.0, 0.9)]
-)
+@pytest.mark.parametrize(("width", "ratio"), [(0.125, 0.95), (0.25, 0.7), (1.0, 0.3)])
 def test_geometry_ratio(build, ratio, width):
     model = ("model=asysplat_4m4s", f"width={width}")
     base = build(*model, device="meta")

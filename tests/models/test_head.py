@@ -1,22 +1,15 @@
-"""Both heads: untrained Gaussians, ranges, extreme numbers, and every model with either."""
+"""Both heads: untrained Gaussians, ranges, extreme numbers."""
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
-from tiny import SIZE as SIZES
 
 from asysplat.models import LongLRMHead, PhotographHead
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Views
 
 HEADS = {"photograph": PhotographHead, "longlrm": LongLRMHead}
-PARTS = ("asysplat", "blocks", "one_branch")  # shared by the files of the models
-OWN_HEAD = ("mvsplat",)
-FOLDER = Path(__file__).parents[2] / "conf" / "model"
-OURS = {"asysplat_plane_sweep", "asysplat_sweep"}  # with the head pixels, a photograph head
-MODELS = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem not in PARTS + OWN_HEAD)
 SIZE, FOCAL = 16, 20.0
 
 
@@ -115,13 +108,3 @@ def test_a_distance_of_500_is_rendered():
     assert (rendering.alpha.amax((-1, -2)) > 0.5).all()
     depths = rendering.depth[rendering.alpha > 0.5]
     assert ((depths > 400) & (depths < 501)).all()
-
-
-@pytest.mark.parametrize("head", [None, *HEADS])
-@pytest.mark.parametrize("model", MODELS)
-def test_every_model_takes_either_head_and_the_paper_s_have_long_lrm_s(build, model, head):
-    choice = [] if head is None else [f"model/head={head}"]
-    net = build(*SIZES, "model.head.sh_degree=1", f"model={model}", *choice, device="meta")
-    own = "photograph" if model in OURS else "longlrm"
-    assert type(net.head) is HEADS[head or own]
-    assert net.head.splits[-1] == 12
