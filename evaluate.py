@@ -4,7 +4,7 @@ python evaluate.py run=last
 """
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 from asysplat.overrides import exit_at_unknown_overrides
@@ -22,7 +22,6 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from rich.progress import track
 from torch import nn
 
-from asysplat.data import SceneDataModule
 from asysplat.data.datamodule import FixedTasks, Sample
 from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
@@ -34,6 +33,7 @@ from asysplat.export.scene_folder import check_visible, find_files, origin_of
 from asysplat.files import make_folder
 from asysplat.interrupts import handle_signals
 from asysplat.models.early_exit import EXACT
+from asysplat.models.network import Network
 from asysplat.scene import Gaussians, Views
 from asysplat.training.checkpoints import load_weights
 from asysplat.training.evaluation_target import find_target
@@ -62,12 +62,15 @@ def evaluate(options: DictConfig) -> None:
     except (ValueError, MisconfigurationException) as error:
         raise InputError(f"trainer: {error}") from error
     measure = make_measure(config, options, fabric.device)
+    net = load_network(config, fabric.device) if options.scenes is None else None
     data = instantiate(config.data)
     data.setup()
     data.check_sizes(measure.protocol.check_size)
     tests, early_exit, described = data.tests, {}, target.described
-    if options.scenes is None:
-        predictor, early_exit = open_network(config, data, fabric)
+    if net is not None:
+        data.check_sizes(net.check_size)
+        data.check_views(net.check_views)
+        predictor, early_exit = make_predictor(net, fabric), net.early_exit_shares
     else:
         tests = {data.name: data.tests[data.name]}
         predictor, found = open_scenes(Path(options.scenes), tests[data.name], fabric.device)
@@ -104,24 +107,25 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
     return PostOptimization(steps, protocol, lpips, background)
 
 
-def open_network(
-    config: DictConfig, data: SceneDataModule, fabric: lightning.Fabric
-) -> tuple[Predictor, Mapping[str, float]]:
-    """Load a model; return its prediction of a scene, and what its last early exit left out."""
+def load_network(config: DictConfig, device: torch.device) -> Network:
+    """Load a model, with its early exit."""
     net = instantiate(config.model)
-    data.check_sizes(net.check_size)
-    data.check_views(net.check_views)
     load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
-    net.to(fabric.device).eval()
+    net.to(device).eval()
     net.early_exit = instantiate(config.get("speed")) or EXACT  # absent in the oldest runs
     net.check_early_exit(net.early_exit)
     print(f"model: {net.describe()}")
+    return net
+
+
+def make_predictor(net: Network, fabric: lightning.Fabric) -> Predictor:
+    """Return a network's prediction of a scene, in the precision of the run."""
 
     def predict(inputs: Views) -> Gaussians:
         with torch.no_grad(), fabric.autocast():
             return net(Views.stack([inputs])).map(lambda tensor: tensor[0].float())
 
-    return lambda sample: predict, net.early_exit_shares
+    return lambda sample: predict
 
 
 def open_scenes(

@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.files import make_folder
 from asysplat.interrupts import handle_signals, interrupt_once
 from asysplat.training.messages import error_sentence, exit_with_message
-from asysplat.training.prepare import PreparedRun, Stage, prepare_run
+from asysplat.training.prepare import PreparedRun, TrainingStage, prepare_run
 from asysplat.training.revision import revision
 from asysplat.training.run_folder import job_name, run_folder
 from asysplat.training.runs import find_run
@@ -45,7 +45,7 @@ def train(config: DictConfig) -> float | None:
     return run.results.get(f"test/{config.data.name}/psnr")
 
 
-def train_stage(run: PreparedRun, stage: Stage) -> None:
+def train_stage(run: PreparedRun, stage: TrainingStage) -> None:
     config = stage.config
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     data = instantiate(config.data)

@@ -173,11 +173,7 @@ def load_weights(path: str | None, module: nn.Module, option: str = "init_path")
     """
     if path is None:
         return
-    file = weights_file(path)
-    if not file.is_file():
-        raise InputError(
-            f"{option}={path} does not exist: name a .ckpt or .safetensors file, or shipped."
-        )
+    file = existing_weights(path, option)
     damage = None if file.suffix == ".safetensors" else _damage(file)
     if damage is not None:
         raise InputError(f"{option}={path} {damage}: copy it again, or name another file.")
@@ -195,6 +191,16 @@ def load_weights(path: str | None, module: nn.Module, option: str = "init_path")
 def weights_file(path: str) -> Path:
     """Return the file that `init_path` names."""
     return SHIPPED if path == "shipped" else Path(path)
+
+
+def existing_weights(path: str, option: str = "init_path") -> Path:
+    """Return the file that an option names; raise InputError if there is none."""
+    file = weights_file(path)
+    if not file.is_file():
+        raise InputError(
+            f"{option}={path} does not exist: name a .ckpt or .safetensors file, or shipped."
+        )
+    return file
 
 
 def atomic_save(values: Any, path: Path) -> None:

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import lightning
+import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from torch import nn
 
 from asysplat.data.datamodule import SceneDataModule
 from asysplat.errors import InputError
@@ -20,6 +22,7 @@ from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
 from asysplat.training.checkpoints import (
     check_checkpoint,
     config_diff,
+    existing_weights,
     find_checkpoint,
     has_checkpoints,
     load_weights,
@@ -44,7 +47,7 @@ Callbacks = Mapping[str, lightning.Callback]
 
 
 @dataclass
-class Stage:
+class TrainingStage:
     """A stage of a run."""
 
     config: DictConfig
@@ -69,7 +72,6 @@ class Stage:
         data.check_sizes(net.check_size)
         data.check_views(net.check_views)
         data.check_sizes(instantiate(config.metrics).check_size)
-        check_checkpoint(self.checkpoint, module)
         load_weights(self.weights, module)
         print(f"{config.stage}: {describe_stage(config)}")
         print(f"model: {net.describe()}")
@@ -117,10 +119,12 @@ class PreparedRun:
 
     config: DictConfig
     described: Results  # see `describe_run`
-    stages: Sequence[Stage]  # that are still to be trained
+    stages: Sequence[TrainingStage]  # that are still to be trained
     results: Results  # of the stages that are finished
 
-    def record(self, stage: Stage, trainer: lightning.Trainer, callbacks: Callbacks) -> None:
+    def record(
+        self, stage: TrainingStage, trainer: lightning.Trainer, callbacks: Callbacks
+    ) -> None:
         """Collect what a tested stage measured; write metrics.json after the last; print it."""
         new_results = dict(callbacks["costs"].values) if "costs" in callbacks else {}
         new_results |= callbacks["metrics"].results if "metrics" in callbacks else {}
@@ -159,10 +163,24 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
         checkpoint = find_checkpoint(config.ckpt_path, folder, runs)
         first, results = resume_point(checkpoint, configs)
         weights = config.init_path if checkpoint is None else None
-        stages: list[Stage] = []
+        check_start(configs[first], checkpoint, weights)
+        stages: list[TrainingStage] = []
         for stage in configs[first:]:
             if stage is not config:
                 stage.paths.run = str(folder / stage.stage)
-            stages.append(Stage(stage, weights, checkpoint, results))
+            stages.append(TrainingStage(stage, weights, checkpoint, results))
             weights, checkpoint = f"{stage.paths.run}/checkpoints/last.ckpt", None
         yield PreparedRun(config, described, stages, results)
+
+
+def check_start(config: DictConfig, checkpoint: Path | None, weights: str | None) -> None:
+    """Check that the file to resume or start from fits the model, before any scene is made.
+
+    Raises:
+        InputError: there is no such file, or it holds the weights of another model.
+    """
+    file = existing_weights(weights) if weights is not None else checkpoint
+    if file is not None:
+        with torch.device("meta"):
+            net = instantiate(config.model)
+        check_checkpoint(file, nn.ModuleDict({"net": net}))  # named as in a checkpoint
