@@ -13,8 +13,9 @@ import pytest
 from nbclient import NotebookClient
 from tiny import NETWORK, VIEWS
 
-from asysplat import read_gaussians
+from asysplat import read_gaussians, refine
 from asysplat.data import SceneOptions, open_scene
+from asysplat.overrides import check_overrides
 
 
 @pytest.fixture
@@ -36,8 +37,13 @@ def test_it_draws_a_figure(run_example, tmp_path, capsys, name):
     assert str(figure) in capsys.readouterr().out
 
 
-@pytest.mark.slow  # the notebook does the same
-def test_a_scene_is_reconstructed(run_example, tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def few_steps(monkeypatch):
+    """A refinement of seconds takes a few steps."""
+    monkeypatch.setattr("asysplat.refine", lambda *given, seconds: refine(*given, steps=5))
+
+
+def test_a_scene_is_reconstructed(run_example, few_steps, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     run_example("reconstruct_scene")
     count = read_gaussians("reconstructed.ply").num_gaussians
@@ -45,20 +51,31 @@ def test_a_scene_is_reconstructed(run_example, tmp_path, monkeypatch, capsys):
     assert cv2.imread("reconstructed.png").std() > 20
 
 
-@pytest.mark.medium
-def test_the_notebook_runs_and_holds_no_outputs(repository, tmp_path):
-    notebook = nbformat.read(repository / "examples" / "reconstruct_scene.ipynb", as_version=4)
+@pytest.fixture
+def notebook(repository):
+    return nbformat.read(repository / "examples" / "reconstruct_scene.ipynb", as_version=4)
+
+
+def test_the_notebook_holds_no_outputs_and_its_code_runs(notebook, few_steps, capsys):
     nbformat.validate(notebook)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert all(cell.outputs == [] and cell.execution_count is None for cell in cells)
+    names = {}
+    for cell in cells:
+        exec(cell.source.replace("%matplotlib inline", ""), names)
+    scene = capsys.readouterr().out.strip().splitlines()[-1]
+    assert read_gaussians(scene).num_gaussians > 1000
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_in_a_kernel(notebook, repository, tmp_path):
     # What it imports is this copy of the project.
     first = nbformat.v4.new_code_cell(f"import sys; sys.path.insert(0, {str(repository)!r})")
     notebook.cells.insert(0, first)
     NotebookClient(notebook, timeout=500, resources={"metadata": {"path": tmp_path}}).execute()
-    kinds = [kind for cell in cells for out in cell.outputs for kind in out.get("data", ())]
-    assert "image/png" in kinds
-    scene = cells[-1].outputs[-1].text.strip()
-    assert read_gaussians(scene).num_gaussians > 1000
+    outputs = [out for cell in notebook.cells for out in cell.get("outputs", ())]
+    assert "image/png" in [kind for out in outputs for kind in out.get("data", ())]
+    assert read_gaussians(outputs[-1].text.strip()).num_gaussians > 1000
 
 
 @pytest.mark.medium
@@ -77,20 +94,43 @@ def test_names_that_bring_much_along_are_imported_when_asked_for(repository):
     assert before == [] and found == names
 
 
-@pytest.mark.medium
-def test_photographs_are_checked_and_trained_on(run_example, repository, tmp_path):
-    scene = tmp_path / "my_scene"
-    run_example("write_scene", scene)
-    assert open_scene(scene, SceneOptions(64, 64)).num_images == 48
-    tiny = [*NETWORK, *VIEWS, "steps=1", "validate_every=1", "data.cache.folder=null"]
-    tiny += [f"paths.logs={tmp_path}/logs", "~callbacks.figures"]
-    said = subprocess.run(
-        ["bash", repository / "examples" / "train_on_photographs.sh", scene, *tiny],
-        env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
-        cwd=tmp_path,
+@pytest.fixture
+def written_scene(run_example, tmp_path):
+    run_example("write_scene", tmp_path / "my_scene")
+    assert open_scene(tmp_path / "my_scene", SceneOptions(64, 64)).num_images == 48
+    return tmp_path / "my_scene"
+
+
+def train_on_photographs(repository, scene, python: Path, *options):
+    """Run the script with this folder's python."""
+    return subprocess.run(
+        ["bash", repository / "examples" / "train_on_photographs.sh", scene, *options],
+        env={**os.environ, "PATH": f"{python}:{os.environ['PATH']}"},
+        cwd=scene.parent,
         capture_output=True,
         text=True,
     )
-    assert said.returncode == 0, said.stderr
-    assert "The cameras fit the images." in said.stdout
-    assert len(list(tmp_path.glob("logs/photographs/*/metrics.json"))) == 1
+
+
+def test_the_commands_for_photographs_are_those_of_the_scripts(repository, written_scene):
+    """A program in Python's place prints its words."""
+    folder = written_scene.parent
+    (folder / "python").write_text('#!/bin/sh\necho "$@"\n')
+    (folder / "python").chmod(0o755)
+    done = train_on_photographs(repository, written_scene, folder, "steps=1")
+    check, train = (line.split() for line in done.stdout.splitlines())
+    assert check == ["-m", "asysplat.data.check", str(written_scene)]
+    assert Path(train[0]).samefile(repository / "train.py") and train[-1] == "steps=1"
+    assert f"data.root={written_scene}" in train
+    check_overrides(train[1:])
+
+
+@pytest.mark.slow
+def test_photographs_are_checked_and_trained_on(repository, written_scene):
+    logs = written_scene.parent / "logs"
+    tiny = [*NETWORK, *VIEWS, "steps=1", "validate_every=1", "data.cache.folder=null"]
+    tiny += [f"paths.logs={logs}", "~callbacks.figures"]
+    done = train_on_photographs(repository, written_scene, Path(sys.executable).parent, *tiny)
+    assert done.returncode == 0, done.stderr
+    assert "The cameras fit the images." in done.stdout
+    assert len(list(logs.glob("photographs/*/metrics.json"))) == 1

@@ -73,16 +73,16 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
 
     Returns:
         parameters; geometry_share, of 1; gflops as the paper counts them (`module_flops`) and
-        gflops_true (`true_flops`), in 1e9; gaussians, their number; and `activation_gb`.
+        gflops_true as `true_flops` does, in 1e9; gaussians, their number; and `activation_gb`.
     """
-    on_meta = copy.deepcopy(net).to("meta")
-    with torch.device("meta"), torch.no_grad():
+    on_meta, products = copy.deepcopy(net).to("meta"), FlopCounterMode(display=False)
+    with torch.device("meta"), torch.no_grad(), products:
         flops, gaussians = module_flops(on_meta, blank_views(num_views, height, width))
     return {
         "parameters": count_parameters(net),
         "geometry_share": net.geometry_share(),
         "gflops": flops / GIGA,
-        "gflops_true": true_flops(net, num_views, height, width) / GIGA,
+        "gflops_true": products.get_total_flops() / GIGA,
         "gaussians": gaussians.num_gaussians,
         "activation_gb": activation_gb(on_meta, num_views, height, width),
     }

@@ -2,13 +2,9 @@
 
 import itertools
 import json
-from copy import deepcopy
-from functools import cache
 from pathlib import Path
 
-import hydra
 import pytest
-from hydra import initialize_config_dir
 from omegaconf import OmegaConf
 
 from asysplat.evaluation import static_cost
@@ -20,22 +16,6 @@ from asysplat.training.runs import describe_run, find_run
 from asysplat.training.stages import stage_configs
 
 OVERRIDES = ["steps=7"]
-
-
-@pytest.fixture
-def compose(repository):
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        yield compose_train
-
-
-def compose_train(overrides):
-    """A copy of a configuration, which is ten times as fast as composing."""
-    return deepcopy(composed(tuple(overrides)))
-
-
-@cache
-def composed(overrides):
-    return hydra.compose("train", list(overrides), return_hydra_config=True)
 
 
 def write_run(folder: Path, config, numbers: dict, seed: int) -> None:
@@ -224,6 +204,7 @@ def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, t
         assert [column in row.values for row in filled.rows].count(True) == 1
     scale = fill_table(load_paper()["two_views"], [], compose, runs).notes["Ours"]
     assert "2 input views of 64x64, " in scale
+    scale = fill_table(load_paper()["replica"], [], compose, runs).notes["Ours"]
     sizes = [f"{stage.data.height}x{stage.data.width}" for stage in stage_configs(config)]
     assert [words.split(" at ")[1] for words in scale.split(", then ")][:2] == sizes[:2]
     assert sizes[0] != sizes[1]

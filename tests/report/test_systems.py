@@ -2,31 +2,13 @@
 
 import json
 import re
-from copy import deepcopy
 
-import hydra
 import pytest
-from hydra import initialize_config_dir
 
 from asysplat.report.fill import fill_table
 from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import load_paper
 from asysplat.training.systems import find_systems, options_of_test
-
-
-@pytest.fixture(scope="module")
-def compose(repository):
-    known = {}
-
-    def composed(overrides):
-        key = tuple(overrides)
-        if key not in known:
-            known[key] = hydra.compose("train", list(key), return_hydra_config=True)
-        return deepcopy(known[key])
-
-    with initialize_config_dir(str(repository / "conf"), version_base=None):
-        yield composed
-
 
 RE10K = ["data=realestate10k", "data.test_root=/a/re10k/test", "data.root=/a/re10k/train"]
 TWO_VIEWS = ["experiment=two_views", "metrics=pixelsplat", *RE10K]
@@ -70,13 +52,13 @@ def test_a_measured_system_stands_beside_its_quoted_numbers(compose, write, tmp_
         "seed 0, "
     )
     assert row.note.endswith("; the paper's numbers are quoted")
-    assert not rows["MVSplat"].values and filled.metrics == ("protocol pixelsplat",)
+    assert not rows["DepthSplat"].values and filled.metrics == ("protocol pixelsplat",)
     page = render_markdown([filled])
     (line,) = re.findall(r"\| pixelSplat \|.*", page)
     assert "25.89 | 24.50 ± 0.71 | 0.858 | quoted |" in line
-    (line,) = re.findall(r"\| MVSplat \|.*", page)
-    assert "26.39 | quoted |" in line
-    assert "- **Quoted**: MVSplat; GS-LRM; DepthSplat" in page
+    (line,) = re.findall(r"\| DepthSplat \|.*", page)
+    assert "27.47 | quoted |" in line
+    assert "- **Quoted**: DepthSplat" in page
     assert "- **Measured: 12 scenes of realestate10k data" in page
 
 

@@ -13,7 +13,6 @@ from tiny import NETWORK, SCENES, STEPS, VIEWS
 
 COSTS = "callbacks.costs={_target_: asysplat.training.callbacks.Costs}"
 # Costs and plan take longer than the steps of most tests: COSTS turns them on.
-HEAD = "model/head=photograph"  # whose Gaussians show from the first step
 TINY = [*NETWORK, *STEPS, *VIEWS, "callbacks.costs=null"]
 TINY_SCENES = [*SCENES, "data.test_scenes=2"]
 
@@ -42,7 +41,7 @@ def module_train(tmp_path_factory, run_script, repository):
 def whole(tmp_path_factory, run_script, repository) -> Path:
     """The folder of a finished run of 6 steps."""
     train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
-    return finished(train("name=whole", "steps=6", "callbacks.monitor.every=2", COSTS, HEAD))
+    return finished(train("name=whole", "steps=6", "callbacks.monitor.every=2", COSTS))
 
 
 def make_train(logs, run_script, repository):

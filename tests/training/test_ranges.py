@@ -1,6 +1,7 @@
 """What users set most is refused out of its range, in one sentence, and taken within."""
 
 import pytest
+from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
 from asysplat.training.ranges import RANGES, check_ranges
@@ -41,8 +42,9 @@ REFUSED = {
 
 @pytest.mark.parametrize("override", REFUSED)
 def test_out_of_range(composed, override):
+    changed = OmegaConf.merge(composed(), OmegaConf.from_dotlist([override]))
     with pytest.raises(InputError) as raised:
-        check_ranges(composed(override))
+        check_ranges(changed)
     assert str(raised.value).startswith(REFUSED[override])
 
 

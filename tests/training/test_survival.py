@@ -90,7 +90,7 @@ SLOW = (pytest.mark.slow, pytest.mark.timeout(3600))
 @pytest.mark.parametrize(
     ("kills", "longest", "steps", "validate_every"),
     [
-        pytest.param(2, 3, 6, 3, marks=pytest.mark.medium),
+        pytest.param(1, 2, 4, 2, marks=pytest.mark.medium),
         pytest.param(20, 6, 150, 10, marks=SLOW),
     ],
 )
@@ -112,7 +112,7 @@ def test_a_killed_run_ends_with_the_same_bits_and_logs(
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("seconds", [0, 0.01, 0.05])
+@pytest.mark.parametrize("seconds", [0.01, *(pytest.param(s, marks=SLOW) for s in (0, 0.05))])
 def test_two_interrupts_of_all_processes_end_without_an_abort(train, seconds):
     options = [*OPTIONS, "steps=1000", "validate_every=1000"]
     process, output = start_or_resume(train, "interrupted", *options)

@@ -1,7 +1,7 @@
 """Sweeps: finished runs are not repeated, failures do not stop other jobs, launchers work."""
 
 import json
-import signal
+from types import SimpleNamespace
 
 import pytest
 
@@ -30,60 +30,62 @@ def finish(train, composed, tmp_path):
     return write
 
 
-def test_an_interrupted_sweep_runs_only_what_is_missing(train, tmp_path):
-    with train.start(*SWEEP, "seed=0,1,2", until="metrics.json") as process:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("metrics.json")}
-    assert len(before) < 3
+@pytest.fixture(autouse=True)
+def table_rows(monkeypatch, capsys):
+    """What a sweep's process prints at its end: the cells of each line of the last table."""
+    at_exit = []
+    register = SimpleNamespace(register=lambda *call: at_exit.append(call))
+    monkeypatch.setattr("asysplat.training.sweep_table.atexit", register)
 
-    result = train.alone(*SWEEP, "seed=0,1,2")
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.count("finished already") == len(before)
-    table = result.stdout.rpartition("test scenes: procedural")[2]
-    cells = [row.split("│")[1].strip() for row in table.splitlines() if "│" in row]
-    assert cells[:3] == ["0", "1", "2"] and "not finished" not in table
-    assert finished_seeds(tmp_path) == [0, 1, 2]
-    assert {path: path.stat().st_mtime_ns for path in before} == before
+    def rows() -> list[list[str]]:
+        capsys.readouterr()
+        function, *arguments = at_exit[-1]
+        function(*arguments)
+        lines = [line for line in capsys.readouterr().out.splitlines() if "│" in line]
+        return [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines]
 
-    other = train(*SWEEP, "seed=2", "learning_rate=1e-4")
-    assert "finished already" not in other.stdout
-    assert finished_seeds(tmp_path) == [0, 1, 2, 2]
+    return rows
 
 
-def test_a_run_of_another_revision_is_named_and_repeated_with_rerun(train, finish, tmp_path):
+def test_a_sweep_runs_only_what_is_missing_and_ends_with_a_table(
+    train, finish, tmp_path, table_rows
+):
     finish(0, revision="0123456789ab")
     finish(1)
-    result = train(*SWEEP, "seed=0,1")
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("metrics.json")}
+    result = train(*SWEEP, "seed=0,1,2")
     lines = [line for line in result.stdout.splitlines() if "finished already" in line]
     assert lines[0].startswith("job 0: finished already by 0123456789ab, while this is")
     assert lines[1:] == ["job 1: finished already"]
     assert f"run: {tmp_path / '0'}" in result.stdout
-    assert finished_seeds(tmp_path) == [0, 1]
+    assert finished_seeds(tmp_path) == [0, 1, 2]
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    rows = table_rows()
+    assert [row[0] for row in rows[:3]] == ["0", "1", "2"] and rows[2][3] != ""
+    assert not any("not" in row for row in rows)
 
-    result = train(*SWEEP, "seed=0,1", "rerun=true")
+    result = train(*SWEEP, "seed=0,1", "rerun=true")  # of another revision
     assert result.stdout.count("finished already") == 1
-    assert finished_seeds(tmp_path) == [0, 0, 1]
+    assert finished_seeds(tmp_path) == [0, 0, 1, 2]
+    other = train(*SWEEP, "seed=2", "learning_rate=1e-4")
+    assert "finished already" not in other.stdout
 
 
-def test_a_failure_is_named_and_the_others_go_on(train, tmp_path):
-    result = train.alone(*SWEEP, "seed=0", "data.height=40,32", "data.width=32")
+def test_a_failure_is_named_and_the_others_go_on(train, tmp_path, table_rows):
+    result = train(*SWEEP, "seed=0", "data.height=40,32", "data.width=32")
     assert result.returncode != 0
     assert "failed: job 0" in result.stderr and "set 48x32" in result.stderr
     assert "Traceback" not in result.stderr
     assert finished_seeds(tmp_path) == [0]
-    rows = [row.split("│") for row in result.stdout.splitlines() if "│" in row]
-    (failed,) = [row for row in rows if row[1].strip() == "40"]
-    assert failed[2].strip() == "not"  # finished
+    (failed,) = [row for row in table_rows() if row[0] == "40"]
+    assert failed[1] == "not"  # finished
     (folder,) = tmp_path.rglob("metrics.json")
     assert folder.parent.name == "1_data.height=32"
 
 
-@pytest.mark.parametrize(
-    "launcher", [pytest.param("joblib", marks=pytest.mark.slow), "submitit_local"]
-)
-def test_launchers(train, finish, tmp_path, launcher):
-    """Two of three jobs are still to be run."""
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_a_launcher_runs_the_missing_jobs(train, finish, tmp_path, launcher):
     plugin = launcher.partition("_")[0]
     pytest.importorskip(f"hydra_plugins.hydra_{plugin}_launcher")
     finish(2)

@@ -42,7 +42,7 @@ C1, C2 = np.float32(reference.C1), np.float32(reference.C2)
 HALF, TWO = np.float32(0.5), np.float32(2)
 
 
-class Images(NamedTuple):
+class ImagePair(NamedTuple):
     """Both images, [channels of all images, H, W]."""
 
     rendered: np.ndarray
@@ -91,7 +91,7 @@ class _ImageLoss(torch.autograd.Function):
         H, W = rendered.shape[-2:]
         per_pixel = (1 - ssim_weight) / (3 * H * W)
         per_window = ssim_weight / (3 * (H - REACH) * (W - REACH)) if ssim_weight else 0.0
-        images = Images(*(tensor.view(-1, H, W).numpy() for tensor in (rendered, target)))
+        images = ImagePair(*(tensor.view(-1, H, W).numpy() for tensor in (rendered, target)))
         gradient = torch.empty_like(rendered) if keep else None
         sums = torch.empty(len(images.target) * -(-H // BAND), 2, dtype=torch.float64)
         run_blocks(
@@ -118,7 +118,7 @@ def compare_bands(start, stop, images, weights, sums, gradient):
     """Compare the bands start to stop, counted over [channels of all images, bands of one].
 
     Args:
-        images, weights: see `Images` and `Weights`.
+        images, weights: see `ImagePair` and `Weights`.
         sums: [bands, 2], written: of |d| over a band's pixels, and of 1 - SSIM over the windows
             that begin in the band.
         gradient: of the loss, shaped as `images.rendered`, written; or None.
