@@ -1,8 +1,8 @@
 .PHONY: demo quick test bench slow style format
 PYTHON ?= python3
 ENV := .venv/.ready
-# Two worker processes of one thread each; an idle one takes tests from the other.
-PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist worksteal
+# Two worker processes of one thread each; a file's tests share a process, and so their fixtures.
+PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 demo: $(ENV) ## train a small model on synthetic scenes, test it and draw its renderings
 	.venv/bin/python train.py model=asysplat_plane_sweep name=demo

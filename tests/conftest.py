@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import warnings
+from collections import Counter
 from contextlib import redirect_stderr, redirect_stdout
 from copy import deepcopy
 from functools import cache
@@ -166,10 +167,13 @@ def threads():
     torch.set_num_threads(before)
 
 
+@pytest.hookimpl(trylast=True)  # of the tests that are left
 def pytest_collection_modifyitems(items):
-    # Files with slow tests first, so that no process is left with a long test at the end.
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    # Long files first, so that no process is left with one at the end.
+    seconds = Counter()
+    for item in items:
+        seconds[item.path] += 5 if item.get_closest_marker("medium") else 0.1
+    items.sort(key=lambda item: -seconds[item.path])
     if torch.cuda.is_available():
         return
     for item in items:
