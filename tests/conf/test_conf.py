@@ -1,6 +1,7 @@
 """Every file under conf/ and sweeps/ composes, builds its model, trains a step, and starts with its
 command."""
 
+import re
 from collections import Counter
 from functools import partial
 from pathlib import Path
@@ -29,6 +30,12 @@ CHOICES = sorted(CHOICES - PARTS)
 STAGES = ("stage1", "stage2", "stage3", "ablation")
 TRAINED = [choice for choice in CHOICES if choice.startswith(("model=", "experiment=t"))]
 TRAINED += ["stage=stage3", "stage=ablation"]
+# Of models that differ from another in the mix of their layers alone.
+MIX = re.compile(r"model=(asysplat_\d[mt]\d?a?|asysplat_7m1[st]|longlrm_(18|24))$")
+TRAINED = [
+    pytest.param(choice, marks=[pytest.mark.slow] if MIX.match(choice) else [])
+    for choice in TRAINED
+]
 TINY = [*SIZE, *VIEWS, *SCENES, "data.test_sets=null", "data.batch_size=1"]
 
 
@@ -128,3 +135,22 @@ def test_a_stage_sets_the_sizes_of_its_scale(composed, scale):
 def test_every_table_has_its_sweep():
     tables = Counter(table.key for table in find_tables("all"))
     assert tables == Counter(path.stem for path in SWEEPS.glob("*.yaml"))
+
+
+def test_every_option_of_train_is_read(composed):
+    """By another file of conf/ or by code; what is instantiated refuses unknown keys itself."""
+    settings = "\n".join(path.read_text() for path in FILES)
+    code = "\n".join(
+        path.read_text() for path in (*ROOT.glob("*.py"), *ROOT.glob("asysplat/**/*.py"))
+    )
+    groups = {path.name for path in CONF.iterdir() if path.is_dir()} | {"defaults", "hydra"}
+    options = set(OmegaConf.load(CONF / "train.yaml")) - groups
+    for stage in composed().stages.values():
+        options |= set(stage)
+    unread = [
+        key
+        for key in options
+        if not re.search(rf"\$\{{.*\b{key}\b", settings)
+        and not re.search(rf"\b(config|options|stage)\.{key}\b|[\"']{key}[\"']", code)
+    ]
+    assert options and unread == []
