@@ -5,8 +5,11 @@ from itertools import product
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scans import (
     EXACT_PATHS,
+    PATHS,
     RATES,
     SCANS,
     STEPS,
@@ -46,6 +49,25 @@ def test_bfloat16(path, steps, rates, reverse):
 
 def test_float16(path, reverse):
     assert_exact(path, make_arguments(path[0], 131, dtype=torch.float16), reverse=reverse)
+
+
+@pytest.mark.parametrize("path", PATHS, ids="-".join)
+@settings(max_examples=20, derandomize=True, deadline=None)
+@given(
+    sizes=st.fixed_dictionaries(
+        {
+            "length": st.integers(1, 140),
+            "steps": st.sampled_from(STEPS),
+            "rates": st.sampled_from(RATES),
+            "batch": st.integers(1, 3),
+            "channels": st.integers(1, 4),
+            "seed": st.integers(0, 10**6),
+        }
+    ),
+    reverse=st.booleans(),
+)
+def test_any_sizes_steps_and_rates(path, sizes, reverse):
+    assert_exact(path, make_arguments(path[0], **sizes), reverse=reverse, slack=2)
 
 
 @pytest.mark.parametrize("length", LENGTHS)
