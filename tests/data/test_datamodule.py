@@ -77,6 +77,7 @@ def test_a_resumed_epoch_has_the_same_scenes():
     assert epoch_of_scenes(procedural(), 1, done=2) == epochs[1][2:]
 
 
+@pytest.mark.medium
 def test_the_steps_of_several_processes_are_those_of_one(monkeypatch):
     """For any micro-batch: two steps of 4 scenes, in the second epoch."""
     monkeypatch.setattr(datamodule, "batches_done", lambda trainer: 0)
@@ -214,6 +215,7 @@ def refuse(refused):
     return check
 
 
+@pytest.mark.medium
 def test_tests_may_have_another_size_than_training():
     """The same scenes and images, larger; a test set keeps a size of its own."""
     sets = {"rooms": {"places": "rooms"}, "wide": {"height": 16, "width": 32}}
@@ -248,6 +250,7 @@ def test_test_sets_are_those_whose_path_and_name_are_set(written):
         files_data(test_sets={"lost": {"root": f"{root}/nowhere"}}, **own).setup()
 
 
+@pytest.mark.medium
 def test_the_root_of_a_test_set_is_what_it_tests_beside_a_test_root(folder):
     far = {"root": folder("other", 7), "selection": "kmeans"}
     options = {"root": folder("train", 3, 4, 5), "test_root": folder("test", 6), "val_scenes": 1}
@@ -288,6 +291,7 @@ def folders(folder, written):
     return {"name": "files", "root": root, "test_root": str(written / "s6"), "val_scenes": 1}
 
 
+@pytest.mark.medium
 def test_another_scene_is_drawn_where_one_cannot_be_read(folders):
     options = {**folders, **OPTIONS}
     with pytest.raises(InputError, match=r"train/s4/images/\S+ cannot be read as an image"):

@@ -69,14 +69,11 @@ def test_lengths_are_scaled_and_nothing_else_changes(pair):
         assert torch.equal(after.cameras.intrinsics, before.cameras.intrinsics)
 
 
-def test_cameras_in_one_place_keep_their_scale():
+def test_cameras_in_one_place_keep_their_scale_and_a_full_circle_has_a_frame():
     views = make_views(random_rotations(4), torch.tensor([7.0, -3, 2]).expand(4, 3))
     inputs, _, frame = normalize(views, views)
     assert frame.scale == 1
     torch.testing.assert_close(inputs.cameras.centers, torch.zeros(4, 3), atol=1e-6, rtol=0)
-
-
-def test_a_full_circle_of_cameras_has_a_frame():
     angle = torch.arange(4) * torch.pi / 2
     zero, one = torch.zeros(4), torch.ones(4)
     forward = torch.stack((angle.sin(), zero, angle.cos()), -1)

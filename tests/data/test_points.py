@@ -78,7 +78,7 @@ def test_a_slanted_surface_keeps_its_points():
     assert (seen > 0).sum() > 0.85 * len(pixels)
 
 
-def test_inputs_have_point_depths_in_their_own_frame():
+def test_loaded_inputs_have_point_depths_in_their_own_frame():
     sequence = SequenceWithPoints(frame=5)
     task = Task(sequence, Selection([9, 5, 1], [7]))
     plain = load(task, share=0.8)

@@ -14,6 +14,7 @@ from asysplat.evaluation.static_cost import (
 )
 
 
+@pytest.mark.medium
 def test_static_costs_at_the_papers_scale_are_the_papers(build):
     costs = static_costs(build("model=asysplat_4m4s", "scale=paper", device="meta"), 32, 256, 256)
     assert abs(costs["gflops"] / 2033 - 1) < 0.005  # paper, Table 6c
@@ -24,6 +25,7 @@ def test_static_costs_at_the_papers_scale_are_the_papers(build):
     assert 20 < costs["activation_gb"] < 30
 
 
+@pytest.mark.medium
 def test_activation_memory_is_what_a_forward_pass_saves(build):
     net = build("model=asysplat_4m4s", "width=0.125", "state_size=8")
     views = blank_views(2, 64, 64).map(torch.zeros_like)

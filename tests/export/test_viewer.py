@@ -108,6 +108,7 @@ def test_pages_of_other_sites_are_refused(viewer, origin):
         until(viewer._server.get_clients)
 
 
+@pytest.mark.medium
 def test_pictures_do_not_pile_up_for_a_page_that_does_not_read(viewer):
     noise = np.random.default_rng(0).integers(0, 256, (800, 800, 3), dtype=np.uint8)
     last, count = np.full((8, 8, 3), 200, np.uint8), 120
@@ -203,6 +204,7 @@ def test_errors_are_in_the_panel_until_the_next_scene(scene, viewer, monkeypatch
         until(lambda: "fixed" in viewer._text.content)
 
 
+@pytest.mark.medium
 def test_coarse_after_a_change_and_in_full_at_rest(scene, monkeypatch):
     gaussians, views = scene
     pixels = []

@@ -363,6 +363,7 @@ def test_means_move_in_their_unit(unit):
     assert len(units) > 0 and (units == 1).all() == (unit == "scene")
 
 
+@pytest.mark.medium
 def test_exposure_and_pose_corrections_improve_held_out_views(room, start):
     """Of four inputs, one is too dark and one too bright; their positions are a little wrong."""
     inputs, held = room[0].select([0, 3, 6, 9]), replace(room[1], images=0.7 * room[1].images)

@@ -102,6 +102,7 @@ def test_cameras_as_published_fit(real):
     assert len(real[1].pairs) >= 8
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("mistakes", [SEVERE, SLIGHT], ids=["severe", "slight"])
 def test_mistakes_of_cameras_are_named(real, mistakes):
     cameras, matches, names = real
@@ -132,6 +133,7 @@ def test_the_fit_of_cameras_does_not_depend_on_the_world_frame(real):
     )
 
 
+@pytest.mark.medium
 def test_shuffled_poses_match_no_mistake(real):
     cameras, matches, names = real
     order = torch.randperm(cameras.num_views)
@@ -140,6 +142,7 @@ def test_shuffled_poses_match_no_mistake(real):
     assert not verdict.fits and "no usual mistake explains it" in verdict.sentence
 
 
+@pytest.mark.medium
 def test_poses_sorted_as_strings_are_named(real):
     cameras, matches, names = real
     # As if the files had no leading zeros.

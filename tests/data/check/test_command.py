@@ -82,6 +82,7 @@ def test_the_report_of_a_good_scene_fits_one_screen_and_overwrites_nothing(check
         assert min(figure.size) > 500 and len(figure.getcolors(2**20)) > 1000
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("no_figure")
 def test_a_mistake_exits_with_1_and_its_fix(check, scene):
     def unflip(content):
@@ -95,6 +96,7 @@ def test_a_mistake_exits_with_1_and_its_fix(check, scene):
     assert "OpenGL axes were taken for OpenCV's" in out and "right, up, backward" in out
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("no_figure")
 def test_all_damaged_files_and_a_wrong_depth_unit_are_reported(check, scene):
     damage(scene / "images/00003.png")
@@ -111,6 +113,7 @@ def test_all_damaged_files_and_a_wrong_depth_unit_are_reported(check, scene):
     assert "images          9 " in out and "divide the unit of depth by 9.9" in out
 
 
+@pytest.mark.medium
 def test_the_first_of_many_scenes_are_checked_also_without_a_point_to_match(check, scene):
     for image in (scene / "images").iterdir():
         Image.new("RGB", (WIDTH, HEIGHT), (90, 90, 90)).save(image)

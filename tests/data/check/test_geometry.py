@@ -40,17 +40,23 @@ def points():
     return torch.randn(30, 3).double() + torch.tensor([0, 0, 9])
 
 
-def test_true_matches_lie_on_their_lines(cameras, points):
-    matches, depths = seen(cameras, 3, 1, points)
-    assert epipolar_distances(cameras, matches).max() < 1e-9
-    found, angles = triangulate(cameras, matches)
-    torch.testing.assert_close(found, depths)
-    rays = points[:, None] - cameras.centers[[3, 1]]
-    cosine = torch.nn.functional.cosine_similarity(rays[:, 0], rays[:, 1], dim=-1)
-    torch.testing.assert_close(angles, torch.rad2deg(torch.arccos(cosine)))
+def test_true_matches_lie_on_their_epipolar_lines_and_triangulate_to_their_depths(cameras, points):
+    for sign in (1, -1):  # in front of the cameras, and behind
+        matches, depths = seen(cameras, 3, 1, sign * points)
+        assert (depths.sign() == sign).all()
+        assert epipolar_distances(cameras, matches).max() < 1e-9
+        found, angles = triangulate(cameras, matches)
+        torch.testing.assert_close(found, depths)
+        rays = sign * points[:, None] - cameras.centers[[3, 1]]
+        cosine = torch.nn.functional.cosine_similarity(rays[:, 0], rays[:, 1], dim=-1)
+        expected = torch.rad2deg(torch.arccos(cosine))
+        torch.testing.assert_close(angles, expected)
+    poses = cameras.cam_to_world.clone()
+    poses[:, :3, 3] = 5  # one place has no epipolar lines
+    assert epipolar_distances(replace(cameras, cam_to_world=poses), matches).isinf().all()
 
 
-def test_the_distance_is_in_pixels(cameras, points):
+def test_epipolar_distances_are_in_pixels(cameras, points):
     matches, _ = seen(cameras, 0, 2, points)
     lines = epipolar_lines(cameras, matches)
     moved = matches.points.clone()
@@ -63,17 +69,3 @@ def test_the_distance_is_in_pixels(cameras, points):
     first = epipolar_lines(cameras, moved)[:, 0]
     other = ((first[:, :2] * moved.points[:, 0]).sum(-1) + first[:, 2]).abs()
     torch.testing.assert_close(epipolar_distances(cameras, moved), (3 + other) / 2)
-
-
-def test_one_place_has_no_epipolar_lines(cameras, points):
-    poses = cameras.cam_to_world.clone()
-    poses[:, :3, 3] = 5
-    cameras = replace(cameras, cam_to_world=poses)
-    matches, _ = seen(cameras, 0, 1, points)
-    assert bool(epipolar_distances(cameras, matches).isinf().all())
-
-
-def test_points_behind_have_negative_depth(cameras, points):
-    matches, depths = seen(cameras, 0, 1, -points)
-    assert depths.max() < 0
-    torch.testing.assert_close(triangulate(cameras, matches)[0], depths)

@@ -17,12 +17,14 @@ def room(few, tmp_path):
     return write(few, tmp_path / "Réplica") / "room0"
 
 
-def set_camera(**values):
-    def change(room):
-        file = room.parent / "cam_params.json"
-        edit_json(file, lambda content: content["camera"].update(values))
+def parameters(room):
+    return room.parent / "cam_params.json"
 
-    return change
+
+def set_camera(**values):
+    return lambda room: edit_json(
+        parameters(room), lambda content: content["camera"].update(values)
+    )
 
 
 def set_row(index, change):
@@ -44,7 +46,7 @@ def test_depths_have_the_published_steps(views, tmp_path):
 
 def test_a_room_alone_without_depth_maps(room):
     set_camera(cx=15.5, cy=11.5)(room)
-    (room.parent / "cam_params.json").rename(room / "cam_params.json")
+    parameters(room).rename(room / "cam_params.json")
     for file in room.glob("results/depth*"):
         file.unlink()
     views = opened(room).views(range(4))
@@ -63,14 +65,8 @@ def transposed(row):
             lambda room: save_image(room / "results/frame000002.jpg", torch.ones(3, 12, 16)),
             "cam_params.json is for 32 x 24",
         ),
-        "nan": (
-            set_row(2, lambda row: row.replace(row.split()[3], "nan")),
-            "traj.txt, row 3 holds NaN",
-        ),
-        "15 numbers": (
-            set_row(2, lambda row: row.rsplit(maxsplit=1)[0]),
-            "traj.txt, row 3 is not 4x4",
-        ),
+        "nan": (set_row(2, lambda row: f"nan {row.split(maxsplit=1)[1]}"), "row 3 holds NaN"),
+        "15 numbers": (set_row(2, lambda row: row.rsplit(maxsplit=1)[0]), "row 3 is not 4x4"),
         "no number": (set_row(2, lambda row: row + "x"), "traj.txt, row 3 is not 4x4"),
         "world-to-camera": (set_row(2, transposed), "traj.txt, row 3 has last row"),
     }
@@ -84,13 +80,10 @@ def test_a_bad_image_is_named_or_left_out(room, damage, message):
     {
         "more images than rows": (set_row(3, lambda row: ""), "traj.txt has 3 rows for 4 images"),
         "no trajectory": (lambda room: (room / "traj.txt").unlink(), "traj.txt does not exist"),
-        "no parameters": (
-            lambda room: (room.parent / "cam_params.json").unlink(),
-            "cam_params.json does not exist",
-        ),
+        "no parameters": (lambda room: parameters(room).unlink(), "cam_params.json does not exist"),
         "no camera": (
-            lambda room: (room.parent / "cam_params.json").write_text("[]"),
-            'cam_params.json has no "camera"',
+            lambda room: parameters(room).write_text("[]"),
+            'params.json has no "camera"',
         ),
         "no focal length": (set_camera(fx=None), "fx is None"),
         "no scale": (set_camera(scale=0), "must be above 0"),
