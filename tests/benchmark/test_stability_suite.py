@@ -14,7 +14,6 @@ from rich.console import Console
 
 from asysplat.benchmark.stability.comparison import StabilityCase, compare_to_reference, unit
 from asysplat.benchmark.stability.hostile import HOSTILE_GAUSSIANS, hostile_views
-from asysplat.benchmark.stability.models import depth_cases
 from asysplat.benchmark.stability.report import AREAS, measure, plot, tables, verdict
 from asysplat.errors import InputError
 from asysplat.models import head
@@ -122,13 +121,6 @@ def test_a_red_page_says_so_and_the_command_fails(tmp_path, run_script, monkeypa
     assert "raised ZeroDivisionError" in (tmp_path / "stability.md").read_text()
     assert json.loads((tmp_path / "stability.json").read_text())["rows"][0]["green"] is False
     assert (tmp_path / "stability.png").stat().st_size > 0
-
-
-@pytest.mark.medium
-def test_priors_of_uninformative_views_are_green():
-    names = ("black photographs", "white photographs", "views: 1")
-    rows = [case.row() for case in depth_cases(False, [1]) if case.name in names]
-    assert len(rows) == 3 and all(row["green"] for row in rows)
 
 
 def test_a_box_short_of_a_tile_is_red(measured, monkeypatch):

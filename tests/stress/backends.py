@@ -17,19 +17,11 @@ BACKGROUND = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
 
 @dataclass(frozen=True)
 class Backend:
-    """Args:
-    name: as `render` takes it.
-    dtype: what its inputs are given in.
-    image_error: largest difference to the float64 reference, of values near 1.
-    gradient_error: the same of a gradient, relative, L2.
-    many: Gaussians of a scene of moderate size.
-    """
-
-    name: str
-    dtype: torch.dtype
-    image_error: float
-    gradient_error: float
-    many: int
+    name: str  # as `render` takes it
+    dtype: torch.dtype  # what its inputs are given in
+    image_error: float  # largest difference to the float64 reference, of values near 1
+    gradient_error: float  # the same of a gradient, relative, L2
+    many: int  # Gaussians of a scene of moderate size
 
     def __str__(self) -> str:
         return f"{self.name}-{str(self.dtype).removeprefix('torch.')}"
@@ -56,17 +48,9 @@ class Result:
     grads: dict[str, Tensor]
     stats: dict[str, int]
 
-    @property
-    def image(self) -> Tensor:
-        return self.outputs["image"]
-
-    @property
-    def alpha(self) -> Tensor:
-        return self.outputs["alpha"]
-
-    @property
-    def depth(self) -> Tensor:
-        return self.outputs["depth"]
+    image = property(lambda self: self.outputs["image"])
+    alpha = property(lambda self: self.outputs["alpha"])
+    depth = property(lambda self: self.outputs["depth"])
 
     def is_finite(self) -> bool:
         return all(t.isfinite().all() for t in (*self.outputs.values(), *self.grads.values()))
@@ -154,16 +138,14 @@ def assert_as_without(result: Result, clean: Result, gone: int) -> None:
     """Check that the others have the same bits as without Gaussian `gone`."""
     for name, output in clean.outputs.items():
         assert torch.equal(result.outputs[name], output), name
+    dim = result.alpha.ndim - 3  # of the Gaussians, after those of the batch
     for name, grad in clean.grads.items():
+        own = result.grads[name]
         if name in FIELDS:
-            # Gaussians first, whether there is a batch or not.
-            lead = result.outputs["alpha"].ndim - 3
-            per_gaussian = result.grads[name].movedim(lead, 0)
-            others = torch.arange(len(per_gaussian)) != gone
-            assert (per_gaussian[gone] == 0).all(), name
-            assert torch.equal(per_gaussian[others], grad.movedim(lead, 0)), name
-        else:
-            assert torch.equal(result.grads[name], grad), name
+            assert (own.select(dim, gone) == 0).all(), name
+            others = torch.arange(own.shape[dim]) != gone
+            own = own.movedim(dim, 0)[others].movedim(0, dim)
+        assert torch.equal(own, grad), name
 
 
 def facing(cameras: Cameras) -> Cameras:
