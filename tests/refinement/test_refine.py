@@ -131,6 +131,18 @@ def test_masked_pixels_have_no_effect_on_a_refinement():
     assert same_bits(one, other)
 
 
+def test_masked_pixels_are_left_out_of_ssim():
+    """Windows that hold masked pixels would compare them with black."""
+    true, gray, views = small_scene(), torch.full((3,), 0.5), small_views(2, 24, 30)
+    with torch.no_grad():
+        views.images[:] = render(true, views.cameras, gray, depth=False).image.clamp(0, 1)
+    start = replace(true, sh=true.sh + 0.4 * torch.randn_like(true.sh))
+    masked = replace(views, masks=torch.rand(2, 24, 30) < 0.6)
+    settings = RefinementSettings(ssim=1.0, densify="none", half_size=0.0)
+    found = refine(start, masked, settings, steps=20, background=gray)
+    assert quality(found, views) > quality(start, views) + 1
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_refinement_takes_images_of_any_size(kind):
     """Also of less than the 11 pixels of an SSIM window, and of an odd number of them."""
