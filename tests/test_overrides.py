@@ -132,6 +132,12 @@ def test_every_printed_command_names_what_is_there(repository):
         check_overrides(get_args_parser().parse_args(words).overrides, script)
 
 
+def test_printed_commands_with_the_shipped_weights_have_their_model(repository):
+    commands = [given for _, given in printed_commands(repository) if "init_path=shipped" in given]
+    assert commands
+    assert [given for given in commands if "model=asysplat_plane_sweep" not in given] == []
+
+
 @pytest.mark.parametrize("script", ["train", "reconstruct", "evaluate", "report", "benchmark"])
 def test_help_is_a_page_of_options_that_exist(run_script, composed, script):
     lines = run_script(f"{script}.py", "--help").stdout.strip().splitlines()

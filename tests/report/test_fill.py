@@ -30,7 +30,7 @@ def write_run(folder: Path, config, numbers: dict, seed: int) -> None:
 def test_costs_of_every_row_are_the_papers_or_flagged(compose, table, monkeypatch):
     # The paper prints no activations, and counting them is slow.
     monkeypatch.setattr(static_cost, "activation_gb", lambda *_: 0.0)
-    filled = with_costs(fill_table(load_paper()[table], [], compose, {}), compose)
+    filled = with_costs(load_paper()[table], compose)
     for row in filled.rows:
         if row.quoted or row.post_optimization:
             continue
