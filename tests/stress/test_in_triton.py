@@ -17,7 +17,7 @@ LARGE = "blobs or wide or mixed or huge_step"
 # The cases of each file here, as an expression of pytest's -k.
 STRESS = {
     "boundary_band": "depth",
-    "culled": "reason and True or length or nothing and median or poison",
+    "culled": "reason and True or length or nothing and median or poison and opacities",
     "extents": "not alpha",
     "gradchecks": "",
     "memory_and_types": "strided or bfloat16",
@@ -32,6 +32,7 @@ CASES = " or ".join(f"test_{name}.py and ({STRESS[name] or 'test'})" for name in
 
 
 @pytest.mark.medium
+@pytest.mark.timeout(1800)
 @pytest.mark.skipif(INTERPRETED, reason="this is that process")
 @pytest.mark.parametrize(
     "paths, cases",
