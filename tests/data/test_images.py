@@ -20,13 +20,23 @@ BARREL = Lens(**WIDE, distortion=(-0.25, 0.06, 0.002, -0.003, 0.01))
 FISHEYE = Lens(**WIDE, distortion=(0.05, -0.02, 0.01, -0.002), fisheye=True)
 
 
-def distort(point: np.ndarray, lens: Lens) -> np.ndarray:
-    """Where OpenCV projects to what a pinhole projects to a pixel position [2]."""
-    matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
-    ray = np.linalg.solve(matrix, (*point, 1))
-    project = (cv2.fisheye if lens.fisheye else cv2).projectPoints
-    still, distortion = np.zeros(3), np.array(lens.distortion)
-    return project(ray[None, None], still, still, matrix, distortion)[0].ravel()
+def distort(points: np.ndarray, lens: Lens) -> np.ndarray:
+    """The lens equations of the OpenCV manual, on pinhole pixel positions [..., 2]."""
+    x, y = (points[..., 0] - lens.cx) / lens.fx, (points[..., 1] - lens.cy) / lens.fy
+    r2 = x * x + y * y
+    if lens.fisheye:
+        theta = np.arctan(np.sqrt(r2))
+        powers = sum(k * theta ** (2 * i + 2) for i, k in enumerate(lens.distortion))
+        factor = theta * (1 + powers) / np.sqrt(np.maximum(r2, 1e-12))
+        x, y = x * factor, y * factor
+    else:
+        k1, k2, p1, p2, k3 = lens.distortion
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        )
+    return np.stack((x * lens.fx + lens.cx, y * lens.fy + lens.cy), -1)
 
 
 def pixel_centers(width: int, height: int) -> np.ndarray:

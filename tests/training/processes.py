@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import runpy
+import signal
 import sys
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -22,6 +23,7 @@ def start(output: Path, *overrides: str) -> BaseProcess:
 
 def _train(output: Path, overrides: tuple[str, ...]) -> None:
     os.setsid()  # for signals to all of its processes
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # however the tests were started
     os.chdir(REPO)
     descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for stream in (sys.stdout, sys.stderr):
