@@ -22,6 +22,7 @@ def test_named_files_exist(repository, document):
     assert links or places
 
 
+@pytest.mark.medium
 def test_the_architecture_figure_is_up_to_date(repository):
     drawn = runpy.run_path(str(repository / "docs" / "architecture.py"))["draw"]()
     assert (repository / "docs" / "architecture.svg").read_text() == drawn, (

@@ -29,6 +29,7 @@ def run_example(repository, monkeypatch):
     return run
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["render_scene", "predict_scene"])
 def test_it_draws_a_figure(run_example, tmp_path, capsys, name):
     figure = tmp_path / f"{name}.png"
@@ -43,6 +44,7 @@ def few_steps(monkeypatch):
     monkeypatch.setattr("asysplat.refine", lambda *given, seconds: refine(*given, steps=5))
 
 
+@pytest.mark.medium
 def test_a_scene_is_reconstructed(run_example, few_steps, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     run_example("reconstruct_scene")
@@ -56,6 +58,7 @@ def notebook(repository):
     return nbformat.read(repository / "examples" / "reconstruct_scene.ipynb", as_version=4)
 
 
+@pytest.mark.medium
 def test_the_notebook_holds_no_outputs_and_its_code_runs(notebook, few_steps, capsys):
     nbformat.validate(notebook)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -112,6 +115,7 @@ def train_on_photographs(repository, scene, python: Path, *options):
     )
 
 
+@pytest.mark.medium
 def test_the_commands_for_photographs_are_those_of_the_scripts(repository, written_scene):
     """A program in Python's place prints its words."""
     folder = written_scene.parent

@@ -9,6 +9,7 @@ from asysplat.errors import InputError
 TINY = ["width=0.125", "state_size=8", "model.layers=1m1s"]
 
 
+@pytest.mark.medium
 def test_overrides_change_the_network_that_ships():
     plain, other = load(), load("shipped", ["model.blocks.s.grid=1", "model.prior.planes=24"])
     assert (plain.prior.planes, other.prior.planes) == (48, 24)

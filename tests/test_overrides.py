@@ -73,6 +73,7 @@ UNKNOWN = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("override", UNKNOWN)
 def test_an_unknown_override_names_the_nearest(override):
     with pytest.raises(InputError) as raised:
@@ -138,6 +139,7 @@ def test_printed_commands_with_the_shipped_weights_have_their_model(repository):
     assert [given for given in commands if "model=asysplat_plane_sweep" not in given] == []
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("script", ["train", "reconstruct", "evaluate", "report", "benchmark"])
 def test_help_is_a_page_of_options_that_exist(run_script, composed, script):
     lines = run_script(f"{script}.py", "--help").stdout.strip().splitlines()

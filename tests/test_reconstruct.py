@@ -248,6 +248,7 @@ def check_refusal(result, message):
     assert len(result.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("overrides", REFUSED)
 def test_a_mistake_is_one_sentence_and_status_1(command, photographs, tmp_path, overrides):
     path = None if overrides in ("", "path=absent") else photographs
@@ -275,6 +276,7 @@ def test_too_few_photographs(command, views, tmp_path):
     check_refusal(command(tmp_path / "two"), message)
 
 
+@pytest.mark.medium
 def test_a_checkpoint_of_another_model(command, photographs, tmp_path):
     file = tmp_path / "other.safetensors"
     save_file({"net.layer": torch.zeros(2)}, file)
@@ -292,6 +294,7 @@ def test_cameras_without_overlap(command, views, tmp_path):
     finished(command(tmp_path / "apart", "steps=5"))
 
 
+@pytest.mark.medium
 def test_logs_that_cannot_be_written(command, photographs, tmp_path):
     (tmp_path / "run").write_text("a file")
     check_refusal(command(photographs), str(tmp_path / "run"))

@@ -167,6 +167,7 @@ FROM_OUTSIDE = {
 }
 
 
+@pytest.mark.medium
 def test_views_from_outside_are_checked(repository):
     """In a process without the types' checks of the tests."""
     script = """

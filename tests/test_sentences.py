@@ -145,6 +145,7 @@ def test_a_reconstruction_is_no_run(tmp_path):
         assert list(find_runs(tmp_path)) == []
 
 
+@pytest.mark.medium
 def test_arguments_are_named_as_the_caller_does(views):
     with pytest.raises(InputError, match="checkpoint=shiped does not exist"):
         load("shiped")

@@ -23,6 +23,7 @@ def test_every_suite_has_a_committed_result():
     assert {path.stem for path in FILES} == set(SUITES)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(FOLDER)))
 def test_committed_results_are_shown_and_compared(path):
     results, suite = json.loads(path.read_text()), find_suite(path.stem)

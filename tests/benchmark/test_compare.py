@@ -116,6 +116,7 @@ def run(monkeypatch, run_script, tmp_path):
     return script
 
 
+@pytest.mark.medium
 def test_the_exit_status_is_1_where_a_number_became_worse(run, tmp_path):
     old = tmp_path / "old" / "made.json"
     assert run(row(), output=old.parent).returncode == 0

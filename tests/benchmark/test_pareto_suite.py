@@ -124,6 +124,7 @@ def test_a_row_is_what_the_network_and_the_renderer_give(measured, tmp_path):
     assert row["psnr"] == pytest.approx(psnr(image, scene.held_out.images).mean().item(), abs=1e-4)
 
 
+@pytest.mark.medium
 def test_a_folder_of_photographs_is_a_scene(tmp_path):
     write_photographs(tmp_path / "mine", 12, 40, 60)
     scenes, absent = find_scenes(["mine", "fox"], tmp_path)
@@ -202,6 +203,7 @@ MISTAKES = [
 ]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("changes, sentence", MISTAKES)
 def test_mistakes_are_named(make_pareto, changes, sentence):
     with pytest.raises(InputError, match=sentence) as raised:

@@ -123,6 +123,7 @@ def test_a_red_page_says_so_and_the_command_fails(tmp_path, run_script, monkeypa
     assert (tmp_path / "stability.png").stat().st_size > 0
 
 
+@pytest.mark.medium
 def test_a_box_short_of_a_tile_is_red(measured, monkeypatch):
     """In the reference, which the kernels are compared with."""
     module = import_module("asysplat.rendering.reference.draw")

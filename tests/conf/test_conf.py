@@ -44,6 +44,7 @@ def composed(composed):
     return partial(composed, return_hydra_config=True)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("choice", CHOICES)
 def test_a_choice_composes_and_builds_its_model(build, choice):
     assert sum(p.numel() for p in build(choice, device="meta").parameters()) > 1e6

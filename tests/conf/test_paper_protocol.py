@@ -53,6 +53,7 @@ def test_every_table_is_listed():
     assert set(PAPER) == set(load_paper())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("sweep", PAPER)
 def test_every_row_on_dl3dv(compose_train, sweep):
     metrics, selection, test_sets = PAPER[sweep]
@@ -97,6 +98,7 @@ COMMANDS = [
 ]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_of_the_paper_compose_its_network(compose_train, command):
     """Without a model: asysplat_4m4s, without a prior, with the head of the scale."""
@@ -114,6 +116,7 @@ def test_commands_of_the_paper_compose_its_network(compose_train, command):
         assert config.training.loss.ssim == config.training.loss.opacity == 0
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("sweep", PAPER)
 def test_all_rows_of_a_table_have_one_head(compose_train, sweep):
     """But for MVSplat, whose head is that of its volume."""
@@ -162,6 +165,7 @@ def test_a_test_set_has_the_given_path(compose_train):
     assert config.data.test_sets.scannetpp.root is None
 
 
+@pytest.mark.medium
 def test_the_command_for_a_cluster(compose_train):
     """The command of docs/tables.md, and each of its jobs."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")

@@ -102,6 +102,7 @@ def scenes_of_steps(processes, micro_batch):
     return shares
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("scenes", "processes"), [(3, 1), (5, 4), (2, 3)])
 def test_no_scene_is_evaluated_by_two_processes(scenes, processes):
     """All have equally many batches; a process with fewer scenes repeats one of its own."""
@@ -116,6 +117,7 @@ def test_no_scene_is_evaluated_by_two_processes(scenes, processes):
     assert sum(map(len, having)) == len(set().union(*having)) == scenes
 
 
+@pytest.mark.medium
 def test_augmented_tasks_are_repeated_by_their_seed():
     plain, varied = (
         TrainingTasks(procedural(augmentation=augmentation))
@@ -174,6 +176,7 @@ def test_fixed_tasks_stay_loaded_up_to_a_limit(monkeypatch):
     assert [len(sequence.decoded) for sequence in sequences] == [3, 3, 6]
 
 
+@pytest.mark.medium
 def test_a_test_set_differs_only_in_its_options():
     data = set_up(with_test_sets({"rooms": {"places": "rooms"}, "more_views": {"inputs": 5}}))
     assert list(data.tests) == ["procedural", "rooms", "more_views"]
@@ -194,6 +197,7 @@ def test_a_procedural_source_of_one_kind_of_place_has_its_splits_seeds():
     assert [seed % 3 for seed in seeds] == 2 * [1] + 3 * [2] + 3 * [0]
 
 
+@pytest.mark.medium
 def test_an_unusable_test_set_is_named():
     for test_sets, message in (
         ({"far": {"palces": "rooms"}}, r"\.far\.palces is no"),
@@ -235,6 +239,7 @@ def test_tests_may_have_another_size_than_training():
             data.check_sizes(refuse(width))
 
 
+@pytest.mark.medium
 def test_test_sets_are_those_whose_path_and_name_are_set(written):
     root = f"{written}/s3"
     sets = {"here": {"root": root, "selection": "kmeans"}, "nowhere": {"root": None}}
@@ -270,6 +275,7 @@ def test_the_root_of_a_test_set_is_what_it_tests_beside_a_test_root(folder):
     assert drawn | {validated} == {"s3", "s4", "s5"} and validated not in drawn
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("scenes", [None, 1])
 def test_files_are_tested_on_the_same_images_at_another_size(folder, scenes):
     """Every 8th image of all scenes, or those of a test root."""

@@ -59,6 +59,7 @@ def test_procedural_scenes_are_image_sequences():
     assert torch.equal(views.cameras.cam_to_world, short.cameras.cam_to_world[[7, 2]])
 
 
+@pytest.mark.medium
 def test_half_of_the_seeds_are_rooms_and_places_override_the_seed():
     # Nothing in a room is farther than its diagonal; the sky is 60 m away.
     farthest = [ProceduralScene(seed, 8, 8).views([0, 48]).depths.max() for seed in range(16)]

@@ -104,6 +104,7 @@ def test_first_96_takes_every_8th_as_target_and_even_inputs_of_the_others():
     assert not set(selected.inputs) & set(selected.targets)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("selection", ["every_8th", "kmeans", "first_96"])
 def test_validation_shares_no_image_with_the_test(selection):
     cameras = cameras_at(np.random.default_rng(0).normal(size=(70, 3)))
@@ -289,6 +290,7 @@ def test_an_unusable_index_is_named(tmp_path):
             read_index(tmp_path / "index.json", 2)
 
 
+@pytest.mark.medium
 def test_the_command_writes_an_index_outside_of_the_data_set(folder, tmp_path, capsys):
     scenes, file = folder("scenes", 3, 4), tmp_path / "index.json"
     index_command([scenes, str(file), "--inputs", "4"])

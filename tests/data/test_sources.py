@@ -75,6 +75,7 @@ def test_the_least_recently_used_scenes_are_closed(folder, opened, monkeypatch):
     assert opened == ["s0", "s1", "s2", "s1"]
 
 
+@pytest.mark.medium
 def test_tested_scenes_are_not_trained_on(folder):
     """Although the root holds them too, in subfolders."""
     root, tested = folder("all/1K", *range(8)), folder("tested", 2, 5)

@@ -14,6 +14,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SEEDS = range(3)
 
 
+@pytest.mark.medium
 def test_only_training_scenes_are_varied():
     source = ProceduralSource(16, 16, 24, (12, 24), val_scenes=1, test_scenes=1, varied=True)
     rng = np.random.default_rng(0)

@@ -61,6 +61,7 @@ def check(found, expected):
     assert found.tolist() == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "name, store, options",
     [

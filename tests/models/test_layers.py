@@ -30,6 +30,7 @@ def saved_bytes(net, views):
     return sum(s.nbytes() for address, s in storages.items() if address not in parameters)
 
 
+@pytest.mark.medium
 def test_checkpointing_changes_nothing_but_memory(build):
     torch.manual_seed(0)
     net, views = build(*SMALL), make_views(batch=(1,), width=48)
@@ -42,6 +43,7 @@ def test_checkpointing_changes_nothing_but_memory(build):
     assert saved_bytes(again, views) < 0.5 * saved_bytes(net, views)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("model", ["asysplat_4m4s", "asysplat_7m1t"])
 def test_float32_gives_the_gaussians_of_float64(build, model):
     torch.manual_seed(0)

@@ -37,6 +37,7 @@ def same_bits(one, other):
     return all(map(torch.equal, vars(one).values(), vars(other).values()))
 
 
+@pytest.mark.medium
 def test_off_is_exact_and_reports_nothing(net, composed):
     exact = predict(net, wall())
     assert instantiate(composed("speed=exact").speed) == EXACT == net.early_exit
@@ -93,6 +94,7 @@ def test_without_the_network_gaussians_are_those_of_the_prior(net):
     torch.testing.assert_close(*images)
 
 
+@pytest.mark.medium
 def test_presets_skip_where_the_prior_is_confident(net, composed):
     textured = wall()
     flat = replace(textured, images=torch.full_like(textured.images, 0.4))

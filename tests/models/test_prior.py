@@ -139,6 +139,7 @@ def test_a_surface_in_one_view_alone_is_opaque():
     assert prior.opacity[:, 0, :, 13:].max() < 0.8
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_takes_a_prior(build, model):
     views = wall(2)
@@ -158,6 +159,7 @@ def test_every_model_takes_a_prior(build, model):
     assert different == tokenizers
 
 
+@pytest.mark.medium
 def test_costs_are_counted_on_the_meta_device(build):
     costs = static_costs(build(*SIZE, "model=asysplat_plane_sweep"), 3, 32, 32)
     assert costs["gaussians"] == 3 * 32 * 32 and costs["activation_gb"] > 0

@@ -58,6 +58,7 @@ def test_a_gaussian_for_every_pixel(build, model, patch):
     )
 
 
+@pytest.mark.medium
 def test_every_view_reaches_every_other(build):
     net = build(*TINY, "model=longlrm").eval()
     views = blank_views(2, 32, 32).map(torch.zeros_like)

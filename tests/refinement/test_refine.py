@@ -161,6 +161,7 @@ def test_one_view_and_one_gaussian_improve(kind):
     assert quality(found, views) > quality(start, views)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("case", ["masked", "one position", "tiny", "huge", "hidden", "faint"])
 def test_refinement_of_unusual_scenes_keeps_a_gaussian(kind, case):
@@ -229,6 +230,7 @@ def test_pruned_gaussians_are_replaced():
         assert (refinement.gaussians.opacities > MIN_OPACITY).all()
 
 
+@pytest.mark.medium
 def test_rounds_of_densification_come_at_their_steps():
     """Of 3 rounds in the first half of 16 steps, the steps before which Gaussians are added."""
     for options, expected in (

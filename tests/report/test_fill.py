@@ -68,6 +68,7 @@ def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
     assert filled.notes["Command"] == "python train.py sweeps=layers steps=7"
 
 
+@pytest.mark.medium
 def test_a_sweep_over_one_option_fills_its_table(compose, tmp_path):
     """python train.py -m geometry_ratio=0.5,0.9, without `sweeps=geometry_ratio`."""
     for ratio in (0.5, 0.9):
@@ -86,6 +87,7 @@ def test_a_sweep_over_one_option_fills_its_table(compose, tmp_path):
     assert not any(row.values for row in fill_table(table, ["steps=8"], compose, runs).rows)
 
 
+@pytest.mark.medium
 def test_a_row_without_a_run_names_the_one_most_like_it(compose, tmp_path):
     config = compose(["geometry_ratio=0.5", "steps=8"])
     write_run(tmp_path / "ratio", config, {"test/procedural/psnr": 20.0}, 0)
@@ -101,6 +103,7 @@ def test_a_row_without_a_run_names_the_one_most_like_it(compose, tmp_path):
     assert not any(row.note for row in rows)  # they differ in too much
 
 
+@pytest.mark.medium
 def test_one_run_fills_every_table_with_its_configuration(compose, logs, tmp_path):
     config = compose(["sweeps=layers", "model=asysplat_4m4s"])
     numbers = {"test/procedural/psnr": 20.0, "test/outdoors/psnr": 19.0}
@@ -116,6 +119,7 @@ def test_one_run_fills_every_table_with_its_configuration(compose, logs, tmp_pat
 DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
 
 
+@pytest.mark.medium
 def test_runs_on_the_papers_data(compose, tmp_path):
     """They are found without their paths; a test set without a path has no numbers."""
     config = compose(
@@ -143,6 +147,7 @@ def test_runs_on_the_papers_data(compose, tmp_path):
     assert fill_table(load_paper()["layers"], moved, compose, runs).rows[0].values
 
 
+@pytest.mark.medium
 def test_mixed_protocols_and_folders_are_reported(compose, tmp_path):
     for seed, root, name in ((0, "/a/DL3DV", "longlrm"), (1, "/a/DL3DV-small", "default")):
         overrides = ["sweeps=layers", "model=asysplat_4m4s", "data=dl3dv", f"data.root={root}"]
@@ -158,6 +163,7 @@ def test_mixed_protocols_and_folders_are_reported(compose, tmp_path):
     )
 
 
+@pytest.mark.medium
 def test_a_run_that_was_tested_on_all_sets_comes_first(compose, tmp_path):
     paths = ["paths.mipnerf360=/a/360_v2"]
     every = compose(["sweeps=geometry_ratio", "model=asysplat_4m4s", *DL3DV, *paths])
@@ -177,6 +183,7 @@ def test_a_run_that_was_tested_on_all_sets_comes_first(compose, tmp_path):
     assert first_row("layers") == {"dl3dv/psnr": [3.0]}
 
 
+@pytest.mark.medium
 def test_a_row_of_a_further_test_set_has_its_costs(compose, tmp_path):
     costs = {"cost/inference_seconds": 0.5, "cost/more_views/inference_seconds": 0.9}
     config = compose(["sweeps=more_views", "model=asysplat_4m4s"])
@@ -187,6 +194,7 @@ def test_a_row_of_a_further_test_set_has_its_costs(compose, tmp_path):
     assert [values.get("dl3dv/psnr") for values in ours] == [None, [18.0]]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("data", ["files", "colmap", "mipnerf360", "replica", "realestate10k"])
 def test_a_table_on_any_data(compose, data):
     filled = fill_table(load_paper()["more_views"], [f"data={data}"], compose, {})
@@ -194,6 +202,7 @@ def test_a_table_on_any_data(compose, data):
     assert f"{data} data" in filled.notes["Ours"]
 
 
+@pytest.mark.medium
 def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, tmp_path):
     config = compose(["sweeps=state_of_the_art", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, {"test/rooms/psnr": 20.0, "cost/inference_gb": 0.5}, 0)
@@ -210,6 +219,7 @@ def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, t
     assert sizes[0] != sizes[1]
 
 
+@pytest.mark.medium
 def test_post_optimization_is_not_run_until_evaluation_adds_it(compose, tmp_path):
     config = compose(["sweeps=state_of_the_art", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, {"test/procedural/psnr": 20.0}, 0)
@@ -241,6 +251,7 @@ def test_broken_results_are_ignored(compose, tmp_path, text):
         assert find_run(tmp_path, config) is None
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("table", load_paper("ours").values(), ids=lambda table: table.key)
 def test_rows_of_our_tables_are_those_of_their_sweeps(compose, table):
     varied = dict(compose([f"sweeps={table.key}"]).hydra.sweeper.params)

@@ -172,6 +172,7 @@ def test_notes_under_a_table(table):
         assert note in text
 
 
+@pytest.mark.medium
 def test_our_numbers_have_the_name_of_our_test_set(table, ratios):
     """In every renderer: ours under my_rooms, the paper's under DL3DV-140."""
     ratios = replace(ratios, sets=table.sets)
@@ -240,6 +241,7 @@ def test_overview_has_a_line_a_table(table, ratios):
     assert "All tables" not in render_markdown([table])
 
 
+@pytest.mark.medium
 def test_html_has_the_texts_of_markdown(table, ratios):
     markdown = render_markdown([table, ratios])
     page = Page(render_html([table, ratios]))
@@ -249,6 +251,7 @@ def test_html_has_the_texts_of_markdown(table, ratios):
     assert [text for text in words if escape(text) not in markdown and text not in markdown] == []
 
 
+@pytest.mark.medium
 def test_html_needs_nothing_else(table, ratios):
     text = render_html([table, ratios])
     page = Page(text)

@@ -1,5 +1,7 @@
 """report.py as a user runs it."""
 
+import pytest
+
 
 def test_writes_markdown_and_a_page(run_script, tmp_path):
     result = run_script("report.py", "table=layers", f"logs={tmp_path}")
@@ -11,6 +13,7 @@ def test_writes_markdown_and_a_page(run_script, tmp_path):
     assert "18.78" in (tmp_path / "report" / "report.md").read_text()
 
 
+@pytest.mark.medium
 def test_overrides_of_the_sweeps_reach_the_configuration(run_script, tmp_path):
     given = ["table=layers", "data=dl3dv", "scale=paper", "data.root=/a/DL3DV", f"logs={tmp_path}"]
     result = run_script("report.py", *given, 'overrides=["steps=7"]')

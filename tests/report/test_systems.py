@@ -40,6 +40,7 @@ def fill(compose, tmp_path, table, *overrides):
     return filled, {row.name: row for row in filled.rows}
 
 
+@pytest.mark.medium
 def test_a_measured_system_stands_beside_its_quoted_numbers(compose, write, tmp_path):
     for seed, psnr in ((1, 24.0), (0, 25.0)):
         write("PixelSplat", psnr, *TWO_VIEWS, seed=seed)
@@ -71,6 +72,7 @@ UNLIKE = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("case", UNLIKE)
 def test_other_options_are_not_the_tables(compose, write, tmp_path, case):
     change, more, message = UNLIKE[case]
@@ -84,6 +86,7 @@ def test_other_options_are_not_the_tables(compose, write, tmp_path, case):
     assert row.note.startswith("measured with other options than the table's (in brackets)")
 
 
+@pytest.mark.medium
 def test_evaluations_on_several_sets_make_a_row(compose, write, tmp_path):
     """The 3DGS of Table 2, measured on DL3DV and on MipNeRF-360, each as a data set."""
     options = ["experiment=three_stages", "metrics=longlrm"]
@@ -95,6 +98,7 @@ def test_evaluations_on_several_sets_make_a_row(compose, write, tmp_path):
     assert "12 scenes of dl3dv data" in row.note and "12 scenes of mipnerf360 data" in row.note
 
 
+@pytest.mark.medium
 def test_input_views_tell_rows_of_one_system_apart(compose, write, tmp_path):
     options = ["experiment=three_stages", "metrics=longlrm", "data=dl3dv"]
     write("AnySplat", 13.0, *options, "data.inputs=${more_inputs}")
@@ -103,6 +107,7 @@ def test_input_views_tell_rows_of_one_system_apart(compose, write, tmp_path):
     assert not rows["AnySplat, 32 views"].values
 
 
+@pytest.mark.medium
 def test_further_systems_are_added_to_tables_that_quote_some(compose, write, tmp_path):
     write("FreeSplat", 24.0, "experiment=two_views", "metrics=pixelsplat")
     filled, rows = fill(compose, tmp_path, "two_views")

@@ -17,6 +17,7 @@ CASES = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("case", CASES)
 def test_images_and_gradients_are_those_of_the_reference(fast_backend, case):
     outputs, options = CASES[case]

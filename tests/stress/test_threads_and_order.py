@@ -9,6 +9,7 @@ from asysplat.benchmark.scenes import random_scene
 from asysplat.scene import Cameras, Gaussians
 
 
+@pytest.mark.medium
 def test_any_number_of_threads_gives_the_same_bits(backend, threads):
     scenes = [random_scene(backend.many, 48, 64, seed) for seed in range(2)]
     gaussians = Gaussians.stack([scene for scene, _ in scenes])
@@ -25,6 +26,7 @@ def test_any_number_of_threads_gives_the_same_bits(backend, threads):
         assert_same_bits(run(count), one, f"{count} threads: ")
 
 
+@pytest.mark.medium
 @pytest.mark.skipif(INTERPRETED, reason="too many for the interpreter")
 def test_six_renderings_of_a_dense_scene_are_the_same(threads):
     """Bits and statistics, on one thread and on two, where splats end at the edges of tiles."""

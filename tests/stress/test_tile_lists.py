@@ -141,6 +141,7 @@ def test_boxes_and_several_views(lists_of):
     assert (np.bincount(boxes.entries[:, 1]) == 1).all()
 
 
+@pytest.mark.medium
 def test_a_splat_whose_rows_end_past_its_box():
     """The box ends where a tile does: rounding put one row past it while another row fell short,
     and tiles that were listed were not those that had been counted."""

@@ -62,6 +62,7 @@ resident = pytest.mark.skipif(
 )
 
 
+@pytest.mark.medium
 @resident
 def test_memory_of_each_test_set_is_that_of_its_predictions():
     sets = {"main": [1, 300, 1], "more_views": [200, 1], "small": [1, 1]}
@@ -72,6 +73,7 @@ def test_memory_of_each_test_set_is_that_of_its_predictions():
         assert rise == pytest.approx(expected, abs=TOLERANCE_GB)
 
 
+@pytest.mark.medium
 def test_seconds_leave_the_longest_out(monkeypatch):
     clock = iter([0.0, 1.0, 10.0, 40.0, 50.0, 53.0])  # start and end of each prediction
     monkeypatch.setattr(measured_cost, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
@@ -88,6 +90,7 @@ def test_seconds_of_steps_leave_the_longest_out():
     assert costs.values == {"cost/seconds_per_step": 8.0}
 
 
+@pytest.mark.medium
 def test_what_does_not_fit_is_refused_before_the_first_step(train, monkeypatch, tmp_path):
     monkeypatch.setattr(costs, "memory_gb", lambda device: 0.001)
     result = train(COSTS, "steps=1", "validate_every=1", "data.test_sets=null")

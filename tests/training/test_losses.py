@@ -243,6 +243,7 @@ LAYERS = {  # the scale of images, and the weights by the end of their layers; 0
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", LAYERS)
 def test_layers_and_weights(distances, name):
     """Long-LRM's have mean pooling."""

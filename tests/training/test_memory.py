@@ -42,6 +42,7 @@ def test_the_same_gradients_in_less_memory(module):  # noqa: F811
         assert less < most * whole
 
 
+@pytest.mark.medium
 @pytest.mark.skipif(not reset_peak_memory("cpu"), reason="the peak cannot be reset")
 def test_views_at_once_bound_the_memory_of_rendering(make_scene):
     gaussians, cameras = make_scene(count=40_000, views=8, dtype=torch.float32)

@@ -37,6 +37,7 @@ UNREAD = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("model", MODELS)
 def test_which_parameters_are_trained_and_which_decay(build, model):
     module = make_module(build("width=0.125", "state_size=8", f"model={model}", device="meta"))
@@ -59,6 +60,7 @@ def test_which_parameters_are_trained_and_which_decay(build, model):
         assert not name.endswith(".weight") or "Norm" in kind, name
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("algorithm", "measure"), [("norm", torch.linalg.vector_norm), ("value", torch.amax)]
 )
@@ -72,6 +74,7 @@ def test_gradients_are_clipped(build, algorithm, measure):
     torch.testing.assert_close(measure(grads), torch.tensor(0.5).double(), rtol=1e-5, atol=0)
 
 
+@pytest.mark.medium
 def test_a_branch_that_nothing_reads_is_not_trained(build):
     overrides = ("model/source=fine", "model/links=only_fine_to_coarse", "width=0.125")
     net = make_module(build(*overrides, "state_size=8")).net
@@ -80,6 +83,7 @@ def test_a_branch_that_nothing_reads_is_not_trained(build):
     assert all(isinstance(p, torch.nn.Parameter) and not p.is_meta for p in net.parameters())
 
 
+@pytest.mark.medium
 def test_the_background_follows_the_inputs(build):
     """What no Gaussian covers has the mean color of each scene's inputs."""
     module = make_module(build("width=0.125", "state_size=8"), "inputs")

@@ -44,6 +44,7 @@ def config(composed):
     return composed(*overrides_of_today(), "paths.run=unused")
 
 
+@pytest.mark.medium
 def test_a_sweep_and_the_report_find_it(old_run, config):
     run = find_run(old_run.parent, config)
     assert run.folder == old_run

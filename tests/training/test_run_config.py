@@ -32,6 +32,7 @@ def run(tmp_path):
     return write
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("key", ["head", "prior", "_args_"])
 @pytest.mark.parametrize("target", TARGETS.split())
 def test_no_other_class_is_built(run, tmp_path, target, key):

@@ -53,6 +53,7 @@ OTHER = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("case", SAME)
 def test_options_that_change_no_number_keep_the_hash(composed, case):
     plain, changed = composed(*DL3DV), composed(*DL3DV, *SAME[case])
@@ -75,6 +76,7 @@ def test_paths_may_be_left_out(composed):
     }
 
 
+@pytest.mark.medium
 def test_runs_of_other_data_differ(composed, write_run, tmp_path):
     overrides = ["data=files", "data.root=/a/garden"]
     folder = write_run("one", composed(*overrides))
@@ -83,6 +85,7 @@ def test_runs_of_other_data_differ(composed, write_run, tmp_path):
     assert find_run(tmp_path, composed("data=files", "data.root=/a/bicycle")) is None
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("option", ["data.index", "init_path"])
 def test_files_are_compared_by_content(composed, write_run, tmp_path, option):
     paths = [tmp_path / f"{number}.json" for number in range(3)]
@@ -96,6 +99,7 @@ def test_files_are_compared_by_content(composed, write_run, tmp_path, option):
     assert find_run(tmp_path, other) is None
 
 
+@pytest.mark.medium
 def test_a_run_with_more_test_sets_is_found_for_fewer(composed, write_run, tmp_path):
     tested = [*DL3DV, "test_sets=[mipnerf360,replica]", "paths.replica=/a/Replica"]
     folder = write_run("run", composed(*tested))
@@ -186,6 +190,7 @@ def files(tmp_path):
     return paths
 
 
+@pytest.mark.medium
 def test_weights_are_compared_by_content(scene_folder, files):
     same, moved, other = (scene_folder(f"init_path={path}", *GARDEN) for path in files)
     assert moved.name == same.name and other.name != same.name
@@ -202,6 +207,7 @@ OTHER_EVALUATION = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("case", OTHER_EVALUATION)
 def test_other_options_are_another_evaluation(scene_folder, files, case):
     weights = f"init_path={files[0]}"

@@ -73,6 +73,7 @@ def test_the_mean_over_scenes(module):
     assert all(p.grad is not None for p in parameters.values() if p.requires_grad)
 
 
+@pytest.mark.medium
 def test_the_terms_of_a_batch_are_means_over_its_scenes(module):
     batch, net = make_batch(), module.net.eval()
     with torch.no_grad():
@@ -84,6 +85,7 @@ def test_the_terms_of_a_batch_are_means_over_its_scenes(module):
         torch.testing.assert_close(term, mean, rtol=1e-4, atol=0)
 
 
+@pytest.mark.medium
 def test_any_number_of_workers_gives_the_same_bits(module, threads, monkeypatch):
     batch, found, kinds = make_batch(), [], []
     start = {name: buffer.clone() for name, buffer in module.net.named_buffers()}
@@ -104,6 +106,7 @@ def test_any_number_of_workers_gives_the_same_bits(module, threads, monkeypatch)
             assert torch.equal(tensor, other[name]), name
 
 
+@pytest.mark.medium
 def test_it_computes_under_autocast_where_its_caller_does(module):
     types = []
 

@@ -44,6 +44,7 @@ def test_the_papers_three_stages(composed):
         assert [OmegaConf.select(config, key) for config in found] == values, key
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("scale", ["laptop", "gpu", "paper"])
 def test_every_scale_has_them_and_tests_them_alike(composed, scale):
     config = composed(f"scale={scale}", "data=dl3dv")
@@ -59,6 +60,7 @@ def test_every_scale_has_them_and_tests_them_alike(composed, scale):
     assert stage_configs(alone) == [alone]
 
 
+@pytest.mark.medium
 def test_the_hash_covers_all_stages(composed):
     runs = [[], ["stages.stage1.steps=7"], ["+stages.stage2.crop=0.5"], ["earlier_stages=[stage2]"]]
     runs += [["earlier_stages=[stage2,stage1]"], ["earlier_stages=[]"], ["stage=ablation"]]
@@ -76,6 +78,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_mistake_in_any_stage_is_refused_at_once(composed, case):
     overrides, message = REFUSED[case]

@@ -218,6 +218,7 @@ def test_a_mistake_is_one_sentence(train, case, tmp_path):
     assert not list(tmp_path.rglob("checkpoints"))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("option", ["ckpt_path", "init_path"])
 def test_a_checkpoint_of_another_model(train, whole, tmp_path, option):
     path = whole / "checkpoints" / "last.ckpt"

@@ -114,6 +114,7 @@ def test_mistakes_of_cameras_are_named(real, mistakes):
             assert "(corrected, the error is" in verdict.sentence, name
 
 
+@pytest.mark.medium
 def test_other_resolutions_are_fitted(real):
     cameras, matches, names = real
     verdict = diagnose_cameras(scaled(1.4, 1.4)(cameras), matches, names)

@@ -61,6 +61,7 @@ def no_figure(monkeypatch):
     monkeypatch.setattr("asysplat.data.check.__main__.save_figure", lambda *_: "check.png")
 
 
+@pytest.mark.medium
 def test_the_report_of_a_good_scene_fits_one_screen_and_overwrites_nothing(check, scene, tmp_path):
     folder = tmp_path / "elsewhere/walk"
     folder.mkdir(parents=True)

@@ -112,6 +112,7 @@ def test_damaged_images_are_refused_or_usable(suffix, tmp_path, count):
     assert attack(file, lambda: load_image(file), count, suffix) == []
 
 
+@pytest.mark.medium
 @many_mutants
 def test_damaged_runs_are_refused_or_usable(composed, tmp_path, count):
     """Mutants of the checkpoint and the configuration of a run."""

@@ -47,6 +47,7 @@ def counts(sample):
     return sample["inputs"].num_views, sample["targets"].num_views
 
 
+@pytest.mark.medium
 def test_tables_2_and_3_test_their_zero_shot_sets(tests_of):
     tests = tests_of("sweeps=state_of_the_art", "replica_size.height=16", "replica_size.width=22")
     assert list(tests) == ["dl3dv", "tanks_and_temples", "mipnerf360", "deep_blending", "replica"]

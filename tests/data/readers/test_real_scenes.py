@@ -48,6 +48,7 @@ def test_a_layouts_reader_and_colmaps_give_the_same_cameras(scene):
     np.testing.assert_allclose(intrinsics(own), intrinsics(model), rtol=1e-5)
 
 
+@pytest.mark.medium
 def test_points_of_real_scenes_agree_with_their_depths(scene):
     sequence = open_scene(scene, SceneOptions(64, 64))
     views = sequence.views(range(0, sequence.num_images, 10)).validate()

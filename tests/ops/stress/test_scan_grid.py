@@ -51,6 +51,7 @@ def test_float16(path, reverse):
     assert_exact(path, make_arguments(path[0], 131, dtype=torch.float16), reverse=reverse)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("path", PATHS, ids="-".join)
 @settings(max_examples=20, derandomize=True, deadline=None)
 @given(
