@@ -211,6 +211,7 @@ def test_more_pixels_than_the_photographs_have(scene):
     assert "height=3000: the photographs have 24 pixels, which are used." in said
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("script", ["train", "reconstruct", "evaluate", "report"])
 def test_a_typo_is_named_before_torch_is_imported(repository, script):
     program = f"""

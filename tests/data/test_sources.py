@@ -42,6 +42,7 @@ def images(tasks):
     return {index for task in tasks for index in task.selection.inputs + task.selection.targets}
 
 
+@pytest.mark.medium
 def test_images_that_test_or_validate_are_not_trained_on(folder):
     source = FilesSource(folder("one", 3), SIZE, (12, 24))
     held = set(held_out(IMAGES, "test") + held_out(IMAGES, "val"))

@@ -3,6 +3,7 @@
 import pytest
 
 
+@pytest.mark.medium
 def test_writes_markdown_and_a_page(run_script, tmp_path):
     result = run_script("report.py", "table=layers", f"logs={tmp_path}")
     assert result.returncode == 0, result.stderr

@@ -14,6 +14,7 @@ CASES |= {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.skipif(INTERPRETED, reason="too many Gaussians for the interpreter")
 @pytest.mark.parametrize("name", CASES)
 def test_error_is_within_what_rounding_explains(fast_backend, name):

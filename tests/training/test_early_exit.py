@@ -4,6 +4,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import lightning
+import pytest
 from omegaconf import OmegaConf, open_dict
 
 from asysplat.evaluation.protocol import Protocol
@@ -37,6 +38,7 @@ def test_means_over_the_scenes_of_each_set():
     assert logged({"rooms": [{}, {}]}) == ({}, {})  # exact
 
 
+@pytest.mark.medium
 def test_exact_has_the_hash_of_a_run_without_speed(composed):
     before = composed()
     with open_dict(before):

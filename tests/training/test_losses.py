@@ -261,6 +261,7 @@ def test_layers_and_weights(distances, name):
     torch.testing.assert_close(distance(rendered, target), expected)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", NETWORKS)
 def test_perceptual_term_has_the_same_bits_under_autocast(distances, name):
     distance, _ = distances[name]

@@ -62,6 +62,7 @@ def test_options_that_change_no_number_keep_the_hash(composed, case):
     assert described == data_of(plain)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("case", OTHER)
 def test_options_that_change_numbers_change_the_hash(composed, case):
     assert config_hash(composed(*DL3DV, *OTHER[case])) != config_hash(composed(*DL3DV))

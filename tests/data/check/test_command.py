@@ -127,6 +127,7 @@ def test_the_first_of_many_scenes_are_checked_also_without_a_point_to_match(chec
     assert [name for name in "bcde" if f"{name}, layout" in out] == ["b", "c", "d"]
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("scene")
 def test_errors_of_the_check_are_one_line(check):
     for arguments, message in (

@@ -27,6 +27,7 @@ def read(layout, folder):
     return scene
 
 
+@pytest.mark.medium
 def test_a_layouts_reader_and_colmaps_give_the_same_cameras(scene):
     own, model = (
         {image.file: image for image in read(layout, scene).images}

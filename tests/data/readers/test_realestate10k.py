@@ -72,6 +72,7 @@ def set_image(value):
     return lambda content: content["images"].__setitem__(2, value)
 
 
+@pytest.mark.medium
 @table(
     {
         "nan": (set_camera(9, float("nan")), "frame 2: its world-to-camera holds NaN"),
