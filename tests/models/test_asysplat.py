@@ -48,7 +48,11 @@ PARAMETERS = {
 }
 
 
-@pytest.mark.parametrize("model", PARAMETERS)
+QUICK = ("asysplat_4m4s", "asysplat_7m1t", "single_branch", "longlrm", "gs_lrm")
+MODELS = [pytest.param(m, marks=[] if m in QUICK else [pytest.mark.medium]) for m in PARAMETERS]
+
+
+@pytest.mark.parametrize("model", MODELS)
 def test_parameters_and_head_at_full_width(build, model):
     net = build("scale=paper", f"model={model}", device="meta")
     millions = sum(p.numel() for p in net.parameters()) / 1e6
