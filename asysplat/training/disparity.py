@@ -17,15 +17,13 @@ from asysplat.errors import InputError
 from asysplat.scene import Gaussians, Views
 from asysplat.training.prediction import Prediction
 
+STRIDE = 2  # p_c / p_f of the paper: both maps are downsampled by it
 MIN_ALPHA = 0.5  # pixels with less alpha are ignored
 MIN_DEPTH = 1e-2  # depths are clamped to it, as in Long-LRM
 
 
 class RenderedDisparity:
-    """The paper's formula: compares the depth rendered at the targets with their disparities.
-
-    Both are downsampled as the Gaussians' grid is, by p_c / p_f.
-    """
+    """The paper's formula: compares the depth rendered at the targets with their disparities."""
 
     renders_depth = True
 
@@ -34,9 +32,8 @@ class RenderedDisparity:
         rendering, target = prediction.rendering, reference_disparities(batch["targets"])
         if target is None:
             return None
-        stride = grid_stride(prediction.gaussians, batch["inputs"])
         depth, alpha, target = (
-            maps[..., ::stride, ::stride] for maps in (rendering.depth, rendering.alpha, target)
+            maps[..., ::STRIDE, ::STRIDE] for maps in (rendering.depth, rendering.alpha, target)
         )
         return disparity_distance(depth, target, (target > 0) & (alpha > MIN_ALPHA) & (depth > 0))
 
@@ -72,12 +69,6 @@ def reference_disparities(views: Views) -> Float[Tensor, "*batch V H W"] | None:
     return torch.where(valid, 1 / torch.where(valid, views.depths, 1), 0)
 
 
-def grid_stride(gaussians: Gaussians, inputs: Views) -> int:
-    """Return the pixels of the input views along a side of each Gaussian: p_c / p_f."""
-    cameras, count = inputs.cameras, gaussians.num_gaussians
-    return max(1, math.isqrt(inputs.num_views * cameras.height * cameras.width // count))
-
-
 def own_depths(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "*batch V h w"]:
     """Compute each Gaussian's depth in the input view it is aligned with.
 
@@ -85,7 +76,7 @@ def own_depths(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "*batch V h
         InputError: there are not V h w Gaussians, with height / h = width / w a whole number.
     """
     cameras, count = inputs.cameras, gaussians.num_gaussians
-    stride = grid_stride(gaussians, inputs)
+    stride = max(1, math.isqrt(inputs.num_views * cameras.height * cameras.width // count))
     height, width = cameras.height // stride, cameras.width // stride
     if count != inputs.num_views * height * width:
         raise InputError(
