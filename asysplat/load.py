@@ -28,8 +28,8 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
         checkpoint: "shipped" for the model that comes with the project; a .ckpt file in the folder
             of its run, whose config.yaml describes the model; a .safetensors file with the layout
             of the shipped model; None: without training.
-        overrides: of train.py, which change the shipped model and its early exit (`speed=fast`);
-            a run's model ignores them.
+        overrides: options of train.py, which change the shipped model and its early exit
+            (`speed=fast`); a run's model ignores them.
 
     Raises:
         InputError: no such file, the weights of another model, or an unknown override.

@@ -31,7 +31,7 @@ def read_gaussians(
         path: of the file.
         origin: of the coordinates of the means; None: the file's own, whose offset (see
             `write_ply`) is left out.
-        dtype: of the result; only .safetensors may hold more than float32.
+        dtype: the result's type; only .safetensors may hold more than float32.
 
     Raises:
         InputError: another suffix, or see the format's reader.

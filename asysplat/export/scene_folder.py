@@ -152,7 +152,7 @@ def check_visible(gaussians: Gaussians, cameras: Cameras, file: SceneFile, fitte
 
     Args:
         gaussians, cameras: in one frame.
-        file: of the Gaussians, for the message.
+        file: the Gaussians' file, for the message.
         fitted: whether they were moved there by the file's cameras.
 
     Raises:

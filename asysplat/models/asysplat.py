@@ -34,7 +34,7 @@ class AsySplat(TokenNetwork):
         source: component that merges the branches.
         head: component that decodes Gaussians.
         patch_coarse, patch_fine: p_c, p_f; the first a multiple of the second.
-        prior: of TokenNetwork.
+        prior: see TokenNetwork.
 
     Raises:
         InputError: an unusable layer mix, patch sizes that do not divide, unequal stage counts.

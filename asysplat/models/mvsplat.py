@@ -30,8 +30,8 @@ class MVSplat(Network):
     Args:
         width: factor of all channels.
         geometry_ratio, parameter_budget: must be None and 1: there is one branch.
-        channels: of the features.
-        refine_channels: of the U-Net over pixels.
+        channels: number of channels of the features.
+        refine_channels: that of the U-Net over pixels.
         planes: number of inverse depths of the volume, equally spaced.
         near, far: least and greatest depth, in units of the normalized scene.
         sh_degree: 0 to 3.
@@ -296,7 +296,7 @@ class UNet(nn.Module):
     """A U-Net of equal width at each level, whose coarsest level attends to all views.
 
     Args:
-        width: of the features.
+        width: number of features.
         levels: each has half the resolution of the one before.
     """
 

@@ -129,8 +129,8 @@ class TokenNetwork(Network):
     of its layers.
 
     Args:
-        widths: of the network.
-        patch, prior, prune: of Network.
+        widths: widths of the stages.
+        patch, prior, prune: see Network.
     """
 
     head: GaussianHead

@@ -27,7 +27,7 @@ class SingleBranch(TokenNetwork):
         head: component that decodes Gaussians.
         patch: side of a token's patch before any merge.
         global_tokens: number of learned tokens that come first in the sequence and have no place.
-        prior, prune: of TokenNetwork.
+        prior, prune: see TokenNetwork.
 
     Raises:
         InputError: lists of unequal length, an unusable layer mix, or global tokens with sparse

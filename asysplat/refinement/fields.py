@@ -65,7 +65,7 @@ class Fields:
         """Update the visible Gaussians (with a gradient of the opacity); return their mask.
 
         Args:
-            gradients: of the parameters.
+            gradients: gradients of the parameters.
             rates, factor: learning rates, and a factor of all, or of the means alone.
             sh_degree: coefficients of higher degrees are not updated.
         """

@@ -20,7 +20,7 @@ def system_rows(
     quotes a system gets further rows.
 
     Args:
-        config: of the table's runs: what is tested.
+        config: configuration of the table's runs: what is tested.
         sets: the paper's test sets -> ours.
         systems: evaluations, oldest first.
 

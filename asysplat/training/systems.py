@@ -24,7 +24,7 @@ def describe_system(config: DictConfig, scenes: Path, system: str | None) -> dic
     """Describe the scenes of a system, and what they are measured on, for evaluation.json.
 
     Args:
-        config: of train.py.
+        config: configuration of train.py.
         scenes: a folder of files of Gaussians, or one file.
         system: its name; None: that of the folder or file.
     """

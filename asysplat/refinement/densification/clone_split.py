@@ -69,7 +69,7 @@ class ScreenGradients:
 
         Args:
             max_gaussians: the limit.
-            generator: of random numbers.
+            generator: random generator.
             prune_large: prune those above MAX_SCALE or MAX_RADIUS too.
         """
         fields, gaussians = self.fields, self.fields.gaussians()
