@@ -52,7 +52,8 @@ class ProceduralSource:
     Args:
         height, width: size of every view, in pixels.
         num_images: length of each camera path.
-        window: least and greatest number of consecutive images that a training task is drawn from.
+        window: least and greatest number of consecutive images that a training task is drawn from;
+            None: all images.
         first_window: those of the first task; None: `window`.
         val_scenes, test_scenes: number of scenes of each split.
         places: content of the scenes: both, rooms or outdoors.
@@ -62,7 +63,7 @@ class ProceduralSource:
     height: int
     width: int
     num_images: int
-    window: Sequence[int]
+    window: Sequence[int] | None
     val_scenes: int
     test_scenes: int
     places: str = "both"
@@ -128,7 +129,8 @@ class FilesSource:
 
     Args:
         root, test_root: one scene, or a folder of scenes.
-        window: least and greatest number of consecutive images that a training task is drawn from.
+        window: least and greatest number of consecutive images that a training task is drawn from;
+            None: all images.
         first_window: those of the first task; None: `window`.
         selection: how the images of a test are chosen: every_8th, kmeans (the paper's tests),
             first_96 (its ablations), uniform, or index.
@@ -144,7 +146,7 @@ class FilesSource:
 
     root: str
     options: SceneOptions
-    window: Sequence[int]
+    window: Sequence[int] | None
     test_root: str | None = None
     selection: str = "every_8th"
     index: str | None = None

@@ -103,7 +103,7 @@ class GaussianHead(nn.Module, ABC):
             if prior is None:
                 opacities = opacities + self.opacity_bias
             else:
-                expected = self.depth_fraction(prior.distance).clamp(1e-4, 0.99).logit()
+                expected = self.depth_fraction(prior.distance, views).clamp(1e-4, 0.99).logit()
                 bound = MAX_DEPTH_CORRECTION * (1 - (1 - CONFIDENT_FACTOR) * prior.confidence)
                 has_depth = (prior.confidence > 0).flatten(1).any(-1)[:, None, None, None]
                 bound = torch.where(has_depth, bound, MAX_DEPTH_WITHOUT_PRIOR)
@@ -115,7 +115,9 @@ class GaussianHead(nn.Module, ABC):
             return self.activate(decoded, views).map(lambda field: field.flatten(1, 3))
 
     @abstractmethod
-    def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
+    def depth_fraction(
+        self, distance: Float[Tensor, "B V h w"], views: Views
+    ) -> Float[Tensor, "B V h w"]:
         """Return the place of a distance in the head's range, in [0, 1] if it is inside."""
 
     @abstractmethod
@@ -151,7 +153,9 @@ class PhotographHead(GaussianHead):
         self.near, self.far = near, far
         self.scale_bias = scale_bias
 
-    def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
+    def depth_fraction(
+        self, distance: Float[Tensor, "B V h w"], views: Views
+    ) -> Float[Tensor, "B V h w"]:
         return (distance / self.near).log() / math.log(self.far / self.near)
 
     def activate(self, raw: Decoded, views: Views) -> Gaussians:
@@ -177,14 +181,14 @@ class LongLRMHead(GaussianHead):
     """The head of Long-LRM (Ziwen et al. 2025), with the values of its configs/7m1t_tm.yaml.
 
     Colors and sizes are direct, sizes in units of the scene and at most e^largest; the distance
-    along the ray is linear from 0 to `farthest`. Lengths are those of the normalized scene, whose
-    input cameras are within radius 1 (`asysplat.data.normalize`); Long-LRM's are in the box
-    [-1, 1]^3, so its scenes are up to sqrt(3) times larger. It renders with a near plane at 0.01,
-    as `asysplat.rendering` does, and a far one at 1e6, beyond every prediction.
+    along the ray is linear from 0 to `farthest`. The unit is Long-LRM's, the largest coordinate of
+    an input camera, which is 1/sqrt(3) to 1 in a normalized scene (`asysplat.data.normalize`: the
+    farthest camera is at distance 1). It renders with a near plane at 0.01, as `asysplat.rendering`
+    does, and a far one at 1e6, beyond every prediction.
 
     Args:
         width, patch_coarse, patch_fine, sh_degree, opacity_bias: of GaussianHead.
-        farthest: distance, in units of the normalized scene.
+        farthest: distance.
         scale_bias: log of an untrained size.
         largest: log of the largest size.
     """
@@ -204,20 +208,32 @@ class LongLRMHead(GaussianHead):
         self.farthest = farthest
         self.scale_bias, self.largest = scale_bias, largest
 
-    def depth_fraction(self, distance: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
-        return distance / self.farthest
+    def depth_fraction(
+        self, distance: Float[Tensor, "B V h w"], views: Views
+    ) -> Float[Tensor, "B V h w"]:
+        return distance / (self.farthest * unit_of(views)[..., 0])
 
     def activate(self, raw: Decoded, views: Views) -> Gaussians:
         origins, directions = views.cameras.resized(*raw.opacities.shape[2:]).rays()
-        sizes = (raw.scales + self.scale_bias).clamp(max=self.largest).exp()
+        unit = unit_of(views)
+        sizes = (raw.scales + self.scale_bias).clamp(max=self.largest).exp() * unit
         return Gaussians(
-            means=origins + self.farthest * raw.depth_fraction * directions,
+            means=origins + self.farthest * unit * raw.depth_fraction * directions,
             quats=raw.quats,
             # Ours: a size stays above 0 where the exponential underflows.
             scales=sizes.clamp_min(torch.finfo(sizes.dtype).tiny),
             opacities=raw.opacities,
             sh=raw.sh,
         )
+
+
+def unit_of(views: Views) -> Float[Tensor, "B 1 1 1 1"]:
+    """Return Long-LRM's unit of length: the largest coordinate of the views' cameras.
+
+    At least 1/sqrt(3), which is its least value in a normalized scene with different positions.
+    """
+    largest = views.cameras.centers.abs().amax((-2, -1))
+    return largest.clamp_min(3**-0.5)[:, None, None, None, None]
 
 
 def bounded(values: Tensor, bound: Tensor | float) -> Tensor:

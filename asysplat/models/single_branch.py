@@ -48,7 +48,7 @@ class SingleBranch(TokenNetwork):
         prune: Prune | None = None,
     ):
         super().__init__(widths, patch * 2 ** sum(merges), prior, prune)
-        self.tokenizer = Tokenizer(patch, widths.stages[0], self.pixel_channels)
+        self.tokenizer = Tokenizer(patch, widths.stages[0], self.pixel_channels, bias=False)
         shapes = widths.stage_shapes(stage_ratios, stage_layers=stage_layers, merges=merges)
         self.stages = nn.ModuleList(
             Stage(previous.width, shape, layers, blocks, merge, global_tokens > 0)

@@ -28,13 +28,14 @@ class Tokenizer(nn.Module):
         patch: p_c or p_f, in pixels.
         width: d_c or d_f.
         channels: of a pixel, PIXEL_CHANNELS plus those of the prior.
+        bias: of the LayerNorm.
     """
 
-    def __init__(self, patch: int, width: int, channels: int = PIXEL_CHANNELS):
+    def __init__(self, patch: int, width: int, channels: int = PIXEL_CHANNELS, bias: bool = True):
         super().__init__()
         self.patch = patch
         self.embed = nn.Linear(channels * patch**2, width, bias=False)
-        self.norm = nn.LayerNorm(width)
+        self.norm = nn.LayerNorm(width, bias=bias)
 
     def forward(self, pixels: Float[Tensor, "B V H W c"]) -> Float[Tensor, "B V h w d"]:
         patches = rearrange(

@@ -17,23 +17,30 @@ from asysplat.errors import InputError
 from asysplat.scene import Gaussians, Views
 from asysplat.training.prediction import Prediction
 
-STRIDE = 2  # p_c / p_f of the paper: both maps are downsampled by it
 MIN_ALPHA = 0.5  # pixels with less alpha are ignored
 MIN_DEPTH = 1e-2  # depths are clamped to it, as in Long-LRM
 
 
 class RenderedDisparity:
-    """The paper's formula: compares the depth rendered at the targets with their disparities."""
+    """The paper's formula: compares the depth rendered at the targets with their disparities.
+
+    Args:
+        stride: both maps are downsampled by it; None: by p_c / p_f of the model, as in the paper.
+    """
 
     renders_depth = True
+
+    def __init__(self, stride: int | None = None):
+        self.stride = stride
 
     def __call__(self, prediction: Prediction, batch: dict[str, Any]) -> Float[Tensor, ""] | None:
         """Compute the term; None if the targets have neither disparities nor depths."""
         rendering, target = prediction.rendering, reference_disparities(batch["targets"])
         if target is None:
             return None
+        stride = self.stride or pixels_apart(prediction.gaussians, batch["inputs"])
         depth, alpha, target = (
-            maps[..., ::STRIDE, ::STRIDE] for maps in (rendering.depth, rendering.alpha, target)
+            maps[..., ::stride, ::stride] for maps in (rendering.depth, rendering.alpha, target)
         )
         return disparity_distance(depth, target, (target > 0) & (alpha > MIN_ALPHA) & (depth > 0))
 
@@ -69,6 +76,12 @@ def reference_disparities(views: Views) -> Float[Tensor, "*batch V H W"] | None:
     return torch.where(valid, 1 / torch.where(valid, views.depths, 1), 0)
 
 
+def pixels_apart(gaussians: Gaussians, inputs: Views) -> int:
+    """Return the distance of neighboring Gaussians in the input views, p_c / p_f, in pixels."""
+    pixels = inputs.num_views * inputs.cameras.height * inputs.cameras.width
+    return max(1, math.isqrt(pixels // gaussians.num_gaussians))
+
+
 def own_depths(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "*batch V h w"]:
     """Compute each Gaussian's depth in the input view it is aligned with.
 
@@ -76,7 +89,7 @@ def own_depths(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "*batch V h
         InputError: there are not V h w Gaussians, with height / h = width / w a whole number.
     """
     cameras, count = inputs.cameras, gaussians.num_gaussians
-    stride = max(1, math.isqrt(inputs.num_views * cameras.height * cameras.width // count))
+    stride = pixels_apart(gaussians, inputs)
     height, width = cameras.height // stride, cameras.width // stride
     if count != inputs.num_views * height * width:
         raise InputError(

@@ -37,6 +37,8 @@ class SplattingModule(lightning.LightningModule):
         checkpoint_layers: compute each layer again in the backward pass, to save memory.
         views_at_once: render this many targets of each scene at a time, and again in the backward
             pass, to save memory; None: all at once. See `render`.
+        drop_above: drop a step whose gradient's norm is above this multiple of the trainer's
+            gradient_clip_val, as Long-LRM does; None: drop none.
     """
 
     def __init__(
@@ -48,13 +50,14 @@ class SplattingModule(lightning.LightningModule):
         background: Sequence[float] | Literal["inputs"],
         checkpoint_layers: bool = False,
         views_at_once: int | None = None,
+        drop_above: float | None = None,
     ):
         super().__init__()
         freeze_unused(net)
         net.checkpoint_layers(checkpoint_layers)
         self.net, self.loss = net, loss
         self.optimizer, self.schedule = optimizer, schedule
-        self.views_at_once = views_at_once
+        self.views_at_once, self.drop_above = views_at_once, drop_above
         self.parts = Parts()  # of a step, timed by a callback
         self._side_by_side = SideBySide(net, self.compute_terms, self.parts)
         self._step_means = StepMeans(net)
@@ -140,20 +143,25 @@ class SplattingModule(lightning.LightningModule):
     ) -> None:
         # Lightning refuses a fused optimizer under autocast, because of fp16's loss scaling, which
         # bf16 does not need.
-        value = gradient_clip_algorithm == "value"
-        clip = nn.utils.clip_grad_value_ if value else nn.utils.clip_grad_norm_
-        if gradient_clip_val:
-            clip(self.parameters(), gradient_clip_val)
+        if not gradient_clip_val:
+            return
+        if gradient_clip_algorithm == "value":
+            nn.utils.clip_grad_value_(self.parameters(), gradient_clip_val)
+            return
+        norm = nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val)
+        if self.drop_above is not None and norm > self.drop_above * gradient_clip_val:
+            optimizer.zero_grad(set_to_none=True)  # without gradients nothing is updated
 
 
 def decaying(net: nn.Module) -> list[nn.Parameter]:
-    """List the parameters that weight decay applies to: weights of Linear and Conv layers.
+    """List the parameters that weight decay applies to, as in Long-LRM: weights and learned tokens.
 
-    Zero is no neutral value of the others: norms, biases, learned tokens, and A, dt and D of the
-    scans.
+    Zero is no neutral value of the others: norms, biases, and A, dt and D of the scans.
     """
     kinds = (nn.Linear, nn.Conv1d, nn.Conv2d)
-    return [module.weight for module in net.modules() if isinstance(module, kinds)]
+    weights = [module.weight for module in net.modules() if isinstance(module, kinds)]
+    tokens = getattr(net, "global_tokens", None)
+    return weights if tokens is None else [*weights, tokens]
 
 
 def freeze_unused(net: Network) -> None:

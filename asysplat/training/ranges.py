@@ -77,7 +77,11 @@ RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
         ["callbacks.checkpoints.minutes"],
     ),
     ("fail or skip", lambda value: value in ("fail", "skip"), ["data.on_bad_scene"]),
-    ("two whole numbers, such as [64,96]", is_window, ["data.window"]),
+    (
+        "two whole numbers, such as [64,96], or null for all images",
+        lambda value: value is None or is_window(value),
+        ["data.window"],
+    ),
     (
         "height and width in pixels, such as [64,96], or null for the size that trains",
         lambda value: value is None or is_window(value, 1),

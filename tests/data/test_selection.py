@@ -62,6 +62,7 @@ def test_training_stays_in_its_window_shares_no_image_and_is_repeated_by_its_see
         starts.add(ordered[0])
     assert min(starts) <= 1 and max(starts) >= 36 and len(starts) > 30
     assert training_selection(9, 4, 3, (64, 128), rng).inputs == [0, 3, 5, 8]  # is clipped
+    assert training_selection(9, 4, 3, None, rng).inputs == [0, 3, 5, 8]  # the whole sequence
 
 
 def test_too_short_a_sequence_or_window_is_refused():
@@ -97,9 +98,9 @@ def test_held_out_and_training_images_share_none():
 def test_first_96_takes_every_8th_as_target_and_even_inputs_of_the_others():
     selected = first_96_selection(300, 32, 8, "test")
     assert selected.targets == [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 80, 88]
-    # Every 2.68th of the 84 others, which begin with 1 and end with 95.
-    assert selected.inputs[:8] == [1, 4, 6, 10, 13, 15, 19, 22]
-    assert selected.inputs[-3:] == [90, 92, 95] and len(set(selected.inputs)) == 32
+    # Positions 0, 2, 5, 8, 10, 13, 16, ... (2.68 apart, truncated) of the 84 others.
+    assert selected.inputs[:8] == [1, 3, 6, 10, 12, 15, 19, 21]
+    assert selected.inputs[-3:] == [89, 92, 95] and len(set(selected.inputs)) == 32
     assert selected == first_96_selection(96, 32, 8, "test")
     assert not set(selected.inputs) & set(selected.targets)
 

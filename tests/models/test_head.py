@@ -66,6 +66,18 @@ def test_longlrm_by_hand():
     torch.testing.assert_close(gaussians.sh[0, 0], numbers[11:].reshape(16, 3))
 
 
+def test_longlrm_lengths_are_in_units_of_the_largest_coordinate_of_an_input_camera():
+    """In Long-LRM's normalization it is 1; in ours a camera is at distance 1 in any direction."""
+    views, numbers = make_views(), torch.arange(59.0) / 10 - 2
+    unit, _ = decode("longlrm", numbers, views)
+    views.cameras.cam_to_world[0, 1, :3, 3] = torch.tensor([0.48, -0.6, 0.64])
+    smaller, _ = decode("longlrm", numbers, views)
+    torch.testing.assert_close(smaller.scales, 0.64 * unit.scales)
+    torch.testing.assert_close(distances(smaller, views), 0.64 * distances(unit, make_views()))
+    views.cameras.cam_to_world[..., :3, 3] = 0  # no scale at all: finite
+    assert decode("longlrm", numbers, views)[0].means.abs().sum() > 0
+
+
 RANGES = {  # of distances, and of sizes at the farthest
     "photograph": (0.1, 100.0, math.exp(3) * 100 / (FOCAL / 2)),
     "longlrm": (0.0, 500.0, math.exp(-1.2)),

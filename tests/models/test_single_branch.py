@@ -25,7 +25,7 @@ def test_merge_combines_2_x_2_tokens(width, new_width, group):
 def test_global_tokens_are_part_of_the_sequence_and_are_read(build):
     """The layers get one sequence; the global tokens change the result and are trained."""
     net = build(*TINY, "model=longlrm").eval()
-    assert net.global_tokens.shape[0] == 2
+    assert net.global_tokens.shape[0] == 2 and net.tokenizer.norm.bias is None
     shapes = []
     for block in (layer for stage in net.stages for layer in stage.layers):
         block.register_forward_pre_hook(lambda _, inputs: shapes.append(inputs[0].shape))

@@ -13,8 +13,9 @@ from torchvision.models import vgg19 as torchvision_vgg19
 from asysplat.errors import InputError
 from asysplat.rendering import Rendering
 from asysplat.scene import Cameras, Gaussians, Views
-from asysplat.training import InputDisparity, Prediction, SplattingLoss
+from asysplat.training import InputDisparity, Prediction, RenderedDisparity, SplattingLoss
 from asysplat.training.disparity import (
+    disparity_distance,
     normalized_disparity,
     own_depths,
     reference_disparities,
@@ -109,6 +110,18 @@ def test_rendered_disparity_by_hand():
     torch.testing.assert_close(terms["depth"].item(), BY_HAND)
     terms["loss"].backward()
     assert depth.grad[:, ::2, ::2].abs().sum() > 0 and (depth.grad[:, 1::2] == 0).all()
+
+
+@pytest.mark.parametrize(("size", "stride"), [(4, 1), (8, 2), (16, 4)])
+def test_the_stride_is_that_of_the_gaussians(size, stride):
+    """p_c / p_f: 16 Gaussians of one view. Another can be given."""
+    views = Views(cameras(size, views=1), torch.rand(1, 3, size, size), torch.ones(1, size, size))
+    rendering = Rendering(views.images, torch.ones(1, size, size), torch.rand(1, size, size), {})
+    prediction = Prediction(gaussians_at(torch.ones(16, 3)), rendering)
+    for term, step in ((RenderedDisparity(), stride), (RenderedDisparity(stride=2), 2)):
+        kept = [maps[:, ::step, ::step] for maps in (rendering.depth, views.depths)]
+        expected = disparity_distance(*kept, torch.ones_like(kept[0], dtype=torch.bool))
+        torch.testing.assert_close(term(prediction, {"inputs": views, "targets": views}), expected)
 
 
 def test_input_disparity_by_hand():

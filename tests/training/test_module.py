@@ -53,7 +53,9 @@ def test_which_parameters_are_trained_and_which_decay(build, model):
     assert set(decaying) | set(steady) == set(named) - unread and decaying and steady
     # By name, which the code does not look at.
     for name in decaying:
-        assert name.endswith(".weight") and "norm" not in name, name
+        learned = name == "global_tokens"
+        assert learned or (name.endswith(".weight") and "norm" not in name), name
+    assert "global_tokens" not in steady
     modules = dict(module.net.named_modules())
     for name in steady:
         kind = type(modules[name.rpartition(".")[0]]).__name__
@@ -72,6 +74,22 @@ def test_gradients_are_clipped(build, algorithm, measure):
     module.configure_gradient_clipping(optimizer, 0.5, algorithm)
     grads = torch.cat([p.grad.flatten().double() for p in module.parameters()])
     torch.testing.assert_close(measure(grads), torch.tensor(0.5).double(), rtol=1e-5, atol=0)
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(("norm", "dropped"), [(2.4, False), (2.6, True)])
+def test_a_step_with_a_gradient_above_5_times_the_clip_changes_nothing(build, norm, dropped):
+    module = make_module(build("width=0.125", "state_size=8"))
+    module.drop_above = 5.0
+    optimizer = module.configure_optimizers()["optimizer"]
+    count = sum(parameter.numel() for parameter in module.parameters())
+    for parameter in module.parameters():
+        parameter.grad = torch.full_like(parameter, norm / math.sqrt(count))
+    before = [parameter.detach().clone() for parameter in module.parameters()]
+    module.configure_gradient_clipping(optimizer, 0.5, "norm")
+    optimizer.step()
+    same = [torch.equal(a, b) for a, b in zip(before, module.parameters(), strict=True)]
+    assert all(same) if dropped else not any(same)
 
 
 @pytest.mark.medium

@@ -48,21 +48,22 @@ def training_selection(
     num_images: int,
     num_inputs: int,
     num_targets: int,
-    window: tuple[int, int],
+    window: tuple[int, int] | None,
     rng: np.random.Generator,
     targets_may_be_inputs: bool = False,
 ) -> Selection:
     """Select inputs evenly over a random window, and random targets within it.
 
     Args:
-        window: least and greatest number of images to draw from; clipped to the sequence.
+        window: least and greatest number of images to draw from, clipped to the sequence; None: all
+            of its images.
         targets_may_be_inputs: whether targets are drawn from all images of the window.
 
     Raises:
         InputError: the sequence or the window is too short.
     """
     _check_length(num_images, num_inputs, num_targets)
-    shortest, longest = window
+    shortest, longest = (num_images, num_images) if window is None else window
     if not num_inputs + num_targets <= shortest <= longest:
         raise InputError(
             f"data.window is {shortest} to {longest} images: give two increasing numbers, the "
@@ -76,10 +77,12 @@ def training_selection(
     return Selection(inputs, sorted(rng.choice(candidates, num_targets, replace=False).tolist()))
 
 
-def grown_window(first: Sequence[int] | None, last: Sequence[int], grown: float) -> tuple[int, int]:
-    """Return the window at a share of its growth from `first` to `last` (None: always `last`)."""
-    if first is None:
-        return tuple(last)
+def grown_window(
+    first: Sequence[int] | None, last: Sequence[int] | None, grown: float
+) -> tuple[int, int] | None:
+    """Return the window at a share of its growth from `first` to `last`; without one, `last`."""
+    if first is None or last is None:
+        return None if last is None else tuple(last)
     return tuple(round(a + grown * (b - a)) for a, b in zip(first, last, strict=True))
 
 
@@ -108,11 +111,13 @@ def first_96_selection(
 ) -> Selection:
     """Select as the paper's ablations (Suppl. A): inputs evenly over the first 96 images.
 
-    Every 8th of them is a target, and no input.
+    Every 8th of them is a target, and no input. Even positions are truncated to whole ones, as in
+    Long-LRM (data/dataset.py); the paper does not say.
     """
-    inputs, targets = paper_split(min(num_images, ABLATION_IMAGES), num_targets, split)
-    check_held_out(num_images, len(inputs), num_inputs, split)
-    return Selection(spread(inputs, num_inputs), targets)
+    images, targets = paper_split(min(num_images, ABLATION_IMAGES), num_targets, split)
+    check_held_out(num_images, len(images), num_inputs, split)
+    positions = np.linspace(0, len(images) - 1, num_inputs, dtype=int)
+    return Selection([images[position] for position in positions], targets)
 
 
 def paper_split(num_images: int, num_targets: int, split: Split) -> tuple[list[int], list[int]]:
