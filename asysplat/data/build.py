@@ -38,7 +38,7 @@ def files_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDa
 
     Args:
         test_sets: as for `procedural_data`; the options are inputs, targets, height, width, layout,
-            selection, index and root. A set whose root is null is left out, with a warning.
+            scenes, selection, index and root. A set whose root is null is left out, with a warning.
         options: those of FilesSource, SceneOptions and SceneDataModule; and test_size.
 
     Raises:
@@ -57,7 +57,7 @@ def files_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDa
         )
     sets = tested_sets(test_sets, options["name"], on_disk=True)
     of_tests = {"root": options.get("test_root") or options["root"], "test_root": None}
-    changeable = ("layout", "selection", "index", "root")
+    changeable = ("layout", "scenes", "selection", "index", "root")
     return _data_module(_files_source, changeable, sets, of_tests, **options)
 
 

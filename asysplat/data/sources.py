@@ -132,6 +132,7 @@ class FilesSource:
         window: least and greatest number of consecutive images that a training task is drawn from;
             None: all images.
         first_window: those of the first task; None: `window`.
+        scenes: names of the folders that test; None: all.
         selection: how the images of a test are chosen: every_8th, kmeans (the paper's tests),
             first_96 (its ablations), uniform, or index.
         index: with selection=index, the file that names the images; scenes that it does not name
@@ -148,6 +149,7 @@ class FilesSource:
     options: SceneOptions
     window: Sequence[int] | None
     test_root: str | None = None
+    scenes: Sequence[str] | None = None
     selection: str = "every_8th"
     index: str | None = None
     val_scenes: int = 8
@@ -163,7 +165,7 @@ class FilesSource:
                 folders.append(SceneFolder(root, self.options))
             except InputError as error:
                 raise InputError(f"data.{key}={root}: {error}") from error
-        self.scenes, self.test_scenes = folders[0], folders[-1]
+        self.training_folder, self.test_folder = folders[0], folders[-1]
         if (self.selection == "index") != (self.index is not None):
             raise InputError(
                 f"data.selection is {self.selection} and data.index is {self.index}: give both "
@@ -178,7 +180,7 @@ class FilesSource:
     def training(
         self, inputs: int, targets: int, rng: np.random.Generator, grown: float = 1.0
     ) -> Task:
-        sequence = self.scenes[self._training[rng.integers(len(self._training))]]
+        sequence = self.training_folder[self._training[rng.integers(len(self._training))]]
         count = sequence.num_images
         images = range(count) if self.split_by_scenes else views.training_images(count)
         drawn = views.training_selection(
@@ -196,7 +198,7 @@ class FilesSource:
         if split == "test" and self.selection == "index":
             return self._index_tasks(inputs)
         selection = "every_8th" if self.selection == "index" else self.selection
-        validated = (self.scenes[scene] for scene in self._validation)
+        validated = (self.training_folder[scene] for scene in self._validation)
         return [
             Task(sequence, named_selection(selection, sequence.cameras, inputs, targets, split))
             for sequence in (self._tests if split == "test" else validated)
@@ -204,16 +206,27 @@ class FilesSource:
 
     @cached_property
     def _tests(self) -> list[FileSequence]:
-        return list(self.test_scenes)
+        folder, scenes = self.test_folder, self.scenes
+        if scenes is None:
+            return list(folder)
+        named = [folder.folders(index) & {*scenes} for index in range(len(folder))]
+        missing = {*scenes} - set().union(*named)
+        if missing:
+            raise InputError(
+                f"scenes names {min(missing)}, and {folder.root} has no such folder: choose of "
+                f"{', '.join(path.name for path in folder.paths)}."
+            )
+        return [folder[index] for index, names in enumerate(named) if names]
 
     @cached_property
     def _others(self) -> list[int]:
         """The scenes of `root` that may train and validate."""
-        scenes = range(len(self.scenes))
+        scenes = range(len(self.training_folder))
         if not self.split_by_scenes:
             return list(scenes)
-        names = {sequence.name for sequence in self._tests}
-        return [scene for scene in scenes if names.isdisjoint(self.scenes.folders(scene))]
+        tested = self._tests if self.scenes is None else self.test_folder
+        names = {sequence.name for sequence in tested}
+        return [scene for scene in scenes if names.isdisjoint(self.training_folder.folders(scene))]
 
     @cached_property
     def _validation(self) -> list[int]:

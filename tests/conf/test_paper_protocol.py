@@ -40,7 +40,7 @@ HOW = {
     "mipnerf360": ("colmap", "kmeans"),
     "deep_blending": ("colmap", "kmeans"),
     "replica": ("replica", "kmeans"),
-    "scannetpp": ("scannetpp", "kmeans"),
+    "scannetpp": ("scannetpp_depths", "kmeans"),
 }
 
 

@@ -29,6 +29,7 @@ from asysplat.data.readers import (
     realestate10k,
     replica,
     scannetpp,
+    scannetpp_depths,
     transforms,
 )
 from asysplat.data.readers.common import SUFFIXES, images_in
@@ -38,7 +39,10 @@ from asysplat.errors import InputError
 MAX_NAME = 200  # characters of a path in a message
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 # In this order: the first layout that fits a folder reads it.
-READERS = (long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, llff, posed, colmap)
+READERS = (
+    *(long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, llff, posed, colmap),
+    scannetpp_depths,
+)
 LAYOUTS: dict[str, ModuleType] = {reader.__name__.rpartition(".")[2]: reader for reader in READERS}
 
 

@@ -6,6 +6,8 @@ import pytest
 from hydra.utils import instantiate
 from layouts import colmap, dl3dv, realestate10k, replica, scannetpp
 
+from asysplat.errors import InputError
+
 TINY = ["data.inputs=4", "data.targets=2", "data.window=[8,12]", "data.val_scenes=1"]
 TINY += ["data.height=16", "data.width=16", "data.cache.folder=null", "data.num_workers=0"]
 
@@ -58,6 +60,10 @@ def test_tables_2_and_3_test_their_zero_shot_sets(tests_of):
         assert sample["targets"].images.shape[-2:] == size
         assert (sample["targets"].cameras.height, sample["targets"].cameras.width) == size
     assert tests["replica"]["targets"].depths.shape[-2:] == (16, 22)
+    only = "data.test_sets.replica.scenes"
+    assert tests_of("test_sets=[replica]", f"{only}=[{tests['replica']['scene']}]")["replica"]
+    with pytest.raises(InputError, match=r"replica: scenes names room9, and .* choose of"):
+        tests_of("test_sets=[replica]", f"{only}=[room9]")
 
 
 def test_table_a2_tests_sets_with_depths(tests_of):

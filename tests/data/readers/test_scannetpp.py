@@ -7,7 +7,7 @@ from layouts import assert_listed, edit_json, opener, save_depth, save_image, ta
 from layouts import assert_same as same
 from layouts.scannetpp import SCENE, write_dslr, write_iphone
 
-from asysplat.data.readers import scannetpp
+from asysplat.data.readers import scannetpp, scannetpp_depths
 from asysplat.errors import InputError
 
 FISHEYE = {"k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": -0.001}
@@ -90,6 +90,20 @@ def test_fisheye_is_undistorted_and_has_the_rendered_depths(few, dslr):
     assert views.masks is not None
     same(views.depths[0, 12, 16], torch.tensor(1.5))
     assert opened(dslr).views([0]).depths is None
+
+
+def test_where_depths_are_measured_a_scene_is_the_first_camera_that_has_some(few, iphone, dslr):
+    write_dslr(few, dslr, lens=FISHEYE)
+    scene, fisheye = dslr.parent, dslr / "nerfstudio/transforms.json"
+    assert scannetpp_depths.find_scenes(scene.parent) == [iphone / "pose_intrinsic_imu.json"]
+    assert (opener("scannetpp_depths")(scene).views([0]).depths > 0).any()
+    save_depth(dslr / "render_depth/DSC00001.png", torch.full((24, 32), 1.5))
+    assert scannetpp_depths.find_scenes(scene) == [fisheye]
+    assert scannetpp_depths.find_scenes(fisheye) == [fisheye]
+    (dslr / "render_depth").rename(dslr / "elsewhere")
+    (iphone / "depth").rename(iphone / "elsewhere")
+    with pytest.raises(InputError, match=r"has no depth maps.*dslr/render_depth.*iphone/depth"):
+        scannetpp_depths.find_scenes(scene.parent)
 
 
 def test_masks_are_read(few, dslr, iphone):
