@@ -23,7 +23,12 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.files import make_folder
 from asysplat.interrupts import handle_signals, interrupt_once
 from asysplat.training.messages import error_sentence, exit_with_message
-from asysplat.training.prepare import PreparedRun, TrainingStage, prepare_run
+from asysplat.training.prepare import (
+    PreparedRun,
+    TrainingStage,
+    prepare_run,
+    without_missing_network,
+)
 from asysplat.training.revision import revision
 from asysplat.training.run_folder import job_name, run_folder
 from asysplat.training.runs import find_run
@@ -68,6 +73,7 @@ def train_in_sweep(config: DictConfig) -> float | None:
     """
     job = HydraConfig.get().job
     try:
+        without_missing_network(config)  # before the finished run of what is left is looked for
         finished = find_run(Path(config.paths.logs), config)
         if finished is None or (config.rerun and finished.revision != revision()):
             print(f"job {job.num}: {job.override_dirname}", flush=True)

@@ -16,26 +16,36 @@ from torchvision.models import alexnet, get_model_weights, vgg16, vgg19
 
 from asysplat.errors import InputError
 
-BUILDERS = {"alexnet": alexnet, "vgg16": vgg16, "vgg19": vgg19}
-# torchvision's files in torch's hub cache; the part after the dash is a hash.
-HUB_FILES = {"alexnet": "alexnet-owt-*.pth", "vgg16": "vgg16-*.pth", "vgg19": "vgg19-*.pth"}
+Backbone = Literal["alexnet", "vgg16", "vgg19", "matconvnet_vgg19"]
+BUILDERS = {"alexnet": alexnet, "vgg16": vgg16, "vgg19": vgg19, "matconvnet_vgg19": vgg19}
+# In torch's hub cache: torchvision's files, whose part after the dash is a hash, and Long-LRM's.
+HUB_FILES = {
+    "alexnet": "alexnet-owt-*.pth",
+    "vgg16": "vgg16-*.pth",
+    "vgg19": "vgg19-*.pth",
+    "matconvnet_vgg19": "matconvnet_vgg19.pt",
+}
+# Converted by Long-LRM from vlfeat.org/matconvnet/pretrained; the hash is of its repository's file.
+MATCONVNET_URL = (
+    "https://huggingface.co/arthurhero/llrm_stuff/resolve/main/misc/matconvnet_vgg19.pt"
+)
+MATCONVNET_SHA256 = "c7bc9f4af1aea2134b40e6e9c894ce5902d940ac5766088cc3ab6eaa07fe5660"
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def find_backbone(
-    name: Literal["alexnet", "vgg16", "vgg19"],
-    backbone_dir: Path | str | None,
-    download: bool = False,
+    name: Backbone, backbone_dir: Path | str | None, download: bool = False
 ) -> dict[str, Tensor] | None:
-    """Load torchvision's ImageNet weights of a network's convolutions.
+    """Load ImageNet weights of a network's convolutions: torchvision's, or MatConvNet's of VGG19.
 
     They are read from torch's hub cache or else from `<name>_features_fp16.pth` in `backbone_dir`.
     If neither exists, they are downloaded into the cache if `download` allows it.
 
     Returns:
-        `features.N.weight` and `features.N.bias` in fp32, or None if the weights were not found.
+        `features.N.weight` and `features.N.bias` in fp32, with the values of half precision, so
+        that both files give the same numbers; None if the weights were not found.
 
     Raises:
         InputError: the file cannot be read or holds other weights, or the download failed.
@@ -65,12 +75,19 @@ def _read(name: str, path: Path) -> Any:
 
 
 def _download(name: str) -> dict[str, Tensor]:
-    weights = get_model_weights(name).IMAGENET1K_V1
+    matconvnet = name == "matconvnet_vgg19"
+    weights = None if matconvnet else get_model_weights(name).IMAGENET1K_V1
+    url = MATCONVNET_URL if matconvnet else weights.url
     try:
-        return weights.get_state_dict(progress=True, check_hash=True)
+        if not matconvnet:
+            return weights.get_state_dict(progress=True, check_hash=True)
+        file = _hub_cache() / HUB_FILES[name]
+        file.parent.mkdir(parents=True, exist_ok=True)
+        torch.hub.download_url_to_file(url, str(file), hash_prefix=MATCONVNET_SHA256)
+        return _read(name, file)
     except (OSError, RuntimeError, HTTPException) as error:  # no network, no space, another hash
         raise InputError(
-            f"{weights.url} could not be downloaded ({error}): put it into {_hub_cache()} by other "
+            f"{url} could not be downloaded ({error}): put it into {_hub_cache()} by other "
             "means, or leave paths.download out to go on without it."
         ) from error
 
@@ -83,16 +100,16 @@ def _features(name: str, state: Any, source: Path) -> dict[str, Tensor]:
         if not isinstance(loaded, Tensor) or loaded.shape != tensor.shape:
             raise InputError(
                 f"{source} has no {key} of shape {tuple(tensor.shape)}: "
-                f"give torchvision's ImageNet weights of {name}."
+                f"give ImageNet weights of {name}, as torchvision names them."
             )
-    return {key: state[key].float() for key in expected}
+    return {key: state[key].half().float() for key in expected}
 
 
 class VGGFeatures(nn.Module):
     """Computes frozen activations of VGG16 or VGG19 (Simonyan and Zisserman 2015).
 
     Args:
-        name: of the network.
+        name: of a VGG.
         weights: from `find_backbone(name, ...)`.
         taps: indices of the layers of torchvision's `features` whose outputs are returned.
         std: RGB; divides the images after ImageNet's mean color is subtracted.
@@ -101,7 +118,7 @@ class VGGFeatures(nn.Module):
 
     def __init__(
         self,
-        name: Literal["vgg16", "vgg19"],
+        name: Backbone,
         weights: dict[str, Tensor],
         taps: Sequence[int],
         std: Sequence[float],

@@ -23,12 +23,13 @@ class SplattingLoss(nn.Module):
     Args:
         mse, perceptual, depth, ssim, opacity: weights of the terms; 0 turns a term off.
         perceptual_term, depth_term: constructors, called if the term's weight is not 0.
-        allow_missing: turn off, with a warning, the perceptual term if its network is not on this
-            machine, and the depth term if the data has neither disparities nor depths.
+        allow_missing: turn off, with a warning, the depth term if the data has neither disparities
+            nor depths.
 
     Raises:
-        InputError: all terms are off, or one is missing and that is not allowed; the depth term at
-            the first batch.
+        InputError: all terms are off, or, at the first batch, the depth term is missing and that is
+            not allowed.
+        FileNotFoundError: the perceptual term's network is not on this machine.
     """
 
     def __init__(
@@ -46,21 +47,28 @@ class SplattingLoss(nn.Module):
         self.mse, self.perceptual, self.depth = mse, perceptual, depth
         self.ssim, self.opacity = ssim, opacity
         self.allow_missing = allow_missing
-        distance = None
-        try:
-            distance = perceptual_term() if perceptual else None
-        except FileNotFoundError as error:
-            self._report_missing(f"training.loss.perceptual={perceptual:g}: {error}")
         # A list hides the frozen network from checkpoints.
-        self._perceptual_term = [] if distance is None else [distance]
+        self._perceptual_term = [perceptual_term()] if perceptual else []
         self._depth_term = depth_term() if depth else None
-        if not (mse or self._perceptual_term or depth or ssim):
+        if not (mse or perceptual or depth or ssim):
             raise InputError(
                 "training.loss has no term that is on: give mse, ssim, perceptual or depth a "
-                "weight above 0, and for perceptual alone its network (paths.download=true fetches "
-                "it)."
+                "weight above 0."
             )
-        self._depth_checked = False
+        self._depth_checked, self._depth_missing = False, False
+
+    def describe(self) -> str:
+        """Name the terms that ran, with their weights; the perceptual one with its network's hash.
+
+        As `1 mse, 0.5 perceptual (1a2b3c4d5e6f7a8b), 0.01 depth`.
+        """
+        names = ["mse", "ssim", "opacity", "perceptual", "depth"]
+        on = {name: getattr(self, name) for name in names}
+        on["depth"] = 0 if self._depth_missing else self.depth
+        terms = {name: f"{weight:g} {name}" for name, weight in on.items() if weight}
+        for distance in self._perceptual_term:
+            terms["perceptual"] += f" ({distance.content})"
+        return ", ".join(terms.values())
 
     @property
     def needs_depth(self) -> bool:
@@ -84,15 +92,18 @@ class SplattingLoss(nn.Module):
             if depth is not None:
                 terms["depth"] = depth
             elif not self._depth_checked:
-                self._report_missing(
+                self._depth_missing = True
+                report_missing(
                     f"training.loss.depth={self.depth:g}: the data has neither disparities nor "
-                    "depths; python -m asysplat.data.disparity estimates disparities"
+                    "depths; python -m asysplat.data.disparity estimates disparities",
+                    self.allow_missing,
                 )
             self._depth_checked = True
         return {"loss": sum(getattr(self, name) * term for name, term in terms.items()), **terms}
 
-    def _report_missing(self, reason: str) -> None:
-        """Warn that the training goes on without a term, or refuse to."""
-        if not self.allow_missing:
-            raise InputError(f"{reason}, and allow_missing_losses=true trains without this term.")
-        warnings.warn(f"{reason}. Training goes on without this term.", stacklevel=4)
+
+def report_missing(reason: str, allowed: bool) -> None:
+    """Warn that the training goes on without a term of the loss, or refuse to."""
+    if not allowed:
+        raise InputError(f"{reason}, and allow_missing_losses=true trains without this term.")
+    warnings.warn(f"{reason}. Training goes on without this term.", stacklevel=4)

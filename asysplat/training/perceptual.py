@@ -1,13 +1,15 @@
 """Perceptual distances of images, by frozen networks."""
 
+import hashlib
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from asysplat.evaluation.backbones import IMAGENET_STD, VGGFeatures, find_backbone
+from asysplat.evaluation.backbones import IMAGENET_STD, Backbone, VGGFeatures, find_backbone
 from asysplat.ops.precision import without_autocast
 
 
@@ -23,6 +25,14 @@ class PerceptualDistance(nn.Module):
     def __init__(self, features: VGGFeatures, weights: Sequence[float], image_weight: float):
         super().__init__()
         self.features, self.weights, self.image_weight = features, weights, image_weight
+
+    @property
+    def content(self) -> str:
+        """Hash of the frozen weights, 16 digits."""
+        digest = hashlib.sha256()
+        for parameter in self.features.parameters():
+            digest.update(parameter.detach().cpu().numpy())
+        return digest.hexdigest()[:16]
 
     def forward(
         self, rendered: Float[Tensor, "*batch V 3 H W"], target: Float[Tensor, "*batch V 3 H W"]
@@ -58,30 +68,38 @@ LONG_LRM_WEIGHTS = (0.3846, 0.2083, 0.2703, 0.1786, 6.6667)  # 1/2.6, 1/4.8, 1/3
 LONG_LRM_SCALE = 255.0
 
 
-def longlrm(backbone_dir: str | None = None, download: bool = False) -> PerceptualDistance:
+def longlrm(
+    backbone_dir: str | None = None,
+    download: bool = False,
+    weights: Literal["matconvnet", "torchvision"] = "matconvnet",
+) -> PerceptualDistance:
     """Build Long-LRM's distance (its public code's model/loss.py and configs/7m1t_tm.yaml).
 
     The weighted sum of Chen and Koltun 2017 over the images and VGG19's ReLU 1_2, 2_2, 3_2, 4_2 and
     5_2, with mean pooling in place of maximum pooling. Images, less ImageNet's mean, are scaled to
     [0, 255], and distances divided by 255.
 
-    Long-LRM publishes weights converted from MatConvNet for these units; its code uses
-    torchvision's by default, as does this function. The published weights are read from
-    vgg19_features_fp16.pth in `backbone_dir` if torch's hub cache has no VGG19. Arguments and a
-    missing network are as for `vgg16`.
+    Args:
+        backbone_dir, download: as for `vgg16`.
+        weights: those of MatConvNet, which Long-LRM names and publishes in these units, or
+            torchvision's.
+
+    Raises:
+        FileNotFoundError: as `vgg16`.
     """
-    backbone = _backbone("vgg19", backbone_dir, download)
+    name = "matconvnet_vgg19" if weights == "matconvnet" else "vgg19"
+    backbone = _backbone(name, backbone_dir, download)
     std = (1 / LONG_LRM_SCALE,) * 3
-    features = VGGFeatures("vgg19", backbone, taps=(3, 8, 13, 22, 31), std=std, mean_pooling=True)
+    features = VGGFeatures(name, backbone, taps=(3, 8, 13, 22, 31), std=std, mean_pooling=True)
     scaled = [weight / LONG_LRM_SCALE for weight in LONG_LRM_WEIGHTS]
     return PerceptualDistance(features, scaled, image_weight=1.0)
 
 
-def _backbone(name: str, backbone_dir: str | None, download: bool) -> dict[str, Tensor]:
+def _backbone(name: Backbone, backbone_dir: str | None, download: bool) -> dict[str, Tensor]:
     backbone = find_backbone(name, backbone_dir, download)
     if backbone is None:
         raise FileNotFoundError(
-            f"{name.upper()} is neither in torch's hub cache nor in paths.weights; "
-            "paths.download=true fetches it"
+            f"the weights of {name} are neither in torch's hub cache nor in paths.weights; "
+            "paths.download=true fetches them"
         )
     return backbone

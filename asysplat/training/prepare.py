@@ -28,6 +28,7 @@ from asysplat.training.checkpoints import (
     load_weights,
     read_notes,
 )
+from asysplat.training.losses import report_missing
 from asysplat.training.messages import quiet_lightning
 from asysplat.training.module import SplattingModule
 from asysplat.training.revision import revision
@@ -131,7 +132,8 @@ class PreparedRun:
         data, folder = self.config.data.name, Path(stage.config.paths.run)
         shown, is_last = self.results | new_results, stage is self.stages[-1]
         if is_last:
-            self.results = shown = self.described | shown
+            losses = {"run/losses": trainer.lightning_module.loss.describe()}
+            self.results = shown = self.described | losses | shown
         else:
             stored = {k: v for k, v in new_results.items() if k.startswith(("test/", "cost/"))}
             self.results |= {f"{stage.config.stage}/{key}": v for key, v in stored.items()}
@@ -153,6 +155,7 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
     """
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
+    without_missing_network(config)
     configs = stage_configs(config)
     check_stages(configs)
     folder = Path(config.paths.run)
@@ -184,3 +187,21 @@ def check_start(config: DictConfig, checkpoint: Path | None, weights: str | None
         with torch.device("meta"):
             net = instantiate(config.model)
         check_checkpoint(file, nn.ModuleDict({"net": net}))  # named as in a checkpoint
+
+
+def without_missing_network(config: DictConfig) -> None:
+    """Set the weight of the perceptual term to 0 if its network is not on this machine.
+
+    The run is then hashed and recorded as what it is, a run without the term.
+
+    Raises:
+        InputError: `allow_missing_losses` is off.
+    """
+    loss = config.training.loss
+    if loss.perceptual:
+        try:
+            instantiate(loss.perceptual_term)()
+        except FileNotFoundError as error:
+            reason = f"training.loss.perceptual={loss.perceptual:g}: {error}"
+            report_missing(reason, config.allow_missing_losses)
+            loss.perceptual = 0.0

@@ -104,6 +104,9 @@ def hashed_options(
     if data.get("first_window") is None:  # as every run was before the options existed
         data.pop("first_window", None)
         data.pop("growth_steps", None)
+    depth_term = resolved["training"]["loss"]["depth_term"]
+    if depth_term.get("stride") == 2:  # as in every run before the option existed
+        depth_term.pop("stride")
     for key in NOT_HASHED:
         *groups, name = key.split(".")
         reduce(getitem, groups, resolved).pop(name, None)

@@ -68,6 +68,28 @@ def test_the_hub_cache_comes_first_and_features_are_fp32(requests, hub, tmp_path
     )
 
 
+def test_the_cache_and_the_folder_give_the_same_numbers(hub, tmp_path):
+    """Those of half precision, in which the folder's file is stored."""
+    write_alexnet(hub / ALEXNET, 0.1)
+    cached = find_backbone("alexnet", None)["features.0.bias"]
+    (hub / ALEXNET).unlink()
+    write_alexnet(tmp_path / "alexnet_features_fp16.pth", 0.1, torch.float16)
+    assert torch.equal(cached, find_backbone("alexnet", tmp_path)["features.0.bias"])
+
+
+def test_long_lrms_weights_are_checked_against_their_hash(hub, monkeypatch):
+    asked = {}
+
+    def download(url, file, hash_prefix=None, **_):
+        asked[url] = hash_prefix
+        raise RuntimeError("invalid hash value")
+
+    monkeypatch.setattr("torch.hub.download_url_to_file", download)
+    with pytest.raises(InputError, match=r"matconvnet_vgg19\.pt could not be downloaded"):
+        find_backbone("matconvnet_vgg19", None, download=True)
+    assert [len(digest) for digest in asked.values()] == [64]
+
+
 def test_broken_files_and_files_with_other_content_are_refused(hub):
     for content in (b"", b"not a checkpoint", b"PK\x03\x04 cut short"):
         (hub / ALEXNET).write_bytes(content)

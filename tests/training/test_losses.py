@@ -21,6 +21,8 @@ from asysplat.training.disparity import (
     reference_disparities,
 )
 from asysplat.training.perceptual import longlrm, vgg16
+from asysplat.training.prepare import without_missing_network
+from asysplat.training.runs import config_hash
 
 MEAN = torch.tensor([0.485, 0.456, 0.406])[:, None, None]
 STD = torch.tensor([0.229, 0.224, 0.225])[:, None, None]
@@ -202,20 +204,38 @@ def test_data_without_depth_turns_the_term_off_with_one_warning(reading):
     ]
 
 
-@pytest.mark.parametrize(("term", "name"), [(vgg16, "VGG16"), (longlrm, "VGG19")])
-def test_a_missing_backbone_turns_the_term_off_with_a_warning(tmp_path, monkeypatch, term, name):
+@pytest.mark.medium
+@pytest.mark.parametrize(("term", "name"), [("vgg16", "vgg16"), ("longlrm", "matconvnet_vgg19")])
+def test_a_missing_network_turns_the_term_off_or_is_refused(
+    composed, tmp_path, monkeypatch, term, name
+):
+    """The configuration says so, and so does its hash: that of a run without the term."""
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    with pytest.warns(UserWarning, match=f"{name} is neither .* paths.weights"):
-        loss = make_loss(mse=1.0, perceptual=0.5, perceptual_term=lambda: term(str(tmp_path)))
-    assert set(loss(*pair())) == {"loss", "mse"}
-
-
-def test_missing_terms_are_refused_where_they_are_not_allowed(tmp_path, monkeypatch):
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    message = r"perceptual=0.5: VGG19 .* paths.download=true .* allow_missing_losses=true"
+    command = [f"paths.weights={tmp_path}", f"training/perceptual={term}", "paths.run=here"]
+    config = composed(*command, "training.loss.perceptual=0.5")
+    with pytest.warns(UserWarning, match=f"weights of {name} are neither .* paths.weights"):
+        without_missing_network(config)
+    assert config_hash(config) == config_hash(composed(*command, "training.loss.perceptual=0.0"))
+    config = composed(*command, "training.loss.perceptual=0.5", "allow_missing_losses=false")
+    message = r"perceptual=0.5: .* paths.download=true .* allow_missing_losses=true"
     with pytest.raises(InputError, match=message):
-        term = {"perceptual_term": lambda: longlrm(str(tmp_path))}
-        make_loss(mse=1.0, perceptual=0.5, allow_missing=False, **term)
+        without_missing_network(config)
+
+
+def test_what_ran_is_described(distances):
+    distance, _ = distances["longlrm"]
+    options = {"ssim": 0.05, "perceptual_term": lambda: distance}
+    loss = make_loss(mse=1.0, perceptual=0.5, depth=0.01, **options)
+    described = loss.describe()
+    assert described == f"1 mse, 0.05 ssim, 0.5 perceptual ({distance.content}), 0.01 depth"
+    assert distance.content != distances["vgg16"][0].content and len(distance.content) == 16
+    loss = make_loss(mse=1.0, depth=0.01)
+    with pytest.warns(UserWarning, match="without this term"):
+        loss(*pair(depths=False))
+    assert loss.describe() == "1 mse"
+
+
+def test_data_without_depth_is_refused_where_it_is_not_allowed():
     loss = make_loss(mse=1.0, depth=0.01, allow_missing=False)
     with pytest.raises(InputError, match=r"depth=0.01: .* asysplat.data.disparity estimates"):
         loss(*pair(depths=False))
@@ -224,7 +244,10 @@ def test_missing_terms_are_refused_where_they_are_not_allowed(tmp_path, monkeypa
     assert "depth" in loss(*pair()) and "depth" not in loss(*pair(depths=False))
 
 
-NETWORKS = {"vgg16": (vgg16, torchvision_vgg16), "longlrm": (longlrm, torchvision_vgg19)}
+NETWORKS = {
+    "vgg16": (vgg16, torchvision_vgg16, "vgg16-0a1b2c3d.pth"),
+    "longlrm": (longlrm, torchvision_vgg19, "matconvnet_vgg19.pt"),
+}
 
 
 @pytest.fixture(scope="module")
@@ -233,7 +256,7 @@ def distances(tmp_path_factory):
     folder, made = tmp_path_factory.mktemp("hub"), {}
     (folder / "checkpoints").mkdir()
     torch.manual_seed(0)
-    for name, (distance, network) in NETWORKS.items():
+    for name, (distance, network, file) in NETWORKS.items():
         with torch.device("meta"):
             features = network().features
         features.to_empty(device="cpu")
@@ -241,7 +264,8 @@ def distances(tmp_path_factory):
             if isinstance(layer, torch.nn.Conv2d):
                 torch.nn.init.kaiming_normal_(layer.weight)
                 torch.nn.init.normal_(layer.bias, std=0.1)
-        file = folder / "checkpoints" / f"{network.__name__}-0a1b2c3d.pth"
+        features = features.half().float()  # as both files give them
+        file = folder / "checkpoints" / file
         torch.save(features.state_dict(prefix="features."), file)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(torch.hub, "get_dir", lambda: str(folder))

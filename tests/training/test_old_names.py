@@ -23,6 +23,8 @@ from asysplat.training.runs import config_hash, find_run
 OLD_RUN = Path(__file__).parent / "old_run"
 LATER = {"allow_missing_losses", "training.loss.allow_missing"}  # options without effect on it
 LATER |= {"farthest", "stages.stage3.prune_ratio", "data.first_window", "data.growth_steps"}
+LATER |= {"windows", *(f"windows.{stage}" for stage in ("stage1", "stage2", "stage3", "ablation"))}
+LATER |= {"training.loss.depth_term.stride"}
 LATER |= {"stages.stage1.growth_steps", "stages.ablation.growth_steps"}
 
 
