@@ -104,6 +104,6 @@ if __name__ == "__main__":
     interrupt_once()
     with exit_with_message("stopped."):
         make_folder(logs_of(sys.argv), "paths.logs")
-    OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
-    OmegaConf.register_new_resolver("job_name", job_name, replace=True)
-    main()
+        OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
+        OmegaConf.register_new_resolver("job_name", job_name, replace=True)
+        main()  # of a sweep, which SweepTable ends with how to resume

@@ -31,7 +31,8 @@ def exit_with_message(stopped: str) -> Iterator[None]:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         if isinstance(error, KeyboardInterrupt):
             sys.exit(stopped)
-        sentence = error_sentence(error)
+        # An exit has its message already.
+        sentence = None if isinstance(error, SystemExit) else error_sentence(error)
         if sentence is None:
             raise
         sys.exit(f"error: {sentence}")

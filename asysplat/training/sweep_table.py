@@ -19,17 +19,26 @@ Job = tuple[dict[str, str], DictConfig, Run | None]  # overrides, configuration,
 class SweepTable(Callback):
     """Prints the jobs of a sweep after the last: the options that vary and the test's metrics.
 
-    It reads what Hydra and the runs write to disk, so that jobs of every launcher are in it.
+    It reads what Hydra and the runs write to disk, so that jobs of every launcher are in it. After
+    a failure or an interruption it prints how to resume.
     """
+
+    def __init__(self):
+        self.complete = False
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         # on_multirun_end is not called if a job fails
         atexit.register(self._print, config)
 
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        self.complete = True
+
     def _print(self, config: DictConfig) -> None:
         jobs = read_jobs(Path(config.hydra.sweep.dir), Path(config.paths.logs))
         if any(run is not None for *_, run in jobs):
             Console().print(sweep_table(jobs))
+        if not self.complete:
+            print("The sweep is not finished: the same command skips the jobs that are.")
 
 
 def read_jobs(folder: Path, logs: Path) -> list[Job]:

@@ -2,6 +2,7 @@
 
 import json
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -31,24 +32,34 @@ def finish(train, composed, tmp_path):
 
 
 @pytest.fixture(autouse=True)
-def table_rows(monkeypatch, capsys):
-    """What a sweep's process prints at its end: the cells of each line of the last table."""
-    at_exit = []
-    register = SimpleNamespace(register=lambda *call: at_exit.append(call))
+def at_exit(monkeypatch, capsys):
+    """What the process of the last sweep prints at its end."""
+    calls = []
+    register = SimpleNamespace(register=lambda *call: calls.append(call))
     monkeypatch.setattr("asysplat.training.sweep_table.atexit", register)
 
-    def rows() -> list[list[str]]:
+    def printed() -> str:
         capsys.readouterr()
-        function, *arguments = at_exit[-1]
+        function, *arguments = calls[-1]
         function(*arguments)
-        lines = [line for line in capsys.readouterr().out.splitlines() if "│" in line]
+        return capsys.readouterr().out
+
+    return printed
+
+
+@pytest.fixture
+def table_rows(at_exit):
+    """The cells of each line of the table that it prints."""
+
+    def rows() -> list[list[str]]:
+        lines = [line for line in at_exit().splitlines() if "│" in line]
         return [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines]
 
     return rows
 
 
 def test_a_sweep_runs_only_what_is_missing_and_ends_with_a_table(
-    train, finish, tmp_path, table_rows
+    train, finish, tmp_path, at_exit, table_rows
 ):
     finish(0, revision="0123456789ab")
     finish(1)
@@ -62,7 +73,7 @@ def test_a_sweep_runs_only_what_is_missing_and_ends_with_a_table(
     assert {path: path.stat().st_mtime_ns for path in before} == before
     rows = table_rows()
     assert [row[0] for row in rows[:3]] == ["0", "1", "2"] and rows[2][3] != ""
-    assert not any("not" in row for row in rows)
+    assert not any("not" in row for row in rows) and "not finished" not in at_exit()
 
     result = train(*SWEEP, "seed=0,1", "rerun=true")  # of another revision
     assert result.stdout.count("finished already") == 1
@@ -81,6 +92,16 @@ def test_a_failure_is_named_and_the_others_go_on(train, tmp_path, table_rows):
     assert failed[1] == "not"  # finished
     (folder,) = tmp_path.rglob("metrics.json")
     assert folder.parent.name == "1_data.height=32"
+
+
+@pytest.mark.parametrize("place", ["runs.find_run", "module.SplattingModule.compute_terms"])
+def test_an_interrupted_sweep_prints_how_to_resume(train, monkeypatch, at_exit, place):
+    monkeypatch.setattr(f"asysplat.training.{place}", Mock(side_effect=KeyboardInterrupt))
+    result = train(*SWEEP, "seed=0,1")
+    assert result.returncode != 0 and "Traceback" not in result.stderr
+    assert "stopped." in (result.stdout + result.stderr).splitlines()
+    assert "ckpt_path" not in result.stdout
+    assert "the same command skips the jobs that are" in at_exit()
 
 
 @pytest.mark.slow

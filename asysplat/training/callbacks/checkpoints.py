@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
@@ -128,9 +130,13 @@ class Checkpoints(ModelCheckpoint):
             raise SystemExit(128 + number)
 
     def on_exception(self, trainer: Any, module: Any, error: BaseException) -> None:
-        if trainer.is_global_zero:
-            resume = f"to go on, add ckpt_path={self.last} to the same command"
-            print(f"stopped; {resume if self.last.exists() else 'there is no checkpoint yet'}.")
+        if not trainer.is_global_zero:
+            return
+        if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
+            print("stopped.")  # a sweep has no option for the checkpoint of a single job
+            return
+        resume = f"to go on, add ckpt_path={self.last} to the same command"
+        print(f"stopped; {resume if self.last.exists() else 'there is no checkpoint yet'}.")
 
 
 def _begin_at_next_batch(loop: dict[str, Any]) -> None:
