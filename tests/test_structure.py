@@ -22,7 +22,7 @@ BRITISH = (
 # Packages and modules of asysplat: each imports only from layers before its own.
 LAYERS = (
     ("errors", "interrupts"),
-    ("files", "overrides", "scene"),
+    ("files", "overrides", "scene", "terminal"),
     ("ops",),
     ("rendering",),
     ("motion",),

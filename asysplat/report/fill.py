@@ -14,6 +14,7 @@ from asysplat.report.paper import Costs, Number, PaperRow, PaperTable, our_sets,
 from asysplat.report.systems import system_rows
 from asysplat.training.runs import Run, config_hash, data_of, differences, find_runs
 from asysplat.training.stages import describe_stage, stage_configs
+from asysplat.training.tensorboard import CHOICES
 
 # Overrides of train.py -> its configuration, the node `hydra` included.
 Compose = Callable[[Sequence[str]], DictConfig]
@@ -70,12 +71,12 @@ def fill_table(
             rows.append(row)
             continue
         row_config, same_options, row_runs = _runs_of(compose([*overrides, *row.run]), runs)
-        note = _nearest_run(row_config, same_options, runs) if not row_runs else ""
+        note, options = ("", ()) if row_runs else _nearest_run(row_config, same_options, runs)
         if row.also and not row_runs:
             also = _runs_of(compose([*overrides, *row.run, *row.also]), runs)
             if also[-1]:
                 row_config, same_options, row_runs = also
-                note = f"runs with {' '.join(row.also)}"
+                note, options = f"runs with {' '.join(row.also)}", ()
         used += row_runs.values()
         values: dict[str, list[Number]] = {}
         for column in table.columns:
@@ -92,7 +93,8 @@ def fill_table(
             note = "; ".join(filter(None, (note, f"seeds still to run: {missing}")))
         if row.post_optimization and not values:
             note = "not run: python evaluate.py run=... adds post-optimization to a finished run"
-        row = replace(row, values=values, note=note)
+            options = ()
+        row = replace(row, values=values, note=note, options=options)
         if values:
             revisions = tuple(sorted({run.revision for run in row_runs.values()}))
             row = replace(row, seeds=tuple(sorted(row_runs)), revisions=revisions)
@@ -126,17 +128,23 @@ def _runs_of(config: DictConfig, runs: Runs) -> tuple[DictConfig, list[Run], dic
     return config, same_options, by_seed
 
 
-def _nearest_run(config: DictConfig, same_options: Sequence[Run], runs: Runs) -> str:
-    """Write why the run that is most like a row is not the row's; "" without one like it."""
+def _nearest_run(
+    config: DictConfig, same_options: Sequence[Run], runs: Runs
+) -> tuple[str, tuple[str, ...]]:
+    """Write why the run that is most like a row is not the row's, and the options that differ.
+
+    Both are empty without one like it. Options that a run logs as its choices are first.
+    """
     if same_options:
-        return f"not run on this data; on other data: {same_options[-1].folder}"
+        return f"not run on this data: on other data: {same_options[-1].folder}", ()
     unlike = [(differences(found[-1], config), found[-1].folder) for found in runs.values()]
     unlike = [(options, folder) for options, folder in unlike if 0 < len(options) <= SIMILAR]
     if not unlike:
-        return ""
+        return "", ()
     options, folder = min(unlike, key=lambda each: len(each[0]))
-    texts = [f"{key}={of_run} ({wanted})" for key, (of_run, wanted) in options.items()]
-    return f"not run; {folder} has other options than the row (in brackets): {', '.join(texts)}"
+    keys = sorted(options, key=lambda key: key not in CHOICES)
+    texts = [f"{key}={options[key][0]} ({options[key][1]})" for key in keys]
+    return f"not run: {folder} has other options than the row (in brackets)", tuple(texts)
 
 
 def with_costs(filled: PaperTable, compose: Compose) -> PaperTable:

@@ -42,5 +42,13 @@ def _cell(cell: Cell) -> str:
 
 def _notes(notes: Sequence[Note]) -> str:
     texts = [f"`{note.text}`" if note.code else escape(note.text) for note in notes]
-    lines = [f"- **{escape(n.label)}**: {text}" for n, text in zip(notes, texts, strict=True)]
-    return "\n".join(lines)
+    folds = [_fold(note) for note in notes]
+    lines = zip(notes, texts, folds, strict=True)
+    return "\n".join(f"- **{escape(note.label)}**: {text}{fold}" for note, text, fold in lines)
+
+
+def _fold(note: Note) -> str:
+    if not note.more:
+        return ""
+    text = escape(", ".join(note.more))
+    return f" <details><summary>{note.fold}</summary> {text}</details>"

@@ -4,6 +4,8 @@ from asysplat.report.compare import CLEAR_SIGNAL, rank_agreement
 from asysplat.report.paper import PaperTable, set_titles
 from asysplat.report.table import Note
 
+SHOWN = 3  # options of a remark that are not folded away
+
 
 def notes(filled: PaperTable) -> list[Note]:
     """Write the notes below a table, from what is compared to the command of our numbers."""
@@ -69,13 +71,18 @@ def _order(filled: PaperTable) -> str:
 
 def _remarks(filled: PaperTable) -> list[Note]:
     """Write remarks on single rows; rows with the same remark share a line."""
-    names: dict[str, list[str]] = {}
+    rows: dict[tuple[str, tuple[str, ...]], list[str]] = {}
     for row in filled.rows:
         if row.quoted or row.note:
-            names.setdefault(row.note or "quoted", []).append(row.label)
-    shared = [Note(note[0].upper() + note[1:], "; ".join(rows)) for note, rows in names.items()]
+            rows.setdefault((row.note or "quoted", row.options), []).append(row.label)
+    remarks = []
+    for (note, options), names in rows.items():
+        label, _, details = note.partition(": ")
+        texts = ("; ".join(names), details, ", ".join(options[:SHOWN]))
+        text = ": ".join(filter(None, texts))
+        remarks.append(Note(label[0].upper() + label[1:], text, more=options[SHOWN:]))
     unverified = [row for row in filled.rows if row.unverified]
-    return shared + [Note(f"† {row.name}", row.unverified) for row in unverified]
+    return remarks + [Note(f"† {row.name}", row.unverified) for row in unverified]
 
 
 def _revisions(filled: PaperTable) -> str:

@@ -65,6 +65,7 @@ class PaperRow:
     seeds: tuple[int, ...] = ()  # of the runs
     revisions: tuple[str, ...] = ()  # of the code of the runs, see `asysplat.training.revision`
     note: str = ""  # a remark on this row, such as "seeds still to run: 2"
+    options: tuple[str, ...] = ()  # that the note ends with; those that matter most first
 
     @property
     def label(self) -> str:

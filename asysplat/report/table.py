@@ -36,11 +36,17 @@ class Grid(NamedTuple):
 
 
 class Note(NamedTuple):
-    """A line above or below a table; `code` is set in typewriter."""
+    """A line above or below a table; `code` is set in typewriter, `more` is folded away."""
 
     label: str
     text: str
     code: bool = False
+    more: tuple[str, ...] = ()
+
+    @property
+    def fold(self) -> str:
+        """What stands for `more`; "" without."""
+        return f"and {len(self.more)} more" if self.more else ""
 
 
 class Section(NamedTuple):

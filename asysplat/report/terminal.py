@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 from rich.box import ROUNDED
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from asysplat.report.cells import make_overview, make_section
 from asysplat.report.paper import PaperTable
 from asysplat.report.table import Grid, Note
+from asysplat.terminal import print_table
 
 STYLES = {"": "", "best": "bold green", "muted": "dim", "alarm": "bold red"}
 
@@ -29,16 +29,15 @@ def render_terminal(tables: Sequence[PaperTable], console: Console) -> None:
 
 def _print_notes(notes: Sequence[Note], console: Console) -> None:
     for note in notes:
-        console.print(Text.assemble((f"{note.label}: ", "bold"), note.text))
+        fold = f", {note.fold} (in the page)" if note.more else ""
+        console.print(Text.assemble((f"{note.label}: ", "bold"), note.text, fold))
 
 
 def _print_grid(grid: Grid, console: Console) -> None:
     console.print(Text(grid.caption, style="italic"))
-    table = Table(box=ROUNDED)
-    for number, heading in enumerate(grid.headings):
-        words = (*heading.title.split(" "), heading.part)  # a line each
-        title = Text("\n".join(filter(None, words)))
-        table.add_column(title, justify="right" if number else "left", overflow="fold")
-    for row in grid.rows:
-        table.add_row(*(Text(cell.text, style=STYLES[cell.style]) for cell in row))
-    console.print(table)
+    words = [(*heading.title.split(" "), heading.part) for heading in grid.headings]  # a line each
+    headings = [Text("\n".join(filter(None, lines))) for lines in words]
+    rows = [[Text(cell.text, style=STYLES[cell.style]) for cell in row] for row in grid.rows]
+    # Ours stays beside the paper's.
+    first = [n for n, heading in enumerate(grid.headings) if n and heading.part in ("", "paper")]
+    print_table(console, headings, rows, box=ROUNDED, first=first)

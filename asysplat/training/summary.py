@@ -6,10 +6,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Table
 
 from asysplat.evaluation.measured_cost import SECONDS
 from asysplat.files import atomic_write
+from asysplat.terminal import print_table
 
 Results = dict[str, float | int | str]  # flat, as in metrics.json
 
@@ -86,7 +87,6 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
 
 def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> None:
     """Print a table for each test set, the data set's own first, the figures and the folder."""
-    tables = []
     for name in sets:
         costs = "cost" if name == sets[0] else f"cost/{name}"
         keys = [key.split("/") for key in results if key.startswith(f"test/{name}/post")]
@@ -94,16 +94,17 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
         metrics = [metric for metric in METRICS if [metric] in [key[3:] for key in keys]]
         title = f"test scenes: {name}, metrics: {results['protocol/name']}, "
         title += f"{results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
-        titles = ("seconds", "GB", "inputs (dB)", *(METRICS[metric] for metric in metrics))
-        tables.append(Table(Column("steps", min_width=12), *titles, title=title))
-        rows = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
-        rows |= {label: (prefix.format(name), "") for label, prefix in BASELINES.items()}
-        for label, (prefix, source) in rows.items():
+        titles = ("steps", "seconds", "GB", "inputs (dB)", *(METRICS[m] for m in metrics))
+        sources = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
+        sources |= {label: (prefix.format(name), "") for label, prefix in BASELINES.items()}
+        rows = []
+        for label, (prefix, source) in sources.items():
             spent = [results.get(f"{costs}/{source}/{unit}") for unit in ("seconds", "gb")]
             values = [results.get(f"inputs/{name}/{source}/psnr")]
             values += [results.get(f"{prefix}/{metric}") for metric in metrics]
-            tables[-1].add_row(label, *_cells(spent, digits=2), *_cells(values))
-    _print(tables, folder, "evaluation")
+            rows.append([label, *_cells(spent, digits=2), *_cells(values)])
+        print_table(Console(), titles, rows, title)
+    _print((), folder, "evaluation")
     print(f"evaluation: {folder}")
 
 

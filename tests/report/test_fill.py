@@ -95,9 +95,9 @@ def test_a_row_without_a_run_names_the_one_most_like_it(compose, tmp_path):
     OmegaConf.save(config, tmp_path / "ratio" / "config.yaml", resolve=True)
     (table,) = find_tables("geometry_ratio")
     rows = fill_table(table, OVERRIDES, compose, finished_runs(tmp_path)).rows
-    note = next(row.note for row in rows if row.name == "50%")
-    assert note.startswith(f"not run; {tmp_path / 'ratio'} has other options than the row")
-    assert "parameter_budget=1.0 (0.98)" in note and "steps=8 (7)" in note
+    row = next(row for row in rows if row.name == "50%")
+    assert row.note.startswith(f"not run: {tmp_path / 'ratio'} has other options than the row")
+    assert row.options[0] == "steps=8 (7)" and "parameter_budget=1.0 (0.98)" in row.options
     (table,) = find_tables("layers")
     rows = fill_table(table, ["scale=paper"], compose, finished_runs(tmp_path)).rows
     assert not any(row.note for row in rows)  # they differ in too much

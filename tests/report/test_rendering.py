@@ -61,12 +61,14 @@ def table() -> PaperTable:
     off |= {"inference_seconds": 0.3, "note": "2 of 3 seeds"}
     open_row |= {"values": values(21.5), "seeds": (0,), "costs": costs(93e6)}
     quick = {"inference_seconds": "<1"}
+    differing = ("width=1 (0.5)", "steps=8 (7)", "data.inputs=4 (8)", "seed=*", "training.a=<b>")
+    later = {"note": "not run: logs/one has other options", "options": differing}
     rows = (
         make_row("Quoted|net", None, parameters=125e6, psnr=25.89, lpips=0.142),
         make_row("Net*", parameters=98e6, psnr=19.24, lpips=0.49, bounds=quick, **ours),
         make_row("Off", parameters=88e6, psnr=18.74, lpips=0.52, **off),
         make_row("Open", parameters=89e6, psnr=19.1, **open_row),
-        make_row("Later", parameters=95e6, psnr=17.78, costs=costs(95e6), note="not run"),
+        make_row("Later", parameters=95e6, psnr=17.78, costs=costs(95e6), **later),
     )
     notes = {"Ours": "laptop: 8 views of 64x64", "Machine": "2 cores"}
     notes["Command"] = "python train.py sweeps=layers"
@@ -89,7 +91,7 @@ class Page(HTMLParser):
     """Checks that elements close in order; collects texts, ids, links and tags."""
 
     VOID = ("meta", "link")
-    TEXT = ("td", "th", "dt", "dd", "h2", "figcaption", "p")
+    TEXT = ("td", "th", "dt", "dd", "h2", "figcaption", "summary", "p")
 
     def __init__(self, text: str):
         super().__init__()
@@ -164,7 +166,8 @@ def test_notes_under_a_table(table):
         "rows; rows differ 1.2 x as much as seeds alone make them: the order means little",
         "**Quoted**: Quoted\\|net",
         "**2 of 3 seeds**: Off",
-        "**Not run**: Later",
+        "**Not run**: Later: logs/one has other options: width=1 (0.5), steps=8 (7), data.inputs=4",
+        "<details><summary>and 2 more</summary> seed=\\*, training.a=\\<b\\></details>",
         "**† Open**: No layers are named.",
         "**Machine**: 2 cores",
         "**Command**: `python train.py sweeps=layers`",
@@ -259,15 +262,26 @@ def test_html_needs_nothing_else(table, ratios):
     assert "script" not in page.tags
     assert page.links == {"#table-6b-layers-of-a-stage", "#table-a3-share"}
     assert {link[1:] for link in page.links} <= page.ids
-    assert "Layers &lt;of&gt; a stage" in text
+    assert "Layers &lt;of&gt; a stage" in text and "details" in page.tags
     assert text == render_html([table, ratios])
 
 
-def test_the_terminal_folds_a_wide_table(table):
+def test_a_narrow_terminal_has_all_of_a_wide_table(table):
     wide, narrow = (on_terminal(table, width) for width in (200, 80))
     assert "22.00 ± 1.00" in wide and "unverified, no fit" in wide
-    assert max(map(len, narrow.split("Paper: 32")[0].splitlines())) <= 80
-    assert "…" not in narrow
+    tables = [narrow.split("Paper: 32")[0] for narrow in (narrow, on_terminal(table, 60))]
+    for text, width in zip(tables, (80, 60), strict=True):
+        assert max(map(len, text.splitlines())) <= width
+        for line in wide.split("Paper: 32")[0].splitlines():
+            cells = [cell.strip() for cell in line.split("│")[2:-1]]  # of numbers
+            assert [cell for cell in cells if cell not in text] == []
+    # The paper's numbers and ours are never apart.
+    headings = [line.split() for line in tables[1].splitlines() if line.startswith("│ Row")]
+    assert len(headings) > 2
+    assert all(
+        words.count("paper") == words.count("ours") for words in headings if "paper" in words
+    )
+    assert "…" not in "".join(tables)
 
 
 def test_pareto_front():

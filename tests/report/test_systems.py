@@ -60,7 +60,7 @@ def test_a_measured_system_stands_beside_its_quoted_numbers(compose, write, tmp_
     (line,) = re.findall(r"\| DepthSplat \|.*", page)
     assert "27.47 | quoted |" in line
     assert "- **Quoted**: DepthSplat" in page
-    assert "- **Measured: 12 scenes of realestate10k data" in page
+    assert "- **Measured**: pixelSplat: 12 scenes of realestate10k data" in page
 
 
 UNLIKE = {
