@@ -74,13 +74,26 @@ def exit_at_unknown_overrides(script: str) -> None:
     Scripts call it before they import torch, which takes seconds.
     """
     os.environ.setdefault("ASYSPLAT_SHARED", str(CONF.parents[1] / "shared"))
-    given = get_args_parser().parse_args()
-    if given.config_dir or given.config_name or given.config_path or given.shell_completion:
-        return  # other configuration files, or no run
+    words = sys.argv[1:]
+    given, unknown = get_args_parser().parse_known_args(words)
+    other = given.config_dir or given.config_name or given.config_path or given.shell_completion
     try:
-        check_overrides(given.overrides, script)
+        _check_dashes(words, unknown)
+        if not other:  # configuration files, and a run
+            check_overrides(given.overrides, script)
     except InputError as error:
         sys.exit(f"error: {error}")
+
+
+def _check_dashes(words: Sequence[str], unknown: Collection[str]) -> None:
+    """Raise InputError if some of `words`, as in `--steps 20`, is `unknown` to Hydra."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        if word in unknown and word.startswith("-"):
+            name, _, value = word.partition("=")
+            if not value and following and not re.match("-|.*=", following):
+                value, word = following, f"{word} {following}"
+            override = f"{name.lstrip('-').replace('-', '_')}={value or 'true'}"
+            raise InputError(f"{word}: options are given as {override}.")
 
 
 def _parse(override: str) -> Override:

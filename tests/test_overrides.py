@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from asysplat import overrides
 from asysplat.errors import InputError
-from asysplat.overrides import CONF, check_overrides
+from asysplat.overrides import CONF, check_overrides, exit_at_unknown_overrides
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -100,6 +100,22 @@ def test_a_script_says_it_from_any_folder(repository, tmp_path):
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert result.returncode != 0
     assert result.stderr == "error: cots is unknown: did you mean costs?\n"
+
+
+DASHES = {
+    "--quality best": "quality=best",
+    "--steps=20": "steps=20",
+    "name=a --learning-rate 1e-3": "learning_rate=1e-3",
+    "--viewer": "viewer=true",
+    "--viewer steps=20": "viewer=true",
+}
+
+
+@pytest.mark.parametrize("given", DASHES)
+def test_options_with_dashes_are_answered_by_how_they_are_given(given, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["train.py", *given.split()])
+    with pytest.raises(SystemExit, match=f": options are given as {DASHES[given]}\\.$"):
+        exit_at_unknown_overrides("train")
 
 
 COMMAND = re.compile(
