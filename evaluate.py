@@ -167,7 +167,7 @@ def write_scenes(
 ) -> None:
     """Write the Gaussians of every test scene, in the data's world, as <scene>.safetensors."""
     make_folder(folder, "write_scenes")
-    for index in range(len(tests)):
+    for index in track(range(len(tests)), "writing scenes"):
         sample, sequence = tests[index], tests.tasks[index].sequence
         gaussians = predictor(sample)(sample["inputs"].to(device)).to(torch.float64)
         path, offset = folder / f"{sample['scene']}.safetensors", origin_of(sequence)

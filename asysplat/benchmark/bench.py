@@ -141,8 +141,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     try:
         pairs = list(make_pairs())
         rounds = [Measurement(partial(_seconds, pair)) for pair in pairs]
-        with console.status(f"{options.repeats} rounds"):
-            time_in_rounds(rounds, options.repeats)
+        time_in_rounds(rounds, options.repeats, console)
     finally:
         torch.set_num_threads(threads)
     rows = []

@@ -90,8 +90,7 @@ def measure(options: DictConfig, console: Console) -> Result:
                 return times
 
         timed = Measurement(seconds)
-        with console.status(f"{options.repeats} rounds"):
-            time_in_rounds([timed], options.repeats)
+        time_in_rounds([timed], options.repeats, console)
     rates = {name: summary([1 / s for s in timed.seconds[name]]) for name in CACHES}
     loading = [{"cache": name, "frames_per_second": rate} for name, rate in rates.items()]
     scene = {"frames": config.frames, "photographs": list(config.photographs)}

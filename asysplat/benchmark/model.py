@@ -150,8 +150,7 @@ def measure(options: DictConfig, console: Console) -> Result:
                 workload = Workload(net, precision, views)
                 timer = partial(_seconds, workload, config.steps)
                 measurements.append(Measurement(timer, row | {"precision": precision}))
-    with console.status(f"{options.repeats} rounds"):
-        time_in_rounds(measurements, options.repeats)
+    time_in_rounds(measurements, options.repeats, console)
     rows = []
     for timed in measurements:
         times = {name: timed.summary(name) for name in timed.seconds}

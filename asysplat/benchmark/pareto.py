@@ -24,6 +24,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
+from rich.progress import Progress, track
 from rich.table import Table
 from torch import Tensor
 
@@ -305,11 +306,13 @@ def _measure_scene(
     refinement: DictConfig,
     device: torch.device,
     repeats: int,
+    advance: Callable[[], None],
 ) -> list[Result]:
     """Measure all settings in turns, those with a limit in seconds once; return a row for each.
 
     Networks are on the device, refinements on the CPU. A setting other than BASE that cannot render
-    this scene has no numbers, but the reason in "not_measured".
+    this scene has no numbers, but the reason in "not_measured". `advance` is called after each of
+    the `count_runs`.
     """
     base = settings[BASE]
     own_device = CPU if isinstance(base, Refined) else device
@@ -321,9 +324,11 @@ def _measure_scene(
         def render_scene() -> None:
             images[name] = renderers[name](scene)
 
-        return {"seconds": seconds_of(render_scene, own_device)}
+        seconds = seconds_of(render_scene, own_device)
+        advance()
+        return {"seconds": seconds}
 
-    once = isinstance(base, Refined) and base.seconds is not None
+    once = runs_once(base)
     if once:  # compiles kernels
         replace(base, seconds=None, steps=1).prepare(refinement, CPU)(scene)
     for name in settings:
@@ -361,6 +366,16 @@ def _measure_scene(
     return rows
 
 
+def runs_once(base: Setting) -> bool:
+    """Return whether the settings of this base have a limit in seconds."""
+    return isinstance(base, Refined) and base.seconds is not None
+
+
+def count_runs(settings: Mapping[str, Setting], repeats: int) -> int:
+    """Count the runs of all settings on a scene: once, or also in a warm-up and the rounds."""
+    return len(settings) * (1 if runs_once(settings[BASE]) else 2 + repeats)
+
+
 def decibels(image: Tensor, exact: Tensor) -> float:
     """Compare images, clamped to [0, 1], by the decibels of their mean squared error."""
     error = image.double().clamp(0, 1) - exact.double().clamp(0, 1)
@@ -385,10 +400,10 @@ def measure(options: DictConfig, console: Console) -> Result:
     protocol = instantiate(options.metrics)
     lpips = load_lpips(protocol.lpips_net, shared / "weights")
     device = find_device(options.device)
-    renderers = {
-        family: {n: each.prepare(options.refinement, device) for n, each in settings.items()}
-        for family, settings in families.items()
-    }
+    every = [(family, *each) for family, settings in families.items() for each in settings.items()]
+    renderers: dict[str, dict[str, RenderScene]] = {family: {} for family in families}
+    for family, name, setting in track(every, "loading", console=console, transient=True):
+        renderers[family][name] = setting.prepare(options.refinement, device)
     scenes, absent = find_scenes(config["scenes"], shared / "data")
     common = (protocol, lpips, options.refinement, device, options.repeats)
     if lpips is None:
@@ -396,13 +411,16 @@ def measure(options: DictConfig, console: Console) -> Result:
     if not torch.cuda.is_available():
         absent["a GPU"] = "there is none"
     rows: list[Result] = []
-    for name, open_scene in scenes.items():
-        for family, settings in families.items():
-            if name not in (config[family]["scenes"] or scenes):
-                continue
+    parts = [
+        (name, f) for name in scenes for f in families if name in (config[f]["scenes"] or scenes)
+    ]
+    total = sum(count_runs(families[family], options.repeats) for _, family in parts)
+    with Progress(console=console, transient=True) as bars:
+        advance = partial(bars.advance, bars.add_task("measuring", total=total))
+        for name, family in parts:
             sizes = {"side": config["side"]} | SIZES | (config[family].get("photographs") or {})
-            with console.status(f"{name}: {len(settings)} settings, {family}"):
-                found = _measure_scene(open_scene(**sizes), settings, renderers[family], *common)
+            scene, settings = scenes[name](**sizes), families[family]
+            found = _measure_scene(scene, settings, renderers[family], *common, advance=advance)
             console.print(f"{name}: {family}, {len(found)} settings", highlight=False)
             where = {"family": family, "scene": name, "side": sizes["side"]}
             rows += [where | row for row in found]

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
+from rich.progress import track
 from torch import Tensor
 
 from asysplat.evaluation.measured_cost import wait_for
@@ -30,12 +32,16 @@ class Measurement:
         return summary(self.seconds[name])
 
 
-def time_in_rounds(measurements: Sequence[Measurement], repeats: int) -> None:
+def time_in_rounds(
+    measurements: Sequence[Measurement], repeats: int, console: Console | None = None
+) -> None:
     """Call every timer in each of `repeats` rounds, after a round to warm up.
 
-    Measurements take turns, so that other load on the machine affects all of them alike.
+    Measurements take turns, so that other load on the machine affects all of them alike. The
+    console, if there is one, shows the progress.
     """
-    for number in range(repeats + 1):
+    rounds = range(repeats + 1)
+    for number in track(rounds, "rounds", console=console, transient=True, disable=not console):
         for measurement in measurements:
             for name, seconds in measurement.timer().items():
                 if number > 0:

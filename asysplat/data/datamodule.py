@@ -4,12 +4,14 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from multiprocessing import get_all_start_methods
+from multiprocessing import current_process, get_all_start_methods
 from typing import Any
 
 import lightning
 import numpy as np
 import torch
+from lightning.pytorch.utilities import rank_zero_only
+from rich.progress import track
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from asysplat.data.augment import Augmentation, center_crop
@@ -87,11 +89,12 @@ class SceneDataModule(lightning.LightningDataModule):
         if not self.evaluation:
             samples = {"training": TrainingTasks(self)[0]}
             counts = (self.inputs, self.targets)
-            self.evaluation["val"] = FixedTasks(self.source.evaluation("val", *counts), self.points)
+            validation = self.source.evaluation("val", *counts)
+            self.evaluation["val"] = FixedTasks(validation, self.points, "validation")
             own = {self.name: partial(self.source.evaluation, "test", *counts)}
             for name, make_tasks in (own | self.test_sets).items():
                 try:
-                    self.tests[name] = FixedTasks(make_tasks(), self.points)
+                    self.tests[name] = FixedTasks(make_tasks(), self.points, f"test {name}")
                 except InputError as error:
                     if name == self.name:
                         raise
@@ -223,13 +226,19 @@ class TrainingTasks(Dataset):
 
 
 class FixedTasks(Dataset):
-    """Evaluation tasks; the first ones stay in memory, up to MAX_LOADED_BYTES."""
+    """Evaluation tasks; the first ones stay in memory, up to MAX_LOADED_BYTES.
 
-    def __init__(self, tasks: Sequence[Task], points: bool = False):
+    The terminal shows the progress of loading them, under their `name`.
+    """
+
+    def __init__(self, tasks: Sequence[Task], points: bool = False, name: str = ""):
         self.tasks, self.points = tasks, points
         self._loaded: list[Sample] = []
         size = 0
-        for task in tasks:
+        # Processes side by side would draw over each other.
+        alone = rank_zero_only.rank == 0 and current_process().name == "MainProcess"
+        shown = track(tasks, f"loading {name}", transient=True, disable=not alone)
+        for task in shown:
             self._loaded.append(load(task, points=points))
             size += sum(self._loaded[-1][views].images.nbytes for views in ("inputs", "targets"))
             if size > MAX_LOADED_BYTES:

@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from torch.utils.data import Dataset
 
 from asysplat.evaluation.figures import comparison_figure
@@ -47,7 +54,7 @@ def measure_scenes(
     make_folder(folder / "figures", "paths.logs")
     main, last = next(iter(tests)), measure.steps[-1]
     columns = (TextColumn("{task.description:8}"), BarColumn(bar_width=20), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn()) as bars:
+    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn()) as bars:
         scenes = bars.add_task("scenes", total=sum(map(len, tests.values())))
         steps = bars.add_task("steps", total=last)
 

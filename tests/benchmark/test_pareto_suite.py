@@ -4,6 +4,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from rich.console import Console
+from rich.progress import Progress
 
 from asysplat import load
 from asysplat.benchmark import pareto
@@ -125,6 +126,16 @@ def test_a_row_is_what_the_network_and_the_renderer_give(measured, tmp_path):
 
 
 @pytest.mark.medium
+@pytest.mark.parametrize("family", ["refined", "reconstruct"])
+def test_the_bar_ends_with_the_last_run(make_pareto, monkeypatch, family):
+    bars = []
+    monkeypatch.setattr(pareto, "Progress", lambda **how: bars.append(Progress(**how)) or bars[0])
+    options = make_pareto(families=[family], scenes=["room"])
+    options.pareto[family].knobs = {"start": {"seconds": None, "steps": 0}}
+    pareto.measure(options, Console(quiet=True))
+    assert bars[0].finished
+
+
 def test_a_folder_of_photographs_is_a_scene(tmp_path):
     write_photographs(tmp_path / "mine", 12, 40, 60)
     scenes, absent = find_scenes(["mine", "fox"], tmp_path)

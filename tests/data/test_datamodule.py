@@ -176,6 +176,20 @@ def test_fixed_tasks_stay_loaded_up_to_a_limit(monkeypatch):
     assert [len(sequence.decoded) for sequence in sequences] == [3, 3, 6]
 
 
+def test_loading_the_fixed_tasks_is_shown(monkeypatch):
+    shown = []
+
+    def track(items, name, **_):
+        shown.append((name, len(items)))
+        return items
+
+    monkeypatch.setattr(datamodule, "track", track)
+    set_up(with_test_sets({"rooms": {"places": "rooms"}}))
+    names = ("validation", "test procedural", "test rooms")
+    assert [name for name, _ in shown] == [f"loading {name}" for name in names]
+    assert all(count > 0 for _, count in shown)
+
+
 @pytest.mark.medium
 def test_a_test_set_differs_only_in_its_options():
     data = set_up(with_test_sets({"rooms": {"places": "rooms"}, "more_views": {"inputs": 5}}))
