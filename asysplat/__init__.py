@@ -6,9 +6,8 @@ gaussians = asysplat.refine(gaussians, photographs.inputs, seconds=10.0)
 asysplat.write_gaussians("scene.ply", photographs.frame.to_world(gaussians))
 """
 
-from importlib import import_module
+from asysplat.later import import_later
 
-# Imported when first used, since torch takes seconds.
 LATER = {
     "Cameras": "asysplat.scene",
     "Gaussians": "asysplat.scene",
@@ -23,12 +22,4 @@ LATER = {
 }
 
 __all__ = list(LATER)
-
-
-def __getattr__(name: str) -> object:
-    """Import what LATER names."""
-    if name not in LATER:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    # Stored, since the import of asysplat.load leaves the module under the name of its function.
-    globals()[name] = getattr(import_module(LATER[name]), name)
-    return globals()[name]
+__getattr__ = import_later(__name__, LATER)

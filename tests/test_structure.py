@@ -21,7 +21,7 @@ BRITISH = (
 )
 # Packages and modules of asysplat: each imports only from layers before its own.
 LAYERS = (
-    ("errors", "interrupts"),
+    ("errors", "interrupts", "later"),
     ("files", "overrides", "scene", "terminal"),
     ("ops",),
     ("rendering",),

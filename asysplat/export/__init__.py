@@ -1,21 +1,19 @@
 """Files of Gaussians, camera paths, videos and the viewer."""
 
-from asysplat.export.camera_paths import orbit, smoothed_path
-from asysplat.export.gaussians import read_gaussians, write_gaussians
-from asysplat.export.ply import read_ply, write_ply
-from asysplat.export.splat import read_splat
-from asysplat.export.tensors import read_safetensors, write_safetensors
-from asysplat.export.video import write_video
+from asysplat.later import import_later
 
-__all__ = [
-    "orbit",
-    "read_gaussians",
-    "read_ply",
-    "read_safetensors",
-    "read_splat",
-    "smoothed_path",
-    "write_gaussians",
-    "write_ply",
-    "write_safetensors",
-    "write_video",
-]
+LATER = {
+    "orbit": "asysplat.export.camera_paths",
+    "read_gaussians": "asysplat.export.gaussians",
+    "read_ply": "asysplat.export.ply",
+    "read_safetensors": "asysplat.export.tensors",
+    "read_splat": "asysplat.export.splat",
+    "smoothed_path": "asysplat.export.camera_paths",
+    "write_gaussians": "asysplat.export.gaussians",
+    "write_ply": "asysplat.export.ply",
+    "write_safetensors": "asysplat.export.tensors",
+    "write_video": "asysplat.export.video",
+}
+
+__all__ = list(LATER)
+__getattr__ = import_later(__name__, LATER)

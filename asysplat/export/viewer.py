@@ -3,6 +3,14 @@
 python -m asysplat.export.viewer scene.ply [PHOTOGRAPHS]
 """
 
+from argparse import ArgumentParser
+
+if __name__ == "__main__":  # now, since torch takes seconds
+    parser = ArgumentParser("python -m asysplat.export.viewer", description=__doc__.split("\n")[0])
+    parser.add_argument("scene", help="a file of Gaussians: .ply, .splat or .safetensors")
+    parser.add_argument("photographs", nargs="?", help="a folder to show the scene among")
+    arguments = parser.parse_args()
+
 import math
 import re
 import sys
@@ -304,17 +312,15 @@ def _check_one_scene(name: str, batch: tuple[int, ...]) -> None:
         )
 
 
-def main(words: list[str]) -> None:
+def main(scene: str, folder: str | None) -> None:
     """Show a file of Gaussians, among the photographs of a folder if there is one."""
-    if not 1 <= len(words) <= 2:
-        sys.exit("usage: python -m asysplat.export.viewer scene.ply [PHOTOGRAPHS]")
     try:
-        if len(words) == 2:
-            photographs = open_photographs(words[1], height=FRUSTUM_HEIGHT)
-            gaussians = read_gaussians(words[0], photographs.origin)
+        if folder is not None:
+            photographs = open_photographs(folder, height=FRUSTUM_HEIGHT)
+            gaussians = read_gaussians(scene, photographs.origin)
             views, gaussians = photographs.inputs, photographs.frame.to_network(gaussians)
         else:
-            gaussians = read_gaussians(words[0])
+            gaussians = read_gaussians(scene)
             views = _view_of(gaussians)
         with Viewer(views, gaussians) as viewer:
             print(f"viewer: {viewer.url}, until Ctrl-C")
@@ -336,4 +342,4 @@ def _view_of(gaussians: Gaussians) -> Views:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(arguments.scene, arguments.photographs)
