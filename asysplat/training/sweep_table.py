@@ -37,7 +37,7 @@ class SweepTable(Callback):
         jobs = read_jobs(Path(config.hydra.sweep.dir), Path(config.paths.logs))
         if any(run is not None for *_, run in jobs):
             Console().print(sweep_table(jobs))
-        if not self.complete:
+        if jobs and not self.complete:
             print("The sweep is not finished: the same command skips the jobs that are.")
 
 

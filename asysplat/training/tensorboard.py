@@ -9,14 +9,17 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 CHOICES = (
-    *("name", "seed", "width", "state_size", "geometry_ratio", "steps", "learning_rate"),
-    *("model.layers", "metrics.name"),
+    *("geometry_ratio", "seed", "learning_rate", "model.layers", "steps"),
+    *("name", "width", "state_size", "metrics.name"),
     *(f"data.{key}" for key in ("name", "inputs", "height", "width", "batch_size")),
     *(f"training.loss.{key}" for key in ("ssim", "perceptual", "depth", "opacity")),
 )
 EVENTS = "events.out.tfevents.*"
 HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
-FIRST = ("train", "val", "test")  # groups of cards
+TICKED = 5  # of the options: those that TensorBoard's hparams tab shows at first
+FIRST = ("train", "val", "test", "steps")  # groups of cards
+# In the group "steps", so that losses and metrics are the first cards of "train".
+OF_STEPS = ("learning_rate", "grad_norm", "non_finite_steps", "bad_scenes")
 
 
 class TensorBoard(TensorBoardLogger):
@@ -28,7 +31,9 @@ class TensorBoard(TensorBoardLogger):
 
 def _numbered(name: str) -> str:
     """Put a number before the names of FIRST: 1_train/loss."""
-    group = name.partition("/")[0]
+    group, _, inner = name.partition("/")
+    if group == "train" and inner in OF_STEPS:
+        group, name = "steps", f"steps/{inner}"
     return f"{FIRST.index(group) + 1}_{name}" if group in FIRST else name
 
 
@@ -60,7 +65,11 @@ def cut_events(folder: Path, sizes: Mapping[str, int]) -> None:
 def log_choices(logger: Logger, config: DictConfig) -> None:
     """Log the options for the hparams tab, which needs the names of its metrics now."""
     choices = {key: OmegaConf.select(config, key) for key in CHOICES}
-    if isinstance(logger, TensorBoardLogger):
+    if isinstance(logger, TensorBoardLogger):  # sorts options by name
+        choices = {
+            f"{number}_{key}" if number <= TICKED else key: value
+            for number, (key, value) in enumerate(choices.items(), 1)
+        }
         logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in HPARAMS_METRICS})
     else:
         logger.log_hyperparams(choices)

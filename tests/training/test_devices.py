@@ -28,7 +28,7 @@ def read_run(result) -> SimpleNamespace:
         curves={
             name: [value for _, value in row]
             for name, row in events.scalars(folder).items()
-            if name.startswith(("1_train/", "2_val/"))
+            if name.startswith(("1_train/", "2_val/", "4_steps/"))
         },
         test={k: v for k, v in results.items() if k.startswith(("test/", "baseline/"))},
         rows=len((folder / "metrics.csv").read_text().splitlines()) - 1,
@@ -52,11 +52,11 @@ def check_the_same(found, expected) -> None:
     assert {
         "1_train/loss",
         "1_train/psnr",
-        "1_train/grad_norm",
+        "4_steps/grad_norm",
         "2_val/psnr",
     } <= found.curves.keys()
     for name, values in expected.curves.items():
-        rel = 1e-4 if name == "1_train/grad_norm" else 1e-5
+        rel = 1e-4 if name == "4_steps/grad_norm" else 1e-5
         assert len(values) == 2 and found.curves[name] == pytest.approx(values, rel=rel), name
     assert found.test == pytest.approx(expected.test, rel=1e-5) and found.test
     assert found.rows == expected.rows == 3 * 2

@@ -13,6 +13,7 @@ import torch
 import yaml
 from conftest import COSTS, finished
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams import metadata
 
 
 def metrics(folder: Path) -> dict:
@@ -57,10 +58,12 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     events.Reload()
     tags = events.Tags()
     scalars = set(tags["scalars"])
-    names = ("1_train/psnr", "1_train/learning_rate", "2_val/psnr", "3_test/procedural/psnr")
+    names = ("1_train/psnr", "2_val/psnr", "3_test/procedural/psnr", "4_steps/learning_rate")
     assert {*names, "cost/parameters", "baseline/procedural/mean_color/psnr"} <= scalars
     groups = sorted({tag.partition("/")[0] for tag in scalars if "/" in tag})
-    assert groups[:3] == ["1_train", "2_val", "3_test"]  # the order of TensorBoard's cards
+    # The order of TensorBoard's cards
+    assert groups[:4] == ["1_train", "2_val", "3_test", "4_steps"]
+    assert not any(name.startswith("1_train/") and "bad" in name for name in scalars)
     for name in ("time/share_data", "gradient/geometry", "gradient/head", "memory/peak_gb"):
         assert [event.step for event in events.Scalars(name)] == [1, 3, 5]
     shares = [tag for tag in scalars if tag.startswith("time/share_")]
@@ -80,7 +83,10 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
     last = events.Scalars("hp/psnr")[-1].value
     assert abs(last - numbers["test/procedural/psnr"]) < 1e-3
     assert any(tag.startswith("val/") for tag in tags["images"])
-    assert "_hparams_/session_start_info" in events.summary_metadata
+    started = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    options = metadata.parse_session_start_info_plugin_data(started).hparams
+    ticked = [name.partition("_")[2] for name in sorted(options)[:5]]
+    assert ticked == ["geometry_ratio", "seed", "learning_rate", "model.layers", "steps"]
 
 
 LEFT_OUT = [
