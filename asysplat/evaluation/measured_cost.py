@@ -28,8 +28,8 @@ PEAKS = {
 }
 STATUS, CLEAR_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")  # Linux alone
 SECONDS = (
-    "mean of all measurements but the longest, which is left out as an outlier; "
-    "of a single measurement, that one"
+    "of training steps the mean; of inference the mean of all measurements but the longest, which "
+    "is left out as an outlier, or a single measurement"
 )
 
 

@@ -1,6 +1,7 @@
 """Measure the costs of a run: parameters, FLOPs, Gaussians, seconds, memory."""
 
 import math
+import statistics
 from datetime import timedelta
 from typing import Any
 
@@ -19,9 +20,10 @@ class Costs(lightning.Callback):
 
     Before the first step, it counts the `static_costs` of one scene at the run's views and
     resolution, prints the training's plan (`make_plan`) and refuses a training that does not fit.
-    During the run it measures, by `CostMeter`, seconds (mean of all but the longest) and peak
-    memory of a training step (seconds_per_step, peak_gb) and of the network's forward pass over
-    the test scenes (inference_seconds, inference_gb; under cost/<set>/ for further test sets).
+    During the run it measures, by `CostMeter`, seconds and peak memory of a training step
+    (seconds_per_step, the mean; peak_gb) and of the network's forward pass over the test scenes
+    (inference_seconds, the mean of all but the longest; inference_gb; under cost/<set>/ for further
+    test sets).
     """
 
     def __init__(self):
@@ -55,7 +57,7 @@ class Costs(lightning.Callback):
 
     def on_fit_end(self, trainer: Any, module: Any) -> None:
         if self.step.seconds:
-            seconds = trainer.accumulate_grad_batches * mean_but_longest(self.step.seconds)
+            seconds = trainer.accumulate_grad_batches * statistics.fmean(self.step.seconds)
             self.values["cost/seconds_per_step"] = seconds
         if self.step.gb:
             self.values["cost/peak_gb"] = max(self.step.gb)
