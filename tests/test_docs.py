@@ -35,3 +35,17 @@ def test_the_scaling_tables_match_their_results(repository):
     made = runpy.run_path(str(repository / "docs" / "scaling.py"))
     assert made["filled"](page) == page, "run python docs/scaling.py"
     assert all(f"<!-- {name} -->" in page for name in made["tables"]())
+
+
+VERDICTS = ("as the paper", "assumed", "ours", "not here")
+
+
+def test_every_statement_of_the_paper_has_a_verdict(repository):
+    text = (repository / "docs" / "tables.md").read_text()
+    listed = text.split("## The paper, statement by statement")[1].split("\n## ")[0]
+    rows = [line.strip("|").split("|") for line in listed.splitlines() if line.startswith("| ")]
+    rows = [row for row in rows if row[0].strip() != "the paper"]
+    assert len(rows) > 50
+    for statement, _, verdict in rows:
+        assert verdict.strip().startswith(VERDICTS), statement
+    assert all(any(verdict in row[2] for row in rows) for verdict in VERDICTS)
