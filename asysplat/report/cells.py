@@ -22,16 +22,16 @@ ARROWS = {"higher": "\u00a0↑", "lower": "\u00a0↓", None: ""}  # after a spac
 # Key in `Costs`: title, unit, format.
 COSTS = {
     "parameters": ("Param (M)", 1e6, "{:.4g}"),
-    "gflops": ("GFLOPs", 1, "{:,.0f}"),
-    "gaussians": ("Gaussians (M)", 1e6, "{:.3g}"),
+    "gflops": ("Module GFLOPs", 1, "{:,.0f}"),
     "gflops_true": ("True GFLOPs", 1, "{:,.0f}"),
+    "gaussians": ("Gaussians (M)", 1e6, "{:.3g}"),
     "geometry_share": ("Geometry (%)", 0.01, "{:.1f}"),
     "activation_gb": ("Activation (GB)", 1, "{:.3g}"),
 }
 COST_CAPTION = (
-    "Costs at the paper's scale. GFLOPs are those of linear and convolution modules, as the paper "
-    "counts them; true ones have attention and scans too. Geometry is the share of the parameters "
-    "in that branch."
+    "Costs at the paper's scale. Module GFLOPs are those of linear and convolution modules, as the "
+    "paper counts them; true ones have attention products, scans and depthwise convolutions too. "
+    "Geometry is the share of the parameters in that branch."
 )
 NOTHING = Cell("-", "muted")
 

@@ -1,10 +1,13 @@
 """Counts of parameters and FLOPs; costs at the paper's scale, without data or memory."""
 
+import math
+
 import pytest
 import torch
 from torch import nn
 
 from asysplat.evaluation.static_cost import (
+    NORMS,
     activation_gb,
     blank_views,
     count_parameters,
@@ -12,6 +15,10 @@ from asysplat.evaluation.static_cost import (
     static_costs,
     true_flops,
 )
+from asysplat.models.attention import CrossAttention, SelfAttention
+from asysplat.models.mamba2 import Mamba2Direction
+from asysplat.models.mamba_vision import MambaVisionMixer
+from asysplat.ops.ssd.chunked import CHUNK
 
 
 @pytest.mark.medium
@@ -90,6 +97,50 @@ def test_attention_products_are_in_the_true_count_only():
     assert module_flops(net, inputs)[0] == 2 * tokens * width * 3 * width
     products = 2 * 2 * tokens * tokens * width  # q k^T and its product with v
     assert true_flops(net, views, height, width) == 2 * tokens * width * 3 * width + products
+
+
+def omitted_flops(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> int:
+    """By hand, from the shapes: the true count of a module without that of its modules."""
+    tokens = inputs[0]
+    if isinstance(module, (SelfAttention, CrossAttention)):
+        scenes, views, *size, width = tokens.shape
+        if isinstance(module, SelfAttention):  # a query sees the keys of its place of the grid
+            queries = scenes * views * math.prod(size)
+            keys = views * math.prod(size) // module.grid**2
+        else:  # those of its view
+            queries, keys = scenes * views * math.prod(size), math.prod(inputs[1].shape[2:4])
+            width = module.query.out_features
+        return 2 * 2 * queries * keys * width  # q k^T and its product with v
+    if isinstance(module, Mamba2Direction):
+        length, inner, state = math.prod(tokens.shape[:2]), module.splits[0], module.state_size
+        conv = 2 * length * module.conv.in_channels * module.conv.kernel_size[0]
+        within_chunks = 2 * length * CHUNK * (state + inner)  # C B^T and its product with x
+        states = 2 * 2 * length * inner * state  # written and read
+        return conv + within_chunks + states
+    if isinstance(module, MambaVisionMixer):
+        length, width = math.prod(tokens.shape[:2]), tokens.shape[-1]
+        scanned, state = module.A_log.shape
+        return 2 * length * width * 3 + 2 * 2 * length * scanned * state
+    # Norms are no products.
+    return -4 * tokens.numel() if isinstance(module, NORMS) else 0
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("model", ["asysplat_4m4s", "longlrm"])
+def test_the_true_count_has_what_the_modules_omit(build, model):
+    """Attention products, scans and depthwise convolutions; it has no norms."""
+    net = build(f"model={model}", "width=0.125", "state_size=8", device="meta")
+    omitted = []
+
+    def count(module, inputs):
+        omitted.append(omitted_flops(module, inputs))
+
+    hooks = [m.register_forward_pre_hook(count) for m in net.modules()]
+    with torch.device("meta"), torch.no_grad():
+        modules, _ = module_flops(net, blank_views(2, 64, 96))
+    for hook in hooks:
+        hook.remove()
+    assert true_flops(net, 2, 64, 96) == modules + sum(omitted)
 
 
 def test_every_use_of_a_shared_module_counts_and_hooks_are_removed():
