@@ -10,6 +10,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.evaluation.static_cost import static_costs
+from asysplat.report.notes import rows_by_text
 from asysplat.report.paper import Costs, Number, PaperRow, PaperTable, our_sets, set_titles
 from asysplat.report.systems import system_rows
 from asysplat.training.runs import Run, config_hash, data_of, differences, find_runs
@@ -65,6 +66,7 @@ def fill_table(
     sets = our_sets(table, config.data.name, config.data.test_sets or ())
     seeds = str(config.hydra.sweeper.params.get("seed", config.seed)).split(",")
     rows: list[PaperRow] = []
+    heads: dict[str, list[str]] = {}  # of the rows that have it
     given, used = system_rows(table, config, sets, systems)
     for row in given:
         if row.quoted:
@@ -78,6 +80,7 @@ def fill_table(
                 row_config, same_options, row_runs = also
                 note, options = f"runs with {' '.join(row.also)}", ()
         used += row_runs.values()
+        heads.setdefault(_head(row_config), []).append(row.label)
         values: dict[str, list[Number]] = {}
         for column in table.columns:
             if column.key in OPTIONS:
@@ -105,6 +108,7 @@ def fill_table(
     notes = {
         "Ours": f"{data.name} data, {data.inputs} input views of {height}x{width}, {stages}, "
         f"{config.width:g} of the paper's width",
+        "Head": rows_by_text(heads),
         "Not tested": _untested(sets, config, rows),
         "Baselines": _baselines(sets, used),
         "Data": _folders(used),
@@ -165,6 +169,15 @@ def _costs(compose: Compose, run: tuple[str, ...], views: int, size: tuple[int, 
     with torch.device("meta"):
         net = instantiate(config.model)
     return static_costs(net, views, *size)
+
+
+def _head(config: DictConfig) -> str:
+    """Write the head of a model and its options, as `PhotographHead(sh_degree=3)`."""
+    head = OmegaConf.to_container(config.model, resolve=True).get("head")
+    if head is None:
+        return "the model's own"
+    options = (f"{key}={value}" for key, value in head.items() if not key.startswith("_"))
+    return f"{head['_target_'].rpartition('.')[-1]}({', '.join(options)})"
 
 
 def _result_key(column: str, row: PaperRow, sets: dict[str, str]) -> str | None:

@@ -1,5 +1,7 @@
 """Write the notes of a table: how both sides were measured, and how far to trust the order."""
 
+from collections.abc import Mapping, Sequence
+
 from asysplat.report.compare import CLEAR_SIGNAL, rank_agreement
 from asysplat.report.paper import PaperTable, set_titles
 from asysplat.report.table import Note
@@ -19,7 +21,7 @@ def notes(filled: PaperTable) -> list[Note]:
         "Revision": _revisions(filled),
         **filled.notes,
     }
-    above = ("Paper", "Ours", "Substitutes", "Not tested", "Baselines", "Seeds", "Order")
+    above = ("Paper", "Ours", "Head", "Substitutes", "Not tested", "Baselines", "Seeds", "Order")
     below = ("Data", "Revision", "Machine", "Command")
     lines = [Note(label, texts.get(label, "")) for label in above]
     lines += _remarks(filled)
@@ -91,7 +93,11 @@ def _revisions(filled: PaperTable) -> str:
     for row in filled.rows:
         for revision in row.revisions:
             rows.setdefault(revision, []).append(row.label)
+    return "runs of several are mixed: " * (len(rows) > 1) + rows_by_text(rows)
+
+
+def rows_by_text(rows: Mapping[str, Sequence[str]]) -> str:
+    """Write each text with the rows that it is about; a single text, which is about all, alone."""
     if len(rows) < 2:
         return "".join(rows)
-    parts = [f"{revision}: {', '.join(names)}" for revision, names in rows.items()]
-    return f"runs of several are mixed: {'; '.join(parts)}"
+    return "; ".join(f"{text}: {', '.join(names)}" for text, names in rows.items())

@@ -97,8 +97,8 @@ class PaperTable:
     # Of our numbers
     sets: dict[str, str] = field(default_factory=dict)  # the paper's test set -> ours
     metrics: tuple[str, ...] = ()  # the protocols, a sentence for each; several if runs differ
-    # Label -> how they were made: Ours (the scale), Not tested (the paper's test sets whose path no
-    # run was given), Baselines, Data, Machine, Command; "" if unknown
+    # Label -> how they were made: Ours (the scale), Head (of the models), Not tested (the paper's
+    # test sets whose path no run was given), Baselines, Data, Machine, Command; "" if unknown
     notes: dict[str, str] = field(default_factory=dict)
 
     @property

@@ -69,6 +69,17 @@ def test_a_row_has_the_runs_of_its_configuration_and_no_others(compose, logs):
 
 
 @pytest.mark.medium
+def test_the_head_of_every_row_is_named(compose):
+    def head(key, *overrides):
+        return fill_table(load_paper()[key], overrides, compose, {}).notes["Head"]
+
+    assert head("layers") == "PhotographHead(sh_degree=3)"
+    assert head("layers", "scale=paper") == "LongLRMHead(sh_degree=3, farthest=500.0)"
+    own = "the model's own: MVSplat"
+    assert head("two_views") == f"{own}; PhotographHead(sh_degree=3): GS-LRM †, AsySplat"
+
+
+@pytest.mark.medium
 def test_a_sweep_over_one_option_fills_its_table(compose, tmp_path):
     """python train.py -m geometry_ratio=0.5,0.9, without `sweeps=geometry_ratio`."""
     for ratio in (0.5, 0.9):
