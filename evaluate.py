@@ -5,6 +5,7 @@ python evaluate.py run=last
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from asysplat.overrides import exit_at_unknown_overrides
@@ -121,11 +122,12 @@ def load_network(config: DictConfig, device: torch.device) -> Network:
 def make_predictor(net: Network, fabric: lightning.Fabric) -> Predictor:
     """Return a network's prediction of a scene, in the precision of the run."""
 
-    def predict(inputs: Views) -> Gaussians:
+    def predict(prune: bool, inputs: Views) -> Gaussians:
         with torch.no_grad(), fabric.autocast():
-            return net(Views.stack([inputs])).map(lambda tensor: tensor[0].float())
+            gaussians = net(Views.stack([inputs]), prune=prune)
+        return gaussians.map(lambda tensor: tensor[0].float())
 
-    return lambda sample: predict
+    return lambda sample: partial(predict, sample["prune"])
 
 
 def open_scenes(

@@ -3,7 +3,7 @@
 import inspect
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -21,7 +21,7 @@ def procedural_data(test_sets: Mapping[str, Any] | None = None, **options) -> Sc
 
     Args:
         test_sets: name -> the options in which a further test set differs: inputs, targets, height,
-            width, num_images, test_scenes or places.
+            width, num_images, test_scenes or places; and prune (see Task).
         options: those of ProceduralSource and SceneDataModule; and test_size, the height and width
             of all tests but of sets with their own, None for the size of training.
 
@@ -37,8 +37,9 @@ def files_data(test_sets: Mapping[str, Any] | None = None, **options) -> SceneDa
     """Build a data module of scenes on disk.
 
     Args:
-        test_sets: as for `procedural_data`; the options are inputs, targets, height, width, layout,
-            scenes, selection, index and root. A set whose root is null is left out, with a warning.
+        test_sets: as for `procedural_data`; the options are inputs, targets, height, width, prune,
+            layout, scenes, selection, index and root. A set whose root is null is left out, with a
+            warning.
         options: those of FilesSource, SceneOptions and SceneDataModule; and test_size.
 
     Raises:
@@ -84,7 +85,7 @@ def _data_module(
     if test_size is not None:
         main["height"], main["width"] = test_size
         sets[name] = partial(_test_tasks, make_source, **main)
-    changeable = ("inputs", "targets", *SIZE, *changeable)
+    changeable = ("inputs", "targets", "prune", *SIZE, *changeable)
     for other, changes in test_sets.items():
         where = f"data.test_sets.{other}"
         if other == name:
@@ -126,6 +127,11 @@ def _has_root(options: Any) -> bool:
 
 
 def _test_tasks(
-    make_source: Callable[..., Source], inputs: int, targets: int, **options: Any
+    make_source: Callable[..., Source],
+    inputs: int,
+    targets: int,
+    prune: bool = True,
+    **options: Any,
 ) -> list[Task]:
-    return make_source(**options).evaluation("test", inputs, targets)
+    tasks = make_source(**options).evaluation("test", inputs, targets)
+    return [replace(task, prune=prune) for task in tasks]

@@ -27,7 +27,8 @@ from asysplat.scene import Views
 
 MAX_DRAWS = 10  # of scenes for one task, with on_bad_scene=skip
 MAX_LOADED_BYTES = 2**30  # of images that a set of fixed tasks keeps in memory
-Sample = dict[str, Any]  # scene: name, inputs: Views, targets: Views; a batch has lists of names
+# scene: name, inputs: Views, targets: Views, prune: bool; a batch has lists of names
+Sample = dict[str, Any]
 
 
 @dataclass(eq=False, repr=False)
@@ -270,7 +271,8 @@ def load(task: Task, share: float = 1.0, points: bool = False) -> Sample:
     if sparse is not None:
         inputs = replace(inputs, point_depths=depths_of_points(sparse, inputs.cameras))
     inputs, targets, frame = normalize(inputs, targets)
-    return {"scene": task.sequence.name, "inputs": inputs, "targets": targets, "frame": frame}
+    views = {"inputs": inputs, "targets": targets, "frame": frame}
+    return {"scene": task.sequence.name, "prune": task.prune, **views}
 
 
 def collate(samples: list[Sample]) -> Sample:
@@ -278,5 +280,6 @@ def collate(samples: list[Sample]) -> Sample:
         "scene": [sample["scene"] for sample in samples],
         "inputs": Views.stack([sample["inputs"] for sample in samples]),
         "targets": Views.stack([sample["targets"] for sample in samples]),
+        "prune": all(sample.get("prune", True) for sample in samples),
         "bad_scenes": [error for sample in samples for error in sample.get("bad_scenes", ())],
     }

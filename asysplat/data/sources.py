@@ -21,10 +21,16 @@ MAX_OPEN = 64  # scenes of a folder
 
 @dataclass(frozen=True)
 class Task:
-    """A sequence, with the indices of the input images and of the images to predict."""
+    """A sequence, with the indices of the input images and of the images to predict.
+
+    Args:
+        sequence, selection: those.
+        prune: whether a model that prunes its Gaussians does so.
+    """
 
     sequence: ImageSequence
     selection: Selection
+    prune: bool = True
 
 
 @runtime_checkable

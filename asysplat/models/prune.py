@@ -12,9 +12,10 @@ from asysplat.scene import Gaussians
 class Prune:
     """Keep the most opaque Gaussians, and a few of the others, so that those learn too.
 
-    The published settings are 0.6 and 0.1 (arthurhero/Long-LRM,
-    configs/dl3dv_i540_32input_8target.yaml). There the others are drawn at random; here they are
-    evenly spaced by opacity, so that the same views give the same Gaussians.
+    The public settings are 0.6 and 0.1 (arthurhero/Long-LRM,
+    configs/dl3dv_i540_32input_8target.yaml), the paper's Table 4 keeps half. There the others are
+    drawn at random; here they are evenly spaced by opacity, so that the same views give the same
+    Gaussians.
 
     Args:
         prune_ratio: share of the Gaussians to drop, in [0, 1).

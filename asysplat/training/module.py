@@ -80,7 +80,8 @@ class SplattingModule(lightning.LightningModule):
         targets, background = batch["targets"], self.background_for(batch)
         with self.parts("rendering"):
             options = {"masks": targets.masks, "views_at_once": self.views_at_once, "depth": depth}
-            rendering = render(net.select(gaussians), targets.cameras, background, **options)
+            kept = net.select(gaussians) if batch.get("prune", True) else gaussians
+            rendering = render(kept, targets.cameras, background, **options)
         return Prediction(gaussians, rendering)
 
     def background_for(self, batch: Batch) -> Tensor:

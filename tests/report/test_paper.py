@@ -122,7 +122,7 @@ def test_unverified_rows_have_another_reading():
     assert {row.run[0].removeprefix("model=") for row in unverified} == {
         *("asysplat_only_fine_to_coarse", "asysplat_only_coarse_to_fine"),
         *("single_branch", "two_branch", "longlrm_18", "longlrm_24", "longlrm_24h"),
-        *("asysplat_8m0a", "asysplat_7m1a", "asysplat_6m2a", "gs_lrm"),
+        *("asysplat_8m0a", "asysplat_7m1a", "asysplat_6m2a", "gs_lrm", "longlrm"),
     }
     assert all(run[0] == row.run[0] for row in unverified for run in row.readings.values())
 

@@ -11,6 +11,7 @@ from hydra.utils import instantiate
 from tiny import OneLayer
 from torch.utils.data import DataLoader
 
+from asysplat.evaluation.static_cost import blank_views
 from asysplat.scene import Cameras, Views
 from asysplat.training import SplattingLoss, SplattingModule
 from asysplat.training.schedule import cosine
@@ -167,3 +168,22 @@ def test_no_task_comes_twice(composed, tmp_path):
     module = TaskRecorder()
     instantiate(config, default_root_dir=tmp_path, **quiet).fit(module, Numbers())
     assert module.read == list(range(STEPS))
+
+
+@pytest.mark.medium
+def test_a_batch_says_whether_its_gaussians_are_pruned(build):
+    """Table 3: none is pruned on Replica, whatever the model does elsewhere."""
+    module = make_module(build("width=0.125", "state_size=8", "model=longlrm", "stage=stage3"))
+    views = blank_views(2, 32, 32).map(torch.zeros_like)
+    views.cameras.intrinsics[:] = torch.tensor([[50.0, 0, 16], [0, 50, 16], [0, 0, 1]])
+    views.cameras.cam_to_world[:] = torch.eye(4)
+    batch = {"inputs": views, "targets": views}
+
+    def rendered(**options):
+        with torch.no_grad():
+            return module.eval()(batch | options, depth=True).rendering.alpha
+
+    pruned, unpruned = rendered(), rendered(prune=False)
+    assert pruned.sum() < unpruned.sum() and torch.equal(pruned, rendered(prune=True))
+    module.net.prune = None
+    assert torch.equal(unpruned, rendered())

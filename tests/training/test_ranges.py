@@ -25,7 +25,7 @@ REFUSED = {
     "callbacks.monitor.every=0": "callbacks.monitor.every=0: give a whole number of at least 1.",
     "training.loss.opacity=-1": "training.loss.opacity=-1: give a number of at least 0.",
     "data.val_scenes=0": "data.val_scenes=0: give a whole number of at least 1.",
-    "data.window=12": "data.window=12: give two whole numbers, such as [64,96], or null for all images.",
+    "data.window=12": "data.window=12: give two whole numbers, such as [64,96], or null",
     "data.window=[12]": "data.window=[12]: give two whole numbers, such as [64,96], or null",
     "callbacks.checkpoints.minutes=-1": "callbacks.checkpoints.minutes=-1: give a number",
     "callbacks.non_finite_steps.budget=0": "callbacks.non_finite_steps.budget=0: "

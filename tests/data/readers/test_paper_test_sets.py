@@ -56,6 +56,7 @@ def test_tables_2_and_3_test_their_zero_shot_sets(tests_of):
     assert tests["dl3dv"]["scene"] == dl3dv.HASH
     for name, sample in tests.items():
         assert counts(sample) == (4, 2)  # every 8th of twelve is a target
+        assert sample["prune"] == (name != "replica")
         size = (16, 22) if name == "replica" else (16, 16)
         assert sample["targets"].images.shape[-2:] == size
         assert (sample["targets"].cameras.height, sample["targets"].cameras.width) == size
