@@ -26,6 +26,7 @@ PEAKS = {
     "NVIDIA GeForce RTX 4090": (165.2, 82.6, 82.6),
     "NVIDIA GeForce RTX 3090": (71.0, 35.6, 35.6),
 }
+PEAK_MEMORY = {"cpu": "resident set", "cuda": "peak allocated"}  # what `peak_memory_gb` reads
 STATUS, CLEAR_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")  # Linux alone
 SECONDS = (
     "of training steps the mean; of inference the mean of all measurements but the longest, which "

@@ -9,6 +9,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from asysplat.evaluation.measured_cost import PEAK_MEMORY
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.report.notes import rows_by_text
 from asysplat.report.paper import Costs, Number, PaperRow, PaperTable, our_sets, set_titles
@@ -115,8 +116,9 @@ def fill_table(
         "Machine": ", ".join(sorted({run.results.get("run/machine", "") for run in used} - {""})),
         "Command": f"python train.py {' '.join(overrides)}",
     }
-    metrics = _metrics(table, config, used)
-    return replace(table, rows=tuple(rows), sets=sets, metrics=metrics, notes=notes)
+    metrics, memory = _metrics(table, config, used), _memory(config, used)
+    rows = tuple(rows)
+    return replace(table, rows=rows, sets=sets, memory=memory, metrics=metrics, notes=notes)
 
 
 def _runs_of(config: DictConfig, runs: Runs) -> tuple[DictConfig, list[Run], dict[int, Run]]:
@@ -205,6 +207,13 @@ def _metrics(table: PaperTable, config: DictConfig, runs: Sequence[Run]) -> tupl
         name = protocol.get("name", config.metrics.name)
         texts.append(". ".join([f"protocol {name}", *sentences]))
     return tuple(dict.fromkeys(texts))
+
+
+def _memory(config: DictConfig, runs: Sequence[Run]) -> str:
+    """Write what the runs' memory is: that of the process, or of a GPU's tensors."""
+    machines = [run.results.get("run/machine", "") for run in runs]
+    on_cpu = {config.trainer.accelerator == "cpu" or "CPU" in name for name in machines if name}
+    return " or ".join(PEAK_MEMORY["cpu" if cpu else "cuda"] for cpu in sorted(on_cpu))
 
 
 def _baselines(sets: dict[str, str], runs: Sequence[Run]) -> str:

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
 
+MEMORY = ("train_gb", "inference_gb")  # columns
 Number = int | float
 Costs = dict[str, Number]  # see `static_costs`
 
@@ -96,6 +97,7 @@ class PaperTable:
 
     # Of our numbers
     sets: dict[str, str] = field(default_factory=dict)  # the paper's test set -> ours
+    memory: str = ""  # what the runs measured of MEMORY; "" without runs
     metrics: tuple[str, ...] = ()  # the protocols, a sentence for each; several if runs differ
     # Label -> how they were made: Ours (the scale), Head (of the models), Not tested (the paper's
     # test sets whose path no run was given), Baselines, Data, Machine, Command; "" if unknown
@@ -111,9 +113,10 @@ class PaperTable:
         return next((c for c in self.columns if c.key == self.rank_by), None)
 
     def our_title(self, column: Column) -> str:
-        """Return the title of our numbers, which names our test set if it is another."""
+        """Return the title of our numbers: our test set if it is another, what memory is."""
         ours = self.sets.get(column.test_set, column.test_set)
-        return column.title(None if ours == column.test_set else ours)
+        title = column.title(None if ours == column.test_set else ours)
+        return f"{title}, {self.memory}" if column.key in MEMORY and self.memory else title
 
     @property
     def test_sets(self) -> list[str]:

@@ -231,6 +231,22 @@ def test_tables_of_three_stages_share_their_runs_and_name_every_stage(compose, t
 
 
 @pytest.mark.medium
+@pytest.mark.parametrize(
+    "machine, memory", [("2 CPU cores", "resident set"), ("1 x NVIDIA H200", "peak allocated")]
+)
+def test_memory_is_what_the_machine_of_the_run_measures(compose, tmp_path, machine, memory):
+    config = compose(["sweeps=inference_overhead", "model=asysplat_4m4s"])
+    numbers = {"cost/inference_gb": 0.5, "run/machine": f"{machine}, torch 2.8.0"}
+    write_run(tmp_path / "run", config, numbers, 0)
+    table = load_paper()["inference_overhead"]
+    filled = fill_table(table, [], compose, finished_runs(tmp_path))
+    titles = {column.key: filled.our_title(column) for column in table.columns}
+    assert titles["inference_gb"] == f"Memory (GB), {memory}"
+    assert titles["inference_seconds"] == "Time (s)"
+    assert table.our_title(table.columns[3]) == "Memory (GB)"
+
+
+@pytest.mark.medium
 def test_post_optimization_is_not_run_until_evaluation_adds_it(compose, tmp_path):
     config = compose(["sweeps=state_of_the_art", "model=asysplat_4m4s"])
     write_run(tmp_path / "run", config, {"test/procedural/psnr": 20.0}, 0)
