@@ -2,10 +2,17 @@
 
 from collections.abc import Sequence
 
-from asysplat.report.compare import LIMITS, check_costs, cost_errors, fits, mean_and_spread
+from asysplat.report.compare import (
+    LIMITS,
+    check_costs,
+    claim_value,
+    cost_errors,
+    fits,
+    mean_and_spread,
+)
 from asysplat.report.fill import COMPUTED
 from asysplat.report.notes import notes, protocol_notes, rho_text
-from asysplat.report.paper import Column, Costs, Number, PaperRow, PaperTable
+from asysplat.report.paper import Claim, Column, Costs, Number, PaperRow, PaperTable
 from asysplat.report.table import Cell, Grid, Heading, Section, anchor
 
 TITLE = "AsySplat: our numbers beside the paper's"
@@ -33,12 +40,17 @@ COST_CAPTION = (
     "paper counts them; true ones have attention products, scans and depthwise convolutions too. "
     "Geometry is the share of the parameters in that branch."
 )
+CLAIM_FORMS = {"reduction": "{:.1%}", "speedup": "{:,.0f}x", "total": "{:.3g} h"}
+CLAIM_CAPTION = (
+    "Paper: computed from the numbers that its tables print. Ours: from those of AsySplat and of "
+    "what it is compared with; hours are summed over the stages."
+)
 NOTHING = Cell("-", "muted")
 
 
 def make_section(filled: PaperTable) -> Section:
     """Build everything that is printed of one table."""
-    grids = [_measured_grid(filled)]
+    grids = [_measured_grid(filled)] if filled.rows else [_claim_grid(filled.claims)]
     if any(row.costs for row in filled.rows):
         grids.append(_cost_grid(_networks(filled)))
     title, above = filled.heading, protocol_notes(filled)
@@ -48,7 +60,8 @@ def make_section(filled: PaperTable) -> Section:
 def make_overview(tables: Sequence[PaperTable]) -> Grid:
     """Build a line for each table: the rows that ran, and their agreement with the paper."""
     titles = ("Table", "Rows run", "Seeds", "Rank agreement", "Costs that fit")
-    return Grid(OVERVIEW, list(map(Heading, titles)), list(map(_overview_line, tables)))
+    lines = [_overview_line(filled) for filled in tables if filled.rows]
+    return Grid(OVERVIEW, list(map(Heading, titles)), lines)
 
 
 def _networks(filled: PaperTable) -> list[PaperRow]:
@@ -96,6 +109,47 @@ def _measured_grid(filled: PaperTable) -> Grid:
         missing = ["quoted" if row.quoted else "not run" for row in filled.rows]
         columns.append(_cells(texts, means, column, missing))
     return Grid("Measured", headings, list(map(list, zip(*columns, strict=True))))
+
+
+def _claim_grid(claims: Sequence[Claim]) -> Grid:
+    """Build a line for each claim: from the paper's tables, from our numbers, and those."""
+    titles = (("Claim", ""), ("Number", "paper"), ("Number", "ours"), ("Computed from", "ours"))
+    lines = []
+    for claim in claims:
+        paper = claim_value(claim, lambda row, key=claim.column.key: _least(row, key))
+        bounded = any(claim.column.key in row.bounds for side in claim.rows for row in side)
+        ours = claim_value(claim, lambda row, key=claim.column.key: _our_number(row, key))
+        missing = "not counted" if claim.column.key in COMPUTED else "not measured"
+        sides = [_our_side(side, claim.column) for side in claim.rows]
+        numbers = f": {' / '.join(side or missing for side in sides)}" * any(sides)
+        form = CLAIM_FORMS[claim.form]
+        lines.append(
+            [
+                Cell(claim.text) if claim.stated else Cell(f"ours: {claim.text}", "muted"),
+                NOTHING if paper is None else Cell("over " * bounded + form.format(paper)),
+                Cell(missing, "muted") if ours is None else Cell(form.format(ours)),
+                Cell(claim.column.kind + numbers, "muted" * (ours is None)),
+            ]
+        )
+    return Grid(CLAIM_CAPTION, [Heading(*title) for title in titles], lines)
+
+
+def _least(row: PaperRow, key: str) -> Number | None:
+    """Return the paper's number, or the bound that it prints in place of one."""
+    return float(row.bounds[key][1:]) if key in row.bounds else row.numbers.get(key)
+
+
+def _our_number(row: PaperRow, key: str) -> Number | None:
+    """Return our count of a row or the mean of its seeds; None without."""
+    if key in COMPUTED:
+        return (row.costs or {}).get(key)
+    return mean_and_spread(row.values[key])[0] if row.values.get(key) else None
+
+
+def _our_side(rows: Sequence[PaperRow], column: Column) -> str:
+    """Format the sum of our numbers of a claim's rows; "" where one is missing."""
+    numbers = [_our_number(row, column.key) for row in rows]
+    return "" if None in numbers else column.text(float(sum(numbers)))
 
 
 def _cells(

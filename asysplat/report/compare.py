@@ -1,13 +1,13 @@
 """Compare our numbers with the paper's: the order of a table's rows, and the costs of each."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import spearmanr
 
-from asysplat.report.paper import Costs, Number, PaperRow, PaperTable
+from asysplat.report.paper import Claim, Costs, Number, PaperRow, PaperTable
 
 # A smaller `signal` may come from the seeds alone: one table in twenty of six equal rows and three
 # seeds exceeds it (the F distribution's 95 % is 3.1 = 1.76 ** 2).
@@ -66,6 +66,20 @@ def pooled_spread(groups: Sequence[Sequence[Number]]) -> float | None:
         return None
     squares = sum(float(np.var(group)) * len(group) for group in groups)
     return math.sqrt(squares / freedom)
+
+
+def claim_value(claim: Claim, number: Callable[[PaperRow], Number | None]) -> float | None:
+    """Compute a claim from numbers of its rows, summed on each side; None where one is missing.
+
+    "reduction" is 1 - first side / second side, "speedup" second / first, "total" the first.
+    """
+    numbers = [[number(row) for row in side] for side in claim.rows]
+    if any(None in side for side in numbers):
+        return None
+    first, *second = map(sum, numbers)
+    if claim.form == "total":
+        return float(first)
+    return 1 - first / second[0] if claim.form == "reduction" else second[0] / first
 
 
 def cost_errors(row: PaperRow, costs: Costs) -> dict[str, float]:

@@ -12,7 +12,16 @@ from omegaconf import DictConfig, OmegaConf
 from asysplat.evaluation.measured_cost import PEAK_MEMORY
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.report.notes import rows_by_text
-from asysplat.report.paper import Costs, Number, PaperRow, PaperTable, our_sets, set_titles
+from asysplat.report.paper import (
+    Costs,
+    Number,
+    PaperRow,
+    PaperTable,
+    load_paper,
+    our_sets,
+    set_titles,
+    stage_hours,
+)
 from asysplat.report.systems import system_rows
 from asysplat.training.runs import Run, config_hash, data_of, differences, find_runs
 from asysplat.training.stages import describe_stage, stage_configs
@@ -34,7 +43,7 @@ SIMILAR = 16  # options, at most, that the run named beside a row without one ma
 # Columns that are options of a run.
 OPTIONS = {"batch": "data.batch_size", "train_steps": "steps"}
 # Columns that need no run: they are printed with the costs, at the paper's scale.
-COMPUTED = ("parameters", "gflops", "gaussians")
+COMPUTED = ("parameters", "gflops", "gflops_true", "gaussians")
 
 
 def finished_runs(logs: Path) -> Runs:
@@ -62,6 +71,8 @@ def fill_table(
         runs: to select from.
         systems: evaluations of other systems, see `system_rows`.
     """
+    if table.claims:
+        return _fill_claims(table, overrides, compose, runs, systems)
     overrides = [f"sweeps={table.key}", *overrides]
     config = compose(overrides)
     sets = our_sets(table, config.data.name, config.data.test_sets or ())
@@ -86,6 +97,9 @@ def fill_table(
         for column in table.columns:
             if column.key in OPTIONS:
                 numbers = [OmegaConf.select(row_config, OPTIONS[column.key])] if row_runs else []
+            elif column.key == "train_hours":  # of the whole stage, of which the runs are a part
+                steps = row_config.stages[row_config.stage].steps
+                numbers = [stage_hours(steps, s) for s in values.get("seconds_per_step", ())]
             else:
                 key = _result_key(column.key, row, sets)
                 numbers = [row_runs[seed].results.get(key) for seed in sorted(row_runs)]
@@ -119,6 +133,37 @@ def fill_table(
     metrics, memory = _metrics(table, config, used), _memory(config, used)
     rows = tuple(rows)
     return replace(table, rows=rows, sets=sets, memory=memory, metrics=metrics, notes=notes)
+
+
+def _fill_claims(
+    table: PaperTable,
+    overrides: Sequence[str],
+    compose: Compose,
+    runs: Runs,
+    systems: Sequence[Run],
+) -> PaperTable:
+    """Fill the rows of claims as those of their tables."""
+    keys = dict.fromkeys(claim.table for claim in table.claims)
+    tables = {key: fill_table(load_paper()[key], overrides, compose, runs, systems) for key in keys}
+    claims = []
+    for claim in table.claims:
+        rows = {row.name: row for row in tables[claim.table].rows}
+        sides = tuple(tuple(rows[row.name] for row in side) for side in claim.rows)
+        claims.append(replace(claim, rows=sides))
+
+    def joined(label: str, by: str) -> str:
+        texts = dict.fromkeys(filled.notes[label] for filled in tables.values())
+        return by.join(filter(None, texts))
+
+    config = compose(overrides)
+    notes = {
+        "Ours": f"counts at the paper's scale; seconds and hours on {config.data.name} data, "
+        f"{config.data.inputs} input views, {config.width:g} of the paper's width",
+        "Head": joined("Head", "; "),
+        "Machine": joined("Machine", "; "),
+        "Command": joined("Command", " && "),
+    }
+    return replace(table, claims=tuple(claims), notes=notes)
 
 
 def _runs_of(config: DictConfig, runs: Runs) -> tuple[DictConfig, list[Run], dict[int, Run]]:
@@ -155,14 +200,22 @@ def _nearest_run(
 
 def with_costs(filled: PaperTable, compose: Compose) -> PaperTable:
     """Add the costs of every row and its other readings at the paper's scale."""
-    rows = []
-    for row in filled.rows:
-        if not row.quoted and not row.post_optimization:
-            runs = (row.run, *row.readings.values())
-            own, *readings = (_costs(compose, run, row.views, row.size) for run in runs)
-            row = replace(row, costs=own, reading_costs=tuple(readings))
-        rows.append(row)
-    return replace(filled, rows=tuple(rows))
+    claims = []
+    for claim in filled.claims:
+        if claim.column.key in COMPUTED:
+            sides = (tuple(_row_with_costs(row, compose) for row in side) for side in claim.rows)
+            claim = replace(claim, rows=tuple(sides))
+        claims.append(claim)
+    rows = tuple(_row_with_costs(row, compose) for row in filled.rows)
+    return replace(filled, rows=rows, claims=tuple(claims))
+
+
+def _row_with_costs(row: PaperRow, compose: Compose) -> PaperRow:
+    if row.quoted or row.post_optimization:
+        return row
+    runs = (row.run, *row.readings.values())
+    own, *readings = (_costs(compose, run, row.views, row.size) for run in runs)
+    return replace(row, costs=own, reading_costs=tuple(readings))
 
 
 @cache

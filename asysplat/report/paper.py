@@ -84,16 +84,29 @@ class PaperRow:
 
 
 @dataclass(frozen=True)
+class Claim:
+    """A number that the text computes from rows of a table."""
+
+    text: str  # the paper's words, or ours
+    stated: bool  # whether the paper states it
+    form: str  # see `compare.claim_value`
+    table: str  # key
+    column: Column
+    rows: tuple[tuple[PaperRow, ...], ...]  # those compared, and those that they are compared with
+
+
+@dataclass(frozen=True)
 class PaperTable:
     """One table of the paper, or one of ours, and the sweep of the same key that reproduces it."""
 
-    key: str  # name of the file in sweeps/
-    number: str | None  # in the paper, such as "6b" or "A3"; None for a table of ours
+    key: str  # name of the file in sweeps/, or "claims"
+    number: str | None  # in the paper, such as "6b" or "A3"; None for claims and tables of ours
     title: str  # what it compares
     protocol: str  # how the paper measured it
     columns: tuple[Column, ...]
     rows: tuple[PaperRow, ...] = field(repr=False)  # in the paper's order
     rank_by: str | None = None  # key of the column whose order is compared with the paper's
+    claims: tuple[Claim, ...] = field(default=(), repr=False)  # in place of columns and rows
 
     # Of our numbers
     sets: dict[str, str] = field(default_factory=dict)  # the paper's test set -> ours
@@ -105,7 +118,9 @@ class PaperTable:
 
     @property
     def heading(self) -> str:
-        return f"{'Ours' if self.number is None else f'Table {self.number}'}: {self.title}"
+        if self.number is None:
+            return f"{'Claims' if self.claims else 'Ours'}: {self.title}"
+        return f"Table {self.number}: {self.title}"
 
     @property
     def ranked_column(self) -> Column | None:
@@ -129,13 +144,28 @@ def load_paper(file: str = "paper") -> dict[str, PaperTable]:
     return {key: _table(key, entry) for key, entry in _read(file)["tables"].items()}
 
 
+@cache
+def load_claims() -> PaperTable:
+    """Read what the paper's text says of its tables."""
+    entry, tables = _read("paper")["claims"], load_paper()
+    claims = []
+    for claim in entry["claims"]:
+        rows = {row.name: row for row in tables[claim["table"]].rows}
+        sides = tuple(tuple(rows[name] for name in side) for side in claim["rows"])
+        text, column = claim.get("text") or claim["ours"], _column(claim["column"])
+        claims.append(Claim(text, "text" in claim, claim["form"], claim["table"], column, sides))
+    return PaperTable(
+        "claims", None, entry["title"], entry["protocol"], (), (), None, tuple(claims)
+    )
+
+
 def find_tables(names: str | Sequence[str]) -> list[PaperTable]:
-    """Find tables of the paper or ours by name: one, several with commas, or "all".
+    """Find tables of the paper, "claims" or ours by name: one, several with commas, or "all".
 
     Raises:
         InputError: a name that no table has, with the nearest ones.
     """
-    tables = load_paper() | load_paper("ours")
+    tables = load_paper() | {"claims": load_claims()} | load_paper("ours")
     names = names.split(",") if isinstance(names, str) else list(names)
     if names == ["all"]:
         return list(tables.values())
@@ -177,12 +207,19 @@ def _read(name: str) -> dict:
     return OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name(f"{name}.yaml")))
 
 
+def stage_hours(steps: Number, seconds_per_step: Number) -> float:
+    """Compute the hours of a stage of training."""
+    return steps * seconds_per_step / 3600
+
+
+def _column(key: str) -> Column:
+    kind = _read("paper")["columns"][key.rpartition("/")[-1]]
+    unit = float(kind.get("unit", 1))
+    return Column(key, kind["title"], kind.get("better"), kind["format"], unit)
+
+
 def _table(key: str, entry: dict) -> PaperTable:
-    columns = []
-    for column in entry["columns"]:
-        kind = _read("paper")["columns"][column.rpartition("/")[-1]]
-        unit = float(kind.get("unit", 1))
-        columns.append(Column(column, kind["title"], kind.get("better"), kind["format"], unit))
+    columns = map(_column, (*entry["columns"], *entry.get("computed", ())))
     rows = tuple(_row(row, entry) for row in entry["rows"])
     number = None if entry["number"] is None else str(entry["number"])
     title, protocol, rank_by = entry["title"], entry["protocol"], entry.get("rank_by")
@@ -192,6 +229,9 @@ def _table(key: str, entry: dict) -> PaperTable:
 def _row(row: dict, table: dict) -> PaperRow:
     columns = table["columns"]
     printed = dict(zip(columns, row.get("paper", [None] * len(columns)), strict=True))
+    if "train_hours" in table.get("computed", ()):
+        hours = stage_hours(printed["train_steps"], printed["seconds_per_step"])
+        printed["train_hours"] = hours
     return PaperRow(
         name=row["name"],
         numbers={key: float(v) for key, v in printed.items() if isinstance(v, int | float)},

@@ -134,7 +134,7 @@ def test_a_stage_sets_the_sizes_of_its_scale(composed, scale):
 
 
 def test_every_table_has_its_sweep():
-    tables = Counter(table.key for table in find_tables("all"))
+    tables = Counter(table.key for table in find_tables("all") if table.rows)
     assert tables == Counter(path.stem for path in SWEEPS.glob("*.yaml"))
 
 

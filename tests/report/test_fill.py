@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from asysplat.evaluation import static_cost
 from asysplat.report.compare import check_costs, fits
 from asysplat.report.fill import fill_table, finished_runs, with_costs
+from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import find_tables, load_paper
 from asysplat.training.revision import revision
 from asysplat.training.runs import describe_run, find_run
@@ -244,6 +245,34 @@ def test_memory_is_what_the_machine_of_the_run_measures(compose, tmp_path, machi
     assert titles["inference_gb"] == f"Memory (GB), {memory}"
     assert titles["inference_seconds"] == "Time (s)"
     assert table.our_title(table.columns[3]) == "Memory (GB)"
+
+
+@pytest.mark.medium
+def test_claims_are_of_the_numbers_of_the_tables(compose, tmp_path, monkeypatch):
+    monkeypatch.setattr(static_cost, "activation_gb", lambda *_: 0.0)
+    for model, seconds in (("asysplat_4m4s", 2.0), ("longlrm", 4.0)):
+        for stage in ("stage1", "stage2", "stage3"):
+            config = compose(["sweeps=training_overhead", f"model={model}", f"stage={stage}"])
+            write_run(tmp_path / model / stage, config, {"cost/seconds_per_step": seconds}, 0)
+    (claims,) = find_tables("claims")
+    filled = fill_table(claims, [], compose, finished_runs(tmp_path))
+    text = render_markdown([with_costs(filled, compose)])
+    ours = {}
+    for line in text.splitlines():
+        if line.startswith("| "):
+            name, paper, number, numbers = line.strip("| ").split(" | ")
+            ours[name] = paper, number, numbers
+    # 240, 80 and 80 steps of 2 or 4 seconds at laptop scale.
+    assert ours["training time by 30%"] == ("29.0%", "50.0%", "Stage (h): 0.222 / 0.444")
+    assert ours["AsySplat requires only 54 hours"][:2] == ("54.4 h", "0.222 h")
+    assert ours["parameters by 30%"] == ("31.0%", "30.9%", "Param (M): 98.1 / 141.9")
+    assert ours["inference FLOPs by 20%"][:2] == ("19.8%", "19.7%")
+    true = ours["ours: with attention products, scans and depthwise convolutions"]
+    assert true == ("-", "58.0%", "True GFLOPs: 55,338 / 131,685")
+    assert ours["Gaussians by 50%"] == ("50.0%", "37.5%", "Gaussians (M): 4.18 / 6.68")
+    faster = ours["nearly 800x faster inference than 3DGS"]
+    assert faster == ("over 780x", "not measured", "Time (s)")
+    assert "not counted" in render_markdown([filled])
 
 
 @pytest.mark.medium

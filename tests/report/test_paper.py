@@ -9,6 +9,7 @@ from asysplat.report.paper import (
     PaperRow,
     PaperTable,
     find_tables,
+    load_claims,
     load_paper,
     our_sets,
     set_titles,
@@ -84,7 +85,8 @@ def check_row(table: PaperTable, row: PaperRow, cells: list[str]) -> None:
         assert int(cell["views"]) == row.views
     if "post_optimization" in cell:
         assert read_number(cell["post_optimization"], 1) in (("=", row.post_optimization), None)
-    numbers = dict(zip([c.key for c in table.columns], cells[len(leading) :], strict=True))
+    printed = [column.key for column in table.columns if column.key != "train_hours"]
+    numbers = dict(zip(printed, cells[len(leading) :], strict=True))
     printed = {k: read_number(v, HEADER_UNITS.get((table.key, k), 1)) for k, v in numbers.items()}
     assert printed == {key: recorded(row, key) for key in numbers}
 
@@ -95,6 +97,22 @@ def test_every_number_is_the_papers(tabulars):
         assert len(rows) == len(table.rows)
         for row, cells in zip(table.rows, rows, strict=True):
             check_row(table, row, cells)
+
+
+def test_every_claim_is_the_papers(shared):
+    source = shared / "paper" / "asysplat.tex"
+    if not source.is_file():
+        pytest.skip(f"{source} is absent")
+    text = re.sub(r"[$\\]", "", source.read_text().replace(r"$\times$", "x"))
+    claims = load_claims().claims
+    assert all(claim.text in text for claim in claims if claim.stated)
+    assert sum(claim.stated for claim in claims) == 9
+
+
+def test_hours_of_a_stage_are_its_steps():
+    rows = {row.name: row.numbers for row in load_paper()["training_overhead"].rows}
+    assert rows["LongLRM, 256x256"]["train_hours"] == 60000 * 2.7 / 3600
+    assert rows["AsySplat, 540x960"]["train_hours"] == 10000 * 6.0 / 3600
 
 
 def test_rows_of_a_table_have_their_own_names_and_runs():
@@ -137,7 +155,7 @@ def test_text_is_in_the_unit_of_the_title():
 
 def test_a_table_is_found_by_its_name():
     assert [table.number for table in find_tables("layers,mamba_ratio")] == ["6b", "A2"]
-    assert len(find_tables("all")) == 13
+    assert len(find_tables("all")) == 14
     assert [table.number for table in find_tables("prior")] == [None]
     with pytest.raises(InputError, match=r"table=layer is unknown: did you mean layers"):
         find_tables("layer")

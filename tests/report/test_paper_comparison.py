@@ -6,13 +6,14 @@ import pytest
 
 from asysplat.report.compare import (
     check_costs,
+    claim_value,
     cost_errors,
     fits,
     pooled_spread,
     rank_agreement,
     spearman,
 )
-from asysplat.report.paper import Column, PaperRow, PaperTable
+from asysplat.report.paper import Claim, Column, PaperRow, PaperTable
 
 PSNR = Column("dl3dv/psnr", "PSNR", "higher", "{:.2f}")
 
@@ -62,6 +63,20 @@ def test_cost_errors_are_relative_to_the_paper():
     )
     assert errors == {"parameters": pytest.approx(0.01), "gflops": pytest.approx(-0.05)}
     assert cost_errors(row(psnr=19.0), {"parameters": 101e6}) == {}
+
+
+def test_a_claim_compares_the_sums_of_its_sides():
+    def claim(form, first, second):
+        sides = tuple(tuple(row(psnr=n) for n in side) for side in (first, second))
+        return Claim("words", True, form, "table", PSNR, sides)
+
+    def number(row):
+        return row.numbers["dl3dv/psnr"]
+
+    assert claim_value(claim("reduction", [1.0, 2.0], [4.0, 2.0]), number) == 0.5
+    assert claim_value(claim("speedup", [2.0], [6.0]), number) == 3
+    assert claim_value(claim("total", [2.0, 3.0], []), number) == 5
+    assert claim_value(claim("speedup", [2.0], [6.0]), lambda row: None) is None
 
 
 def test_limits_of_a_fit():
