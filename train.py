@@ -30,7 +30,7 @@ from asysplat.training.prepare import (
     without_missing_network,
 )
 from asysplat.training.revision import revision
-from asysplat.training.run_folder import job_name, run_folder
+from asysplat.training.run_folder import job_name, run_folder, unused_removed
 from asysplat.training.runs import find_run
 
 
@@ -38,7 +38,8 @@ from asysplat.training.runs import find_run
 def main(config: DictConfig) -> float | None:
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         return train_in_sweep(config)
-    with exit_with_message("stopped."):  # during the training, Checkpoints prints how to resume
+    # During the training, Checkpoints prints how to resume.
+    with exit_with_message("stopped."), unused_removed(Path(config.paths.run)):
         return train(config)
 
 

@@ -59,7 +59,7 @@ class TrainingStage:
     def prepare(
         self, data: SceneDataModule, module: SplattingModule, early_exit: EarlyExit | None
     ) -> tuple[lightning.Trainer, Callbacks]:
-        """Check the parts, load the weights, write config.yaml, build callbacks and trainer.
+        """Check the parts, load the weights, build callbacks and trainer, write config.yaml.
 
         A stage that is resumed drops the events that it logged after the checkpoint, since it will
         log them again. The trainer accumulates the micro-batches of each process.
@@ -77,8 +77,6 @@ class TrainingStage:
         print(f"{config.stage}: {describe_stage(config)}")
         print(f"model: {net.describe()}")
 
-        folder.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(config, folder / "config.yaml", resolve=True)
         options = OmegaConf.to_container(config, resolve=True)
         module.save_hyperparameters(options, logger=False)
         notes = {} if self.checkpoint is None else read_notes(self.checkpoint)
@@ -90,9 +88,6 @@ class TrainingStage:
             logger = instantiate(config.logger)
         except InstantiationException as error:  # of an optional package
             raise InputError(f"logger: {error.__cause__}") from error
-        if logger is not None and not resumes:
-            log_choices(logger, config)
-
         callbacks = instantiate(config.get("callbacks") or {})
         callbacks = {name: each for name, each in callbacks.items() if each is not None}
         try:
@@ -111,6 +106,12 @@ class TrainingStage:
         trainer.accumulate_grad_batches = split.accumulated
         if trainer.is_global_zero:
             print(split)
+
+        # Last: an option that is refused leaves nothing.
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(config, folder / "config.yaml", resolve=True)
+        if logger is not None and not resumes:
+            log_choices(logger, config)
         return trainer, callbacks
 
 

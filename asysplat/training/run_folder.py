@@ -2,9 +2,10 @@
 
 import fcntl
 import re
+import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lightning.pytorch.utilities import rank_zero_only
@@ -15,6 +16,7 @@ from asysplat.training.checkpoints import LAST, has_checkpoints, newest_folder
 from asysplat.training.runs import RESULTS
 
 LOCK = ".lock"  # in the folder of each run
+HYDRA = ".hydra"  # where Hydra writes the configuration
 MAX_NAME = 120  # characters; file systems allow 255 bytes
 
 
@@ -52,6 +54,23 @@ def job_name(overrides: Sequence[str], params: Mapping[str, str] | None) -> str:
     named = {key: options[key] for key in options if key in swept} or options
     words = (f"{key.rpartition('/')[2]}={value.rpartition('/')[2]}" for key, value in named.items())
     return re.sub(r"[^\w=,.+-]", "", ",".join(words))[:MAX_NAME]
+
+
+@contextmanager
+def unused_removed(folder: Path) -> Iterator[None]:
+    """Remove a run's folder if the body fails before the run has written to it.
+
+    So does a mistyped option; Hydra has written its configuration there. An empty folder around it
+    is removed, too.
+    """
+    try:
+        yield
+    except BaseException:
+        if {path.name for path in folder.glob("*")} <= {HYDRA, LOCK}:
+            shutil.rmtree(folder, ignore_errors=True)
+            with suppress(OSError):  # other runs are there
+                folder.parent.rmdir()
+        raise
 
 
 @contextmanager
