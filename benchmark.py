@@ -23,6 +23,7 @@ from asysplat.benchmark.compare import compare, read_old
 from asysplat.benchmark.options import describe_machine, find_suite
 from asysplat.benchmark.table import write_results
 from asysplat.errors import InputError, input_error_behind
+from asysplat.files import check_writable
 from asysplat.interrupts import handle_signals
 from asysplat.training.revision import revision
 
@@ -46,6 +47,7 @@ def benchmark(options: DictConfig) -> bool:
     if not isinstance(options.repeats, int) or options.repeats < 1:
         raise InputError(f"repeats={options.repeats} cannot be: give a whole number from 1.")
     path = Path(options.output) / options.suite
+    check_writable(path.parent, "output")
     old = read_old(options.compare, path.with_suffix(".json"))
     console = Console()
     code = {"suite": options.suite, "revision": revision()}

@@ -31,7 +31,7 @@ from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.export import write_safetensors
 from asysplat.export.scene_folder import check_visible, find_files, origin_of
-from asysplat.files import make_folder
+from asysplat.files import check_writable, make_folder
 from asysplat.interrupts import handle_signals
 from asysplat.models.early_exit import EXACT
 from asysplat.models.network import Network
@@ -56,6 +56,7 @@ def evaluate(options: DictConfig) -> None:
     quiet_lightning()
     target = find_target(options, HydraConfig.get().overrides.task)
     config = target.config
+    check_writable(target.scene_folder, "paths.logs")
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     try:  # the device and the precision of a prediction, as in the test of train.py
         choices = {key: config.trainer[key] for key in ("accelerator", "precision")}

@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from asysplat.files import make_folder
+from asysplat.files import check_writable
 from asysplat.interrupts import handle_signals, interrupt_once
 from asysplat.training.messages import error_sentence, exit_with_message
 from asysplat.training.prepare import (
@@ -104,7 +104,7 @@ if __name__ == "__main__":
     handle_signals()
     interrupt_once()
     with exit_with_message("stopped."):
-        make_folder(logs_of(sys.argv), "paths.logs")
+        check_writable(logs_of(sys.argv), "paths.logs")
         OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
         OmegaConf.register_new_resolver("job_name", job_name, replace=True)
         main()  # of a sweep, which SweepTable ends with how to resume

@@ -4,7 +4,7 @@ import errno
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path
 from uuid import uuid4
@@ -60,6 +60,21 @@ def make_folder(path: Path, option: str) -> None:
         reason = os.strerror(errno.EACCES)
     if reason is not None:
         raise InputError(f"{path} cannot be written to ({reason}): set {option} to another folder.")
+
+
+def check_writable(path: Path, option: str) -> None:
+    """Check that a folder is, or can be created, writable; leave the disk as it is.
+
+    Raises:
+        InputError: see `make_folder`.
+    """
+    missing = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
+    try:
+        make_folder(path, option)
+    finally:
+        for folder in missing:
+            with suppress(OSError):  # never created, or another process writes there
+                folder.rmdir()
 
 
 def new_folder(path: Path, room: int) -> Path:

@@ -7,7 +7,7 @@ import pytest
 from full_disk import largest_file
 
 from asysplat.errors import InputError
-from asysplat.files import atomic_write, new_folder
+from asysplat.files import atomic_write, check_writable, new_folder
 
 
 @pytest.fixture
@@ -85,6 +85,35 @@ def test_folders_of_many_at_once_are_different(tmp_path):
     with ThreadPoolExecutor(8) as pool:
         folders = list(pool.map(lambda _: new_folder(tmp_path / "logs" / "run", 1), range(40)))
     assert len(set(folders)) == 40 and tmp_path / "logs" / "run-40" in folders
+
+
+def test_a_check_leaves_the_disk_as_it_is(tmp_path):
+    check_writable(tmp_path / "new" / "logs", "paths.logs")
+    assert not list(tmp_path.iterdir())
+    check_writable(tmp_path, "paths.logs")
+    (tmp_path / "file").touch()
+    with pytest.raises(
+        InputError, match=r"cannot be written to \(Not a directory\): set output to"
+    ):
+        check_writable(tmp_path / "file" / "new", "output")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+UNWRITABLE = {
+    "train": ["paths.logs=README.md/x"],
+    "reconstruct": ["nowhere", "paths.logs=README.md/x"],
+    "evaluate": ["init_path=shipped", "model=asysplat_plane_sweep", "paths.logs=README.md/x"],
+    "benchmark": ["suite=bench", "output=README.md/x"],
+}
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("script", UNWRITABLE)
+def test_scripts_find_a_folder_that_cannot_be_written_to_first(run_script, script):
+    result = run_script(f"{script}.py", *UNWRITABLE[script])
+    option = UNWRITABLE[script][-1].partition("=")[0]
+    assert f"(Not a directory): set {option} to another folder." in result.stderr
+    assert result.returncode != 0 and not result.stdout
 
 
 def test_no_folder_without_room_for_the_results(tmp_path, monkeypatch):

@@ -21,7 +21,7 @@ from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.rows import average, write_csv
 from asysplat.export import orbit, smoothed_path, write_ply, write_safetensors, write_video
-from asysplat.files import atomic_write, new_folder
+from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.refine import RefinementProgress
 from asysplat.rendering import Rendering, render
@@ -39,10 +39,11 @@ class Results:
     """Write the result folder of a reconstruction, with the configuration conf/reconstruct.yaml.
 
     Raises:
-        InputError: an unknown camera path of the video.
+        InputError: an unknown camera path of the video; a folder that cannot be created.
     """
 
     def __init__(self, folder: Path, config: DictConfig):
+        check_writable(folder.parent, "paths.logs")
         self.folder, self._config = folder, config
         self._protocol = instantiate(config.metrics)
         self._lpips = load_lpips(
