@@ -20,7 +20,8 @@ from asysplat.training.run_config import flat_options
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_plane_sweep.safetensors"
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # of a run, to resume from
-WITHOUT_EFFECT = ("ckpt_path", "paths.", "callbacks.")  # options that change no weight
+# Options that change no weight.
+WITHOUT_EFFECT = ("ckpt_path", "paths.", "callbacks.", "trainer.num_sanity_val_steps")
 
 
 def find_checkpoint(ckpt_path: str | None, run: Path, runs: Path) -> Path | None:

@@ -100,6 +100,7 @@ def hashed_options(
     speed = resolved.get("speed") or {}
     if not any(value for key, value in speed.items() if key != "_target_"):
         resolved.pop("speed", None)  # exact, as every run was before the option existed
+    resolved["trainer"]["num_sanity_val_steps"] = 0  # changes no number; every run before had 0
     data = resolved["data"]
     if data.get("first_window") is None:  # as every run was before the options existed
         data.pop("first_window", None)

@@ -12,8 +12,10 @@ import pytest
 from tiny import NETWORK, SCENES, STEPS, VIEWS
 
 COSTS = "callbacks.costs={_target_: asysplat.training.callbacks.Costs}"
-# Costs and plan take longer than the steps of most tests: COSTS turns them on.
-TINY = [*NETWORK, *STEPS, *VIEWS, "callbacks.costs=null"]
+# They take longer than the steps of most tests: COSTS turns costs and plan on, UNTRAINED the
+# validation before the first step.
+UNTRAINED = "trainer.num_sanity_val_steps=-1"
+TINY = [*NETWORK, *STEPS, *VIEWS, "callbacks.costs=null", "trainer.num_sanity_val_steps=0"]
 TINY_SCENES = [*SCENES, "data.test_scenes=2"]
 
 
@@ -41,7 +43,7 @@ def module_train(tmp_path_factory, run_script, repository):
 def whole(tmp_path_factory, run_script, repository) -> Path:
     """The folder of a finished run of 6 steps."""
     train = make_train(tmp_path_factory.mktemp("logs"), run_script, repository)
-    return finished(train("name=whole", "steps=6", "callbacks.monitor.every=2", COSTS))
+    return finished(train("name=whole", "steps=6", "callbacks.monitor.every=2", COSTS, UNTRAINED))
 
 
 def make_train(logs, run_script, repository):

@@ -30,13 +30,13 @@ def loader(count=2):
     return DataLoader(torch.zeros(count, 2))
 
 
-def fit(tmp_path, steps, checkpoint=None):
+def fit(tmp_path, steps, checkpoint=None, before=0):
     """Two steps an epoch, a validation after each, then a test of two sets of three scenes."""
     trainer = lightning.Trainer(
         **QUIET | {"enable_progress_bar": True},
         max_steps=steps,
         max_epochs=-1,
-        num_sanity_val_steps=0,
+        num_sanity_val_steps=before,
         callbacks=[TrainingProgressBar()],
         enable_checkpointing=False,
         default_root_dir=tmp_path,
@@ -59,6 +59,13 @@ def test_lines_after_each_validation_without_a_terminal(tmp_path, capsys):
     fit(tmp_path, 10, checkpoint=tmp_path / "last.ckpt")
     output = lines(capsys.readouterr().out)
     assert [line.split(",")[0] for line in output] == ["step 8 of 10", "step 10 of 10"]
+
+
+def test_a_validation_before_the_first_step(tmp_path, capsys):
+    fit(tmp_path, 2, before=-1)
+    output = lines(capsys.readouterr().out)
+    assert output[0] == "step 0 of 2: validation 18.5"
+    assert [line.split(",")[0] for line in output[1:]] == ["step 2 of 2"]
 
 
 def test_lines_between_validations(tmp_path, capsys, monkeypatch):

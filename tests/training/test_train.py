@@ -48,7 +48,7 @@ def test_a_run_leaves_metrics_figures_curves_and_checkpoints(whole):
     assert {"best.ckpt", "last.ckpt"} <= {p.name for p in (folder / "checkpoints").iterdir()}
     assert (folder / "figures" / "test-0.png").stat().st_size > 10_000
     with (folder / "curve.csv").open() as file:
-        assert [row["step"] for row in csv.DictReader(file)] == ["2", "4", "6"]
+        assert [row["step"] for row in csv.DictReader(file)] == ["0", "2", "4", "6"]
     assert (folder / "figures" / "curve.png").stat().st_size > 5_000
     check_tensorboard(folder / "tensorboard", numbers)
 
@@ -77,7 +77,7 @@ def check_tensorboard(folder: Path, numbers: dict) -> None:
         f"gaussians/{name}" for name in ("opacity", "log10_scale", "log10_depth")
     }
     counted = events.Histograms("gaussians/opacity")
-    assert [event.step for event in counted] == [2, 4, 6]
+    assert [event.step for event in counted] == [0, 2, 4, 6]
     assert counted[-1].histogram_value.num == numbers["cost/gaussians"]
     assert 0 < events.Scalars("gaussians/opacity_median")[-1].value < 1
     last = events.Scalars("hp/psnr")[-1].value

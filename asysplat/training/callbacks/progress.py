@@ -29,10 +29,13 @@ class TrainingProgressBar(ProgressBar):
     def disable(self) -> None:
         self.enabled = False
 
+    def on_fit_start(self, trainer: Any, module: Any) -> None:
+        self._open()  # a validation may precede the training
+        self.training = self._add("training", total=trainer.max_steps)
+
     def on_train_start(self, trainer: Any, module: Any) -> None:
-        self._open()
         step = trainer.global_step
-        self.training = self._add("training", total=trainer.max_steps, completed=step)
+        self.bars.reset(self.training, completed=step)
         self._draw(trainer, now=True)
         self.printed_step, self.printed_at = step, time.monotonic()
 
