@@ -184,7 +184,7 @@ def _nearest_run(
 ) -> tuple[str, tuple[str, ...]]:
     """Write why the run that is most like a row is not the row's, and the options that differ.
 
-    Both are empty without one like it. Options that a run logs as its choices are first.
+    Both are empty without one like it. The choices that a run logs are first, then its model's.
     """
     if same_options:
         return f"not run on this data: on other data: {same_options[-1].folder}", ()
@@ -193,7 +193,7 @@ def _nearest_run(
     if not unlike:
         return "", ()
     options, folder = min(unlike, key=lambda each: len(each[0]))
-    keys = sorted(options, key=lambda key: key not in CHOICES)
+    keys = sorted(options, key=lambda key: (key not in CHOICES, not key.startswith("model.")))
     texts = [f"{key}={options[key][0]} ({options[key][1]})" for key in keys]
     return f"not run: {folder} has other options than the row (in brackets)", tuple(texts)
 
