@@ -7,9 +7,11 @@ import sys
 import traceback
 from pathlib import Path
 
+from asysplat.interrupts import end_at_interrupt, handle_signals, interrupt_once
 from asysplat.overrides import exit_at_unknown_overrides
 
 if __name__ == "__main__":
+    end_at_interrupt()
     exit_at_unknown_overrides("train")
 
 import hydra
@@ -21,7 +23,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.files import check_writable
-from asysplat.interrupts import handle_signals, interrupt_once
 from asysplat.training.messages import error_sentence, exit_with_message
 from asysplat.training.prepare import (
     PreparedRun,

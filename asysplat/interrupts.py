@@ -30,9 +30,15 @@ def _hang_up(number: int, frame: FrameType | None) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
+def end_at_interrupt() -> None:
+    """End the process at Ctrl-C without a traceback: while modules load, nothing is to clean up."""
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def interrupt_once() -> None:
     """Raise KeyboardInterrupt at the first Ctrl-C only, as training then saves and ends."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _interrupt)
 
 

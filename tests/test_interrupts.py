@@ -47,6 +47,21 @@ def test_an_interrupt_that_python_would_ignore_arrives(repository, case, kept, o
     assert done.returncode == 0
 
 
+@pytest.mark.parametrize("ignored", [False, True])
+def test_an_interrupt_while_modules_load_ends_the_process(repository, ignored):
+    script = f"""
+        import signal
+        from asysplat.interrupts import end_at_interrupt
+
+        signal.signal(signal.SIGINT, signal.SIG_IGN if {ignored} else signal.default_int_handler)
+        end_at_interrupt()
+        signal.raise_signal(signal.SIGINT)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    done = subprocess.run(command, cwd=repository, capture_output=True, timeout=50)
+    assert done.returncode == (0 if ignored else -signal.SIGINT) and not done.stderr
+
+
 def test_other_errors_are_printed_as_before(monkeypatch):
     told = []
     monkeypatch.setattr(sys, "unraisablehook", told.append)
