@@ -144,7 +144,7 @@ def test_long_lrm_is_as_published(compose_train):
 def test_table_5_takes_the_frames_of_an_index(compose_train):
     overrides = ["sweeps=two_views", "scale=paper", "data=realestate10k", *PLACES]
     config = compose_train(*overrides, "data.index=index.json")
-    assert (config.metrics.name, config.data.inputs) == ("pixelsplat", 2)
+    assert (config.metrics.name, config.data.inputs, config.data.targets) == ("pixelsplat", 2, 4)
     assert (config.data.selection, config.data.index) == ("index", "index.json")
     assert (config.stage, config.earlier_stages, config.data.test_size) == ("stage1", [], None)
     assert (config.data.height, config.data.width) == (256, 256)
