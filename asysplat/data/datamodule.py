@@ -1,7 +1,8 @@
 """Batches of tasks: the same for the same seed, wherever a run is resumed."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import current_process, get_all_start_methods
@@ -88,18 +89,19 @@ class SceneDataModule(lightning.LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         """Load the validation and test tasks, and try one training task."""
         if not self.evaluation:
-            samples = {"training": TrainingTasks(self)[0]}
             counts = (self.inputs, self.targets)
-            validation = self.source.evaluation("val", *counts)
-            self.evaluation["val"] = FixedTasks(validation, self.points, "validation")
+            # All images are selected before any is read, since an index may not fit the scenes.
             own = {self.name: partial(self.source.evaluation, "test", *counts)}
+            tests: dict[str, list[Task]] = {}
             for name, make_tasks in (own | self.test_sets).items():
-                try:
-                    self.tests[name] = FixedTasks(make_tasks(), self.points, f"test {name}")
-                except InputError as error:
-                    if name == self.name:
-                        raise
-                    raise InputError(f"data.test_sets.{name}: {error}") from error
+                with self._naming(name):
+                    tests[name] = make_tasks()
+            validation = self.source.evaluation("val", *counts)
+            samples = {"training": TrainingTasks(self)[0]}
+            self.evaluation["val"] = FixedTasks(validation, self.points, "validation")
+            for name, tasks in tests.items():
+                with self._naming(name):
+                    self.tests[name] = FixedTasks(tasks, self.points, f"test {name}")
             self.evaluation["test"] = self.tests[self.name]
             samples |= {name: tasks[0] for name, tasks in self.tests.items()}
             missing = [
@@ -114,6 +116,16 @@ class SceneDataModule(lightning.LightningDataModule):
                     "the files that hold them.",
                     stacklevel=2,
                 )
+
+    @contextmanager
+    def _naming(self, test_set: str) -> Iterator[None]:
+        """Name a further test set in the InputErrors of the body."""
+        try:
+            yield
+        except InputError as error:
+            if test_set == self.name:
+                raise
+            raise InputError(f"data.test_sets.{test_set}: {error}") from error
 
     def check_sizes(self, check: Callable[[int, int], None]) -> None:
         """Call `check(height, width)` for every set; its InputError names the set."""

@@ -262,6 +262,11 @@ class FilesSource:
             for each in self._tests
             if each.name in index
         ]
+        if not tasks:
+            raise InputError(
+                f"data.index={self.index} names none of the scenes of {self.test_folder.root}, such "
+                f"as {self._tests[0].name}: give the index of this data set."
+            )
         missing = set(index) - {task.sequence.name for task in tasks}
         if missing:
             raise InputError(

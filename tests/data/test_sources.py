@@ -152,6 +152,9 @@ def test_an_index_that_does_not_fit_the_scenes_is_refused(folder, index):
     source = FilesSource(root, SIZE, (12, 24), **options)
     with pytest.raises(InputError, match=r"names 2 scenes that do not exist, such as s7"):
         source.evaluation("test", 2, 2)
+    other = FilesSource(root, SIZE, (12, 24), selection="index", index=index(s7=entry))
+    with pytest.raises(InputError, match=r"names none of the scenes of .*one, such as s2: give"):
+        other.evaluation("test", 2, 2)
     with pytest.raises(InputError, match=r"data\.selection=index would test images that are"):
         drawn(source)
     with pytest.raises(InputError, match=r"data\.selection is kmeans and data\.index is"):
