@@ -264,8 +264,8 @@ class FilesSource:
         ]
         if not tasks:
             raise InputError(
-                f"data.index={self.index} names none of the scenes of {self.test_folder.root}, such "
-                f"as {self._tests[0].name}: give the index of this data set."
+                f"data.index={self.index} names none of the scenes of {self.test_folder.root}, "
+                f"such as {self._tests[0].name}: give the index of this data set."
             )
         missing = set(index) - {task.sequence.name for task in tasks}
         if missing:
