@@ -11,6 +11,7 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
+from asysplat.models.prior.prior import FREE_OPACITY
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import SPREAD, merge_to_limit
 from asysplat.refinement.photographs import Photographs
@@ -75,7 +76,8 @@ def initial_gaussians(
 def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:
     """Place an isotropic Gaussian at the surface point of each pixel of a prior's depth maps.
 
-    Pixels that are masked out, wholly or in part, get none, unless all are masked out.
+    Pixels in free space get none, and those that are masked out, wholly or in part, unless that is
+    all of them.
     """
     size = tuple(prior.distance.shape[-2:])
     cameras = views.cameras.resized(*size)
@@ -88,9 +90,9 @@ def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:
         prior.opacity[0].to(directions).flatten(),
         colors.flatten(0, 2),
     )
-    if views.masks is None:
-        return gaussians
-    valid = F.interpolate(views.masks[:, None].float(), size, mode="area").flatten() == 1
+    valid = gaussians.opacities > FREE_OPACITY
+    if views.masks is not None:
+        valid &= F.interpolate(views.masks[:, None].float(), size, mode="area").flatten() == 1
     return gaussians.keep(valid) if valid.any() else gaussians
 
 

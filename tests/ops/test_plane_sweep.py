@@ -86,8 +86,8 @@ def test_consistency_equals_the_reference(backend, size):
     inverse = ranges.mean(-1)[..., None, None] * (1 + torch.rand(scenes, views, height, width)) / 2
     trust = torch.rand(scenes, views, height, width)
     arguments = inverse, inverse.mean((-1, -2)) / 4, trust, chosen, projections
-    exact = reference.consistency(*converted(arguments, torch.float64))
-    got = form.consistency(*(tensor.to(DEVICES[backend]) for tensor in arguments))
+    exact = reference.consistency(*converted(arguments, torch.float64), tolerance=0.05)
+    got = form.consistency(*(tensor.to(DEVICES[backend]) for tensor in arguments), tolerance=0.05)
     for name, there, here in zip(exact._fields, exact, got, strict=True):
         assert here.dtype == torch.float32 and here.shape == there.shape
         # Inside and agreeing may depend on the last bit: at one pixel in a thousand.

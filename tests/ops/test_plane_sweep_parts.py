@@ -6,26 +6,33 @@ import torch
 import torch.nn.functional as F
 from surfaces import cameras_at, depth_of_plane, four_cameras, slanted_plane, turned
 
+from asysplat.models.prior import Prior
 from asysplat.models.prior.plane_sweep import edges, plane_sweep, shrink
-from asysplat.models.prior.prior import other_views
+from asysplat.models.prior.prior import FREE_OPACITY, DepthEstimate, in_free_space, other_views
 from asysplat.models.prior.projections import MARGIN, Projections, observed_range
 from asysplat.ops.plane_sweep import load_backend, reference
-from asysplat.scene import Cameras
+from asysplat.scene import Cameras, Views
 
 CAMERAS = cameras_at([(0.1 * v, 0.05 * (v % 2), 0.0) for v in range(4)])
 INNER = (slice(None), slice(None), slice(4, -4), slice(12, -12))
 
 
-def check_wall(halved=(), trust=None):
-    """Compare the depths of a wall between all views; some views have half the distance."""
+def wall(halved=(), trust=None):
+    """The inverse depths of a wall, trust in them, and all other views; some are twice as near."""
     inverse = 1 / depth_of_plane(CAMERAS, 2.0)[0]
     for view in halved:
         inverse[:, view] *= 2
     others = other_views(4, 1, torch.device("cpu"))
     projections = Projections.between(CAMERAS).into(others, CAMERAS.height, CAMERAS.width)
     trust = torch.ones_like(inverse) if trust is None else trust
+    return inverse, trust, others, projections
+
+
+def check_wall(halved=(), trust=None):
+    """Compare the depths of a wall between all views."""
+    inverse, *rest = wall(halved, trust)
     steps = torch.zeros(1, 4, dtype=torch.float64)
-    return load_backend("auto", inverse).consistency(inverse, steps, trust, others, projections)
+    return load_backend("auto", inverse).consistency(inverse, steps, *rest)
 
 
 def test_all_views_agree_on_a_wall():
@@ -49,6 +56,23 @@ def test_views_contradict_a_depth_that_is_too_near_as_much_as_they_are_trusted(m
     found = check_wall(halved=[3], trust=trust)
     assert (found.contradicting[:, 3][:, 4:-4, 12:-12] == 2.25).all()
     assert (found.agreeing[:, 1][:, 4:-4, 12:-12] == 1.25).all()
+
+
+def test_what_three_views_see_through_is_in_free_space_and_hardly_opaque():
+    inverse, trust, others, projections = wall(halved=[3])
+    free = in_free_space(inverse, trust, others, projections)
+    assert free[:, 3, 4:-4, 12:-12].all() and not free[:, :3].any()
+    counts = [torch.ones_like(inverse)] * 2
+    estimate = DepthEstimate(inverse, trust, *counts, free)
+    views = Views(CAMERAS, torch.rand(1, 4, 3, CAMERAS.height, CAMERAS.width))
+    opacity = Prior.of_estimate(estimate, views, (CAMERAS.height, CAMERAS.width)).opacity
+    assert (opacity[free] == FREE_OPACITY).all() and opacity[~free].min() > 0.5
+
+
+def test_what_one_other_view_denies_or_none_sees_is_kept():
+    inverse, trust, _, projections = wall(halved=[3])
+    for others in ([[1, -1, -1]] * 3 + [[0, -1, -1]], [[-1, -1, -1]] * 4):
+        assert not in_free_space(inverse, trust, torch.tensor([others]), projections).any()
 
 
 @pytest.mark.parametrize("views", [1, 2, 5])

@@ -15,7 +15,13 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.errors import InputError
-from asysplat.models.prior.prior import DepthEstimate, Prior, fill_unknown, other_views
+from asysplat.models.prior.prior import (
+    DepthEstimate,
+    Prior,
+    fill_unknown,
+    in_free_space,
+    other_views,
+)
 from asysplat.models.prior.projections import (
     Projections,
     choose_neighbors,
@@ -121,7 +127,7 @@ def _plane_sweep(
     neighbors: int,
     backend: str,
     ranges: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Sweep twice; one operator for torch, so that the meta device gets shapes without content."""
     cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
     projections = Projections.between(cameras)
@@ -175,13 +181,16 @@ def _plane_sweep(
     squared = inverse**2  # how well a depth differs from the next plane's; 0 at infinity
     precision = squared / (squared + steps[..., None, None] ** 2).clamp_min(1e-30)
     inverse = fill_unknown(inverse, agreement * precision)
-    return inverse, agreement * (1 + precision) / 2, found.agreeing, found.containing
+    confidence = agreement * (1 + precision) / 2
+    free = in_free_space(inverse, confidence, others, small, backend)
+    return inverse, confidence, found.agreeing, found.containing, free
 
 
 @_plane_sweep.register_fake
 def _(images, intrinsics, cam_to_world, stride, planes, neighbors, backend, ranges):
     shape = (*images.shape[:2], images.shape[-2] // stride, images.shape[-1] // stride)
-    return tuple(images.new_empty(shape) for _ in range(4))
+    maps = (images.new_empty(shape) for _ in range(4))
+    return *maps, images.new_empty(shape, dtype=torch.bool)
 
 
 def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbors: int) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from asysplat.models.prior.projections import Projections
@@ -15,6 +15,8 @@ PRIOR_CHANNELS = 2
 UNKNOWN_DISTANCE = 10**0.5  # the middle of PhotographHead's range
 COVER = 0.95  # opacity of a surface, over all views that are confident of it,
 UNSURE_COVER = 0.7  # and over all views that contain the point where none is confident
+FREE_TOLERANCE = 0.05  # relative, of two inverse depths: beyond it one is seen through,
+FREE_OPACITY = 1e-4  # and has an opacity too small to be drawn
 SURROUNDINGS = 0.05  # weight of a pixel's surroundings against its own depth at full confidence
 
 
@@ -26,12 +28,14 @@ class DepthEstimate(TensorRecord):
         inverse_depth: 1 / depth along the camera's z axis, > 0; 0 where no depth is known.
         confidence: in [0, 1]; 0 where no other view confirms the depth.
         agreeing, containing: see `Consistency`.
+        free: whether the point is in free space, see `in_free_space`.
     """
 
     inverse_depth: Float[Tensor, "*batch V h w"]
     confidence: Float[Tensor, "*batch V h w"]
     agreeing: Float[Tensor, "*batch V h w"]
     containing: Float[Tensor, "*batch V h w"]
+    free: Bool[Tensor, "*batch V h w"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,8 @@ class Prior(TensorRecord):
     Args:
         distance: along the ray of each pixel of the head's grid, > 0, in scene units.
         confidence: in [0, 1].
-        opacity: to start from, in (0, 1); views that see the same surface share it.
+        opacity: to start from, in (0, 1); views that see the same surface share it. In free space
+            FREE_OPACITY.
     """
 
     distance: Float[Tensor, "B V h w"]
@@ -61,7 +66,8 @@ class Prior(TensorRecord):
         )
         length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
         distance = torch.where(inverse > 0, length / inverse.clamp_min(1e-6), UNKNOWN_DISTANCE)
-        return cls(distance, confidence, opacity.sigmoid())
+        free = F.interpolate(depth.free.to(opacity), size) > 0.5
+        return cls(distance, confidence, opacity.sigmoid().masked_fill(free, FREE_OPACITY))
 
     @classmethod
     def of_given_depths(
@@ -79,7 +85,8 @@ class Prior(TensorRecord):
         steps = torch.zeros_like(inverse[..., 0, 0])
         kernels = load_backend("auto", inverse)
         found: Consistency = kernels.consistency(inverse, steps, confidence, others, projections)
-        estimate = DepthEstimate(inverse, confidence, found.agreeing, found.containing)
+        free = in_free_space(inverse, confidence, others, projections)
+        estimate = DepthEstimate(inverse, confidence, found.agreeing, found.containing, free)
         return cls.of_estimate(estimate, views, tuple(size))
 
     def features(self, height: int, width: int) -> Float[Tensor, "B V H W 2"]:
@@ -93,6 +100,28 @@ class Prior(TensorRecord):
         return torch.stack(
             [F.interpolate(each, (height, width), mode="bilinear") for each in maps], dim=-1
         )
+
+
+def in_free_space(
+    inverse: Float[Tensor, "B V h w"],
+    trust: Float[Tensor, "B V h w"],
+    others: Int[Tensor, "B V K"],
+    projections: Float[Tensor, "B V K 3 4"],
+    backend: str = "auto",
+) -> Bool[Tensor, "B V h w"]:
+    """Return the pixels whose point other views see through, to a surface behind it.
+
+    At least one more view than twice those that confirm it, each as much as it is trusted: what a
+    single view knows is kept, and what one other view denies.
+
+    Args:
+        inverse, trust, others, projections: see `asysplat.ops.plane_sweep.reference.consistency`.
+        backend: a name for `load_backend`.
+    """
+    consistency = load_backend(backend, inverse).consistency
+    steps = torch.zeros_like(inverse[..., 0, 0])
+    found = consistency(inverse, steps, trust, others, projections, tolerance=FREE_TOLERANCE)
+    return found.contradicting > 2 * found.agreeing + 1
 
 
 def other_views(views: int, scenes: int, device: torch.device) -> Int[Tensor, "B V K"]:

@@ -17,7 +17,7 @@ LARGE_STEP = 0.6  # and for more than one plane,
 EDGE = 0.05  # which halves where the color changes by this
 MIN_WEIGHT = 0.05  # of a pixel's own costs
 MIN_BEND = 1e-9  # curvature of a parabola that has a minimum
-TOLERANCE = 0.01  # relative, or half a step if that is more: two inverse depths agree
+TOLERANCE = 0.01  # relative, of two inverse depths that agree
 PIXELS_AT_ONCE = 2**20  # whose consistency is checked at a time
 FRONT = 1e-6  # smallest depth in front of a camera, over the depth in the other
 
@@ -177,6 +177,7 @@ def consistency(
     trust: Float[Tensor, "B V h w"],
     others: Int[Tensor, "B V K"],
     projections: Float[Tensor, "B V K 3 4"],
+    tolerance: float = TOLERANCE,
 ) -> Consistency:
     """Compare the inverse depth of each pixel with those of other views at the same point.
 
@@ -188,6 +189,7 @@ def consistency(
         trust: in a view's depths, in [0, 1].
         others: the views to compare with; -1 for none.
         projections: into those; see `asysplat.models.prior.projections.Projections.into`.
+        tolerance: of two inverse depths that agree, relative; half a step if that is more.
     """
     B, _, h, w = inverse.shape
     scene = torch.arange(B, device=others.device)[:, None, None]
@@ -206,9 +208,9 @@ def consistency(
         place = (scene[..., None, None], view[..., None, None], row, column)
         nearer = inverse[:, :, None] / front - inverse[place]
         half_step = steps[scene, view][..., None, None] / 2
-        tolerance = torch.maximum(half_step, TOLERANCE * inverse[place])
-        agree = inside & (nearer.abs() <= tolerance)
-        contradict = inside & (nearer > tolerance)
+        apart = torch.maximum(half_step, tolerance * inverse[place])
+        agree = inside & (nearer.abs() <= apart)
+        contradict = inside & (nearer > apart)
         weight = trust[place]
         counts = (agree * weight, contradict * weight, inside.to(weight))
         return Consistency(*(each.sum(2) for each in counts))

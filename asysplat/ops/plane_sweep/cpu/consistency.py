@@ -23,7 +23,6 @@ from asysplat.ops.simd.vectors import (
 )
 
 HALF, FRONT = np.float32(0.5), np.float32(reference.FRONT)
-TOLERANCE = np.float32(reference.TOLERANCE)
 
 
 class ConsistencyInputs(NamedTuple):
@@ -34,12 +33,14 @@ class ConsistencyInputs(NamedTuple):
         steps: [n].
         others: [n, K], counted from a scene's first view; -1 for none.
         projections: [n, K, 3, 4].
+        tolerance: relative.
     """
 
     maps: np.ndarray
     steps: np.ndarray
     others: np.ndarray
     projections: np.ndarray
+    tolerance: np.float32
 
 
 def consistency(
@@ -48,6 +49,7 @@ def consistency(
     trust: Float[Tensor, "B V h w"],
     others: Int[Tensor, "B V K"],
     projections: Float[Tensor, "B V K 3 4"],
+    tolerance: float = reference.TOLERANCE,
 ) -> reference.Consistency:
     """Count in float32; see `reference.consistency`."""
     B, V, h, w = inverse.shape
@@ -56,6 +58,7 @@ def consistency(
         steps=steps.flatten().numpy(),
         others=others.flatten(0, 1).contiguous().numpy(),
         projections=projections.flatten(0, 1).contiguous().numpy(),
+        tolerance=np.float32(tolerance),
     )
     result = reference.Consistency(
         *(torch.empty(B, V, h, w) for _ in reference.Consistency._fields)
@@ -101,11 +104,11 @@ def count_views(start, stop, inputs, views, counts):
                     v = min(max(v, ZERO), bottom - ONE)
                     stored, trust = gather_pairs(inputs.maps[other], v, u)
                     nearer = depth * scale - stored
-                    tolerance = max(stored * TOLERANCE, inputs.steps[other] * HALF)
+                    limit = max(stored * inputs.tolerance, inputs.steps[other] * HALF)
                     weight = where(inside, trust, ZERO)
                     apart = max(nearer, ZERO - nearer)
-                    agreeing = agreeing + where(less(tolerance, apart), ZERO, weight)
-                    contradicting = contradicting + where(less(tolerance, nearer), weight, ZERO)
+                    agreeing = agreeing + where(less(limit, apart), ZERO, weight)
+                    contradicting = contradicting + where(less(limit, nearer), weight, ZERO)
                     containing = containing + where(inside, ONE, ZERO)
                 store_some(counts.agreeing[n, y], x, count, agreeing)
                 store_some(counts.contradicting[n, y], x, count, contradicting)
