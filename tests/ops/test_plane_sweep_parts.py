@@ -9,7 +9,12 @@ from surfaces import cameras_at, depth_of_plane, four_cameras, slanted_plane, tu
 from asysplat.models.prior import Prior
 from asysplat.models.prior.plane_sweep import edges, plane_sweep, shrink
 from asysplat.models.prior.prior import FREE_OPACITY, DepthEstimate, in_free_space, other_views
-from asysplat.models.prior.projections import MARGIN, Projections, observed_range
+from asysplat.models.prior.projections import (
+    MARGIN,
+    Projections,
+    inverse_depth_range,
+    observed_range,
+)
 from asysplat.ops.plane_sweep import load_backend, reference
 from asysplat.scene import Cameras, Views
 
@@ -73,6 +78,17 @@ def test_what_one_other_view_denies_or_none_sees_is_kept():
     inverse, trust, _, projections = wall(halved=[3])
     for others in ([[1, -1, -1]] * 3 + [[0, -1, -1]], [[-1, -1, -1]] * 4):
         assert not in_free_space(inverse, trust, torch.tensor([others]), projections).any()
+
+
+def test_no_neighbor_sees_no_depth():
+    """An index of -1 is not the last view, nor the view itself where that is the last."""
+    cameras = cameras_at([(0.1 * v, 0.0, 0.0) for v in range(3)])
+    projections = Projections.between(cameras)
+    padded = torch.tensor([[[1, -1, -1], [0, -1, -1], [1, -1, -1]]])
+    found, expected = (
+        inverse_depth_range(cameras, projections, chosen) for chosen in (padded, padded[..., :1])
+    )
+    assert torch.equal(found, expected) and (found[..., 1] > 0).all()
 
 
 @pytest.mark.parametrize("views", [1, 2, 5])

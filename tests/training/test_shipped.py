@@ -9,6 +9,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 
+from asysplat import mean_color, open_photographs, render
 from asysplat.data import FilesSource, SceneOptions
 from asysplat.data.datamodule import collate, load
 from asysplat.evaluation.baselines import mean_color_images, nearest_view_images
@@ -72,3 +73,20 @@ def test_real_photographs(module, shared, most):
         ours, theirs = torch.tensor(distances).mean(0)
         sharper += int(ours < theirs)
     assert sharper >= len(SCENES) / 2
+
+
+@pytest.mark.medium
+def test_the_order_of_the_photographs_does_not_matter(module, shared):
+    """With few that overlap, so that some have fewer neighbors than are compared."""
+    folder = shared / "data" / "mydesk"
+    if not folder.is_dir():
+        pytest.skip(f"{shared} has no data/mydesk")
+    photographs = open_photographs(folder, height=128, width=128, views=8)
+    inputs, held_out = photographs.inputs, photographs.held_out.select(range(4))
+    found = []
+    for order in (range(8), (7, 2, 5, 0, 3, 6, 1, 4), (3, 1, 7, 6, 0, 2, 5, 4)):
+        with torch.no_grad():
+            gaussians = module.net(inputs.select(order))
+            image = render(gaussians, held_out.cameras, mean_color(inputs), depth=False).image
+        found.append(psnr(image.clamp(0, 1), held_out.images).mean().item())
+    assert max(found) - min(found) < 0.1

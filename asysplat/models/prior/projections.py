@@ -96,7 +96,8 @@ def inverse_depth_range(
     steps = torch.logspace(-2, 2, 97, base=10.0).to(distance)
     focal = cameras.intrinsics[..., 0, 0] / cameras.width
     inverse = steps / (distance.clamp_min(1e-12) * focal)[..., None]
-    share = _inside(projections, neighbors, inverse).amax(2).mean(-2)
+    seen = _inside(projections, neighbors, inverse) * (neighbors >= 0)[..., None, None]
+    share = seen.amax(2).mean(-2)
     enough = share >= MIN_SHARE
     first = enough.int().argmax(-1, keepdim=True)
     last = enough.shape[-1] - 1 - enough.flip(-1).int().argmax(-1, keepdim=True)
