@@ -27,7 +27,7 @@ def print_table(
 
     Args:
         console: the terminal.
-        headings: of the columns.
+        headings: titles of the columns.
         rows: one text for each column.
         title: stands above the first table.
         box: the borders.

@@ -24,7 +24,6 @@ class Task:
     """A sequence, with the indices of the input images and of the images to predict.
 
     Args:
-        sequence, selection: those.
         prune: whether a model that prunes its Gaussians does so.
     """
 

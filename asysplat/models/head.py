@@ -188,7 +188,7 @@ class LongLRMHead(GaussianHead):
 
     Args:
         width, patch_coarse, patch_fine, sh_degree, opacity_bias: of GaussianHead.
-        farthest: distance.
+        farthest: greatest distance, in that unit.
         scale_bias: log of an untrained size.
         largest: log of the largest size.
     """

@@ -28,7 +28,7 @@ class Tokenizer(nn.Module):
         patch: p_c or p_f, in pixels.
         width: d_c or d_f.
         channels: of a pixel, PIXEL_CHANNELS plus those of the prior.
-        bias: of the LayerNorm.
+        bias: whether the LayerNorm has one.
     """
 
     def __init__(self, patch: int, width: int, channels: int = PIXEL_CHANNELS, bias: bool = True):

@@ -78,7 +78,7 @@ def fill_table(
     sets = our_sets(table, config.data.name, config.data.test_sets or ())
     seeds = str(config.hydra.sweeper.params.get("seed", config.seed)).split(",")
     rows: list[PaperRow] = []
-    heads: dict[str, list[str]] = {}  # of the rows that have it
+    heads: dict[str, list[str]] = {}  # head -> labels of its rows
     given, used = system_rows(table, config, sets, systems)
     for row in given:
         if row.quoted:
@@ -97,7 +97,9 @@ def fill_table(
         for column in table.columns:
             if column.key in OPTIONS:
                 numbers = [OmegaConf.select(row_config, OPTIONS[column.key])] if row_runs else []
-            elif column.key == "train_hours":  # of the whole stage, of which the runs are a part
+            elif (
+                column.key == "train_hours"
+            ):  # hours of the whole stage, of which the runs are a part
                 steps = row_config.stages[row_config.stage].steps
                 numbers = [stage_hours(steps, s) for s in values.get("seconds_per_step", ())]
             else:

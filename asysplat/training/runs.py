@@ -28,16 +28,8 @@ EVALUATION = "evaluation.json"  # added to a run by evaluate.py
 # is divided.
 NOT_HASHED = (
     *("name", "ckpt_path", "rerun", "paths", "callbacks", "logger"),
-    *(
-        "stage",
-        "stages",
-        "earlier_stages",
-        "selections",
-        "windows",
-        "more_inputs",
-        "replica_size",
-        "farthest",
-    ),
+    *("stage", "stages", "earlier_stages", "selections", "windows"),
+    *("more_inputs", "replica_size", "farthest"),
     *("allow_missing_losses", "training.loss.allow_missing"),
     *("data.root", "data.index", "data.cache", "data.test_sets"),
     *(f"trainer.{name}" for name in ("devices", "num_nodes", "strategy")),

@@ -111,8 +111,8 @@ def in_free_space(
 ) -> Bool[Tensor, "B V h w"]:
     """Return the pixels whose point other views see through, to a surface behind it.
 
-    At least one more view than twice those that confirm it, each as much as it is trusted: what a
-    single view knows is kept, and what one other view denies.
+    They exceed twice those that confirm it by more than one, each counted as much as it is trusted:
+    what a single view knows is kept, and what one other view denies.
 
     Args:
         inverse, trust, others, projections: see `asysplat.ops.plane_sweep.reference.consistency`.

@@ -189,7 +189,8 @@ def consistency(
         trust: in a view's depths, in [0, 1].
         others: the views to compare with; -1 for none.
         projections: into those; see `asysplat.models.prior.projections.Projections.into`.
-        tolerance: of two inverse depths that agree, relative; half a step if that is more.
+        tolerance: relative difference up to which two inverse depths agree; half a step if that is
+            more.
     """
     B, _, h, w = inverse.shape
     scene = torch.arange(B, device=others.device)[:, None, None]

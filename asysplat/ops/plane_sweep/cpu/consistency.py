@@ -33,7 +33,7 @@ class ConsistencyInputs(NamedTuple):
         steps: [n].
         others: [n, K], counted from a scene's first view; -1 for none.
         projections: [n, K, 3, 4].
-        tolerance: relative.
+        tolerance: relative difference up to which two inverse depths agree.
     """
 
     maps: np.ndarray
