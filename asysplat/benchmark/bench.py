@@ -37,8 +37,7 @@ OPERATORS = {  # the backend that is the baseline, and the sizes of the inputs
     "selective_scan": ("chunked", {"batch": 8, "length": 128, "channels": 64, "state": 16}),
     "plane_sweep": (
         "reference",
-        {"batch": 1, "views": 4, "height": 32, "width": 32}
-        | {"stride": 2, "planes": 48, "neighbors": 3},
+        {"batch": 1, "views": 4, "height": 32, "width": 32} | {"planes": 48, "neighbors": 3},
     ),
 }
 GAUSSIANS, SIDE = 5000, 96  # of the renderer's scene

@@ -53,7 +53,7 @@ SHAPES = {
 # The backends beside "cpu" or "cuda", and the sizes that are arguments of the operator.
 BACKENDS = dict.fromkeys(SCANS, "chunked") | {ATTENTION: "sdpa", PLANE_SWEEP: REFERENCE}
 ARGUMENTS = dict.fromkeys(SCANS, ()) | {ATTENTION: ("grid",)}
-ARGUMENTS[PLANE_SWEEP] = ("stride", "planes", "neighbors")
+ARGUMENTS[PLANE_SWEEP] = ("planes", "neighbors")
 # The plane sweep's scene: cameras on an arc before a slanted wall with a texture.
 SLANT = 0.3  # by which the wall is farther away, a unit to the right
 WAVES = 20  # of each color

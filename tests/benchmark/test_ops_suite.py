@@ -18,7 +18,7 @@ TINY = {
     "selective_scan": {"batch": 2, "length": LENGTH, "channels": 16, "state": 4},
     "grid_attention": {"batch": 1, "views": 2, "height": 4, "width": 6, "heads": 2, "head_dim": 8}
     | {"grids": [1, 2]},
-    "plane_sweep": {"batch": 1, "views": 4, "height": 24, "width": 32, "stride": 2}
+    "plane_sweep": {"batch": 1, "views": 4, "height": 24, "width": 32}
     | {"planes": 20, "neighbors": 2},
     "loop_tokens": LOOP_TOKENS,
     "exact": {

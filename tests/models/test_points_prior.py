@@ -63,9 +63,9 @@ def test_points_set_the_range_of_a_plane_sweep(monkeypatch):
     """In a view with enough points; the cameras set the range of the other view."""
     given = []
 
-    def spy(images, cameras, stride, ranges, **options):
+    def spy(images, cameras, ranges, **options):
         given.append(ranges)
-        return plane_sweep(images, cameras, stride, backend="reference", ranges=ranges, **options)
+        return plane_sweep(images, cameras, backend="reference", ranges=ranges, **options)
 
     monkeypatch.setattr(import_module(PlaneSweepPrior.__module__), "plane_sweep", spy)
     points = torch.zeros(1, 2, 32, 32)

@@ -70,3 +70,9 @@ def slanted_plane(cameras: Cameras, distance: float = 3.0, seed: int = 0) -> tup
     depth, points = depth_of_plane(cameras, distance, slant=0.3)
     focal = (cameras.intrinsics[..., 0, 0] / cameras.width).mean().item()
     return texture(points, scale=distance / (3 * focal), seed=seed), depth
+
+
+def maps_of(estimate):
+    """All maps of a DepthEstimate by name."""
+    votes = estimate.votes._asdict()
+    return {"inverse_depth": estimate.inverse_depth, "confidence": estimate.confidence} | votes

@@ -48,8 +48,7 @@ def test_all_kernels_of_the_plane_sweep_compile(monkeypatch, architecture):
     costs = cuda.cost_volume(
         *(torch.zeros(1, 2, 8, 12), neighbors, torch.zeros(1, 2, 4, 3, 4), torch.zeros(1, 2, 2)),
         planes=48,
-        stride=2,
     )
-    cuda.sgm(costs, torch.ones(1, 2, 4, 6), torch.zeros(1, 2, 2, 4, 6))
+    cuda.sgm(costs, torch.ones(1, 2, 8, 12), torch.zeros(1, 2, 2, 8, 12))
     assert {name for name, _ in kernels} == {"cost_band", "add_paths"}
     assert all(kernel.asm["cubin"] for kernel in kernels.values())

@@ -8,7 +8,13 @@ from surfaces import cameras_at, depth_of_plane, four_cameras, slanted_plane, tu
 
 from asysplat.models.prior import Prior
 from asysplat.models.prior.plane_sweep import edges, plane_sweep, shrink
-from asysplat.models.prior.prior import FREE_OPACITY, DepthEstimate, in_free_space, other_views
+from asysplat.models.prior.prior import (
+    FREE_OPACITY,
+    DepthEstimate,
+    count_votes,
+    in_free_space,
+    other_views,
+)
 from asysplat.models.prior.projections import (
     MARGIN,
     Projections,
@@ -54,6 +60,7 @@ def test_views_contradict_a_depth_that_is_too_near_as_much_as_they_are_trusted(m
     assert (found.contradicting[:, 3][:, 4:-4, 12:-12] == 3).all()
     assert not found.agreeing[:, 3].any()
     # The near surface of the fourth view occludes the wall: it does not contradict the others.
+    assert (found.occluding[:, :3][INNER] == 1).all()
     assert (found.agreeing[:, :3][INNER] == 2).all() and not found.contradicting[:, :3].any()
     monkeypatch.setattr(reference, "PIXELS_AT_ONCE", 1)
     assert all(map(torch.equal, check_wall(halved=[3], trust=trust), found))
@@ -64,20 +71,36 @@ def test_views_contradict_a_depth_that_is_too_near_as_much_as_they_are_trusted(m
 
 
 def test_what_three_views_see_through_is_in_free_space_and_hardly_opaque():
-    inverse, trust, others, projections = wall(halved=[3])
-    free = in_free_space(inverse, trust, others, projections)
+    inverse, *rest = wall(halved=[3])
+    votes = count_votes(inverse, *rest)
+    free = in_free_space(votes)
     assert free[:, 3, 4:-4, 12:-12].all() and not free[:, :3].any()
-    counts = [torch.ones_like(inverse)] * 2
-    estimate = DepthEstimate(inverse, trust, *counts, free)
+    estimate = DepthEstimate(inverse, torch.ones_like(inverse), votes)
     views = Views(CAMERAS, torch.rand(1, 4, 3, CAMERAS.height, CAMERAS.width))
     opacity = Prior.of_estimate(estimate, views, (CAMERAS.height, CAMERAS.width)).opacity
-    assert (opacity[free] == FREE_OPACITY).all() and opacity[~free].min() > 0.5
+    assert (opacity[free] == FREE_OPACITY).all() and opacity[~free].min() > 0.4
 
 
 def test_what_one_other_view_denies_or_none_sees_is_kept():
     inverse, trust, _, projections = wall(halved=[3])
     for others in ([[1, -1, -1]] * 3 + [[0, -1, -1]], [[-1, -1, -1]] * 4):
-        assert not in_free_space(inverse, trust, torch.tensor([others]), projections).any()
+        votes = count_votes(inverse, trust, torch.tensor([others]), projections)
+        assert not in_free_space(votes).any()
+
+
+def test_views_from_which_a_point_is_hidden_leave_it_its_opacity():
+    """The fourth view sees a surface in front of the wall, so the wall's other views share it."""
+    inverse, *rest = wall(halved=[3])
+    votes, clear = count_votes(inverse, *rest), count_votes(*wall())
+    assert (votes.occluding[:, :3][INNER] == 1).all() and not votes.occluding[:, 3].any()
+    views = Views(CAMERAS, torch.rand(1, 4, 3, CAMERAS.height, CAMERAS.width))
+    hidden, seen = (
+        Prior.of_estimate(
+            DepthEstimate(inverse, torch.zeros_like(inverse), each), views, inverse.shape[-2:]
+        ).opacity
+        for each in (votes, clear)
+    )
+    assert (hidden > seen)[:, :3][INNER].all()
 
 
 def test_no_neighbor_sees_no_depth():

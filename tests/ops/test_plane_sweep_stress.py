@@ -4,7 +4,7 @@ import inspect
 
 import pytest
 import torch
-from surfaces import cameras_at, four_cameras, slanted_plane, turned
+from surfaces import cameras_at, four_cameras, maps_of, slanted_plane, turned
 
 from asysplat.errors import InputError
 from asysplat.models.prior.plane_sweep import plane_sweep
@@ -97,7 +97,7 @@ def test_any_number_of_threads_gives_the_same_bits(threads):
     results = []
     for count in (1, 2, 3):
         threads(count)
-        results.append(vars(estimate(cameras, "cpu", images)))
+        results.append(maps_of(estimate(cameras, "cpu", images)))
         for name, value in results[-1].items():
             assert torch.equal(value, results[0][name]), (count, name)
 
@@ -105,16 +105,14 @@ def test_any_number_of_threads_gives_the_same_bits(threads):
 def test_shapes_on_the_meta_device():
     cameras = four_cameras().to("meta", torch.float32)
     images = torch.empty(1, 4, 3, cameras.height, cameras.width, device="meta")
-    found = plane_sweep(images, cameras, stride=4)
-    assert found.inverse_depth.shape == found.confidence.shape == (1, 4, 6, 8)
+    found = plane_sweep(images, cameras)
+    assert found.inverse_depth.shape == found.confidence.shape == (1, 4, 24, 32)
 
 
 @pytest.mark.parametrize(
     "change, message",
     [
         ({"images": torch.zeros(1, 3, 3, 24, 32)}, r"have shape .* expected \(1, 4, 3, 24, 32\)"),
-        ({"stride": 5}, "stride=5 for images of 24x32: give a number that divides both"),
-        ({"stride": 0}, "stride=0"),
         ({"planes": 3}, "planes=3 .* at least 4 planes"),
         ({"neighbors": 0}, "neighbors=0: give at least 4 planes and one neighbor"),
         ({"backend": "fast"}, "backend='fast': expected one of auto, reference, cpu, cuda"),

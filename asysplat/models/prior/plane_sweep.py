@@ -18,8 +18,8 @@ from asysplat.errors import InputError
 from asysplat.models.prior.prior import (
     DepthEstimate,
     Prior,
+    count_votes,
     fill_unknown,
-    in_free_space,
     other_views,
 )
 from asysplat.models.prior.projections import (
@@ -29,13 +29,12 @@ from asysplat.models.prior.projections import (
     observed_range,
     smallest_step,
 )
-from asysplat.ops.plane_sweep import choose_backend, load_backend
+from asysplat.ops.plane_sweep import Consistency, choose_backend, load_backend
 from asysplat.scene import Cameras, Views
 
 PLANES = 48
 NEIGHBORS = 4
 LONGEST_SIDE = 128  # of the swept images, pixels: more than twice the planes
-STRIDE = 2  # swept pixels along a side that share a depth: their mean cost is less noisy
 FULL_CONTRAST = 0.5  # by which the best plane's costs, of four paths, are below the mean
 MIN_AGREEMENT = 0.5  # of a depth that counts for the range of the second sweep
 CONTRADICTION = 2.0  # one contradicting view takes two thirds of the confidence
@@ -62,10 +61,7 @@ class PlaneSweepPrior(nn.Module):
         height, width, factor = views.cameras.height, views.cameras.width, 1
         while max(height, width) > self.longest_side * factor:
             factor *= 2
-        multiple = factor * STRIDE
-        small = views.cameras.resized(
-            *(max(1, side // multiple) * STRIDE for side in (height, width))
-        )
+        small = views.cameras.resized(*(max(1, side // factor) for side in (height, width)))
         images = shrink(views.images, small.height, small.width)
         ranges = None
         if views.point_depths is not None:  # of each block of pixels the nearest point counts
@@ -73,7 +69,7 @@ class PlaneSweepPrior(nn.Module):
             inverse = F.max_pool2d(inverse, factor).flatten(2)
             ranges = observed_range(inverse, inverse > 0)
         estimate = plane_sweep(
-            images, small, STRIDE, planes=self.planes, neighbors=self.neighbors, ranges=ranges
+            images, small, planes=self.planes, neighbors=self.neighbors, ranges=ranges
         )
         return Prior.of_estimate(estimate, views, size)
 
@@ -81,15 +77,14 @@ class PlaneSweepPrior(nn.Module):
 def plane_sweep(
     images: Float[Tensor, "B V 3 H W"],
     cameras: Cameras,
-    stride: int = 1,
     planes: int = PLANES,
     neighbors: int = NEIGHBORS,
     backend: str = "auto",
     ranges: Float[Tensor, "B V 2"] | None = None,
 ) -> DepthEstimate:
-    """Estimate the depth of every `stride` x `stride` block of pixels: [B, V, H/stride, W/stride].
+    """Estimate the depth of every pixel: [B, V, H, W].
 
-    The cost volume takes 4 B V h w D bytes for D planes; the first sweep's, a quarter of that, is
+    The cost volume takes 4 B V H W D bytes for D planes; the first sweep's, a quarter of that, is
     freed before. In addition "cpu" holds twice the volume of one view for each thread, "cuda" the
     whole volume once more, and "reference" several times, with some fifty maps [D, H, W] while it
     compares one view.
@@ -97,7 +92,6 @@ def plane_sweep(
     Args:
         images: RGB in [0, 1].
         cameras: of the images, [B, V].
-        stride: divides H and W; costs are computed at every pixel and averaged over blocks.
         planes: number of inverse depths, at least 4.
         neighbors: most views that each view is compared with.
         backend: "reference" (torch, any device and float type), "cpu", "cuda", or "auto": the
@@ -108,13 +102,14 @@ def plane_sweep(
     Raises:
         InputError: sizes that do not fit together, or an unknown backend.
     """
-    _check(images, cameras, stride, planes, neighbors)
+    _check(images, cameras, planes, neighbors)
     backend = choose_backend(backend, images)
     images = images if images.dtype == torch.float64 else images.float()
     poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
-    return DepthEstimate(
-        *_plane_sweep(images, intrinsics, poses, stride, planes, neighbors, backend, ranges)
+    inverse, confidence, *votes = _plane_sweep(
+        images, intrinsics, poses, planes, neighbors, backend, ranges
     )
+    return DepthEstimate(inverse, confidence, Consistency(*votes))
 
 
 @torch.library.custom_op("asysplat::plane_sweep", mutates_args=())
@@ -122,12 +117,11 @@ def _plane_sweep(
     images: Tensor,
     intrinsics: Tensor,
     cam_to_world: Tensor,
-    stride: int,
     planes: int,
     neighbors: int,
     backend: str,
     ranges: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Sweep twice; one operator for torch, so that the meta device gets shapes without content."""
     cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
     projections = Projections.between(cameras)
@@ -141,31 +135,29 @@ def _plane_sweep(
 
     def sweep(
         images: Float[Tensor, "B V 3 H W"], ranges: Float[Tensor, "B V 2"], aggregations: int
-    ) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V"], Float[Tensor, "B V h w"]]:
+    ) -> tuple[Float[Tensor, "B V H W"], Float[Tensor, "B V"], Float[Tensor, "B V H W"]]:
         """Return the inverse depths, the steps between planes, and how far neighbors agree.
 
         From the second aggregation on, a pixel's costs have its agreement as weight.
         """
         height, width = images.shape[-2:]
-        h, w = height // stride, width // stride
         gray = (images * images.new_tensor(LUMA)[:, None, None]).sum(-3)
         into = projections.into(chosen, height, width)
-        costs = kernels.cost_volume(gray, chosen, into, ranges, planes, stride)
-        borders = edges(shrink(images, h, w))
+        costs = kernels.cost_volume(gray, chosen, into, ranges, planes)
+        borders = edges(images)
         first, last = ranges[..., None, None, :].unbind(-1)
         spacing = (last - first) / (planes - 1)
         steps = torch.maximum(spacing[..., 0, 0], shortest)
-        small = projections.into(chosen, h, w)
-        agreement = images.new_ones(*images.shape[:2], h, w)
+        agreement = torch.ones_like(gray)
         for _ in range(aggregations):
             best = kernels.sgm(costs, agreement, borders)
             inverse = first + best.plane * spacing
-            found = kernels.consistency(inverse, steps, torch.ones_like(inverse), chosen, small)
+            found = kernels.consistency(inverse, steps, torch.ones_like(inverse), chosen, into)
             agree, contradict = found.agreeing, found.contradicting
             agreement = (2 * agree / (agree + contradict + 1)).clamp_max(1)
         return inverse, steps, agreement * (best.contrast / FULL_CONTRAST).clamp(0, 1)
 
-    half = (max(1, side // (2 * stride)) * stride for side in images.shape[-2:])
+    half = (max(1, side // 2) for side in images.shape[-2:])
     inverse, steps, agreement = sweep(shrink(images, *half), ranges, aggregations=1)
     # Narrow the ranges to the depths that neighbors agree on, unless these are few.
     observed = observed_range(inverse.flatten(2), agreement.flatten(2) > MIN_AGREEMENT)
@@ -175,25 +167,22 @@ def _plane_sweep(
     ranges = torch.where(observed[..., 1:] > 0, narrowed, ranges)
     inverse, steps, agreement = sweep(images, ranges, aggregations=2)
     others = other_views(images.shape[1], images.shape[0], images.device)
-    small = projections.into(others, *inverse.shape[-2:])
-    found = kernels.consistency(inverse, steps, agreement, others, small)
+    into = projections.into(others, *images.shape[-2:])
+    found = kernels.consistency(inverse, steps, agreement, others, into)
     agreement = agreement / (1 + CONTRADICTION * found.contradicting)
     squared = inverse**2  # how well a depth differs from the next plane's; 0 at infinity
     precision = squared / (squared + steps[..., None, None] ** 2).clamp_min(1e-30)
     inverse = fill_unknown(inverse, agreement * precision)
     confidence = agreement * (1 + precision) / 2
-    free = in_free_space(inverse, confidence, others, small, backend)
-    return inverse, confidence, found.agreeing, found.containing, free
+    return inverse, confidence, *count_votes(inverse, confidence, others, into, backend)
 
 
 @_plane_sweep.register_fake
-def _(images, intrinsics, cam_to_world, stride, planes, neighbors, backend, ranges):
-    shape = (*images.shape[:2], images.shape[-2] // stride, images.shape[-1] // stride)
-    maps = (images.new_empty(shape) for _ in range(4))
-    return *maps, images.new_empty(shape, dtype=torch.bool)
+def _(images, intrinsics, cam_to_world, planes, neighbors, backend, ranges):
+    return tuple(torch.empty_like(images[:, :, 0]) for _ in range(6))
 
 
-def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbors: int) -> None:
+def _check(images: Tensor, cameras: Cameras, planes: int, neighbors: int) -> None:
     expected = (*cameras.intrinsics.shape[:-2], 3, cameras.height, cameras.width)
     if images.ndim != 5 or tuple(images.shape) != expected:
         raise InputError(
@@ -202,11 +191,6 @@ def _check(images: Tensor, cameras: Cameras, stride: int, planes: int, neighbors
         )
     if images.is_cpu and not is_fake(images):  # on a GPU it would wait for the device
         cameras.validate("plane_sweep's cameras")
-    if stride < 1 or cameras.height % stride or cameras.width % stride:
-        raise InputError(
-            f"plane_sweep got stride={stride} for images of {cameras.height}x{cameras.width}: give "
-            "a number that divides both."
-        )
     if planes < 4 or neighbors < 1:
         raise InputError(
             f"plane_sweep got planes={planes} and neighbors={neighbors}: give at least 4 planes "
@@ -232,7 +216,7 @@ def shrink(
     return reduce(torch.add, (rows[..., k::right] for k in range(right))) / (down * right)
 
 
-def edges(images: Float[Tensor, "B V 3 h w"]) -> Float[Tensor, "B V 2 h w"]:
+def edges(images: Float[Tensor, "B V 3 H W"]) -> Float[Tensor, "B V 2 H W"]:
     """Return the mean absolute color difference to the left pixel, and to the pixel above."""
     left = F.pad(images.diff(dim=-1).abs().mean(2), (1, 0))
     above = F.pad(images.diff(dim=-2).abs().mean(2), (0, 0, 1, 0))

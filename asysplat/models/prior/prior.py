@@ -13,29 +13,26 @@ from asysplat.scene import TensorRecord, Views
 
 PRIOR_CHANNELS = 2
 UNKNOWN_DISTANCE = 10**0.5  # the middle of PhotographHead's range
-COVER = 0.95  # opacity of a surface, over all views that are confident of it,
-UNSURE_COVER = 0.7  # and over all views that contain the point where none is confident
-FREE_TOLERANCE = 0.05  # relative, of two inverse depths: beyond it one is seen through,
-FREE_OPACITY = 1e-4  # and has an opacity too small to be drawn
+VOTE_TOLERANCE = 0.05  # relative, of two inverse depths of the same surface
+COVER = 0.9  # opacity of a surface, over all views that confirm it,
+UNSURE_COVER = 0.7  # and where no depth is sure, over all views that may see it
+FREE_OPACITY = 1e-4  # in free space: too small to be drawn
 SURROUNDINGS = 0.05  # weight of a pixel's surroundings against its own depth at full confidence
 
 
 @dataclass(frozen=True)
-class DepthEstimate(TensorRecord):
+class DepthEstimate:
     """Depths of all views, and how many other views confirm them.
 
     Args:
         inverse_depth: 1 / depth along the camera's z axis, > 0; 0 where no depth is known.
         confidence: in [0, 1]; 0 where no other view confirms the depth.
-        agreeing, containing: see `Consistency`.
-        free: whether the point is in free space, see `in_free_space`.
+        votes: see `count_votes`.
     """
 
     inverse_depth: Float[Tensor, "*batch V h w"]
     confidence: Float[Tensor, "*batch V h w"]
-    agreeing: Float[Tensor, "*batch V h w"]
-    containing: Float[Tensor, "*batch V h w"]
-    free: Bool[Tensor, "*batch V h w"]
+    votes: Consistency
 
 
 @dataclass(frozen=True)
@@ -55,10 +52,16 @@ class Prior(TensorRecord):
 
     @classmethod
     def of_estimate(cls, depth: DepthEstimate, views: Views, size: tuple[int, int]) -> "Prior":
-        """Return the prior of estimated depths, resized to the grid's size."""
-        alone = (depth.containing == 0).to(depth.confidence)
-        sure = _share(COVER, depth.agreeing).logit()
-        unsure = _share(UNSURE_COVER, depth.containing).logit()
+        """Return the prior of estimated depths, resized to the grid's size.
+
+        Each view's share of a surface's opacity follows from the number of views that confirm it;
+        where no depth is sure, from the number of views that contain the point and do not see
+        another surface in front of it.
+        """
+        votes = depth.votes
+        alone = (votes.containing == 0).to(depth.confidence)
+        sure = _share(COVER, votes.agreeing).logit()
+        unsure = _share(UNSURE_COVER, votes.containing - votes.occluding).logit()
         opacity = unsure + (sure - unsure) * torch.maximum(depth.confidence, alone)
         inverse, confidence, opacity = (
             F.interpolate(each, size, mode="bilinear")
@@ -66,7 +69,7 @@ class Prior(TensorRecord):
         )
         length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
         distance = torch.where(inverse > 0, length / inverse.clamp_min(1e-6), UNKNOWN_DISTANCE)
-        free = F.interpolate(depth.free.to(opacity), size) > 0.5
+        free = F.interpolate(in_free_space(votes).to(opacity), size) > 0.5
         return cls(distance, confidence, opacity.sigmoid().masked_fill(free, FREE_OPACITY))
 
     @classmethod
@@ -82,12 +85,8 @@ class Prior(TensorRecord):
         inverse = fill_unknown(inverse, weight)
         others = other_views(count, scenes, inverse.device)
         projections = Projections.between(views.cameras).into(others, *size)
-        steps = torch.zeros_like(inverse[..., 0, 0])
-        kernels = load_backend("auto", inverse)
-        found: Consistency = kernels.consistency(inverse, steps, confidence, others, projections)
-        free = in_free_space(inverse, confidence, others, projections)
-        estimate = DepthEstimate(inverse, confidence, found.agreeing, found.containing, free)
-        return cls.of_estimate(estimate, views, tuple(size))
+        votes = count_votes(inverse, confidence, others, projections)
+        return cls.of_estimate(DepthEstimate(inverse, confidence, votes), views, tuple(size))
 
     def features(self, height: int, width: int) -> Float[Tensor, "B V H W 2"]:
         """Return the log distance relative to the scene's median, and the confidence.
@@ -102,17 +101,14 @@ class Prior(TensorRecord):
         )
 
 
-def in_free_space(
+def count_votes(
     inverse: Float[Tensor, "B V h w"],
     trust: Float[Tensor, "B V h w"],
     others: Int[Tensor, "B V K"],
     projections: Float[Tensor, "B V K 3 4"],
     backend: str = "auto",
-) -> Bool[Tensor, "B V h w"]:
-    """Return the pixels whose point other views see through, to a surface behind it.
-
-    They exceed twice those that confirm it by more than one, each counted as much as it is trusted:
-    what a single view knows is kept, and what one other view denies.
+) -> Consistency:
+    """Count for each pixel's point the views that see it, that see through it, or that do not.
 
     Args:
         inverse, trust, others, projections: see `asysplat.ops.plane_sweep.reference.consistency`.
@@ -120,8 +116,16 @@ def in_free_space(
     """
     consistency = load_backend(backend, inverse).consistency
     steps = torch.zeros_like(inverse[..., 0, 0])
-    found = consistency(inverse, steps, trust, others, projections, tolerance=FREE_TOLERANCE)
-    return found.contradicting > 2 * found.agreeing + 1
+    return consistency(inverse, steps, trust, others, projections, tolerance=VOTE_TOLERANCE)
+
+
+def in_free_space(votes: Consistency) -> Bool[Tensor, "B V h w"]:
+    """Return the pixels whose point other views see through, to a surface behind it.
+
+    They exceed twice those that confirm it by more than one: what a single view knows is kept, and
+    what one other view denies.
+    """
+    return votes.contradicting > 2 * votes.agreeing + 1
 
 
 def other_views(views: int, scenes: int, device: torch.device) -> Int[Tensor, "B V K"]:

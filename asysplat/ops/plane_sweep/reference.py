@@ -10,10 +10,11 @@ from torch import Tensor
 
 WINDOW = 5  # pixels along a side of the compared patches
 BEST = 2  # neighbors that count at each plane: in the others the point may be occluded
-UNSEEN = 1.0  # the cost of a point outside a neighbor's image: that of unrelated patches
+UNMATCHED = 0.8  # greatest cost, that of unrelated patches or of a point that no neighbor sees
+SECOND = 0.15  # greatest cost of the second best neighbor over the best: it may not see the point
 NOISE = 3e-4  # variance of a patch without texture
 SMALL_STEP = 0.1  # SGM's penalty for one plane more or less than the pixel before
-LARGE_STEP = 0.6  # and for more than one plane,
+LARGE_STEP = 1.0  # and for more than one plane,
 EDGE = 0.05  # which halves where the color changes by this
 MIN_WEIGHT = 0.05  # of a pixel's own costs
 MIN_BEND = 1e-9  # curvature of a parabola that has a minimum
@@ -35,11 +36,13 @@ class Consistency(NamedTuple):
     Args:
         agreeing: views with the same depth at the pixel's point.
         contradicting: views that see through the point, to a surface behind it.
+        occluding: views that see a surface in front of the point.
         containing: views whose image contains the point, visible or occluded, each counted as 1.
     """
 
     agreeing: Float[Tensor, "B V h w"]
     contradicting: Float[Tensor, "B V h w"]
+    occluding: Float[Tensor, "B V h w"]
     containing: Float[Tensor, "B V h w"]
 
 
@@ -49,17 +52,17 @@ def cost_volume(
     projections: Float[Tensor, "B V K 3 4"],
     ranges: Float[Tensor, "B V 2"],
     planes: int,
-    stride: int,
-) -> Float[Tensor, "B V h w D"]:
-    """Compute the matching cost of each pixel with its neighbors at every plane, from 0 to 2.
+) -> Float[Tensor, "B V H W D"]:
+    """Compute the matching cost of each pixel with its neighbors at every plane, in [0, UNMATCHED].
 
     1 - the zero-mean normalized cross-correlation of patches, which is independent of exposure; the
-    mean of the best two neighbors, averaged over blocks of `stride`.
+    mean of the best two neighbors whose images contain the point. The second's is at most the
+    best's + SECOND, so that a neighbor that does not see a plane hardly counts against it.
     """
     B, V, H, W = images.shape
     # An image's small variances would be lost beside large squares.
     images = images - images.mean((-2, -1), keepdim=True)
-    costs = images.new_empty(B, V, H // stride, W // stride, planes)
+    costs = images.new_empty(B, V, H, W, planes)
     pixels = _pixels(H, W, images)
     for b in range(B):
         for v in range(V):
@@ -71,11 +74,13 @@ def cost_volume(
                 for other, matrix in zip(neighbors[b, v].tolist(), projections[b, v], strict=True)
                 if other >= 0
             ]
-            unseen = images.new_full((planes, H, W), UNSEEN)
+            unseen = images.new_full((planes, H, W), torch.inf)
             while len(matched) < BEST:
                 matched.append(unseen)
-            best = torch.stack(matched).sort(dim=0).values[:BEST].mean(0)
-            costs[b, v] = F.avg_pool2d(best, stride).permute(1, 2, 0)
+            first, second = torch.stack(matched).sort(dim=0).values[:BEST]
+            first = first.clamp_max(UNMATCHED)
+            second = torch.minimum(second, (first + SECOND).clamp_max(UNMATCHED))
+            costs[b, v] = ((first + second) / 2).permute(1, 2, 0)
     return costs
 
 
@@ -86,7 +91,7 @@ def _compare(
     pixels: Float[Tensor, "3 H W"],
     inverse: Float[Tensor, "D"],
 ) -> Float[Tensor, "D H W"]:
-    """Return the cost of one neighbor at every plane; UNSEEN outside its image."""
+    """Return the cost of one neighbor at every plane; infinite outside its image."""
     H, W = image.shape
     flat = torch.einsum("ij,jyx->iyx", matrix[:, :3], pixels)
     points = flat + inverse[:, None, None, None] * matrix[:, 3, None, None]
@@ -103,7 +108,7 @@ def _compare(
     variance = patch_mean(image**2) - mean**2
     other_variance = patch_mean(warped**2) - other_mean**2
     norm = (variance.clamp_min(0) + NOISE) * (other_variance.clamp_min(0) + NOISE)
-    return torch.where(visible, 1 - both / norm.sqrt(), UNSEEN)
+    return torch.where(visible, 1 - both / norm.sqrt(), torch.inf)
 
 
 def patch_mean(values: Float[Tensor, "*more H W"]) -> Float[Tensor, "*more H W"]:
@@ -211,9 +216,9 @@ def consistency(
         half_step = steps[scene, view][..., None, None] / 2
         apart = torch.maximum(half_step, tolerance * inverse[place])
         agree = inside & (nearer.abs() <= apart)
-        contradict = inside & (nearer > apart)
+        contradict, occlude = inside & (nearer > apart), inside & (nearer < -apart)
         weight = trust[place]
-        counts = (agree * weight, contradict * weight, inside.to(weight))
+        counts = (agree * weight, contradict * weight, occlude * weight, inside.to(weight))
         return Consistency(*(each.sum(2) for each in counts))
 
     chunk = max(1, PIXELS_AT_ONCE // inverse.numel())

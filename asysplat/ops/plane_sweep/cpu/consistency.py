@@ -87,7 +87,8 @@ def count_views(start, stop, inputs, views, counts):
             for x in range(0, w, LANES):
                 count = min(LANES, w - x)
                 column, depth = load_some(columns, x, count), load_some(own, x, count)
-                agreeing, contradicting, containing = zeros(), zeros(), zeros()
+                agreeing, contradicting = zeros(), zeros()
+                occluding, containing = zeros(), zeros()
                 for k in range(inputs.others.shape[1]):
                     if inputs.others[n, k] < 0:
                         continue
@@ -106,10 +107,13 @@ def count_views(start, stop, inputs, views, counts):
                     nearer = depth * scale - stored
                     limit = max(stored * inputs.tolerance, inputs.steps[other] * HALF)
                     weight = where(inside, trust, ZERO)
-                    apart = max(nearer, ZERO - nearer)
+                    farther = ZERO - nearer
+                    apart = max(nearer, farther)
                     agreeing = agreeing + where(less(limit, apart), ZERO, weight)
                     contradicting = contradicting + where(less(limit, nearer), weight, ZERO)
+                    occluding = occluding + where(less(limit, farther), weight, ZERO)
                     containing = containing + where(inside, ONE, ZERO)
                 store_some(counts.agreeing[n, y], x, count, agreeing)
                 store_some(counts.contradicting[n, y], x, count, contradicting)
+                store_some(counts.occluding[n, y], x, count, occluding)
                 store_some(counts.containing[n, y], x, count, containing)

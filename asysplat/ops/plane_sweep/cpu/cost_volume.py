@@ -38,7 +38,7 @@ NOISE = np.float32(reference.NOISE * WINDOW**4)  # in the variance of sums
 BUFFER = WINDOW + 1  # rows that two rows of patches need
 HALF = np.float32(0.5)
 FRONT = np.float32(reference.FRONT)
-UNSEEN = np.float32(reference.UNSEEN)
+UNMATCHED, SECOND = np.float32(reference.UNMATCHED), np.float32(reference.SECOND)
 INFINITY = np.float32(np.inf)
 
 
@@ -48,35 +48,32 @@ def cost_volume(
     projections: Float[Tensor, "B V K 3 4"],
     ranges: Float[Tensor, "B V 2"],
     planes: int,
-    stride: int,
-) -> Float[Tensor, "B V h w D"]:
+) -> Float[Tensor, "B V H W D"]:
     """Compute the costs in float32; see `reference.cost_volume`."""
     B, V, H, W = images.shape
     inputs = prepare(images, neighbors, projections, ranges, planes)
-    costs = torch.empty(B * V, H // stride, W // stride, planes)
+    costs = torch.empty(B * V, H, W, planes)
     run_blocks(
         cost_planes,
         even_bounds(B * V * (inputs.inverse.shape[1] // LANES)),
         CostInputs(*(tensor.numpy() for tensor in inputs)),
-        stride,
         costs.numpy(),
     )
     return costs.unflatten(0, (B, V))
 
 
 @kernel
-def cost_planes(start, stop, inputs, stride, costs):
+def cost_planes(start, stop, inputs, costs):
     """Write the costs of the blocks start to stop, counted over [views, vectors of planes].
 
     Args:
         inputs: see `CostInputs`.
-        costs: [n, h, w, D].
+        costs: [n, H, W, D].
     """
     H, W = inputs.images.shape[1:]
-    h, w, planes = costs.shape[1:]
+    planes = costs.shape[-1]
     K = inputs.neighbors.shape[1]
     vectors = inputs.inverse.shape[1] // LANES
-    share = np.float32(0.5 / (stride * stride))
     # A place for each of the last rows of each neighbor.
     warped = np.empty((K, BUFFER, W, LANES), np.float32)
     visible = np.empty((K, BUFFER, W), np.uint16)
@@ -86,24 +83,20 @@ def cost_planes(start, stop, inputs, stride, costs):
     # Of the patches of these rows.
     offsets, scales = np.empty((2, W), np.float32), np.empty((2, W), np.float32)
     along = np.empty((2, W + WINDOW - 1), np.float32)
-    sums = np.empty((w, LANES), np.float32)
     for block in range(start, stop):
         view, vector = block // vectors, block % vectors
         depth = load(inputs.inverse[view], vector)
         image = inputs.images[view]
-        number = 0
         for k in range(K):
             if inputs.neighbors[view, k] >= 0:
-                number += 1
                 for y in range(H):
                     _find_span(spans[k, y], inputs.projections[view, k], y, depth, H, W)
         for y in range(0, H, 2):
-            # With fewer than two neighbors the others count as unseen.
             for row in range(2):
                 _describe_row(offsets[row], scales[row], image, min(y + row, H - 1), along)
                 for x in range(W):
-                    store(first[row], x, zeros() + (UNSEEN if number < 2 else INFINITY))
-                    store(second[row], x, zeros() + (UNSEEN if number < 1 else INFINITY))
+                    store(first[row], x, zeros() + INFINITY)
+                    store(second[row], x, zeros() + INFINITY)
             for k in range(K):
                 if inputs.neighbors[view, k] < 0:
                     continue
@@ -121,18 +114,12 @@ def cost_planes(start, stop, inputs, stride, costs):
                 patches = (image, offsets, scales)
                 _compare_rows(first, second, patches, y, warped[k], visible[k], spans[k])
             for row in range(y, min(y + 2, H)):
-                if row % stride == 0:
-                    sums[:] = ZERO
-                for i in range(w):
-                    both = load(sums, i)
-                    for x in range(i * stride, (i + 1) * stride):
-                        both = both + (load(first[row - y], x) + load(second[row - y], x))
-                    store(sums, i, both)
-                if row % stride == stride - 1:
-                    for i in range(w):
-                        place = ((view * h + row // stride) * w + i) * planes + vector * LANES
-                        width = min(LANES, planes - vector * LANES)
-                        store_some(costs, place, width, load(sums, i) * share)
+                for x in range(W):
+                    best = min(load(first[row - y], x), UNMATCHED)
+                    next_best = min(load(second[row - y], x), min(best + SECOND, UNMATCHED))
+                    place = ((view * H + row) * W + x) * planes + vector * LANES
+                    width = min(LANES, planes - vector * LANES)
+                    store_some(costs, place, width, (best + next_best) * HALF)
 
 
 @inline
@@ -196,11 +183,6 @@ def _compare_rows(first, second, patches, y, warped, visible, spans):
     below = min(y + 1, H - 1)
     begin = min(spans[y, 0], spans[below, 0])
     end = max(begin, spans[y, 1], spans[below, 1])
-    for row in range(2):
-        for x in range(begin):
-            _merge(first[row], second[row], x, UNSEEN + zeros())
-        for x in range(end, W):
-            _merge(first[row], second[row], x, UNSEEN + zeros())
     top, bottom = max(y - AROUND, 0), min(y + AROUND + 1, H - 1)
     # Sums along the last columns: of the neighbor, its square, its product with the view.
     nothing = (zeros(), zeros(), zeros(), zeros())
@@ -216,11 +198,11 @@ def _compare_rows(first, second, patches, y, warped, visible, spans):
         x = right - AROUND
         if x >= begin:
             sums = (_sum(a, upper[0]), _sum(b, upper[1]), _sum(c, upper[2]))
-            cost = where(visible[y % BUFFER, x], _cost(sums, offsets[0, x], scales[0, x]), UNSEEN)
+            cost = where(visible[y % BUFFER, x], _cost(sums, offsets[0, x], scales[0, x]), INFINITY)
             _merge(first[0], second[0], x, cost)
             sums = (_sum(d, lower[0]), _sum(e, lower[1]), _sum(f, lower[2]))
             cost = _cost(sums, offsets[1, x], scales[1, x])
-            _merge(first[1], second[1], x, where(visible[below % BUFFER, x], cost, UNSEEN))
+            _merge(first[1], second[1], x, where(visible[below % BUFFER, x], cost, INFINITY))
         a, b, c = _advance(a, upper[0]), _advance(b, upper[1]), _advance(c, upper[2])
         d, e, f = _advance(d, lower[0]), _advance(e, lower[1]), _advance(f, lower[2])
 

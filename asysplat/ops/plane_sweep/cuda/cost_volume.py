@@ -17,8 +17,9 @@ AROUND = tl.constexpr(reference.WINDOW // 2)
 EARLIER = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch
 SHARE = tl.constexpr(1 / reference.WINDOW**2)  # of a pixel in a patch
 FRONT, NOISE = tl.constexpr(reference.FRONT), tl.constexpr(reference.NOISE)
-UNSEEN, INFINITY = tl.constexpr(reference.UNSEEN), tl.constexpr(float("inf"))
-TILE, BAND = (8192, 1024) if INTERPRETED else (128, 16)  # columns x planes; rows of blocks
+UNMATCHED, SECOND = tl.constexpr(reference.UNMATCHED), tl.constexpr(reference.SECOND)
+INFINITY = tl.constexpr(float("inf"))
+TILE, BAND = (8192, 1024) if INTERPRETED else (128, 16)  # columns x planes; rows
 
 
 def cost_volume(
@@ -27,20 +28,18 @@ def cost_volume(
     projections: Float[Tensor, "B V K 3 4"],
     ranges: Float[Tensor, "B V 2"],
     planes: int,
-    stride: int,
-) -> Float[Tensor, "B V h w D"]:
+) -> Float[Tensor, "B V H W D"]:
     """Compute the costs in float32; see `reference.cost_volume`."""
     B, V, H, W = images.shape
-    h, w = H // stride, W // stride
     inputs = prepare(images, neighbors, projections, ranges, planes)
     means = reference.patch_mean(inputs.images)
     variances = (reference.patch_mean(inputs.images**2) - means**2).clamp_min(0)
-    costs = images.new_zeros(B * V, h, w, planes)
+    costs = images.new_empty(B * V, H, W, planes)
     tile_planes = min(triton.next_power_of_2(planes), TILE)
-    columns = min(triton.next_power_of_2(w), TILE // tile_planes)
-    tiles = -(-w // columns) * -(-planes // tile_planes)
+    columns = min(triton.next_power_of_2(W), TILE // tile_planes)
+    tiles = -(-W // columns) * -(-planes // tile_planes)
     with torch.cuda.device_of(images):
-        cost_band[(tiles, -(-h // BAND), B * V)](
+        cost_band[(tiles, -(-H // BAND), B * V)](
             *inputs,
             means=means,
             scales=(variances + reference.NOISE).rsqrt(),
@@ -49,7 +48,6 @@ def cost_volume(
             width=W,
             planes=planes,
             padded_planes=inputs.inverse.shape[1],
-            stride=stride,
             K=neighbors.shape[2],
             COLUMNS=columns,
             PLANES=tile_planes,
@@ -73,13 +71,12 @@ def cost_band(
     width,
     planes,
     padded_planes,
-    stride,
     K: tl.constexpr,
     COLUMNS: tl.constexpr,
     PLANES: tl.constexpr,
     BAND: tl.constexpr,
 ):
-    """Add to zeros the costs [n, h, w, D] of COLUMNS x PLANES in BAND rows.
+    """Write the costs [n, H, W, D] of COLUMNS x PLANES in BAND rows.
 
     Args:
         images, padded, neighbors, projections, inverse: see `CostInputs`.
@@ -87,65 +84,54 @@ def cost_band(
     """
     view = tl.program_id(2).to(tl.int64)
     parts = tl.cdiv(planes, PLANES)
-    block = tl.program_id(0) // parts * COLUMNS + tl.arange(0, COLUMNS)
+    column = tl.program_id(0) // parts * COLUMNS + tl.arange(0, COLUMNS)
     plane = tl.program_id(0) % parts * PLANES + tl.arange(0, PLANES)
     depth = tl.load(inverse + view * padded_planes + plane, mask=plane < planes, other=0.0)[None, :]
-    number = 0
-    for k in tl.static_range(K):
-        number += (tl.load(neighbors + view * K + k) >= 0).to(tl.int32)
-    begin = tl.program_id(1) * BAND * stride
-    rows = tl.minimum(BAND * stride, height - begin)
+    x = tl.minimum(column, width - 1)
+    begin = tl.program_id(1) * BAND
+    rows = tl.minimum(BAND, height - begin)
     nothing = tl.zeros((COLUMNS, PLANES), tl.float32)
-    for part in range(stride):
-        x = tl.minimum(block * stride + part, width - 1)
-        sums = ()
-        for _ in tl.static_range(K * EARLIER):
-            sums = sums + ((nothing, nothing, nothing),)
-        total = nothing
-        for step in range(rows + 2 * AROUND):
-            y = begin + step - 2 * AROUND  # all rows of its patch are summed now
-            row = tl.minimum(tl.maximum(y + AROUND, 0), height - 1)
-            middle = tl.minimum(tl.maximum(y, 0), height - 1)
-            pixel = (view * height + middle) * width + x
-            mean, scale = tl.load(means + pixel)[:, None], tl.load(scales + pixel)[:, None]
-            # With fewer than two neighbors the others count as unseen.
-            first = nothing + tl.where(number < 2, UNSEEN, INFINITY)
-            second = nothing + tl.where(number < 1, UNSEEN, INFINITY)
-            buffered = ()
-            for k in tl.static_range(K):
-                neighbor = tl.load(neighbors + view * K + k).to(tl.int64)
-                other = padded + tl.maximum(neighbor, 0) * (height + 1) * (width + 1)
-                matrix = projections + (view * K + k) * 12
-                line = images + (view * height + row) * width
-                a, b, c = add_row(line, other, matrix, x, row, depth, height, width)
-                total_a, total_b, total_c = a, b, c
-                for j in tl.static_range(EARLIER):
-                    earlier = sums[k * EARLIER + j]
-                    total_a += earlier[0]
-                    total_b += earlier[1]
-                    total_c += earlier[2]
-                    if j > 0:
-                        buffered = buffered + (earlier,)
-                buffered = buffered + ((a, b, c),)
-                u, v, z = project(factors_at(matrix, middle), x, depth)
-                visible = (z > FRONT) & (u > 0) & (u < width) & (v > 0) & (v < height)
-                other_mean = total_a * SHARE
-                both = total_c * SHARE - mean * other_mean
-                variance = tl.maximum(total_b * SHARE - other_mean * other_mean, 0.0) + NOISE
-                cost = tl.where(visible, 1 - both * scale / tl.sqrt(variance), UNSEEN)
-                cost = tl.where(neighbor >= 0, cost, INFINITY)
-                second = tl.minimum(second, tl.maximum(first, cost))
-                first = tl.minimum(first, cost)
-            sums = buffered
-            total = tl.where(y % stride == 0, 0.0, total) + 0.5 * (first + second)
-            limit = tl.where((y >= begin) & (y % stride == stride - 1), width, 0)
-            done = (block * stride < limit)[:, None] & (plane < planes)[None, :]
-            blocks = ((view * (height // stride) + y // stride) * (width // stride) + block)[
-                :, None
-            ]
-            place = costs + blocks * planes + plane[None, :]
-            before = tl.load(place, mask=done, other=0.0)
-            tl.store(place, before + total / (stride * stride), mask=done)
+    sums = ()
+    for _ in tl.static_range(K * EARLIER):
+        sums = sums + ((nothing, nothing, nothing),)
+    for step in range(rows + 2 * AROUND):
+        y = begin + step - 2 * AROUND  # all rows of its patch are summed now
+        row = tl.minimum(tl.maximum(y + AROUND, 0), height - 1)
+        middle = tl.minimum(tl.maximum(y, 0), height - 1)
+        pixel = (view * height + middle) * width + x
+        mean, scale = tl.load(means + pixel)[:, None], tl.load(scales + pixel)[:, None]
+        first, second = nothing + INFINITY, nothing + INFINITY
+        buffered = ()
+        for k in tl.static_range(K):
+            neighbor = tl.load(neighbors + view * K + k).to(tl.int64)
+            other = padded + tl.maximum(neighbor, 0) * (height + 1) * (width + 1)
+            matrix = projections + (view * K + k) * 12
+            line = images + (view * height + row) * width
+            a, b, c = add_row(line, other, matrix, x, row, depth, height, width)
+            total_a, total_b, total_c = a, b, c
+            for j in tl.static_range(EARLIER):
+                earlier = sums[k * EARLIER + j]
+                total_a += earlier[0]
+                total_b += earlier[1]
+                total_c += earlier[2]
+                if j > 0:
+                    buffered = buffered + (earlier,)
+            buffered = buffered + ((a, b, c),)
+            u, v, z = project(factors_at(matrix, middle), x, depth)
+            visible = (z > FRONT) & (u > 0) & (u < width) & (v > 0) & (v < height)
+            other_mean = total_a * SHARE
+            both = total_c * SHARE - mean * other_mean
+            variance = tl.maximum(total_b * SHARE - other_mean * other_mean, 0.0) + NOISE
+            cost = 1 - both * scale / tl.sqrt(variance)
+            cost = tl.where(visible & (neighbor >= 0), cost, INFINITY)
+            second = tl.minimum(second, tl.maximum(first, cost))
+            first = tl.minimum(first, cost)
+        sums = buffered
+        first = tl.minimum(first, UNMATCHED)
+        second = tl.minimum(second, tl.minimum(first + SECOND, UNMATCHED))
+        done = (column < tl.where(y >= begin, width, 0))[:, None] & (plane < planes)[None, :]
+        place = costs + ((view * height + y) * width + column)[:, None] * planes + plane[None, :]
+        tl.store(place, 0.5 * (first + second), mask=done)
 
 
 @kernel
