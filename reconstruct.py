@@ -69,7 +69,7 @@ def reconstruct(config: DictConfig) -> None:
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
     photographs = open_photographs(config.path, **{name: config[name] for name in names})
     print(describe(config, photographs, limit))
-    gaussians = initialize(config, photographs, settings.max_gaussians or sys.maxsize)
+    gaussians = initialize(config, photographs, settings)
     background = mean_color(photographs.inputs)
     results.save_start(gaussians, photographs, background)
     with RefinementDisplay(photographs.inputs, config.view) as display:
@@ -128,7 +128,9 @@ def read_limit(config: DictConfig) -> dict[str, float]:
     return {name: value if name == "steps" else float(value)}
 
 
-def initialize(config: DictConfig, photographs: Photographs, max_gaussians: int) -> Gaussians:
+def initialize(
+    config: DictConfig, photographs: Photographs, settings: RefinementSettings
+) -> Gaussians:
     """Build the Gaussians to refine, in the network's frame."""
     init = config.init or best_init(photographs.inputs.num_views)
     network = None
@@ -144,7 +146,7 @@ def initialize(config: DictConfig, photographs: Photographs, max_gaussians: int)
     if init not in INITS and Path(init).suffix:
         gaussians = photographs.frame.to_network(read_gaussians(init, photographs.origin))
     else:
-        gaussians = initial_gaussians(init, photographs, max_gaussians, network)
+        gaussians = initial_gaussians(init, photographs, settings, network)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
     if network is not None and network.early_exit_shares:
         shares = (f"{share:.0%} of {name}" for name, share in network.early_exit_shares.items())

@@ -170,7 +170,7 @@ class Refined:
 
         def run(scene: Photographs) -> Tensor:
             scene = select_inputs(scene, self.views, self.side)
-            gaussians = initial_gaussians(self.init, scene, settings.max_gaussians, net)
+            gaussians = initial_gaussians(self.init, scene, settings, net)
             color = mean_color(scene.inputs)
             if self.steps != 0:
                 gaussians = refine(gaussians, scene.inputs, settings, background=color, **limit)

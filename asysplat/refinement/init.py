@@ -15,6 +15,7 @@ from asysplat.models.prior.prior import FREE_OPACITY
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import SPREAD, merge_to_limit
 from asysplat.refinement.photographs import Photographs
+from asysplat.refinement.settings import RefinementSettings
 from asysplat.refinement.views import resize
 from asysplat.scene import Gaussians, Views
 
@@ -33,12 +34,15 @@ def best_init(num_views: int) -> str:
 
 @torch.no_grad()
 def initial_gaussians(
-    init: str, photographs: Photographs, max_gaussians: int, network: Network | None = None
+    init: str,
+    photographs: Photographs,
+    settings: RefinementSettings,
+    network: Network | None = None,
 ) -> Gaussians:
-    """Build at most `max_gaussians` Gaussians, in the network's frame.
+    """Build the Gaussians that a refinement with `settings` starts from, in the network's frame.
 
     Gaussians of several views on the same surface are merged, in cells of a pixel of the network's
-    input or of the prior's depth map.
+    input or of the prior's depth map, or larger ones: `RefinementSettings.initial_limit`.
 
     Raises:
         InputError: `init` is none of INITS, or needs points or depths that the photographs lack.
@@ -70,7 +74,7 @@ def initial_gaussians(
         pixels = longest / max(prior.distance.shape[-2:])
     else:
         raise InputError(f"init={init}: choose {', '.join(INITS)}, or a file of Gaussians.")
-    return merge_to_limit(gaussians, views.cameras, max(1.0, pixels), max_gaussians)
+    return merge_to_limit(gaussians, views.cameras, max(1.0, pixels), settings.initial_limit)
 
 
 def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:

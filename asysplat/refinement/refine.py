@@ -4,7 +4,6 @@ The paper's post-optimization is the setting `PAPER`.
 """
 
 import math
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -33,7 +32,6 @@ from asysplat.refinement.views import mean_color, resize
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
-PIXELS_PER_GAUSSIAN = 8  # of the input images, at least: with fewer, Gaussians fit noise
 VIEWS_PER_ROUND = 8  # rendered to find pixels with large errors
 
 
@@ -84,10 +82,7 @@ class Refinement:
         self._steps = 0
         self._last_visible = torch.zeros(len(self.fields), dtype=torch.long)
         self._screen_gradients = ScreenGradients(self.fields)
-        pixels = views.images[:, 0].numel()
-        limit = pixels // PIXELS_PER_GAUSSIAN
-        allowed = settings.max_gaussians
-        self._max_gaussians = sys.maxsize if allowed is None else min(allowed, limit)
+        self._max_gaussians = settings.limit(views.images[:, 0].numel())
 
     @property
     def gaussians(self) -> Gaussians:

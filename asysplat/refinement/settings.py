@@ -1,6 +1,7 @@
 """Settings of a refinement: learning rates, loss, schedule and densification."""
 
 import math
+import sys
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -8,6 +9,7 @@ from asysplat.errors import InputError
 
 Densify = Literal["error", "mcmc", "gradient", "none"]
 Unit = Literal["pixel", "scene"]
+PIXELS_PER_GAUSSIAN = 8  # of the input images, at least: with fewer, Gaussians fit noise
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,22 @@ class RefinementSettings:
     def _check(self, name: str, valid: bool, fix: str) -> None:
         if not valid:
             raise InputError(f"refinement.{name}={getattr(self, name)}: {fix}.")
+
+    def limit(self, pixels: int) -> int:
+        """Return the greatest number of Gaussians for input images of so many pixels together."""
+        if self.max_gaussians is None:
+            return sys.maxsize
+        return min(self.max_gaussians, pixels // PIXELS_PER_GAUSSIAN)
+
+    @property
+    def initial_limit(self) -> int:
+        """The greatest number of Gaussians to start from: so that the rounds grow it to the limit.
+
+        With more the limit would be reached earlier, and the steps until then would take longer.
+        """
+        if self.max_gaussians is None or self.densify not in ("error", "mcmc"):
+            return self.max_gaussians or sys.maxsize
+        return max(1, int(self.max_gaussians / (1 + self.growth) ** self.rounds))
 
     def max_steps(self, num_views: int) -> float:
         """Return the steps after which each image was used `max_steps_per_image` times."""

@@ -218,6 +218,18 @@ def test_densification_keeps_to_its_limit_and_growth(kind, limit, most):
         assert all(b <= 1.25 * a for a, b in pairwise(counts))
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_rounds_grow_the_greatest_initial_number_of_gaussians_to_the_limit(kind):
+    settings = RefinementSettings(densify=kind, rounds=9, growth=0.25, max_gaussians=50_000)
+    first = settings.initial_limit
+    if kind in ("error", "mcmc"):
+        assert first * 1.25**9 <= 50_000 < (first + 1) * 1.25**9
+        assert replace(settings, max_gaussians=1).initial_limit == 1
+    else:
+        assert first == 50_000
+    assert replace(settings, max_gaussians=None).initial_limit > 10**9
+
+
 def test_pruned_gaussians_are_replaced():
     """In a long refinement more would be lost between two rounds than one adds."""
     start = small_scene()

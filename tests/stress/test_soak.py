@@ -77,7 +77,7 @@ if __name__ == "__main__":
     with poisoned(FILLS[0] if checked else None):
         photographs = open_photographs(scene, SIDE, SIDE, held_out_every=None)
         views = photographs.inputs
-        start = initial_gaussians("plane_sweep", photographs, RefinementSettings().max_gaussians)
+        start = initial_gaussians("plane_sweep", photographs, RefinementSettings())
         end = refine_and_draw(views, start, steps)
         images = [render(gaussians, views.cameras).image for gaussians in (start, end)]
     flat = BASELINES["mean_color"](views, views)
