@@ -1,7 +1,5 @@
 """The Gaussians that a refinement starts from."""
 
-from dataclasses import replace
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -11,12 +9,12 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
-from asysplat.models.prior.prior import FREE_OPACITY
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import SPREAD, merge_to_limit
 from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.settings import RefinementSettings
 from asysplat.refinement.views import resize
+from asysplat.rendering import INRIA
 from asysplat.scene import Gaussians, Views
 
 INITS = ("network", "plane_sweep", "points", "depth")
@@ -57,7 +55,8 @@ def initial_gaussians(
             )
         gaussians = gaussians_from_points(photographs.points, views)
     elif init == "network":
-        gaussians = network.eval()(_resize(views, NETWORK_MAX_SIDE, network.patch))
+        small = _resize(views, NETWORK_MAX_SIDE, network.patch)
+        gaussians = without_invisible(network.eval()(small))
         pixels = longest / PRIOR_MAX_SIDE
     elif init in ("plane_sweep", "depth"):
         if init == "depth" and views.depths is None:
@@ -80,8 +79,7 @@ def initial_gaussians(
 def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:
     """Place an isotropic Gaussian at the surface point of each pixel of a prior's depth maps.
 
-    Pixels in free space get none, and those that are masked out, wholly or in part, unless that is
-    all of them.
+    Those of opacities that are too small to be drawn are left out, unless that is all of them.
     """
     size = tuple(prior.distance.shape[-2:])
     cameras = views.cameras.resized(*size)
@@ -94,10 +92,13 @@ def gaussians_from_prior(views: Views, prior: Prior) -> Gaussians:
         prior.opacity[0].to(directions).flatten(),
         colors.flatten(0, 2),
     )
-    valid = gaussians.opacities > FREE_OPACITY
-    if views.masks is not None:
-        valid &= F.interpolate(views.masks[:, None].float(), size, mode="area").flatten() == 1
-    return gaussians.keep(valid) if valid.any() else gaussians
+    return without_invisible(gaussians)
+
+
+def without_invisible(gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians that are opaque enough to be drawn; all if none is."""
+    visible = gaussians.opacities >= INRIA.alpha_min
+    return gaussians.keep(visible) if visible.any() else gaussians
 
 
 def gaussians_from_points(points: Float[Tensor, "P 3"], views: Views) -> Gaussians:
@@ -143,4 +144,4 @@ def _resize(views: Views, longest: int, multiple: int) -> Views:
     height, width = views.cameras.height, views.cameras.width
     scale = min(1.0, longest / max(height, width))
     size = (max(multiple, round(side * scale / multiple) * multiple) for side in (height, width))
-    return resize(replace(views, masks=None), *size)
+    return resize(views, *size)

@@ -11,7 +11,7 @@ from tiny import SIZE
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.models import DepthPrior, LongLRMHead, PhotographHead, PlaneSweepPrior
 from asysplat.models.head import CONFIDENT_FACTOR, MAX_DEPTH_CORRECTION
-from asysplat.models.prior.prior import COVER, UNKNOWN_DISTANCE, Prior
+from asysplat.models.prior.prior import COVER, FREE_OPACITY, UNKNOWN_DISTANCE, Prior
 from asysplat.scene import Cameras, Views
 
 MODELS = ["asysplat_4m4s", "longlrm", "single_branch", "asysplat_pred_fine"]
@@ -52,6 +52,22 @@ def test_a_coarser_plane_sweep_is_less_exact(knob):
         return (found[:, :, 2:-2, 4:-4] - 2).abs().mean()
 
     assert 0 < error() < error(**knob) < 1
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_a_masked_pixel_neither_votes_nor_is_kept(name):
+    views = wall(4, step=0.1)
+    masks = torch.ones_like(views.depths, dtype=torch.bool)
+    masks[:, 1, :16] = False  # the upper half of the second view,
+    masks[:, 0, 31, 31] = False  # and a quarter of the first's last pixel
+    whole, prior = (PRIORS[name]()(each, (16, 16)) for each in (views, replace(views, masks=masks)))
+    valid = torch.ones(1, 4, 16, 16, dtype=torch.bool)
+    valid[:, 1, :8] = valid[:, 0, 15, 15] = False
+    assert (prior.opacity == FREE_OPACITY).eq(~valid).all()
+    assert not prior.confidence[:, 1, :6].any()
+    # The views that remain have a larger share of the wall's opacity.
+    others = (slice(None), [0, 2, 3], slice(1, 6), slice(5, 11))
+    assert prior.opacity[others].mean() > 1.1 * whole.opacity[others].mean()
 
 
 @pytest.mark.parametrize("name", PRIORS)

@@ -7,6 +7,7 @@ import torch
 
 from asysplat.errors import InputError
 from asysplat.models.prior import Prior
+from asysplat.models.prior.prior import FREE_OPACITY
 from asysplat.refinement.init import (
     POINT_OPACITY,
     gaussians_from_points,
@@ -72,20 +73,15 @@ def test_a_prior_of_any_size_gives_a_gaussian_a_pixel_in_the_images_colors(size)
     )
 
 
-def test_masked_pixels_of_a_prior_give_no_gaussian():
+def test_pixels_of_a_prior_that_nothing_shows_give_no_gaussian():
     views = front_views(height=8, width=10)
-    masks = torch.ones(1, 8, 10, dtype=torch.bool)
-    masks[0, 0, 0] = False  # a quarter of the first block
-    masks[0, 4:, 2:] = False  # eight blocks, wholly
     distance = torch.full((1, 1, 4, 5), 2.0)
-    prior = Prior(distance, distance, distance / 4)
-    every = gaussians_from_prior(views, prior)
-    some = gaussians_from_prior(replace(views, masks=masks), prior)
-    rows = torch.ones(4, 5, dtype=torch.bool)
-    rows[0, 0] = rows[2, 1:] = rows[3, 1:] = False
-    assert_equal(some, every.keep(rows.flatten()))
-    none = gaussians_from_prior(replace(views, masks=torch.zeros_like(masks)), prior)
-    assert torch.equal(none.means, every.means)
+    opacity = torch.where(torch.rand(1, 1, 4, 5) < 0.5, FREE_OPACITY, 0.5)
+    every = gaussians_from_prior(views, Prior(distance, distance, torch.full_like(distance, 0.5)))
+    some = gaussians_from_prior(views, Prior(distance, distance, opacity))
+    assert_equal(some, every.keep((opacity > FREE_OPACITY).flatten()))
+    none = Prior(distance, distance, torch.full_like(distance, FREE_OPACITY))
+    assert torch.equal(gaussians_from_prior(views, none).means, every.means)
 
 
 def test_footprints_are_the_smallest_over_visible_views():

@@ -10,7 +10,7 @@ from functools import reduce
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import is_fake
 
@@ -21,6 +21,7 @@ from asysplat.models.prior.prior import (
     count_votes,
     fill_unknown,
     other_views,
+    whole_pixels,
 )
 from asysplat.models.prior.projections import (
     Projections,
@@ -68,9 +69,11 @@ class PlaneSweepPrior(nn.Module):
             inverse = (views.point_depths > 0) / views.point_depths.clamp_min(1e-6)
             inverse = F.max_pool2d(inverse, factor).flatten(2)
             ranges = observed_range(inverse, inverse > 0)
-        estimate = plane_sweep(
-            images, small, planes=self.planes, neighbors=self.neighbors, ranges=ranges
-        )
+        masks = views.masks
+        if masks is not None:
+            masks = whole_pixels(masks, (small.height, small.width))
+        options = {"planes": self.planes, "neighbors": self.neighbors}
+        estimate = plane_sweep(images, small, ranges=ranges, masks=masks, **options)
         return Prior.of_estimate(estimate, views, size)
 
 
@@ -81,6 +84,7 @@ def plane_sweep(
     neighbors: int = NEIGHBORS,
     backend: str = "auto",
     ranges: Float[Tensor, "B V 2"] | None = None,
+    masks: Bool[Tensor, "B V H W"] | None = None,
 ) -> DepthEstimate:
     """Estimate the depth of every pixel: [B, V, H, W].
 
@@ -98,6 +102,7 @@ def plane_sweep(
             kernels of the device, and "reference" for float64.
         ranges: least and greatest inverse depth of each view; where both are 0, and in all views
             if None, they follow from the cameras.
+        masks: False in pixels that have no confidence; None: in none.
 
     Raises:
         InputError: sizes that do not fit together, or an unknown backend.
@@ -107,7 +112,7 @@ def plane_sweep(
     images = images if images.dtype == torch.float64 else images.float()
     poses, intrinsics = cameras.cam_to_world.to(images), cameras.intrinsics.to(images)
     inverse, confidence, *votes = _plane_sweep(
-        images, intrinsics, poses, planes, neighbors, backend, ranges
+        images, intrinsics, poses, planes, neighbors, backend, ranges, masks
     )
     return DepthEstimate(inverse, confidence, Consistency(*votes))
 
@@ -121,6 +126,7 @@ def _plane_sweep(
     neighbors: int,
     backend: str,
     ranges: Tensor | None,
+    masks: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Sweep twice; one operator for torch, so that the meta device gets shapes without content."""
     cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
@@ -134,7 +140,10 @@ def _plane_sweep(
     kernels = load_backend(backend, images)
 
     def sweep(
-        images: Float[Tensor, "B V 3 H W"], ranges: Float[Tensor, "B V 2"], aggregations: int
+        images: Float[Tensor, "B V 3 H W"],
+        valid: Float[Tensor, "B V H W"],
+        ranges: Float[Tensor, "B V 2"],
+        aggregations: int,
     ) -> tuple[Float[Tensor, "B V H W"], Float[Tensor, "B V"], Float[Tensor, "B V H W"]]:
         """Return the inverse depths, the steps between planes, and how far neighbors agree.
 
@@ -148,24 +157,26 @@ def _plane_sweep(
         first, last = ranges[..., None, None, :].unbind(-1)
         spacing = (last - first) / (planes - 1)
         steps = torch.maximum(spacing[..., 0, 0], shortest)
-        agreement = torch.ones_like(gray)
+        agreement = valid
         for _ in range(aggregations):
             best = kernels.sgm(costs, agreement, borders)
             inverse = first + best.plane * spacing
-            found = kernels.consistency(inverse, steps, torch.ones_like(inverse), chosen, into)
+            found = kernels.consistency(inverse, steps, valid, chosen, into)
             agree, contradict = found.agreeing, found.contradicting
-            agreement = (2 * agree / (agree + contradict + 1)).clamp_max(1)
+            agreement = valid * (2 * agree / (agree + contradict + 1)).clamp_max(1)
         return inverse, steps, agreement * (best.contrast / FULL_CONTRAST).clamp(0, 1)
 
-    half = (max(1, side // 2) for side in images.shape[-2:])
-    inverse, steps, agreement = sweep(shrink(images, *half), ranges, aggregations=1)
+    valid = torch.ones_like(images[:, :, 0]) if masks is None else masks.to(images)
+    half = [max(1, side // 2) for side in images.shape[-2:]]
+    smaller = shrink(images, *half), (shrink(valid, *half) == 1).to(valid)
+    inverse, steps, agreement = sweep(*smaller, ranges, aggregations=1)
     # Narrow the ranges to the depths that neighbors agree on, unless these are few.
     observed = observed_range(inverse.flatten(2), agreement.flatten(2) > MIN_AGREEMENT)
     least = torch.maximum(ranges[..., 0], observed[..., 0] - steps / 2)
     greatest = torch.maximum(observed[..., 1] + steps / 2, least + planes * shortest)
     narrowed = torch.stack((least, torch.minimum(ranges[..., 1], greatest)), dim=-1)
     ranges = torch.where(observed[..., 1:] > 0, narrowed, ranges)
-    inverse, steps, agreement = sweep(images, ranges, aggregations=2)
+    inverse, steps, agreement = sweep(images, valid, ranges, aggregations=2)
     others = other_views(images.shape[1], images.shape[0], images.device)
     into = projections.into(others, *images.shape[-2:])
     found = kernels.consistency(inverse, steps, agreement, others, into)
@@ -178,7 +189,7 @@ def _plane_sweep(
 
 
 @_plane_sweep.register_fake
-def _(images, intrinsics, cam_to_world, planes, neighbors, backend, ranges):
+def _(images, intrinsics, cam_to_world, planes, neighbors, backend, ranges, masks):
     return tuple(torch.empty_like(images[:, :, 0]) for _ in range(6))
 
 

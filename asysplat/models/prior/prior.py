@@ -16,7 +16,7 @@ UNKNOWN_DISTANCE = 10**0.5  # the middle of PhotographHead's range
 VOTE_TOLERANCE = 0.05  # relative, of two inverse depths of the same surface
 COVER = 0.9  # opacity of a surface, over all views that confirm it,
 UNSURE_COVER = 0.7  # and where no depth is sure, over all views that may see it
-FREE_OPACITY = 1e-4  # in free space: too small to be drawn
+FREE_OPACITY = 1e-4  # where nothing is: too small to be drawn
 SURROUNDINGS = 0.05  # weight of a pixel's surroundings against its own depth at full confidence
 
 
@@ -42,8 +42,8 @@ class Prior(TensorRecord):
     Args:
         distance: along the ray of each pixel of the head's grid, > 0, in scene units.
         confidence: in [0, 1].
-        opacity: to start from, in (0, 1); views that see the same surface share it. In free space
-            FREE_OPACITY.
+        opacity: to start from, in (0, 1); views that see the same surface share it. FREE_OPACITY
+            where nothing is to be drawn.
     """
 
     distance: Float[Tensor, "B V h w"]
@@ -56,7 +56,8 @@ class Prior(TensorRecord):
 
         Each view's share of a surface's opacity follows from the number of views that confirm it;
         where no depth is sure, from the number of views that contain the point and do not see
-        another surface in front of it.
+        another surface in front of it. In free space, and in pixels that are masked out, wholly or
+        in part, it is FREE_OPACITY.
         """
         votes = depth.votes
         alone = (votes.containing == 0).to(depth.confidence)
@@ -69,8 +70,10 @@ class Prior(TensorRecord):
         )
         length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
         distance = torch.where(inverse > 0, length / inverse.clamp_min(1e-6), UNKNOWN_DISTANCE)
-        free = F.interpolate(in_free_space(votes).to(opacity), size) > 0.5
-        return cls(distance, confidence, opacity.sigmoid().masked_fill(free, FREE_OPACITY))
+        dropped = F.interpolate(in_free_space(votes).to(opacity), size) > 0.5
+        if views.masks is not None:
+            dropped = dropped | ~whole_pixels(views.masks, size)
+        return cls(distance, confidence, opacity.sigmoid().masked_fill(dropped, FREE_OPACITY))
 
     @classmethod
     def of_given_depths(
@@ -85,6 +88,8 @@ class Prior(TensorRecord):
         inverse = fill_unknown(inverse, weight)
         others = other_views(count, scenes, inverse.device)
         projections = Projections.between(views.cameras).into(others, *size)
+        if views.masks is not None:
+            confidence = confidence * whole_pixels(views.masks, tuple(size))
         votes = count_votes(inverse, confidence, others, projections)
         return cls.of_estimate(DepthEstimate(inverse, confidence, votes), views, tuple(size))
 
@@ -126,6 +131,11 @@ def in_free_space(votes: Consistency) -> Bool[Tensor, "B V h w"]:
     what one other view denies.
     """
     return votes.contradicting > 2 * votes.agreeing + 1
+
+
+def whole_pixels(masks: Bool[Tensor, "B V H W"], size: tuple[int, int]) -> Bool[Tensor, "B V h w"]:
+    """Return masks of another size: True where all pixels that a pixel covers are."""
+    return F.interpolate(masks.float(), size, mode="area") == 1
 
 
 def other_views(views: int, scenes: int, device: torch.device) -> Int[Tensor, "B V K"]:
