@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache, partial
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import torch
@@ -70,6 +70,7 @@ WATCHED = Watched(
 )
 TITLES = {
     "feed_forward": "Feed-forward",
+    "sequence": "Feed-forward, more and more photographs",
     "networks": "Other layers, untrained",
     "refined": "Refined",
     "reconstruct": "Refined for some seconds",
@@ -83,7 +84,15 @@ NOTES = """\
 error: of images in [0, 1] against the base in float64, of other layers against their own, of \
 refinements against the base"""
 
-RenderScene = Callable[[Photographs], Tensor]  # all held-out views [V, 3, H, W]
+
+class Drawn(NamedTuple):
+    """All held-out views of a scene, and the number of the Gaussians that they show."""
+
+    images: Tensor  # [V, 3, H, W]
+    gaussians: int
+
+
+RenderScene = Callable[[Photographs], Drawn]
 
 
 @dataclass(frozen=True)
@@ -122,7 +131,7 @@ class FeedForward:
         options |= {"depth": False, "convention": replace(INRIA, **self.convention)}
 
         @torch.no_grad()
-        def run(scene: Photographs) -> Tensor:
+        def run(scene: Photographs) -> Drawn:
             scene = select_inputs(scene, self.views, self.side)
             inputs, targets = scene.inputs.to(dtype), scene.held_out.to(dtype)
             with torch.autocast(device.type, torch.bfloat16, enabled=half):
@@ -133,7 +142,8 @@ class FeedForward:
             if self.cell is not None or self.max_gaussians is not None:
                 limit = self.max_gaussians or gaussians.num_gaussians
                 gaussians = merge_to_limit(gaussians, inputs.cameras, self.cell or 1.0, limit)
-            return render(gaussians, targets.cameras, mean_color(inputs), **options).image
+            image = render(gaussians, targets.cameras, mean_color(inputs), **options).image
+            return Drawn(image, gaussians.num_gaussians)
 
         return run
 
@@ -168,19 +178,20 @@ class Refined:
         net = _load_network("shipped", ()) if self.init == "network" else None
         limit = {"steps": self.steps, "seconds": self.seconds}
 
-        def run(scene: Photographs) -> Tensor:
+        def run(scene: Photographs) -> Drawn:
             scene = select_inputs(scene, self.views, self.side)
             gaussians = initial_gaussians(self.init, scene, settings, net)
             color = mean_color(scene.inputs)
             if self.steps != 0:
                 gaussians = refine(gaussians, scene.inputs, settings, background=color, **limit)
             with torch.no_grad():
-                return render(gaussians, scene.held_out.cameras, color, depth=False).image
+                image = render(gaussians, scene.held_out.cameras, color, depth=False).image
+            return Drawn(image, gaussians.num_gaussians)
 
         return run
 
 
-FAMILIES = dict.fromkeys(("feed_forward", "networks"), FeedForward)
+FAMILIES = dict.fromkeys(("feed_forward", "sequence", "networks"), FeedForward)
 FAMILIES |= dict.fromkeys(("refined", "reconstruct"), Refined)
 Setting = FeedForward | Refined
 
@@ -318,11 +329,11 @@ def _measure_scene(
     own_device = CPU if isinstance(base, Refined) else device
     views = {name: getattr(scene, name).to(own_device) for name in ("inputs", "held_out")}
     scene = replace(scene, **views)
-    images, measurements, absent = {}, {}, {}
+    drawn, measurements, absent = {}, {}, {}
 
     def run(name: str) -> dict[str, float]:
         def render_scene() -> None:
-            images[name] = renderers[name](scene)
+            drawn[name] = renderers[name](scene)
 
         seconds = seconds_of(render_scene, own_device)
         advance()
@@ -342,25 +353,27 @@ def _measure_scene(
             absent[name] = str(error)
     if not once:
         timing.time_in_rounds(list(measurements.values()), repeats)
-    exact_images = {repr(base): images[BASE]}
+    exact_images = {repr(base): drawn[BASE].images}
     rows = []
     for name, setting in settings.items():
         row = {"setting": name, "values": asdict(setting), "not_measured": absent.get(name)}
-        row |= dict.fromkeys(("seconds", "over_base", "error", "psnr", "ssim", "lpips"))
+        empty = ("seconds", "over_base", "error", "psnr", "ssim", "lpips", "gaussians")
+        row |= dict.fromkeys(empty)
         if name in measurements:
             own, of_base = (measurements[n].seconds["seconds"] for n in (name, BASE))
             ratios = [a / b for a, b in zip(own, of_base, strict=True)]
             row |= {"seconds": summary(own), "over_base": summary(ratios)}
+            row["gaussians"] = drawn[name].gaussians
             exact = base
             if isinstance(setting, FeedForward):
                 exact = replace(base if setting.trained else setting, precision=EXACT)
             if exact != setting:
                 key = repr(exact)
                 if key not in exact_images:
-                    exact_images[key] = exact.prepare(refinement, device)(scene)
-                row["error"] = {"decibels": decibels(images[name], exact_images[key])}
+                    exact_images[key] = exact.prepare(refinement, device)(scene).images
+                row["error"] = {"decibels": decibels(drawn[name].images, exact_images[key])}
             if setting.trained:
-                metrics = protocol.image_metrics(images[name], scene.held_out, lpips)
+                metrics = protocol.image_metrics(drawn[name].images, scene.held_out, lpips)
                 row |= {metric: values.mean().item() for metric, values in metrics.items()}
         rows.append(row | ({"noise": NOISE_OF_SECONDS} if once else {}))
     return rows
@@ -391,8 +404,8 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": one for each family, scene and setting: "seconds", their ratio to the base's of the
         same round "over_base", "error" of the images against the exact ones in "decibels", and
-        metrics against the photographs; None for what was not measured. "not_measured": what, and
-        why.
+        metrics against the photographs, the number of "gaussians"; None for what was not measured.
+        "not_measured": what, and why.
     """
     config = OmegaConf.to_container(options.pareto, resolve=True)
     shared = Path(config["shared"])
@@ -503,6 +516,7 @@ ROWS: Columns = {
     "/ base": spread("over_base", "{:.2f}", unit=1.0),
     "PSNR": number("psnr", "{:.2f}"),
     "LPIPS": number("lpips", "{:.3f}"),
+    "Gaussians": number("gaussians", "{:,}"),
     "error\ndB": number("error.decibels", "{:.1f}"),
 }
 MEANS: Columns = {

@@ -122,6 +122,7 @@ def test_a_row_is_what_the_network_and_the_renderer_give(measured, tmp_path):
     with torch.no_grad():
         gaussians, background = load()(scene.inputs), mean_color(scene.inputs)
         image = render(gaussians, scene.held_out.cameras, background, depth=False).image
+    assert row["gaussians"] == gaussians.num_gaussians
     assert row["psnr"] == pytest.approx(psnr(image, scene.held_out.images).mean().item(), abs=1e-4)
 
 
@@ -225,7 +226,7 @@ def test_mistakes_are_named(make_pareto, changes, sentence):
 def test_every_knob_of_the_configuration_is_a_setting(make_options):
     config = OmegaConf.to_container(make_options("pareto", {}).pareto, resolve=True)
     for family, settings in find_families(config | {"families": list(FAMILIES)}).items():
-        assert len(settings) > 6
+        assert len(settings) > 1
         same = [name for name in settings if settings[name] == settings[BASE]]
         assert same == [BASE], family
     some = find_families(config | {"knobs": ["bf16"]})
