@@ -19,13 +19,11 @@ from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Gaussians, Views
 
 # With a prior the network's corrections are bounded: on scenes unlike those of its training it is
-# wrong more often than the prior. In logits of the place in the head's range, and of opacity; in
-# logarithms of size.
+# wrong more often than the prior. In logits of the place in the head's range,
 MAX_DEPTH_CORRECTION = 0.01  # at confidence 0: more makes surfaces rough,
 CONFIDENT_FACTOR = 0.3  # times that at confidence 1,
-MAX_DEPTH_WITHOUT_PRIOR = 10.0  # and in scenes without any known depth
-MAX_OPACITY_CORRECTION = 0.5
-MAX_SIZE_CORRECTION = 1.0
+MAX_DEPTH_WITHOUT_PRIOR = 10.0  # and in scenes without any known depth;
+MAX_SIZE_CORRECTION = 1.0  # in logarithms
 
 
 class Decoded(NamedTuple):
@@ -51,7 +49,7 @@ class GaussianHead(nn.Module, ABC):
     Args:
         width: d_3.
         patch_coarse, patch_fine: p_c, p_f.
-        sh_degree: 0 to 3.
+        sh_degree: 0 to 3; None for a head that predicts no colors.
         opacity_bias: logit of an untrained opacity without a prior.
         std: standard deviation of the untrained weights.
     """
@@ -61,7 +59,7 @@ class GaussianHead(nn.Module, ABC):
         width: int,
         patch_coarse: int,
         patch_fine: int,
-        sh_degree: int,
+        sh_degree: int | None,
         opacity_bias: float,
         std: float,
     ):
@@ -69,7 +67,7 @@ class GaussianHead(nn.Module, ABC):
         self.opacity_bias = opacity_bias
         self.patch, self.stride = patch_fine, patch_coarse // patch_fine
         # position, quaternion, scale, opacity, SH
-        self.sh_bands = (sh_degree + 1) ** 2
+        self.sh_bands = 0 if sh_degree is None else (sh_degree + 1) ** 2
         self.splits = (3, 4, 3, 1, 3 * self.sh_bands)
         self.norm = nn.LayerNorm(width, bias=False)
         self.decode = nn.Linear(width, patch_fine**2 * sum(self.splits), bias=False)
@@ -80,8 +78,8 @@ class GaussianHead(nn.Module, ABC):
     ) -> Gaussians:
         """Decode Gaussians [B, V h p_f w p_f], row by row of view after view.
 
-        With a prior, the decoder corrects its distances, less at higher confidence, and its
-        opacities. Without features nothing is corrected.
+        With a prior, the opacities are the prior's, and the decoder corrects its distances, less
+        at higher confidence. Without features nothing is corrected.
         """
         if features is None:
             size = (views.cameras.height // self.stride, views.cameras.width // self.stride)
@@ -99,19 +97,18 @@ class GaussianHead(nn.Module, ABC):
             position, quats, scales, opacities, sh = raw.split(self.splits, dim=-1)
             # The mean of three outputs, as in Long-LRM.
             depth_logit = position.mean(-1, keepdim=True)
-            opacities = opacities[..., 0]
             if prior is None:
-                opacities = opacities + self.opacity_bias
+                opacities = (opacities[..., 0] + self.opacity_bias).sigmoid()
             else:
                 expected = self.depth_fraction(prior.distance, views).clamp(1e-4, 0.99).logit()
                 bound = MAX_DEPTH_CORRECTION * (1 - (1 - CONFIDENT_FACTOR) * prior.confidence)
                 has_depth = (prior.confidence > 0).flatten(1).any(-1)[:, None, None, None]
                 bound = torch.where(has_depth, bound, MAX_DEPTH_WITHOUT_PRIOR)
                 depth_logit = (expected + bounded(depth_logit[..., 0], bound))[..., None]
-                opacities = prior.opacity.logit() + bounded(opacities, MAX_OPACITY_CORRECTION)
+                opacities = prior.opacity
                 scales = bounded(scales, MAX_SIZE_CORRECTION)
-            sh = sh.unflatten(-1, (-1, 3))
-            decoded = Decoded(depth_logit.sigmoid(), quats, scales, opacities.sigmoid(), sh)
+            sh = sh.unflatten(-1, (self.sh_bands, 3))
+            decoded = Decoded(depth_logit.sigmoid(), quats, scales, opacities, sh)
             return self.activate(decoded, views).map(lambda field: field.flatten(1, 3))
 
     @abstractmethod
@@ -133,7 +130,8 @@ class PhotographHead(GaussianHead):
     the appearance branch contributes less than in a head without it.
 
     Args:
-        width, patch_coarse, patch_fine, sh_degree, opacity_bias: of GaussianHead.
+        width, patch_coarse, patch_fine, opacity_bias: of GaussianHead.
+        sh_degree: 0 to 3; None: the colors are those of the image.
         near, far: distances along the ray lie between them, in units of the normalized scene.
         scale_bias: log of an untrained size, in pixel footprints.
     """
@@ -143,7 +141,7 @@ class PhotographHead(GaussianHead):
         width: int,
         patch_coarse: int,
         patch_fine: int,
-        sh_degree: int = 3,
+        sh_degree: int | None = 3,
         near: float = 0.1,
         far: float = 100.0,
         opacity_bias: float = 0.0,
@@ -168,12 +166,13 @@ class PhotographHead(GaussianHead):
         batch = views.images.shape[:2]
         small = F.avg_pool2d(views.images.flatten(0, 1), self.stride).unflatten(0, batch)
         dc = (rearrange(small, "b v c h w -> b v h w 1 c") - 0.5) / SH_C0
+        sh = torch.cat((raw.sh[..., :1, :] + dc, raw.sh[..., 1:, :]), -2) if self.sh_bands else dc
         return Gaussians(
             means=origins + distance * directions,
             quats=raw.quats + identity,
             scales=sizes * distance * pixel,
             opacities=raw.opacities,
-            sh=torch.cat((raw.sh[..., :1, :] + dc, raw.sh[..., 1:, :]), dim=-2),
+            sh=sh,
         )
 
 
