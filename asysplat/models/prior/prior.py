@@ -70,7 +70,7 @@ class Prior(TensorRecord):
         )
         length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
         distance = torch.where(inverse > 0, length / inverse.clamp_min(1e-6), UNKNOWN_DISTANCE)
-        dropped = F.interpolate(in_free_space(votes).to(opacity), size) > 0.5
+        dropped = F.interpolate(in_free_space(votes).to(opacity), size, mode="area") > 0.5
         if views.masks is not None:
             dropped = dropped | ~whole_pixels(views.masks, size)
         return cls(distance, confidence, opacity.sigmoid().masked_fill(dropped, FREE_OPACITY))
