@@ -116,6 +116,7 @@ def _measure_network(net: Network, hostile: HostileViews, precision: str, wild: 
         return {name: getattr(gaussians, name) for name in FIELDS}
 
     double = copy.deepcopy(net).double()
+    double.training = True  # of itself, not its layers: it takes perturbed views, a white above 1
     return compare_to_reference(
         partial(predict, net, half),
         partial(predict, double, False),
