@@ -33,7 +33,7 @@ from asysplat.interrupts import handle_signals
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
 from asysplat.refinement import RefinementSettings, mean_color, refine
-from asysplat.refinement.init import INITS, best_init, initial_gaussians
+from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.refinement.photographs import Photographs, open_photographs
 from asysplat.scene import Gaussians
 from asysplat.training.ranges import check_ranges, is_number
@@ -132,18 +132,11 @@ def initialize(
     config: DictConfig, photographs: Photographs, settings: RefinementSettings
 ) -> Gaussians:
     """Build the Gaussians to refine, in the network's frame."""
-    init = config.init or best_init(photographs.inputs.num_views)
-    network = None
+    init, network = config.init, None
     if init == "network":
-        try:
-            network = load(config.checkpoint)
-            network.early_exit = instantiate(config.speed)
-        except InputError as error:
-            if config.init is not None:
-                raise
-            print(f"warning: {error} Starting with init=plane_sweep.")
-            init = "plane_sweep"
-    if init not in INITS and Path(init).suffix:
+        network = load(config.checkpoint)
+        network.early_exit = instantiate(config.speed)
+    if init not in INITS and Path(str(init)).suffix:
         gaussians = photographs.frame.to_network(read_gaussians(init, photographs.origin))
     else:
         gaussians = initial_gaussians(init, photographs, settings, network)

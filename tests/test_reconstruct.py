@@ -184,13 +184,13 @@ def test_each_init_beats_its_baseline(command, views, photographs, tmp_path, mon
 
 
 @pytest.mark.medium
-def test_a_missing_checkpoint_falls_back_to_the_plane_sweep(command, photographs, tmp_path):
+def test_only_a_start_from_the_network_reads_its_weights(command, photographs):
     overrides = ("views=4", "checkpoint=absent.safetensors", "steps=2")
-    said = finished(command(photographs, "init=null", *overrides))
-    assert "absent.safetensors does not exist" in said and "by init=plane_sweep" in said
-    assert "refinement.max_steps_per_image" not in said
-    asked = command(photographs, "init=network", *overrides)
-    assert asked.returncode == 1 and "absent.safetensors does not exist" in asked.stderr
+    said = finished(command(photographs, *overrides))
+    assert "by init=plane_sweep" in said and "refinement.max_steps_per_image" not in said
+    check_refusal(
+        command(photographs, "init=network", *overrides), "absent.safetensors does not exist"
+    )
 
 
 @pytest.mark.medium

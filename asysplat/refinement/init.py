@@ -20,14 +20,8 @@ from asysplat.scene import Gaussians, Views
 INITS = ("network", "plane_sweep", "points", "depth")
 PRIOR_MAX_SIDE = 64  # pixels of a prior's depth maps
 NETWORK_MAX_SIDE = 128  # pixels of the network's input images
-NETWORK_MAX_VIEWS = 8  # above it the network adds nothing (checkpoints/asysplat_plane_sweep.md)
 NEIGHBORS = 3  # the size of a point is their mean distance (Kerbl et al. 2023)
 POINT_OPACITY = 0.1
-
-
-def best_init(num_views: int) -> str:
-    """Return the better initialization: the network for few views, else the plane sweep."""
-    return "network" if num_views <= NETWORK_MAX_VIEWS else "plane_sweep"
 
 
 @torch.no_grad()
