@@ -1,4 +1,4 @@
-"""Turn posed photographs into a scene of Gaussians that opens everywhere.
+"""Turn photographs into a scene of Gaussians that opens everywhere.
 
 python reconstruct.py my_scene
 """
@@ -25,8 +25,11 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
 
 from asysplat import load
+from asysplat.data.cameras import find_cameras
+from asysplat.data.readers import bare_photographs
 from asysplat.errors import InputError, input_error_behind, plain_warnings
 from asysplat.export import read_gaussians
 from asysplat.interrupts import handle_signals
@@ -55,7 +58,7 @@ def main(config: DictConfig) -> None:
 
 
 def reconstruct(config: DictConfig) -> None:
-    """Initialize Gaussians, refine them, and write the results."""
+    """Find cameras where there are none, initialize Gaussians, refine them, write the results."""
     if OmegaConf.is_missing(config, "path"):
         raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
     check_ranges(OmegaConf.masked_copy(config, "speed"))
@@ -66,8 +69,13 @@ def reconstruct(config: DictConfig) -> None:
         raise InputError("view=true needs viser: pip install 'asysplat[viewer]', or leave it out.")
     settings = instantiate(config.refinement)
     results = Results(Path(config.paths.run), config)
+    path = config.path
+    if config.layout == "auto" and bare_photographs(path):
+        where = Path(config.paths.logs) / "cameras"
+        path = find_cameras(path, where, config.on_bad_image, Console())
+        print(f"found cameras: {path}")
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
-    photographs = open_photographs(config.path, **{name: config[name] for name in names})
+    photographs = open_photographs(path, **{name: config[name] for name in names})
     print(describe(config, photographs, limit))
     gaussians = initialize(config, photographs, settings)
     background = mean_color(photographs.inputs)

@@ -175,7 +175,7 @@ COMMANDS = {
     "reconstruct.py {photographs} height=abc": "height=abc",
     "reconstruct.py {photographs} max_held_out=0": "max_held_out=0",
     "reconstruct.py {empty}": "camera poses",
-    "reconstruct.py {bare}": "camera poses",
+    "reconstruct.py {bare} paths.logs={empty}": "found cameras for 0 of 4",
 }
 
 

@@ -32,7 +32,7 @@ from asysplat.data.readers import (
     scannetpp_depths,
     transforms,
 )
-from asysplat.data.readers.common import SUFFIXES, images_in
+from asysplat.data.readers.common import SUFFIXES, images_in, natural_order
 from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.errors import InputError
 
@@ -74,12 +74,17 @@ def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]
             return name, scenes
     if not root.exists():
         raise InputError(f"{root} does not exist: name a scene, or a folder of scenes.")
-    bare = _bare_photographs(root) if layout == "auto" else None
-    if bare is not None:
+    if root.is_file() and root.suffix.lower() in VIDEOS:
         raise InputError(
-            f"{root} has {bare} without camera poses: find them first, for example with colmap "
-            "automatic_reconstructor --workspace_path my_scene --image_path my_scene/images, and "
-            "name the folder of images/ and sparse/."
+            f"{root} is a video: extract photographs into a folder of their own, for example with "
+            f"ffmpeg -i {root.name} -vf fps=2 my_scene/%04d.jpg, and name that folder."
+        )
+    if root.is_file() and root.suffix.lower() in SUFFIXES:
+        raise InputError(f"{root} is one photograph: name the folder of all.")
+    if layout == "auto" and (count := len(_photographs(root))):
+        raise InputError(
+            f"{root} has {count} photographs without camera poses: find them first, with python "
+            f"-m asysplat.data.cameras {root}, and name the folder that it prints."
         )
     raise InputError(
         f"{root} holds no photographs with camera poses, in layout {layout}: data/README.md "
@@ -92,13 +97,17 @@ def _check_layout(layout: str) -> None:
         raise InputError(f"layout={layout}: expected auto or one of {', '.join(LAYOUTS)}.")
 
 
-def _bare_photographs(root: Path) -> str | None:
-    """Describe photographs or a video without poses; None where there are neither."""
-    if root.is_file():
-        kinds = dict.fromkeys(VIDEOS, "a video") | dict.fromkeys(SUFFIXES, "one photograph")
-        return kinds.get(root.suffix.lower())
-    count = len(images_in(root)) or len(images_in(root / "images"))
-    return f"{count} photographs" if count else None
+def bare_photographs(root: Path | str) -> list[Path]:
+    """List the photographs of a folder without camera poses, 2 before 10; none if it has poses."""
+    root = Path(root).absolute()
+    with _file_errors(root):
+        if any(reader.find_scenes(root) for reader in READERS):
+            return []
+        return _photographs(root)
+
+
+def _photographs(root: Path) -> list[Path]:
+    return sorted(images_in(root) or images_in(root / "images"), key=natural_order)
 
 
 def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:

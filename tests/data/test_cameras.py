@@ -1,0 +1,163 @@
+"""Cameras that are found for photographs of a synthetic scene are those that rendered them."""
+
+import json
+import re
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image, ImageFilter
+
+from asysplat.data import ProceduralScene, cameras, open_scene
+from asysplat.data.cameras import ORIENTATION, find_cameras, main
+from asysplat.data.readers.colmap import read_poses
+from asysplat.data.sequence import SceneOptions
+from asysplat.errors import InputError
+
+COUNT, HEIGHT, WIDTH = 14, 240, 320
+TURNED, BLURRED = 3, 5
+
+
+@pytest.fixture(scope="module")
+def views():
+    return ProceduralScene(1, HEIGHT, WIDTH, num_images=32).views(range(COUNT))
+
+
+def save(image, file, **options):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray((image * 255).round().byte().movedim(0, -1).numpy()).save(file, **options)
+
+
+@pytest.fixture(scope="module")
+def photographs(views, tmp_path_factory):
+    """Names with spaces; one is stored turned, one is blurred, the last shows another place."""
+    folder = tmp_path_factory.mktemp("photographs") / "my place"
+    for index, image in enumerate(views.images):
+        save(image, folder / f"walk {index}.png")
+    turned, blurred = (folder / f"walk {index}.png" for index in (TURNED, BLURRED))
+    exif = Image.Exif()
+    exif[ORIENTATION] = 6  # stored a quarter turn to the left of upright
+    Image.open(turned).transpose(Image.Transpose.ROTATE_90).save(turned, exif=exif)
+    Image.open(blurred).filter(ImageFilter.GaussianBlur(1)).save(blurred)
+    elsewhere = ProceduralScene(9, HEIGHT, WIDTH, num_images=32).views([20])
+    save(elsewhere.images[0], folder / f"walk {COUNT}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(photographs, tmp_path_factory):
+    return find_cameras(photographs, tmp_path_factory.mktemp("logs") / "cameras")
+
+
+@pytest.mark.medium
+def test_they_are_those_of_the_scene(views, found):
+    """To .5 % of the scene's size and .3 degrees, after a similarity."""
+    poses = dict(read_poses(found / "sparse" / "0"))
+    assert sorted(poses) == sorted(f"walk_{index}.png" for index in range(COUNT))
+    found = torch.as_tensor(np.stack([poses[f"walk_{index}.png"] for index in range(COUNT)]))
+    given = views.cameras.cam_to_world.double()
+    # The similarity: positions alone, almost in a line, would leave a turn about it free.
+    left, _, right = torch.linalg.svd((given[:, :3, :3] @ found[:, :3, :3].mT).sum(0))
+    turned = (left @ right) @ found[:, :3]
+    angles = (turned[:, :, :3] * given[:, :3, :3]).sum((-2, -1)).sub(1).div(2).clamp(-1, 1).acos()
+    assert torch.rad2deg(angles).max() < 0.3
+    centers, moved = (p - p.mean(0) for p in (given[:, :3, 3], turned[..., 3]))
+    moved *= (centers * moved).sum() / moved.square().sum()
+    assert (moved - centers).norm(dim=-1).max() < 0.005 * torch.cdist(centers, centers).max()
+
+
+@pytest.mark.medium
+def test_the_scene_opens_upright_without_what_shows_another_place(views, found):
+    with pytest.warns(
+        UserWarning, match=rf"has not registered 1 of {COUNT + 1} .*walk_{COUNT}.png"
+    ):
+        scene = open_scene(found, SceneOptions(HEIGHT, WIDTH))
+    assert scene.num_images == COUNT and len(scene.scene.points) > 100
+    turned = scene.views([TURNED]).images[0]
+    assert (turned - views.images[TURNED]).abs().mean() < 0.02
+
+
+@pytest.mark.medium
+def test_they_are_found_once(photographs, found, monkeypatch, capsys):
+    monkeypatch.delattr(cameras, "_reconstruct")
+    assert find_cameras(photographs, found.parent) == found
+    assert main([str(photographs), "--out", str(found.parent)]) == 0
+    assert capsys.readouterr().out.strip() == str(found)
+    assert {path.name for path in found.parent.iterdir()} == {found.name}
+    assert all(path.suffix == ".png" for path in photographs.iterdir())
+
+
+@pytest.mark.medium
+def test_reconstruct_finds_them(photographs, found, run_script):
+    small = ("height=48", "views=6", "steps=20", "video.path=none")
+    result = run_script(
+        "reconstruct.py", str(photographs), *small, f"paths.logs={found.parent.parent}"
+    )
+    assert result.returncode == 0, result.stderr
+    assert f"found cameras: {found}" in result.stdout
+    (metrics,) = (found.parent.parent / "reconstruct").glob("*/metrics.json")
+    numbers = json.loads(metrics.read_text())
+    assert numbers["held_out/psnr"] > numbers["baseline/nearest_view/psnr"]
+
+
+def test_pairs_of_long_sequences_are_few_and_connected():
+    names = [f"{index}" for index in range(500)]
+    pairs = {(int(first), int(second)) for first, second in cameras._pairs(names)}
+    assert len(pairs) < 500 * 499 / 2 / 10
+    assert all((index, index + 1) in pairs for index in range(499)) and (0, 499) in pairs
+    assert len(cameras._pairs(names[:30])) == 30 * 29 / 2
+
+
+def refused(folder, tmp_path, **options) -> str:
+    """The sentence, after which there is nothing new on the disk."""
+    with pytest.raises(InputError) as error:
+        find_cameras(folder, tmp_path / "logs", **options)
+    assert not list((tmp_path / "logs").glob("*"))
+    return str(error.value)
+
+
+def test_too_few_photographs(views, tmp_path):
+    for number, count in enumerate((1, 2)):
+        folder = tmp_path / f"scene{number}"
+        for index in range(count):
+            save(views.images[index], folder / f"{index}.png")
+        sentence = refused(folder, tmp_path)
+        assert f"has {count} photographs without camera poses" in sentence and "3" in sentence
+
+
+@pytest.mark.medium
+def test_photographs_that_share_nothing(tmp_path):
+    for index in range(4):
+        save(torch.zeros(3, 60, 80), tmp_path / "black" / f"{index}.png")
+        noise = torch.rand(3, 60, 80, generator=torch.Generator().manual_seed(index))
+        save(noise, tmp_path / "noise" / f"{index}.png")
+    for name in ("black", "noise"):
+        sentence = refused(tmp_path / name, tmp_path)
+        assert re.search("found cameras for 0 of 4 photographs: too few show the same", sentence)
+
+
+@pytest.mark.medium
+def test_a_damaged_photograph(views, tmp_path):
+    folder = tmp_path / "scene"
+    for index in range(6):
+        save(views.images[index], folder / "images" / f"{index}.jpg", quality=95)
+    damaged = folder / "images" / "2.jpg"
+    damaged.write_bytes(damaged.read_bytes()[:1000])
+    assert "1 of 6 images cannot be used" in refused(folder, tmp_path)
+    with pytest.warns(UserWarning, match="left out 1 of 6 images"):
+        found = find_cameras(folder, tmp_path / "logs", on_bad_image="skip")
+    assert len(read_poses(found / "sparse" / "0")) == 5
+
+
+@pytest.mark.parametrize("part", ["extract_features", "match_image_pairs", "incremental_mapping"])
+def test_an_interrupt_leaves_nothing(part, views, tmp_path, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    for index in range(3):
+        save(views.images[index], tmp_path / "scene" / f"{index}.png")
+    monkeypatch.setattr(pycolmap, part, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        find_cameras(tmp_path / "scene", tmp_path / "logs")
+    assert not list((tmp_path / "logs").glob("*"))
