@@ -29,7 +29,7 @@ from rich.console import Console
 
 from asysplat import load
 from asysplat.data.cameras import find_cameras
-from asysplat.data.readers import bare_photographs
+from asysplat.data.readers import without_cameras
 from asysplat.errors import InputError, input_error_behind, plain_warnings
 from asysplat.export import read_gaussians
 from asysplat.interrupts import handle_signals
@@ -70,9 +70,9 @@ def reconstruct(config: DictConfig) -> None:
     settings = instantiate(config.refinement)
     results = Results(Path(config.paths.run), config)
     path = config.path
-    if config.layout == "auto" and bare_photographs(path):
+    if config.layout == "auto" and without_cameras(path):
         where = Path(config.paths.logs) / "cameras"
-        path = find_cameras(path, where, config.on_bad_image, Console())
+        path = find_cameras(path, where, config.frames, config.on_bad_image, Console())
         print(f"found cameras: {path}")
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
     photographs = open_photographs(path, **{name: config[name] for name in names})

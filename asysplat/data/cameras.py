@@ -1,4 +1,4 @@
-"""Find the cameras of photographs that have none: structure from motion.
+"""Find the cameras of photographs or of a video: structure from motion.
 
 python -m asysplat.data.cameras my_photographs
 
@@ -24,8 +24,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asysplat.data.bad_images import BadImages, Policy
+from asysplat.data.frames import save_sharp_frames
 from asysplat.data.images import image_size
-from asysplat.data.readers import bare_photographs
+from asysplat.data.readers import photographs_in, without_cameras
 from asysplat.errors import InputError
 from asysplat.files import make_folder
 
@@ -74,35 +75,36 @@ ATTEMPTS = (
 def find_cameras(
     photographs: Path | str,
     where: Path | str,
+    frames: int = 100,
     on_bad_image: Policy = "fail",
     console: Console | None = None,
 ) -> Path:
-    """Find the cameras of a folder of photographs, and return a folder in COLMAP's layout.
+    """Find the cameras of photographs or of a video; return a folder in COLMAP's layout.
 
-    Its images/ are links to the photographs, or upright copies of those that are stored turned; its
-    sparse/0 has the cameras, and the points they were found with. A second attempt with weaker
-    features follows where the first finds fewer than 9 of 10 cameras; the better one is returned.
+    Its images/ are links to the photographs, upright copies of those that are stored turned, or the
+    frames of a video; its sparse/0 has the cameras and the points they were found with. A second
+    attempt with weaker features follows where the first finds fewer than 9 of 10 cameras; the
+    better one is returned.
 
     Args:
-        photographs: of one place, as files of a folder or of its images/.
+        photographs: of one place, as files of a folder or of its images/; or a video.
         where: the folder is made in it, named by the content of the photographs.
+        frames: of a video, at most; the sharpest of equal parts.
+        on_bad_image: "fail", or "skip" to leave out photographs that cannot be read.
         console: where progress is shown; None shows none.
 
     Raises:
-        InputError: no folder of photographs without poses, a photograph that cannot be read,
-            `where` cannot be written to, or too few photographs that show the same place.
+        InputError: no photographs without poses, one that cannot be read, `where` cannot be
+            written to, or too few photographs that show the same place.
     """
-    files = bare_photographs(photographs)
-    if len(files) < LEAST_PHOTOGRAPHS:
+    source, where = Path(photographs).absolute(), Path(where).absolute()
+    if without_cameras(source) is None:
         raise InputError(
-            f"{photographs} has {len(files)} photographs without camera poses: cameras are found "
-            f"from at least {LEAST_PHOTOGRAPHS} that overlap."
+            f"{photographs} is no folder of photographs without cameras, and no video: name one."
         )
-    bad = BadImages(on_bad_image)
-    lenses = dict(bad.read_each(lambda file: (file, _lens_of(file)), ((file,) for file in files)))
-    bad.report(str(photographs), count := len(lenses))
-    where = Path(where).absolute()
-    folder = where / f"{Path(photographs).absolute().name}-{_digest(list(lenses))}"
+    files = [source] if source.is_file() else photographs_in(source)
+    lenses = {} if source.is_file() else _lenses(files, source, on_bad_image)
+    folder = where / f"{source.stem}-{_digest(files, frames)}"
     if folder.is_dir():
         return folder
     make_folder(where, "paths.logs")
@@ -113,33 +115,45 @@ def find_cameras(
     ):
         images = Path(work) / "images"
         images.mkdir()
+        if source.is_file():
+            save_sharp_frames(source, images, frames, progress)
+            lenses = _lenses(photographs_in(images), source, on_bad_image)
         names = {}
         for file, lens in lenses.items():
             name = "_".join(file.name.split())  # COLMAP separates names by spaces
-            _link_upright(file, images / name)
+            if file.parent != images:
+                _link_upright(file, images / name)
             names[name] = lens
-        best = None
-        for number, attempt in enumerate(ATTEMPTS):
-            model = _reconstruct(Path(work) / str(number), images, names, attempt, progress)
-            if best is None or _registered(model) > _registered(best):
-                best = model
-            if _registered(best) >= ENOUGH * count:
-                break
-        if _registered(best) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * count):
+        model = _best_model(Path(work), images, names, progress)
+        if _registered(model) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * len(names)):
             raise InputError(
-                f"{photographs}: found cameras for {_registered(best)} of {count} photographs: too "
-                "few show the same place; photograph it with more overlap, from different places."
+                f"{photographs}: found cameras for {_registered(model)} of {len(names)} "
+                "photographs: too few show the same place; photograph it with more overlap, from "
+                "different places."
             )
         result = Path(work) / "result"
         (result / "sparse" / "0").mkdir(parents=True)
-        best.write(result / "sparse" / "0")
+        model.write(result / "sparse" / "0")
         images.rename(result / "images")
         result.rename(folder)
     return folder
 
 
+def _lenses(files: Sequence[Path], source: Path, on_bad_image: Policy) -> dict[Path, tuple]:
+    """Return for each photograph what tells its camera from others."""
+    if len(files) < LEAST_PHOTOGRAPHS:
+        raise InputError(
+            f"{source} has {len(files)} photographs without camera poses: cameras are found from "
+            f"at least {LEAST_PHOTOGRAPHS} that overlap."
+        )
+    bad = BadImages(on_bad_image)
+    lenses = dict(bad.read_each(lambda file: (file, _lens_of(file)), ((file,) for file in files)))
+    bad.report(str(source), len(lenses))
+    return lenses
+
+
 def _lens_of(file: Path) -> tuple:
-    """Return what tells the cameras of photographs apart: size, make, model and focal length."""
+    """Return the size upright, and the make, model and focal length that the file names."""
     size = image_size(file)
     with Image.open(file) as image:
         exif = image.getexif()
@@ -149,9 +163,9 @@ def _lens_of(file: Path) -> tuple:
     return (size[::-1] if turned else size, *names)
 
 
-def _digest(files: Sequence[Path]) -> str:
+def _digest(files: Sequence[Path], frames: int) -> str:
     """Return a name that follows from the photographs, from where they are, and from the method."""
-    digest = hashlib.sha256(f"{ATTEMPTS} {pycolmap.__version__}".encode())
+    digest = hashlib.sha256(f"{ATTEMPTS} {frames} {pycolmap.__version__}".encode())
     for path in files:
         digest.update(f"{path}\0".encode())
         with path.open("rb") as file:
@@ -181,6 +195,19 @@ def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
 
 def _registered(model: pycolmap.Reconstruction | None) -> int:
     return 0 if model is None else model.num_reg_images()
+
+
+def _best_model(
+    work: Path, images: Path, lenses: dict[str, tuple], progress: Progress
+) -> pycolmap.Reconstruction | None:
+    """Return the largest model of the attempts, which end with the first that is large enough."""
+    best = None
+    for number, attempt in enumerate(ATTEMPTS):
+        model = _reconstruct(work / str(number), images, lenses, attempt, progress)
+        best = max(best, model, key=_registered)
+        if _registered(best) >= ENOUGH * len(lenses):
+            break
+    return best
 
 
 def _reconstruct(
@@ -247,12 +274,15 @@ def _chunks(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = ArgumentParser(prog="python -m asysplat.data.cameras", description=__doc__)
-    parser.add_argument("path", type=Path, help="a folder of photographs")
+    parser.add_argument("path", type=Path, help="a folder of photographs, or a video")
     parser.add_argument("--out", type=Path, default=Path("logs/cameras"), help="outside of it")
+    parser.add_argument("--frames", type=int, default=100, help="of a video, at most")
     parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
     options = parser.parse_args(arguments)
     try:
-        folder = find_cameras(options.path, options.out, options.on_bad_image, Console())
+        folder = find_cameras(
+            options.path, options.out, options.frames, options.on_bad_image, Console()
+        )
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

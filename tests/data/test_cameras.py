@@ -8,12 +8,16 @@ import pycolmap
 import pytest
 import torch
 from PIL import Image, ImageFilter
+from rich.progress import Progress
 
 from asysplat.data import ProceduralScene, cameras, open_scene
 from asysplat.data.cameras import ORIENTATION, find_cameras, main
+from asysplat.data.frames import save_sharp_frames
+from asysplat.data.images import load_image
 from asysplat.data.readers.colmap import read_poses
 from asysplat.data.sequence import SceneOptions
 from asysplat.errors import InputError
+from asysplat.export import write_video
 
 COUNT, HEIGHT, WIDTH = 14, 240, 320
 TURNED, BLURRED = 3, 5
@@ -99,6 +103,44 @@ def test_reconstruct_finds_them(photographs, found, run_script):
     (metrics,) = (found.parent.parent / "reconstruct").glob("*/metrics.json")
     numbers = json.loads(metrics.read_text())
     assert numbers["held_out/psnr"] > numbers["baseline/nearest_view/psnr"]
+
+
+@pytest.fixture(scope="module")
+def video(views, tmp_path_factory):
+    """Each image twice, first blurred."""
+    path = tmp_path_factory.mktemp("videos") / "walk.mp4"
+    blurred = torch.nn.functional.avg_pool2d(views.images, 7, stride=1, padding=3)
+    pairs = torch.stack((blurred, views.images), 1)
+    write_video(path, pairs.flatten(0, 1), fps=10)
+    return path
+
+
+def save_frames(video, folder, count):
+    folder.mkdir()
+    save_sharp_frames(video, folder, count, Progress(disable=True))
+    return [torch.as_tensor(load_image(file)) / 255 for file in sorted(folder.iterdir())]
+
+
+def test_frames_of_a_video_are_the_sharp_ones(video, views, tmp_path):
+    frames = save_frames(video, tmp_path / "frames", COUNT)
+    assert len(frames) == COUNT
+    for frame, image in zip(frames, views.images, strict=True):
+        assert (frame.movedim(-1, 0) - image).abs().mean() < 0.02
+    assert len(save_frames(video, tmp_path / "all", 1000)) == 2 * COUNT
+
+
+@pytest.mark.medium
+def test_a_video(video, tmp_path):
+    found = find_cameras(video, tmp_path, frames=COUNT)
+    assert found.name.startswith("walk-") and len(list((found / "images").iterdir())) == COUNT
+    assert len(read_poses(found / "sparse" / "0")) == COUNT
+
+
+@pytest.mark.parametrize("content", [b"", b"no video"])
+def test_what_is_no_video(content, tmp_path):
+    file = tmp_path / "walk.mp4"
+    file.write_bytes(content)
+    assert "walk.mp4 cannot be read as a video" in refused(file, tmp_path)
 
 
 def test_pairs_of_long_sequences_are_few_and_connected():

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
+from asysplat.data import frames
 from asysplat.data.bad_images import BadImages
 from asysplat.data.disparity.maps import with_disparities
 from asysplat.data.readers import (
@@ -37,7 +38,6 @@ from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.errors import InputError
 
 MAX_NAME = 200  # characters of a path in a message
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 # In this order: the first layout that fits a folder reads it.
 READERS = (
     *(long_lrm, realestate10k, replica, scannetpp, dl3dv, transforms, llff, posed, colmap),
@@ -74,17 +74,12 @@ def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]
             return name, scenes
     if not root.exists():
         raise InputError(f"{root} does not exist: name a scene, or a folder of scenes.")
-    if root.is_file() and root.suffix.lower() in VIDEOS:
-        raise InputError(
-            f"{root} is a video: extract photographs into a folder of their own, for example with "
-            f"ffmpeg -i {root.name} -vf fps=2 my_scene/%04d.jpg, and name that folder."
-        )
     if root.is_file() and root.suffix.lower() in SUFFIXES:
         raise InputError(f"{root} is one photograph: name the folder of all.")
-    if layout == "auto" and (count := len(_photographs(root))):
+    if layout == "auto" and (bare := without_cameras(root)):
         raise InputError(
-            f"{root} has {count} photographs without camera poses: find them first, with python "
-            f"-m asysplat.data.cameras {root}, and name the folder that it prints."
+            f"{root} has {bare} without camera poses: find them first, with python -m "
+            f"asysplat.data.cameras {root}, and name the folder that it prints."
         )
     raise InputError(
         f"{root} holds no photographs with camera poses, in layout {layout}: data/README.md "
@@ -97,16 +92,20 @@ def _check_layout(layout: str) -> None:
         raise InputError(f"layout={layout}: expected auto or one of {', '.join(LAYOUTS)}.")
 
 
-def bare_photographs(root: Path | str) -> list[Path]:
-    """List the photographs of a folder without camera poses, 2 before 10; none if it has poses."""
+def without_cameras(root: Path | str) -> str | None:
+    """Describe photographs or a video without camera poses; None where nothing is, or poses are."""
     root = Path(root).absolute()
+    if root.is_file():
+        return "a video" if root.suffix.lower() in frames.SUFFIXES else None
     with _file_errors(root):
         if any(reader.find_scenes(root) for reader in READERS):
-            return []
-        return _photographs(root)
+            return None
+    count = len(photographs_in(root))
+    return f"{count} photographs" if count else None
 
 
-def _photographs(root: Path) -> list[Path]:
+def photographs_in(root: Path) -> list[Path]:
+    """List the image files of a folder, or of its images/, 2 before 10."""
     return sorted(images_in(root) or images_in(root / "images"), key=natural_order)
 
 
