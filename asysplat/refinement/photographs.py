@@ -68,7 +68,7 @@ def open_photographs(
             ratio.
         views, max_held_out: number of input and of held-out views, at most.
         held_out_every: hold out every n-th photograph, from the first on; None: none.
-        say: takes warnings: fewer views than asked for, or cameras that do not fit the photographs.
+        say: takes warnings: a smaller height than asked for, or cameras that do not fit the images.
 
     Raises:
         InputError: fewer than two input views; see `open_scene`.
@@ -99,8 +99,6 @@ def open_photographs(
             f"{path} has {len(indices)} photographs, of which held_out_every={held_out_every} "
             f"leaves {len(rest)}: set held_out_every=null, or give more photographs."
         )
-    if len(rest) < views:
-        say(f"{path} has {len(rest)} photographs to fit to, not {views}: all are used.")
     inputs = spread(rest, min(views, len(rest)))
     held_out = spread(held_out, min(max_held_out, len(held_out))) if held_out else []
     files = [str(image.file) for image in scene.images]
