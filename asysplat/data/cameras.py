@@ -94,14 +94,16 @@ def find_cameras(
         console: where progress is shown; None shows none.
 
     Raises:
-        InputError: no photographs without poses, one that cannot be read, `where` cannot be
-            written to, or too few photographs that show the same place.
+        InputError: no photographs without poses, fewer than 3 `frames`, a photograph that cannot be
+            read, `where` cannot be written to, or too few that show the same place.
     """
     source, where = Path(photographs).absolute(), Path(where).absolute()
     if without_cameras(source) is None:
         raise InputError(
             f"{photographs} is no folder of photographs without cameras, and no video: name one."
         )
+    if not isinstance(frames, int) or frames < LEAST_PHOTOGRAPHS:
+        raise InputError(f"frames={frames}: give a whole number of at least {LEAST_PHOTOGRAPHS}.")
     files = [source] if source.is_file() else photographs_in(source)
     lenses = {} if source.is_file() else _lenses(files, source, on_bad_image)
     folder = where / f"{source.stem}-{_digest(files, frames)}"

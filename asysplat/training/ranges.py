@@ -28,7 +28,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
         "a whole number of at least 1",
         lambda value: is_whole(value, 1),
         (
-            *("steps", "validate_every", "state_size", "trainer.num_nodes", "frames"),
+            *("steps", "validate_every", "state_size", "trainer.num_nodes"),
             *(f"data.{key}" for key in ("inputs", "targets", "height", "width", "batch_size")),
             *(f"data.{key}" for key in ("val_scenes", "test_scenes", "micro_batch")),
             *("callbacks.non_finite_steps.budget", "callbacks.monitor.every"),

@@ -143,6 +143,12 @@ def test_what_is_no_video(content, tmp_path):
     assert "walk.mp4 cannot be read as a video" in refused(file, tmp_path)
 
 
+@pytest.mark.parametrize("frames", [0, 2])
+def test_too_few_frames(frames, tmp_path):
+    (tmp_path / "walk.mp4").touch()
+    assert refused(tmp_path / "walk.mp4", tmp_path, frames=frames).startswith(f"frames={frames}: ")
+
+
 def test_pairs_of_long_sequences_are_few_and_connected():
     names = [f"{index}" for index in range(500)]
     pairs = {(int(first), int(second)) for first, second in cameras._pairs(names)}
