@@ -20,6 +20,7 @@ from typing import Any
 
 import pycolmap
 from PIL import Image, ImageOps
+from PIL.ExifTags import IFD, Base
 from rich.console import Console
 from rich.progress import Progress
 
@@ -27,11 +28,12 @@ from asysplat.data.bad_images import BadImages, Policy
 from asysplat.data.frames import save_sharp_frames
 from asysplat.data.images import image_size
 from asysplat.data.readers import photographs_in, without_cameras
+from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
 from asysplat.files import make_folder
 
-MIN_FOUND = 0.25  # of the photographs; with fewer there is no scene
-ENOUGH = 0.9  # of the photographs; with fewer the next attempt is made
+MIN_FOUND = 0.25  # share of the photographs; with fewer there is no scene
+ENOUGH = 0.9  # share of the photographs; with fewer the next attempt is made
 LEAST_PHOTOGRAPHS = 3
 ALL_PAIRS = 80  # photographs; of more, not all pairs are matched but
 FOLLOWING = 10  # each with so many that follow, and with those 16, 32, ... further on,
@@ -39,7 +41,6 @@ ANCHORS = 40  # and so many, spread evenly, with each other: a sequence may retu
 CHUNK = 8  # photographs, or that squared of pairs, between two updates of the progress bar
 SEED = 0
 ONLY_FATAL = 3  # the least severe messages that are printed
-ORIENTATION, MAKE, MODEL, EXIF_FOLDER, FOCAL, FOCAL_35MM = 274, 271, 272, 34665, 37386, 41989
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,13 @@ class Attempt:
     """How hard features and matches are sought.
 
     Args:
-        max_side: of the images in which features are found, pixels.
-        features: of an image, at most.
-        contrast: of the weakest feature.
-        guided: matches are sought again along epipolar lines.
-        pair, first_pair, image: inliers of a pair, of the pair to start with, and of an image that
-            is added, at least.
-        angle: between the rays of the pair to start with, degrees.
+        max_side: pixels of the longer side; larger images are shrunk to find features.
+        features: greatest number of features in an image.
+        contrast: least contrast of a feature.
+        guided: whether matches are sought again along epipolar lines.
+        pair, first_pair, image: least number of inliers of a pair, of the pair to start with, and
+            of an image that is added.
+        angle: least angle between the rays of the pair to start with, in degrees.
     """
 
     max_side: int
@@ -87,9 +88,9 @@ def find_cameras(
     better one is returned.
 
     Args:
-        photographs: of one place, as files of a folder or of its images/; or a video.
+        photographs: a folder of photographs of one place, or of an images/ with them; or a video.
         where: the folder is made in it, named by the content of the photographs.
-        frames: of a video, at most; the sharpest of equal parts.
+        frames: greatest number of frames of a video, each the sharpest of an equal part.
         on_bad_image: "fail", or "skip" to leave out photographs that cannot be read.
         console: where progress is shown; None shows none.
 
@@ -123,6 +124,8 @@ def find_cameras(
         names = {}
         for file, lens in lenses.items():
             name = "_".join(file.name.split())  # COLMAP separates names by spaces
+            while name in names:
+                name = f"_{name}"
             if file.parent != images:
                 _link_upright(file, images / name)
             names[name] = lens
@@ -159,10 +162,10 @@ def _lens_of(file: Path) -> tuple:
     size = image_size(file)
     with Image.open(file) as image:
         exif = image.getexif()
-        details = exif.get_ifd(EXIF_FOLDER)
-    turned = exif.get(ORIENTATION, 1) >= 5
-    names = (exif.get(MAKE), exif.get(MODEL), details.get(FOCAL), details.get(FOCAL_35MM))
-    return (size[::-1] if turned else size, *names)
+        details = exif.get_ifd(IFD.Exif)
+    turned = exif.get(Base.Orientation, 1) >= 5
+    focal = details.get(Base.FocalLength), details.get(Base.FocalLengthIn35mmFilm)
+    return (size[::-1] if turned else size, exif.get(Base.Make), exif.get(Base.Model), *focal)
 
 
 def _digest(files: Sequence[Path], frames: int) -> str:
@@ -178,7 +181,7 @@ def _digest(files: Sequence[Path], frames: int) -> str:
 def _link_upright(file: Path, link: Path) -> None:
     """Link to a photograph; copy it where its pixels are stored turned."""
     with Image.open(file) as image:
-        if image.getexif().get(ORIENTATION, 1) == 1:
+        if image.getexif().get(Base.Orientation, 1) == 1:
             link.symlink_to(file)
             return
         upright = ImageOps.exif_transpose(image)
@@ -222,7 +225,7 @@ def _reconstruct(
     extraction = pycolmap.FeatureExtractionOptions(max_image_size=attempt.max_side)
     extraction.sift.max_num_features = attempt.features
     extraction.sift.peak_threshold = attempt.contrast
-    for lens in set(lenses.values()):
+    for lens in dict.fromkeys(lenses.values()):
         options = pycolmap.ImageReaderOptions()
         for chunk in _chunks([name for name in lenses if lenses[name] == lens], CHUNK):
             pycolmap.extract_features(
@@ -282,6 +285,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
     options = parser.parse_args(arguments)
     try:
+        refuse_inside(options.out, options.path, "name a folder elsewhere with --out")
         folder = find_cameras(
             options.path, options.out, options.frames, options.on_bad_image, Console()
         )

@@ -44,9 +44,10 @@ def save_sharp_frames(video: Path, folder: Path, count: int, progress: Progress)
             progress.advance(task)
             if frame.pts is None:
                 continue
-            if (of := (frame.pts - first) * count // length) != part:
+            current = (frame.pts - first) * count // length
+            if current != part:
                 save()
-                part, best = of, None
+                part, best = current, None
             pixels = frame.to_ndarray(format="rgb24")
             sharp = _sharpness(pixels)
             if best is None or sharp > best[0]:

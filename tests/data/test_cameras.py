@@ -8,10 +8,11 @@ import pycolmap
 import pytest
 import torch
 from PIL import Image, ImageFilter
+from PIL.ExifTags import Base
 from rich.progress import Progress
 
 from asysplat.data import ProceduralScene, cameras, open_scene
-from asysplat.data.cameras import ORIENTATION, find_cameras, main
+from asysplat.data.cameras import find_cameras, main
 from asysplat.data.frames import save_sharp_frames
 from asysplat.data.images import load_image
 from asysplat.data.readers.colmap import read_poses
@@ -41,7 +42,7 @@ def photographs(views, tmp_path_factory):
         save(image, folder / f"walk {index}.png")
     turned, blurred = (folder / f"walk {index}.png" for index in (TURNED, BLURRED))
     exif = Image.Exif()
-    exif[ORIENTATION] = 6  # stored a quarter turn to the left of upright
+    exif[Base.Orientation] = 6  # stored a quarter turn to the left of upright
     Image.open(turned).transpose(Image.Transpose.ROTATE_90).save(turned, exif=exif)
     Image.open(blurred).filter(ImageFilter.GaussianBlur(1)).save(blurred)
     elsewhere = ProceduralScene(9, HEIGHT, WIDTH, num_images=32).views([20])
@@ -155,6 +156,23 @@ def test_pairs_of_long_sequences_are_few_and_connected():
     assert len(pairs) < 500 * 499 / 2 / 10
     assert all((index, index + 1) in pairs for index in range(499)) and (0, 499) in pairs
     assert len(cameras._pairs(names[:30])) == 30 * 29 / 2
+
+
+def test_names_that_differ_by_spaces(views, tmp_path):
+    for index, name in enumerate(("a 1.png", "a_1.png", "a  1.png", "b.png")):
+        save(views.images[index], tmp_path / "scene" / name)
+    found = find_cameras(tmp_path / "scene", tmp_path / "logs")
+    assert {file.resolve().name for file in (found / "images").iterdir()} == {
+        *("a 1.png", "a_1.png", "a  1.png", "b.png")
+    }
+
+
+def test_nothing_is_written_beside_the_photographs(views, tmp_path, capsys):
+    for index in range(3):
+        save(views.images[index], tmp_path / "scene" / f"{index}.png")
+    assert main([str(tmp_path / "scene"), "--out", str(tmp_path / "scene" / "logs")]) == 1
+    assert "name a folder elsewhere with --out" in capsys.readouterr().err
+    assert len(list((tmp_path / "scene").iterdir())) == 3
 
 
 def refused(folder, tmp_path, **options) -> str:

@@ -128,19 +128,15 @@ def forward_backward(function: Function, inputs: Tensors, leaves: Collection[str
     outputs = function(inputs)
     # Random numbers that every precision represents exactly.
     random = [torch.Generator().manual_seed(seed) for seed in range(len(outputs))]
-    weights = {
-        name: torch.randn(output.shape, generator=generator).bfloat16().to(output)
-        for (name, output), generator in zip(outputs.items(), random, strict=True)
-    }
+    weights = [
+        torch.randn(output.shape, generator=generator).bfloat16().to(output)
+        for output, generator in zip(outputs.values(), random, strict=True)
+    ]
     own = [inputs[name] for name in leaves]
     # Where the network has a prior, its opacities and colors depend on no leaf.
-    names = [name for name, output in outputs.items() if output.requires_grad]
-    grads = torch.autograd.grad(
-        [outputs[name] for name in names],
-        own,
-        [weights[name] for name in names],
-        materialize_grads=True,
-    )
+    pairs = zip(outputs.values(), weights, strict=True)
+    ends, weights = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
+    grads = torch.autograd.grad(ends, own, weights, materialize_grads=True)
     named = {f"gradient of {name}": grad for name, grad in zip(leaves, grads, strict=True)}
     return {name: output.detach() for name, output in outputs.items()} | named
 

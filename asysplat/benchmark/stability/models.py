@@ -116,7 +116,9 @@ def _measure_network(net: Network, hostile: HostileViews, precision: str, wild: 
         return {name: getattr(gaussians, name) for name in FIELDS}
 
     double = copy.deepcopy(net).double()
-    double.training = True  # of itself, not its layers: it takes perturbed views, a white above 1
+    # The flag of the network alone, whose layers stay as they are: in training it does not validate
+    # its views, and a perturbed white exceeds 1.
+    double.training = True
     return compare_to_reference(
         partial(predict, net, half),
         partial(predict, double, False),

@@ -76,7 +76,7 @@ def find_scenes(root: Path | str, layout: str = "auto") -> tuple[str, list[Path]
         raise InputError(f"{root} does not exist: name a scene, or a folder of scenes.")
     if root.is_file() and root.suffix.lower() in SUFFIXES:
         raise InputError(f"{root} is one photograph: name the folder of all.")
-    if layout == "auto" and (bare := without_cameras(root)):
+    if layout == "auto" and (bare := _bare(root)):
         raise InputError(
             f"{root} has {bare} without camera poses: find them first, with python -m "
             f"asysplat.data.cameras {root}, and name the folder that it prints."
@@ -95,11 +95,14 @@ def _check_layout(layout: str) -> None:
 def without_cameras(root: Path | str) -> str | None:
     """Describe photographs or a video without camera poses; None where nothing is, or poses are."""
     root = Path(root).absolute()
+    with _file_errors(root):
+        posed = any(reader.find_scenes(root) for reader in READERS)
+    return None if posed else _bare(root)
+
+
+def _bare(root: Path) -> str | None:
     if root.is_file():
         return "a video" if root.suffix.lower() in frames.SUFFIXES else None
-    with _file_errors(root):
-        if any(reader.find_scenes(root) for reader in READERS):
-            return None
     count = len(photographs_in(root))
     return f"{count} photographs" if count else None
 
