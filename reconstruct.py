@@ -96,12 +96,14 @@ def reconstruct(config: DictConfig) -> None:
 def describe(config: DictConfig, photographs: Photographs, limit: dict[str, float]) -> str:
     """Write a line of what is used, of what there is, and of the options that change it."""
     inputs, held_out = photographs.inputs, len(photographs.held_out_files)
+    masked = 0.0 if inputs.masks is None else 1 - inputs.masks.float().mean().item()
+    masked = f", {masked:.0%} of the pixels masked out" if masked >= 0.01 else ""
     (name, value), gaussians = next(iter(limit.items())), config.refinement.max_gaussians
     return (
         f"{inputs.num_views} of {photographs.total} photographs are fitted (views=), {held_out} "
-        f"measure the result (held_out_every=), {inputs.cameras.height} pixels high (height=), at "
-        f"most {gaussians or math.inf:,} Gaussians (refinement.max_gaussians=), {value:g} {name} "
-        f"({name}=); all of these: quality=preview or best"
+        f"measure the result (held_out_every=), {inputs.cameras.height} pixels high (height="
+        f"){masked}, at most {gaussians or math.inf:,} Gaussians (refinement.max_gaussians=), "
+        f"{value:g} {name} ({name}=); all of these: quality=preview or best"
     )
 
 

@@ -33,7 +33,7 @@ from asysplat.benchmark import timing
 from asysplat.benchmark.compare import DECIBELS, LPIPS_DISTANCE, TIME, Watched
 from asysplat.benchmark.options import CPU, PRECISIONS, check_names, find_device
 from asysplat.benchmark.table import Columns, machine_note, make_table, number, spread, text
-from asysplat.benchmark.timing import Measurement, Result, seconds_of, summary
+from asysplat.benchmark.timing import Measurement, Result, summary
 from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.procedural.scene import split_seed
@@ -41,6 +41,7 @@ from asysplat.data.selection.views import spread as select_evenly
 from asysplat.data.selection.views import uniform_selection
 from asysplat.errors import InputError, input_error_behind
 from asysplat.evaluation.lpips import load_lpips
+from asysplat.evaluation.measured_cost import PEAK_MEMORY, CostMeter
 from asysplat.evaluation.protocol import Protocol
 from asysplat.models.network import Network
 from asysplat.refinement import mean_color, merge_to_limit, refine
@@ -79,8 +80,9 @@ QUALITIES = {  # higher is better
     "psnr": "PSNR against photographs, dB",
     "error": "PSNR against the exact images, dB",
 }
-NOTES = """\
+NOTES = f"""\
 -: not measured; photographs in memory to all held-out views; / base: in the same round, in turns
+GB: {PEAK_MEMORY["cpu"]} of the process, {PEAK_MEMORY["cuda"]} on a GPU
 error: of images in [0, 1] against the base in float64, of other layers against their own, of \
 refinements against the base"""
 
@@ -330,14 +332,14 @@ def _measure_scene(
     views = {name: getattr(scene, name).to(own_device) for name in ("inputs", "held_out")}
     scene = replace(scene, **views)
     drawn, measurements, absent = {}, {}, {}
+    meters = {name: CostMeter(own_device) for name in settings}
 
     def run(name: str) -> dict[str, float]:
-        def render_scene() -> None:
-            drawn[name] = renderers[name](scene)
-
-        seconds = seconds_of(render_scene, own_device)
+        meters[name].start()
+        drawn[name] = renderers[name](scene)
+        meters[name].stop()
         advance()
-        return {"seconds": seconds}
+        return {"seconds": meters[name].seconds[-1]}
 
     once = runs_once(base)
     if once:  # compiles kernels
@@ -357,13 +359,14 @@ def _measure_scene(
     rows = []
     for name, setting in settings.items():
         row = {"setting": name, "values": asdict(setting), "not_measured": absent.get(name)}
-        empty = ("seconds", "over_base", "error", "psnr", "ssim", "lpips", "gaussians")
+        empty = ("seconds", "over_base", "error", "psnr", "ssim", "lpips", "gaussians", "peak_gb")
         row |= dict.fromkeys(empty)
         if name in measurements:
             own, of_base = (measurements[n].seconds["seconds"] for n in (name, BASE))
             ratios = [a / b for a, b in zip(own, of_base, strict=True)]
             row |= {"seconds": summary(own), "over_base": summary(ratios)}
             row["gaussians"] = drawn[name].gaussians
+            row["peak_gb"] = max(meters[name].gb, default=None)
             exact = base
             if isinstance(setting, FeedForward):
                 exact = replace(base if setting.trained else setting, precision=EXACT)
@@ -404,7 +407,8 @@ def measure(options: DictConfig, console: Console) -> Result:
     Returns:
         "rows": one for each family, scene and setting: "seconds", their ratio to the base's of the
         same round "over_base", "error" of the images against the exact ones in "decibels", and
-        metrics against the photographs, the number of "gaussians"; None for what was not measured.
+        metrics against the photographs, the number of "gaussians", and "peak_gb", the largest
+        `peak_memory_gb` of all runs; None for what was not measured.
         "not_measured": what, and why.
     """
     config = OmegaConf.to_container(options.pareto, resolve=True)
@@ -517,6 +521,7 @@ ROWS: Columns = {
     "PSNR": number("psnr", "{:.2f}"),
     "LPIPS": number("lpips", "{:.3f}"),
     "Gaussians": number("gaussians", "{:,}"),
+    "GB": number("peak_gb", "{:.2f}"),
     "error\ndB": number("error.decibels", "{:.1f}"),
 }
 MEANS: Columns = {

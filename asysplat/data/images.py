@@ -23,6 +23,7 @@ from asysplat.errors import InputError
 
 END_MARKERS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
 TAIL_BYTES = 4096  # some cameras append data after the end marker
+WHOLE = 0.9999  # share of a pixel, as rounded, from which all of it is covered
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +100,13 @@ def load_depth(path: ImageFile) -> Float32[ndarray, "h w"]:
 
 
 def load_mask(path: ImageFile) -> Bool[ndarray, "h w"]:
-    """Read a mask: True where the stored value is not 0."""
-    return _read(path, lambda image: np.asarray(image.convert("L")) > 0)
+    """Read a mask: True where the image is opaque; of one without alpha, where it is not black."""
+    return _read(path, _to_mask)
+
+
+def has_alpha(path: ImageFile) -> bool:
+    """Read from the header whether an image may be transparent."""
+    return _read(path, lambda image: image.has_transparency_data)
 
 
 def undistort(
@@ -114,6 +120,8 @@ def undistort(
     """
     if not lens.is_distorted:
         return pixels
+    if pixels.dtype == bool:
+        return undistort(pixels.astype(np.uint8), lens, nearest=True) > 0
     x, y = _undistortion_maps(lens, pixels.shape[1], pixels.shape[0])
     if nearest:
         return cv2.remap(pixels, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
@@ -125,9 +133,14 @@ def resize_and_crop(
 ) -> Shaped[ndarray, "height width *channels"]:
     """Crop to the largest centered part with the given proportions; resize to `height` x `width`.
 
-    Antialiased (Lanczos), or the pixel under each new center with `nearest`.
+    Antialiased (Lanczos), or the pixel under each new center with `nearest`; of booleans, True
+    where all pixels are that the new one covers.
     """
     _, *box = _centered_box(pixels.shape[1], pixels.shape[0], height, width)
+    if pixels.dtype == bool:
+        share = Image.fromarray(pixels.astype(np.float32))
+        share = share.resize((width, height), Image.Resampling.BOX, tuple(box))
+        return np.asarray(share) > WHOLE
     method = Image.Resampling.NEAREST if nearest else Image.Resampling.LANCZOS
     return np.asarray(Image.fromarray(pixels).resize((width, height), method, tuple(box)))
 
@@ -171,6 +184,12 @@ def _to_rgb(image: Image.Image) -> UInt8[ndarray, "h w 3"]:
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
     return np.asarray(image.convert("RGB"))
+
+
+def _to_mask(image: Image.Image) -> Bool[ndarray, "h w"]:
+    if image.has_transparency_data:
+        return np.asarray(image.convert("RGBA"))[..., 3] == 255
+    return np.asarray(image.convert("L")) > 0
 
 
 def content_hash(file: ImageFile) -> str:

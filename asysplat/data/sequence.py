@@ -78,7 +78,7 @@ class PosedImage:
     Args:
         cam_to_world: rigid, OpenCV axes.
         depth: one-channel integer image of distances along z, `depth_unit` scene units each.
-        mask: image that is 0 where the pixel must be ignored.
+        mask: image that is 0 where the pixel must be ignored; see `load_mask`.
         disparity: one-channel integer image of inverse depths, up to a scale and a shift; 0 where
             unknown.
     """
@@ -232,9 +232,8 @@ class FileSequence:
     def _mask(self, image: PosedImage) -> Bool[Tensor, "H W"]:
         lens = image.lens
         if image.mask is None:
-            ones = np.ones((lens.height, lens.width), dtype=np.uint8)
-            return torch.tensor(self._fit(ones, lens, nearest=True)) > 0
-        return self._pixels(image.mask, load_mask, lens, nearest=True) > 0
+            return torch.tensor(self._fit(np.ones((lens.height, lens.width), dtype=bool), lens))
+        return self._pixels(image.mask, load_mask, lens)
 
     def _map(self, file: ImageFile | None, load: Load, lens: Lens) -> Float[Tensor, "H W"]:
         """Return unmixed values at this sequence's size; 0 without a file."""
@@ -256,7 +255,5 @@ class FileSequence:
         return torch.tensor(cache.get(key, lambda: self._fit(load(file), lens, nearest), changed))
 
     def _fit(self, pixels: ndarray, lens: Lens, nearest: bool = False) -> ndarray:
-        if pixels.dtype == bool:
-            pixels = pixels.astype(np.uint8)
         pixels = undistort(pixels, lens, nearest)
         return resize_and_crop(pixels, self.options.height, self.options.width, nearest)

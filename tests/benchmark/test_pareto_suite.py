@@ -20,6 +20,7 @@ from asysplat.benchmark.pareto import (
     tables,
 )
 from asysplat.errors import InputError
+from asysplat.evaluation.measured_cost import memory_gb, reset_peak_memory
 from asysplat.evaluation.metrics import psnr
 from asysplat.refinement import mean_color
 from asysplat.rendering import render
@@ -90,6 +91,8 @@ def test_rows_are_complete_and_absences_are_named(measured):
             continue
         assert row["not_measured"] is None and row["lpips"] is None
         assert row["seconds"]["median"] > 0
+        if reset_peak_memory("cpu"):
+            assert 0.1 < row["peak_gb"] < memory_gb("cpu")
         assert name != BASE or row["over_base"]["median"] == 1
         assert (family == "reconstruct") == ("noise" in row)
         assert (row["psnr"] is None) == (family == "networks")

@@ -11,8 +11,9 @@ from PIL import Image, ImageFilter
 from PIL.ExifTags import Base
 from rich.progress import Progress
 
-from asysplat.data import ProceduralScene, cameras, open_scene
-from asysplat.data.cameras import find_cameras, main
+from asysplat.data import ProceduralScene, open_scene
+from asysplat.data.cameras import features, find, find_cameras
+from asysplat.data.cameras.__main__ import main
 from asysplat.data.frames import save_sharp_frames
 from asysplat.data.images import load_image
 from asysplat.data.readers.colmap import read_poses
@@ -85,7 +86,7 @@ def test_the_scene_opens_upright_without_what_shows_another_place(views, found):
 
 @pytest.mark.medium
 def test_they_are_found_once(photographs, found, monkeypatch, capsys):
-    monkeypatch.delattr(cameras, "_reconstruct")
+    monkeypatch.delattr(find, "_reconstruct")
     assert find_cameras(photographs, found.parent) == found
     assert main([str(photographs), "--out", str(found.parent)]) == 0
     assert capsys.readouterr().out.strip() == str(found)
@@ -152,10 +153,10 @@ def test_too_few_frames(frames, tmp_path):
 
 def test_pairs_of_long_sequences_are_few_and_connected():
     names = [f"{index}" for index in range(500)]
-    pairs = {(int(first), int(second)) for first, second in cameras._pairs(names)}
+    pairs = {(int(first), int(second)) for first, second in features._pairs(names)}
     assert len(pairs) < 500 * 499 / 2 / 10
     assert all((index, index + 1) in pairs for index in range(499)) and (0, 499) in pairs
-    assert len(cameras._pairs(names[:30])) == 30 * 29 / 2
+    assert len(features._pairs(names[:30])) == 30 * 29 / 2
 
 
 def test_names_that_differ_by_spaces(views, tmp_path):
@@ -227,3 +228,40 @@ def test_an_interrupt_leaves_nothing(part, views, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         find_cameras(tmp_path / "scene", tmp_path / "logs")
     assert not list((tmp_path / "logs").glob("*"))
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("kind", ["masks", "alpha"])
+def test_what_is_masked_out_is_not_matched(kind, views, tmp_path):
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, : WIDTH // 4] = 0
+    for index in range(6):
+        file = tmp_path / "scene" / "images" / f"{index}.png"
+        save(views.images[index], file)
+        if kind == "alpha":
+            Image.fromarray(np.dstack([np.asarray(Image.open(file)), mask])).save(file)
+        else:
+            small = Image.fromarray(mask).reduce(2)
+            (tmp_path / "scene" / "masks").mkdir(exist_ok=True)
+            small.save(tmp_path / "scene" / "masks" / f"{index}.png")
+    found = find_cameras(tmp_path / "scene", tmp_path / "logs")
+    model = pycolmap.Reconstruction(found / "sparse" / "0")
+    x = [point.xy[0] for image in model.images.values() for point in image.points2D]
+    assert model.num_reg_images() == 6 and min(x) >= WIDTH // 4
+    masks = open_scene(found, SceneOptions(HEIGHT, WIDTH)).views([0]).masks[0]
+    left, right = masks[:, : WIDTH // 4 - 4], masks[8:-8, WIDTH // 4 + 4 : -8]
+    assert not left.any() and right.all()
+
+
+@pytest.mark.medium
+def test_photographs_of_two_sizes_have_two_cameras(views, tmp_path):
+    for index in range(8):
+        file = tmp_path / "scene" / f"{index}.png"
+        save(views.images[index], file)
+        if index % 2:
+            Image.open(file).resize((WIDTH * 3 // 2, HEIGHT * 3 // 2)).save(file)
+    model = pycolmap.Reconstruction(find_cameras(tmp_path / "scene", tmp_path) / "sparse" / "0")
+    assert model.num_reg_images() == 8
+    small, large = sorted(model.cameras.values(), key=lambda camera: camera.width)
+    assert (small.width, large.width) == (WIDTH, WIDTH * 3 // 2)
+    assert large.focal_length / small.focal_length == pytest.approx(1.5, rel=0.02)

@@ -100,6 +100,20 @@ def test_shrinking_averages_and_the_same_size_changes_nothing():
     assert np.array_equal(resize_and_crop(depth, 2, 2, nearest=True), depth[[1, 4]][:, [1, 4]])
 
 
+def test_a_mask_keeps_pixels_that_are_kept_wholly():
+    mask = np.ones((6, 8), bool)
+    mask[3, 5] = False
+    small = np.ones((3, 4), bool)
+    small[1, 2] = False
+    assert np.array_equal(resize_and_crop(mask, 3, 4), small)
+    assert np.array_equal(resize_and_crop(small, 6, 8), small.repeat(2, 0).repeat(2, 1))
+    for factor in (7, 50):
+        large = np.ones((3 * factor, 4 * factor), bool)
+        assert resize_and_crop(large, 3, 4).all()
+        large[factor, 2 * factor] = False
+        assert np.array_equal(resize_and_crop(large, 3, 4), small)
+
+
 def test_transparent_pixels_become_white(tmp_path):
     pixels = np.zeros((2, 3, 4), np.uint8)
     pixels[0], pixels[1] = (200, 100, 0, 255), (200, 100, 0, 0)

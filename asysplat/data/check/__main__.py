@@ -17,7 +17,7 @@ from rich.console import Console
 from asysplat.data.bad_images import BadImages
 from asysplat.data.check.report import Report, check_scene
 from asysplat.data.check.show import draw_report, print_report
-from asysplat.data.readers import LAYOUTS, find_scenes
+from asysplat.data.readers import LAYOUTS, find_scenes, read_scene
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
 
@@ -51,7 +51,7 @@ def check(options: Namespace, console: Console) -> int:
     all_fit = True
     for path in checked:
         bad = BadImages(options.on_bad_image)
-        scene = LAYOUTS[layout].read_scene(path, bad)
+        scene = read_scene(layout, path, bad)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the report lists the skipped images
             report = check_scene(scene, bad, console)

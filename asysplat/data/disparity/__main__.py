@@ -21,7 +21,7 @@ from asysplat.data.bad_images import BadImages
 from asysplat.data.disparity.maps import BESIDE, map_folder, map_name, write_map
 from asysplat.data.disparity.network import MODEL, load_depth_anything
 from asysplat.data.images import load_image
-from asysplat.data.readers import LAYOUTS, find_scenes
+from asysplat.data.readers import LAYOUTS, find_scenes, read_scene
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
 
@@ -69,7 +69,7 @@ def write_maps(
     Raises:
         InputError: files that cannot be read or written; the maps written before stay.
     """
-    posed = LAYOUTS[layout].read_scene(scene, bad)
+    posed = read_scene(layout, scene, bad)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

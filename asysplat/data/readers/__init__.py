@@ -34,7 +34,8 @@ from asysplat.data.readers import (
     transforms,
 )
 from asysplat.data.readers.common import SUFFIXES, images_in, natural_order
-from asysplat.data.sequence import FileSequence, SceneOptions
+from asysplat.data.readers.masks import with_masks
+from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.errors import InputError
 
 MAX_NAME = 200  # characters of a path in a message
@@ -112,6 +113,16 @@ def photographs_in(root: Path) -> list[Path]:
     return sorted(images_in(root) or images_in(root / "images"), key=natural_order)
 
 
+def read_scene(layout: str, scene: Path, bad: BadImages) -> PosedScene:
+    """Read one of the `find_scenes` with the masks of its images; collect errors of single images.
+
+    Raises:
+        InputError: a scene that is not usable.
+    """
+    with _file_errors(scene):
+        return with_masks(LAYOUTS[layout].read_scene(scene, bad), bad)
+
+
 def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
     """Open one scene without reading pixels.
 
@@ -129,8 +140,7 @@ def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:
             raise InputError(f"{path} holds {len(scenes)} scenes: name one, such as {scenes[0]}.")
         path = scenes[0]
     bad = BadImages(options.on_bad_image)
-    with _file_errors(path):
-        posed = LAYOUTS[layout].read_scene(path, bad)
+    posed = read_scene(layout, path, bad)
     if options.disparities is not None:
         posed = with_disparities(posed, path, Path(options.disparities))
     sequence = FileSequence(posed, options)

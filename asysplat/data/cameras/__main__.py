@@ -1,0 +1,37 @@
+"""Find the cameras of photographs or of a video: structure from motion.
+
+python -m asysplat.data.cameras my_photographs
+"""
+
+import sys
+from argparse import ArgumentParser
+from pathlib import Path
+
+from rich.console import Console
+
+from asysplat.data.cameras.find import find_cameras
+from asysplat.data.write import refuse_inside
+from asysplat.errors import InputError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = ArgumentParser(prog="python -m asysplat.data.cameras", description=__doc__)
+    parser.add_argument("path", type=Path, help="a folder of photographs, or a video")
+    parser.add_argument("--out", type=Path, default=Path("logs/cameras"), help="outside of it")
+    parser.add_argument("--frames", type=int, default=100, help="of a video, at most")
+    parser.add_argument("--on-bad-image", default="fail", choices=("fail", "skip"))
+    options = parser.parse_args(arguments)
+    try:
+        refuse_inside(options.out, options.path, "name a folder elsewhere with --out")
+        folder = find_cameras(
+            options.path, options.out, options.frames, options.on_bad_image, Console()
+        )
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(folder)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

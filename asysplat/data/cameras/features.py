@@ -1,0 +1,156 @@
+"""Find features of photographs and match them between pairs, in a database of COLMAP."""
+
+import hashlib
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+from PIL import Image
+from rich.progress import Progress
+
+from asysplat.data.images import image_size, load_mask
+from asysplat.data.readers.common import beside
+
+ALL_PAIRS = 80  # photographs; of more, not all pairs are matched but
+FOLLOWING = 10  # each with so many that follow, and with those 16, 32, ... further on,
+ANCHORS = 40  # and so many, spread evenly, with each other: a sequence may return to a place
+CHUNK = 8  # photographs, or that squared of pairs, between two updates of the progress bar
+SEED = 0
+ONLY_FATAL = 3  # the least severe messages that are printed
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How hard features and matches are sought.
+
+    Args:
+        max_side: pixels of the longer side; larger images are shrunk to find features.
+        features: greatest number of features in an image.
+        contrast: least contrast of a feature.
+        guided: whether matches are sought again along epipolar lines.
+        pair: least number of inliers of a pair.
+    """
+
+    max_side: int
+    features: int
+    contrast: float
+    guided: bool
+    pair: int
+
+
+USUAL = Effort(1600, 4096, 0.0067, guided=False, pair=15)
+HARD = Effort(3200, 8192, 0.002, guided=True, pair=10)
+
+
+def match_photographs(
+    work: Path,
+    lenses: Mapping[str, Hashable],
+    effort: Effort,
+    progress: Progress,
+    cameras: Mapping[Hashable, pycolmap.Camera] | None = None,
+) -> Path:
+    """Write a database of features and verified matches; return its path.
+
+    Args:
+        work: a folder whose images/ has the photographs and whose masks/ may have NAME.png, 0 where
+            features are not wanted.
+        lenses: by the name of each photograph, in the order of the sequence; photographs of the
+            same lens have one camera.
+        cameras: of each lens, if known; else a focal length is guessed.
+    """
+    database = work / f"{effort.features}.db"
+    extraction = pycolmap.FeatureExtractionOptions(max_image_size=effort.max_side)
+    extraction.sift.max_num_features = effort.features
+    extraction.sift.peak_threshold = effort.contrast
+    task = progress.add_task("features", total=len(lenses))
+    for lens in dict.fromkeys(lenses.values()):
+        options = pycolmap.ImageReaderOptions()
+        if (work / "masks").is_dir():
+            options.mask_path = work / "masks"
+        if cameras is not None:
+            options.camera_model = cameras[lens].model_name
+            options.camera_params = cameras[lens].params_to_string()
+        for chunk in _chunks([name for name in lenses if lenses[name] == lens], CHUNK):
+            pycolmap.extract_features(
+                database,
+                work / "images",
+                image_names=chunk,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=options,
+                extraction_options=extraction,
+            )
+            with pycolmap.Database.open(database) as stored:  # the lens's, made with its first
+                options.existing_camera_id = max(c.camera_id for c in stored.read_all_cameras())
+            progress.advance(task, len(chunk))
+    pairs = _pairs(list(lenses))
+    task = progress.add_task("matches", total=len(pairs))
+    matching = pycolmap.FeatureMatchingOptions(guided_matching=effort.guided)
+    verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=effort.pair)
+    verification.ransac.random_seed = SEED
+    for chunk in _chunks(pairs, CHUNK**2):
+        listed = work / "pairs.txt"
+        listed.write_text("".join(f"{first} {second}\n" for first, second in chunk))
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+        pycolmap.match_image_pairs(database, matching, pairing, verification)
+        progress.advance(task, len(chunk))
+    return database
+
+
+def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the pairs of photographs to match; `names` in the order of the sequence."""
+    if len(names) <= ALL_PAIRS:
+        return list(combinations(names, 2))
+    gaps = {*range(1, FOLLOWING + 1)} | {2**k for k in range(4, len(names).bit_length())}
+    near = {(i, i + gap) for i in range(len(names)) for gap in gaps if i + gap < len(names)}
+    anchors = sorted({round(k * (len(names) - 1) / (ANCHORS - 1)) for k in range(ANCHORS)})
+    return [(names[i], names[j]) for i, j in sorted(near | set(combinations(anchors, 2)))]
+
+
+@contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """Keep COLMAP from printing what it does."""
+    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, ONLY_FATAL
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def digest(method: str, files: Iterable[Path]) -> str:
+    """Return a name that follows from files, from where they are, and from the method."""
+    result = hashlib.sha256(f"{method} {pycolmap.__version__}".encode())
+    for path in files:
+        result.update(f"{path}\0".encode())
+        with path.open("rb") as file:
+            result.update(hashlib.file_digest(file, "sha256").digest())
+    return result.hexdigest()[:12]
+
+
+def save_mask(mask: Path | None, image: Path) -> None:
+    """Write the mask of images/NAME, if there is one, to masks/NAME.png beside."""
+    if mask is None:
+        return
+    size = image_size(image)
+    kept = Image.fromarray(load_mask(beside(mask, size, str(image))))
+    target = image.parents[1] / "masks" / f"{image.name}.png"
+    target.parent.mkdir(exist_ok=True)
+    kept.resize(size, Image.Resampling.NEAREST).convert("L").save(target)
+
+
+def without_spaces(files: Iterable[Path]) -> dict[Path, str]:
+    """Return a name of each file for COLMAP, which separates names by spaces."""
+    names: dict[Path, str] = {}
+    for file in files:
+        name = "_".join(file.name.split())
+        while name in names.values():
+            name = f"_{name}"
+        names[file] = name
+    return names
+
+
+def _chunks(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
+    return (items[start : start + size] for start in range(0, len(items), size))

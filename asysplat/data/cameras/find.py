@@ -1,0 +1,208 @@
+"""Find the cameras of photographs or of a video: structure from motion.
+
+With COLMAP (Schönberger & Frahm 2016, Structure-from-Motion Revisited), by pycolmap. Nothing is
+written beside the photographs: the cameras go to a folder of their own in COLMAP's layout, with
+links to the photographs, and the next call with the same photographs returns it at once.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pycolmap
+from PIL import Image, ImageOps
+from PIL.ExifTags import IFD, Base
+from rich.console import Console
+from rich.progress import Progress
+
+from asysplat.data.bad_images import BadImages, Policy
+from asysplat.data.cameras.features import (
+    HARD,
+    SEED,
+    USUAL,
+    Effort,
+    digest,
+    match_photographs,
+    quiet_colmap,
+    save_mask,
+    without_spaces,
+)
+from asysplat.data.frames import save_sharp_frames
+from asysplat.data.images import image_size
+from asysplat.data.readers import photographs_in, without_cameras
+from asysplat.data.readers.masks import mask_of
+from asysplat.errors import InputError
+from asysplat.files import make_folder
+
+MIN_FOUND = 0.25  # share of the photographs; with fewer there is no scene
+ENOUGH = 0.9  # share of the photographs; with fewer the next attempt is made
+LEAST_PHOTOGRAPHS = 3
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """How hard cameras are sought.
+
+    Args:
+        effort: for features and matches.
+        first_pair, image: least number of inliers of the pair to start with, and of an image that
+            is added.
+        angle: least angle between the rays of the pair to start with, in degrees.
+    """
+
+    effort: Effort
+    first_pair: int
+    image: int
+    angle: float
+
+
+ATTEMPTS = (Attempt(USUAL, 100, 30, 16.0), Attempt(HARD, 50, 15, 4.0))
+
+
+def find_cameras(
+    photographs: Path | str,
+    where: Path | str,
+    frames: int = 100,
+    on_bad_image: Policy = "fail",
+    console: Console | None = None,
+) -> Path:
+    """Find the cameras of photographs or of a video; return a folder in COLMAP's layout.
+
+    Its images/ are links to the photographs, upright copies of those that are stored turned, or the
+    frames of a video; its masks/ are theirs, if there are any, and what they leave out is not
+    matched; its sparse/0 has the cameras and the points they were found with. A second attempt with
+    weaker features follows where the first finds fewer than 9 of 10 cameras; the better one is
+    returned.
+
+    Args:
+        photographs: a folder of photographs of one place, or of an images/ with them; or a video.
+        where: the folder is made in it, named by the content of the photographs.
+        frames: greatest number of frames of a video, each the sharpest of an equal part.
+        on_bad_image: "fail", or "skip" to leave out photographs that cannot be read.
+        console: where progress is shown; None shows none.
+
+    Raises:
+        InputError: no photographs without poses, fewer than 3 `frames`, a photograph that cannot be
+            read, `where` cannot be written to, or too few that show the same place.
+    """
+    source, where = Path(photographs).absolute(), Path(where).absolute()
+    if without_cameras(source) is None:
+        raise InputError(
+            f"{photographs} is no folder of photographs without cameras, and no video: name one."
+        )
+    if not isinstance(frames, int) or frames < LEAST_PHOTOGRAPHS:
+        raise InputError(f"frames={frames}: give a whole number of at least {LEAST_PHOTOGRAPHS}.")
+    files = [source] if source.is_file() else photographs_in(source)
+    lenses = {} if source.is_file() else _lenses(files, source, on_bad_image)
+    masks = [mask for file in lenses if (mask := mask_of(file)) not in (None, file)]
+    method = f"{ATTEMPTS} {frames}"
+    folder = where / f"{source.stem}-{digest(method, [*files, *masks])}"
+    if folder.is_dir():
+        return folder
+    make_folder(where, "paths.logs")
+    with (
+        quiet_colmap(),
+        TemporaryDirectory(dir=where) as work,
+        Progress(console=console, transient=True, disable=console is None) as progress,
+    ):
+        images = Path(work) / "images"
+        images.mkdir()
+        if source.is_file():
+            save_sharp_frames(source, images, frames, progress)
+            lenses = _lenses(photographs_in(images), source, on_bad_image)
+        names = without_spaces(lenses)
+        kinds = {names[file]: lens for file, lens in lenses.items()}
+        for file, name in names.items():
+            if file.parent != images:
+                _link_upright(file, images / name)
+            mask = mask_of(file)
+            save_mask(images / name if mask == file else mask, images / name)
+        model = _best_model(Path(work), kinds, progress)
+        if _registered(model) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * len(kinds)):
+            raise InputError(
+                f"{photographs}: found cameras for {_registered(model)} of {len(kinds)} "
+                "photographs: too few show the same place; photograph it with more overlap, from "
+                "different places."
+            )
+        result = Path(work) / "result"
+        (result / "sparse" / "0").mkdir(parents=True)
+        model.write(result / "sparse" / "0")
+        for kind in ("images", "masks"):
+            if (Path(work) / kind).is_dir():
+                (Path(work) / kind).rename(result / kind)
+        result.rename(folder)
+    return folder
+
+
+def _lenses(files: Sequence[Path], source: Path, on_bad_image: Policy) -> dict[Path, tuple]:
+    """Return for each photograph what tells its camera from others."""
+    if len(files) < LEAST_PHOTOGRAPHS:
+        raise InputError(
+            f"{source} has {len(files)} photographs without camera poses: cameras are found from "
+            f"at least {LEAST_PHOTOGRAPHS} that overlap."
+        )
+    bad = BadImages(on_bad_image)
+    lenses = dict(bad.read_each(lambda file: (file, _lens_of(file)), ((file,) for file in files)))
+    bad.report(str(source), len(lenses))
+    return lenses
+
+
+def _lens_of(file: Path) -> tuple:
+    """Return the size upright, and the make, model and focal length that the file names."""
+    size = image_size(file)
+    with Image.open(file) as image:
+        exif = image.getexif()
+        details = exif.get_ifd(IFD.Exif)
+    turned = exif.get(Base.Orientation, 1) >= 5
+    focal = details.get(Base.FocalLength), details.get(Base.FocalLengthIn35mmFilm)
+    return (size[::-1] if turned else size, exif.get(Base.Make), exif.get(Base.Model), *focal)
+
+
+def _link_upright(file: Path, link: Path) -> None:
+    """Link to a photograph; copy it where its pixels are stored turned."""
+    with Image.open(file) as image:
+        if image.getexif().get(Base.Orientation, 1) == 1:
+            link.symlink_to(file)
+            return
+        upright = ImageOps.exif_transpose(image)
+        upright.save(link, exif=upright.getexif(), quality=95)
+
+
+def _registered(model: pycolmap.Reconstruction | None) -> int:
+    return 0 if model is None else model.num_reg_images()
+
+
+def _best_model(
+    work: Path, lenses: dict[str, tuple], progress: Progress
+) -> pycolmap.Reconstruction | None:
+    """Return the largest model of the attempts, which end with the first that is large enough."""
+    best = None
+    for attempt in ATTEMPTS:
+        model = _reconstruct(work, lenses, attempt, progress)
+        best = max(best, model, key=_registered)
+        if _registered(best) >= ENOUGH * len(lenses):
+            break
+    return best
+
+
+def _reconstruct(
+    work: Path, lenses: dict[str, tuple], attempt: Attempt, progress: Progress
+) -> pycolmap.Reconstruction | None:
+    """Return the largest model that can be built; images of the same lens have one camera."""
+    database = match_photographs(work, lenses, attempt.effort, progress)
+    task = progress.add_task("cameras", total=len(lenses))
+    options = pycolmap.IncrementalPipelineOptions(
+        min_num_matches=attempt.effort.pair, min_model_size=LEAST_PHOTOGRAPHS, random_seed=SEED
+    )
+    options.mapper.init_min_num_inliers = attempt.first_pair
+    options.mapper.init_min_tri_angle = attempt.angle
+    options.mapper.abs_pose_min_num_inliers = attempt.image
+    models = pycolmap.incremental_mapping(
+        database,
+        work / "images",
+        work,
+        options,
+        next_image_callback=lambda: progress.advance(task),
+    )
+    return max(models.values(), key=_registered, default=None)
