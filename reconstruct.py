@@ -28,8 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from asysplat import load
-from asysplat.data.cameras import find_cameras
-from asysplat.data.readers import without_cameras
+from asysplat.data.cameras import CameraOptions
 from asysplat.errors import InputError, input_error_behind, plain_warnings
 from asysplat.export import read_gaussians
 from asysplat.interrupts import handle_signals
@@ -58,7 +57,7 @@ def main(config: DictConfig) -> None:
 
 
 def reconstruct(config: DictConfig) -> None:
-    """Find cameras where there are none, initialize Gaussians, refine them, write the results."""
+    """Find or refine cameras, initialize Gaussians, refine them, write the results."""
     if OmegaConf.is_missing(config, "path"):
         raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
     check_ranges(OmegaConf.masked_copy(config, "speed"))
@@ -69,13 +68,11 @@ def reconstruct(config: DictConfig) -> None:
         raise InputError("view=true needs viser: pip install 'asysplat[viewer]', or leave it out.")
     settings = instantiate(config.refinement)
     results = Results(Path(config.paths.run), config)
-    path = config.path
-    if config.layout == "auto" and without_cameras(path):
-        where = Path(config.paths.logs) / "cameras"
-        path = find_cameras(path, where, config.frames, config.on_bad_image, Console())
-        print(f"found cameras: {path}")
     names = ("height", "width", "views", "held_out_every", "max_held_out", "layout", "on_bad_image")
-    photographs = open_photographs(path, **{name: config[name] for name in names})
+    options = {name: config[name] for name in names}
+    where = Path(config.paths.logs) / "cameras"
+    options["cameras"] = CameraOptions(config.cameras, where, config.frames, Console())
+    photographs = open_photographs(config.path, **options)
     print(describe(config, photographs, limit))
     gaussians = initialize(config, photographs, settings)
     background = mean_color(photographs.inputs)

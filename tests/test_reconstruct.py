@@ -32,7 +32,7 @@ from asysplat.reconstruct.results import save_ply, subject
 SIZE = 48
 LAYOUTS = Path(__file__).parent / "data" / "readers"  # writers of them
 TINY = (f"height={SIZE}", "steps=60", "refinement.max_gaussians=3000", "views=12")
-TINY += ("init=plane_sweep", "video.seconds=0.2", "paths.weights=none")
+TINY += ("init=plane_sweep", "video.seconds=0.2", "paths.weights=none", "cameras=given")
 FILES = {"scene.ply", "scene.safetensors", "path.mp4", "contact.png", "start.png"}
 FILES |= {"metrics.json", "metrics.csv", "config.yaml"}
 
@@ -236,6 +236,7 @@ REFUSED = {
     "steps=0.5": "steps=0.5: give a number above 0",
     "last_fit=2": "last_fit=2: give a number from 0 to 1",
     "video.path=spiral": "video.path=spiral: choose own, orbit or none",
+    "cameras=best": "cameras=best: choose auto, given, refined, found",
     "height=0": "height=0, width=None",
     "refinement.until=2.5": "refinement.until=2.5: give 0 to 1",
     "path=absent": "absent does not exist: name a scene",

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from asysplat.data import open_scene
 from asysplat.data.bad_images import Policy
+from asysplat.data.cameras import CameraOptions, find_missing, refine_given
 from asysplat.data.check.matches import find_matches
 from asysplat.data.check.report import diagnose_cameras
 from asysplat.data.normalize import Normalization, normalize
@@ -20,6 +21,7 @@ from asysplat.scene import Views
 
 MATCHED_SIDE = 400  # pixels of the shorter side, to check the cameras
 ANY_SIZE = 8  # pixels a side: to read cameras, before the size is known
+GIVEN = CameraOptions()
 
 
 @dataclass(frozen=True)
@@ -58,15 +60,17 @@ def open_photographs(
     max_held_out: int = 12,
     layout: str = "auto",
     on_bad_image: Policy = "fail",
+    cameras: CameraOptions = GIVEN,
     say: Callable[[str], None] = print,
 ) -> Photographs:
-    """Open posed photographs, select some evenly, and bring them into the network's frame.
+    """Open photographs, select some evenly, and bring them into the network's frame.
 
     Args:
         path, layout, on_bad_image: see `open_scene`.
         height, width: of the views, in pixels; width None keeps the first photograph's aspect
             ratio.
         views, max_held_out: number of input and of held-out views, at most.
+        cameras: whether given cameras are used, refined ones, or cameras that are found.
         held_out_every: hold out every n-th photograph, from the first on; None: none.
         say: takes warnings: a smaller height than asked for, or cameras that do not fit the images.
 
@@ -81,6 +85,9 @@ def open_photographs(
             f"max_held_out={max_held_out}: give whole numbers, at least 1 pixel, 2 views, 1 "
             "held-out view, and held_out_every of 2 or more, or null."
         )
+    if found := find_missing(path, layout, on_bad_image, cameras):
+        say(f"cameras: found, see {found}")
+        path, layout = found, "auto"
     scene = open_scene(path, SceneOptions(ANY_SIZE, ANY_SIZE, layout, on_bad_image)).scene
     if any(scene.origin):
         say(f"the scene is far from the origin: its new origin is {scene.origin} of the files.")
@@ -90,8 +97,7 @@ def open_photographs(
             say(f"height={height}: the photographs have {lens.height} pixels, which are used.")
             height = lens.height
         width = max(1, round(height * lens.width / lens.height))
-    sequence = FileSequence(scene, SceneOptions(height, width))
-    indices = list(range(sequence.num_images))
+    indices = list(range(len(scene.images)))
     held_out = indices[::held_out_every] if held_out_every else []
     rest = sorted(set(indices) - set(held_out))
     if len(rest) < 2:
@@ -101,6 +107,12 @@ def open_photographs(
         )
     inputs = spread(rest, min(views, len(rest)))
     held_out = spread(held_out, min(max_held_out, len(held_out))) if held_out else []
+    if not found:
+        used = sorted((*inputs, *held_out))
+        part = refine_given(replace(scene, images=[scene.images[i] for i in used]), cameras, say)
+        images = dict(enumerate(scene.images)) | dict(zip(used, part.images, strict=True))
+        scene = replace(part, images=list(images.values()))
+    sequence = FileSequence(scene, SceneOptions(height, width))
     files = [str(image.file) for image in scene.images]
     input_files = [files[index] for index in inputs]
     # All photographs: neighbors among the inputs may be too far apart to match.

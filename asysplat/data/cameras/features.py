@@ -66,26 +66,33 @@ def match_photographs(
     extraction = pycolmap.FeatureExtractionOptions(max_image_size=effort.max_side)
     extraction.sift.max_num_features = effort.features
     extraction.sift.peak_threshold = effort.contrast
-    task = progress.add_task("features", total=len(lenses))
+    pycolmap.Database.open(database).close()
     for lens in dict.fromkeys(lenses.values()):
         options = pycolmap.ImageReaderOptions()
-        if (work / "masks").is_dir():
-            options.mask_path = work / "masks"
         if cameras is not None:
             options.camera_model = cameras[lens].model_name
             options.camera_params = cameras[lens].params_to_string()
-        for chunk in _chunks([name for name in lenses if lenses[name] == lens], CHUNK):
-            pycolmap.extract_features(
-                database,
-                work / "images",
-                image_names=chunk,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=options,
-                extraction_options=extraction,
-            )
-            with pycolmap.Database.open(database) as stored:  # the lens's, made with its first
-                options.existing_camera_id = max(c.camera_id for c in stored.read_all_cameras())
-            progress.advance(task, len(chunk))
+        # In order: otherwise threads number the images, and no two runs are alike.
+        pycolmap.import_images(
+            database,
+            work / "images",
+            pycolmap.CameraMode.SINGLE,
+            [name for name in lenses if lenses[name] == lens],
+            options,
+        )
+    task = progress.add_task("features", total=len(lenses))
+    options = pycolmap.ImageReaderOptions()
+    if (work / "masks").is_dir():
+        options.mask_path = work / "masks"
+    for chunk in _chunks(list(lenses), CHUNK):
+        pycolmap.extract_features(
+            database,
+            work / "images",
+            image_names=chunk,
+            reader_options=options,
+            extraction_options=extraction,
+        )
+        progress.advance(task, len(chunk))
     pairs = _pairs(list(lenses))
     task = progress.add_task("matches", total=len(pairs))
     matching = pycolmap.FeatureMatchingOptions(guided_matching=effort.guided)

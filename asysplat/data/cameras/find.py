@@ -30,8 +30,9 @@ from asysplat.data.cameras.features import (
 )
 from asysplat.data.frames import save_sharp_frames
 from asysplat.data.images import image_size
-from asysplat.data.readers import photographs_in, without_cameras
+from asysplat.data.readers import open_scene, photographs_in, without_cameras
 from asysplat.data.readers.masks import mask_of
+from asysplat.data.sequence import SceneOptions
 from asysplat.errors import InputError
 from asysplat.files import make_folder
 
@@ -76,25 +77,23 @@ def find_cameras(
     returned.
 
     Args:
-        photographs: a folder of photographs of one place, or of an images/ with them; or a video.
+        photographs: a folder of photographs of one place, or of an images/ with them; a scene
+            whose given cameras are ignored; or a video.
         where: the folder is made in it, named by the content of the photographs.
         frames: greatest number of frames of a video, each the sharpest of an equal part.
         on_bad_image: "fail", or "skip" to leave out photographs that cannot be read.
         console: where progress is shown; None shows none.
 
     Raises:
-        InputError: no photographs without poses, fewer than 3 `frames`, a photograph that cannot be
+        InputError: no photographs, fewer than 3 `frames`, a photograph that cannot be
             read, `where` cannot be written to, or too few that show the same place.
     """
     source, where = Path(photographs).absolute(), Path(where).absolute()
-    if without_cameras(source) is None:
-        raise InputError(
-            f"{photographs} is no folder of photographs without cameras, and no video: name one."
-        )
     if not isinstance(frames, int) or frames < LEAST_PHOTOGRAPHS:
         raise InputError(f"frames={frames}: give a whole number of at least {LEAST_PHOTOGRAPHS}.")
-    files = [source] if source.is_file() else photographs_in(source)
-    lenses = {} if source.is_file() else _lenses(files, source, on_bad_image)
+    video = source.is_file() and without_cameras(source) is not None
+    files = [source] if video else _photographs(source, on_bad_image)
+    lenses = {} if video else _lenses(files, source, on_bad_image)
     masks = [mask for file in lenses if (mask := mask_of(file)) not in (None, file)]
     method = f"{ATTEMPTS} {frames}"
     folder = where / f"{source.stem}-{digest(method, [*files, *masks])}"
@@ -108,7 +107,7 @@ def find_cameras(
     ):
         images = Path(work) / "images"
         images.mkdir()
-        if source.is_file():
+        if video:
             save_sharp_frames(source, images, frames, progress)
             lenses = _lenses(photographs_in(images), source, on_bad_image)
         names = without_spaces(lenses)
@@ -133,6 +132,17 @@ def find_cameras(
                 (Path(work) / kind).rename(result / kind)
         result.rename(folder)
     return folder
+
+
+def _photographs(source: Path, on_bad_image: Policy) -> list[Path]:
+    """List the photographs of a folder without cameras, or of a scene whose cameras are ignored."""
+    if without_cameras(source) is not None:
+        return photographs_in(source)
+    images = open_scene(source, SceneOptions(1, 1, on_bad_image=on_bad_image)).scene.images
+    files = list(dict.fromkeys(image.file for image in images))
+    if not all(isinstance(file, Path) for file in files):
+        raise InputError(f"{source} has its images inside other files: cameras=given uses it.")
+    return files
 
 
 def _lenses(files: Sequence[Path], source: Path, on_bad_image: Policy) -> dict[Path, tuple]:

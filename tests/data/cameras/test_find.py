@@ -101,7 +101,7 @@ def test_reconstruct_finds_them(photographs, found, run_script):
         "reconstruct.py", str(photographs), *small, f"paths.logs={found.parent.parent}"
     )
     assert result.returncode == 0, result.stderr
-    assert f"found cameras: {found}" in result.stdout
+    assert f"cameras: found, see {found}" in result.stdout
     (metrics,) = (found.parent.parent / "reconstruct").glob("*/metrics.json")
     numbers = json.loads(metrics.read_text())
     assert numbers["held_out/psnr"] > numbers["baseline/nearest_view/psnr"]

@@ -1,0 +1,73 @@
+"""Choose the cameras of photographs: given, refined or found."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from asysplat.data.bad_images import Policy
+from asysplat.data.cameras.find import find_cameras
+from asysplat.data.cameras.refine import refine_cameras
+from asysplat.data.readers import without_cameras
+from asysplat.data.sequence import PosedScene
+from asysplat.errors import InputError
+
+CHOICES = ("auto", "given", "refined", "found")
+LEAST_GAIN = 0.01  # share of the reprojection error; refined cameras that gain less are not used
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """Which cameras of photographs are used.
+
+    Args:
+        choice: "given" with the photographs; "refined" from those; "found" by structure from
+            motion, as always where none are given; or "auto": refined where that lowers the
+            reprojection error by a hundredth, else given.
+        where: the folder of found and refined cameras.
+        frames: greatest number of frames of a video.
+        console: where progress is shown; None shows none.
+
+    Raises:
+        InputError: another choice.
+    """
+
+    choice: str = "given"
+    where: Path = Path("logs/cameras")
+    frames: int = 100
+    console: Console | None = None
+
+    def __post_init__(self):
+        if self.choice not in CHOICES:
+            raise InputError(f"cameras={self.choice}: choose {', '.join(CHOICES)}.")
+
+
+def find_missing(
+    path: Path | str, layout: str, on_bad_image: Policy, options: CameraOptions
+) -> Path | None:
+    """Return the folder of cameras that are found; None where the given ones are wanted."""
+    bare = layout == "auto" and without_cameras(path) is not None
+    if not bare and options.choice != "found":
+        return None
+    return find_cameras(path, options.where, options.frames, on_bad_image, options.console)
+
+
+def refine_given(
+    scene: PosedScene, options: CameraOptions, say: Callable[[str], None]
+) -> PosedScene:
+    """Return a scene with refined cameras, if they are wanted, or better and "auto"."""
+    files = {image.file for image in scene.images if isinstance(image.file, Path)}
+    if options.choice not in ("auto", "refined") or len(files) < len(scene.images):
+        return scene
+    result = refine_cameras(scene, options.where, options.console)
+    if not result.features:
+        say("cameras: as given; too few features match to refine them.")
+        return scene
+    refined = options.choice == "refined" or result.after < (1 - LEAST_GAIN) * result.before
+    say(
+        f"cameras: {'refined' if refined else 'as given'} (cameras=); {result.features:,} features "
+        f"are {result.before:.2f} px from their points with the given cameras, and "
+        f"{result.after:.2f} px with refined ones"
+    )
+    return result.scene if refined else scene

@@ -1,0 +1,191 @@
+"""Refine the cameras of posed photographs: bundle adjustment of features that match.
+
+Triggs et al. 2000, Bundle Adjustment: A Modern Synthesis; with COLMAP, by pycolmap.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float
+from numpy import ndarray
+from rich.console import Console
+from rich.progress import Progress
+
+from asysplat.data.bad_images import BadImages
+from asysplat.data.cameras.features import (
+    SEED,
+    USUAL,
+    digest,
+    match_photographs,
+    quiet_colmap,
+    save_mask,
+    without_spaces,
+)
+from asysplat.data.images import Lens
+from asysplat.data.readers import colmap
+from asysplat.data.readers.common import inverted
+from asysplat.data.sequence import PosedImage, PosedScene
+from asysplat.files import make_folder
+
+ROUNDS = 2  # of triangulation and bundle adjustment
+LEAST_POINTS = 20  # that a photograph sees, for its pose to be refined
+ERRORS = "errors.json"  # in the folder of refined cameras
+
+
+@dataclass(frozen=True)
+class RefinedCameras:
+    """Refined cameras, and how well the given ones and they fit the same points.
+
+    Args:
+        scene: with the refined cameras.
+        before, after: mean distances of the points' projections from their features, in pixels.
+        features: number of these features; with none the cameras are as they were.
+    """
+
+    scene: PosedScene
+    before: float
+    after: float
+    features: int
+
+
+def refine_cameras(
+    scene: PosedScene, where: Path | str, console: Console | None = None
+) -> RefinedCameras:
+    """Refine poses, focal lengths and distortions of a scene's photographs.
+
+    The result is moved back by a similarity, so that it stays in the given world at the given
+    scale; photographs that see few of the points keep their poses. It is written to a folder in
+    COLMAP's layout, and the next call with the same photographs and cameras reads it there.
+
+    Args:
+        scene: its images are files.
+        where: the folder is made in it, named by the content of photographs and cameras.
+        console: where progress is shown; None shows none.
+
+    Raises:
+        InputError: `where` cannot be written to.
+    """
+    where = Path(where).absolute()
+    images = {image.file: image for image in scene.images}
+    names = without_spaces(images)
+    given = [(image.lens, image.cam_to_world.tolist()) for image in scene.images]
+    masks = [image.mask for image in scene.images if image.mask not in (None, image.file)]
+    folder = where / f"{scene.name}-refined-{digest(f'{USUAL} {given}', [*images, *masks])}"
+    if not folder.is_dir():
+        make_folder(where, "paths.logs")
+        with (
+            quiet_colmap(),
+            TemporaryDirectory(dir=where) as work,
+            Progress(console=console, transient=True, disable=console is None) as progress,
+        ):
+            work = Path(work)
+            (work / "images").mkdir()
+            for file, name in names.items():
+                (work / "images" / name).symlink_to(file)
+                save_mask(images[file].mask, work / "images" / name)
+            _refine(work, {names[file]: image for file, image in images.items()}, progress)
+            work.joinpath("result").rename(folder)
+    errors = json.loads((folder / ERRORS).read_text())
+    if not errors["features"]:
+        return RefinedCameras(scene, **errors)
+    found = colmap.read_scene(folder, BadImages())
+    refined = {image.file.name: image for image in found.images}
+    changed = []
+    for file, image in images.items():
+        other = refined[names[file]]
+        changed.append(replace(image, lens=other.lens, cam_to_world=other.cam_to_world))
+    new = replace(scene, images=changed, read_points=lambda: found.points + scene.origin)
+    return RefinedCameras(new, **errors)
+
+
+def _refine(work: Path, images: dict[str, PosedImage], progress: Progress) -> None:
+    """Refine the cameras of work/images/NAME, and write the folder work/result."""
+    cameras = {image.lens: _camera(image.lens) for image in images.values()}
+    lenses = {name: image.lens for name, image in images.items()}
+    database = match_photographs(work, lenses, USUAL, progress, cameras)
+    poses = {name: image.cam_to_world for name, image in images.items()}
+    model = _posed_model(database, poses)
+    task = progress.add_task("refinement", total=2 * ROUNDS)
+    # With more threads, sums vary in their last bits.
+    options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, num_threads=1)
+    errors = {"before": 0.0, "after": 0.0, "features": 0}
+    for number in range(ROUNDS):
+        model = pycolmap.triangulate_points(model, database, work / "images", work, True, options)
+        progress.advance(task)
+        if not model.num_points3D():
+            break
+        before = model.compute_mean_reprojection_error()
+        _adjust(model)
+        model.update_point_3d_errors()
+        progress.advance(task)
+        if number == 0:
+            errors = {"before": before, "after": model.compute_mean_reprojection_error()}
+            errors["features"] = model.compute_num_observations()
+    _move_back(model, poses)
+    result = work / "result"
+    (result / "sparse" / "0").mkdir(parents=True)
+    model.write(result / "sparse" / "0")
+    (result / ERRORS).write_text(json.dumps(errors))
+    for kind in ("images", "masks"):
+        if (work / kind).is_dir():
+            (work / kind).rename(result / kind)
+
+
+def _camera(lens: Lens) -> pycolmap.Camera:
+    """Return a camera of COLMAP, whose distortion can be refined."""
+    k1, k2, third, fourth, k3 = (*lens.distortion, *[0.0] * 5)[:5]
+    model = "OPENCV_FISHEYE" if lens.fisheye else "FULL_OPENCV" if k3 else "OPENCV"
+    params = [lens.fx, lens.fy, lens.cx, lens.cy, k1, k2, third, fourth]
+    params += [k3, 0.0, 0.0, 0.0] if model == "FULL_OPENCV" else []
+    return pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=params)
+
+
+def _posed_model(
+    database: Path, poses: Mapping[str, Float[ndarray, "4 4"]]
+) -> pycolmap.Reconstruction:
+    """Return a model without points of the images in a database, with given poses."""
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as stored:
+        for camera in stored.read_all_cameras():
+            model.add_camera_with_trivial_rig(camera)
+        for image in stored.read_all_images():
+            names = {"name": image.name, "camera_id": image.camera_id, "image_id": image.image_id}
+            pose = pycolmap.Rigid3d(inverted(poses[image.name])[:3])
+            model.add_image_with_trivial_frame(pycolmap.Image(**names), pose)
+    return model
+
+
+def _adjust(model: pycolmap.Reconstruction) -> None:
+    """Adjust poses, points, focal lengths and distortions of a model to its features."""
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.refine_principal_point = False
+    options.ceres.solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def _move_back(model: pycolmap.Reconstruction, poses: Mapping[str, Float[ndarray, "4 4"]]) -> None:
+    """Move a model by the similarity that brings its cameras to the given ones."""
+    images = {image.name: image for image in model.images.values()}
+    given = np.stack([poses[name] for name in images])
+    found = np.stack([image.cam_from_world().inverse().matrix() for image in images.values()])
+    # From the rotations: positions alone, if in a line, leave a turn about it free.
+    left, _, right = np.linalg.svd((given[:, :3, :3] @ found[:, :3, :3].swapaxes(1, 2)).sum(0))
+    rotation = left @ right
+    means = [each[:, :3, 3].mean(0) for each in (given, found)]
+    centers, turned = given[:, :3, 3] - means[0], (found[:, :3, 3] - means[1]) @ rotation.T
+    square = np.square(turned).sum()
+    scale = (centers * turned).sum() / square if square else 1.0
+    translation = means[0] - scale * rotation @ means[1]
+    model.transform(pycolmap.Sim3d(np.column_stack([scale * rotation, translation])))
+    for name, image in images.items():
+        if image.num_points3D < LEAST_POINTS:
+            image.frame.rig_from_world = pycolmap.Rigid3d(inverted(poses[name])[:3])
