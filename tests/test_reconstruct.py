@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from asysplat import read_gaussians, render
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
+from asysplat.data.readers.transforms import read_cameras
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.reconstruct.results import save_ply, subject
@@ -34,7 +35,7 @@ LAYOUTS = Path(__file__).parent / "data" / "readers"  # writers of them
 TINY = (f"height={SIZE}", "steps=60", "refinement.max_gaussians=3000", "views=12")
 TINY += ("init=plane_sweep", "video.seconds=0.2", "paths.weights=none", "cameras=given")
 FILES = {"scene.ply", "scene.safetensors", "path.mp4", "contact.png", "start.png"}
-FILES |= {"metrics.json", "metrics.csv", "config.yaml"}
+FILES |= {"metrics.json", "metrics.csv", "config.yaml", "transforms.json"}
 
 
 @pytest.fixture(scope="session")
@@ -143,6 +144,13 @@ def test_the_scene_is_in_the_world_of_the_files(command, views, tmp_path, unit):
     rows = rows_of(folder)
     seen = open_scene(tmp_path / "photographs", SceneOptions(SIZE, SIZE))
     seen = seen.views([int(Path(row["file"]).stem) for row in rows])
+    written = read_cameras(folder / "transforms.json")
+    torch.testing.assert_close(
+        written.cam_to_world, seen.cameras.cam_to_world, rtol=1e-4, atol=1e-4
+    )
+    torch.testing.assert_close(written.intrinsics, seen.cameras.intrinsics)
+    entries = json.loads((folder / "transforms.json").read_text())["frames"]
+    assert [entry["file_path"] for entry in entries] == [row["file"] for row in rows]
     images = render(gaussians, seen.cameras, background).image.clamp(0, 1)
     psnr = -10 * (images - seen.images).square().mean((1, 2, 3)).log10()
     assert psnr.min() > 20

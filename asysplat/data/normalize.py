@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.motion import transform
-from asysplat.scene import Gaussians, TensorRecord, Views
+from asysplat.scene import Cameras, Gaussians, TensorRecord, Views
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,12 @@ class Normalization(TensorRecord):
     def to_world(self, gaussians: Gaussians) -> Gaussians:
         """Transform Gaussians from the network's frame to the data set's world."""
         return transform(gaussians.scale_by(1 / self.scale), torch.linalg.inv(self.world_to_mean))
+
+    def cameras_to_world(self, cameras: Cameras) -> Cameras:
+        """Transform cameras from the network's frame to the data set's world, in float64."""
+        poses = cameras.cam_to_world.double()
+        poses[..., :3, 3] /= self.scale
+        return replace(cameras, cam_to_world=torch.linalg.inv(self.world_to_mean) @ poses)
 
 
 def normalize(inputs: Views, targets: Views) -> tuple[Views, Views, Normalization]:

@@ -1,14 +1,16 @@
 """Write views to disk in nerfstudio's layout: transforms.json beside images/ and depth/."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
 from asysplat.errors import InputError
-from asysplat.scene import Views
+from asysplat.scene import Cameras, Views
 
 STEPS_PER_UNIT = 1000  # stored depths of one scene unit
 MAX_STEP = 2**16 - 1  # largest depth in a 16-bit image
@@ -17,10 +19,8 @@ MAX_STEP = 2**16 - 1  # largest depth in a 16-bit image
 def write_transforms(views: Views, folder: Path) -> None:
     """Write one scene: transforms.json, images/NNNNN.png, and depth/NNNNN.png where known.
 
-    Matrices are camera-to-world with OpenGL axes (x right, y up, z backward). cx and cy are in
-    pixels with the first pixel's center at +0.5, as in `Cameras`. Depths are 16-bit PNG of
-    thousandths of a scene unit along the camera's z axis, 0 where unknown. Format:
-    https://docs.nerf.studio/quickstart/data_conventions.html
+    Cameras as in `describe_cameras`. Depths are 16-bit PNG of thousandths of a scene unit along the
+    camera's z axis, 0 where unknown.
 
     Raises:
         InputError: views with a batch dimension, or a folder that contains a transforms.json.
@@ -35,16 +35,12 @@ def write_transforms(views: Views, folder: Path) -> None:
         raise InputError(f"{target} exists: name a new folder, nothing is overwritten.")
     views = views.to("cpu")
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    top = {"camera_model": "PINHOLE", "w": views.cameras.width, "h": views.cameras.height}
+    names = [f"{index:05d}.png" for index in range(views.num_views)]
+    content = describe_cameras(views.cameras, [f"images/{name}" for name in names])
     if views.depths is not None:
         (folder / "depth").mkdir(exist_ok=True)
-        top["depth_unit_scale_factor"] = 1 / STEPS_PER_UNIT
-    frames = []
-    poses = views.cameras.cam_to_world * torch.tensor([1.0, -1.0, -1.0, 1.0])
-    for index, (pose, matrix) in enumerate(zip(poses, views.cameras.intrinsics, strict=True)):
-        name = f"{index:05d}.png"
-        (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
-        frame = {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
+        content["depth_unit_scale_factor"] = 1 / STEPS_PER_UNIT
+    for index, (name, frame) in enumerate(zip(names, content["frames"], strict=True)):
         levels = (views.images[index].clamp(0, 1) * 255).round().to(torch.uint8)
         Image.fromarray(levels.permute(1, 2, 0).numpy()).save(folder / "images" / name)
         if views.depths is not None:
@@ -52,8 +48,24 @@ def write_transforms(views: Views, folder: Path) -> None:
             steps = (views.depths[index].double() * STEPS_PER_UNIT).round().numpy()
             steps = np.where(steps > MAX_STEP, 0, steps).astype(np.uint16)  # beyond it: unknown
             Image.fromarray(steps).save(folder / "depth" / name)
-        frames.append(frame | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
-    target.write_text(json.dumps(top | {"frames": frames}, indent=1))
+    target.write_text(json.dumps(content, indent=1))
+
+
+def describe_cameras(cameras: Cameras, files: Sequence[str]) -> dict[str, Any]:
+    """Describe cameras, [V], and their image files as in a transforms.json.
+
+    Matrices are camera-to-world with OpenGL axes (x right, y up, z backward). cx and cy are in
+    pixels with the first pixel's center at +0.5, as in `Cameras`. Format:
+    https://docs.nerf.studio/quickstart/data_conventions.html
+    """
+    frames = []
+    poses = cameras.cam_to_world * cameras.cam_to_world.new_tensor([1, -1, -1, 1])
+    for file, pose, matrix in zip(files, poses, cameras.intrinsics, strict=True):
+        (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+        intrinsics = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+        frames.append({"file_path": file, "transform_matrix": pose.tolist(), **intrinsics})
+    size = {"w": cameras.width, "h": cameras.height}
+    return {"camera_model": "PINHOLE", **size, "frames": frames}
 
 
 def refuse_inside(folder: Path, data: Path, advice: str) -> None:

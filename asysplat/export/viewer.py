@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
@@ -30,6 +31,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.data.normalize import normalize
+from asysplat.data.readers.transforms import read_cameras
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import disparity
 from asysplat.export import frame
@@ -42,6 +44,8 @@ OWN_PAGES = re.compile(r"https?://(127\.0\.0\.1|localhost)(:\d+)?")
 LAYERS = ("color", "depth", "alpha")
 FRUSTUM_LENGTH = 0.1  # in the page's unit
 FRUSTUM_HEIGHT = 128  # pixels of its image, in the command
+CAMERAS = "transforms.json"  # beside a file of Gaussians
+MIN_IN_VIEW = 0.5  # share of the Gaussians that its cameras see, if they are the scene's
 MAX_SAMPLES = 10_000  # pixels from which the range of disparities is computed
 WAITING = "Waiting for the first rendering; kernels may have to compile, for minutes."
 POLL_SECONDS = 0.01  # between two checks for changes
@@ -67,7 +71,7 @@ class Viewer:
     on a camera moves the page's camera there. Scenes may have any size.
 
     Args:
-        views: input views, [V].
+        views: input views, [V]; of images of one pixel, frames alone are drawn.
         gaussians: [N]; None to `show` them later.
         port: of this machine; the next free one is used if it is taken; 0: any free one.
 
@@ -177,7 +181,7 @@ class Viewer:
                 thickness=1.5,
                 thickness_units="screen",
                 color=(209, 98, 45),
-                image=_bytes(images[view]),
+                image=_bytes(images[view]) if images[view, 0].numel() > 1 else None,
                 wxyz=frame.quaternion(self._cameras, view),
                 position=self._cameras.centers[view].numpy(),
             )
@@ -313,7 +317,7 @@ def _check_one_scene(name: str, batch: tuple[int, ...]) -> None:
 
 
 def main(scene: str, folder: str | None) -> None:
-    """Show a file of Gaussians, among the photographs of a folder if there is one."""
+    """Show a file of Gaussians, among the photographs of a folder or the cameras beside it."""
     try:
         if folder is not None:
             photographs = open_photographs(folder, height=FRUSTUM_HEIGHT)
@@ -321,7 +325,8 @@ def main(scene: str, folder: str | None) -> None:
             views, gaussians = photographs.inputs, photographs.frame.to_network(gaussians)
         else:
             gaussians = read_gaussians(scene)
-            views = _view_of(gaussians)
+            cameras = cameras_beside(Path(scene), gaussians) or _camera_before(gaussians)
+            views = Views(cameras.resized(1, 1), torch.zeros(cameras.num_views, 3, 1, 1))
         with Viewer(views, gaussians) as viewer:
             print(f"viewer: {viewer.url}, until Ctrl-C")
             viewer.wait()
@@ -329,16 +334,36 @@ def main(scene: str, folder: str | None) -> None:
         sys.exit(f"error: {error}")
 
 
-def _view_of(gaussians: Gaussians) -> Views:
-    """Make a gray view that has most Gaussians in it, with y down as COLMAP's worlds often have."""
+def cameras_beside(scene: Path, gaussians: Gaussians) -> Cameras | None:
+    """Read the cameras beside a file of Gaussians; None where there are none of this scene.
+
+    A line says why a file is not used.
+    """
+    file = scene.with_name(CAMERAS)
+    if not file.exists():
+        return None
+    try:
+        cameras = read_cameras(file)
+    except (InputError, OSError) as error:
+        print(f"without cameras: {error}")
+        return None
+    seen = torch.zeros(gaussians.num_gaussians, dtype=torch.bool)
+    for view in range(cameras.num_views):
+        seen |= cameras.select([view]).project(gaussians.means)[2][0]
+    if (share := seen.float().mean().item()) < MIN_IN_VIEW:
+        print(f"without cameras: those of {file} have {share:.0%} of the Gaussians in view.")
+        return None
+    return cameras
+
+
+def _camera_before(gaussians: Gaussians) -> Cameras:
+    """Make a camera that has most Gaussians in view, with y down as COLMAP's worlds often have."""
     center = gaussians.means.median(0).values
     radius = (gaussians.means - center).norm(dim=-1).median()
     pose = torch.eye(4)
     pose[:3, 3] = center - torch.tensor([0.0, 0.0, 3.0]) * radius
-    side = FRUSTUM_HEIGHT
-    intrinsics = torch.tensor([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])
-    cameras = Cameras(intrinsics[None], pose[None], side, side)
-    return Views(cameras, torch.full((1, 3, side, side), 0.5))
+    intrinsics = torch.tensor([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    return Cameras(intrinsics[None], pose[None], 1, 1)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """The result folder of a reconstruction: scene files, metrics, figures, a video."""
 
+import json
+import os
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -15,12 +17,14 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
 from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.rows import average, write_csv
 from asysplat.export import orbit, smoothed_path, write_ply, write_safetensors, write_video
+from asysplat.export.viewer import CAMERAS
 from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.refine import RefinementProgress
@@ -90,12 +94,13 @@ class Results:
         write_safetensors(self.folder / "scene.safetensors", world, metadata)
 
     def save(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
-        """Write the scene files, then the configuration, a contact sheet and metrics.
+        """Write the scene files, then cameras, the configuration, a contact sheet and metrics.
 
         Raises:
             InputError: see `save_scene`.
         """
         self.save_scene(gaussians)
+        self._save_cameras()
         OmegaConf.save(self._config, self.folder / "config.yaml", resolve=True)
         self._save_contact_sheet("contact.png", gaussians)
         self._save_metrics(gaussians, progress)
@@ -124,6 +129,14 @@ class Results:
             print(f"video: {self.folder / 'path.mp4'}")
         print(f"viewer: python -m asysplat.export.viewer {self.folder / 'scene.ply'}")
         print(f"scene: {self.folder / 'scene.ply'}")
+
+    def _save_cameras(self) -> None:
+        """Write the cameras of inputs and held-out views in the world of the scene files."""
+        photographs = self._photographs
+        files = map(os.path.abspath, photographs.input_files + photographs.held_out_files)
+        cameras = photographs.frame.cameras_to_world(photographs.all_views().cameras)
+        with atomic_write(self.folder / CAMERAS) as path:
+            path.write_text(json.dumps(describe_cameras(cameras, list(files)), indent=1))
 
     def _save_metrics(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
         """Write metrics.json and metrics.csv, and print the table."""

@@ -119,3 +119,12 @@ def test_to_network_inverts_to_world(make_scene, pair):
     world = frame.to_world(gaussians.map(lambda values: values.float())).validate()
     assert world.means.dtype == world.sh.dtype == world.quats.dtype == torch.float32
     assert torch.equal(world.opacities, gaussians.opacities.float())
+
+
+def test_cameras_come_back_to_the_world(pair):
+    inputs, _, frame = normalize(*pair)
+    cameras = frame.cameras_to_world(inputs.cameras)
+    assert cameras.cam_to_world.dtype == torch.float64
+    expected = pair[0].cameras.cam_to_world
+    torch.testing.assert_close(cameras.cam_to_world.float(), expected, atol=1e-5, rtol=1e-5)
+    assert torch.equal(cameras.intrinsics, pair[0].cameras.intrinsics)

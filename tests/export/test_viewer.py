@@ -1,5 +1,6 @@
 """The viewer: images for its pages, changes of the scene, pages that come and go."""
 
+import json
 import sys
 import time
 from dataclasses import replace
@@ -13,10 +14,11 @@ import numpy as np
 import pytest
 import torch
 
-from asysplat import Views
+from asysplat import Views, write_gaussians
+from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
 from asysplat.export.frame import quaternion
-from asysplat.export.viewer import LAYERS, MAX_PIXELS, Viewer, draw_layer
+from asysplat.export.viewer import LAYERS, MAX_PIXELS, Viewer, cameras_beside, draw_layer, main
 
 pytest.importorskip("viser", minversion="1.1")
 from websockets.exceptions import InvalidStatus
@@ -245,3 +247,60 @@ def test_a_click_on_a_camera_moves_there(scene, viewer):
             distance = np.linalg.norm(forward)
             np.testing.assert_allclose(forward / distance, pose[:3, 2], atol=1e-5)
             assert 0.5 < distance / ((gaussians.means - pose[:3, 3]) @ pose[:3, 2]).median() < 2
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """The viewers that the command opened, which do not wait."""
+    viewers = []
+    monkeypatch.setattr(Viewer, "wait", lambda viewer: viewers.append(viewer))
+    return viewers
+
+
+@pytest.fixture
+def file(scene, tmp_path):
+    """A file of Gaussians, with their cameras beside it, the third first."""
+    gaussians, views = scene
+    write_gaussians(tmp_path / "scene.ply", gaussians)
+    cameras = views.cameras.select([2, 0, 1, 3])
+    content = describe_cameras(cameras, [f"/absent/{view}.png" for view in range(4)])
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    return tmp_path / "scene.ply"
+
+
+def test_the_command_opens_at_the_first_camera_beside_the_scene_upright(scene, file, opened):
+    main(str(file), None)
+    (viewer,), (_, views) = opened, scene
+    first, pose = viewer._server.initial_camera, views.cameras.cam_to_world[2]
+    turn = viewer._frame.world_to_mean.float()
+    position = viewer._frame.scale * (turn @ pose[:, 3])[:3]
+    np.testing.assert_allclose(first.position, position, atol=1e-5)
+    forward = torch.tensor(first.look_at - first.position)
+    forward = torch.nn.functional.normalize(forward.float(), dim=0)
+    torch.testing.assert_close(forward, (turn @ pose[:, 2])[:3], atol=1e-5, rtol=0)
+    assert torch.tensor(first.up).float() @ (turn @ pose[:, 1])[:3] < 0  # y is down
+    assert first.fov == pytest.approx(2 * np.arctan(45 / 110))
+    assert viewer._cameras.num_views == 4
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"frames": []}', '{"frames": [{"file_path": "a"}]}'])
+def test_a_damaged_file_of_cameras_is_a_line(scene, file, opened, capsys, text):
+    beside = file.with_name("transforms.json")
+    beside.write_text(text)
+    assert cameras_beside(file, scene[0]) is None
+    said = capsys.readouterr().out
+    assert said.startswith(f"without cameras: {beside}") and len(said.splitlines()) == 1
+    main(str(file), None)
+    assert opened[0]._cameras.num_views == 1
+
+
+def test_cameras_of_another_scene_are_a_line(scene, file, capsys):
+    gaussians = scene[0]
+    assert cameras_beside(file, gaussians).num_views == 4
+    assert capsys.readouterr().out == ""
+    away = replace(gaussians, means=gaussians.means + 1000)
+    assert cameras_beside(file, away) is None
+    assert "have 0% of the Gaussians in view" in capsys.readouterr().out
+    file.with_name("transforms.json").unlink()
+    assert cameras_beside(file, gaussians) is None
+    assert capsys.readouterr().out == ""

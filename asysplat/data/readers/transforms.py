@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -20,6 +22,7 @@ from asysplat.data.readers.colmap import points_beside
 from asysplat.data.readers.common import number
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
+from asysplat.scene import Cameras
 
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
@@ -111,6 +114,25 @@ def read_poses(file: Path) -> list[tuple[str, Float[ndarray, "4 4"]]]:
         pose = common.rigid(entry.get("transform_matrix"), f"{where}: transform_matrix")
         poses.append((entry["file_path"], common.opencv_from_opengl(pose)))
     return poses
+
+
+def read_cameras(file: Path) -> Cameras:
+    """Read the cameras of a `transforms.json`, whose images may be absent, without distortion.
+
+    Raises:
+        InputError: a damaged file, one without frames, or images of different proportions.
+    """
+    content, poses = common.read_frames(file), [pose for _, pose in read_poses(file)]
+    if not poses:
+        raise InputError(f"{file} has no frames: give at least one.")
+    lenses, size = [], None
+    for index, entry in enumerate(content["frames"]):
+        fields, where = {**content, **entry}, common.frame_label(file, index, entry)
+        size = size or tuple(round(number(fields, side, where)) for side in ("w", "h"))
+        lenses.append(_lens(fields, size, True, where))
+    matrices = [[[o.fx, 0, o.cx], [0, o.fy, o.cy], [0, 0, 1]] for o in lenses]
+    intrinsics, poses = torch.tensor(matrices), torch.tensor(np.stack(poses)).float()
+    return Cameras(intrinsics, poses, size[1], size[0]).validate(str(file))
 
 
 def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: str) -> Lens:

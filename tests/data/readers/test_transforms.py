@@ -10,6 +10,7 @@ from PIL import Image
 
 from asysplat.data import SceneOptions
 from asysplat.data import open_scene as open_at
+from asysplat.data.readers.transforms import read_cameras
 from asysplat.errors import InputError
 
 WIDTH, HEIGHT = 24, 16
@@ -190,3 +191,14 @@ def test_missing_transforms_and_images_of_two_sizes_are_refused(scene):
     shutil.rmtree(folder / "images")
     with pytest.raises(InputError, match="holds no photographs"):
         open_scene(folder)
+
+
+def test_cameras_are_read_without_their_images(scene):
+    folder = scene(lambda content: content["frames"][2].update(w=48, h=32, fl_x=44.0))
+    shutil.rmtree(folder / "images")
+    cameras = read_cameras(folder / "transforms.json")
+    assert (cameras.height, cameras.width, cameras.num_views) == (HEIGHT, WIDTH, 4)
+    assert cameras.intrinsics[0].tolist() == [[20, 0, 12.5], [0, 21, 7.5], [0, 0, 1]]
+    assert cameras.intrinsics[2].tolist() == [[22, 0, 6.25], [0, 10.5, 3.75], [0, 0, 1]]
+    poses = np.stack([pose(i) @ FLIP for i in range(4)])
+    np.testing.assert_allclose(cameras.cam_to_world, poses, atol=1e-6)
