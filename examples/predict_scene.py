@@ -12,6 +12,7 @@ from asysplat import load, render
 from asysplat.data import ProceduralScene
 from asysplat.data.normalize import normalize
 from asysplat.evaluation.figures import comparison_figure
+from asysplat.interrupts import handle_signals
 
 
 @torch.no_grad()
@@ -27,6 +28,7 @@ def main(checkpoint: Path | None, figure: Path) -> None:
 
 
 if __name__ == "__main__":
+    handle_signals()
     words = [Path(word) for word in sys.argv[1:]]
     main(
         next((path for path in words if path.suffix == ".ckpt"), None),

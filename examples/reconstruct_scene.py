@@ -13,6 +13,7 @@ from asysplat import load, mean_color, open_photographs, refine, render, write_g
 from asysplat.data import ProceduralScene
 from asysplat.data.write import write_transforms
 from asysplat.evaluation.figures import comparison_figure
+from asysplat.interrupts import handle_signals
 
 
 def reconstruct(folder: Path, scene: Path, figure: Path) -> None:
@@ -36,6 +37,7 @@ def write_synthetic(folder: Path) -> Path:
 
 
 if __name__ == "__main__":
+    handle_signals()
     with tempfile.TemporaryDirectory() as empty:
         folder = Path(sys.argv[1]) if len(sys.argv) > 1 else write_synthetic(Path(empty) / "scene")
         reconstruct(folder, Path("reconstructed.ply"), Path("reconstructed.png"))

@@ -11,6 +11,7 @@ import torch
 from asysplat import Gaussians, Views, render
 from asysplat.data import ProceduralScene
 from asysplat.evaluation.figures import comparison_figure
+from asysplat.interrupts import handle_signals
 from asysplat.rendering.sh import SH_C0
 
 
@@ -41,4 +42,5 @@ def main(figure: Path) -> None:
 
 
 if __name__ == "__main__":
+    handle_signals()
     main(Path(sys.argv[1] if len(sys.argv) > 1 else "render_scene.png"))

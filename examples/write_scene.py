@@ -15,6 +15,7 @@ from rich.progress import track
 
 from asysplat.data import ProceduralScene
 from asysplat.data.write import write_transforms
+from asysplat.interrupts import handle_signals
 from asysplat.scene import Views
 
 
@@ -26,4 +27,5 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    handle_signals()
     main(arguments.folder)

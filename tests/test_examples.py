@@ -24,6 +24,7 @@ def run_example(repository, monkeypatch):
 
     def run(name, *words):
         monkeypatch.setattr("sys.argv", [name, *map(str, words)])
+        monkeypatch.setattr("asysplat.interrupts.handle_signals", lambda: None)  # pytest's stay
         runpy.run_path(str(repository / "examples" / f"{name}.py"), run_name="__main__")
 
     return run

@@ -140,3 +140,13 @@ def test_names_are_american(repository):
     words = {word.lower() for text in texts for word in re.findall(r"\w+", text)}
     assert words
     assert [word for word in words if any(part in word for part in BRITISH)] == []
+
+
+def test_every_command_handles_signals(repository):
+    """Else pycolmap's handler of SIGTERM prints a stack trace."""
+    files = [*repository.glob("*.py"), *repository.glob("examples/*.py")]
+    files += (repository / "asysplat").rglob("*.py")
+    parts = {path: path.read_text().split('if __name__ == "__main__":') for path in files}
+    commands = {path: blocks[-1] for path, blocks in parts.items() if len(blocks) > 1}
+    assert len(commands) > 10
+    assert [path for path, block in commands.items() if "    handle_signals()" not in block] == []

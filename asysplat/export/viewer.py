@@ -36,6 +36,7 @@ from asysplat.errors import InputError
 from asysplat.evaluation.figures import disparity
 from asysplat.export import frame
 from asysplat.export.gaussians import read_gaussians
+from asysplat.interrupts import handle_signals
 from asysplat.refinement.photographs import open_photographs
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
@@ -367,4 +368,5 @@ def _camera_before(gaussians: Gaussians) -> Cameras:
 
 
 if __name__ == "__main__":
+    handle_signals()
     main(arguments.scene, arguments.photographs)

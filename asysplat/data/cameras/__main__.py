@@ -12,6 +12,7 @@ from rich.console import Console
 from asysplat.data.cameras.find import find_cameras
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
+from asysplat.interrupts import handle_signals
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -34,4 +35,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    handle_signals()
     sys.exit(main())

@@ -20,6 +20,7 @@ from asysplat.data.check.show import draw_report, print_report
 from asysplat.data.readers import LAYOUTS, find_scenes, read_scene
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
+from asysplat.interrupts import handle_signals
 
 MAX_SCENES = 3  # checked of a folder of more
 
@@ -75,4 +76,5 @@ def save_figure(report: Report, title: str, out: Path) -> Path:
 
 
 if __name__ == "__main__":
+    handle_signals()
     sys.exit(main())

@@ -24,6 +24,7 @@ from asysplat.data.images import load_image
 from asysplat.data.readers import LAYOUTS, find_scenes, read_scene
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
+from asysplat.interrupts import handle_signals
 
 CACHE = Path("~/.cache/asysplat/disparities")  # as in conf/data/disk.yaml
 MAX_SHORT_SIDE = 272  # pixels of a map: the loss compares every second pixel of 544
@@ -96,4 +97,5 @@ def shrink(disparity: ndarray, height: int, width: int) -> ndarray:
 
 
 if __name__ == "__main__":
+    handle_signals()
     sys.exit(main())

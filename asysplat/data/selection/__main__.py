@@ -14,6 +14,7 @@ from asysplat.data.selection.views import Selection
 from asysplat.data.sequence import SceneOptions
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
+from asysplat.interrupts import handle_signals
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -43,4 +44,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
+    handle_signals()
     main()
