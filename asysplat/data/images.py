@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 from numpy import ndarray
 from PIL import Image
@@ -24,6 +25,16 @@ from asysplat.errors import InputError
 END_MARKERS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
 TAIL_BYTES = 4096  # some cameras append data after the end marker
 WHOLE = 0.9999  # share of a pixel, as rounded, from which all of it is covered
+OUTSIDE = -1.0  # a position beyond the border of every image
+TWO_FOCALS = {  # COLMAP's models with one focal length; with two, more parameters follow, all 0
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "SIMPLE_DIVISION": "DIVISION",
+    "SIMPLE_FISHEYE": "FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +58,10 @@ class Lens:
     Args:
         width, height: the image's size in pixels.
         fx, fy, cx, cy: pinhole intrinsics in pixels.
-        distortion: OpenCV's k1 k2 p1 p2 k3, or k1 k2 k3 k4 of its fisheye model.
-        fisheye: whether `distortion` belongs to the fisheye model.
+        model: name of a model of COLMAP that has a focal length.
+        distortion: the model's other parameters, in COLMAP's order.
+
+    https://github.com/colmap/colmap/blob/main/src/colmap/sensor/models.h
     """
 
     width: int
@@ -57,13 +70,40 @@ class Lens:
     fy: float
     cx: float
     cy: float
+    model: str = "PINHOLE"
     distortion: tuple[float, ...] = ()
-    fisheye: bool = False
+
+    @staticmethod
+    def of(camera: pycolmap.Camera) -> "Lens":
+        """Return the lens of COLMAP's camera, which must have a focal length."""
+        return Lens(
+            camera.width,
+            camera.height,
+            camera.focal_length_x,
+            camera.focal_length_y,
+            camera.principal_point_x,
+            camera.principal_point_y,
+            camera.model_name,
+            tuple(camera.params[camera.extra_params_idxs()].tolist()),
+        )
+
+    def camera(self) -> pycolmap.Camera:
+        """Return COLMAP's camera, with id 0; of the model in TWO_FOCALS if fx and fy differ."""
+        model, params = self.model, [self.fx, self.fy, self.cx, self.cy, *self.distortion]
+        if model in TWO_FOCALS and self.fx == self.fy:
+            del params[0]
+        else:
+            model = TWO_FOCALS.get(model, model)
+        create = pycolmap.Camera.create_from_model_name
+        camera = create(0, model, self.fx, self.width, self.height)
+        camera.params = [*params, *camera.params[len(params) :]]
+        return camera
 
     @property
     def is_distorted(self) -> bool:
         # A fisheye is not a pinhole even with all coefficients 0.
-        return self.fisheye or any(self.distortion)
+        camera = self.camera()
+        return camera.is_perspective_fisheye() or not camera.is_undistorted()
 
 
 def image_size(path: ImageFile) -> tuple[int, int]:
@@ -167,14 +207,16 @@ def _undistortion_maps(
     lens: Lens, width: int, height: int
 ) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
     """Return x and y in the distorted image for each undistorted pixel."""
-    scale_x, scale_y = width / lens.width, height / lens.height
-    # OpenCV puts the first pixel's center at 0.
-    cx, cy = lens.cx * scale_x - 0.5, lens.cy * scale_y - 0.5
-    matrix = np.array([[lens.fx * scale_x, 0, cx], [0, lens.fy * scale_y, cy], [0, 0, 1.0]])
-    model = cv2.fisheye if lens.fisheye else cv2
-    return model.initUndistortRectifyMap(
-        matrix, np.array(lens.distortion), np.eye(3), matrix, (width, height), cv2.CV_32FC1
-    )
+    scale = np.array((width / lens.width, height / lens.height))
+    camera, maps = lens.camera(), np.empty((2, height, width), dtype=np.float32)
+    rays = np.ones((width, 3))
+    rays[:, 0] = ((np.arange(width) + 0.5) / scale[0] - lens.cx) / lens.fx
+    for row in range(height):
+        rays[:, 1] = ((row + 0.5) / scale[1] - lens.cy) / lens.fy
+        # OpenCV puts the first pixel's center at 0.
+        maps[:, row] = (camera.img_from_cam(rays) * scale - 0.5).T
+    x, y = np.nan_to_num(maps, nan=OUTSIDE)  # NaN where the lens does not see
+    return x, y
 
 
 def _to_rgb(image: Image.Image) -> UInt8[ndarray, "h w 3"]:

@@ -16,15 +16,15 @@ from asysplat.data.images import (
 from asysplat.errors import InputError
 
 WIDE = {"width": 160, "height": 120, "fx": 100.0, "fy": 105.0, "cx": 82.0, "cy": 57.5}
-BARREL = Lens(**WIDE, distortion=(-0.25, 0.06, 0.002, -0.003, 0.01))
-FISHEYE = Lens(**WIDE, distortion=(0.05, -0.02, 0.01, -0.002), fisheye=True)
+BARREL = Lens(**WIDE, model="FULL_OPENCV", distortion=(-0.25, 0.06, 0.002, -0.003, 0.01))
+FISHEYE = Lens(**WIDE, model="OPENCV_FISHEYE", distortion=(0.05, -0.02, 0.01, -0.002))
 
 
 def distort(points: np.ndarray, lens: Lens) -> np.ndarray:
     """The lens equations of the OpenCV manual, on pinhole pixel positions [..., 2]."""
     x, y = (points[..., 0] - lens.cx) / lens.fx, (points[..., 1] - lens.cy) / lens.fy
     r2 = x * x + y * y
-    if lens.fisheye:
+    if lens.model == "OPENCV_FISHEYE":
         theta = np.arctan(np.sqrt(r2))
         powers = sum(k * theta ** (2 * i + 2) for i, k in enumerate(lens.distortion))
         factor = theta * (1 + powers) / np.sqrt(np.maximum(r2, 1e-12))
@@ -63,15 +63,56 @@ def test_undistorted_dots_lie_on_a_straight_grid(lens):
     assert np.abs(distort(np.array([20.0, 20.0]), lens) - 20).max() > 2
 
 
+@pytest.mark.parametrize("lens", [BARREL, FISHEYE], ids=["opencv", "fisheye"])
+def test_images_are_undistorted_to_a_thousandth_of_a_pixel_as_by_opencv(lens):
+    width, height = 80, 60  # half the image's size
+    matrix = np.array([[50.0, 0, 41 - 0.5], [0, 52.5, 28.75 - 0.5], [0, 0, 1]])
+    model = cv2.fisheye if lens is FISHEYE else cv2
+    x, y = model.initUndistortRectifyMap(
+        *(matrix, np.array(lens.distortion), np.eye(3), matrix, (width, height), cv2.CV_32FC1)
+    )
+    inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
+    columns, rows = (ramp.astype(np.float32) for ramp in np.indices((height, width))[::-1])
+    for ramp, expected in ((columns, x), (rows, y)):
+        found = undistort(ramp, lens)
+        # OpenCV itself interpolates between 32 positions of a pixel.
+        assert np.abs(found - cv2.remap(ramp, x, y, cv2.INTER_LINEAR))[inside].max() < 1e-3
+        assert np.abs(found - expected)[inside].max() < 1 / 32
+
+
+def test_a_lens_is_colmap_s_camera_and_back():
+    lens = Lens(160, 120, 100.0, 100.0, 82.0, 57.5, "RADIAL", (0.1, -0.02))
+    assert Lens.of(lens.camera()) == lens
+    # Two focal lengths need a model that has them.
+    scaled = Lens(160, 120, 100.0, 105.0, 82.0, 57.5, "RADIAL", (0.1, -0.02))
+    camera = scaled.camera()
+    assert camera.model_name == "OPENCV"
+    assert camera.params.tolist() == [100, 105, 82, 57.5, 0.1, -0.02, 0, 0]
+    one, two = lens.camera(), camera
+    rays = np.random.default_rng(0).uniform((-0.5, -0.4, 1), (0.5, 0.4, 1), (20, 3))
+    stretched = (one.img_from_cam(rays) - (82, 57.5)) * (1, 1.05) + (82, 57.5)
+    np.testing.assert_allclose(two.img_from_cam(rays), stretched, atol=1e-9)
+
+
 def test_nearest_undistortion_mixes_no_values_and_is_zero_outside():
     stored = np.random.default_rng(0).integers(1, 9, (60, 80)).astype(np.float32)
-    pincushion = Lens(**WIDE, distortion=(0.3, 0.0, 0.0, 0.0, 0.0))
+    pincushion = Lens(**WIDE, model="FULL_OPENCV", distortion=(0.3, 0.0, 0.0, 0.0, 0.0))
     flat = undistort(stored, pincushion, nearest=True)
     assert set(np.unique(flat)) <= set(range(9)) and flat[0, 0] == 0
     # Half the image's size, so every position halves.
     x, y = distort(np.array([61.0, 41.0]), pincushion) / 2
     assert flat[20, 30] == stored[int(y), int(x)]
-    assert undistort(stored, Lens(**WIDE, distortion=(0.0,) * 5)) is stored
+    assert undistort(stored, Lens(**WIDE, model="OPENCV", distortion=(0.0,) * 4)) is stored
+
+
+def test_pixels_that_the_lens_does_not_see_are_masked():
+    lens = Lens(**WIDE, model="DIVISION", distortion=(0.45,))
+    rays = np.ones((120, 160, 3))
+    rays[..., :2] = (pixel_centers(160, 120) - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
+    pixels = lens.camera().img_from_cam(rays.reshape(-1, 3)).reshape(120, 160, 2)
+    inside = ((pixels > 0) & (pixels < (160, 120))).all(-1)
+    assert np.isnan(pixels[0, 0]).all() and 0.1 < inside.mean() < 0.9
+    assert np.array_equal(undistort(np.ones((120, 160), bool), lens), inside)
 
 
 @pytest.mark.parametrize("height, width", [(40, 60), (60, 40), (150, 300)])

@@ -26,7 +26,6 @@ from asysplat.data.cameras.features import (
     save_mask,
     without_spaces,
 )
-from asysplat.data.images import Lens
 from asysplat.data.readers import colmap
 from asysplat.data.readers.common import inverted
 from asysplat.data.sequence import PosedImage, PosedScene
@@ -105,8 +104,10 @@ def refine_cameras(
 
 def _refine(work: Path, images: dict[str, PosedImage], progress: Progress) -> None:
     """Refine the cameras of work/images/NAME, and write the folder work/result."""
-    cameras = {image.lens: _camera(image.lens) for image in images.values()}
     lenses = {name: image.lens for name, image in images.items()}
+    # Of a pinhole, the distortion is refined as well.
+    models = {lens: "OPENCV" if "PINHOLE" in lens.model else lens.model for lens in lenses.values()}
+    cameras = {lens: replace(lens, model=model).camera() for lens, model in models.items()}
     database = match_photographs(work, lenses, USUAL, progress, cameras)
     poses = {name: image.cam_to_world for name, image in images.items()}
     model = _posed_model(database, poses)
@@ -134,15 +135,6 @@ def _refine(work: Path, images: dict[str, PosedImage], progress: Progress) -> No
     for kind in ("images", "masks"):
         if (work / kind).is_dir():
             (work / kind).rename(result / kind)
-
-
-def _camera(lens: Lens) -> pycolmap.Camera:
-    """Return a camera of COLMAP, whose distortion can be refined."""
-    k1, k2, third, fourth, k3 = (*lens.distortion, *[0.0] * 5)[:5]
-    model = "OPENCV_FISHEYE" if lens.fisheye else "FULL_OPENCV" if k3 else "OPENCV"
-    params = [lens.fx, lens.fy, lens.cx, lens.cy, k1, k2, third, fourth]
-    params += [k3, 0.0, 0.0, 0.0] if model == "FULL_OPENCV" else []
-    return pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=params)
 
 
 def _posed_model(

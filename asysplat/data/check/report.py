@@ -173,9 +173,9 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
     if identical := len(images) - len({content_hash(image.file) for image in images}):
         rows.append(("", f"{identical} with the same file as another"))
     for lens, count in Counter(image.lens for image in images).most_common(MAX_LENSES):
-        kind = " fisheye" if lens.fisheye else " distorted" if lens.is_distorted else ""
+        model = f" {lens.model}" if lens.is_distorted else ""
         numbers = f"fx {lens.fx:.5g}, fy {lens.fy:.5g}, cx {lens.cx:.5g}, cy {lens.cy:.5g}"
-        rows.append(("lens", f"{count} of {lens.width} x {lens.height}{kind}: {numbers}"))
+        rows.append(("lens", f"{count} of {lens.width} x {lens.height}{model}: {numbers}"))
     masks = f"{known['masks']:.1%} of the pixels are kept" if "masks" in known else "none"
     depths = _describe_depths(sequence, known, matches, verdict)
     rows += [("points", "none" if points is None else str(len(points)))]

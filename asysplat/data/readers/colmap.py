@@ -18,20 +18,12 @@ from numpy import ndarray
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers import common
-from asysplat.data.readers.colmap_model import read_model
+from asysplat.data.readers.colmap_model import CAMERA_MODELS, read_model
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 FOLDERS = ("images", "images_undistort", "images_2", "images_4", "images_8", ".")
-PARAMETERS = {  # names of each camera model's parameters, in COLMAP's order
-    "SIMPLE_PINHOLE": "f cx cy",
-    "PINHOLE": "fx fy cx cy",
-    "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
-}
 MAX_NAMES = 5  # in a warning
 SAME_WORLD = 1e-3  # greatest difference of rotations, and of positions over the cameras' spread
 
@@ -121,24 +113,12 @@ def _points(colmap: pycolmap.Reconstruction | Path) -> Points | None:
 
 
 def _lens(camera: pycolmap.Camera, where: str) -> Lens:
-    if camera.model_name not in PARAMETERS:
+    if camera.is_spherical():
         raise InputError(
-            f"{where} has model {camera.model_name}: undistort with colmap image_undistorter, or "
-            f"use one of {', '.join(PARAMETERS)}."
+            f"{where} has model {camera.model_name}: make perspective images of the panoramas, or "
+            f"use one of {', '.join(CAMERA_MODELS)}."
         )
-    values = dict(zip(PARAMETERS[camera.model_name].split(), camera.params.tolist(), strict=True))
-    fisheye = camera.model_name == "OPENCV_FISHEYE"
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-    return Lens(
-        width=camera.width,
-        height=camera.height,
-        fx=values.get("fx", values.get("f")),
-        fy=values.get("fy", values.get("f")),
-        cx=values["cx"],
-        cy=values["cy"],
-        distortion=tuple(values.get(name, 0.0) for name in names),
-        fisheye=fisheye,
-    )
+    return Lens.of(camera)
 
 
 def _images_folder(scene: Path, model: Path, names: Sequence[str]) -> Path:

@@ -14,6 +14,8 @@ import pycolmap
 
 from asysplat.errors import InputError
 
+NO_MODELS = ("INVALID", "EQUIRECTANGULAR")
+CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name not in NO_MODELS]
 POINT_FIELDS = 8  # of a line of points3D.txt before its track
 
 
@@ -21,7 +23,7 @@ def read_model(model: Path) -> pycolmap.Reconstruction:
     """Read a model; without its tracks, and with a warning, if these contradict its points.
 
     Raises:
-        InputError: files that are missing, cut short or damaged.
+        InputError: files that are missing, cut short or damaged, or an unknown camera model.
     """
     binary = (model / "cameras.bin").is_file()
     entries = {file: _entries(file) for file in model.glob("*.bin")} if binary else {}
@@ -30,6 +32,11 @@ def read_model(model: Path) -> pycolmap.Reconstruction:
     # Damaged files make COLMAP raise anything from IndexError to MemoryError, with a C++ trace.
     except Exception as error:
         reason = str(error).split("\n")[0]
+        if reason == "Camera model does not exist":
+            raise InputError(
+                f"{model} has a camera model that is not known: undistort with colmap "
+                f"image_undistorter, or use one of {', '.join(CAMERA_MODELS)}."
+            ) from error
         try:
             with TemporaryDirectory() as folder:
                 _write_without_tracks(model, Path(folder), entries)

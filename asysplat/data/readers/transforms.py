@@ -24,7 +24,13 @@ from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
 
-PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # read as OPENCV
+DISTORTIONS = {  # names of the parameters of the others, in COLMAP's order
+    "OPENCV": "k1 k2 p1 p2",
+    "FULL_OPENCV": "k1 k2 p1 p2 k3 k4 k5 k6",
+    "OPENCV_FISHEYE": "k1 k2 k3 k4",
+    "THIN_PRISM_FISHEYE": "k1 k2 p1 p2 k3 k4 sx1 sy1",
+}
 
 
 def find_scenes(root: Path) -> list[Path]:
@@ -143,17 +149,22 @@ def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: s
             f"{where}: w x h is {given['w']} x {given['h']}, but the image is {size[0]} x "
             f"{size[1]}: give intrinsics for the images' own resolution."
         )
-    model = fields.get("camera_model", "OPENCV")
-    fisheye = model == "OPENCV_FISHEYE" or bool(fields.get("is_fisheye", False))
-    if not fisheye and model not in PERSPECTIVE_MODELS:
+    model = "OPENCV_FISHEYE" if fields.get("is_fisheye") else fields.get("camera_model", "OPENCV")
+    known = (*PERSPECTIVE_MODELS, *DISTORTIONS)
+    if model not in known:
         raise InputError(
             f"{where}: camera_model is {model!r}: undistort the images to PINHOLE, or use one of "
-            f"{', '.join(PERSPECTIVE_MODELS)}, OPENCV_FISHEYE."
+            f"{', '.join(known)}."
         )
-    # The formats disagree about what k4 means for perspective cameras.
-    if not fisheye and number(fields, "k4", where, default=0.0) != 0:
-        raise InputError(f"{where}: k4 is only known for OPENCV_FISHEYE: undistort the images.")
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    if model in (*PERSPECTIVE_MODELS, "OPENCV"):
+        # The formats disagree about what k4 means for them.
+        if number(fields, "k4", where, default=0.0) != 0:
+            raise InputError(
+                f"{where}: k4 is only known for OPENCV_FISHEYE, FULL_OPENCV and "
+                "THIN_PRISM_FISHEYE: name one of them as camera_model, or undistort the images."
+            )
+        model = "FULL_OPENCV" if number(fields, "k3", where, default=0.0) else "OPENCV"
+    names = DISTORTIONS[model].split()
     width, height = (round(number(given, key, where)) for key in ("w", "h"))
     lens = Lens(
         width,
@@ -161,8 +172,8 @@ def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: s
         *_focal(fields, width, height, where),
         cx=number(fields, "cx", where, default=width / 2),
         cy=number(fields, "cy", where, default=height / 2),
+        model=model,
         distortion=tuple(number(fields, name, where, default=0.0) for name in names),
-        fisheye=fisheye,
     )
     return common.scaled(lens, size, where)
 

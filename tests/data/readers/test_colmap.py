@@ -2,16 +2,18 @@ import shutil
 import warnings
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pycolmap
 import pytest
 from layouts import colmap as layout
 from layouts import opener, save_image, table
+from PIL import Image
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens
 from asysplat.data.readers import colmap
+from asysplat.data.readers.colmap_model import CAMERA_MODELS
+from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.errors import InputError
 
 opened = opener("colmap")
@@ -85,31 +87,53 @@ def test_the_model_is_found_in_its_usual_folders(scene, tmp_path):
         assert len(read(folder).images) == 12, place
 
 
-NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
-LENSES = {
-    "SIMPLE_PINHOLE 32 24 30 15 11": (30.0, 30.0, NONE),
-    "PINHOLE 32 24 30 31 15 11": (30.0, 31.0, NONE),
-    "SIMPLE_RADIAL 32 24 30 15 11 0.1": (30.0, 30.0, (0.1, 0.0, 0.0, 0.0, 0.0)),
-    "RADIAL 32 24 30 15 11 0.1 -0.02": (30.0, 30.0, (0.1, -0.02, 0.0, 0.0, 0.0)),
-    "OPENCV 32 24 30 31 15 11 0.1 -0.02 0.003 0.004": (30.0, 31.0, (0.1, -0.02, 0.003, 0.004, 0.0)),
-    "OPENCV_FISHEYE 32 24 30 31 15 11 0.1 -0.02 0.03 0.04": (30.0, 31.0, (0.1, -0.02, 0.03, 0.04)),
-}
+LENSES = [
+    "SIMPLE_PINHOLE 320 240 200 162 117",
+    "PINHOLE 320 240 200 210 162 117",
+    "SIMPLE_RADIAL 320 240 200 162 117 0.1",
+    "RADIAL 320 240 200 162 117 0.1 -0.02",
+    "OPENCV 320 240 200 210 162 117 0.1 -0.02 0.003 0.004",
+    "FULL_OPENCV 320 240 200 210 162 117 0.1 -0.02 0.003 0.004 0.01 0.2 0.03 -0.01",
+    "SIMPLE_DIVISION 320 240 200 162 117 -0.1",
+    "DIVISION 320 240 200 210 162 117 -0.1",
+    "FOV 320 240 200 210 162 117 0.8",
+    "EUCM 320 240 200 210 162 117 0.5 1.1",
+    "SIMPLE_FISHEYE 320 240 200 162 117",
+    "FISHEYE 320 240 200 210 162 117",
+    "SIMPLE_RADIAL_FISHEYE 320 240 200 162 117 0.1",
+    "RADIAL_FISHEYE 320 240 200 162 117 0.1 -0.02",
+    "OPENCV_FISHEYE 320 240 200 210 162 117 0.1 -0.02 0.03 0.04",
+    "THIN_PRISM_FISHEYE 320 240 200 210 162 117 0.1 -0.02 0.003 0.004 0.03 0.04 0.01 -0.02",
+    "RAD_TAN_THIN_PRISM_FISHEYE 320 240 200 210 162 117 "
+    "0.1 -0.02 0.03 0.01 0.02 0.01 0.003 0.004 0.01 -0.02 0.01 0.02",
+]
 
 
+def test_every_model_that_is_named_as_known_is_tested():
+    assert sorted(CAMERA_MODELS) == sorted(line.split()[0] for line in LENSES)
+
+
+@pytest.mark.parametrize("size", [(320, 240), (163, 122)], ids=["whole", "half"])
 @pytest.mark.parametrize("line", LENSES, ids=lambda line: line.split()[0])
-def test_camera_models_project_as_in_colmap(scene, line):
-    fx, fy, distortion = LENSES[line]
-    lens = read(with_camera(scene, line)).images[0].lens
-    assert lens == Lens(32, 24, fx, fy, 15.0, 11.0, distortion, line.startswith("OPENCV_FISHEYE"))
-    # COLMAP itself projects to the same pixels.
-    in_camera = np.random.default_rng(0).uniform((-0.5, -0.4, 1), (0.5, 0.4, 1), (20, 3))
+def test_points_lie_where_the_pinhole_says(scene, line, size):
+    """In images of the camera's size and of half of it, rounded; COLMAP projects the points."""
+    with_camera(scene, line)
     camera = pycolmap.Reconstruction(scene / "sparse/0").cameras[1]
-    matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]])
-    still, project = np.zeros(3), cv2.fisheye if lens.fisheye else cv2
-    distortion = np.array(lens.distortion)
-    pixels, _ = project.projectPoints(in_camera[:, None], still, still, matrix, distortion)
-    np.testing.assert_allclose(pixels[:, 0], camera.img_from_cam(in_camera), atol=1e-9)
-    opened(scene).views([0]).validate()
+    scale = np.array(size) / (camera.width, camera.height)
+    rays = np.array([(0.0, 0, 1), (-0.5, -0.35, 1), (0.5, -0.35, 1), (-0.5, 0.4, 1), (0.5, 0.4, 1)])
+    rows, columns = np.indices(size[::-1]) + 0.5
+    spread = 3 * scale.max()  # of a dot, in pixels
+    for index, (x, y) in enumerate(camera.img_from_cam(rays) * scale):
+        dot = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * spread**2))
+        Image.fromarray(np.round(255 * dot).astype(np.uint8)).save(scene / f"images/{index}.png")
+    posed = read(scene)
+    assert posed.images[0].lens.model == line.split()[0]
+    views = FileSequence(posed, SceneOptions(*size[::-1])).views(range(len(rays)))
+    expected = views.cameras.intrinsics.double().numpy() @ rays[..., None]
+    weights = views.images[:, 0].double().numpy() ** 2
+    for weight, position in zip(weights, expected[:, :2, 0], strict=True):
+        found = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+        assert np.abs(found - position).max() < 0.1
 
 
 def test_every_image_has_its_own_camera(scene, views):
@@ -126,7 +150,7 @@ def test_intrinsics_are_scaled_to_smaller_images(scene):
     with_camera(scene, "OPENCV 130 97 120 124 60 44 0.1 0 0 0")
     lens = read(scene).images[0].lens
     x, y = 32 / 130, 24 / 97
-    assert lens == Lens(32, 24, 120 * x, 124 * y, 60 * x, 44 * y, (0.1, 0.0, 0.0, 0.0, 0.0))
+    assert lens == Lens(32, 24, 120 * x, 124 * y, 60 * x, 44 * y, "OPENCV", (0.1, 0.0, 0.0, 0.0))
 
 
 def test_images_of_the_full_size_are_preferred(scene, views):
@@ -173,15 +197,16 @@ def nan_pose(scene):
     in_model("images.bin", lambda stored: stored[: first.start] + nan + stored[first.stop :])(scene)
 
 
-def camera_model(line):
-    return lambda scene: with_camera(scene, line), f"model {line.split()[0]}: undistort with colmap"
-
-
 @table(
     {
-        "FULL_OPENCV": camera_model("FULL_OPENCV 32 24 30 31 15 11 0.1 0 0 0 0 0 0 0"),
-        "FOV": camera_model("FOV 32 24 30 31 15 11 0.5"),
-        "SIMPLE_RADIAL_FISHEYE": camera_model("SIMPLE_RADIAL_FISHEYE 32 24 30 15 11 0.1"),
+        "EQUIRECTANGULAR": (
+            lambda scene: with_camera(scene, "EQUIRECTANGULAR 32 24 32 24"),
+            "model EQUIRECTANGULAR: make perspective images .* use one of SIMPLE_PINHOLE, ",
+        ),
+        "a camera model of no name": (
+            lambda scene: with_camera(scene, "FOO 32 24 30 31 15 11"),
+            "a camera model that is not known: .* or use one of SIMPLE_PINHOLE, ",
+        ),
         "another shape": (
             lambda scene: with_camera(scene, "PINHOLE 64 40 60 60 32 20"),
             r"12 of 12 .*\n.*0\.png is 32 x 24 and .* for 64 x 40",

@@ -31,7 +31,7 @@ def test_smaller_images_are_read_where_there_are_no_others_with_the_same_distort
     sequence = opened(tmp_path / HASH)
     found = sequence.scene.images[0].lens
     assert (found.width, found.height) == (16, 12)
-    assert found.distortion == (0.1, -0.02, 0.003, -0.004, 0)
+    assert (found.model, found.distortion) == ("OPENCV", (0.1, -0.02, 0.003, -0.004))
     assert_same(sequence.cameras.intrinsics, few.cameras.intrinsics)
     write_scene(few, tmp_path / HASH, lens=lens)
     views = opened(tmp_path / HASH).views([0])

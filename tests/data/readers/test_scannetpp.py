@@ -86,7 +86,7 @@ def test_fisheye_is_undistorted_and_has_the_rendered_depths(few, dslr):
         save_depth(dslr / f"render_depth/DSC{index + 1:05d}.png", torch.full((24, 32), 1.5))
     sequence = opened(dslr / "nerfstudio/transforms.json")
     lens, views = sequence.scene.images[0].lens, sequence.views([0])
-    assert lens.fisheye and lens.distortion == tuple(FISHEYE.values())
+    assert lens.model == "OPENCV_FISHEYE" and lens.distortion == tuple(FISHEYE.values())
     assert views.masks is not None
     same(views.depths[0, 12, 16], torch.tensor(1.5))
     assert opened(dslr).views([0]).depths is None

@@ -142,6 +142,29 @@ def drop(*keys):
     return lambda content: [content.pop(key) for key in keys]
 
 
+@pytest.mark.parametrize(
+    "fields, model",
+    [
+        ({"k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": 0.004}, "OPENCV"),
+        ({"k1": 0.1, "k2": 0, "p1": 0, "p2": 0, "k3": 0.01}, "FULL_OPENCV"),
+        ({"k1": 0, "k2": 0, "p1": 0, "p2": 0, "k3": 0, "k4": 0.3, "k5": 0.2}, "FULL_OPENCV"),
+        ({"k1": 0.1, "k2": -0.02, "k3": 0.03, "k4": 0.04}, "OPENCV_FISHEYE"),
+        (
+            {"k1": 0.1, "k2": 0, "p1": 0, "p2": 0, "k3": 0, "k4": 0.3, "sx1": 0.2, "sy1": 0.1},
+            "THIN_PRISM_FISHEYE",
+        ),
+    ],
+)
+def test_distortions_have_colmap_s_names(scene, fields, model):
+    named = "OPENCV" if model == "FULL_OPENCV" and "k4" not in fields else model
+    lens = open_scene(scene(set_scene(camera_model=named, **fields))).scene.images[0].lens
+    camera = lens.camera()
+    names = camera.params_info.split(", ")
+    given = dict(zip(names, camera.params.tolist(), strict=True))
+    assert camera.model_name == model and (lens.width, lens.height) == (WIDTH, HEIGHT)
+    assert given == dict.fromkeys(names, 0) | {"fx": 20, "fy": 21, "cx": 12.5, "cy": 7.5} | fields
+
+
 BROKEN = {
     "no frames": (drop("frames"), r'transforms\.json has no list "frames"'),
     "one frame": (lambda content: content["frames"].__delitem__(slice(1, None)), "has 1 usable"),
