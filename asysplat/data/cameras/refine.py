@@ -4,6 +4,7 @@ Triggs et al. 2000, Bundle Adjustment: A Modern Synthesis; with COLMAP, by pycol
 """
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +34,7 @@ from asysplat.files import make_folder
 
 ROUNDS = 2  # of triangulation and bundle adjustment
 LEAST_POINTS = 20  # that a photograph sees, for its pose to be refined
+LEAST_OF_LENS = 10  # photographs of a lens, for its focal length and distortion to be refined
 ERRORS = "errors.json"  # in the folder of refined cameras
 
 
@@ -55,11 +57,12 @@ class RefinedCameras:
 def refine_cameras(
     scene: PosedScene, where: Path | str, console: Console | None = None
 ) -> RefinedCameras:
-    """Refine poses, focal lengths and distortions of a scene's photographs.
+    """Refine poses of a scene's photographs, and focal lengths and distortions of their lenses.
 
-    The result is moved back by a similarity, so that it stays in the given world at the given
-    scale; photographs that see few of the points keep their poses. It is written to a folder in
-    COLMAP's layout, and the next call with the same photographs and cameras reads it there.
+    A lens of fewer than 10 photographs stays as it is. The result is moved back by a similarity, so
+    that it stays in the given world at the given scale; photographs that see few of the points keep
+    their poses. It is written to a folder in COLMAP's layout, and the next call with the same
+    photographs and cameras reads it there.
 
     Args:
         scene: its images are files.
@@ -74,7 +77,10 @@ def refine_cameras(
     names = without_spaces(images)
     given = [(image.lens, image.cam_to_world.tolist()) for image in scene.images]
     masks = [image.mask for image in scene.images if image.mask not in (None, image.file)]
-    folder = where / f"{scene.name}-refined-{digest(f'{USUAL} {given}', [*images, *masks])}"
+    folder = (
+        where
+        / f"{scene.name}-refined-{digest(f'{USUAL} {LEAST_OF_LENS} {given}', [*images, *masks])}"
+    )
     if not folder.is_dir():
         make_folder(where, "paths.logs")
         with (
@@ -153,13 +159,17 @@ def _posed_model(
 
 
 def _adjust(model: pycolmap.Reconstruction) -> None:
-    """Adjust poses, points, focal lengths and distortions of a model to its features."""
+    """Adjust poses and points of a model to its features, and lenses of several photographs."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.refine_principal_point = False
     options.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         config.add_image(image)
+    photographs = Counter(image.camera_id for image in model.images.values())
+    for camera, count in photographs.items():
+        if count < LEAST_OF_LENS:
+            config.set_constant_cam_intrinsics(camera)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 

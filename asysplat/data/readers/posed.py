@@ -21,8 +21,9 @@ POSES = ("poses_refined.txt", "poses.txt")  # the first file that exists is read
 
 
 def find_scenes(root: Path) -> list[Path]:
-    """Find folders with a `K.txt`."""
-    return folders_with(root, "K.txt")
+    """Find folders with a `K.txt` and poses."""
+    folders = folders_with(root, "K.txt")
+    return [folder for folder in folders if any((folder / name).is_file() for name in POSES)]
 
 
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:

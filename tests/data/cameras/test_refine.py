@@ -9,7 +9,7 @@ import torch
 
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.cameras import CameraOptions, refine_cameras, refine_given
-from asysplat.data.cameras.refine import LEAST_POINTS
+from asysplat.data.cameras.refine import LEAST_OF_LENS, LEAST_POINTS
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.refinement.photographs import open_photographs
@@ -110,6 +110,15 @@ def test_a_scene_far_from_the_origin(folder, refined, tmp_path):
     new = refine_cameras(scene, tmp_path).scene
     assert new.origin == OFFSET
     np.testing.assert_allclose(new.points, refined[1].scene.points, atol=1e-9)
+
+
+@pytest.mark.medium
+def test_a_lens_of_few_photographs_stays(folder, tmp_path):
+    scene = read(folder)
+    few = replace(scene, images=scene.images[: LEAST_OF_LENS - 1])
+    for given, new in zip(few.images, refine_cameras(few, tmp_path).scene.images, strict=True):
+        assert new.lens.fx == pytest.approx(given.lens.fx, rel=1e-12)
+        assert not any(new.lens.distortion) and (new.cam_to_world != given.cam_to_world).any()
 
 
 def test_photographs_without_features_keep_their_cameras(views, tmp_path):

@@ -3,6 +3,7 @@ import pytest
 from layouts import assert_listed, opener
 from layouts import posed as layout
 
+from asysplat.data.readers import without_cameras
 from asysplat.errors import InputError
 
 open_posed = opener("posed")
@@ -55,6 +56,8 @@ def test_missing_images_and_poses_are_refused(scene):
     (scene / "images/00003.png").unlink()
     with pytest.raises(InputError, match=r"poses\.txt has 12 poses and .*images 11 images"):
         open_posed(scene)
+    assert without_cameras(scene) is None
     (scene / "poses.txt").unlink()
     with pytest.raises(InputError, match=r"poses\.txt cannot be read"):
         open_posed(scene)
+    assert without_cameras(scene) == "11 photographs"  # K.txt alone is no pose
