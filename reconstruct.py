@@ -32,6 +32,7 @@ from asysplat.data.cameras import CameraOptions
 from asysplat.errors import InputError, input_error_behind, plain_warnings
 from asysplat.export import read_gaussians
 from asysplat.interrupts import handle_signals
+from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
 from asysplat.refinement import RefinementSettings, mean_color, refine
@@ -58,6 +59,7 @@ def main(config: DictConfig) -> None:
 
 def reconstruct(config: DictConfig) -> None:
     """Find or refine cameras, initialize Gaussians, refine them, write the results."""
+    config = continue_run(config, given_options())
     if OmegaConf.is_missing(config, "path"):
         raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
     check_ranges(OmegaConf.masked_copy(config, "speed"))
@@ -120,10 +122,14 @@ def fit_to_all(
     return refine(gaussians, views, settings, **options)
 
 
+def given_options() -> set[str]:
+    """Return the names of the options on the command line."""
+    return {each.lstrip("+").partition("=")[0] for each in HydraConfig.get().overrides.task}
+
+
 def read_limit(config: DictConfig) -> dict[str, float]:
     """Read the limit of the refinement: steps, or else seconds."""
-    given = {override.partition("=")[0] for override in HydraConfig.get().overrides.task}
-    if {"steps", "seconds"} <= given and None not in (config.steps, config.seconds):
+    if {"steps", "seconds"} <= given_options() and None not in (config.steps, config.seconds):
         raise InputError(
             f"seconds={config.seconds} and steps={config.steps}: give one of them; steps are "
             "repeatable, seconds are not."

@@ -18,6 +18,7 @@ import pytest
 import torch
 import yaml
 from full_disk import largest_file
+from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -28,6 +29,7 @@ from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.readers.transforms import read_cameras
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
+from asysplat.overrides import CONF
 from asysplat.reconstruct.results import save_ply, subject
 
 SIZE = 48
@@ -192,6 +194,83 @@ def test_each_init_beats_its_baseline(command, views, photographs, tmp_path, mon
 
 
 @pytest.mark.medium
+def test_a_run_goes_on_from_a_finished_one(command, run_script, photographs, tmp_path):
+    small = ("height=40", "views=5", "held_out_every=4", "video.path=none")
+    finished(command(photographs, *small))
+    first = (tmp_path / "run").rename(tmp_path / "first")
+    before, files = numbers_of(first), {file: file.read_bytes() for file in first.iterdir()}
+    options = ("steps=40", "views=6", "video.path=none", "paths.weights=none")
+    said = finished(run_script("reconstruct.py", "run=last", f"paths.logs={tmp_path}", *options))
+    assert f"goes on from {first}, on the photographs {photographs}" in said
+    assert {file: file.read_bytes() for file in first.iterdir()} == files
+    (folder,) = (tmp_path / "reconstruct").iterdir()
+    config, after = OmegaConf.load(folder / "config.yaml"), numbers_of(folder)
+    assert (config.height, config.held_out_every, config.views) == (40, 4, 6)
+    assert (config.run, config.init) == (str(first), str(first / "scene.safetensors"))
+    assert config.refinement.half_size == 0 and config.refinement.max_gaussians == 150_000
+    assert after["held_out/psnr"] > before["held_out/psnr"] - 0.5
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """A finished reconstruction as far as its files tell, with this configuration."""
+
+    def write(content):
+        folder = tmp_path / "old"
+        folder.mkdir(exist_ok=True)
+        for name in ("metrics.json", "scene.safetensors", "scene.ply"):
+            (folder / name).write_text("{}")
+        OmegaConf.save(OmegaConf.create(content), folder / "config.yaml")
+        return folder
+
+    return write
+
+
+def test_only_what_describes_the_photographs_is_taken_from_a_run(run_folder, script):
+    stored = {"path": "scene", "height": 300, "views": 7, "frames": 9, "seed": 5, "seconds": 600}
+    stored |= {"paths": {"run": "elsewhere"}, "checkpoint": "x", "video": {"path": "orbit"}}
+    folder = run_folder(stored)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        words = ["path=mine", f"run={folder}", "paths.run=new", "quality=best"]
+        config = compose("reconstruct", words)
+    for given, height, views in (
+        ({"run"}, 300, 7),
+        ({"run", "views"}, 300, 200),
+        ({"run", "quality"}, 540, 200),
+    ):
+        continued = script.continue_run(config, given)
+        assert (continued.height, continued.views, continued.frames) == (height, views, 9)
+        assert (continued.path, continued.width) == ("scene", None)
+        assert continued.init == str(folder / "scene.safetensors")
+        assert continued.refinement.half_size == 0
+        for key in ("seed", "seconds", "paths", "checkpoint", "video"):
+            assert continued[key] == config[key]
+    given = {"run", "path", "init", "refinement.half_size"}
+    continued = script.continue_run(config, given)
+    assert (continued.path, continued.init) == ("mine", config.init)
+    assert continued.refinement.half_size == config.refinement.half_size > 0
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"height": 9}, "config.yaml has no path of photographs"),
+        ({"path": {"a": 1}}, "config.yaml has no path of photographs"),
+        ({"path": "a", "views": [1]}, r"config.yaml: views is \[1\]: expected a word or a"),
+        ({"path": "a", "x": {"_target_": "os.system"}}, "os.system"),
+        (None, "has no scene.safetensors: name the folder of a finished run, or last"),
+    ],
+)
+def test_a_run_of_another_kind_is_refused(run_folder, script, content, message):
+    folder = run_folder(content or {"path": "a"})
+    if content is None:
+        (folder / "scene.safetensors").unlink()
+    config = OmegaConf.create({"run": str(folder), "paths": {"logs": "none"}})
+    with pytest.raises(InputError, match=message):
+        script.continue_run(config, ())
+
+
+@pytest.mark.medium
 def test_only_a_start_from_the_network_reads_its_weights(command, photographs):
     overrides = ("views=4", "checkpoint=absent.safetensors", "steps=2")
     said = finished(command(photographs, *overrides))
@@ -247,6 +326,8 @@ REFUSED = {
     "cameras=best": "cameras=best: choose auto, given, refined, found",
     "height=0": "height=0, width=None",
     "refinement.until=2.5": "refinement.until=2.5: give 0 to 1",
+    "run=nowhere": "run=nowhere has no metrics.json: name the folder of a finished run",
+    "run=last paths.logs=nowhere": "run=last found no finished run in nowhere",
     "path=absent": "absent does not exist: name a scene",
 }
 

@@ -9,9 +9,10 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from asysplat.errors import InputError
 from asysplat.training.ranges import check_ranges
 from asysplat.training.run_config import read_config
-from asysplat.training.runs import RESULTS, describe_run, find_runs, hash_of
+from asysplat.training.runs import RESULTS, describe_run, find_runs, folder_of, hash_of
 from asysplat.training.systems import describe_system
 
+CHECKPOINT = "checkpoints/last.ckpt"
 OWN_OPTIONS = ("run", "scenes", "system", "steps", "write_scenes")  # the others are train.py's
 
 
@@ -70,22 +71,13 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
 
 def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarget:
     """Take a run with its own options; the evaluation is written beside its results."""
-    folder = Path(options.run)
-    if options.run == "last":
-        runs = list(find_runs(Path(options.paths.logs)))
-        if not runs:
-            raise InputError(
-                f"run=last found no finished run in {options.paths.logs}: name its folder, or set "
-                "paths.logs=."
-            )
-        folder = runs[-1].folder
-    checkpoint = folder / "checkpoints" / "last.ckpt"
-    for path in (folder / RESULTS, folder / "config.yaml", checkpoint):
-        if not path.is_file():
-            raise InputError(
-                f"run={options.run} has no {path.relative_to(folder)}: name the folder of a "
-                "finished run, or last."
-            )
+
+    def find(logs: Path) -> list[Path]:
+        return [run.folder for run in find_runs(logs)]
+
+    files = (RESULTS, "config.yaml", CHECKPOINT)
+    folder = folder_of(options.run, Path(options.paths.logs), find, files)
+    checkpoint = folder / CHECKPOINT
     for override in overrides:
         key = override.partition("=")[0].lstrip("+~")
         if key not in OWN_OPTIONS and not key.startswith("paths."):

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, reduce
@@ -16,6 +16,7 @@ import torch
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
 from asysplat.data.build import tested_sets
+from asysplat.errors import InputError
 from asysplat.training.checkpoints import weights_file
 from asysplat.training.old_names import FORMAT, upgrade_results
 from asysplat.training.revision import revision
@@ -166,9 +167,8 @@ def describe_run(config: DictConfig) -> dict[str, str | int]:
 
 def find_runs(logs: Path) -> Iterator[Run]:
     """Yield every finished run below `logs`, oldest first; warn of results that are damaged."""
-    paths = sorted(logs.rglob(RESULTS), key=lambda path: (path.stat().st_mtime, path))
-    for path in paths:
-        if path.with_name("scene.ply").exists():  # a reconstruction
+    for path in _results_below(logs):
+        if _is_reconstruction(path.parent):
             continue
         try:
             results = json.loads(path.read_text())
@@ -183,6 +183,50 @@ def find_runs(logs: Path) -> Iterator[Run]:
             )
             continue
         yield Run(path.parent, hash_now, seed, commit, upgrade_results(results))
+
+
+def find_reconstructions(logs: Path) -> list[Path]:
+    """Return the folders of the finished reconstructions below `logs`, oldest first."""
+    folders = (path.parent for path in _results_below(logs))
+    return [folder for folder in folders if _is_reconstruction(folder)]
+
+
+def _results_below(logs: Path) -> list[Path]:
+    return sorted(logs.rglob(RESULTS), key=lambda path: (path.stat().st_mtime, path))
+
+
+def _is_reconstruction(folder: Path) -> bool:
+    return (folder / "scene.ply").exists()
+
+
+def folder_of(
+    run: object, logs: Path, find: Callable[[Path], list[Path]], files: Sequence[str]
+) -> Path:
+    """Return the folder of a finished run.
+
+    Args:
+        run: the option run=: the folder, or "last".
+        logs: where "last" is searched.
+        find: returns the folders of the finished runs below a folder, oldest first.
+        files: what the folder must have.
+
+    Raises:
+        InputError: no finished run, or a file is missing.
+    """
+    folder = Path(str(run))
+    if run == "last":
+        folders = find(logs)
+        if not folders:
+            raise InputError(
+                f"run=last found no finished run in {logs}: name its folder, or set paths.logs=."
+            )
+        folder = folders[-1]
+    for file in files:
+        if not (folder / file).is_file():
+            raise InputError(
+                f"run={run} has no {file}: name the folder of a finished run, or last."
+            )
+    return folder
 
 
 def _config_hash_now(folder: Path, results: Mapping[str, Any]) -> str:
