@@ -100,8 +100,8 @@ def describe(config: DictConfig, photographs: Photographs, limit: dict[str, floa
     (name, value), gaussians = next(iter(limit.items())), config.refinement.max_gaussians
     return (
         f"{inputs.num_views} of {photographs.total} photographs are fitted (views=), {held_out} "
-        f"measure the result (held_out_every=), {inputs.cameras.height} pixels high (height="
-        f"){masked}, at most {gaussians or math.inf:,} Gaussians (refinement.max_gaussians=), "
+        f"measure the result (held_out_every=), {inputs.cameras.height} pixels high (height=)"
+        f"{masked}, at most {gaussians or math.inf:,} Gaussians (refinement.max_gaussians=), "
         f"{value:g} {name} ({name}=); all of these: quality=preview or best"
     )
 

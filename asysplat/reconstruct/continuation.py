@@ -6,10 +6,10 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError
+from asysplat.reconstruct.results import SCENE
 from asysplat.training.run_config import read_config
 from asysplat.training.runs import RESULTS, find_reconstructions, folder_of
 
-SCENE = "scene.safetensors"
 OF_PHOTOGRAPHS = ("path", "layout", "cameras", "frames", "on_bad_image", "height", "width")
 OF_PHOTOGRAPHS += ("views", "held_out_every", "max_held_out")
 OF_QUALITY = ("height", "views")  # those that quality= sets
@@ -22,8 +22,8 @@ def continue_run(config: DictConfig, given: Collection[str]) -> DictConfig:
     stranger.
 
     Args:
-        config: of reconstruct.py; it is left as it is.
-        given: options of the command line, which stay.
+        config: configuration of reconstruct.py; it is left as it is.
+        given: names of the options on the command line, which stay.
 
     Raises:
         InputError: no finished reconstruction.

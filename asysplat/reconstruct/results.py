@@ -32,6 +32,7 @@ from asysplat.rendering import Rendering, render
 from asysplat.scene import Cameras, Gaussians
 from asysplat.training.summary import write_json
 
+SCENE = "scene.safetensors"
 CAMERA_PATHS = ("own", "orbit")
 BYTES_PER_GAUSSIAN = 2 * 4 * 62  # of scene.ply and scene.safetensors, at most
 OTHER_BYTES = 20_000_000  # of figures and the video
@@ -91,7 +92,7 @@ class Results:
         save_ply(self.folder / "scene.ply", world, origin)
         color = " ".join(f"{value:.6f}" for value in self._background.tolist())
         metadata = {"background": color, "offset": " ".join(map(repr, origin))}
-        write_safetensors(self.folder / "scene.safetensors", world, metadata)
+        write_safetensors(self.folder / SCENE, world, metadata)
 
     def save(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
         """Write the scene files, then cameras, the configuration, a contact sheet and metrics.

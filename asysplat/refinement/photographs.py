@@ -70,7 +70,7 @@ def open_photographs(
         height, width: of the views, in pixels; width None keeps the first photograph's aspect
             ratio.
         views, max_held_out: number of input and of held-out views, at most.
-        cameras: whether given cameras are used, refined ones, or cameras that are found.
+        cameras: choice of given, refined or found cameras.
         held_out_every: hold out every n-th photograph, from the first on; None: none.
         say: takes warnings: a smaller height than asked for, or cameras that do not fit the images.
 

@@ -205,10 +205,10 @@ def folder_of(
     """Return the folder of a finished run.
 
     Args:
-        run: the option run=: the folder, or "last".
-        logs: where "last" is searched.
-        find: returns the folders of the finished runs below a folder, oldest first.
-        files: what the folder must have.
+        run: value of the option run=: the folder, or "last".
+        logs: folder in which "last" is searched.
+        find: function that returns the folders of the finished runs below a folder, oldest first.
+        files: names of files that the folder must have.
 
     Raises:
         InputError: no finished run, or a file is missing.

@@ -22,12 +22,12 @@ class CameraOptions:
     """Which cameras of photographs are used.
 
     Args:
-        choice: "given" with the photographs; "refined" from those; "found" by structure from
-            motion, as always where none are given; or "auto": refined where that lowers the
-            reprojection error by a hundredth, else given.
-        where: the folder of found and refined cameras.
+        choice: which cameras: "given" with the photographs; "refined" from those; "found" by
+            structure from motion, as always where none are given; or "auto": refined where that
+            lowers the reprojection error by a hundredth, else given.
+        where: folder of found and refined cameras.
         frames: greatest number of frames of a video.
-        console: where progress is shown; None shows none.
+        console: console that shows the progress; None shows none.
 
     Raises:
         InputError: another choice.
@@ -57,8 +57,11 @@ def refine_given(
     scene: PosedScene, options: CameraOptions, say: Callable[[str], None]
 ) -> PosedScene:
     """Return a scene with refined cameras, if they are wanted, or better and "auto"."""
+    if options.choice not in ("auto", "refined"):
+        return scene
     files = {image.file for image in scene.images if isinstance(image.file, Path)}
-    if options.choice not in ("auto", "refined") or len(files) < len(scene.images):
+    if len(files) < len(scene.images):
+        say("cameras: as given; only those of images in files of their own can be refined.")
         return scene
     result = refine_cameras(scene, options.where, options.console)
     if not result.features:

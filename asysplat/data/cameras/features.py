@@ -1,26 +1,19 @@
 """Find features of photographs and match them between pairs, in a database of COLMAP."""
 
-import hashlib
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import pycolmap
-from PIL import Image
 from rich.progress import Progress
-
-from asysplat.data.images import image_size, load_mask
-from asysplat.data.readers.common import beside
 
 ALL_PAIRS = 80  # photographs; of more, not all pairs are matched but
 FOLLOWING = 10  # each with so many that follow, and with those 16, 32, ... further on,
 ANCHORS = 40  # and so many, spread evenly, with each other: a sequence may return to a place
 CHUNK = 8  # photographs, or that squared of pairs, between two updates of the progress bar
 SEED = 0
-ONLY_FATAL = 3  # the least severe messages that are printed
 
 
 @dataclass(frozen=True)
@@ -56,11 +49,13 @@ def match_photographs(
     """Write a database of features and verified matches; return its path.
 
     Args:
-        work: a folder whose images/ has the photographs and whose masks/ may have NAME.png, 0 where
+        work: folder whose images/ has the photographs and whose masks/ may have NAME.png, 0 where
             features are not wanted.
-        lenses: by the name of each photograph, in the order of the sequence; photographs of the
-            same lens have one camera.
-        cameras: of each lens, if known; else a focal length is guessed.
+        lenses: lens by the name of each photograph, in the order of the sequence; photographs of
+            the same lens have one camera.
+        effort: effort for features and matches.
+        progress: bars, to which two are added.
+        cameras: camera of each lens, where lenses are known; else a focal length is guessed.
     """
     database = work / f"{effort.features}.db"
     extraction = pycolmap.FeatureExtractionOptions(max_image_size=effort.max_side)
@@ -115,48 +110,6 @@ def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
     near = {(i, i + gap) for i in range(len(names)) for gap in gaps if i + gap < len(names)}
     anchors = sorted({round(k * (len(names) - 1) / (ANCHORS - 1)) for k in range(ANCHORS)})
     return [(names[i], names[j]) for i, j in sorted(near | set(combinations(anchors, 2)))]
-
-
-@contextmanager
-def quiet_colmap() -> Iterator[None]:
-    """Keep COLMAP from printing what it does."""
-    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, ONLY_FATAL
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before
-
-
-def digest(method: str, files: Iterable[Path]) -> str:
-    """Return a name that follows from files, from where they are, and from the method."""
-    result = hashlib.sha256(f"{method} {pycolmap.__version__}".encode())
-    for path in files:
-        result.update(f"{path}\0".encode())
-        with path.open("rb") as file:
-            result.update(hashlib.file_digest(file, "sha256").digest())
-    return result.hexdigest()[:12]
-
-
-def save_mask(mask: Path | None, image: Path) -> None:
-    """Write the mask of images/NAME, if there is one, to masks/NAME.png beside."""
-    if mask is None:
-        return
-    size = image_size(image)
-    kept = Image.fromarray(load_mask(beside(mask, size, str(image))))
-    target = image.parents[1] / "masks" / f"{image.name}.png"
-    target.parent.mkdir(exist_ok=True)
-    kept.resize(size, Image.Resampling.NEAREST).convert("L").save(target)
-
-
-def without_spaces(files: Iterable[Path]) -> dict[Path, str]:
-    """Return a name of each file for COLMAP, which separates names by spaces."""
-    names: dict[Path, str] = {}
-    for file in files:
-        name = "_".join(file.name.split())
-        while name in names.values():
-            name = f"_{name}"
-        names[file] = name
-    return names
 
 
 def _chunks(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:

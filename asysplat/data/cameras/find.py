@@ -8,7 +8,6 @@ links to the photographs, and the next call with the same photographs returns it
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pycolmap
 from PIL import Image, ImageOps
@@ -17,24 +16,14 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asysplat.data.bad_images import BadImages, Policy
-from asysplat.data.cameras.features import (
-    HARD,
-    SEED,
-    USUAL,
-    Effort,
-    digest,
-    match_photographs,
-    quiet_colmap,
-    save_mask,
-    without_spaces,
-)
-from asysplat.data.frames import save_sharp_frames
+from asysplat.data.cameras.features import HARD, SEED, USUAL, Effort, match_photographs
+from asysplat.data.cameras.folder import digest, keep, save_mask, without_spaces, work_folder
+from asysplat.data.frames import SUFFIXES, save_sharp_frames
 from asysplat.data.images import image_size
 from asysplat.data.readers import open_scene, photographs_in, without_cameras
 from asysplat.data.readers.masks import mask_of
 from asysplat.data.sequence import SceneOptions
 from asysplat.errors import InputError
-from asysplat.files import make_folder
 
 MIN_FOUND = 0.25  # share of the photographs; with fewer there is no scene
 ENOUGH = 0.9  # share of the photographs; with fewer the next attempt is made
@@ -46,7 +35,7 @@ class Attempt:
     """How hard cameras are sought.
 
     Args:
-        effort: for features and matches.
+        effort: effort for features and matches.
         first_pair, image: least number of inliers of the pair to start with, and of an image that
             is added.
         angle: least angle between the rays of the pair to start with, in degrees.
@@ -77,60 +66,48 @@ def find_cameras(
     returned.
 
     Args:
-        photographs: a folder of photographs of one place, or of an images/ with them; a scene
-            whose given cameras are ignored; or a video.
-        where: the folder is made in it, named by the content of the photographs.
+        photographs: folder of photographs of one place, or of an images/ with them; a scene whose
+            given cameras are ignored; or a video.
+        where: parent of the folder, whose name follows from the photographs.
         frames: greatest number of frames of a video, each the sharpest of an equal part.
         on_bad_image: "fail", or "skip" to leave out photographs that cannot be read.
-        console: where progress is shown; None shows none.
+        console: console that shows the progress; None shows none.
 
     Raises:
-        InputError: no photographs, fewer than 3 `frames`, a photograph that cannot be
-            read, `where` cannot be written to, or too few that show the same place.
+        InputError: no photographs, fewer than 3 `frames`, a photograph that cannot be read, `where`
+            cannot be written to, or too few that show the same place.
     """
     source, where = Path(photographs).absolute(), Path(where).absolute()
     if not isinstance(frames, int) or frames < LEAST_PHOTOGRAPHS:
         raise InputError(f"frames={frames}: give a whole number of at least {LEAST_PHOTOGRAPHS}.")
-    video = source.is_file() and without_cameras(source) is not None
+    video = source.is_file() and source.suffix.lower() in SUFFIXES
     files = [source] if video else _photographs(source, on_bad_image)
     lenses = {} if video else _lenses(files, source, on_bad_image)
-    masks = [mask for file in lenses if (mask := mask_of(file)) not in (None, file)]
-    method = f"{ATTEMPTS} {frames}"
-    folder = where / f"{source.stem}-{digest(method, [*files, *masks])}"
+    masks = {file: mask for file in lenses if (mask := mask_of(file)) is not None}
+    beside = [mask for file, mask in masks.items() if mask != file]
+    folder = where / f"{source.stem}-{digest(f'{ATTEMPTS} {frames}', [*files, *beside])}"
     if folder.is_dir():
         return folder
-    make_folder(where, "paths.logs")
-    with (
-        quiet_colmap(),
-        TemporaryDirectory(dir=where) as work,
-        Progress(console=console, transient=True, disable=console is None) as progress,
-    ):
-        images = Path(work) / "images"
-        images.mkdir()
+    with work_folder(where, console) as (work, progress):
+        images = work / "images"
         if video:
             save_sharp_frames(source, images, frames, progress)
             lenses = _lenses(photographs_in(images), source, on_bad_image)
         names = without_spaces(lenses)
-        kinds = {names[file]: lens for file, lens in lenses.items()}
         for file, name in names.items():
-            if file.parent != images:
+            if not video:
                 _link_upright(file, images / name)
-            mask = mask_of(file)
+            mask = masks.get(file)
             save_mask(images / name if mask == file else mask, images / name)
-        model = _best_model(Path(work), kinds, progress)
+        kinds = {names[file]: lens for file, lens in lenses.items()}
+        model = _best_model(work, kinds, progress)
         if _registered(model) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * len(kinds)):
             raise InputError(
                 f"{photographs}: found cameras for {_registered(model)} of {len(kinds)} "
                 "photographs: too few show the same place; photograph it with more overlap, from "
                 "different places."
             )
-        result = Path(work) / "result"
-        (result / "sparse" / "0").mkdir(parents=True)
-        model.write(result / "sparse" / "0")
-        for kind in ("images", "masks"):
-            if (Path(work) / kind).is_dir():
-                (Path(work) / kind).rename(result / kind)
-        result.rename(folder)
+        keep(work, model, folder)
     return folder
 
 

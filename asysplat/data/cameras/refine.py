@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
@@ -18,24 +17,22 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asysplat.data.bad_images import BadImages
-from asysplat.data.cameras.features import (
-    SEED,
-    USUAL,
+from asysplat.data.cameras.features import SEED, USUAL, match_photographs
+from asysplat.data.cameras.folder import (
+    ERRORS,
     digest,
-    match_photographs,
-    quiet_colmap,
+    keep,
     save_mask,
     without_spaces,
+    work_folder,
 )
 from asysplat.data.readers import colmap
 from asysplat.data.readers.common import inverted
 from asysplat.data.sequence import PosedImage, PosedScene
-from asysplat.files import make_folder
 
 ROUNDS = 2  # of triangulation and bundle adjustment
 LEAST_POINTS = 20  # that a photograph sees, for its pose to be refined
 LEAST_OF_LENS = 10  # photographs of a lens, for its focal length and distortion to be refined
-ERRORS = "errors.json"  # in the folder of refined cameras
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ class RefinedCameras:
     """Refined cameras, and how well the given ones and they fit the same points.
 
     Args:
-        scene: with the refined cameras.
+        scene: scene with the refined cameras.
         before, after: mean distances of the points' projections from their features, in pixels.
         features: number of these features; with none the cameras are as they were.
     """
@@ -65,9 +62,9 @@ def refine_cameras(
     photographs and cameras reads it there.
 
     Args:
-        scene: its images are files.
-        where: the folder is made in it, named by the content of photographs and cameras.
-        console: where progress is shown; None shows none.
+        scene: scene whose images are files, each once.
+        where: parent of the folder, whose name follows from photographs and cameras.
+        console: console that shows the progress; None shows none.
 
     Raises:
         InputError: `where` cannot be written to.
@@ -77,24 +74,15 @@ def refine_cameras(
     names = without_spaces(images)
     given = [(image.lens, image.cam_to_world.tolist()) for image in scene.images]
     masks = [image.mask for image in scene.images if image.mask not in (None, image.file)]
-    folder = (
-        where
-        / f"{scene.name}-refined-{digest(f'{USUAL} {LEAST_OF_LENS} {given}', [*images, *masks])}"
-    )
+    method = f"{USUAL} {LEAST_OF_LENS} {given}"
+    folder = where / f"{scene.name}-refined-{digest(method, [*images, *masks])}"
     if not folder.is_dir():
-        make_folder(where, "paths.logs")
-        with (
-            quiet_colmap(),
-            TemporaryDirectory(dir=where) as work,
-            Progress(console=console, transient=True, disable=console is None) as progress,
-        ):
-            work = Path(work)
-            (work / "images").mkdir()
+        with work_folder(where, console) as (work, progress):
             for file, name in names.items():
                 (work / "images" / name).symlink_to(file)
                 save_mask(images[file].mask, work / "images" / name)
-            _refine(work, {names[file]: image for file, image in images.items()}, progress)
-            work.joinpath("result").rename(folder)
+            named = {names[file]: image for file, image in images.items()}
+            keep(work, _refine(work, named, progress), folder)
     errors = json.loads((folder / ERRORS).read_text())
     if not errors["features"]:
         return RefinedCameras(scene, **errors)
@@ -108,8 +96,10 @@ def refine_cameras(
     return RefinedCameras(new, **errors)
 
 
-def _refine(work: Path, images: dict[str, PosedImage], progress: Progress) -> None:
-    """Refine the cameras of work/images/NAME, and write the folder work/result."""
+def _refine(
+    work: Path, images: Mapping[str, PosedImage], progress: Progress
+) -> pycolmap.Reconstruction:
+    """Return a model with refined cameras of work/images/NAME; write its errors to `work`."""
     lenses = {name: image.lens for name, image in images.items()}
     # Of a pinhole, the distortion is refined as well.
     models = {lens: "OPENCV" if "PINHOLE" in lens.model else lens.model for lens in lenses.values()}
@@ -134,13 +124,8 @@ def _refine(work: Path, images: dict[str, PosedImage], progress: Progress) -> No
             errors = {"before": before, "after": model.compute_mean_reprojection_error()}
             errors["features"] = model.compute_num_observations()
     _move_back(model, poses)
-    result = work / "result"
-    (result / "sparse" / "0").mkdir(parents=True)
-    model.write(result / "sparse" / "0")
-    (result / ERRORS).write_text(json.dumps(errors))
-    for kind in ("images", "masks"):
-        if (work / kind).is_dir():
-            (work / kind).rename(result / kind)
+    (work / ERRORS).write_text(json.dumps(errors))
+    return model
 
 
 def _posed_model(

@@ -22,8 +22,7 @@ def with_masks(scene: PosedScene, bad: BadImages) -> PosedScene:
             return image
         mask = mask_of(image.file)
         size = (image.lens.width, image.lens.height)
-        checked = mask and (mask if mask == image.file else beside(mask, size, str(image.file)))
-        return replace(image, mask=checked)
+        return replace(image, mask=mask and beside(mask, size, str(image.file)))
 
     return replace(scene, images=bad.read_each(read, ((image,) for image in scene.images)))
 

@@ -122,7 +122,7 @@ def test_points_lie_where_the_pinhole_says(scene, line, size):
     scale = np.array(size) / (camera.width, camera.height)
     rays = np.array([(0.0, 0, 1), (-0.5, -0.35, 1), (0.5, -0.35, 1), (-0.5, 0.4, 1), (0.5, 0.4, 1)])
     rows, columns = np.indices(size[::-1]) + 0.5
-    spread = 3 * scale.max()  # of a dot, in pixels
+    spread = 3 * scale.max()  # radius of a dot, in pixels
     for index, (x, y) in enumerate(camera.img_from_cam(rays) * scale):
         dot = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * spread**2))
         Image.fromarray(np.round(255 * dot).astype(np.uint8)).save(scene / f"images/{index}.png")

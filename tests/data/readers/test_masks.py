@@ -39,7 +39,7 @@ def test_masks_of_images_in_folders(few, tmp_path):
         file = folder / "transforms.json"
         file.write_text(file.read_text().replace(f"images/{name}", f"images/left/{name}"))
     save(half(), folder / "masks" / "left" / "00001.png")
-    save(half(), folder / "masks" / "00002.png")  # of another image
+    save(half(), folder / "masks" / "00002.png")  # another image's
     sequence = opened(folder)
     names = [image.file.stem for image in sequence.scene.images]
     masks = dict(zip(names, sequence.views(range(4)).masks, strict=True))

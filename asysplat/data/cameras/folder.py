@@ -1,0 +1,84 @@
+"""Folders of COLMAP: photographs, their masks, and a model of their cameras."""
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pycolmap
+from PIL import Image
+from rich.console import Console
+from rich.progress import Progress
+
+from asysplat.data.images import image_size, load_mask
+from asysplat.data.readers.common import beside
+from asysplat.data.readers.masks import FOLDER as MASKS
+from asysplat.files import make_folder
+
+ERRORS = "errors.json"  # of refined cameras
+KEPT = ("images", MASKS, ERRORS)
+ONLY_FATAL = 3  # the least severe messages that are printed
+
+
+@contextmanager
+def work_folder(where: Path, console: Console | None) -> Iterator[tuple[Path, Progress]]:
+    """Yield a temporary folder in `where` with an empty images/, and progress bars; quiet COLMAP.
+
+    Raises:
+        InputError: `where` cannot be written to.
+    """
+    make_folder(where, "paths.logs")
+    before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, ONLY_FATAL
+    try:
+        with (
+            TemporaryDirectory(dir=where) as work,
+            Progress(console=console, transient=True, disable=console is None) as progress,
+        ):
+            (Path(work) / "images").mkdir()
+            yield Path(work), progress
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def digest(method: str, files: Iterable[Path]) -> str:
+    """Return a name that follows from files, from where they are, and from the method."""
+    result = hashlib.sha256(f"{method} {pycolmap.__version__}".encode())
+    for path in files:
+        result.update(f"{path}\0".encode())
+        with path.open("rb") as file:
+            result.update(hashlib.file_digest(file, "sha256").digest())
+    return result.hexdigest()[:12]
+
+
+def without_spaces(files: Iterable[Path]) -> dict[Path, str]:
+    """Return a name of each file for COLMAP, which separates names by spaces."""
+    names: dict[Path, str] = {}
+    for file in files:
+        name = "_".join(file.name.split())
+        while name in names.values():
+            name = f"_{name}"
+        names[file] = name
+    return names
+
+
+def save_mask(mask: Path | None, image: Path) -> None:
+    """Write the mask of images/NAME, if there is one, to masks/NAME.png beside."""
+    if mask is None:
+        return
+    size = image_size(image)
+    kept = Image.fromarray(load_mask(beside(mask, size, str(image))))
+    target = image.parents[1] / MASKS / f"{image.name}.png"
+    target.parent.mkdir(exist_ok=True)
+    kept.resize(size, Image.Resampling.NEAREST).convert("L").save(target)
+
+
+def keep(work: Path, model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write a model and move it, with what a work folder has of KEPT, to a new folder."""
+    result = work / "result"
+    (result / "sparse" / "0").mkdir(parents=True)
+    model.write(result / "sparse" / "0")
+    for name in KEPT:
+        if (work / name).exists():
+            (work / name).rename(result / name)
+    result.rename(folder)
