@@ -77,6 +77,20 @@ def check_writable(path: Path, option: str) -> None:
                 folder.rmdir()
 
 
+def check_room(folder: Path, room: int) -> None:
+    """Check that the disk of a folder has `room` bytes of free space.
+
+    Raises:
+        InputError: it has less.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < room:
+        raise InputError(
+            f"{folder} has {free / 1e6:.0f} MB of free space, and the results may take "
+            f"{room / 1e6:.0f} MB: free some, or set paths.logs to a folder on another disk."
+        )
+
+
 def new_folder(path: Path, room: int) -> Path:
     """Create a folder that was not there: `path`, or else `path`-2, -3, ...
 
@@ -94,12 +108,10 @@ def new_folder(path: Path, room: int) -> Path:
         except OSError:
             make_folder(folder, "paths.logs")  # raises unless there is one
             continue
-        free = shutil.disk_usage(folder).free
-        if free < room:
+        try:
+            check_room(folder, room)
+        except InputError:
             folder.rmdir()
-            raise InputError(
-                f"{folder} has {free / 1e6:.0f} MB of free space, and the results may take "
-                f"{room / 1e6:.0f} MB: free some, or set paths.logs to a folder on another disk."
-            )
+            raise
         return folder
     raise AssertionError

@@ -55,8 +55,10 @@ class BadImages:
             InputError: there are errors and the policy is "fail", or too few images are left.
         """
         bad, total = len(self.errors), left + len(self.errors)
-        listed = "".join(f"\n  {error}" for error in self.errors[:MAX_LISTED])
-        listed += f"\n  and {bad - MAX_LISTED} more" if bad > MAX_LISTED else ""
+        different = list(dict.fromkeys(self.errors))
+        listed = "".join(f"\n  {error}" for error in different[:MAX_LISTED])
+        more = len(different) - MAX_LISTED
+        listed += f"\n  and {more} more" if more > 0 else ""
         if bad and self.policy == "fail":
             raise InputError(
                 f"{scene}: {bad} of {total} images cannot be used; fix them, or leave them out "

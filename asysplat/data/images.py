@@ -8,7 +8,7 @@ functions that read raise an InputError for a file that is missing, empty, damag
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from PIL import Image
 
 from asysplat.errors import InputError
 
+HEIF = (".heic", ".heif")  # suffixes of what phones save
 END_MARKERS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
 TAIL_BYTES = 4096  # some cameras append data after the end marker
 WHOLE = 0.9999  # share of a pixel, as rounded, from which all of it is covered
@@ -265,6 +266,11 @@ def _read(file: ImageFile, extract: Callable[[Image.Image], Any]) -> Any:
     """Return `extract` of the opened image; every failure becomes an InputError."""
     if isinstance(file, Path):
         _check_exists(file)
+        if file.suffix.lower() in HEIF and not _register_heif():
+            raise InputError(
+                f"{file} is HEIF, which needs pillow-heif: pip install 'asysplat[heif]', or save "
+                "it as JPEG."
+            )
     stored = file if isinstance(file, Path) else BytesIO(file.data.tobytes())
     try:
         with Image.open(stored) as image:
@@ -274,6 +280,17 @@ def _read(file: ImageFile, extract: Callable[[Image.Image], Any]) -> Any:
         raise InputError(
             f"{file} cannot be read as an image ({error}): copy it again, or leave it out."
         ) from error
+
+
+@cache
+def _register_heif() -> bool:
+    """Have Pillow read HEIF; return whether it can."""
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        return False
+    register_heif_opener()
+    return True
 
 
 def _check_exists(path: Path) -> None:

@@ -10,17 +10,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
-from PIL import Image, ImageOps
+from PIL import Image
 from PIL.ExifTags import IFD, Base
 from rich.console import Console
 from rich.progress import Progress
 
 from asysplat.data.bad_images import BadImages, Policy
 from asysplat.data.cameras.features import HARD, SEED, USUAL, Effort, match_photographs
-from asysplat.data.cameras.folder import digest, keep, save_mask, without_spaces, work_folder
+from asysplat.data.cameras.folder import (
+    colmap_names,
+    digest,
+    keep,
+    link_photograph,
+    save_mask,
+    work_folder,
+)
 from asysplat.data.frames import SUFFIXES, save_sharp_frames
 from asysplat.data.images import image_size
-from asysplat.data.readers import open_scene, photographs_in, without_cameras
+from asysplat.data.readers import open_scene, photographs_in
 from asysplat.data.readers.masks import mask_of
 from asysplat.data.sequence import SceneOptions
 from asysplat.errors import InputError
@@ -75,7 +82,7 @@ def find_cameras(
 
     Raises:
         InputError: no photographs, fewer than 3 `frames`, a photograph that cannot be read, `where`
-            cannot be written to, or too few that show the same place.
+            cannot be written to or is too full, or too few that show the same place.
     """
     source, where = Path(photographs).absolute(), Path(where).absolute()
     if not isinstance(frames, int) or frames < LEAST_PHOTOGRAPHS:
@@ -88,15 +95,15 @@ def find_cameras(
     folder = where / f"{source.stem}-{digest(f'{ATTEMPTS} {frames}', [*files, *beside])}"
     if folder.is_dir():
         return folder
-    with work_folder(where, console) as (work, progress):
+    with work_folder(where, frames if video else len(files), console) as (work, progress):
         images = work / "images"
         if video:
             save_sharp_frames(source, images, frames, progress)
             lenses = _lenses(photographs_in(images), source, on_bad_image)
-        names = without_spaces(lenses)
+        names = colmap_names(lenses)
         for file, name in names.items():
             if not video:
-                _link_upright(file, images / name)
+                link_photograph(file, images / name, upright=True)
             mask = masks.get(file)
             save_mask(images / name if mask == file else mask, images / name)
         kinds = {names[file]: lens for file, lens in lenses.items()}
@@ -112,9 +119,9 @@ def find_cameras(
 
 
 def _photographs(source: Path, on_bad_image: Policy) -> list[Path]:
-    """List the photographs of a folder without cameras, or of a scene whose cameras are ignored."""
-    if without_cameras(source) is not None:
-        return photographs_in(source)
+    """List the photographs of a folder, or of a scene that has them elsewhere."""
+    if files := photographs_in(source):
+        return files
     images = open_scene(source, SceneOptions(1, 1, on_bad_image=on_bad_image)).scene.images
     files = list(dict.fromkeys(image.file for image in images))
     if not all(isinstance(file, Path) for file in files):
@@ -144,16 +151,6 @@ def _lens_of(file: Path) -> tuple:
     turned = exif.get(Base.Orientation, 1) >= 5
     focal = details.get(Base.FocalLength), details.get(Base.FocalLengthIn35mmFilm)
     return (size[::-1] if turned else size, exif.get(Base.Make), exif.get(Base.Model), *focal)
-
-
-def _link_upright(file: Path, link: Path) -> None:
-    """Link to a photograph; copy it where its pixels are stored turned."""
-    with Image.open(file) as image:
-        if image.getexif().get(Base.Orientation, 1) == 1:
-            link.symlink_to(file)
-            return
-        upright = ImageOps.exif_transpose(image)
-        upright.save(link, exif=upright.getexif(), quality=95)
 
 
 def _registered(model: pycolmap.Reconstruction | None) -> int:

@@ -7,28 +7,34 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pycolmap
-from PIL import Image
+from PIL import Image, ImageOps
+from PIL.ExifTags import Base
 from rich.console import Console
 from rich.progress import Progress
 
-from asysplat.data.images import image_size, load_mask
+from asysplat.data.images import HEIF, image_size, load_mask
 from asysplat.data.readers.common import beside
 from asysplat.data.readers.masks import FOLDER as MASKS
-from asysplat.files import make_folder
+from asysplat.files import check_room, make_folder
 
 ERRORS = "errors.json"  # of refined cameras
 KEPT = ("images", MASKS, ERRORS)
+JPEG_QUALITY = 95
+BYTES_PER_PHOTOGRAPH = 10_000_000  # features and matches take up to 4 MB, and a copy as much
 ONLY_FATAL = 3  # the least severe messages that are printed
 
 
 @contextmanager
-def work_folder(where: Path, console: Console | None) -> Iterator[tuple[Path, Progress]]:
+def work_folder(
+    where: Path, photographs: int, console: Console | None
+) -> Iterator[tuple[Path, Progress]]:
     """Yield a temporary folder in `where` with an empty images/, and progress bars; quiet COLMAP.
 
     Raises:
-        InputError: `where` cannot be written to.
+        InputError: `where` cannot be written to, or has too little space for so many photographs.
     """
     make_folder(where, "paths.logs")
+    check_room(where, photographs * BYTES_PER_PHOTOGRAPH)  # without it, COLMAP ends the process
     before, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, ONLY_FATAL
     try:
         with (
@@ -51,15 +57,27 @@ def digest(method: str, files: Iterable[Path]) -> str:
     return result.hexdigest()[:12]
 
 
-def without_spaces(files: Iterable[Path]) -> dict[Path, str]:
-    """Return a name of each file for COLMAP, which separates names by spaces."""
+def colmap_names(files: Iterable[Path]) -> dict[Path, str]:
+    """Return a name of each file for COLMAP, which separates names by spaces and reads no HEIF."""
     names: dict[Path, str] = {}
     for file in files:
-        name = "_".join(file.name.split())
+        name = "_".join(file.name.split()) + ".jpg" * (file.suffix.lower() in HEIF)
         while name in names.values():
             name = f"_{name}"
         names[file] = name
     return names
+
+
+def link_photograph(file: Path, link: Path, upright: bool = False) -> None:
+    """Link to a photograph; copy it where COLMAP cannot read it, or it is to be turned upright."""
+    with Image.open(file) as image:
+        turned = upright and image.getexif().get(Base.Orientation, 1) != 1
+        if file.suffix.lower() not in HEIF and not turned:
+            link.symlink_to(file)
+            return
+        if turned:
+            image = ImageOps.exif_transpose(image)
+        image.save(link, exif=image.getexif(), quality=JPEG_QUALITY)
 
 
 def save_mask(mask: Path | None, image: Path) -> None:

@@ -20,10 +20,11 @@ from asysplat.data.bad_images import BadImages
 from asysplat.data.cameras.features import SEED, USUAL, match_photographs
 from asysplat.data.cameras.folder import (
     ERRORS,
+    colmap_names,
     digest,
     keep,
+    link_photograph,
     save_mask,
-    without_spaces,
     work_folder,
 )
 from asysplat.data.readers import colmap
@@ -67,19 +68,19 @@ def refine_cameras(
         console: console that shows the progress; None shows none.
 
     Raises:
-        InputError: `where` cannot be written to.
+        InputError: `where` cannot be written to or is too full.
     """
     where = Path(where).absolute()
     images = {image.file: image for image in scene.images}
-    names = without_spaces(images)
+    names = colmap_names(images)
     given = [(image.lens, image.cam_to_world.tolist()) for image in scene.images]
     masks = [image.mask for image in scene.images if image.mask not in (None, image.file)]
     method = f"{USUAL} {LEAST_OF_LENS} {given}"
     folder = where / f"{scene.name}-refined-{digest(method, [*images, *masks])}"
     if not folder.is_dir():
-        with work_folder(where, console) as (work, progress):
+        with work_folder(where, len(images), console) as (work, progress):
             for file, name in names.items():
-                (work / "images" / name).symlink_to(file)
+                link_photograph(file, work / "images" / name)
                 save_mask(images[file].mask, work / "images" / name)
             named = {names[file]: image for file, image in images.items()}
             keep(work, _refine(work, named, progress), folder)

@@ -143,6 +143,7 @@ def _warn_of_unregistered(model: Path, registered: Sequence[Path]) -> None:
         names = ", ".join(path.name for path in left[:MAX_NAMES])
         warnings.warn(
             f"{model} has not registered {len(left)} of {len(left) + len(used)} images, which are "
-            f"left out: {names}{', ...' * (len(left) > MAX_NAMES)}",
+            f"left out: {names}{', ...' * (len(left) > MAX_NAMES)}; photograph what lies between "
+            "them and the others to use them, too",
             stacklevel=2,
         )

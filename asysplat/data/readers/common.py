@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from asysplat.data.images import Lens, image_size, same_proportions
+from asysplat.data.images import HEIF, Lens, image_size, same_proportions
 from asysplat.errors import InputError
 from asysplat.scene import ORTHONORMAL_TOLERANCE
 
 DEPTH = 3  # levels below the named folder that are searched; DL3DV has parts and hashes
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", *HEIF)
 MAX_NUMBER = 1e300
 MAX_FOCAL, MAX_CENTER = 1000.0, 100.0  # in longer sides of the image
 MAX_DISTORTION = 1e3  # coefficients
@@ -125,6 +125,7 @@ def scaled(lens: Lens, size: tuple[int, int], where: str) -> Lens:
         )
     # To a pixel of the smaller one, whose size was rounded.
     if min(given) < 1 or not same_proportions(*sorted((size, given))):
+        refuse_turned(size, given)
         raise InputError(
             f"{where} is {width} x {height} and its intrinsics are for {given[0]} x {given[1]}: "
             "give images with those proportions, or the images' own intrinsics."
@@ -132,6 +133,20 @@ def scaled(lens: Lens, size: tuple[int, int], where: str) -> Lens:
     x, y = width / given[0], height / given[1]
     focal = {"fx": lens.fx * x, "fy": lens.fy * y, "cx": lens.cx * x, "cy": lens.cy * y}
     return replace(lens, width=width, height=height, **focal)
+
+
+def refuse_turned(size: tuple[int, int], given: tuple[int, int]) -> None:
+    """Check that an image is not stored turned against intrinsics for the size `given`.
+
+    Raises:
+        InputError: it is; the same sentence for all images, which is shown once.
+    """
+    if given == size[::-1] and given != size:
+        raise InputError(
+            f"photographs are stored as {size[0]} x {size[1]}, with an orientation tag, and their "
+            f"intrinsics are for {given[0]} x {given[1]}: save them upright (magick mogrify "
+            "-auto-orient), or have their cameras found with cameras=found."
+        )
 
 
 def beside(path: Path, size: tuple[int, int], where: str) -> Path:

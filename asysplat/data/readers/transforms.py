@@ -145,6 +145,7 @@ def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: s
     """Return the lens of an image of (width, height) `size`."""
     given = {"w": size[0], "h": size[1], **fields}
     if (given["w"], given["h"]) != size and not resized:
+        common.refuse_turned(size, (given["w"], given["h"]))
         raise InputError(
             f"{where}: w x h is {given['w']} x {given['h']}, but the image is {size[0]} x "
             f"{size[1]}: give intrinsics for the images' own resolution."

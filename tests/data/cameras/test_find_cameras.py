@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pycolmap
@@ -9,9 +10,10 @@ import pytest
 import torch
 from PIL import Image, ImageFilter
 from PIL.ExifTags import Base
+from pillow_heif import register_heif_opener
 from rich.progress import Progress
 
-from asysplat.data import ProceduralScene, open_scene
+from asysplat.data import ProceduralScene, images, open_scene
 from asysplat.data.cameras import features, find, find_cameras
 from asysplat.data.cameras.__main__ import main
 from asysplat.data.frames import save_sharp_frames
@@ -22,7 +24,12 @@ from asysplat.errors import InputError
 from asysplat.export import write_video
 
 COUNT, HEIGHT, WIDTH = 14, 240, 320
-TURNED, BLURRED = 3, 5
+TURNED, BLURRED, HEIF = 3, 5, 7
+
+
+def name_of(index):
+    """The name that photographs have where cameras are found."""
+    return f"walk_{index}.{'heic.jpg' if index == HEIF else 'png'}"
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +44,11 @@ def save(image, file, **options):
 
 @pytest.fixture(scope="module")
 def photographs(views, tmp_path_factory):
-    """Names with spaces; one is stored turned, one is blurred, the last shows another place."""
+    """Names with spaces; one is turned, one blurred, one as phones save it; the last is foreign."""
     folder = tmp_path_factory.mktemp("photographs") / "my place"
+    register_heif_opener()
     for index, image in enumerate(views.images):
-        save(image, folder / f"walk {index}.png")
+        save(image, folder / f"walk {index}.{'heic' if index == HEIF else 'png'}", quality=95)
     turned, blurred = (folder / f"walk {index}.png" for index in (TURNED, BLURRED))
     exif = Image.Exif()
     exif[Base.Orientation] = 6  # stored a quarter turn to the left of upright
@@ -60,8 +68,8 @@ def found(photographs, tmp_path_factory):
 def test_they_are_those_of_the_scene(views, found):
     """To .5 % of the scene's size and .3 degrees, after a similarity."""
     poses = dict(read_poses(found / "sparse" / "0"))
-    assert sorted(poses) == sorted(f"walk_{index}.png" for index in range(COUNT))
-    found = torch.as_tensor(np.stack([poses[f"walk_{index}.png"] for index in range(COUNT)]))
+    assert sorted(poses) == sorted(map(name_of, range(COUNT)))
+    found = torch.as_tensor(np.stack([poses[name_of(index)] for index in range(COUNT)]))
     given = views.cameras.cam_to_world.double()
     # The similarity: positions alone, almost in a line, would leave a turn about it free.
     left, _, right = torch.linalg.svd((given[:, :3, :3] @ found[:, :3, :3].mT).sum(0))
@@ -80,8 +88,9 @@ def test_the_scene_opens_upright_without_what_shows_another_place(views, found):
     ):
         scene = open_scene(found, SceneOptions(HEIGHT, WIDTH))
     assert scene.num_images == COUNT and len(scene.scene.points) > 100
-    turned = scene.views([TURNED]).images[0]
-    assert (turned - views.images[TURNED]).abs().mean() < 0.02
+    for index in (TURNED, HEIF):
+        read = scene.views([index]).images[0]
+        assert (read - views.images[index]).abs().mean() < 0.02
 
 
 @pytest.mark.medium
@@ -91,7 +100,8 @@ def test_they_are_found_once(photographs, found, monkeypatch, capsys):
     assert main([str(photographs), "--out", str(found.parent)]) == 0
     assert capsys.readouterr().out.strip() == str(found)
     assert {path.name for path in found.parent.iterdir()} == {found.name}
-    assert all(path.suffix == ".png" for path in photographs.iterdir())
+    assert all(path.name.startswith("walk ") for path in photographs.iterdir())
+    assert len(list(photographs.iterdir())) == COUNT + 1
 
 
 @pytest.mark.medium
@@ -182,6 +192,23 @@ def refused(folder, tmp_path, **options) -> str:
         find_cameras(folder, tmp_path / "logs", **options)
     assert not list((tmp_path / "logs").glob("*"))
     return str(error.value)
+
+
+def test_a_disk_that_is_too_full(views, tmp_path, monkeypatch):
+    for index in range(3):
+        save(views.images[index], tmp_path / "scene" / f"{index}.png")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(9, 0, 29_000_000))
+    sentence = refused(tmp_path / "scene", tmp_path)
+    assert "logs has 29 MB of free space, and the results may take 30 MB" in sentence
+
+
+def test_heif_without_its_library(tmp_path, monkeypatch):
+    monkeypatch.setattr(images, "_register_heif", lambda: False)
+    for index in range(3):
+        (tmp_path / "scene").mkdir(exist_ok=True)
+        (tmp_path / "scene" / f"{index}.HEIC").write_bytes(b"?")
+    sentence = refused(tmp_path / "scene", tmp_path)
+    assert "0.HEIC is HEIF, which needs pillow-heif: pip install 'asysplat[heif]'" in sentence
 
 
 def test_too_few_photographs(views, tmp_path):

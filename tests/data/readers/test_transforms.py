@@ -201,6 +201,14 @@ def test_broken_transforms_are_refused(scene, change, message):
         open_scene(scene(change))
 
 
+def test_photographs_that_are_stored_turned_are_named_once(scene):
+    with pytest.raises(InputError) as error:
+        open_scene(scene(set_scene(w=HEIGHT, h=WIDTH)))
+    tag = "with an orientation tag, and their intrinsics are for 16 x 24"
+    assert f"stored as 24 x 16, {tag}" in str(error.value)
+    assert str(error.value).count(tag) == 1
+
+
 def test_missing_transforms_and_images_of_two_sizes_are_refused(scene):
     folder = scene()
     Image.new("RGB", (30, 16)).save(folder / "images/2.png")
