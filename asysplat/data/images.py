@@ -6,6 +6,7 @@ functions that read raise an InputError for a file that is missing, empty, damag
 """
 
 import hashlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -26,6 +27,7 @@ HEIF = (".heic", ".heif")  # suffixes of what phones save
 END_MARKERS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
 TAIL_BYTES = 4096  # some cameras append data after the end marker
 WHOLE = 0.9999  # share of a pixel, as rounded, from which all of it is covered
+PANORAMA = "EQUIRECTANGULAR"  # COLMAP's model of an image of all directions
 OUTSIDE = -1.0  # a position beyond the border of every image
 TWO_FOCALS = {  # COLMAP's models with one focal length; with two, more parameters follow, all 0
     "SIMPLE_PINHOLE": "PINHOLE",
@@ -57,10 +59,12 @@ class Lens:
     """The camera model of one image.
 
     Args:
-        width, height: the image's size in pixels.
-        fx, fy, cx, cy: pinhole intrinsics in pixels.
-        model: name of a model of COLMAP that has a focal length.
+        width, height: the image's size in pixels; of a face of a panorama, the face's.
+        fx, fy, cx, cy: pinhole intrinsics in pixels; of a panorama and its faces, fx and fy are the
+            panorama's pixels per radian.
+        model: name of a model of COLMAP that has a focal length, or PANORAMA.
         distortion: the model's other parameters, in COLMAP's order.
+        yaw: of a face, degrees to the right of the panorama's middle.
 
     https://github.com/colmap/colmap/blob/main/src/colmap/sensor/models.h
     """
@@ -73,6 +77,7 @@ class Lens:
     cy: float
     model: str = "PINHOLE"
     distortion: tuple[float, ...] = ()
+    yaw: float = 0.0
 
     @staticmethod
     def of(camera: pycolmap.Camera) -> "Lens":
@@ -89,13 +94,18 @@ class Lens:
         )
 
     def camera(self) -> pycolmap.Camera:
-        """Return COLMAP's camera, with id 0; of the model in TWO_FOCALS if fx and fy differ."""
+        """Return COLMAP's camera, with id 0; of the model in TWO_FOCALS if fx and fy differ.
+
+        Of a face, it is the whole panorama's.
+        """
+        create = pycolmap.Camera.create_from_model_name
+        if self.model == PANORAMA:
+            return create(0, PANORAMA, 0, round(2 * math.pi * self.fx), round(math.pi * self.fy))
         model, params = self.model, [self.fx, self.fy, self.cx, self.cy, *self.distortion]
         if model in TWO_FOCALS and self.fx == self.fy:
             del params[0]
         else:
             model = TWO_FOCALS.get(model, model)
-        create = pycolmap.Camera.create_from_model_name
         camera = create(0, model, self.fx, self.width, self.height)
         camera.params = [*params, *camera.params[len(params) :]]
         return camera
@@ -104,7 +114,13 @@ class Lens:
     def is_distorted(self) -> bool:
         # A fisheye is not a pinhole even with all coefficients 0.
         camera = self.camera()
-        return camera.is_perspective_fisheye() or not camera.is_undistorted()
+        pinhole = not (camera.is_perspective_fisheye() or camera.is_spherical())
+        return not (pinhole and camera.is_undistorted())
+
+    @property
+    def rotation(self) -> Float[ndarray, "3 3"]:
+        """Rotation from the pinhole's axes to the image's; of a face, to the panorama's."""
+        return cv2.Rodrigues(np.array((0.0, math.radians(self.yaw), 0.0)))[0]
 
 
 def image_size(path: ImageFile) -> tuple[int, int]:
@@ -152,8 +168,8 @@ def has_alpha(path: ImageFile) -> bool:
 
 def undistort(
     pixels: Shaped[ndarray, "h w *channels"], lens: Lens, nearest: bool = False
-) -> Shaped[ndarray, "h w *channels"]:
-    """Resample to a pinhole camera with the lens's own fx, fy, cx, cy.
+) -> Shaped[ndarray, "height width *channels"]:
+    """Resample to a pinhole camera with the lens's own fx, fy, cx, cy; a panorama, to its face.
 
     `pixels` may have another size than the image, as depth maps do, if the field of view is the
     same. Beyond the image's border the nearest pixel is repeated, or, with `nearest` (for depths
@@ -164,9 +180,11 @@ def undistort(
     if pixels.dtype == bool:
         return undistort(pixels.astype(np.uint8), lens, nearest=True) > 0
     x, y = _undistortion_maps(lens, pixels.shape[1], pixels.shape[0])
-    if nearest:
-        return cv2.remap(pixels, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-    return cv2.remap(pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    method = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+    border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE
+    if lens.model == PANORAMA:  # left of its first column is the last one
+        border = cv2.BORDER_WRAP
+    return cv2.remap(pixels, x, y, method, borderMode=border)
 
 
 def resize_and_crop(
@@ -207,15 +225,16 @@ def _centered_box(
 def _undistortion_maps(
     lens: Lens, width: int, height: int
 ) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
-    """Return x and y in the distorted image for each undistorted pixel."""
-    scale = np.array((width / lens.width, height / lens.height))
-    camera, maps = lens.camera(), np.empty((2, height, width), dtype=np.float32)
-    rays = np.ones((width, 3))
-    rays[:, 0] = ((np.arange(width) + 0.5) / scale[0] - lens.cx) / lens.fx
-    for row in range(height):
+    """Return x and y in the distorted image, of width x height, for each undistorted pixel."""
+    camera, rotation = lens.camera(), lens.rotation
+    scale = np.array((width / camera.width, height / camera.height))
+    columns, rows = (max(1, round(side)) for side in scale * (lens.width, lens.height))
+    maps, rays = np.empty((2, rows, columns), dtype=np.float32), np.ones((columns, 3))
+    rays[:, 0] = ((np.arange(columns) + 0.5) / scale[0] - lens.cx) / lens.fx
+    for row in range(rows):
         rays[:, 1] = ((row + 0.5) / scale[1] - lens.cy) / lens.fy
         # OpenCV puts the first pixel's center at 0.
-        maps[:, row] = (camera.img_from_cam(rays) * scale - 0.5).T
+        maps[:, row] = (camera.img_from_cam(rays @ rotation.T) * scale - 0.5).T
     x, y = np.nan_to_num(maps, nan=OUTSIDE)  # NaN where the lens does not see
     return x, y
 

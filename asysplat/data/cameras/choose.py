@@ -9,6 +9,7 @@ from rich.console import Console
 from asysplat.data.bad_images import Policy
 from asysplat.data.cameras.find import find_cameras
 from asysplat.data.cameras.refine import refine_cameras
+from asysplat.data.images import PANORAMA
 from asysplat.data.readers import without_cameras
 from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
@@ -59,9 +60,10 @@ def refine_given(
     """Return a scene with refined cameras, if they are wanted, or better and "auto"."""
     if options.choice not in ("auto", "refined"):
         return scene
-    files = {image.file for image in scene.images if isinstance(image.file, Path)}
+    images = [image for image in scene.images if image.lens.model != PANORAMA]
+    files = {image.file for image in images if isinstance(image.file, Path)}
     if len(files) < len(scene.images):
-        say("cameras: as given; only those of images in files of their own can be refined.")
+        say("cameras: as given; panoramas and images inside other files are not refined.")
         return scene
     result = refine_cameras(scene, options.where, options.console)
     if not result.features:

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -170,9 +170,11 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
     images, points = sequence.scene.images, sequence.points
     verdict = diagnose_cameras(sequence.cameras, matches, [str(image.file) for image in images])
     rows = [("images", str(len(images)))]
-    if identical := len(images) - len({content_hash(image.file) for image in images}):
+    stored = {(content_hash(image.file), image.lens.yaw) for image in images}
+    if identical := len(images) - len(stored):
         rows.append(("", f"{identical} with the same file as another"))
-    for lens, count in Counter(image.lens for image in images).most_common(MAX_LENSES):
+    lenses = Counter(replace(image.lens, yaw=0.0) for image in images)
+    for lens, count in lenses.most_common(MAX_LENSES):
         model = f" {lens.model}" if lens.is_distorted else ""
         numbers = f"fx {lens.fx:.5g}, fy {lens.fy:.5g}, cx {lens.cx:.5g}, cy {lens.cy:.5g}"
         rows.append(("lens", f"{count} of {lens.width} x {lens.height}{model}: {numbers}"))

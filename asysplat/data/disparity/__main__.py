@@ -20,7 +20,7 @@ from torch.nn.functional import interpolate
 from asysplat.data.bad_images import BadImages
 from asysplat.data.disparity.maps import BESIDE, map_folder, map_name, write_map
 from asysplat.data.disparity.network import MODEL, load_depth_anything
-from asysplat.data.images import load_image
+from asysplat.data.images import PANORAMA, load_image
 from asysplat.data.readers import LAYOUTS, find_scenes, read_scene
 from asysplat.data.write import refuse_inside
 from asysplat.errors import InputError
@@ -77,7 +77,8 @@ def write_maps(
         raise InputError(
             f"{folder} cannot be created ({error.strerror}): name another folder with --folder."
         ) from error
-    images = [image.file for image in posed.images]
+    # Networks of perspective images are not made for panoramas.
+    images = [image.file for image in posed.images if image.lens.model != PANORAMA]
     missing = [image for image in images if not (folder / map_name(image, scene)).exists()]
     written, kept = 0, len(images) - len(missing)
     for image in track(missing, posed.name, console=Console(stderr=True), transient=True):

@@ -35,6 +35,7 @@ from asysplat.data.readers import (
 )
 from asysplat.data.readers.common import SUFFIXES, images_in, natural_order
 from asysplat.data.readers.masks import with_masks
+from asysplat.data.readers.panoramas import with_faces
 from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.errors import InputError
 
@@ -114,13 +115,15 @@ def photographs_in(root: Path) -> list[Path]:
 
 
 def read_scene(layout: str, scene: Path, bad: BadImages) -> PosedScene:
-    """Read one of the `find_scenes` with the masks of its images; collect errors of single images.
+    """Read one of the `find_scenes` with its images' masks, and panoramas as their faces.
+
+    Errors of single images are collected.
 
     Raises:
         InputError: a scene that is not usable.
     """
     with _file_errors(scene):
-        return with_masks(LAYOUTS[layout].read_scene(scene, bad), bad)
+        return with_faces(with_masks(LAYOUTS[layout].read_scene(scene, bad), bad), bad)
 
 
 def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:

@@ -18,7 +18,8 @@ from numpy import ndarray
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers import common
-from asysplat.data.readers.colmap_model import CAMERA_MODELS, read_model
+from asysplat.data.readers.colmap_model import read_model
+from asysplat.data.readers.panoramas import panorama
 from asysplat.data.sequence import Points, PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -114,10 +115,7 @@ def _points(colmap: pycolmap.Reconstruction | Path) -> Points | None:
 
 def _lens(camera: pycolmap.Camera, where: str) -> Lens:
     if camera.is_spherical():
-        raise InputError(
-            f"{where} has model {camera.model_name}: make perspective images of the panoramas, or "
-            f"use one of {', '.join(CAMERA_MODELS)}."
-        )
+        return panorama(*(round(side) for side in camera.params), where)
     return Lens.of(camera)
 
 

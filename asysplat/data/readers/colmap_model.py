@@ -14,8 +14,7 @@ import pycolmap
 
 from asysplat.errors import InputError
 
-NO_MODELS = ("INVALID", "EQUIRECTANGULAR")
-CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name not in NO_MODELS]
+CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
 POINT_FIELDS = 8  # of a line of points3D.txt before its track
 
 

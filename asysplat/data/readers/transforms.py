@@ -16,10 +16,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from asysplat.data.bad_images import BadImages
-from asysplat.data.images import Lens, image_size
+from asysplat.data.images import PANORAMA, Lens, image_size
 from asysplat.data.readers import common
 from asysplat.data.readers.colmap import points_beside
 from asysplat.data.readers.common import number
+from asysplat.data.readers.panoramas import panorama
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 from asysplat.scene import Cameras
@@ -151,12 +152,15 @@ def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: s
             f"{size[1]}: give intrinsics for the images' own resolution."
         )
     model = "OPENCV_FISHEYE" if fields.get("is_fisheye") else fields.get("camera_model", "OPENCV")
-    known = (*PERSPECTIVE_MODELS, *DISTORTIONS)
+    known = (*PERSPECTIVE_MODELS, *DISTORTIONS, PANORAMA)
     if model not in known:
         raise InputError(
             f"{where}: camera_model is {model!r}: undistort the images to PINHOLE, or use one of "
             f"{', '.join(known)}."
         )
+    width, height = (round(number(given, key, where)) for key in ("w", "h"))
+    if model == PANORAMA:
+        return common.scaled(panorama(width, height, where), size, where)
     if model in (*PERSPECTIVE_MODELS, "OPENCV"):
         # The formats disagree about what k4 means for them.
         if number(fields, "k4", where, default=0.0) != 0:
@@ -166,7 +170,6 @@ def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: s
             )
         model = "FULL_OPENCV" if number(fields, "k3", where, default=0.0) else "OPENCV"
     names = DISTORTIONS[model].split()
-    width, height = (round(number(given, key, where)) for key in ("w", "h"))
     lens = Lens(
         width,
         height,

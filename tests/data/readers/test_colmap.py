@@ -10,7 +10,7 @@ from layouts import opener, save_image, table
 from PIL import Image
 
 from asysplat.data.bad_images import BadImages
-from asysplat.data.images import Lens
+from asysplat.data.images import PANORAMA, Lens
 from asysplat.data.readers import colmap
 from asysplat.data.readers.colmap_model import CAMERA_MODELS
 from asysplat.data.sequence import FileSequence, SceneOptions
@@ -110,7 +110,8 @@ LENSES = [
 
 
 def test_every_model_that_is_named_as_known_is_tested():
-    assert sorted(CAMERA_MODELS) == sorted(line.split()[0] for line in LENSES)
+    tested = [*(line.split()[0] for line in LENSES), PANORAMA]  # see test_panoramas.py
+    assert sorted(CAMERA_MODELS) == sorted(tested)
 
 
 @pytest.mark.parametrize("size", [(320, 240), (163, 122)], ids=["whole", "half"])
@@ -199,10 +200,6 @@ def nan_pose(scene):
 
 @table(
     {
-        "EQUIRECTANGULAR": (
-            lambda scene: with_camera(scene, "EQUIRECTANGULAR 32 24 32 24"),
-            "model EQUIRECTANGULAR: make perspective images .* use one of SIMPLE_PINHOLE, ",
-        ),
         "a camera model of no name": (
             lambda scene: with_camera(scene, "FOO 32 24 30 31 15 11"),
             "a camera model that is not known: .* or use one of SIMPLE_PINHOLE, ",

@@ -188,7 +188,10 @@ BROKEN = {
         r"camera_angle_x.*out of range",
     ),
     "text for a number": (set_scene(cx="12"), r"cx is '12'"),
-    "camera model": (set_scene(camera_model="EQUIRECTANGULAR"), r"camera_model is 'EQUIRECT"),
+    "camera model": (
+        set_scene(camera_model="ORTHOPHOTO"),
+        r"camera_model is 'ORTHOPHOTO': undistort",
+    ),
     "k4": (set_scene(k4=0.1), r"k4 is only known for OPENCV_FISHEYE"),
     "other resolution": (set_scene(w=48, h=32), r"48 x 32, but the image is 24 x 16"),
     "mask no path": (set_frame(mask_path=5), r"mask_path is 5"),
