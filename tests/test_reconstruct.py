@@ -26,11 +26,14 @@ from scipy.spatial.transform import Rotation
 
 from asysplat import read_gaussians, render
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
+from asysplat.data.normalize import Normalization
 from asysplat.data.readers.transforms import read_cameras
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.overrides import CONF
-from asysplat.reconstruct.results import save_ply, subject
+from asysplat.reconstruct.results import save_ply
+from asysplat.reconstruct.video import subject, video_cameras
+from asysplat.refinement.photographs import Photographs
 
 SIZE = 48
 LAYOUTS = Path(__file__).parent / "data" / "readers"  # writers of them
@@ -323,6 +326,10 @@ REFUSED = {
     "steps=0.5": "steps=0.5: give a number above 0",
     "last_fit=2": "last_fit=2: give a number from 0 to 1",
     "video.path=spiral": "video.path=spiral: choose own, orbit or none",
+    "video.height=0": "video.height=0: give a whole number from 2 to 4320, or null for the",
+    "video.height=-5": "video.height=-5: give a whole number from 2 to 4320, or null for the",
+    "video.height=big": "video.height=big: give a whole number from 2 to 4320, or null for the",
+    "video.fps=0": "video.fps=0: give a number above 0",
     "cameras=best": "cameras=best: choose auto, given, refined, found",
     "height=0": "height=0, width=None",
     "refinement.until=2.5": "refinement.until=2.5: give 0 to 1",
@@ -499,3 +506,28 @@ def test_the_subject_of_an_orbit_is_where_the_views_see_a_surface(make_scene):
     opaque = torch.full_like(scene.opacities, 0.99)
     flat = replace(scene, means=means, scales=torch.full_like(means, 0.3), opacities=opaque)
     assert subject(flat, cameras)[2].item() == pytest.approx(2.5, abs=0.2)
+
+
+@pytest.fixture
+def video(views, make_scene):
+    """The cameras of a video with these options, of photographs of which two are held out."""
+    parts = [[view for view in range(16) if view % 8], [0, 8]]
+    files = [[f"scene/images/IMG_{view:02}.jpg" for view in part] for part in parts]
+    frame = Normalization(torch.eye(4, dtype=torch.float64), 1.0)
+    photographs = Photographs("scene", *map(views.select, parts), *files, frame, None)
+
+    def cameras(**options):
+        options = {"path": "own", "height": None, "seconds": 1, "fps": 12} | options
+        return video_cameras(OmegaConf.create(options), photographs, make_scene()[0])
+
+    return cameras
+
+
+def test_a_video_of_another_height_has_the_field_of_view_and_even_sides(video):
+    own = video()
+    for height, size in ((None, (48, 48)), (540, (540, 540)), (97, (96, 96)), (2, (2, 2))):
+        made = video(height=height)
+        assert (made.height, made.width) == size and made.num_views == 12
+        scale = torch.tensor([size[1] / 48, size[0] / 48, 1.0])[:, None]
+        torch.testing.assert_close(made.intrinsics, scale * own.intrinsics)
+        assert torch.equal(made.cam_to_world, own.cam_to_world)

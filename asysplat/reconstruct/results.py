@@ -23,17 +23,17 @@ from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.rows import average, write_csv
-from asysplat.export import orbit, smoothed_path, write_ply, write_safetensors, write_video
+from asysplat.export import write_ply, write_safetensors, write_video
 from asysplat.export.viewer import CAMERAS
 from asysplat.files import atomic_write, check_writable, new_folder
+from asysplat.reconstruct.video import check_video, video_cameras
 from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.refine import RefinementProgress
 from asysplat.rendering import Rendering, render
-from asysplat.scene import Cameras, Gaussians
+from asysplat.scene import Gaussians
 from asysplat.training.summary import write_json
 
 SCENE = "scene.safetensors"
-CAMERA_PATHS = ("own", "orbit")
 BYTES_PER_GAUSSIAN = 2 * 4 * 62  # of scene.ply and scene.safetensors, at most
 OTHER_BYTES = 20_000_000  # of figures and the video
 SHEET_ROWS = 4  # views in a contact sheet
@@ -54,11 +54,10 @@ class Results:
         self._lpips = load_lpips(
             self._protocol.lpips_net, Path(config.paths.weights), config.paths.download
         )
-        path = config.video.path
-        if path not in (*CAMERA_PATHS, "none"):
-            raise InputError(f"video.path={path}: choose {', '.join(CAMERA_PATHS)} or none.")
-        self._has_video = path != "none" and find_spec("av") is not None
-        if path != "none" and not self._has_video:
+        check_video(config.video)
+        wanted = config.video.path != "none"
+        self._has_video = wanted and find_spec("av") is not None
+        if wanted and not self._has_video:
             print("no video: it needs PyAV, pip install 'asysplat[video]'.")
         if self._lpips is None:
             print("no LPIPS: its weights are missing; paths.download=true downloads them.")
@@ -110,18 +109,12 @@ class Results:
         """Write the video, and print where the results are."""
         photographs, background = self._photographs, self._background
         if self._has_video:
-            video = self._config.video
-            frames = max(1, round(video.seconds * video.fps))
-            cameras = photographs.inputs.cameras
-            if video.path == "orbit":
-                path = orbit(cameras, frames, subject(gaussians, cameras))
-            else:
-                path = smoothed_path(cameras, frames)
+            path = video_cameras(self._config.video, photographs, gaussians)
             images = (
                 render(gaussians, path.select([frame]), background, depth=False).image[0]
                 for frame in range(path.num_views)
             )
-            write_video(self.folder / "path.mp4", images, video.fps)
+            write_video(self.folder / "path.mp4", images, self._config.video.fps)
         if any(photographs.origin):
             offset = " ".join(map(repr, photographs.origin))
             print(f"add the offset in its header, {offset}, for the coordinates of the photographs")
@@ -180,19 +173,6 @@ class Results:
         figure = comparison_figure(inputs, views, Rendering(**tensors, stats={}))
         with atomic_write(self.folder / name) as path:
             figure.savefig(path, dpi=110)
-
-
-@torch.no_grad()
-def subject(gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "3"]:
-    """Compute the median of the surface points at the centers of the views of one scene [V]."""
-    rows, columns = cameras.height // 3, cameras.width // 3
-    points = []
-    for view in range(cameras.num_views):
-        camera = cameras.select([view])
-        depths = render(gaussians, camera).depth.flatten(0, -3)[0]
-        depth = depths[rows : 2 * rows + 1, columns : 2 * columns + 1].median()
-        points.append(camera.centers[0] + depth * camera.cam_to_world[0, :3, 2])
-    return torch.stack(points).median(0).values
 
 
 def save_ply(path: Path, gaussians: Gaussians, offset: Sequence[float]) -> None:
