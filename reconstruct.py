@@ -35,6 +35,7 @@ from asysplat.interrupts import handle_signals
 from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
+from asysplat.reconstruct.video import views_of
 from asysplat.refinement import RefinementSettings, mean_color, refine
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.refinement.photographs import Photographs, open_photographs
@@ -75,6 +76,7 @@ def reconstruct(config: DictConfig) -> None:
     where = Path(config.paths.logs) / "cameras"
     options["cameras"] = CameraOptions(config.cameras, where, config.frames, Console())
     photographs = open_photographs(config.path, **options)
+    views_of(config.video, photographs)  # an error of names comes before the work
     print(describe(config, photographs, limit))
     gaussians = initialize(config, photographs, settings)
     background = mean_color(photographs.inputs)

@@ -32,7 +32,7 @@ from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.overrides import CONF
 from asysplat.reconstruct.results import save_ply
-from asysplat.reconstruct.video import subject, video_cameras
+from asysplat.reconstruct.video import _view_of, subject, video_cameras
 from asysplat.refinement.photographs import Photographs
 
 SIZE = 48
@@ -325,7 +325,10 @@ REFUSED = {
     "seconds=5 steps=3": "seconds=5 and steps=3: give one of them",
     "steps=0.5": "steps=0.5: give a number above 0",
     "last_fit=2": "last_fit=2: give a number from 0 to 1",
-    "video.path=spiral": "video.path=spiral: choose own, orbit or none",
+    "video.path=spiral": "video.path=spiral: choose own, orbit, none, or photographs",
+    "video.path=[]": "video.path=[]: choose own, orbit, none, or photographs",
+    "video.path=[1,2]": "video.path=[1, 2]: choose own, orbit, none, or photographs",
+    "video.path=[00001.png,x.png]": "video.path: x.png is the name of none of the 14 photographs",
     "video.height=0": "video.height=0: give a whole number from 2 to 4320, or null for the",
     "video.height=-5": "video.height=-5: give a whole number from 2 to 4320, or null for the",
     "video.height=big": "video.height=big: give a whole number from 2 to 4320, or null for the",
@@ -531,3 +534,35 @@ def test_a_video_of_another_height_has_the_field_of_view_and_even_sides(video):
         scale = torch.tensor([size[1] / 48, size[0] / 48, 1.0])[:, None]
         torch.testing.assert_close(made.intrinsics, scale * own.intrinsics)
         assert torch.equal(made.cam_to_world, own.cam_to_world)
+
+
+def test_a_video_passes_the_photographs_in_the_order_of_their_names(video, views):
+    names = ("IMG_08.jpg", "scene/images/IMG_01.jpg", "IMG_14.jpg")
+    made = video(path=names, fps=200)
+    chosen = views.cameras.select([8, 1, 14]).centers
+    distances = torch.cdist(chosen, made.centers)
+    assert (distances.min(1).values < 0.06 * torch.cdist(chosen, chosen).max()).all()
+    order = distances.argmin(1)
+    assert (order.diff() > 0).all() and order[0] == 0 and order[-1] == 199
+
+
+@pytest.mark.parametrize(
+    ("files", "name", "message"),
+    [
+        (
+            [f"a/IMG_{view}.jpg" for view in range(5)],
+            "IMG_31.jpg",
+            r"IMG_31\.jpg is the name of none of the 5 photographs used \(views=\): name one of "
+            r"them, such as IMG_3\.jpg, IMG_1\.jpg, IMG_4\.jpg\.",
+        ),
+        (
+            ["a/left/1.jpg", "a/right/1.jpg", "a/left/2.jpg"],
+            "1.jpg",
+            r"1\.jpg is the name of 2 of .* such as a/left/1\.jpg, a/right/1\.jpg\.",
+        ),
+        (["a/IMG_1.jpg"], "1.jpg", "is the name of none of the 1 .* such as IMG_1"),
+    ],
+)
+def test_names_of_no_photograph_or_of_several_are_refused(files, name, message):
+    with pytest.raises(InputError, match=message):
+        _view_of(name, files)

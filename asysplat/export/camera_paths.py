@@ -26,15 +26,16 @@ MIN_SWING = np.radians(5)  # to either side
 MAX_STEEPNESS = 10.0  # distance over radius, so that no camera looks straight down
 
 
-def smoothed_path(cameras: Cameras, frames: int) -> Cameras:
+def smoothed_path(cameras: Cameras, frames: int, as_given: bool = False) -> Cameras:
     """Build a smooth path through the cameras at constant speed, from the first to the last.
 
-    A turn of one radian counts as much as a translation by the cameras' spread. Cameras that are
-    not in the order of a walk are sorted by nearest neighbors first.
+    A turn of one radian counts as much as a translation by the cameras' spread.
 
     Args:
         cameras: [V], without batch dimension.
         frames: number of video frames.
+        as_given: order of the cameras kept; else those that are not in the order of a walk are
+            sorted by nearest neighbors first.
 
     Returns:
         [frames] with the mean intrinsics, all equal if the cameras are.
@@ -43,7 +44,8 @@ def smoothed_path(cameras: Cameras, frames: int) -> Cameras:
         InputError: a batch dimension, no views, no frames, or see `Cameras.validate`.
     """
     poses = _checked_poses(cameras, frames)
-    poses = poses[_short_order(_pose_vectors(poses))]
+    if not as_given:
+        poses = poses[_short_order(_pose_vectors(poses))]
     steps = _lengths(np.diff(_pose_vectors(poses), axis=0))
     moves = steps > ROUNDING
     if not moves.any():

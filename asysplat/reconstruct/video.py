@@ -1,8 +1,12 @@
 """The camera path of a reconstruction's video."""
 
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
 import torch
 from jaxtyping import Float
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 from torch import Tensor
 
 from asysplat.errors import InputError
@@ -15,13 +19,45 @@ CAMERA_PATHS = ("own", "orbit", "none")
 
 
 def check_video(video: DictConfig) -> None:
-    """Check the camera path.
+    """Check the camera path, except for the names of photographs, see `views_of`.
 
     Raises:
         InputError: an unknown one.
     """
-    if video.path not in CAMERA_PATHS:
-        raise InputError(f"video.path={video.path}: choose {', '.join(CAMERA_PATHS[:-1])} or none.")
+    path = video.path
+    names = isinstance(path, ListConfig) and [isinstance(name, str) for name in path]
+    if path not in CAMERA_PATHS and not (names and all(names)):
+        raise InputError(
+            f"video.path={path}: choose {', '.join(CAMERA_PATHS)}, or photographs that it passes, "
+            "such as [IMG_01.jpg,IMG_20.jpg]."
+        )
+
+
+def views_of(video: DictConfig, photographs: Photographs) -> list[int]:
+    """Find the views that the camera path passes, in its order, among the inputs and held-out ones.
+
+    A photograph is named by its file, or by the end of its path where files share a name.
+
+    Raises:
+        InputError: a name of none of the photographs used, or of several.
+    """
+    inputs, held_out = photographs.input_files, photographs.held_out_files
+    if isinstance(video.path, str):
+        return list(range(len(inputs)))
+    return [_view_of(name, [*inputs, *held_out]) for name in video.path]
+
+
+def _view_of(name: str, files: Sequence[str]) -> int:
+    parts = Path(name).parts
+    found = [view for view, file in enumerate(files) if Path(file).parts[-len(parts) :] == parts]
+    if len(found) == 1:
+        return found[0]
+    like = get_close_matches(name, sorted({Path(file).name for file in files}), cutoff=0)
+    like = [files[view] for view in found[:3]] or like
+    raise InputError(
+        f"video.path: {name} is the name of {len(found) or 'none'} of the {len(files)} photographs "
+        f"used (views=): name one of them, such as {', '.join(like)}."
+    )
 
 
 def video_cameras(video: DictConfig, photographs: Photographs, gaussians: Gaussians) -> Cameras:
@@ -30,11 +66,11 @@ def video_cameras(video: DictConfig, photographs: Photographs, gaussians: Gaussi
     Both sides are even, as H.264 needs, unless they are those of the photographs.
     """
     frames = max(1, round(video.seconds * video.fps))
-    cameras = photographs.inputs.cameras
+    cameras = photographs.all_views().cameras.select(views_of(video, photographs))
     if video.path == "orbit":
         path = orbit(cameras, frames, subject(gaussians, cameras))
     else:
-        path = smoothed_path(cameras, frames)
+        path = smoothed_path(cameras, frames, as_given=video.path != "own")
     if video.height is None:
         return path
     width = video.height * path.width / path.height

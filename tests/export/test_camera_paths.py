@@ -176,6 +176,15 @@ def test_smoothed_paths_keep_a_good_order():
     assert np.linalg.norm(made.centers.numpy() - evenly, axis=1).max() < 0.15
 
 
+def test_smoothed_paths_keep_any_order_where_asked():
+    angles = [0, 120, 40, 160, 80, 200]
+    cameras = cameras_at(ring(angles), np.zeros((6, 3)))
+    for as_given, order in ((True, [0, 1, 2, 3, 4, 5]), (False, [0, 2, 4, 1, 3, 5])):
+        made = smoothed_path(cameras, 200, as_given=as_given)
+        nearest = torch.cdist(cameras.centers, made.centers).argmin(1)
+        assert nearest.argsort().tolist() in (order, order[::-1])
+
+
 def assert_looks_at(cameras: Cameras, point, atol=1e-4):
     ahead = torch.tensor(point) - cameras.centers
     ahead = torch.nn.functional.normalize(ahead, dim=-1)
