@@ -517,23 +517,25 @@ def video(views, make_scene):
     parts = [[view for view in range(16) if view % 8], [0, 8]]
     files = [[f"scene/images/IMG_{view:02}.jpg" for view in part] for part in parts]
     frame = Normalization(torch.eye(4, dtype=torch.float64), 1.0)
+    scene, _ = make_scene(dtype=torch.float32)
     photographs = Photographs("scene", *map(views.select, parts), *files, frame, None)
 
     def cameras(**options):
         options = {"path": "own", "height": None, "seconds": 1, "fps": 12} | options
-        return video_cameras(OmegaConf.create(options), photographs, make_scene()[0])
+        return video_cameras(OmegaConf.create(options), photographs, scene)
 
     return cameras
 
 
-def test_a_video_of_another_height_has_the_field_of_view_and_even_sides(video):
-    own = video()
+@pytest.mark.parametrize("path", ["own", "orbit"])
+def test_a_video_of_another_height_has_the_field_of_view_and_even_sides(video, path):
+    small = video(path=path)
     for height, size in ((None, (48, 48)), (540, (540, 540)), (97, (96, 96)), (2, (2, 2))):
-        made = video(height=height)
+        made = video(path=path, height=height)
         assert (made.height, made.width) == size and made.num_views == 12
         scale = torch.tensor([size[1] / 48, size[0] / 48, 1.0])[:, None]
-        torch.testing.assert_close(made.intrinsics, scale * own.intrinsics)
-        assert torch.equal(made.cam_to_world, own.cam_to_world)
+        torch.testing.assert_close(made.intrinsics, scale * small.intrinsics)
+        assert torch.equal(made.cam_to_world, small.cam_to_world)
 
 
 def test_a_video_passes_the_photographs_in_the_order_of_their_names(video, views):

@@ -9,8 +9,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.export.walls import free_radii
 from asysplat.rendering.reference.project import rotations
-from asysplat.scene import Cameras
+from asysplat.scene import Cameras, Gaussians
 
 ROUNDING = 1e-6  # relative to coordinates, or in radians; smaller differences are rounding
 # Of paths along the cameras.
@@ -24,6 +25,7 @@ MIN_UP_COSINE = 0.5  # between the world's up and the cameras' mean up: 60 degre
 MAX_GAP = np.radians(90)  # between neighbors on a full circle
 MIN_SWING = np.radians(5)  # to either side
 MAX_STEEPNESS = 10.0  # distance over radius, so that no camera looks straight down
+SAME_DIRECTION = 0.2  # radians from the focus, more than the nearest direction
 
 
 def smoothed_path(cameras: Cameras, frames: int, as_given: bool = False) -> Cameras:
@@ -101,17 +103,23 @@ def _rigid(states: Float[ndarray, "T 7"]) -> Float[ndarray, "T 4 4"]:
     return poses
 
 
-def orbit(cameras: Cameras, frames: int, focus: Float[Tensor, "3"] | None = None) -> Cameras:
+def orbit(
+    cameras: Cameras,
+    frames: int,
+    focus: Float[Tensor, "3"] | None = None,
+    gaussians: Gaussians | None = None,
+) -> Cameras:
     """Build a closed path around the focus point, at the cameras' mean height.
 
     A full circle if the cameras are all around, else to and fro within their arc, as other sides of
     the scene are unobserved. It is as far from the point as nine in ten cameras are at most, so
-    that what they show is in frame.
+    that what they show is in frame; nearer where a wall of the scene is in between.
 
     Args:
         cameras: [V], without batch dimension.
         frames: number of video frames.
         focus: the subject; None: where the optical axes meet, which may be behind it.
+        gaussians: scene, whose walls the path evades; None: it evades none.
 
     Returns:
         [frames] upright cameras that look at the point, with the mean intrinsics.
@@ -129,23 +137,48 @@ def orbit(cameras: Cameras, frames: int, focus: Float[Tensor, "3"] | None = None
     offsets = poses[visible, :3, 3] - focus
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
-    radius = max(np.quantile(_lengths(flat), 0.9), _lengths(offsets).mean() / MAX_STEEPNESS)
+    lowest = _lengths(offsets).mean() / MAX_STEEPNESS
+    radius = max(np.quantile(_lengths(flat), 0.9), lowest)
     direction = poses[middle, :3, 3] - focus
     x = direction - (direction @ up) * up
     if np.linalg.norm(x) < ROUNDING * np.linalg.norm(direction):
         x = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     x /= np.linalg.norm(x)
     y = np.cross(up, x)
-    angles = _angles(np.arctan2(flat @ y, flat @ x), frames)[:, None]
-    circle = radius * (np.cos(angles) * x + np.sin(angles) * y)
-    centers = focus + heights.mean() * up + circle
-    forward = focus - centers
+    azimuths = np.arctan2(flat @ y, flat @ x)
+    angles = _angles(azimuths, frames)
+    circle = np.cos(angles)[:, None] * x + np.sin(angles)[:, None] * y
+    center = focus + heights.mean() * up
+    radii = np.full(frames, radius)
+    if gaussians is not None:
+        # Space is free at the input cameras.
+        starts = _nearest(_lengths(flat), azimuths, angles).clip(lowest, radius)
+        outward = _looks(center + starts[:, None] * circle, circle, up)
+        radii = free_radii(gaussians, outward, starts, radius)
+    centers = center + radii[:, None] * circle
+    path = _looks(centers, focus - centers, up)
+    return _with_poses(cameras, path)
+
+
+def _nearest(
+    distances: Float[ndarray, " V"], azimuths: Float[ndarray, " V"], angles: Float[ndarray, " T"]
+) -> Float[ndarray, " T"]:
+    """Return the smallest distance of the cameras in about the direction of each angle."""
+    apart = np.abs((angles[:, None] - azimuths + np.pi) % (2 * np.pi) - np.pi)
+    alike = apart <= apart.min(1, keepdims=True) + SAME_DIRECTION
+    return np.where(alike, distances, np.inf).min(1)
+
+
+def _looks(
+    centers: Float[ndarray, "T 3"], forward: Float[ndarray, "T 3"], up: Float[ndarray, "3"]
+) -> Float[ndarray, "T 4 4"]:
+    """Return upright poses that look forward."""
     right = np.cross(forward, up)
     axes = np.stack((right, np.cross(forward, right), forward), 2)
-    path = np.tile(np.eye(4), (frames, 1, 1))
-    path[:, :3, :3] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    path[:, :3, 3] = centers
-    return _with_poses(cameras, path)
+    poses = np.tile(np.eye(4), (len(centers), 1, 1))
+    poses[:, :3, :3] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    poses[:, :3, 3] = centers
+    return poses
 
 
 def _up(poses: Float[ndarray, "V 4 4"], middle: int) -> Float[ndarray, "3"]:

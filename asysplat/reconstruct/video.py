@@ -68,7 +68,7 @@ def video_cameras(video: DictConfig, photographs: Photographs, gaussians: Gaussi
     frames = max(1, round(video.seconds * video.fps))
     cameras = photographs.all_views().cameras.select(views_of(video, photographs))
     if video.path == "orbit":
-        path = orbit(cameras, frames, subject(gaussians, cameras))
+        path = orbit(cameras, frames, subject(gaussians, cameras), gaussians)
     else:
         path = smoothed_path(cameras, frames, as_given=video.path != "own")
     if video.height is None:

@@ -1,6 +1,7 @@
 """Camera paths: along the cameras' own, and around what they look at."""
 
 import math
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from asysplat.data.procedural import ProceduralScene
 from asysplat.errors import InputError
 from asysplat.export import orbit, smoothed_path
-from asysplat.scene import Cameras
+from asysplat.scene import Cameras, Gaussians
 
 
 def cameras_at(centers, targets=None, roll=0.0) -> Cameras:
@@ -64,7 +65,26 @@ HARD = {
     "far from the origin": cameras_at(ring(range(0, 360, 30)) + 1e4, np.full((12, 3), 1e4)),
     "hand-held": ProceduralScene(2, 12, 16).views(list(range(0, 90, 3))).cameras,
 }
-every_path = pytest.mark.parametrize("path", [smoothed_path, orbit])
+
+
+def panel(x, y, z) -> Gaussians:
+    """An opaque box, a Gaussian at every 0.1."""
+    axes = [torch.arange(low, high + 0.05, 0.1) for low, high in (x, y, z)]
+    means = torch.cartesian_prod(*axes)
+    rows = len(means)
+    sizes, turns = torch.full((rows, 3), 0.06), torch.eye(4)[:1].repeat(rows, 1)
+    return Gaussians(means, turns, sizes, torch.full((rows,), 0.99), torch.zeros(rows, 1, 3))
+
+
+def joined(*parts: Gaussians) -> Gaussians:
+    return Gaussians(*(torch.cat(each) for each in zip(*map(astuple, parts), strict=True)))
+
+
+def evading_orbit(cameras, frames):
+    return orbit(cameras, frames, gaussians=panel((0.8, 0.8), (-1, 1), (-1, 1)))
+
+
+every_path = pytest.mark.parametrize("path", [smoothed_path, orbit, evading_orbit])
 
 
 @every_path
@@ -247,3 +267,35 @@ def test_an_orbit_around_a_subject_in_front_of_where_the_axes_meet():
     radius = torch.quantile(distances, 0.9)
     torch.testing.assert_close((made.centers - focus)[:, :2].norm(dim=-1), radius.expand(20))
     assert distances.mean() < radius < distances.max()
+
+
+# Those in the middle are near the focus, between it and the wall of a room.
+IN_ROOM = np.arange(-60, 61, 5)
+IN_ROOM = cameras_at(ring(IN_ROOM, np.where(np.abs(IN_ROOM) < 30, 2.0, 4.0)), np.zeros((25, 3)))
+
+
+def test_an_orbit_stays_in_front_of_a_wall():
+    wall = panel((2.6, 2.6), (-1.5, 1.5), (-1, 2))
+    before, made = orbit(IN_ROOM, 120), orbit(IN_ROOM, 120, gaussians=wall)
+
+    def beyond(path):
+        return (path.centers[:, 0] > 2.5) & (path.centers[:, 1].abs() < 1.5)
+
+    assert beyond(before).sum() > 20 and not beyond(made).any()
+    assert_looks_at(made, (0.0, 0, 0))
+    torch.testing.assert_close(made.centers[:, 2], before.centers[:, 2])
+    # Farther from the wall it is as before, and on its way there it does not jump.
+    radii = made.centers[:, :2].norm(dim=-1)
+    assert 1.9 < radii.min() < 2.5 and radii.max() > 3.99
+    around = torch.cat((made.centers, made.centers[:1])).diff(dim=0).norm(dim=-1)
+    assert around.max() < 2 * steps(before).max()
+
+
+def test_an_orbit_in_an_open_scene_is_the_same_to_the_bit():
+    subject = panel((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
+    ground = panel((-5, 5), (-5, 5), (-0.5, -0.5))
+    behind = panel((9, 9), (-3, 3), (-1, 2))
+    scene = joined(subject, ground, behind)
+    for cameras in (IN_ROOM, cameras_at(ring(range(0, 360, 20)), np.zeros((18, 3)))):
+        expected = orbit(cameras, 40).cam_to_world
+        assert torch.equal(orbit(cameras, 40, gaussians=scene).cam_to_world, expected)
