@@ -135,7 +135,7 @@ def scaled(lens: Lens, size: tuple[int, int], where: str) -> Lens:
     return replace(lens, width=width, height=height, **focal)
 
 
-def refuse_turned(size: tuple[int, int], given: tuple[int, int]) -> None:
+def refuse_turned(size: tuple[int, int], given: tuple[int | float, int | float]) -> None:
     """Check that an image is not stored turned against intrinsics for the size `given`.
 
     Raises:
