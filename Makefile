@@ -1,9 +1,12 @@
-.PHONY: demo quick test bench slow style format
+.PHONY: install demo quick test bench slow style format
 PYTHON ?= python3
 ENV := .venv/.ready
 # Two worker processes of one thread each; a file's tests share a process, and so their fixtures.
 # Bytecode is kept, as each process would compile the tests and the package again.
 PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= .venv/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+install: $(ENV) ## install into .venv
+	@echo "next: source .venv/bin/activate"
 
 demo: $(ENV) ## train a small model on synthetic scenes, test it and draw its renderings
 	.venv/bin/python train.py model=asysplat_plane_sweep name=demo

@@ -6,6 +6,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from asysplat.data.selection.views import spread
 from asysplat.errors import InputError
 from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
@@ -18,6 +19,7 @@ from asysplat.rendering import INRIA
 from asysplat.scene import Gaussians, Views
 
 INITS = ("network", "plane_sweep", "points", "depth")
+DEPTH_VIEWS = 64  # most views whose depths are used: with more, cells must be larger to hold fewer
 PRIOR_MAX_SIDE = 64  # pixels of a prior's depth maps
 NETWORK_MAX_SIDE = 128  # pixels of the network's input images
 NEIGHBORS = 3  # the size of a point is their mean distance (Kerbl et al. 2023)
@@ -33,13 +35,15 @@ def initial_gaussians(
 ) -> Gaussians:
     """Build the Gaussians that a refinement with `settings` starts from, in the network's frame.
 
-    Gaussians of several views on the same surface are merged, in cells of a pixel of the network's
-    input or of the prior's depth map, or larger ones: `RefinementSettings.initial_limit`.
+    Of many views, those of DEPTH_VIEWS, evenly selected. Gaussians of several views on the same
+    surface are merged, in cells of a pixel of the network's input or of the prior's depth map, or
+    larger ones: `RefinementSettings.initial_limit`.
 
     Raises:
         InputError: `init` is none of INITS, or needs points or depths that the photographs lack.
     """
-    views, pixels = photographs.inputs, 1.0
+    inputs, pixels = photographs.inputs, 1.0
+    views = inputs.select(spread(range(inputs.num_views), min(DEPTH_VIEWS, inputs.num_views)))
     longest = max(views.cameras.height, views.cameras.width)
     if init == "points":
         if photographs.points is None:
@@ -47,7 +51,7 @@ def initial_gaussians(
                 f"init=points: {photographs.name} has no sparse points; choose plane_sweep, or a "
                 "layout with points (COLMAP)."
             )
-        gaussians = gaussians_from_points(photographs.points, views)
+        gaussians = gaussians_from_points(photographs.points, inputs)
     elif init == "network":
         small = _resize(views, NETWORK_MAX_SIDE, network.patch)
         gaussians = without_invisible(network.eval()(small))

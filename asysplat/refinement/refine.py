@@ -79,7 +79,7 @@ class Refinement:
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = resize(views, *size) if settings.half_size > 0 else views
         self._view_order = self._random_order()
-        self._steps = 0
+        self._steps, self._rounds = 0, 0
         self._last_visible = torch.zeros(len(self.fields), dtype=torch.long)
         self._screen_gradients = ScreenGradients(self.fields)
         self._max_gaussians = settings.limit(views.images[:, 0].numel())
@@ -121,9 +121,10 @@ class Refinement:
     @torch.no_grad()
     def densify(self, share: float) -> None:
         """Prune, add or relocate Gaussians, by the method of the settings; share: see `step`."""
-        settings, views = self.settings, self._views(share)
+        settings, views, target = self.settings, self._views(share), self._next_count()
+        self._rounds += 1
         if settings.densify == "mcmc":
-            relocate(self.fields, self._max_gaussians, settings.growth, self._generator)
+            relocate(self.fields, target, self._generator)
         elif settings.densify == "gradient":
             reset = settings.every is not None and self._steps > settings.every.opacity_reset
             self._screen_gradients.clone_and_split(self._max_gaussians, self._generator, reset)
@@ -134,11 +135,10 @@ class Refinement:
         unseen = self._steps - self._last_visible > 2 * views.num_views
         useful = (opacities > MIN_OPACITY) & ~unseen
         useful[opacities.argmax()] = True  # never prune all
-        limit = min(self._max_gaussians, int((1 + settings.growth) * len(self.fields)))
         rows = torch.nonzero(useful)[:, 0]
         self.fields.keep(rows)
         self._last_visible = self._last_visible[rows]
-        count = limit - len(self.fields)
+        count = target - len(self.fields)
         if count > 0:
             order = torch.randperm(views.num_views, generator=self._generator)
             views, now = views.select(order[:VIEWS_PER_ROUND]), self.gaussians
@@ -153,6 +153,11 @@ class Refinement:
     def reset_opacities(self) -> None:
         """Lower all opacities, so that those that are not needed are pruned (Kerbl et al. 2023)."""
         self.fields.reset_opacities(MAX_RESET_OPACITY)
+
+    def _next_count(self) -> int:
+        """Return the number of Gaussians after this round, on an even growth to the limit."""
+        now, left = len(self.fields), self.settings.rounds - self._rounds
+        return round(now * (self._max_gaussians / now) ** (1 / max(1, left)))
 
     def _gradients(
         self, target: Views, view: int, leaves: Parameters, factor: float

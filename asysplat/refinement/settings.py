@@ -67,11 +67,11 @@ class RefinementSettings:
     # "error": spawn Gaussians at pixels with a large error; "mcmc": relocate dead ones (Kheradmand
     # et al. 2024); "gradient": clone and split by screen-space gradients (Kerbl et al. 2023).
     densify: Densify = "error"
-    # Lower if all input images have fewer than 8 pixels for each; None: no limit
+    # Lower if all input images have fewer than 8 pixels for each; None: no other limit.
     max_gaussians: int | None = 150_000
-    rounds: int = 12  # of densification
+    initial: float = 0.19  # share of them to start with, at most
+    rounds: int = 12  # of densification, each of which multiplies their number by the same factor
     until: float = 0.6  # initial share of the refinement with densification
-    growth: float = 0.15  # added in a round, as a share of all, beside replacements of pruned ones
     every: StepSchedule | None = None  # of densification "gradient"; None: `rounds`, evenly
     decay: float = 0.05  # factor of all rates at the end of the cool-down
     decay_means_alone: bool = False  # not of the other rates
@@ -81,7 +81,7 @@ class RefinementSettings:
 
     def __post_init__(self):
         """Check the ranges."""
-        for name in ("half_size", "until", "growth", "decay", "cool_down"):
+        for name in ("half_size", "initial", "until", "decay", "cool_down"):
             self._check(name, 0 <= getattr(self, name) <= 1, "give 0 to 1")
         choices = get_args(Densify)
         self._check("densify", self.densify in choices, f"choose {', '.join(choices)}")
@@ -99,19 +99,16 @@ class RefinementSettings:
 
     def limit(self, pixels: int) -> int:
         """Return the greatest number of Gaussians for input images of so many pixels together."""
-        if self.max_gaussians is None:
+        if self.densify == "gradient" and self.max_gaussians is None:  # as published
             return sys.maxsize
-        return min(self.max_gaussians, pixels // PIXELS_PER_GAUSSIAN)
+        return min(self.max_gaussians or sys.maxsize, max(1, pixels // PIXELS_PER_GAUSSIAN))
 
     @property
     def initial_limit(self) -> int:
-        """The greatest number of Gaussians to start from: so that the rounds grow it to the limit.
-
-        With more the limit would be reached earlier, and the steps until then would take longer.
-        """
+        """The greatest number of Gaussians to start with: with few, early steps are fast."""
         if self.max_gaussians is None or self.densify not in ("error", "mcmc"):
             return self.max_gaussians or sys.maxsize
-        return max(1, int(self.max_gaussians / (1 + self.growth) ** self.rounds))
+        return max(1, int(self.initial * self.max_gaussians))
 
     def max_steps(self, num_views: int) -> float:
         """Return the steps after which each image was used `max_steps_per_image` times."""

@@ -27,7 +27,7 @@ def mcmc_regularizer(gaussians: Gaussians) -> Tensor:
 
 
 @torch.no_grad()
-def relocate(fields: Fields, max_gaussians: int, growth: float, generator: torch.Generator) -> None:
+def relocate(fields: Fields, target: int, generator: torch.Generator) -> None:
     """Move dead Gaussians to live ones sampled by opacity, then add copies sampled likewise.
 
     Copies at one position render together as their original did. The optimizer state of copies
@@ -35,15 +35,14 @@ def relocate(fields: Fields, max_gaussians: int, growth: float, generator: torch
 
     Args:
         fields: of the Gaussians; changed ones are moved to the end.
-        max_gaussians, growth: copies are added up to a limit, and to a share of the Gaussians.
+        target: number of Gaussians to which copies are added.
         generator: of random numbers.
     """
     alive = fields.gaussians().opacities > MIN_OPACITY
     if alive.any():
         _copy(fields, alive.nonzero()[:, 0], int((~alive).sum()), generator)
     count = len(fields)
-    added = min(max_gaussians - count, int(growth * count))
-    _copy(fields, torch.arange(count), max(0, added), generator)
+    _copy(fields, torch.arange(count), max(0, target - count), generator)
 
 
 @torch.no_grad()
