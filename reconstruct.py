@@ -36,7 +36,7 @@ from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
 from asysplat.reconstruct.video import views_of
-from asysplat.refinement import RefinementSettings, mean_color, refine
+from asysplat.refinement import RefinementSettings, refine
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.refinement.photographs import Photographs, open_photographs
 from asysplat.scene import Gaussians
@@ -79,7 +79,7 @@ def reconstruct(config: DictConfig) -> None:
     views_of(config.video, photographs)  # an error of names comes before the work
     print(describe(config, photographs, limit))
     gaussians = initialize(config, photographs, settings)
-    background = mean_color(photographs.inputs)
+    background = photographs.inputs.mean_color()
     results.save_start(gaussians, photographs, background)
     with RefinementDisplay(photographs.inputs, config.view) as display:
         options = {"background": background, "seed": config.seed, "watch": display, **limit}

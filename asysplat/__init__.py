@@ -13,7 +13,6 @@ LATER = {
     "Gaussians": "asysplat.scene",
     "Views": "asysplat.scene",
     "load": "asysplat.load",
-    "mean_color": "asysplat.refinement",
     "open_photographs": "asysplat.refinement.photographs",
     "read_gaussians": "asysplat.export",
     "refine": "asysplat.refinement",

@@ -6,15 +6,18 @@ orthonormal) and is called once, where data enters.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TypeVar
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.errors import InputError
 
 ORTHONORMAL_TOLERANCE = 1e-3
+TINY = 1e-6  # depths and inverse depths above which nothing underflows
 MAX_FIELD_OF_VIEW = 20  # image side over focal length: 169 degrees
 
 Record = TypeVar("Record", bound="TensorRecord")
@@ -252,6 +255,40 @@ class Views(TensorRecord):
             point_depths=pick(self.point_depths, -3),
             disparities=pick(self.disparities, -3),
         )
+
+    def resized(self, height: int, width: int) -> "Views":
+        """Return views of another size, with the same field of view.
+
+        Images are means over areas. A pixel is masked in only where all pixels it covers are; a
+        depth or disparity is that of the nearest pixel, a point's that of the nearest point.
+        """
+        size = (height, width)
+        area, nearest = (
+            partial(F.interpolate, size=size, mode=mode) for mode in ("area", "nearest")
+        )
+
+        def nearest_point(depths: Tensor) -> Tensor:
+            inverse = F.adaptive_max_pool2d((depths > 0) / depths.clamp_min(TINY), size)
+            return (inverse > 0) / inverse.clamp_min(TINY)
+
+        methods = {"images": area, "masks": lambda masks: area(masks.float()) == 1}
+        methods |= {"depths": nearest, "disparities": nearest, "point_depths": nearest_point}
+        resized = {}
+        for name, method in methods.items():
+            values = getattr(self, name)
+            if values is not None:
+                maps = method(values.reshape(-1, 1, *values.shape[-2:]))
+                resized[name] = maps.reshape(*values.shape[:-2], *size)
+        return replace(self, cameras=self.cameras.resized(*size), **resized)
+
+    def mean_color(self) -> Float[Tensor, "*batch 3"]:
+        """Compute the mean color of all pixels that are masked in; gray if there are none."""
+        colors = self.images.movedim(-3, -1)
+        if self.masks is None:
+            return colors.flatten(-4, -2).mean(-2)
+        weights = self.masks[..., None].to(colors)
+        total, count = (each.flatten(-4, -2).sum(-2) for each in (colors * weights, weights))
+        return (total / count).nan_to_num(0.5)
 
     def masked(self, rendered: Float[Tensor, "*batch V 3 H W"]) -> Float[Tensor, "*batch V 3 H W"]:
         """Copy the photographs into masked pixels, where they add no error or gradient."""

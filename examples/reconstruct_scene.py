@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from asysplat import load, mean_color, open_photographs, refine, render, write_gaussians
+from asysplat import load, open_photographs, refine, render, write_gaussians
 from asysplat.data import ProceduralScene
 from asysplat.data.write import write_transforms
 from asysplat.evaluation.figures import comparison_figure
@@ -23,7 +23,7 @@ def reconstruct(folder: Path, scene: Path, figure: Path) -> None:
     gaussians = refine(start, photographs.inputs, seconds=10.0)
     write_gaussians(scene, photographs.frame.to_world(gaussians))  # in the world of the files
 
-    background = mean_color(photographs.inputs)
+    background = photographs.inputs.mean_color()
     rendering = render(gaussians, photographs.held_out.cameras, background)
     comparison_figure(photographs.inputs, photographs.held_out, rendering).savefig(figure, dpi=110)
     print(f"{gaussians.num_gaussians:,} Gaussians; scene: {scene}; figure: {figure}")

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 import textwrap
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -58,6 +59,22 @@ def test_select_and_stack_and_to():
     assert batch.images.shape == (2, 3, 3, 4, 6)
     assert torch.equal(batch.point_depths[0], views.point_depths)
     assert batch.to(torch.float64).cameras.intrinsics.dtype == torch.float64
+
+
+def test_views_of_another_size_keep_every_field():
+    maps = {field.name: torch.rand(2, 3, 4, 6) for field in fields(Views)}
+    maps |= {"images": torch.rand(2, 3, 3, 4, 6), "masks": torch.rand(2, 3, 4, 6) > 0.2}
+    views = Views(**maps | {"cameras": Cameras.stack([cameras(3)] * 2)})
+    half = views.resized(2, 3)
+    assert all(getattr(half, name) is not None for name in maps)
+    assert half.depths.unique().numel() == 2 * 3 * 2 * 3
+    nearest = views.point_depths.unflatten(2, (2, 2)).unflatten(4, (3, 2)).amin((3, 5))
+    torch.testing.assert_close(half.point_depths, nearest)
+    assert not replace(views, point_depths=torch.zeros(2, 3, 4, 6)).resized(2, 3).point_depths.any()
+    for batch in range(2):
+        alone = views.map(lambda values: values[batch]).resized(2, 3)  # noqa: B023
+        assert torch.equal(alone.images, half.images[batch])
+        assert torch.equal(alone.masks, half.masks[batch])
 
 
 def test_a_field_that_one_scene_lacks_is_dropped_from_the_batch():

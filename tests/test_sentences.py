@@ -18,6 +18,7 @@ from asysplat.data.bad_images import BadImages
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
+from asysplat.refinement import photographs
 from asysplat.refinement.adam import VisibleAdam
 from asysplat.training.checkpoints import load_weights
 from asysplat.training.run_folder import locked
@@ -206,9 +207,16 @@ def test_a_wrong_command_ends_with_a_sentence_and_status_1(
 
 def test_more_pixels_than_the_photographs_have(scene):
     said = []
-    photographs = asysplat.open_photographs(scene, height=3000, views=2, say=said.append)
-    assert photographs.inputs.cameras.height == 24
+    opened = asysplat.open_photographs(scene, height=3000, views=2, say=said.append)
+    assert opened.inputs.cameras.height == 24
     assert "height=3000: the photographs have 24 pixels, which are used." in said
+
+
+def test_as_many_photographs_as_memory_holds(scene, monkeypatch):
+    options = {"height": 24, "views": None, "held_out_every": None}
+    assert asysplat.open_photographs(scene, **options).inputs.num_views == 4
+    monkeypatch.setattr(photographs, "MAX_BYTES", 3 * 24 * 32 * photographs.BYTES_PER_PIXEL)
+    assert asysplat.open_photographs(scene, **options).inputs.num_views == 3
 
 
 @pytest.mark.medium

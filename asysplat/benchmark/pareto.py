@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import matplotlib
 import torch
-import torch.nn.functional as F
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lpips import LPIPS
@@ -44,7 +43,7 @@ from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.measured_cost import PEAK_MEMORY, CostMeter
 from asysplat.evaluation.protocol import Protocol
 from asysplat.models.network import Network
-from asysplat.refinement import mean_color, merge_to_limit, refine
+from asysplat.refinement import merge_to_limit, refine
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.refinement.photographs import Photographs, open_photographs
 from asysplat.rendering import INRIA, render
@@ -144,7 +143,7 @@ class FeedForward:
             if self.cell is not None or self.max_gaussians is not None:
                 limit = self.max_gaussians or gaussians.num_gaussians
                 gaussians = merge_to_limit(gaussians, inputs.cameras, self.cell or 1.0, limit)
-            image = render(gaussians, targets.cameras, mean_color(inputs), **options).image
+            image = render(gaussians, targets.cameras, inputs.mean_color(), **options).image
             return Drawn(image, gaussians.num_gaussians)
 
         return run
@@ -183,7 +182,7 @@ class Refined:
         def run(scene: Photographs) -> Drawn:
             scene = select_inputs(scene, self.views, self.side)
             gaussians = initial_gaussians(self.init, scene, settings, net)
-            color = mean_color(scene.inputs)
+            color = scene.inputs.mean_color()
             if self.steps != 0:
                 gaussians = refine(gaussians, scene.inputs, settings, background=color, **limit)
             with torch.no_grad():
@@ -304,8 +303,7 @@ def select_inputs(scene: Photographs, views: int | None, side: int | None) -> Ph
     selected = select_evenly(range(cameras.num_views), min(views, cameras.num_views))
     inputs = _without_depths(scene.inputs.select(selected))
     if side != cameras.height:
-        images = F.interpolate(inputs.images, (side, side), mode="area")
-        inputs = Views(inputs.cameras.resized(side, side), images)
+        inputs = inputs.resized(side, side)
     inputs, targets, _ = normalize(inputs, _without_depths(scene.held_out))
     return replace(scene, inputs=inputs, held_out=targets, points=None)
 

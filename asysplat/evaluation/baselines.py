@@ -8,9 +8,8 @@ from asysplat.scene import Cameras, Views
 
 
 def mean_color_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
-    """Fill every target with one color: the mean of all input pixels of its scene."""
-    color = inputs.images.mean((-4, -2, -1))
-    return color[..., None, :, None, None].expand_as(targets.images)
+    """Fill every target with one color: the mean color of the inputs of its scene."""
+    return inputs.mean_color()[..., None, :, None, None].expand_as(targets.images)
 
 
 def nearest_view_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:

@@ -97,7 +97,7 @@ class PostOptimization:
         """
         background = self.background
         if background is None:
-            background = inputs.images.mean((0, 2, 3))
+            background = inputs.mean_color()
         result = SceneResult(scene)
         for source, baseline in BASELINES.items():
             metrics = self.protocol.image_metrics(baseline(inputs, targets), targets, self.lpips)

@@ -9,7 +9,6 @@ from asysplat.refinement.settings import (
     RefinementSettings,
     StepSchedule,
 )
-from asysplat.refinement.views import mean_color
 
 __all__ = [
     "PAPER",
@@ -19,7 +18,6 @@ __all__ = [
     "RefinementProgress",
     "RefinementSettings",
     "StepSchedule",
-    "mean_color",
     "merge_to_limit",
     "refine",
 ]

@@ -14,7 +14,6 @@ from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import SPREAD, merge_to_limit
 from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.settings import RefinementSettings
-from asysplat.refinement.views import resize
 from asysplat.rendering import INRIA
 from asysplat.scene import Gaussians, Views
 
@@ -53,7 +52,7 @@ def initial_gaussians(
             )
         gaussians = gaussians_from_points(photographs.points, inputs)
     elif init == "network":
-        small = _resize(views, NETWORK_MAX_SIDE, network.patch)
+        small = _shrink(views, NETWORK_MAX_SIDE, network.patch)
         gaussians = without_invisible(network.eval()(small))
         pixels = longest / PRIOR_MAX_SIDE
     elif init in ("plane_sweep", "depth"):
@@ -63,7 +62,7 @@ def initial_gaussians(
             )
         # Depth maps of PRIOR_MAX_SIDE pixels a side at most, a divisor of the views.
         stride = -(-longest // PRIOR_MAX_SIDE)
-        small = _resize(views, longest, stride)
+        small = _shrink(views, longest, stride)
         size = small.cameras.height // stride, small.cameras.width // stride
         run_prior = PlaneSweepPrior() if init == "plane_sweep" else DepthPrior()
         prior = run_prior(small.map(lambda tensor: tensor[None]), size)
@@ -137,9 +136,9 @@ def sample_colors(points: Float[Tensor, "N 3"], views: Views) -> Float[Tensor, "
     return torch.where(count > 0, total / count.clamp_min(1), 0.5)
 
 
-def _resize(views: Views, longest: int, multiple: int) -> Views:
+def _shrink(views: Views, longest: int, multiple: int) -> Views:
     """Return views whose longer side is about `longest` and whose sides are multiples."""
     height, width = views.cameras.height, views.cameras.width
     scale = min(1.0, longest / max(height, width))
     size = (max(multiple, round(side * scale / multiple) * multiple) for side in (height, width))
-    return resize(views, *size)
+    return views.resized(*size)

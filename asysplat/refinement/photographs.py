@@ -21,6 +21,8 @@ from asysplat.scene import Views
 
 MATCHED_SIDE = 400  # pixels of the shorter side, to check the cameras
 ANY_SIZE = 8  # pixels a side: to read cameras, before the size is known
+MAX_BYTES = 2 * 10**9  # of input views; a refinement takes about as much again
+BYTES_PER_PIXEL = 15  # float32 RGB, and the same at half the size
 GIVEN = CameraOptions()
 
 
@@ -55,7 +57,7 @@ def open_photographs(
     path: str | Path,
     height: int,
     width: int | None = None,
-    views: int = 32,
+    views: int | None = 32,
     held_out_every: int | None = 8,
     max_held_out: int = 12,
     layout: str = "auto",
@@ -69,7 +71,8 @@ def open_photographs(
         path, layout, on_bad_image: see `open_scene`.
         height, width: of the views, in pixels; width None keeps the first photograph's aspect
             ratio.
-        views, max_held_out: number of input and of held-out views, at most.
+        views, max_held_out: number of input and of held-out views, at most; views None: as many
+            input views as MAX_BYTES hold.
         cameras: choice of given, refined or found cameras.
         held_out_every: hold out every n-th photograph, from the first on; None: none.
         say: takes warnings: a smaller height than asked for, or cameras that do not fit the images.
@@ -77,7 +80,7 @@ def open_photographs(
     Raises:
         InputError: fewer than two input views; see `open_scene`.
     """
-    counts = (height, width or 1, views, held_out_every or 2, max_held_out)
+    counts = (height, width or 1, 2 if views is None else views, held_out_every or 2, max_held_out)
     whole = all(isinstance(count, int) for count in counts)
     if not whole or min(counts[:2]) < 1 or min(counts[2:4]) < 2 or max_held_out < 1 or width == 0:
         raise InputError(
@@ -105,6 +108,8 @@ def open_photographs(
             f"{path} has {len(indices)} photographs, of which held_out_every={held_out_every} "
             f"leaves {len(rest)}: set held_out_every=null, or give more photographs."
         )
+    if views is None:
+        views = max(2, MAX_BYTES // (height * width * BYTES_PER_PIXEL))
     inputs = spread(rest, min(views, len(rest)))
     held_out = spread(held_out, min(max_held_out, len(held_out))) if held_out else []
     if not found:

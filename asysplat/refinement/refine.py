@@ -28,7 +28,6 @@ from asysplat.refinement.densification.spawn import MIN_OPACITY, spawn_at_errors
 from asysplat.refinement.fields import MAX_SH_DEGREE, Fields, Parameters
 from asysplat.refinement.isotropic import footprints
 from asysplat.refinement.settings import RefinementSettings
-from asysplat.refinement.views import mean_color, resize
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
@@ -72,12 +71,12 @@ class Refinement:
         gaussians.validate("refine's gaussians")
         self.views = views.validate("refine's views")
         self.settings = settings
-        self.background = mean_color(views) if background is None else background
+        self.background = views.mean_color() if background is None else background
         self._generator = torch.Generator().manual_seed(seed)
         self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
         self.corrections = Corrections(views.num_views, settings.rates)
         size = (max(1, side // 2) for side in views.images.shape[-2:])
-        self._half_views = resize(views, *size) if settings.half_size > 0 else views
+        self._half_views = views.resized(*size) if settings.half_size > 0 else views
         self._view_order = self._random_order()
         self._steps, self._rounds = 0, 0
         self._last_visible = torch.zeros(len(self.fields), dtype=torch.long)

@@ -88,7 +88,7 @@ class SplattingModule(lightning.LightningModule):
         """Return the background of the targets: [3], or [B, V, 3] if it depends on the inputs."""
         if self.background is not None:
             return self.background
-        mean = batch["inputs"].images.mean((1, 3, 4))[:, None]
+        mean = batch["inputs"].mean_color()[:, None]
         color = (mean < 0.5).to(mean) if self.training else mean
         return color.expand(-1, batch["targets"].cameras.num_views, -1)
 

@@ -22,7 +22,6 @@ from asysplat.benchmark.pareto import (
 from asysplat.errors import InputError
 from asysplat.evaluation.measured_cost import memory_gb, reset_peak_memory
 from asysplat.evaluation.metrics import psnr
-from asysplat.refinement import mean_color
 from asysplat.rendering import render
 
 SIDE = 32
@@ -123,7 +122,7 @@ def test_a_row_is_what_the_network_and_the_renderer_give(measured, tmp_path):
     scene = select_inputs(room, 3, SIDE)
     assert scene.inputs.num_views == 3 and room.inputs.num_views > 3
     with torch.no_grad():
-        gaussians, background = load()(scene.inputs), mean_color(scene.inputs)
+        gaussians, background = load()(scene.inputs), scene.inputs.mean_color()
         image = render(gaussians, scene.held_out.cameras, background, depth=False).image
     assert row["gaussians"] == gaussians.num_gaussians
     assert row["psnr"] == pytest.approx(psnr(image, scene.held_out.images).mean().item(), abs=1e-4)

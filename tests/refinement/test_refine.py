@@ -19,14 +19,12 @@ from asysplat.refinement import (
     Refinement,
     RefinementSettings,
     StepSchedule,
-    mean_color,
     refine,
 )
 from asysplat.refinement.corrections import correct_poses
 from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
-from asysplat.refinement.views import resize
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 
@@ -36,7 +34,7 @@ KINDS = ["error", "mcmc", "gradient", "none"]
 
 def quality(gaussians, views):
     with torch.no_grad():
-        image = render(gaussians, views.cameras, mean_color(views), depth=False).image
+        image = render(gaussians, views.cameras, views.mean_color(), depth=False).image
     return psnr(views.masked(image.clamp(0, 1)), views.images).mean().item()
 
 
@@ -343,12 +341,12 @@ def test_resized_images_have_the_same_means_and_field_of_view():
     views = small_views(2, 9, 14)
     masks = torch.ones(2, 9, 14, dtype=torch.bool)
     masks[1, 3, 5] = False
-    half = resize(replace(views, masks=masks), 4, 7)
+    half = replace(views, masks=masks).resized(4, 7)
     assert torch.equal(half.cameras.intrinsics, views.cameras.resized(4, 7).intrinsics)
     assert half.masks.sum() == 2 * 4 * 7 - 1 and not half.masks[1, 1, 2]
     whole = small_views(1, 8, 8)
     blocks = whole.images.unflatten(2, (4, 2)).unflatten(4, (4, 2)).mean((3, 5))
-    half = resize(whole, 4, 4)
+    half = whole.resized(4, 4)
     torch.testing.assert_close(half.images, blocks)
     assert half.masks is None
 
@@ -356,15 +354,15 @@ def test_resized_images_have_the_same_means_and_field_of_view():
 def test_the_background_is_the_mean_color_of_unmasked_pixels(threads):
     views = small_views(4, 150, 100)
     threads(2)
-    mean = mean_color(views)
+    mean = views.mean_color()
     threads(1)
-    assert torch.equal(mean_color(views), mean)
+    assert torch.equal(views.mean_color(), mean)
     torch.testing.assert_close(mean, views.images.mean((0, 2, 3)))
     masks = torch.zeros(4, 150, 100, dtype=torch.bool)
-    assert mean_color(replace(views, masks=masks)).tolist() == [0.5] * 3
+    assert replace(views, masks=masks).mean_color().tolist() == [0.5] * 3
     masks[2, 7, 9] = masks[0, 1, 1] = True
     expected = (views.images[2, :, 7, 9] + views.images[0, :, 1, 1]) / 2
-    torch.testing.assert_close(mean_color(replace(views, masks=masks)), expected)
+    torch.testing.assert_close(replace(views, masks=masks).mean_color(), expected)
     assert torch.equal(Refinement(small_scene(), views).background, mean)
     given = torch.tensor([1.0, 0, 0])
     assert torch.equal(Refinement(small_scene(), views, given).background, given)

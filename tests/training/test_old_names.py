@@ -14,7 +14,7 @@ from conftest import finished
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
-from asysplat import load, mean_color, render
+from asysplat import load, render
 from asysplat.evaluation.metrics import psnr
 from asysplat.report.fill import finished_runs
 from asysplat.training.old_names import CLASSES, KEYS
@@ -105,7 +105,7 @@ def test_it_is_evaluated_resumed_and_started_from(old_run, config, run_script, t
     data.setup()
     inputs, targets = (data.tests["procedural"][0][part] for part in ("inputs", "targets"))
     with torch.no_grad():
-        shown = render(load(str(last))(inputs), targets.cameras, mean_color(inputs))
+        shown = render(load(str(last))(inputs), targets.cameras, inputs.mean_color())
     expected = psnr(shown.image.clamp(0, 1), targets.images).mean().item()
     assert found["test/procedural/post0/psnr"] == pytest.approx(expected, rel=1e-4)
     options = [*overrides_of_today(), "logger=none", "data.test_sets=null", "callbacks.costs=null"]

@@ -9,7 +9,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 
-from asysplat import mean_color, open_photographs, render
+from asysplat import open_photographs, render
 from asysplat.data import FilesSource, SceneOptions
 from asysplat.data.datamodule import collate, load
 from asysplat.evaluation.baselines import mean_color_images, nearest_view_images
@@ -87,6 +87,6 @@ def test_the_order_of_the_photographs_does_not_matter(module, shared):
     for order in (range(8), (7, 2, 5, 0, 3, 6, 1, 4), (3, 1, 7, 6, 0, 2, 5, 4)):
         with torch.no_grad():
             gaussians = module.net(inputs.select(order))
-            image = render(gaussians, held_out.cameras, mean_color(inputs), depth=False).image
+            image = render(gaussians, held_out.cameras, inputs.mean_color(), depth=False).image
         found.append(psnr(image.clamp(0, 1), held_out.images).mean().item())
     assert max(found) - min(found) < 0.1
