@@ -8,6 +8,8 @@ import pytest
 PAGES = ("architecture", "benchmarks", "options", "questions", "scaling", "tables")
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", "examples/README.md", "data/README.md"]
 DOCUMENTS += [f"docs/{page}.md" for page in PAGES]
+WORD = r"(?<![\w/-])\w+(?![\w/-]|\.zip)"
+SOURCES = (".py", ".yaml", ".json")
 PLACES = r"`((?:asysplat|conf|sweeps|tests|docs|examples|data)/[\w./-]*)`"
 
 
@@ -20,6 +22,19 @@ def test_named_files_exist(repository, document):
     places = re.findall(PLACES, text)
     assert [place for place in places if not (repository / place).exists()] == []
     assert links or places
+
+
+def test_named_functions_and_options_exist(repository):
+    """Words in code font with an underscore or a capital within, anywhere but in a path."""
+    folders = ("asysplat", "conf", "docs", "examples", "tests")
+    files = [f for name in folders for f in (repository / name).rglob("*") if f.suffix in SOURCES]
+    files += [repository / "pyproject.toml", *repository.glob("*.py")]
+    known = {word for file in files for word in re.findall(r"\w+", file.read_text() + file.stem)}
+    for document in DOCUMENTS:
+        code = re.findall(r"`[^`\n]*`", (repository / document).read_text())
+        words = {word for text in code for word in re.findall(WORD, text)}
+        names = {word for word in words if re.search(r"\w_\w|[a-z][A-Z]", word)}
+        assert names <= known, (document, names - known)
 
 
 @pytest.mark.medium
