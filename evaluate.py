@@ -42,7 +42,7 @@ from asysplat.training.messages import exit_with_message, quiet_lightning
 from asysplat.training.runs import EVALUATION
 from asysplat.training.summary import print_evaluation, write_json
 
-Predictor = Callable[[Sample], Predict]  # of the scene of a sample
+Predictor = Callable[[Sample], Predict]  # prediction function for a sample's scene
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")

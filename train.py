@@ -108,4 +108,4 @@ if __name__ == "__main__":
         check_writable(logs_of(sys.argv), "paths.logs")
         OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
         OmegaConf.register_new_resolver("job_name", job_name, replace=True)
-        main()  # of a sweep, which SweepTable ends with how to resume
+        main()  # SweepTable ends a sweep with how to resume

@@ -104,7 +104,7 @@ def new_folder(path: Path, room: int) -> Path:
     make_folder(path.parent, "paths.logs")
     for folder in chain([path], (path.with_name(f"{path.name}-{n}") for n in count(2))):
         try:
-            folder.mkdir()  # of two processes, one succeeds
+            folder.mkdir()  # only one of two processes succeeds
         except OSError:
             make_folder(folder, "paths.logs")  # raises unless there is one
             continue

@@ -47,7 +47,7 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
             net = instantiate(model)
             if not isinstance(net, Network):
                 raise InputError(f"it is a {type(net).__name__}, not a network")
-        except Exception as error:  # of many kinds
+        except Exception as error:  # instantiate raises many kinds
             reason = input_error_behind(error) or repr(error.__cause__ or error).split("\\n")[0]
             raise InputError(
                 f"{config_path}: model cannot be built ({reason}): copy the run again."

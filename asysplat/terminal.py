@@ -8,7 +8,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-NAMES_SHARE = 1 / 3  # of the terminal's width: the most that the names of the rows take
+NAMES_SHARE = 1 / 3  # greatest share of the terminal's width for the names of the rows
 UNLIMITED = 10_000  # characters
 
 

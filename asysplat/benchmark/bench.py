@@ -40,11 +40,11 @@ OPERATORS = {  # the backend that is the baseline, and the sizes of the inputs
         {"batch": 1, "views": 4, "height": 32, "width": 32} | {"planes": 48, "neighbors": 3},
     ),
 }
-GAUSSIANS, SIDE = 5000, 96  # of the renderer's scene
+GAUSSIANS, SIDE = 5000, 96  # numbers of Gaussians, and of pixels a side, in the renderer's scene
 PRODUCTS = {
     call.default for call in (aten.mm, aten.addmm, aten.bmm, aten.baddbmm, aten.convolution)
 }
-ROWS = 20_000  # of which Adam updates half
+ROWS = 20_000  # rows of parameters, half of which Adam updates
 NETWORK, VIEWS, VIEW_SIDE = "asysplat_plane_sweep", 4, 64
 
 
@@ -106,7 +106,7 @@ class RecordProducts(TorchDispatchMode):
         self.calls: list[Run] = []
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        sizes = []  # of products [b, m, k] x [b, k, n]
+        sizes = []  # b, m, k, n of products [b, m, k] x [b, k, n]
         if func in PRODUCTS:
             self.calls.append(partial(func, *args))
         elif func._schema.name.startswith("aten::_scaled_dot_product"):

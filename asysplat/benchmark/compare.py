@@ -21,7 +21,7 @@ class Kind(NamedTuple):
     unit: str  # dB are compared by their difference, all others by their ratio
     worse: str  # words for a change
     better: str
-    min_change: float  # that counts, of the logarithm or in dB
+    min_change: float  # smallest change that counts, of the logarithm or in dB
     sign: int = 1  # where more is worse; -1 where less is
     any_machine: bool = True  # whether it may be compared with another machine's
 

@@ -61,7 +61,7 @@ def measure(options: DictConfig, console: Console) -> Result:
     """
     config = options.data
     height, width = config.views
-    frames = config.inputs + config.targets  # of a training task
+    frames = config.inputs + config.targets  # images of a training task
     count = max(1, config.frames // frames)
     with TemporaryDirectory() as folder:
         root = write_photographs(Path(folder) / "scene", config.frames, *config.photographs)

@@ -56,8 +56,8 @@ class Workload:
     """A network, its input and their precision."""
 
     net: Network  # with random weights
-    precision: str  # of PRECISIONS; bf16 by autocast
-    views: Views  # of one scene
+    precision: str  # key of PRECISIONS; bf16 by autocast
+    views: Views  # input views of one scene
 
     @property
     def device(self) -> torch.device:

@@ -55,11 +55,11 @@ BACKENDS = dict.fromkeys(SCANS, "chunked") | {ATTENTION: "sdpa", PLANE_SWEEP: RE
 ARGUMENTS = dict.fromkeys(SCANS, ()) | {ATTENTION: ("grid",)}
 ARGUMENTS[PLANE_SWEEP] = ("planes", "neighbors")
 # The plane sweep's scene: cameras on an arc before a slanted wall with a texture.
-SLANT = 0.3  # by which the wall is farther away, a unit to the right
-WAVES = 20  # of each color
+SLANT = 0.3  # depth that the wall gains with each unit to the right
+WAVES = 20  # sine waves in each color channel
 
 Tensors = dict[str, Tensor]
-Sizes = Mapping[str, int]  # of the inputs, as SHAPES names them, and the operator's arguments
+Sizes = Mapping[str, int]  # sizes of the inputs, named as in SHAPES, and the operator's arguments
 
 
 def make_inputs(operator: str, sizes: Sizes) -> Tensors:
@@ -104,10 +104,10 @@ def _make_views(batch: int, views: int, height: int, width: int) -> Tensors:
 class Path:
     """A backend of an operator, with inputs."""
 
-    operator: str  # of `asysplat.ops`
+    operator: str  # name in `asysplat.ops`
     sizes: Sizes
     backend: str
-    inputs: Tensors  # that require gradients
+    inputs: Tensors  # tensors that require gradients
     weights: Tensor  # the gradient of the output, from a normal distribution
 
     def run(self) -> Tensor:

@@ -55,11 +55,11 @@ WHOLE = {"views", "side", "max_gaussians", "views_at_once", "steps"}  # numbers 
 BASE = "base"  # the setting that each knob changes
 EXACT = "fp64"
 SIZES = {"inputs": 16, "targets": 4}  # most views of a scene, unless its family says otherwise
-FRAMES = 96  # of a procedural scene
+FRAMES = 96  # frames of a procedural scene
 PROCEDURAL = {"room": "rooms", "outdoors": "outdoors"}  # test scenes, by their `places`
 REAL = ("fern", "fox", "hololens-000", "mydesk")  # folders of data/; others may be there, too
 HELD_OUT_EVERY = 8
-MIN_SQUARED_ERROR = 1e-20  # of images that are equal: 200 dB, as JSON has no infinity
+MIN_SQUARED_ERROR = 1e-20  # error of equal images: 200 dB, as JSON has no infinity
 # The PSNR after so many seconds depends on the load of the machine: half of 0.5 dB, and of LPIPS.
 NOISE_OF_SECONDS = {"psnr": 0.25, "lpips": 0.02}
 WATCHED = Watched(
@@ -101,14 +101,15 @@ class FeedForward:
     """A network's prediction, with some of its Gaussians merged or left out, rendered."""
 
     views: int  # input views
-    side: int  # of the input views, pixels
+    side: int  # side of the input views, in pixels
     checkpoint: str | None = "shipped"  # see `load`; None: untrained
-    overrides: Sequence[str] = ()  # of train.py; with a checkpoint they may change no weights
-    precision: str = "fp32"  # of the network: fp32, bf16 by autocast, or fp64, for all else too
+    # Overrides of train.py; with a checkpoint they may change no weights.
+    overrides: Sequence[str] = ()
+    precision: str = "fp32"  # fp32; bf16: the network by autocast; fp64: the network and all else
     min_opacity: float = 0.0  # below which Gaussians are dropped
     cell: float | None = None  # pixels: Gaussians in a cell are merged; None: none are
     max_gaussians: int | None = None  # cells grow until so few are left
-    sh_degree: int | None = None  # of the rendered colors; None: all
+    sh_degree: int | None = None  # greatest SH degree rendered; None: all
     views_at_once: int | None = None  # rendered; None: all
     convention: Mapping[str, float] = field(default_factory=dict)  # fields of `Convention`
 
@@ -154,7 +155,7 @@ class Refined:
     """A start and a refinement of so many steps or seconds, rendered."""
 
     views: int | None  # input views; None: all, as they are
-    side: int | None  # of the input views, pixels; None with `views`
+    side: int | None  # side of the input views, in pixels; None with `views`
     steps: int | None = None  # every round gives the same bits; 0: the start alone
     seconds: float | int | None = None  # in place of steps
     init: str = "plane_sweep"  # see `initial_gaussians`; the network is the shipped one

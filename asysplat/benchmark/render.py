@@ -39,7 +39,7 @@ class Backend(NamedTuple):
     """A renderer."""
 
     name: str
-    device: torch.device = CPU  # of its tensors
+    device: torch.device = CPU  # device of its tensors
     culling: tuple[str, ...] = ()  # names of the culling that can be switched off
 
 
@@ -50,8 +50,8 @@ class Outputs(NamedTuple):
     """The results of both passes."""
 
     image: Tensor  # [V, 3, H, W]
-    gradients: tuple[Tensor, ...]  # of each of FIELDS
-    seconds: dict[str, float]  # of "forward" and "backward"
+    gradients: tuple[Tensor, ...]  # gradients of FIELDS, in that order
+    seconds: dict[str, float]  # durations of "forward" and "backward"
     stats: dict[str, int]
 
 

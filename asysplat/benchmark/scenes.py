@@ -11,7 +11,7 @@ from asysplat.scene import Cameras, Gaussians
 Sample = Callable[..., Tensor]
 Scene = tuple[Gaussians, Cameras]
 
-FOCAL = 0.9  # of the image's width
+FOCAL = 0.9  # focal length, in image widths
 DISTANCE = 4.0  # from the camera to pixel-aligned Gaussians
 ARC = 0.5  # radians
 

@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
-GAMMA = 2.2  # of images, about that of sRGB
+GAMMA = 2.2  # gamma of images, about that of sRGB
 
 
 @dataclass(frozen=True)

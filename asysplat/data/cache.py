@@ -16,7 +16,7 @@ import numpy as np
 from numpy import ndarray
 
 GIGABYTE = 2**30
-SHARE_AFTER_CLEARING = 0.9  # of the limit of a full disk cache
+SHARE_AFTER_CLEARING = 0.9  # share of the limit to which a full disk cache is cleared
 
 
 class ImageCache:

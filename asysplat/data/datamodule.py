@@ -26,8 +26,8 @@ from asysplat.data.sources import Source, Task
 from asysplat.errors import InputError
 from asysplat.scene import Views
 
-MAX_DRAWS = 10  # of scenes for one task, with on_bad_scene=skip
-MAX_LOADED_BYTES = 2**30  # of images that a set of fixed tasks keeps in memory
+MAX_DRAWS = 10  # scenes drawn for one task, with on_bad_scene=skip
+MAX_LOADED_BYTES = 2**30  # size of the images that a set of fixed tasks keeps in memory
 # scene: name, inputs: Views, targets: Views, prune: bool; a batch has lists of names
 Sample = dict[str, Any]
 

@@ -25,7 +25,7 @@ def depths_of_points(points: Points, cameras: Cameras) -> Float[Tensor, "V H W"]
     points = torch.as_tensor(points, dtype=torch.float64)
     exact = cameras.to(torch.float64)
     inverse = torch.zeros(cameras.num_views, cameras.height, cameras.width)
-    for view, nearest in enumerate(inverse):  # of every pixel, the greatest inverse depth
+    for view, nearest in enumerate(inverse):  # every pixel's greatest inverse depth
         (pixels,), (depth,), (inside,) = exact.select([view]).project(points)
         x, y = pixels[inside].long().unbind(-1)
         index, values = y * cameras.width + x, (1 / depth[inside]).float()

@@ -32,8 +32,8 @@ from asysplat.scene import Cameras, Views
 
 # A scene is moved if its cameras are this far from the origin, in units and in their extent.
 FAR = 100.0
-MIN_EXTENT = 1e-9  # of their distance from the origin: less is rounding
-MAX_DISTANCE = 1e8  # at which that can still be one position
+MIN_EXTENT = 1e-9  # cameras' extent over their distance from the origin: less is rounding
+MAX_DISTANCE = 1e8  # distance up to which cameras within MIN_EXTENT may be in one place
 Points = Float[ndarray, "P 3"]
 Load = Callable[[ImageFile], ndarray]
 
@@ -44,7 +44,7 @@ class ImageSequence(Protocol):
 
     name: str  # unique within the data set
     num_images: int
-    cameras: Cameras  # of all images, [num_images, ...]
+    cameras: Cameras  # cameras of all images, [num_images, ...]
 
     def views(self, indices: Sequence[int]) -> Views:
         """Return the images at `indices`, in that order: pixels in [0, 1], depths where known."""

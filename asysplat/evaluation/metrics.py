@@ -13,7 +13,7 @@ from asysplat.ops.precision import without_autocast
 
 MSE_FLOOR = 1e-10  # PSNR of identical images is 100 dB, not infinity
 SSIM_WINDOWS = {"gaussian": 11, "uniform": 7}  # pixels on a side
-SSIM_SIGMA = 1.5  # of the Gaussian window
+SSIM_SIGMA = 1.5  # standard deviation of the Gaussian window, in pixels
 SSIM_K2 = 0.03
 DELTA = 1.25
 

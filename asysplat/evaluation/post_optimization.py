@@ -36,8 +36,8 @@ class SceneResult:
     # "post<steps>" -> the seconds of the prediction and that many steps together and, where it can
     # be measured, their peak memory, gb.
     costs: dict[str, dict[str, float]] = field(default_factory=dict)
-    # Of each image: `images` (targets or inputs), `view`, `source` (post<steps> or a baseline) and
-    # its metrics.
+    # A row for each image: `images` (targets or inputs), `view`, `source` (post<steps> or a
+    # baseline) and its metrics.
     rows: list[ImageRow] = field(default_factory=list)
     early_exit: dict[str, float] = field(default_factory=dict)  # shares left out, see `Network`
 

@@ -14,11 +14,11 @@ from asysplat.rendering.reference.project import rotations
 from asysplat.scene import Cameras, Gaussians
 
 ROUNDING = 1e-6  # relative to coordinates, or in radians; smaller differences are rounding
-# Of paths along the cameras.
-MAX_DETOUR = 1.5  # of the given order, over that of nearest neighbors
-SAMPLES = 2000  # of a path, before it is smoothed
+# Paths along the cameras.
+MAX_DETOUR = 1.5  # greatest length of the given order, over that of nearest neighbors
+SAMPLES = 2000  # samples of a path, before it is smoothed
 SMOOTHING = 0.02  # standard deviation of the Gaussian filter, over the path's length
-# Of orbits.
+# Orbits.
 PARALLEL = 0.01  # mean squared angle between axes and their mean, below it parallel: 6 degrees
 FOCUS_DISTANCE = 4.0  # in spreads of the cameras, if their axes do not meet
 MIN_UP_COSINE = 0.5  # between the world's up and the cameras' mean up: 60 degrees

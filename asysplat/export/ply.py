@@ -19,7 +19,7 @@ from asysplat.scene import Gaussians
 
 MEAN, NORMAL, COLOR = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
 SCALE, ROTATION = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
-REST_COUNTS = (0, 9, 24, 45)  # of properties f_rest_*, for SH of degree 0 to 3
+REST_COUNTS = (0, 9, 24, 45)  # numbers of properties f_rest_*, for SH of degree 0 to 3
 MAX_HEADER = 65536  # bytes in which an offset is searched
 OFFSET = "comment offset"
 MAX_OPACITY = 1 - 1e-7  # the logit of 1 is infinite

@@ -18,7 +18,7 @@ TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4"
 TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"}
 TYPES |= {"uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
 MAX_LINE = 4096  # bytes of a header's line: other files may have no lines
-# Of an element, as declared by the header: name, number of rows, and numpy's type by property,
+# An element as the header declares it: name, number of rows, and numpy's type by property,
 # None for a list.
 Element = tuple[str, int, dict[str, str | None]]
 
@@ -59,7 +59,7 @@ def read_vertices(path: Path) -> ndarray:
         if byte_order:
             return np.fromfile(file, row, count)
         try:
-            with warnings.catch_warnings():  # of no line at all
+            with warnings.catch_warnings():  # loadtxt warns if no line is left
                 warnings.simplefilter("ignore", UserWarning)
                 rows = np.loadtxt(file, row, comments=None, max_rows=count, ndmin=1)
         except ValueError as error:

@@ -19,12 +19,12 @@ from asysplat.motion import fit_similarity, transform
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians
 
-CAMERAS = ".cameras.json"  # beside <scene>.ply, a transforms.json; or a COLMAP model in
-MODEL = "sparse/0"  # the folder <scene>/
-MAX_RESIDUAL = 0.1  # of the fit of cameras, as a share of their spread
-MAX_NAMES = 5  # of the data's scenes, in a message
-# A view shows nothing if it has Gaussians in a smaller share of its pixels, at a height and width
-# of COVERAGE_SIZE; half of the views must show something.
+CAMERAS = ".cameras.json"  # suffix of <scene>.cameras.json beside <scene>.ply, a transforms.json
+MODEL = "sparse/0"  # COLMAP model in the folder <scene>/, in place of <scene>.cameras.json
+MAX_RESIDUAL = 0.1  # greatest residual of fitted cameras, as a share of their spread
+MAX_NAMES = 5  # scene names of the data in a message
+# A view shows nothing if it has Gaussians in a smaller share of its pixels, at a height and
+# width of COVERAGE_SIZE; half of the views must show something.
 MIN_COVERAGE, COVERAGE_SIZE = 0.01, 64
 VISIBLE = 0.05  # alpha of a pixel that has Gaussians
 NamedPoses = list[tuple[str, Float[ndarray, "4 4"]]]

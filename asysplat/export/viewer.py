@@ -50,9 +50,9 @@ MIN_IN_VIEW = 0.5  # share of the Gaussians that its cameras see, if they are th
 MAX_SAMPLES = 10_000  # pixels from which the range of disparities is computed
 WAITING = "Waiting for the first rendering; kernels may have to compile, for minutes."
 POLL_SECONDS = 0.01  # between two checks for changes
-TARGET_SECONDS = 0.05  # of a rendering while something changes
+TARGET_SECONDS = 0.05  # target duration of a rendering while something changes
 REST_SECONDS = 0.2  # without a change, before rendering at full resolution
-MIN_PIXELS, MAX_PIXELS = 320 * 200, 1920 * 1080  # of a rendering
+MIN_PIXELS, MAX_PIXELS = 320 * 200, 1920 * 1080  # bounds of a rendering's size
 
 
 @dataclass
@@ -60,9 +60,9 @@ class Page:
     """The rendering state of an open page."""
 
     state: object = None  # what was rendered last
-    pixels: int = MAX_PIXELS // 16  # of a rendering while something changes
+    pixels: int = MAX_PIXELS // 16  # size of a rendering while something changes
     due: float = math.inf  # time of the rendering at full resolution
-    seconds: float = 0.0  # of the last such rendering
+    seconds: float = 0.0  # duration of the last rendering at full resolution
 
 
 class Viewer:

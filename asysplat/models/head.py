@@ -19,11 +19,11 @@ from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Gaussians, Views
 
 # With a prior the network's corrections are bounded: on scenes unlike those of its training it is
-# wrong more often than the prior. In logits of the place in the head's range,
-MAX_DEPTH_CORRECTION = 0.01  # at confidence 0: more makes surfaces rough,
-CONFIDENT_FACTOR = 0.3  # times that at confidence 1,
-MAX_DEPTH_WITHOUT_PRIOR = 10.0  # and in scenes without any known depth;
-MAX_SIZE_CORRECTION = 1.0  # in logarithms
+# wrong more often than the prior. Depth corrections are in logits of `depth_fraction`.
+MAX_DEPTH_CORRECTION = 0.01  # greatest depth correction at confidence 0; more makes surfaces rough
+CONFIDENT_FACTOR = 0.3  # factor of MAX_DEPTH_CORRECTION at confidence 1
+MAX_DEPTH_WITHOUT_PRIOR = 10.0  # greatest depth correction in scenes without any known depth
+MAX_SIZE_CORRECTION = 1.0  # greatest correction of a size, in logarithms
 
 
 class Decoded(NamedTuple):

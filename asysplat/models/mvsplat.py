@@ -19,8 +19,8 @@ from asysplat.scene import Cameras, Gaussians, Views
 STRIDE = 4  # pixels along a side of a feature
 WINDOWS = 2  # attention windows along a side of the feature maps
 TRANSFORMER_LAYERS = 6
-LEVELS, REFINE_LEVELS = 3, 5  # of the U-Nets over features and over pixels
-SCALE_RANGE = (0.5, 15.0)  # of Gaussians, in tenths of the sum of a pixel's sides
+LEVELS, REFINE_LEVELS = 3, 5  # levels of the U-Nets over features and over pixels
+SCALE_RANGE = (0.5, 15.0)  # scales of Gaussians, in tenths of the sum of a pixel's sides
 MAX_SH_DEGREE = 3
 
 

@@ -34,8 +34,8 @@ from asysplat.scene import Gaussians
 from asysplat.training.summary import write_json
 
 SCENE = "scene.safetensors"
-BYTES_PER_GAUSSIAN = 2 * 4 * 62  # of scene.ply and scene.safetensors, at most
-OTHER_BYTES = 20_000_000  # of figures and the video
+BYTES_PER_GAUSSIAN = 2 * 4 * 62  # size in scene.ply and scene.safetensors together, at most
+OTHER_BYTES = 20_000_000  # space for the figures and the video
 SHEET_ROWS = 4  # views in a contact sheet
 TABLE_ROWS = ("held_out", "inputs", "baseline/nearest_view", "baseline/mean_color")
 

@@ -9,8 +9,8 @@ from asysplat.refinement.isotropic import footprints
 from asysplat.scene import Cameras, Gaussians
 
 SPREAD = 0.5  # standard deviation of a Gaussian, in sides of the cell that it covers
-MIN_OPACITY, MAX_OPACITY = 0.05, 0.95  # of merged Gaussians, so that they keep a gradient
-CELL_GROWTH = 2**0.5  # by which cells grow until few enough Gaussians are left
+MIN_OPACITY, MAX_OPACITY = 0.05, 0.95  # range of merged opacities, so that they keep a gradient
+CELL_GROWTH = 2**0.5  # factor by which cells grow until few enough Gaussians are left
 
 
 def merge_cells(gaussians: Gaussians, cells: Float[Tensor, "N"]) -> Gaussians:

@@ -21,7 +21,7 @@ from asysplat.scene import Views
 
 MATCHED_SIDE = 400  # pixels of the shorter side, to check the cameras
 ANY_SIZE = 8  # pixels a side: to read cameras, before the size is known
-MAX_BYTES = 2 * 10**9  # of input views; a refinement takes about as much again
+MAX_BYTES = 2 * 10**9  # size of all input views; a refinement takes about as much again
 BYTES_PER_PIXEL = 15  # float32 RGB, and the same at half the size
 GIVEN = CameraOptions()
 
@@ -30,7 +30,7 @@ GIVEN = CameraOptions()
 class Photographs:
     """Views of one scene, and its sparse points if any, in the network's frame."""
 
-    name: str  # of the scene
+    name: str  # name of the scene
     inputs: Views
     held_out: Views | None
     input_files: list[str]
@@ -38,7 +38,7 @@ class Photographs:
     frame: Normalization  # the network's frame, in the world of the files
     points: Float[Tensor, "P 3"] | None
     total: int = 0  # photographs of the scene
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of that world, see `near_origin`
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # offset subtracted by `near_origin`
 
     def all_views(self) -> Views:
         """Return the inputs and the held-out views as one, without depths."""

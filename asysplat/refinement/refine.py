@@ -39,7 +39,7 @@ class RefinementProgress:
     """Progress of a refinement."""
 
     step: int  # steps so far
-    share: float  # of the refinement that is done, in [0, 1]
+    share: float  # share of the refinement that is done, in [0, 1]
     seconds: float  # since its start
     psnr: float  # mean over the last steps, one for each input image, each before its update
     gaussians: int  # their number
@@ -93,7 +93,7 @@ class Refinement:
         settings, views = self.settings, self._views(share)
         chosen = list(islice(self._view_order, settings.views_per_step or views.num_views))
         leaves, cool_down = self.fields.leaves(), settings.cool_down
-        # Of all rates: 1, then down to `decay` over the cool-down.
+        # The factor of the rates: 1, then down to `decay` over the cool-down.
         cooled = max(0.0, (share - 1 + cool_down) / cool_down) if cool_down else 0
         factor = settings.decay**cooled
         error, gradients = 0.0, None

@@ -9,22 +9,22 @@ from asysplat.errors import InputError
 
 Densify = Literal["error", "mcmc", "gradient", "none"]
 Unit = Literal["pixel", "scene"]
-PIXELS_PER_GAUSSIAN = 8  # of the input images, at least: with fewer, Gaussians fit noise
+PIXELS_PER_GAUSSIAN = 8  # input pixels for each Gaussian, at least: with fewer, Gaussians fit noise
 
 
 @dataclass(frozen=True)
 class Rates:
     """Learning rates of Adam; with 0 a field is not optimized and costs nothing."""
 
-    means: float = 0.4  # in `unit`
+    means: float = 0.4  # rate of means, in `unit`
     unit: Unit = "pixel"  # its size at the Gaussian; "scene": the farthest camera's distance
-    quats: float = 8e-3  # of unit quaternions
-    scales: float = 0.04  # of log scales
-    opacities: float = 0.4  # of opacity logits
-    sh: float = 0.02  # of SH of degree 0
-    sh_rest: float = 0.05  # of higher degrees, times `sh`
-    exposure: float = 0.0  # of a log gain and an offset per channel of each image
-    poses: float = 0.0  # of each image's rotation, in radians, and position, in the scene's unit
+    quats: float = 8e-3  # rate of unit quaternions
+    scales: float = 0.04  # rate of log scales
+    opacities: float = 0.4  # rate of opacity logits
+    sh: float = 0.02  # rate of SH of degree 0
+    sh_rest: float = 0.05  # rate of SH of higher degrees, as a multiple of `sh`
+    exposure: float = 0.0  # rate of each image's log gain and offset per channel
+    poses: float = 0.0  # rate of each image's rotation, in radians, and position, in scene units
 
     def __post_init__(self):
         """Check the ranges."""
@@ -39,7 +39,7 @@ class Rates:
 class StepSchedule:
     """What happens every so many steps, not at shares of the refinement (Kerbl et al. 2023)."""
 
-    round: int = 100  # of densification
+    round: int = 100  # steps from one round of densification to the next
     first_round: int = 500
     opacity_reset: int = 3000  # to at most MAX_RESET_OPACITY
     sh_degree: int = 1000  # raised by one, from 0
@@ -69,13 +69,13 @@ class RefinementSettings:
     densify: Densify = "error"
     # Lower if all input images have fewer than 8 pixels for each; None: no other limit.
     max_gaussians: int | None = 150_000
-    initial: float = 0.19  # share of them to start with, at most
-    rounds: int = 12  # of densification, each of which multiplies their number by the same factor
+    initial: float = 0.19  # share of max_gaussians to start with, at most
+    rounds: int = 12  # densification rounds; each multiplies the Gaussian count by the same factor
     until: float = 0.6  # initial share of the refinement with densification
-    every: StepSchedule | None = None  # of densification "gradient"; None: `rounds`, evenly
-    decay: float = 0.05  # factor of all rates at the end of the cool-down
-    decay_means_alone: bool = False  # not of the other rates
-    cool_down: float = 0.5  # last share of the refinement
+    every: StepSchedule | None = None  # schedule of densify="gradient"; None: `rounds`, evenly
+    decay: float = 0.05  # factor of the rates at the end of the cool-down
+    decay_means_alone: bool = False  # True: only the rate of means decays
+    cool_down: float = 0.5  # last share of the refinement, in which the rates fall
     # Steps with each input image that end it, whatever time is left: more would fit noise.
     max_steps_per_image: int | None = 400
 

@@ -26,7 +26,7 @@ CAMERA, CAMERA_GRADIENT = 20, 16
 WHITEN_TO_LOG2 = math.sqrt(0.5 / math.log(2))  # exp(-x^2 / 2) = 2^-(WHITEN_TO_LOG2 x)^2
 
 # Margins of culling: rounding never removes a splat from a pixel that shows it.
-EXPONENT_MARGIN = 1e-3  # of log2 alpha
+EXPONENT_MARGIN = 1e-3  # margin of log2 alpha
 PIXEL_MARGIN = 1e-3
 
 # Pixels. A center farther from the image's corner is stored as an offset from this position.

@@ -15,7 +15,7 @@ from asysplat.rendering.chunks import draw_in_chunks
 from asysplat.rendering.interface import INRIA, Convention, Culling, RenderOutputs, RenderSettings
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
-DEPTH_SWITCH = {True: "expected", False: None}  # of depth=True and depth=False
+DEPTH_SWITCH = {True: "expected", False: None}  # meanings of depth=True and depth=False
 MIN_ALPHA = 1e-6  # avoids division by 0; an alpha below 1/255 is exactly 0
 
 

@@ -20,7 +20,7 @@ class RankAgreement(NamedTuple):
     """The agreement of our order of the rows with the paper's."""
 
     rho: float | None  # Spearman's; None below three rows, and where all rows are equal
-    rows: int  # that have both numbers
+    rows: int  # rows that have both numbers
     # Standard deviation between the rows' means, over the one that such means of equal rows would
     # have by their seeds alone: the root of the F statistic, about 1 where rows are equal. None
     # where every row has a single seed.

@@ -22,7 +22,7 @@ class Column:
     key: str  # "parameters", "gflops", ..., or "<test set>/<metric>" such as "dl3dv/psnr"
     kind: str  # as printed, such as "PSNR"
     better: str | None  # "higher" or "lower"; None if neither is
-    format: str  # of one number in `unit`, as for str.format
+    format: str  # format of one number in `unit`, as for str.format
     unit: float = 1.0  # the value of the unit in `kind`, such as 1e6 for (M)
 
     @property
@@ -53,7 +53,7 @@ class PaperRow:
     # Column key -> the bound that the paper prints in place of a number: "<1"
     bounds: dict[str, str] = field(default_factory=dict)
     post_optimization: int = 0  # steps on the Gaussians; such rows need evaluate.py
-    test_set: str | None = None  # of our run, in place of the one that `our_sets` gives
+    test_set: str | None = None  # test set of our run, in place of the one from `our_sets`
     also: tuple[str, ...] = ()  # overrides of other runs that fill the row where `run` has none
     unverified: str | None = None  # why its architecture may differ from the paper's
     # The other architectures that the paper's text allows: name -> overrides
@@ -63,10 +63,10 @@ class PaperRow:
     reading_costs: tuple[Costs, ...] = ()  # one for each of `readings`, or empty if not requested
     # Column key -> measured numbers, one for each seed; a column without any is left out
     values: dict[str, list[Number]] = field(default_factory=dict)
-    seeds: tuple[int, ...] = ()  # of the runs
-    revisions: tuple[str, ...] = ()  # of the code of the runs, see `asysplat.training.revision`
+    seeds: tuple[int, ...] = ()  # seeds of the runs
+    revisions: tuple[str, ...] = ()  # revisions of their code, see `asysplat.training.revision`
     note: str = ""  # a remark on this row, such as "seeds still to run: 2"
-    options: tuple[str, ...] = ()  # that the note ends with; those that matter most first
+    options: tuple[str, ...] = ()  # options that end the note, the most important first
 
     @property
     def label(self) -> str:
@@ -108,7 +108,7 @@ class PaperTable:
     rank_by: str | None = None  # key of the column whose order is compared with the paper's
     claims: tuple[Claim, ...] = field(default=(), repr=False)  # in place of columns and rows
 
-    # Of our numbers
+    # Our numbers
     sets: dict[str, str] = field(default_factory=dict)  # the paper's test set -> ours
     memory: str = ""  # what the runs measured of MEMORY; "" without runs
     metrics: tuple[str, ...] = ()  # the protocols, a sentence for each; several if runs differ

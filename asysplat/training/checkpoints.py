@@ -19,7 +19,7 @@ from asysplat.training.old_names import upgrade_checkpoint
 from asysplat.training.run_config import flat_options
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_plane_sweep.safetensors"
-LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # of a run, to resume from
+LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # checkpoints of a run to resume from
 # Options that change no weight.
 WITHOUT_EFFECT = ("ckpt_path", "paths.", "callbacks.", "trainer.num_sanity_val_steps")
 
@@ -82,7 +82,7 @@ def _damage(path: Path) -> str | None:
     try:
         with zipfile.ZipFile(path) as parts:
             damaged = parts.testzip()  # torch itself compares no checksums
-    except Exception:  # of many kinds in zipfile
+    except Exception:  # zipfile raises many kinds
         return "cannot be read as a checkpoint"
     return None if damaged is None else f"is damaged, at {damaged}"
 

@@ -58,7 +58,7 @@ class SplattingModule(lightning.LightningModule):
         self.net, self.loss = net, loss
         self.optimizer, self.schedule = optimizer, schedule
         self.views_at_once, self.drop_above = views_at_once, drop_above
-        self.parts = Parts()  # of a step, timed by a callback
+        self.parts = Parts()  # parts of a step, timed by a callback
         self._side_by_side = SideBySide(net, self.compute_terms, self.parts)
         self._step_means = StepMeans(net)
         fixed = None if background == "inputs" else torch.tensor(background)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-FORMAT = 4  # of the files of a run; raise it with every line that is added below
+FORMAT = 4  # version of the files of a run; raise it with every line that is added below
 
 CLASSES = {
     "asysplat.models.SceneSkips": "asysplat.models.EarlyExit",
@@ -25,7 +25,7 @@ CLASSES = {
     "asysplat.training.callbacks.SkippedScenes": "asysplat.training.callbacks.BadScenes",
     "asysplat.training.callbacks.Watch": "asysplat.training.callbacks.TrainingMonitor",
 }
-KEYS = {  # of the configuration; a new name has the same parent
+KEYS = {  # keys of the configuration; a new name has the same parent
     "callbacks.guard": "non_finite_steps",
     "callbacks.pictures": "figures",
     "callbacks.skips": "bad_scenes",

@@ -52,9 +52,9 @@ class TrainingStage:
     """A stage of a run."""
 
     config: DictConfig
-    weights: str | None  # to start from, as `init_path` names them
-    checkpoint: Path | None  # to resume from
-    earlier: Results  # of the stages before it
+    weights: str | None  # weights to start from, as `init_path` names them
+    checkpoint: Path | None  # checkpoint to resume from
+    earlier: Results  # results of the stages before it
 
     def prepare(
         self, data: SceneDataModule, module: SplattingModule, early_exit: EarlyExit | None
@@ -86,7 +86,7 @@ class TrainingStage:
         cut_events(folder, notes["event_files"] if resumes else {})
         try:
             logger = instantiate(config.logger)
-        except InstantiationException as error:  # of an optional package
+        except InstantiationException as error:  # an optional package is missing
             raise InputError(f"logger: {error.__cause__}") from error
         callbacks = instantiate(config.get("callbacks") or {})
         callbacks = {name: each for name, each in callbacks.items() if each is not None}
@@ -121,8 +121,8 @@ class PreparedRun:
 
     config: DictConfig
     described: Results  # see `describe_run`
-    stages: Sequence[TrainingStage]  # that are still to be trained
-    results: Results  # of the stages that are finished
+    stages: Sequence[TrainingStage]  # stages that are still to be trained
+    results: Results  # results of the stages that are finished
 
     def record(
         self, stage: TrainingStage, trainer: lightning.Trainer, callbacks: Callbacks

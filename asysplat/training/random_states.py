@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-RandomStates = dict[str, Any]  # of tensors and plain values: a checkpoint is read with weights_only
+RandomStates = dict[str, Any]  # tensors and plain values: a checkpoint is read with weights_only
 
 
 def random_states() -> RandomStates:

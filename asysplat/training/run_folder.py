@@ -35,7 +35,8 @@ def run_folder(ckpt_path: str | None, runs: str, new: str) -> str:
         folder = Path(ckpt_path).parents[1]
     else:
         return new
-    run = folder.parent if (folder.parent / LOCK).exists() else folder  # of an earlier stage
+    # An earlier stage has its folder inside the run's.
+    run = folder.parent if (folder.parent / LOCK).exists() else folder
     return new if not has_checkpoints(folder) or (run / RESULTS).exists() else str(run)
 
 
@@ -90,6 +91,6 @@ def locked(folder: Path) -> Iterator[None]:
             ) from None
         except OSError:
             pass  # a network disk without locks
-        for partial in folder.rglob("checkpoints/.next.*.ckpt"):  # of a write that was killed
+        for partial in folder.rglob("checkpoints/.next.*.ckpt"):  # leftovers of killed writes
             partial.unlink()
         yield

@@ -46,8 +46,8 @@ class Run:
     folder: Path
     config_hash: str  # by today's code, see the function `config_hash`
     seed: int
-    revision: str  # of the code that made it
-    results: dict[str, Any]  # of metrics.json and, if there is one, evaluation.json
+    revision: str  # revision of the code that made it
+    results: dict[str, Any]  # content of metrics.json and, if there is one, evaluation.json
 
     def agrees(self, data: Mapping[str, str]) -> bool:
         """Return whether the run and `data` (see `data_of`) contradict each other nowhere."""

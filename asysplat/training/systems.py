@@ -17,7 +17,7 @@ SYSTEM = "evaluation/system"
 TESTED = "tested/"
 # Options of the data that choose the images of a test, and their size.
 IMAGES = ("inputs", "targets", "height", "width", "selection")
-IMAGES += ("num_images", "test_scenes", "places")  # of procedural scenes
+IMAGES += ("num_images", "test_scenes", "places")  # options of procedural scenes
 
 
 def describe_system(config: DictConfig, scenes: Path, system: str | None) -> dict[str, Any]:

@@ -16,7 +16,7 @@ CHOICES = (
 )
 EVENTS = "events.out.tfevents.*"
 HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
-TICKED = 5  # of the options: those that TensorBoard's hparams tab shows at first
+TICKED = 5  # number of options that TensorBoard's hparams tab shows at first
 FIRST = ("train", "val", "test", "steps")  # groups of cards
 # In the group "steps", so that losses and metrics are the first cards of "train".
 OF_STEPS = ("learning_rate", "grad_norm", "non_finite_steps", "bad_scenes")

@@ -10,7 +10,7 @@ from asysplat.scene import Cameras, Gaussians
 ALPHA_ROUNDING = 1e-5  # relative, ten times the error of float32
 # The transmittance accumulates the rounding of 1 - alpha, up to 100 times that of alpha.
 TRANSMITTANCE_ROUNDING = 1e-3
-ROWS = 8  # of pixels at a time
+ROWS = 8  # rows of pixels at a time
 
 
 @torch.no_grad()

@@ -21,7 +21,7 @@ RULE = (
     f"the last place of the result. R = {ROUNDINGS**0.5:g}, a random walk of {ROUNDINGS} "
     "roundings; for a network in fp32 32, of 1,024"
 )
-NEGLIGIBLE = 1e-12  # of all gradients: a smaller one that consists of noise is 0 in truth
+NEGLIGIBLE = 1e-12  # share of all gradients: a smaller one that consists of noise is 0 in truth
 
 Tensors = dict[str, Tensor]
 Function = Callable[[Tensors], Tensors]

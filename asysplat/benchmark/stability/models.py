@@ -23,12 +23,12 @@ from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.scene import Cameras, Views
 
 MIN_INVERSE_DEPTH = 1e-30  # avoids division by 0 where the plane sweep finds nothing
-WILD, WILD_FACTOR = "wild weights", 1e4  # of the decoder, as after a failed training
+WILD, WILD_FACTOR = "wild weights", 1e4  # factor of the decoder, as after a failed training
 # Views for 16 bits.
 HALF = ("black photographs", "noise photographs", "poses kilometers apart")
 HALF += ("fisheye-like focal lengths", "telescopic focal lengths")
-# Of the 3,600 operations that round in both passes of the laptop's network; in half precision only
-# products round.
+# Roundings in sequence, of the 3,600 operations that round in both passes of the laptop's
+# network; in half precision only products round.
 NETWORK_ROUNDINGS = 1024
 
 

@@ -30,8 +30,8 @@ from asysplat.scene import Gaussians, Views
 from asysplat.training.module import SplattingModule
 
 SMALL = ("width=0.125", "state_size=8", "model.layers=1m1s")
-COUNTS = (1, 2, 4)  # of views
-DEPTHS = (0.0, 1e-3, DISTANCE, 1e6)  # of all pixels; 0 is unknown
+COUNTS = (1, 2, 4)  # numbers of views
+DEPTHS = (0.0, 1e-3, DISTANCE, 1e6)  # depths of all pixels; 0 is unknown
 
 
 def training_cases(models: Sequence[str], steps: int) -> Iterator[StabilityCase]:

@@ -9,9 +9,9 @@ from typing import Any
 import pycolmap
 from rich.progress import Progress
 
-ALL_PAIRS = 80  # photographs; of more, not all pairs are matched but
-FOLLOWING = 10  # each with so many that follow, and with those 16, 32, ... further on,
-ANCHORS = 40  # and so many, spread evenly, with each other: a sequence may return to a place
+ALL_PAIRS = 80  # greatest number of photographs of which all pairs are matched
+FOLLOWING = 10  # next photographs that each is matched with, besides those 16, 32, ... further on
+ANCHORS = 40  # evenly spread photographs that are all matched: a sequence may return to a place
 CHUNK = 8  # photographs, or that squared of pairs, between two updates of the progress bar
 SEED = 0
 

@@ -17,7 +17,7 @@ from asysplat.data.readers.common import beside
 from asysplat.data.readers.masks import FOLDER as MASKS
 from asysplat.files import check_room, make_folder
 
-ERRORS = "errors.json"  # of refined cameras
+ERRORS = "errors.json"  # file of the errors of refined cameras
 KEPT = ("images", MASKS, ERRORS)
 JPEG_QUALITY = 95
 BYTES_PER_PHOTOGRAPH = 10_000_000  # features and matches take up to 4 MB, and a copy as much

@@ -31,8 +31,8 @@ from asysplat.data.readers import colmap
 from asysplat.data.readers.common import inverted
 from asysplat.data.sequence import PosedImage, PosedScene
 
-ROUNDS = 2  # of triangulation and bundle adjustment
-LEAST_POINTS = 20  # that a photograph sees, for its pose to be refined
+ROUNDS = 2  # rounds of triangulation and bundle adjustment
+LEAST_POINTS = 20  # points that a photograph must see for its pose to be refined
 LEAST_OF_LENS = 10  # photographs of a lens, for its focal length and distortion to be refined
 
 
@@ -102,7 +102,7 @@ def _refine(
 ) -> pycolmap.Reconstruction:
     """Return a model with refined cameras of work/images/NAME; write its errors to `work`."""
     lenses = {name: image.lens for name, image in images.items()}
-    # Of a pinhole, the distortion is refined as well.
+    # The distortion of a pinhole is refined as well.
     models = {lens: "OPENCV" if "PINHOLE" in lens.model else lens.model for lens in lenses.values()}
     cameras = {lens: replace(lens, model=model).camera() for lens, model in models.items()}
     database = match_photographs(work, lenses, USUAL, progress, cameras)

@@ -20,9 +20,9 @@ from asysplat.scene import Cameras
 
 MAX_PAIRS = 12  # pairs of images, starting at evenly spaced images of the sequence
 FIRST_GAP = 4  # images between the two of a pair, at first
-MIN_MATCHES = 80  # of two images that show the same place
-MAX_MATCHES = 200  # of a pair, so that no pair outweighs the others
-MAX_KEYPOINTS = 2500  # of an image
+MIN_MATCHES = 80  # matches of two images that show the same place, at least
+MAX_MATCHES = 200  # matches kept of a pair, so that no pair outweighs the others
+MAX_KEYPOINTS = 2500  # keypoints of an image
 LOWE_RATIO = 0.8  # greatest distance to the best match, over the second best (Lowe, 2004)
 RANSAC_THRESHOLD = 1.5  # pixels to the epipolar lines of the pair's own fundamental matrix
 MIN_PARALLAX = 2.0  # pixels: if a camera moved, a tenth of the points is farther off a homography

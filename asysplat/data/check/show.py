@@ -19,11 +19,11 @@ from asysplat.data.selection.views import spread
 from asysplat.scene import Cameras
 
 WIDTH, PATH_HEIGHT, MAX_IMAGE_HEIGHT, TITLE_HEIGHT = 12.0, 5.0, 4.5, 0.3  # inches
-MAX_PAIRS = 3  # of images
+MAX_PAIRS = 3  # pairs of images that are drawn
 MAX_LINES = 10  # in a pair
 MAX_ARROWS = 60  # along the path
 MAX_POINTS = 5000  # sparse points, about
-POINT_QUANTILES = (0.05, 0.95)  # of the sparse points that the axes include
+POINT_QUANTILES = (0.05, 0.95)  # quantiles of the sparse points that the axes include
 MARGIN = 0.1  # around the path and the points, of their size
 
 

@@ -16,7 +16,7 @@ from asysplat.errors import InputError
 from asysplat.files import atomic_write
 
 BESIDE = "disparities"  # the folder inside a scene's own folder, if a user puts maps there
-LEVELS = 4095  # of a map: finer than any network's precision, and PNG packs 12 bits well
+LEVELS = 4095  # levels of a map: finer than any network's precision, and PNG packs 12 bits well
 
 
 def map_folder(scene: Path, cache: Path) -> Path:

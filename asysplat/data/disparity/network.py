@@ -9,7 +9,7 @@ from torch import nn
 from asysplat.errors import InputError
 
 MODEL = "LiheYoung/depth-anything-small-hf"  # the weights that Long-LRM trains with; Apache-2.0
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, RGB
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # statistics of ImageNet, RGB
 SHORT_SIDE = 518  # pixels of the shorter side in the network's training
 
 

@@ -11,7 +11,7 @@ from asysplat.data.procedural.floor_plan import TRIES, FloorPlan, any_material, 
 from asysplat.data.procedural.textures import Material
 
 UNDERGROUND = 0.5  # meters of a pole below the floor, as ground outdoors is not level
-GLOSSY_SHARE = 0.5  # of the materials
+GLOSSY_SHARE = 0.5  # probability that a material is glossy
 
 
 def add_clutter(plan: FloorPlan, rng: Generator) -> None:

@@ -18,9 +18,9 @@ ANGLE_ROUNDING = 1e-3  # radians, more than the error of computed angles
 MIN_GROUND_T = 0.5  # no ray meets the ground before this t, as cameras are at eye level
 
 Points = Float[Tensor, "3 R"]  # or directions
-Origins = Float[Tensor, "3 #R"]  # of rays, or one for all
+Origins = Float[Tensor, "3 #R"]  # origins of rays, or one for all
 PerRay = Float[Tensor, " R"]
-Index = Int[Tensor, "_"]  # of any length
+Index = Int[Tensor, "_"]  # any number of indices
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ SHADOW_OFFSET = 2e-3  # meters from a surface to the start of its shadow rays
 SPHERE_AXES = ((0.8, 0.1, 0.6), (-0.2, 0.95, 0.25))  # texture axes
 ZENITH = (0.25, 0.45, 0.9)
 HORIZON = (0.85, 0.9, 1.0)
-REFINE_STEPS = 8  # of the point where a ray meets the ground
+REFINE_STEPS = 8  # steps to refine the point where a ray meets the ground
 BLOCK = 64  # rays that torch sums at once, or a multiple
 SKY = -1  # its number as a surface
 

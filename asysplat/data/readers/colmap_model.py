@@ -15,7 +15,7 @@ import pycolmap
 from asysplat.errors import InputError
 
 CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
-POINT_FIELDS = 8  # of a line of points3D.txt before its track
+POINT_FIELDS = 8  # fields of a line of points3D.txt before its track
 
 
 def read_model(model: Path) -> pycolmap.Reconstruction:

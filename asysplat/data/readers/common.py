@@ -111,7 +111,7 @@ def scaled(lens: Lens, size: tuple[int, int], where: str) -> Lens:
     Raises:
         InputError: intrinsics of no lens, or an image of other proportions.
     """
-    # Of JSON, integers may be too large for a float.
+    # Integers from JSON may be too large for a float.
     (width, height), given = size, tuple(min(side, 10**9) for side in (lens.width, lens.height))
     numbers, longest = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion), max(given)
     usable = 0 < min(lens.fx, lens.fy) <= max(lens.fx, lens.fy) < MAX_FOCAL * longest

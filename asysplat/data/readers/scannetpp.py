@@ -37,7 +37,7 @@ EXTRACT = (
     "ffmpeg -i rgb.mkv -start_number 0 -q:v 1 rgb/frame_%06d.jpg"
 )
 ARKIT = "iphone/pose_intrinsic_imu.json"
-# Of each file of poses: its folders of images, masks and depths, and how to get the images.
+# For each file of poses: its folders of images, masks and depths, and how to get the images.
 PARTS = {
     "dslr/nerfstudio/transforms_undistorted.json": (
         *("resized_undistorted_images", "resized_undistorted_masks", None),

@@ -10,8 +10,8 @@ from threadpoolctl import threadpool_limits
 from asysplat.data.selection.views import Selection, Split, check_held_out, paper_split
 from asysplat.scene import Cameras
 
-DECIMALS = 5  # of positions and directions,
-FLOAT_NOISE = 1e-6  # relative, of distances: both are below the differences between cameras
+DECIMALS = 5  # decimals kept of positions and directions; cameras differ by more
+FLOAT_NOISE = 1e-6  # relative difference up to which distances count as equal
 
 
 def kmeans_selection(

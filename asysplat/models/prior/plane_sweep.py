@@ -35,9 +35,9 @@ from asysplat.scene import Cameras, Views
 
 PLANES = 48
 NEIGHBORS = 4
-LONGEST_SIDE = 128  # of the swept images, pixels: more than twice the planes
-FULL_CONTRAST = 0.5  # by which the best plane's costs, of four paths, are below the mean
-MIN_AGREEMENT = 0.5  # of a depth that counts for the range of the second sweep
+LONGEST_SIDE = 128  # greatest side of the swept images in pixels: more than twice the planes
+FULL_CONTRAST = 0.5  # contrast of a sure depth: mean minus least cost, summed over four paths
+MIN_AGREEMENT = 0.5  # agreement above which a depth counts for the second sweep's range
 CONTRADICTION = 2.0  # one contradicting view takes two thirds of the confidence
 LUMA = (0.299, 0.587, 0.114)
 
@@ -65,7 +65,7 @@ class PlaneSweepPrior(nn.Module):
         small = views.cameras.resized(*(max(1, side // factor) for side in (height, width)))
         images = shrink(views.images, small.height, small.width)
         ranges = None
-        if views.point_depths is not None:  # of each block of pixels the nearest point counts
+        if views.point_depths is not None:  # the nearest point in each block of pixels counts
             inverse = (views.point_depths > 0) / views.point_depths.clamp_min(1e-6)
             inverse = F.max_pool2d(inverse, factor).flatten(2)
             ranges = observed_range(inverse, inverse > 0)

@@ -13,10 +13,10 @@ from asysplat.scene import TensorRecord, Views
 
 PRIOR_CHANNELS = 2
 UNKNOWN_DISTANCE = 10**0.5  # the middle of PhotographHead's range
-VOTE_TOLERANCE = 0.05  # relative, of two inverse depths of the same surface
-COVER = 0.9  # opacity of a surface, over all views that confirm it,
-UNSURE_COVER = 0.7  # and where no depth is sure, over all views that may see it
-FREE_OPACITY = 1e-4  # where nothing is: too small to be drawn
+VOTE_TOLERANCE = 0.05  # greatest relative difference of two inverse depths of the same surface
+COVER = 0.9  # joint opacity of all views that confirm a surface
+UNSURE_COVER = 0.7  # joint opacity of all views that may see a point whose depth is not sure
+FREE_OPACITY = 1e-4  # opacity in free space, too small to be drawn
 SURROUNDINGS = 0.05  # weight of a pixel's surroundings against its own depth at full confidence
 
 

@@ -9,12 +9,12 @@ from torch import Tensor
 from asysplat.scene import Cameras
 
 SAMPLES = 6  # points along each side of a view that stand for all its pixels
-USEFUL_PARALLAX = 0.1  # in image widths: more adds nothing,
-WIDE_PARALLAX = 0.5  # and above this two views look too different
-MIN_SHARE = 0.2  # of a view that a neighbor must see at the nearest plane
+USEFUL_PARALLAX = 0.1  # parallax in image widths, beyond which more adds nothing
+WIDE_PARALLAX = 0.5  # parallax in image widths, beyond which two views look too different
+MIN_SHARE = 0.2  # share of a view that a neighbor must see at the nearest and farthest plane
 OUTLIERS = 0.02  # share of the known depths at either end that a range ignores
 MIN_POINTS = 16  # known depths that a range needs
-MARGIN = 1.5  # by which a range is wider: surfaces without texture have no known depth
+MARGIN = 1.5  # factor that widens a range: surfaces without texture have no known depth
 SUBPIXEL = 0.25  # error of a match, pixels
 
 

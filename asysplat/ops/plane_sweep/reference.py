@@ -14,12 +14,12 @@ UNMATCHED = 0.8  # greatest cost, that of unrelated patches or of a point that n
 SECOND = 0.15  # greatest cost of the second best neighbor over the best: it may not see the point
 NOISE = 3e-4  # variance of a patch without texture
 SMALL_STEP = 0.1  # SGM's penalty for one plane more or less than the pixel before
-LARGE_STEP = 1.0  # and for more than one plane,
-EDGE = 0.05  # which halves where the color changes by this
-MIN_WEIGHT = 0.05  # of a pixel's own costs
+LARGE_STEP = 1.0  # SGM's penalty for more than one plane, where the color does not change
+EDGE = 0.05  # color difference to the pixel before that halves LARGE_STEP
+MIN_WEIGHT = 0.05  # smallest weight of a pixel's own costs in SGM
 MIN_BEND = 1e-9  # curvature of a parabola that has a minimum
-TOLERANCE = 0.01  # relative, of two inverse depths that agree
-PIXELS_AT_ONCE = 2**20  # whose consistency is checked at a time
+TOLERANCE = 0.01  # relative difference up to which two inverse depths agree
+PIXELS_AT_ONCE = 2**20  # pixels whose consistency is checked at a time
 FRONT = 1e-6  # smallest depth in front of a camera, over the depth in the other
 
 

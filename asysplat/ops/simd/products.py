@@ -16,7 +16,7 @@ from asysplat.ops.simd.vectors import FLOATS, INTEGERS, LANES, ONE, check_range,
 
 HAS_32_VECTORS = bool(llvmlite.binding.get_host_cpu_features().get("avx512f", False))
 ROWS = 8 if HAS_32_VECTORS else 4
-BYTES = 4  # of a float32
+BYTES = 4  # size of a float32
 
 
 @inline

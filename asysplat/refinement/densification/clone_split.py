@@ -17,7 +17,7 @@ from asysplat.scene import Cameras
 
 DENSIFY_GRAD_THRESHOLD = 2e-4  # mean screen-space gradient, in half images
 SPLIT_SCALE = 0.011  # scale above which a Gaussian is split: 1 % of the scene extent of 1.1
-SPLIT_FACTOR = 1.6  # by which the two halves are smaller
+SPLIT_FACTOR = 1.6  # factor by which the two halves are smaller
 MAX_SCALE = 0.11  # above it a Gaussian is pruned, after the first opacity reset: 10 % of the extent
 MAX_RADIUS = 20.0  # likewise, in pixels of any image: three standard deviations
 MAX_RESET_OPACITY = 0.01

@@ -16,7 +16,7 @@ from asysplat.scene import Gaussians
 
 REGULARIZER = 0.01  # weight of the mean opacity, and of the mean scale
 NOISE = 80.0  # the paper's factor, 5e5, times its learning rate of means, 1.6e-4
-SHARPNESS = 100  # of the sigmoid of opacity that gates the noise
+SHARPNESS = 100  # steepness of the sigmoid of opacity that gates the noise
 NOISE_MAX_OPACITY = 0.1  # above it the gate is below 1e-4, and the noise is left out
 MAX_COPIES = 51  # Gaussians at one position for which Eq. 9 is evaluated, as in the paper's code
 

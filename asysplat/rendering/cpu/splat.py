@@ -58,14 +58,14 @@ class Frame(NamedTuple):
     """Sizes and settings for every kernel."""
 
     images: int  # views of all scenes
-    views: int  # of a scene
+    views: int  # views of a scene
     num: int  # Gaussians of a scene
-    blocks: int  # of an image
+    blocks: int  # blocks of Gaussians in an image
     block_size: int  # Gaussians
     height: int  # pixels
     width: int
-    columns: int  # of tiles
-    tiles: int  # of an image
+    columns: int  # tile columns of an image
+    tiles: int  # tiles of an image
     project: ProjectSettings
     raster: RasterSettings
 
@@ -118,7 +118,7 @@ class Row(NamedTuple):
 
     base: int  # where the row begins in a plane of the tile's state
     dy: np.float32  # from the splat's center down to the row
-    exponent: np.float32  # of 2 in alpha where u is 0
+    exponent: np.float32  # exponent of 2 in alpha where u is 0
     middle: np.float32  # u in the middle of the row
 
 

@@ -42,7 +42,7 @@ from asysplat.rendering.cuda.splat import GRADIENT
 
 LOG_2 = tl.constexpr(math.log(2))
 WHITEN_GRADIENT = tl.constexpr(math.log(2) * formulas.WHITEN_TO_LOG2)
-PAIRS = tl.constexpr(8)  # of a splat, summed at a time
+PAIRS = tl.constexpr(8)  # pairs of a splat that are summed at a time
 
 
 @kernel

@@ -25,13 +25,13 @@ class Frame(NamedTuple):
     """The sizes for the kernels."""
 
     images: int  # views of all scenes
-    views: int  # of a scene
+    views: int  # views of a scene
     num: int  # Gaussians of a scene
     sh_count: int  # coefficients
     height: int  # pixels
     width: int
-    columns: int  # of tiles
-    tiles: int  # of an image
+    columns: int  # tile columns of an image
+    tiles: int  # tiles of an image
 
     @property
     def grid(self) -> dict[str, int]:

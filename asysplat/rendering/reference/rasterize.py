@@ -150,7 +150,7 @@ class _Block:
         if self.median:
             grad_values[..., -1:] = self.median_weights() @ grad_output[:, -1:].mT
             values, grad_output = values[..., :-1], grad_output[:, :-1]
-        share = weights * (values @ grad_output)  # of each splat in grad_output . output
+        share = weights * (values @ grad_output)  # each splat's share of grad_output . output
         light_behind = share.sum(1, keepdim=True) - share.cumsum(1)
         # alpha dL/dalpha; 0 where alpha is clamped.
         grad = share.addcmul_(light_behind, self.alpha / self.passing, value=-1)

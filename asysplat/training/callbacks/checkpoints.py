@@ -100,8 +100,8 @@ class Checkpoints(ModelCheckpoint):
         self._save_last(trainer)
 
     def on_fit_end(self, trainer: Any, module: Any) -> None:
-        # The test is logged at this step. Lightning's count is one lower if it resumed from the end
-        # of a training: see `_begin_at_next_batch`.
+        # The test is logged at this step. Lightning's count is one lower if it resumed from the
+        # end of a training: see `_begin_at_next_batch`.
         trainer.fit_loop.epoch_loop._batches_that_stepped = trainer.global_step
 
     def _save_last(self, trainer: Any) -> None:

@@ -18,7 +18,7 @@ from asysplat.training.prediction import Prediction
 GIGA = 1e9
 PASSES = 3  # forward, and a backward of about twice its products; recomputation does not count
 MIN_ALPHA = 0.5  # the depth of a pixel with less coverage is not counted
-SAMPLES = 10_000  # of each validation scene and histogram, at least, if there are as many
+SAMPLES = 10_000  # values of a validation scene in a histogram, at least, if it has as many
 
 
 class TrainingMonitor(Callback):
@@ -44,7 +44,7 @@ class TrainingMonitor(Callback):
         self.measurements: list[dict[str, float]] = []
 
     def on_fit_start(self, trainer: Any, module: Any) -> None:
-        self.flops: int | None = None  # of a training scene, counted when first needed
+        self.flops: int | None = None  # FLOPs of a training scene, counted when first needed
         self.peak = peak_flops(module.device, trainer.precision)
         # The first step compiles kernels and is not counted.
         self.first_step, self.begin_step = trainer.global_step, None

@@ -31,8 +31,8 @@ class NonFiniteSteps(lightning.Callback):
     def __init__(self, budget: int = 10):
         self.budget = budget
         self.count, self.in_a_row = 0, 0
-        self.batches: list[tuple[dict[str, Any], RandomStates]] = []  # of the current step
-        self.buffers: list[Tensor] = []  # before the step
+        self.batches: list[tuple[dict[str, Any], RandomStates]] = []  # the step's micro-batches
+        self.buffers: list[Tensor] = []  # copies from before the step
 
     def state_dict(self) -> dict[str, Any]:
         return {"count": self.count, "in_a_row": self.in_a_row}

@@ -10,7 +10,7 @@ from rich import progress
 from rich.console import Console
 
 REFRESH_SECONDS = 0.2
-SPEED_SECONDS = 3600  # of training, from which the remaining time is estimated
+SPEED_SECONDS = 3600  # period of training from which the remaining time is estimated
 LINE_SECONDS, LINE_SHARE = 60, 0.01  # minimum time and share of the steps between two lines
 
 

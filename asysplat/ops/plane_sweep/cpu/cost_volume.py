@@ -80,7 +80,7 @@ def cost_planes(start, stop, inputs, costs):
     spans = np.empty((K, H, 2), np.int64)
     # The least cost of each pixel of two rows, and the one after.
     first, second = np.empty((2, W, LANES), np.float32), np.empty((2, W, LANES), np.float32)
-    # Of the patches of these rows.
+    # Offsets and scales of the patches in these rows.
     offsets, scales = np.empty((2, W), np.float32), np.empty((2, W), np.float32)
     along = np.empty((2, W + WINDOW - 1), np.float32)
     for block in range(start, stop):

@@ -15,7 +15,7 @@ from asysplat.ops.triton_utils import FUSED, INTERPRETED, kernel
 
 AROUND = tl.constexpr(reference.WINDOW // 2)
 EARLIER = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch
-SHARE = tl.constexpr(1 / reference.WINDOW**2)  # of a pixel in a patch
+SHARE = tl.constexpr(1 / reference.WINDOW**2)  # weight of a pixel in a patch's mean
 FRONT, NOISE = tl.constexpr(reference.FRONT), tl.constexpr(reference.NOISE)
 UNMATCHED, SECOND = tl.constexpr(reference.UNMATCHED), tl.constexpr(reference.SECOND)
 INFINITY = tl.constexpr(float("inf"))

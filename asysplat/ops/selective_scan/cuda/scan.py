@@ -11,8 +11,8 @@ from asysplat.ops.triton_utils import FUSED, INTERPRETED, check_size
 
 # Tokens of a chunk; the backward pass keeps all their states in registers.
 FORWARD_CHUNK, BACKWARD_CHUNK = (4, 4) if INTERPRETED else (16, 8)
-TILE = 256  # numbers of the state in a program,
-PASSED = 128  # and in one that passes states from chunk to chunk
+TILE = 256  # numbers of the state in a program
+PASSED = 128  # numbers of the state in a program that passes states from chunk to chunk
 WARP = {"num_warps": 1, **FUSED}  # no sum leaves a warp
 
 

@@ -14,9 +14,9 @@ from asysplat.ops.ssd.cuda.chunk import ROWS, sum_decays
 from asysplat.ops.ssd.cuda.forward import forward_chunk, pass_states, score_chunk
 from asysplat.ops.triton_utils import FUSED, INTERPRETED, check_size
 
-TOKENS = 16 if INTERPRETED else CHUNK  # of a chunk; the slow interpreter, too, runs several
+TOKENS = 16 if INTERPRETED else CHUNK  # tokens of a chunk; the slow interpreter, too, runs several
 BLOCK = 64  # columns of a state in a program
-HEADS = 8  # of a program that sums decays
+HEADS = 8  # heads in a program that sums decays
 LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}  # with fewer warps, fp32 products spill
 MAX_HEAD_DIM, MAX_STATE = 128, 256
 # The type of a product's factors: fp16 lacks the range of a state, TF32 has all of its bits.
