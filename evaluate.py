@@ -115,7 +115,6 @@ def load_network(config: DictConfig, device: torch.device) -> Network:
     load_weights(config.init_path, nn.ModuleDict({"net": net}))  # named as in a checkpoint
     net.to(device).eval()
     net.early_exit = instantiate(config.get("speed")) or EXACT  # absent in the oldest runs
-    net.check_early_exit(net.early_exit)
     print(f"model: {net.describe()}")
     return net
 

@@ -63,7 +63,7 @@ def reconstruct(config: DictConfig) -> None:
     config = continue_run(config, given_options())
     if OmegaConf.is_missing(config, "path"):
         raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
-    check_ranges(OmegaConf.masked_copy(config, ["speed", "video"]))
+    check_ranges(OmegaConf.masked_copy(config, "speed"))
     if not is_number(config.last_fit) or not 0 <= config.last_fit <= 1:
         raise InputError(f"last_fit={config.last_fit}: give a number from 0 to 1.")
     limit = read_limit(config)

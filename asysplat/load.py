@@ -61,7 +61,6 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
             config = compose("train", list(overrides))
         net = instantiate(config.model)
         net.early_exit = instantiate(config.speed)
-        net.check_early_exit(net.early_exit)
     weights = nn.ModuleDict({"net": net})  # named as in a checkpoint
     load_weights(checkpoint, weights, option="checkpoint")
     return net.eval()

@@ -91,8 +91,8 @@ class AsySplat(TokenNetwork):
     def tokens(
         self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()
     ) -> Float[Tensor, "B V h w d"]:
-        coarse = self.geometry["tokenizer"](pixels)
-        fine = self.appearance["tokenizer"](pixels)
+        coarse = self.geometry["tokenizer"](pixels)  # [B, V, H / p_c, W / p_c, d_1]
+        fine = self.appearance["tokenizer"](pixels)  # [B, V, H / p_f, W / p_f, d_v]
         branches = zip(
             self.geometry["stages"],
             self.appearance["stages"],
@@ -101,10 +101,11 @@ class AsySplat(TokenNetwork):
             strict=True,
         )
         for geometry, appearance, coarse_reads_fine, fine_reads_coarse in branches:
-            (coarse, _), fine = geometry(coarse, skip_layers), appearance(fine, skip_layers)
+            coarse, _ = geometry(coarse, skip_layers)  # [B, V, H / p_c, W / p_c, d_s]
+            fine = appearance(fine, skip_layers)
             # Both links read the values from before the exchange (Eq. 3).
             coarse, fine = coarse_reads_fine(coarse, fine), fine_reads_coarse(fine, coarse)
-        return self.source(coarse, fine)
+        return self.source(coarse, fine)  # [B, V, H / p_f, W / p_f, d], or of p_c
 
     @property
     def skippable_layers(self) -> Collection[nn.Module]:

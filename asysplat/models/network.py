@@ -36,7 +36,7 @@ class Network(nn.Module, ABC):
     def __init__(self, patch: int, prior: nn.Module | None = None, prune: Prune | None = None):
         super().__init__()
         self.patch, self.prior, self.prune = patch, prior, prune
-        self.early_exit: EarlyExit = EXACT
+        self._early_exit = EXACT
         self.early_exit_shares: dict[str, float] = {}
 
     def forward(self, views: Views, prune: bool = True) -> Gaussians:
@@ -44,15 +44,13 @@ class Network(nn.Module, ABC):
 
         Raises:
             InputError: image sides that are no multiples of `patch`, or a number of views outside
-                `view_counts`; outside of training, invalid views; early exit for a network without
-                a prior, or for several scenes at a time.
+                `view_counts`; outside of training, invalid views, or early exit for several scenes
+                at a time.
         """
         self.check_size(views.cameras.height, views.cameras.width)
         self.check_views(views.num_views)
-        if not self.training:
-            self.check_early_exit(self.early_exit)
-            if not (views.images.is_meta or is_fake(views.images)):
-                views.validate("the network's views")  # in training the data module does
+        if not (self.training or views.images.is_meta or is_fake(views.images)):
+            views.validate("the network's views")  # in training the data module does
         batch = views.images.shape[:-4]
         self.early_exit_shares.clear()
         gaussians = self.predict(views.map(lambda x: x.reshape(-1, *x.shape[len(batch) :])))
@@ -92,6 +90,16 @@ class Network(nn.Module, ABC):
         for module in self.modules():
             if isinstance(module, Layers):
                 module.checkpointing = checkpointing
+
+    @property
+    def early_exit(self) -> EarlyExit:
+        """The thresholds of predictions outside of training; see `check_early_exit`."""
+        return self._early_exit
+
+    @early_exit.setter
+    def early_exit(self, early_exit: EarlyExit) -> None:
+        self.check_early_exit(early_exit)
+        self._early_exit = early_exit
 
     def check_early_exit(self, early_exit: EarlyExit) -> None:
         """Raise InputError for early exit without a prior, whose confidence it depends on."""

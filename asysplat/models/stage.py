@@ -57,7 +57,7 @@ class Stage(nn.Module):
         skip_layers: Collection[nn.Module] = (),
         extra: Float[Tensor, "B G d"] | None = None,
     ) -> tuple[Float[Tensor, "B V h2 w2 e"], Float[Tensor, "B G e"] | None]:
-        """Return the tokens and the global tokens `extra` after this stage."""
+        """Return the tokens, and the global tokens `extra` if there are any, after this stage."""
         tokens = self.project(tokens) if self.merge is None else self.merge(tokens)
         if extra is None:
             return self.layers(tokens, skip_layers), None

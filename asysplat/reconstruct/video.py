@@ -14,16 +14,27 @@ from asysplat.export import orbit, smoothed_path
 from asysplat.refinement.photographs import Photographs
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians
+from asysplat.training.ranges import is_number, is_whole
 
+MAX_HEIGHT = 4320  # pixels of 8K, the most that decoders of H.264 take
 CAMERA_PATHS = ("own", "orbit", "none")
 
 
 def check_video(video: DictConfig) -> None:
-    """Check the camera path, except for the names of photographs, see `views_of`.
+    """Check the options of a video, except for the names of photographs, see `views_of`.
 
     Raises:
-        InputError: an unknown one.
+        InputError: an unknown path, or a number that is out of range.
     """
+    height = video.height
+    if not (height is None or is_whole(height, 2, MAX_HEIGHT + 1)):
+        raise InputError(
+            f"video.height={height}: give a whole number from 2 to {MAX_HEIGHT}, or null for the "
+            "photographs' height."
+        )
+    for name in ("seconds", "fps"):
+        if not (is_number(video[name]) and video[name] > 0):
+            raise InputError(f"video.{name}={video[name]}: give a number above 0.")
     path = video.path
     names = isinstance(path, ListConfig) and [isinstance(name, str) for name in path]
     if path not in CAMERA_PATHS and not (names and all(names)):

@@ -8,7 +8,6 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from asysplat.errors import InputError
 
 SEEDS = 2**32  # NumPy takes seeds below it
-MAX_VIDEO_HEIGHT = 4320  # pixels: 8K, what decoders of H.264 take at most
 
 
 def is_whole(value: object, low: int | float = 0, below: int | float = math.inf) -> bool:
@@ -41,11 +40,6 @@ RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
         ["training.views_at_once"],
     ),
     (
-        f"a whole number from 2 to {MAX_VIDEO_HEIGHT}, or null for the photographs' height",
-        lambda value: value is None or is_whole(value, 2, MAX_VIDEO_HEIGHT + 1),
-        ["video.height"],
-    ),
-    (
         "a whole number of at least 0",
         is_whole,
         (
@@ -57,7 +51,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
     (
         "a number above 0",
         lambda value: is_number(value) and value > 0,
-        ["width", "parameter_budget", "learning_rate", "video.seconds", "video.fps"],
+        ["width", "parameter_budget", "learning_rate"],
     ),
     (
         "a number of at least 0",
