@@ -10,7 +10,7 @@ from test_prior import wall
 from tiny import NETWORK
 
 from asysplat.errors import InputError, input_error_behind
-from asysplat.models import BiMamba2, EarlyExit
+from asysplat.models import EarlyExit
 from asysplat.models.early_exit import EXACT
 from asysplat.rendering import render
 from asysplat.scene import Views
@@ -25,6 +25,10 @@ def net(build):
     net = build("model=asysplat_plane_sweep", *NETWORK).eval()
     torch.nn.init.normal_(net.head.decode.weight, std=0.05)
     return net
+
+
+def layers_of(stage):
+    return getattr(stage, "layers", stage)
 
 
 @torch.no_grad()
@@ -62,18 +66,19 @@ def test_training_skips_nothing(net):
     assert same_bits(*results)
 
 
-def test_skipped_layers_are_scans_and_middle_stages(net):
+def test_skipped_layers_are_those_after_the_first_stage(net):
     called = []
-    for module in net.modules():
-        if module in net.skippable_layers or isinstance(module, BiMamba2):
-            module.register_forward_hook(lambda module, *_: called.append(module))
+    branches = net.geometry["stages"], net.appearance["stages"]
+    for layer in [
+        layer for stages in branches for stage in stages[1:] for layer in layers_of(stage)
+    ]:
+        layer.register_forward_hook(lambda module, *_: called.append(module))
     exact = predict(net, wall())
     assert set(called) == set(net.skippable_layers)
     called.clear()
     found = predict(net, wall(), skip_layers_above=ALWAYS)
     assert called == []
-    # Of 3 stages with a scan, an attention and two layers of MambaVision: all but 2 attentions.
-    assert math.isclose(net.early_exit_shares["layers"], 10 / 12)
+    assert math.isclose(net.early_exit_shares["layers"], 2 / 3)
     assert net.early_exit_shares["network"] == 0
     assert not torch.equal(found.means, exact.means)
 
