@@ -118,7 +118,9 @@ def fit_to_all(
     """Refine Gaussians on all photographs for a share of the limit, without new Gaussians."""
     views = photographs.all_views()
     print(f"last fit: {views.num_views} photographs, the held-out ones too, after the measurement")
-    settings = replace(settings, half_size=0.0, densify="none", every=None, cool_down=1.0)
+    settings = replace(
+        settings, half_resolution_until=0.0, densify="none", every=None, cool_down=1.0
+    )
     for name in {"steps", "seconds"} & options.keys():
         options = options | {name: type(options[name])(max(1, share * options[name]))}
     return refine(gaussians, views, settings, **options)

@@ -210,7 +210,9 @@ def test_a_run_goes_on_from_a_finished_one(command, run_script, photographs, tmp
     config, after = OmegaConf.load(folder / "config.yaml"), numbers_of(folder)
     assert (config.height, config.held_out_every, config.views) == (40, 4, 6)
     assert (config.run, config.init) == (str(first), str(first / "scene.safetensors"))
-    assert config.refinement.half_size == 0 and config.refinement.max_gaussians == 150_000
+    assert (
+        config.refinement.half_resolution_until == 0 and config.refinement.max_gaussians == 150_000
+    )
     assert after["held_out/psnr"] > before["held_out/psnr"] - 0.5
 
 
@@ -245,13 +247,13 @@ def test_only_what_describes_the_photographs_is_taken_from_a_run(run_folder, scr
         assert (continued.height, continued.views, continued.frames) == (height, views, 9)
         assert (continued.path, continued.width) == ("scene", None)
         assert continued.init == str(folder / "scene.safetensors")
-        assert continued.refinement.half_size == 0
+        assert continued.refinement.half_resolution_until == 0
         for key in ("seed", "seconds", "paths", "checkpoint", "video"):
             assert continued[key] == config[key]
-    given = {"run", "path", "init", "refinement.half_size"}
+    given = {"run", "path", "init", "refinement.half_resolution_until"}
     continued = script.continue_run(config, given)
     assert (continued.path, continued.init) == ("mine", config.init)
-    assert continued.refinement.half_size == config.refinement.half_size > 0
+    assert continued.refinement.half_resolution_until == config.refinement.half_resolution_until > 0
 
 
 @pytest.mark.parametrize(
@@ -335,7 +337,7 @@ REFUSED = {
     "video.fps=0": "video.fps=0: give a number above 0",
     "cameras=best": "cameras=best: choose auto, given, refined, found",
     "height=0": "height=0, width=None",
-    "refinement.until=2.5": "refinement.until=2.5: give 0 to 1",
+    "refinement.densify_until=2.5": "refinement.densify_until=2.5: give 0 to 1",
     "run=nowhere": "run=nowhere has no metrics.json: name the folder of a finished run",
     "run=last paths.logs=nowhere": "run=last found no finished run in nowhere",
     "path=absent": "absent does not exist: name a scene",

@@ -19,7 +19,7 @@ from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
 from asysplat.refinement import photographs
-from asysplat.refinement.adam import VisibleAdam
+from asysplat.refinement.adam import SelectiveAdam
 from asysplat.training.checkpoints import load_weights
 from asysplat.training.run_folder import locked
 from asysplat.training.runs import find_runs
@@ -117,7 +117,7 @@ def test_one_message_lists_some_of_many_errors():
 
 def test_half_precision_is_refused_by_adam():
     with pytest.raises(InputError, match="give float32 or float64"):
-        VisibleAdam({"means": torch.zeros(3, 3, dtype=torch.float16)})
+        SelectiveAdam({"means": torch.zeros(3, 3, dtype=torch.float16)})
 
 
 def test_a_bit_of_the_weights_to_start_from(tmp_path):

@@ -40,7 +40,8 @@ def continue_run(config: DictConfig, given: Collection[str]) -> DictConfig:
     for key, value in taken.items():
         if not isinstance(value, str | int | None):
             raise InputError(f"{file}: {key} is {value}: expected a word or a whole number.")
-    taken |= {"run": str(folder), "init": str(folder / SCENE), "refinement.half_size": 0.0}
+    taken |= {"run": str(folder), "init": str(folder / SCENE)}
+    taken |= {"refinement.half_resolution_until": 0.0}
     kept = {*given, *(OF_QUALITY if "quality" in given else ())} - {"run"}
     config = config.copy()
     for key, value in taken.items():

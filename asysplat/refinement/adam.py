@@ -10,7 +10,7 @@ from asysplat.errors import InputError
 from asysplat.ops.adam import AdamSettings, Rows, adam_step
 
 
-class VisibleAdam:
+class SelectiveAdam:
     """Adam (Kingma and Ba 2015) that updates only the visible rows of its tensors.
 
     Each row of each tensor counts its own steps for the bias correction, so that a row that is
@@ -39,8 +39,8 @@ class VisibleAdam:
         for name, tensor in self.parameters.items():
             if tensor.dtype not in (torch.float32, torch.float64):
                 raise InputError(
-                    f"VisibleAdam got {name} of type {tensor.dtype}: give float32 or float64; half "
-                    "precision would lose small steps."
+                    f"SelectiveAdam got {name} of type {tensor.dtype}: give float32 or float64; "
+                    "half precision would lose small steps."
                 )
         self.non_finite = 0
         self._settings = AdamSettings(*betas, eps)
@@ -112,7 +112,7 @@ def _expect(name: str, tensor: Tensor | None, shape: tuple[int, ...]) -> None:
     """Raise InputError for another shape: the kernels have no bounds checks."""
     if tensor is None or tensor.shape != shape:
         problem = "is missing" if tensor is None else f"has shape {tuple(tensor.shape)}"
-        raise InputError(f"VisibleAdam's {name} {problem}: expected {tuple(shape)}.")
+        raise InputError(f"SelectiveAdam's {name} {problem}: expected {tuple(shape)}.")
 
 
 def _zero_state(parameter: Tensor) -> dict[str, Tensor]:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.refinement.adam import VisibleAdam
+from asysplat.refinement.adam import SelectiveAdam
 from asysplat.refinement.settings import Rates
 from asysplat.scene import Cameras
 
@@ -20,7 +20,7 @@ class Corrections:
 
     def __init__(self, count: int, rates: Rates):
         self._rates = {"exposure": rates.exposure, "poses": rates.poses}
-        self._adam = VisibleAdam({n: torch.zeros(count, 2, 3) for n in self._rates}, eps=1e-8)
+        self._adam = SelectiveAdam({n: torch.zeros(count, 2, 3) for n in self._rates}, eps=1e-8)
 
     def leaves(self) -> dict[str, Float[Tensor, "V 2 3"]]:
         """Return the parameters of all images as leaves of a graph; none if both are off."""

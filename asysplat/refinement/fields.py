@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from asysplat.refinement.adam import VisibleAdam
+from asysplat.refinement.adam import SelectiveAdam
 from asysplat.refinement.settings import Rates
 from asysplat.scene import Gaussians
 
@@ -33,7 +33,7 @@ class Fields:
         self.count = gaussians.sh.shape[1] if sh_degree is None else (sh_degree + 1) ** 2
         self._origins, parameters = self._unconstrained(gaussians)
         self.units = units.to(self._origins)
-        self.optimizer = VisibleAdam(parameters)
+        self.optimizer = SelectiveAdam(parameters)
         self.parameters = self.optimizer.parameters
 
     def __len__(self) -> int:

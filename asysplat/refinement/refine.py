@@ -76,7 +76,7 @@ class Refinement:
         self.fields = Fields(gaussians, self._units(gaussians.means), settings.sh_degree)
         self.corrections = Corrections(views.num_views, settings.rates)
         size = (max(1, side // 2) for side in views.images.shape[-2:])
-        self._half_views = views.resized(*size) if settings.half_size > 0 else views
+        self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
         self._view_order = self._random_order()
         self._steps, self._rounds = 0, 0
         self._last_visible = torch.zeros(len(self.fields), dtype=torch.long)
@@ -95,7 +95,7 @@ class Refinement:
         leaves, cool_down = self.fields.leaves(), settings.cool_down
         # The factor of the rates: 1, then down to `decay` over the cool-down.
         cooled = max(0.0, (share - 1 + cool_down) / cool_down) if cool_down else 0
-        factor = settings.decay**cooled
+        factor = settings.final_lr_factor**cooled
         error, gradients = 0.0, None
         for view in chosen:
             mse, of_view = self._gradients(views.select([view]), view, leaves, factor)
@@ -155,7 +155,7 @@ class Refinement:
 
     def _next_count(self) -> int:
         """Return the number of Gaussians after this round, on an even growth to the limit."""
-        now, left = len(self.fields), self.settings.rounds - self._rounds
+        now, left = len(self.fields), self.settings.densify_rounds - self._rounds
         return round(now * (self._max_gaussians / now) ** (1 / max(1, left)))
 
     def _gradients(
@@ -183,7 +183,7 @@ class Refinement:
         return mse, gradients[: len(leaves)]
 
     def _views(self, share: float) -> Views:
-        return self._half_views if share < self.settings.half_size else self.views
+        return self._half_views if share < self.settings.half_resolution_until else self.views
 
     def _random_order(self) -> Iterator[int]:
         """Yield views in a random order; all are used before one is used again."""
@@ -232,12 +232,12 @@ def refine(
     step, rounds, share = 0, 0, 0.0
     clock = time.perf_counter()
     while share < 1:
-        due = rounds_until(step, share, settings) if share < settings.until else 0
+        due = rounds_until(step, share, settings) if share < settings.densify_until else 0
         if due > rounds:
             refinement.densify(share)
             rounds = due
         every = settings.every
-        if every and step and step % every.opacity_reset == 0 and share < settings.until:
+        if every and step and step % every.opacity_reset == 0 and share < settings.densify_until:
             refinement.reset_opacities()
         errors.append(refinement.step(share))
         step += 1
@@ -254,5 +254,5 @@ def refine(
 def rounds_until(step: int, share: float, settings: RefinementSettings) -> int:
     """Return the number of rounds of densification that are due by now."""
     if settings.every is None:
-        return int(share / settings.until * (settings.rounds + 1))
+        return int(share / settings.densify_until * (settings.densify_rounds + 1))
     return max(0, (step - settings.every.first_round) // settings.every.round + 1)

@@ -63,17 +63,18 @@ class RefinementSettings:
     ssim: float | None = 0.2  # weight of 1 - SSIM beside L1; None: the mean squared error alone
     views_per_step: int | None = 1  # input views rendered in a step; None: all
     sh_degree: int | None = 1  # 0 to 3; None keeps the degree of the Gaussians
-    half_size: float = 0.25  # initial share of the refinement at half the image size
+    half_resolution_until: float = 0.25  # initial share of the refinement at half the image size
     # "error": spawn Gaussians at pixels with a large error; "mcmc": relocate dead ones (Kheradmand
     # et al. 2024); "gradient": clone and split by screen-space gradients (Kerbl et al. 2023).
     densify: Densify = "error"
     # Lower if all input images have fewer than 8 pixels for each; None: no other limit.
     max_gaussians: int | None = 150_000
-    initial: float = 0.19  # share of max_gaussians to start with, at most
-    rounds: int = 12  # densification rounds; each multiplies the Gaussian count by the same factor
-    until: float = 0.6  # initial share of the refinement with densification
-    every: StepSchedule | None = None  # schedule of densify="gradient"; None: `rounds`, evenly
-    decay: float = 0.05  # factor of the rates at the end of the cool-down
+    initial_fraction: float = 0.19  # share of max_gaussians to start with, at most
+    densify_rounds: int = 12  # each multiplies the number of Gaussians by the same factor
+    densify_until: float = 0.6  # initial share of the refinement with densification
+    # Schedule of densify="gradient"; None: `densify_rounds`, evenly.
+    every: StepSchedule | None = None
+    final_lr_factor: float = 0.05  # factor of the rates at the end of the cool-down
     decay_means_alone: bool = False  # True: only the rate of means decays
     cool_down: float = 0.5  # last share of the refinement, in which the rates fall
     # Steps with each input image that end it, whatever time is left: more would fit noise.
@@ -81,12 +82,13 @@ class RefinementSettings:
 
     def __post_init__(self):
         """Check the ranges."""
-        for name in ("half_size", "initial", "until", "decay", "cool_down"):
+        shares = ("half_resolution_until", "initial_fraction", "densify_until")
+        for name in (*shares, "final_lr_factor", "cool_down"):
             self._check(name, 0 <= getattr(self, name) <= 1, "give 0 to 1")
         choices = get_args(Densify)
         self._check("densify", self.densify in choices, f"choose {', '.join(choices)}")
         self._check("sh_degree", self.sh_degree in (None, 0, 1, 2, 3), "choose 0, 1, 2, 3 or null")
-        self._check("rounds", self.rounds >= 0, "give at least 0")
+        self._check("densify_rounds", self.densify_rounds >= 0, "give at least 0")
         steps = self.every is None or self.densify == "gradient"
         self._check("every", steps, "set densify=gradient, or every=null")
         for name in ("views_per_step", "max_steps_per_image", "max_gaussians"):
@@ -108,7 +110,7 @@ class RefinementSettings:
         """The greatest number of Gaussians to start with: with few, early steps are fast."""
         if self.max_gaussians is None or self.densify not in ("error", "mcmc"):
             return self.max_gaussians or sys.maxsize
-        return max(1, int(self.initial * self.max_gaussians))
+        return max(1, int(self.initial_fraction * self.max_gaussians))
 
     def max_steps(self, num_views: int) -> float:
         """Return the steps after which each image was used `max_steps_per_image` times."""
@@ -123,7 +125,7 @@ PAPER = RefinementSettings(
     ssim=None,
     views_per_step=None,
     sh_degree=None,
-    half_size=0.0,
+    half_resolution_until=0.0,
     densify="none",
     cool_down=0.0,
     max_steps_per_image=None,
@@ -134,12 +136,12 @@ PAPER = RefinementSettings(
 PUBLISHED_3DGS = RefinementSettings(
     Rates(means=1.76e-4, unit="scene", quats=1e-3, scales=5e-3, opacities=0.05, sh=2.5e-3),
     sh_degree=3,
-    half_size=0.0,
+    half_resolution_until=0.0,
     densify="gradient",
     max_gaussians=None,
-    until=0.5,
+    densify_until=0.5,
     every=StepSchedule(),
-    decay=0.01,
+    final_lr_factor=0.01,
     decay_means_alone=True,
     cool_down=1.0,
     max_steps_per_image=None,

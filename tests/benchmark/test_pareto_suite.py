@@ -211,7 +211,10 @@ MISTAKES = [
     (knob("feed_forward", overrides=["model.layers=8m"]), "not fit this model"),
     (knob("feed_forward", overrides=["model.layer=8m"]), r"^model\.layer is unknown: did you mean"),
     (knob("refined", views=0), r"refined\.a: views=0: give a whole number from 1\."),
-    (knob("refined", refinement={"half_size": 2.0}), r"^refinement\.half_size=2\.0: give 0 to 1"),
+    (
+        knob("refined", refinement={"half_resolution_until": 2.0}),
+        r"^refinement\.half_resolution_until=2\.0: give 0 to 1",
+    ),
     (knob("reconstruct", init="dust"), r"reconstruct\.a: init=dust is unknown: choose from"),
     (knob("reconstruct", seconds=0), r"steps=None and seconds=0: give one of them, above 0\."),
 ]

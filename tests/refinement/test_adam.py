@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from asysplat.errors import InputError
-from asysplat.refinement.adam import VisibleAdam
+from asysplat.refinement.adam import SelectiveAdam
 
 NUM = 2100  # more than two blocks, and no whole number of vectors
 # Rows of a number, of less than a vector, of a vector and of more.
@@ -65,7 +65,7 @@ def run_steps(optimizer, steps=5, dtype=torch.float32):
 )
 def test_each_row_moves_as_with_its_own_adam_of_torch(dtype, runs, options):
     """Each group of rows has its own times; there may be whole vectors and blocks of a group."""
-    ours = VisibleAdam(normal(dtype=dtype), **options)
+    ours = SelectiveAdam(normal(dtype=dtype), **options)
     groups = torch.arange(NUM) * 4 // NUM if runs else torch.randint(4, (NUM,))
     begin = everything(ours)
     theirs = {}
@@ -99,8 +99,8 @@ def test_each_row_moves_as_with_its_own_adam_of_torch(dtype, runs, options):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_rows_with_a_non_finite_gradient_are_not_updated(dtype):
     begin = normal(dtype=dtype)
-    ours = VisibleAdam({name: tensor.clone() for name, tensor in begin.items()})
-    clean = VisibleAdam(begin)
+    ours = SelectiveAdam({name: tensor.clone() for name, tensor in begin.items()})
+    clean = SelectiveAdam(begin)
     gradients, seen = random_gradients(dtype=dtype), torch.rand(NUM) < 0.5
     seen[[0, 17, 18, NUM - 1]] = True
     seen[40] = False
@@ -120,7 +120,7 @@ def test_rows_with_a_non_finite_gradient_are_not_updated(dtype):
 
 
 def test_a_gradient_with_an_infinite_square_stops_its_element_alone():
-    optimizer = VisibleAdam(normal())
+    optimizer = SelectiveAdam(normal())
     every = torch.ones(NUM, dtype=torch.bool)
     for step in range(3):
         gradients = random_gradients()
@@ -135,7 +135,7 @@ def test_a_gradient_with_an_infinite_square_stops_its_element_alone():
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_tensor_without_a_rate_stays_and_may_start_later(dtype):
-    ours = VisibleAdam(normal(dtype=dtype))
+    ours = SelectiveAdam(normal(dtype=dtype))
     begin = everything(ours)
     every = torch.ones(NUM, dtype=torch.bool)
     without = {name: RATES[name] for name in ("means", "quats")} | {"opacities": 0.0}
@@ -155,10 +155,10 @@ def test_a_tensor_without_a_rate_stays_and_may_start_later(dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_elements_of_a_row_may_have_their_own_rates(dtype):
-    whole, rates = VisibleAdam(normal(dtype=dtype)), torch.full((16, 1), 5e-5)
+    whole, rates = SelectiveAdam(normal(dtype=dtype)), torch.full((16, 1), 5e-5)
     rates[0] = 1e-3
     sh = whole.parameters["sh"]
-    parts = VisibleAdam({"first": sh[:, :1].clone(), "rest": sh[:, 1:].clone()})
+    parts = SelectiveAdam({"first": sh[:, :1].clone(), "rest": sh[:, 1:].clone()})
     for _ in range(4):
         seen, gradients = torch.rand(NUM) < 0.7, random_gradients(dtype=dtype)
         whole.step(gradients, {"sh": rates}, seen)
@@ -172,7 +172,7 @@ def test_any_number_of_threads_gives_the_same_bits(threads):
     begin = normal(9000)
     for count in (1, 2, 3):
         threads(count)
-        optimizer = VisibleAdam({name: tensor.clone() for name, tensor in begin.items()})
+        optimizer = SelectiveAdam({name: tensor.clone() for name, tensor in begin.items()})
         torch.manual_seed(1)
         run_steps(optimizer)
         first = everything(optimizer) if count == 1 else first
@@ -181,7 +181,7 @@ def test_any_number_of_threads_gives_the_same_bits(threads):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_rows_are_kept_copied_and_appended(dtype):
-    optimizer, more = VisibleAdam(normal(dtype=dtype)), normal(70, dtype)
+    optimizer, more = SelectiveAdam(normal(dtype=dtype)), normal(70, dtype)
     run_steps(optimizer, dtype=dtype)
     before, index = everything(optimizer), torch.tensor([5, 2, 2, NUM - 1, 0])
     optimizer.keep(index)
@@ -193,7 +193,7 @@ def test_rows_are_kept_copied_and_appended(dtype):
     added = {name: tensor.new_zeros(70, *tensor.shape[1:]) for name, tensor in before.items()}
     expected = {name: torch.cat((before[name], t)) for name, t in (added | more).items()}
     assert_same(everything(optimizer), expected)
-    alone, gradients = VisibleAdam(more), random_gradients(70, dtype)
+    alone, gradients = SelectiveAdam(more), random_gradients(70, dtype)
     for _ in range(2):
         rows = {name: torch.cat((t[:5], t)) for name, t in gradients.items()}
         optimizer.step(rows, RATES, torch.ones(75, dtype=torch.bool))
@@ -206,7 +206,7 @@ def test_rows_are_kept_copied_and_appended(dtype):
 
 
 def test_gradients_that_are_missing_or_of_another_shape_change_nothing():
-    optimizer = VisibleAdam(normal(4))
+    optimizer = SelectiveAdam(normal(4))
     before, visible = everything(optimizer), torch.ones(4, dtype=torch.bool)
     for sentence, gradients in {
         "gradient of sh is missing": {"means": torch.ones(4, 3)},
@@ -215,5 +215,5 @@ def test_gradients_that_are_missing_or_of_another_shape_change_nothing():
         with pytest.raises(InputError, match=sentence):
             optimizer.step(gradients, {"means": 1.0, "sh": 1.0}, visible)
     with pytest.raises(InputError, match=r"visible has shape \(5,\): expected \(4,\)"):
-        inspect.unwrap(VisibleAdam.step)(optimizer, normal(4), RATES, torch.ones(5) > 0)
+        inspect.unwrap(SelectiveAdam.step)(optimizer, normal(4), RATES, torch.ones(5) > 0)
     assert_same(everything(optimizer), before)

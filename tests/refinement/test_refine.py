@@ -86,7 +86,7 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(room, start,
     found = []
     for count, seed in ((1, 0), (2, 0), (2, 0), (1, 1)):
         threads(count)
-        settings = RefinementSettings(densify=kind, rounds=3)
+        settings = RefinementSettings(densify=kind, densify_rounds=3)
         found.append(refine(start, room[0], settings, steps=12, seed=seed))
     assert same_bits(found[1], found[0]) and same_bits(found[2], found[0])
     assert not torch.equal(found[3].sh, found[0].sh)
@@ -120,7 +120,10 @@ def test_masked_pixels_have_no_effect_on_a_refinement():
     masks[0, :7] = False
     masks[1, :, 3:6] = False
     noise = torch.where(masks[:, None], views.images, torch.rand_like(views.images))
-    settings, start = RefinementSettings(ssim=0.0, half_size=0.5, rounds=2), small_scene()
+    settings, start = (
+        RefinementSettings(ssim=0.0, half_resolution_until=0.5, densify_rounds=2),
+        small_scene(),
+    )
     one, other = (
         refine(start, Views(views.cameras, images, masks=masks), settings, steps=10)
         for images in (views.images, noise)
@@ -136,7 +139,7 @@ def test_masked_pixels_are_left_out_of_ssim():
         views.images[:] = render(true, views.cameras, gray, depth=False).image.clamp(0, 1)
     start = replace(true, sh=true.sh + 0.4 * torch.randn_like(true.sh))
     masked = replace(views, masks=torch.rand(2, 24, 30) < 0.6)
-    settings = RefinementSettings(ssim=1.0, densify="none", half_size=0.0)
+    settings = RefinementSettings(ssim=1.0, densify="none", half_resolution_until=0.0)
     found = refine(start, masked, settings, steps=20, background=gray)
     assert quality(found, views) > quality(start, views) + 1
 
@@ -144,7 +147,7 @@ def test_masked_pixels_are_left_out_of_ssim():
 @pytest.mark.parametrize("kind", KINDS)
 def test_refinement_takes_images_of_any_size(kind):
     """Also of less than the 11 pixels of an SSIM window, and of an odd number of them."""
-    settings, start = RefinementSettings(densify=kind, rounds=3), small_scene()
+    settings, start = RefinementSettings(densify=kind, densify_rounds=3), small_scene()
     for size in ((1, 1), (1, 9), (11, 11), (23, 31)):
         found = refine(start, small_views(2, *size), settings, steps=6).validate()
         assert not torch.equal(found.sh[:20, 0], start.sh[:, 0]), size
@@ -154,7 +157,7 @@ def test_refinement_takes_images_of_any_size(kind):
 def test_one_view_and_one_gaussian_improve(kind):
     views, half = small_views(1), torch.tensor([0.5])
     start = isotropic_gaussians(torch.tensor([[0.0, 0, 3]]), half, half, torch.rand(1, 3))
-    settings = RefinementSettings(densify=kind, rounds=3)
+    settings = RefinementSettings(densify=kind, densify_rounds=3)
     found = refine(start, views, settings, steps=10).validate()
     assert quality(found, views) > quality(start, views)
 
@@ -174,7 +177,9 @@ def test_refinement_of_unusual_scenes_keeps_a_gaussian(kind, case):
         views.cameras.cam_to_world[:, :3, 3] *= scale
         start = start.scale_by(scale)
     else:
-        settings = replace(settings, rounds=30, until=1.0, rates=Rates(opacities=0.0))
+        settings = replace(
+            settings, densify_rounds=30, densify_until=1.0, rates=Rates(opacities=0.0)
+        )
         start.means[:, 2] *= -1 if case == "hidden" else 1
         start.opacities[:] = 0.5 if case == "hidden" else torch.linspace(1e-5, MIN_OPACITY / 2, 20)
     assert refine(start, views, settings, steps=20).validate().num_gaussians >= 1
@@ -206,7 +211,9 @@ def padded(gaussians):
 @pytest.mark.parametrize(("limit", "most"), [(5, 20), (40, 40), (10**6, 2 * 12 * 15 // 8)])
 def test_densification_grows_evenly_to_its_limit(kind, limit, most):
     """From 20 Gaussians and two images of 12 x 15 pixels: at most one for 8 pixels."""
-    settings = RefinementSettings(densify=kind, max_gaussians=limit, rounds=9, until=1.0)
+    settings = RefinementSettings(
+        densify=kind, max_gaussians=limit, densify_rounds=9, densify_until=1.0
+    )
     _, records = watched(small_scene(), small_views(), settings, steps=20)
     counts = [progress.gaussians for progress in records]
     assert counts[0] == 20 and max(counts) <= most
@@ -218,7 +225,7 @@ def test_densification_grows_evenly_to_its_limit(kind, limit, most):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_refinement_that_grows_starts_with_few_gaussians(kind):
-    settings = RefinementSettings(densify=kind, initial=0.25, max_gaussians=50_000)
+    settings = RefinementSettings(densify=kind, initial_fraction=0.25, max_gaussians=50_000)
     if kind in ("error", "mcmc"):
         assert settings.initial_limit == 12_500
         assert replace(settings, max_gaussians=1).initial_limit == 1
@@ -232,7 +239,7 @@ def test_pruned_gaussians_are_replaced():
     start = small_scene()
     start.opacities[:] = torch.where(torch.arange(20) < 10, MIN_OPACITY / 2, 0.95)
     for limit, count in ((20, 20), (40, 28)):
-        settings = RefinementSettings(max_gaussians=limit, rounds=2)
+        settings = RefinementSettings(max_gaussians=limit, densify_rounds=2)
         refinement = Refinement(start, small_views(), settings=settings)
         refinement.densify(0.0)
         assert len(refinement.fields) == count
@@ -243,9 +250,9 @@ def test_pruned_gaussians_are_replaced():
 def test_rounds_of_densification_come_at_their_steps():
     """Of 3 rounds in the first half of 16 steps, the steps before which Gaussians are added."""
     for options, expected in (
-        ({"rounds": 3, "until": 0.5, "max_gaussians": 10**6}, [2, 4, 6]),
-        ({"rounds": 0}, []),
-        ({"until": 0.0}, []),
+        ({"densify_rounds": 3, "densify_until": 0.5, "max_gaussians": 10**6}, [2, 4, 6]),
+        ({"densify_rounds": 0}, []),
+        ({"densify_until": 0.0}, []),
         ({"densify": "none"}, []),
     ):
         settings = RefinementSettings(**options)
@@ -265,7 +272,7 @@ def color_steps(settings):
 
 def test_rates_cool_down_at_the_end_and_only_that_of_means_in_3dgs():
     rates = Rates(means=0.0, quats=0.0, scales=0.0, opacities=0.0, sh=1e-4)
-    options = {"cool_down": 0.5, "decay": 0.1, "ssim": 0.0, "half_size": 0.0}
+    options = {"cool_down": 0.5, "final_lr_factor": 0.1, "ssim": 0.0, "half_resolution_until": 0.0}
     settings = RefinementSettings(rates, densify="none", **options)
     expected = [1e-4 * 0.1 ** max(0, (step / 20 - 0.5) / 0.5) for step in range(1, 20)]
     assert color_steps(settings) == pytest.approx(expected, rel=0.02)
@@ -317,7 +324,7 @@ def test_watch_may_end_a_refinement():
 
 def test_the_reported_psnr_is_that_before_the_last_steps():
     views, small = small_views(1), small_scene()
-    settings = RefinementSettings(densify="none", half_size=0.0)
+    settings = RefinementSettings(densify="none", half_resolution_until=0.0)
 
     def record(progress, refinement):
         return progress.psnr, quality(refinement.gaussians, views)
@@ -375,7 +382,9 @@ def test_means_move_in_their_unit(unit):
     rates = Rates(means=0.01, unit=unit)
     views = small_views(1)
     refinement = Refinement(
-        start, views, settings=RefinementSettings(rates, half_size=0.0, rounds=1)
+        start,
+        views,
+        settings=RefinementSettings(rates, half_resolution_until=0.0, densify_rounds=1),
     )
     refinement.step(0.0)
     moved = (refinement.gaussians.means - start.means).abs().amax(-1)
@@ -399,7 +408,7 @@ def test_exposure_and_pose_corrections_improve_held_out_views(room, start):
     wrong = Views(replace(inputs.cameras, cam_to_world=poses), images)
     found = []
     for rates in (Rates(), Rates(exposure=0.03, poses=3e-3)):
-        settings = RefinementSettings(rates, densify="none", half_size=0.0, sh_degree=0)
+        settings = RefinementSettings(rates, densify="none", half_resolution_until=0.0, sh_degree=0)
         last, states = watched(start, wrong, settings, lambda _, state: state, steps=80)
         found.append((quality(last, held), states[-1].corrections.leaves()))
     (before, none), (after, learned) = found
@@ -435,12 +444,16 @@ def test_refine_names_wrong_arguments():
     "kind, sentence, options",
     [
         (StepSchedule, "every.round=0: give at least 1", {"round": 0}),
-        (RefinementSettings, "half_size=1.5: give 0 to 1", {"half_size": 1.5}),
-        (RefinementSettings, "initial=-0.1", {"initial": -0.1}),
+        (
+            RefinementSettings,
+            "half_resolution_until=1.5: give 0 to 1",
+            {"half_resolution_until": 1.5},
+        ),
+        (RefinementSettings, "initial_fraction=-0.1", {"initial_fraction": -0.1}),
         (RefinementSettings, "densify=adc: choose error, mcmc, gradient", {"densify": "adc"}),
         (RefinementSettings, "sh_degree=4: choose", {"sh_degree": 4}),
         (RefinementSettings, "max_gaussians=0: give at least 1", {"max_gaussians": 0}),
-        (RefinementSettings, "rounds=-1", {"rounds": -1}),
+        (RefinementSettings, "densify_rounds=-1", {"densify_rounds": -1}),
         (RefinementSettings, "views_per_step=0: give at least 1, or null", {"views_per_step": 0}),
         (RefinementSettings, "image=0: give at least 1, or null", {"max_steps_per_image": 0}),
         (Rates, "rates.unit=meter: choose pixel or scene", {"unit": "meter"}),
