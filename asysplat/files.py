@@ -17,12 +17,13 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path in the same folder to write to, then move it to `path`.
 
     The file is synced to disk before. Any exception, KeyboardInterrupt too, leaves `path` unchanged
-    and no temporary file.
+    and no temporary file. A link is replaced, and what it names stays: it may come with a
+    stranger's folder.
 
     Raises:
         InputError: the file cannot be written: no such folder, no permission, a full disk.
     """
-    target = Path(path).resolve()  # keeps a symbolic link
+    target = Path(path).absolute()
     if target.exists() and not target.is_file():
         raise InputError(f"{path} is a folder or a device: name a file.")
     partial = target.with_name(f".{target.stem}.{uuid4().hex[:8]}{target.suffix}")
@@ -30,7 +31,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         yield partial
         with open(partial, "rb+") as file:
             os.fsync(file.fileno())
-        if target.exists():
+        if target.exists() and not target.is_symlink():
             shutil.copymode(target, partial)
         os.replace(partial, target)
     except OSError as error:
@@ -60,6 +61,21 @@ def make_folder(path: Path, option: str) -> None:
         reason = os.strerror(errno.EACCES)
     if reason is not None:
         raise InputError(f"{path} cannot be written to ({reason}): set {option} to another folder.")
+
+
+def refuse_links(folder: Path) -> None:
+    """Check that a folder holds no symbolic links, through which one would write elsewhere.
+
+    Raises:
+        InputError: it does.
+    """
+    for place, folders, files in os.walk(folder):
+        for path in (Path(place) / name for name in (*folders, *files)):
+            if path.is_symlink():
+                raise InputError(
+                    f"{path} is a link, and {folder} is written to: put what it names in its "
+                    "place, or remove it."
+                )
 
 
 def check_writable(path: Path, option: str) -> None:

@@ -7,7 +7,7 @@ import pytest
 from full_disk import largest_file
 
 from asysplat.errors import InputError
-from asysplat.files import atomic_write, check_writable, new_folder
+from asysplat.files import atomic_write, check_writable, new_folder, refuse_links
 
 
 @pytest.fixture
@@ -71,14 +71,25 @@ def test_folders_and_devices_are_refused(tmp_path, path):
         raise AssertionError("never reached")
 
 
-def test_links_and_permissions_stay(old, tmp_path):
+def test_permissions_stay(old):
     old.chmod(0o640)
-    link = tmp_path / "link.ply"
+    with atomic_write(old) as partial:
+        partial.write_text("new")
+    assert old.read_text() == "new" and old.stat().st_mode & 0o777 == 0o640
+
+
+def test_nothing_is_written_through_a_link(old, tmp_path):
+    link, content = tmp_path / "link.ply", old.read_text()
     link.symlink_to(old)
+    with pytest.raises(InputError, match=r"link\.ply is a link, and .* is written to"):
+        refuse_links(tmp_path)
     with atomic_write(link) as partial:
         partial.write_text("new")
-    assert link.is_symlink() and old.read_text() == "new"
-    assert old.stat().st_mode & 0o777 == 0o640
+    assert not link.is_symlink() and link.read_text() == "new" and old.read_text() == content
+    refuse_links(tmp_path)
+    (tmp_path / "figures").symlink_to(tmp_path.parent)
+    with pytest.raises(InputError, match="figures is a link"):
+        refuse_links(tmp_path)
 
 
 def test_folders_of_many_at_once_are_different(tmp_path):

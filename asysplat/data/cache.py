@@ -5,6 +5,7 @@ inside a data set.
 """
 
 import os
+import re
 import tempfile
 import warnings
 from collections import OrderedDict
@@ -16,6 +17,7 @@ import numpy as np
 from numpy import ndarray
 
 GIGABYTE = 2**30
+KEY = re.compile("[0-9a-f]{32}-[0-9a-f]{16}")  # keys of images, see FileSequence
 SHARE_AFTER_CLEARING = 0.9  # share of the limit to which a full disk cache is cleared
 
 
@@ -89,9 +91,11 @@ class ImageCache:
             self._on_disk -= size
 
     def _files(self) -> list[tuple[float, int, Path]]:
-        """List the last use, the bytes and the path of every file on disk."""
+        """List the last use, the bytes and the path of every array on disk."""
         entries = []
         for file in self.folder.glob("*/*.npy"):
+            if not KEY.fullmatch(file.stem) or file.parent.name != file.stem[:2]:
+                continue  # it is not the cache's to remove
             with suppress(OSError):  # another process has cleared it
                 stat = file.stat()
                 entries.append((stat.st_mtime, stat.st_size, file))

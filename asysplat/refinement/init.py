@@ -54,7 +54,7 @@ def initial_gaussians(
     elif init == "network":
         small = _shrink(views, NETWORK_MAX_SIDE, network.patch)
         gaussians = without_invisible(network.eval()(small))
-        pixels = longest / PRIOR_MAX_SIDE
+        pixels = longest / max(small.cameras.height, small.cameras.width)
     elif init in ("plane_sweep", "depth"):
         if init == "depth" and views.depths is None:
             raise InputError(

@@ -7,6 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from asysplat.errors import InputError
+from asysplat.files import refuse_links
 from asysplat.training.ranges import check_ranges
 from asysplat.training.run_config import read_config
 from asysplat.training.runs import RESULTS, describe_run, find_runs, folder_of, hash_of
@@ -77,6 +78,7 @@ def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationT
 
     files = (RESULTS, "config.yaml", CHECKPOINT)
     folder = folder_of(options.run, Path(options.paths.logs), find, files)
+    refuse_links(folder)
     checkpoint = folder / CHECKPOINT
     for override in overrides:
         key = override.partition("=")[0].lstrip("+~")

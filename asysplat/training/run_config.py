@@ -18,7 +18,8 @@ from asysplat.training.old_names import upgrade_config
 def read_config(path: Path) -> DictConfig:
     """Read the config.yaml of a run, under today's names.
 
-    Hydra imports and calls whatever a `_target_` names, so only those of conf/ are accepted.
+    Hydra imports and calls whatever a `_target_` names, so only those of conf/ are accepted. A
+    cache and downloads are not the run's to choose: there is no cache, and nothing is downloaded.
 
     Raises:
         InputError: the file cannot be read, has a `_target_` that no file of conf/ has, or an
@@ -33,7 +34,17 @@ def read_config(path: Path) -> DictConfig:
         raise InputError(f"{path} is not the configuration of a run: copy the run again.")
     content = upgrade_config(content)
     _check_targets(path, content)
-    return OmegaConf.create(content)
+    return OmegaConf.create(_without_caches(content))
+
+
+def _without_caches(node: Any) -> Any:
+    """Return a copy whose caches are null and whose downloads are false."""
+    if isinstance(node, list):
+        return [_without_caches(value) for value in node]
+    if not isinstance(node, dict):
+        return node
+    fixed = {"cache": None, "download": False}
+    return {key: fixed[key] if key in fixed else _without_caches(node[key]) for key in node}
 
 
 def _check_targets(path: Path, node: Any, key: str = "") -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from lightning.pytorch.utilities import rank_zero_only
 
 from asysplat.errors import InputError
-from asysplat.files import make_folder
+from asysplat.files import make_folder, refuse_links
 from asysplat.training.checkpoints import LAST, has_checkpoints, newest_folder
 from asysplat.training.runs import RESULTS
 
@@ -81,6 +81,7 @@ def locked(folder: Path) -> Iterator[None]:
         yield
         return
     make_folder(folder, "paths.logs")
+    refuse_links(folder)
     with open(folder / LOCK, "w") as file:
         try:
             # Not flock: the loaders of a killed run would hold it for seconds.

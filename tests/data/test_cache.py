@@ -52,11 +52,16 @@ def test_memory_is_bounded_and_the_least_recently_used_goes_first(tmp_path):
 def test_the_disk_is_bounded(tmp_path):
     folder = tmp_path / "cache"
     cache = ImageCache(folder, disk_gb=10 * KILOBYTE, memory_gb=0)
+    others = [folder / "ab" / "abcd.npy", folder / "ab" / f"{1:032x}-{0:016x}.npy"]
+    others[0].parent.mkdir(parents=True)
+    for file in others:
+        np.save(file, numbers(1000))
     for index in range(40):
-        cache.get(f"{index:04}", lambda: numbers(1000), to_disk=True)
-    left = [path.stat().st_size for path in folder.rglob("*.npy")]
+        cache.get(f"{index:032x}-{0:016x}", lambda: numbers(1000), to_disk=True)
+    left = [path.stat().st_size for path in folder.rglob("*.npy") if path not in others]
     assert 5_000 < sum(left) <= 10_000
-    cache.get("0039", never, to_disk=True)
+    cache.get(f"{39:032x}-{0:016x}", never, to_disk=True)
+    assert all(file.exists() for file in others)
 
 
 def test_a_file_that_is_cut_short_is_made_again(tmp_path):

@@ -60,6 +60,18 @@ def test_a_target_cannot_be_hidden(run, value, message):
         read_config(file.parents[1] / "config.yaml")
 
 
+def test_caches_and_downloads_are_not_the_runs(run, tmp_path):
+    cache = {"_target_": "asysplat.data.ImageCache", "folder": str(tmp_path), "disk_gb": 0}
+
+    def change(content):
+        content["data"]["cache"] = content["model"]["cache"] = cache
+        content["training"]["loss"]["more"] = [{"download": True}]
+
+    config = read_config(run(change).parents[1] / "config.yaml")
+    assert config.data.cache is None and config.model.cache is None
+    assert config.training.loss.more[0].download is False
+
+
 @pytest.mark.parametrize("content", ["[1, 2]", "a: {", "1", "", "a: !!python/object:os.system {}"])
 def test_a_damaged_file_is_named(tmp_path, content):
     (tmp_path / "config.yaml").write_text(content)
