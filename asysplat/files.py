@@ -63,6 +63,16 @@ def make_folder(path: Path, option: str) -> None:
         raise InputError(f"{path} cannot be written to ({reason}): set {option} to another folder.")
 
 
+def check_regular(path: str | Path) -> None:
+    """Check that a path is no pipe or device, which may have no end.
+
+    Raises:
+        InputError: it is.
+    """
+    if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
+        raise InputError(f"{path} is a pipe or a device: put a file in its place.")
+
+
 def refuse_links(folder: Path) -> None:
     """Check that a folder holds no symbolic links, through which one would write elsewhere.
 

@@ -467,21 +467,29 @@ def as_in_a_terminal():
 
 @pytest.mark.medium
 @pytest.mark.parametrize(
-    ("number", "times"), [(signal.SIGINT, 1), (signal.SIGTERM, 1), (signal.SIGINT, 2)]
+    "numbers",
+    [
+        [signal.SIGINT],
+        [signal.SIGTERM],
+        [signal.SIGTERM, signal.SIGHUP, signal.SIGHUP, signal.SIGTERM],
+        [signal.SIGINT, signal.SIGINT],
+    ],
 )
-def test_the_first_interrupt_saves_and_the_second_stops(process, tmp_path, number, times):
+def test_the_first_signal_saves_and_the_second_interrupt_stops(process, tmp_path, numbers):
     running = process("seconds=600")
     while not running.stdout.readline().startswith("figure:"):
         assert running.poll() is None, running.stderr.read()
     time.sleep(1)
-    running.send_signal(number)
+    running.send_signal(numbers[0])
     assert running.stderr.readline().startswith("stopping after this step")
-    if times == 2:
+    for number in numbers[1:]:
         running.send_signal(number)
+        time.sleep(0.02)
     _, errors = running.communicate(timeout=60)
     file = tmp_path / "run" / "scene.ply"
-    if times == 1:
+    if numbers[1:] != [signal.SIGINT]:
         assert running.returncode == 0 and read_gaussians(file).num_gaussians > 0, errors
+        assert {"metrics.json", "contact.png"} <= {path.name for path in file.parent.iterdir()}
     else:
         assert running.returncode == 1 and errors.endswith("stopped.\n"), errors
         assert not list((tmp_path / "run").glob(".*"))

@@ -24,6 +24,8 @@ from PIL import Image
 from asysplat.errors import InputError
 
 HEIF = (".heic", ".heif")  # suffixes of what phones save
+# Pillow goes by the content and knows more, some of which start other programs (EPS).
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 END_MARKERS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
 TAIL_BYTES = 4096  # some cameras append data after the end marker
 WHOLE = 0.9999  # share of a pixel, as rounded, from which all of it is covered
@@ -283,16 +285,19 @@ def _checked_size(image: Image.Image) -> tuple[int, int]:
 
 def _read(file: ImageFile, extract: Callable[[Image.Image], Any]) -> Any:
     """Return `extract` of the opened image; every failure becomes an InputError."""
+    formats = FORMATS
     if isinstance(file, Path):
         _check_exists(file)
-        if file.suffix.lower() in HEIF and not _register_heif():
-            raise InputError(
-                f"{file} is HEIF, which needs pillow-heif: pip install 'asysplat[heif]', or save "
-                "it as JPEG."
-            )
+        if file.suffix.lower() in HEIF:
+            if not _register_heif():
+                raise InputError(
+                    f"{file} is HEIF, which needs pillow-heif: pip install 'asysplat[heif]', or "
+                    "save it as JPEG."
+                )
+            formats = (*FORMATS, "HEIF")
     stored = file if isinstance(file, Path) else BytesIO(file.data.tobytes())
     try:
-        with Image.open(stored) as image:
+        with Image.open(stored, formats=formats) as image:
             return extract(image)
     # Damaged files make Pillow raise anything from OSError to SyntaxError.
     except Exception as error:

@@ -1,5 +1,6 @@
 """Read and write Gaussians in the format of the file's suffix."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from asysplat.export.splat import read_splat
 from asysplat.export.tensors import read_safetensors, write_safetensors
 from asysplat.scene import Gaussians
 
+MAX_TEXT = 80  # characters of a file in a message
 READERS = {
     ".ply": lambda path, dtype: read_ply(path).to(dtype),
     ".splat": lambda path, dtype: read_splat(path).to(dtype),
@@ -55,6 +57,11 @@ def _offset(path: Path) -> list[float]:
         x, y, z = map(float, text.split())
     except ValueError:
         return [0.0, 0.0, 0.0]
+    if not all(map(math.isfinite, (x, y, z))):
+        raise InputError(
+            f"{path} has the offset {text.strip()[:MAX_TEXT]}: give three finite numbers, or "
+            "remove it."
+        )
     return [x, y, z]
 
 

@@ -20,7 +20,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class RefinementDisplay:
     """Show a progress bar and, with `view`, a viewer; Ctrl-C ends the refinement after its step.
 
-    As a context manager it handles SIGINT and SIGTERM, until its end or the first signal.
+    As a context manager it handles SIGINT and SIGTERM until its end: the second Ctrl-C interrupts,
+    while a scheduler or a closed terminal may send any number of signals.
     """
 
     def __init__(self, views: Views, view: bool):
@@ -75,10 +76,15 @@ class RefinementDisplay:
             self._viewer.wait()
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
-        self.stopped = True
-        self._restore_handlers()  # first: the next signal may follow the message at once
-        # To stderr, without print, which is not reentrant and may be running.
-        os.write(2, b"stopping after this step; repeat to stop at once and save nothing\n")
+        first, self.stopped = not self.stopped, True
+        again = ""
+        if number == signal.SIGINT:
+            # Before the message, which the next signal may follow at once.
+            signal.signal(number, self._handlers[number])
+            again = "; repeat to stop at once and save nothing"
+        if first or again:
+            # To stderr, without print, which is not reentrant and may be running.
+            os.write(2, f"stopping after this step{again}\n".encode())
 
     def _restore_handlers(self) -> None:
         for number, handler in self._handlers.items():

@@ -11,8 +11,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from asysplat.errors import InputError
+from asysplat.files import check_regular
 from asysplat.overrides import CONF
 from asysplat.training.old_names import upgrade_config
+
+MAX_BYTES, MAX_NODES = 2**20, 100_000  # size of a configuration: ours have 10 KB and 500 values
 
 
 def read_config(path: Path) -> DictConfig:
@@ -25,9 +28,15 @@ def read_config(path: Path) -> DictConfig:
         InputError: the file cannot be read, has a `_target_` that no file of conf/ has, or an
             interpolation, which could hide one.
     """
+    check_regular(path)
     try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
+        if _count_nodes(yaml.compose(path.read_text(), yaml.SafeLoader), {}) > MAX_NODES:
+            raise ValueError(f"its aliases make more than {MAX_NODES:,} values")
         content = OmegaConf.to_container(OmegaConf.load(path))
-    except (OSError, UnicodeError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
+    # ValueError: also an integer of thousands of digits, or text that is not UTF-8.
+    except (OSError, ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
         reason = str(error).split("\n")[0]
         raise InputError(f"{path} cannot be read ({reason}): copy the run again.") from error
     if not isinstance(content, dict) or not content:
@@ -35,6 +44,19 @@ def read_config(path: Path) -> DictConfig:
     content = upgrade_config(content)
     _check_targets(path, content)
     return OmegaConf.create(_without_caches(content))
+
+
+def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
+    """Count the values of a node after its aliases are expanded; `known` has those of others."""
+    if node is None or isinstance(node, yaml.ScalarNode):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = MAX_NODES + 1  # until it is counted: a node may contain itself
+        pairs = (
+            node.value if isinstance(node, yaml.MappingNode) else [[each] for each in node.value]
+        )
+        known[id(node)] = 1 + sum(_count_nodes(each, known) for pair in pairs for each in pair)
+    return known[id(node)]
 
 
 def _without_caches(node: Any) -> Any:

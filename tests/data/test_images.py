@@ -193,6 +193,13 @@ def test_a_cut_off_image_is_refused_when_opened(tmp_path, suffix):
                 read(cut)
 
 
+@pytest.mark.parametrize("kind", ["EPS", "GIF", "PDF"])
+def test_only_formats_of_photographs_are_opened(tmp_path, kind):
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png", format=kind)
+    with pytest.raises(InputError, match=r"a\.png cannot be read as an image"):
+        load_image(tmp_path / "a.png")
+
+
 def test_depth_maps_and_images_are_not_confused(tmp_path):
     cv2.imwrite(str(tmp_path / "depth.png"), np.full((2, 2), 40000, np.uint16))
     with pytest.raises(InputError, match="8-bit RGB"):

@@ -60,6 +60,23 @@ def test_a_target_cannot_be_hidden(run, value, message):
         read_config(file.parents[1] / "config.yaml")
 
 
+BOMB = "a0: &a0 [1, 2]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40))
+HUGE = {
+    "aliases": (BOMB, "aliases make more than 100,000 values"),
+    "itself": ("a: &a [1, *a]", "aliases make more than 100,000 values"),
+    "bytes": ("a: " + "1" * 2**20, "more than 1,048,576 bytes"),
+    "digits": ("a: " + "1" * 5000, "digits"),
+    "depth": ("[" * 5000, "cannot be read"),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), HUGE.values(), ids=HUGE)
+def test_a_configuration_that_is_too_large_is_refused(tmp_path, content, message):
+    (tmp_path / "config.yaml").write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_config(tmp_path / "config.yaml")
+
+
 def test_caches_and_downloads_are_not_the_runs(run, tmp_path):
     cache = {"_target_": "asysplat.data.ImageCache", "folder": str(tmp_path), "disk_gb": 0}
 

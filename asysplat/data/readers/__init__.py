@@ -13,6 +13,7 @@ tests/data/readers/layouts/NAME.py. A data set in a known layout needs no code: 
 conf/data/mipnerf360.yaml.
 """
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,11 +34,12 @@ from asysplat.data.readers import (
     scannetpp_depths,
     transforms,
 )
-from asysplat.data.readers.common import SUFFIXES, images_in, natural_order
+from asysplat.data.readers.common import DEPTH, SUFFIXES, images_in, natural_order
 from asysplat.data.readers.masks import with_masks
 from asysplat.data.readers.panoramas import with_faces
 from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.errors import InputError
+from asysplat.files import check_regular
 
 MAX_NAME = 200  # characters of a path in a message
 # In this order: the first layout that fits a folder reads it.
@@ -123,7 +125,20 @@ def read_scene(layout: str, scene: Path, bad: BadImages) -> PosedScene:
         InputError: a scene that is not usable.
     """
     with _file_errors(scene):
+        if scene.is_dir():
+            _check_files(scene)
         return with_faces(with_masks(LAYOUTS[layout].read_scene(scene, bad), bad), bad)
+
+
+def _check_files(folder: Path, depth: int = DEPTH) -> None:
+    """Raise InputError for a pipe or a device in a folder, or some folders below."""
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir():
+                if depth > 0:
+                    _check_files(Path(entry.path), depth - 1)
+            elif not entry.is_file():
+                check_regular(entry.path)
 
 
 def open_scene(scene: Path | str, options: SceneOptions) -> FileSequence:

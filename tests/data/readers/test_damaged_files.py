@@ -3,6 +3,7 @@
 pytest -m slow -k damaged runs 10,000 of them.
 """
 
+import os
 import random
 import time
 import traceback
@@ -27,6 +28,7 @@ from asysplat.errors import InputError
 SECONDS = 5.0
 FEW = 24  # mutants of each kind in the fast test
 MANY = 1500
+ENDLESS = (os.mkfifo, lambda path: path.symlink_to("/dev/zero"))
 BYTES = (b"\x00", b"\xff" * 8, b"9" * 400, b"-1", b"nan", b"1e400", b"[" * 3000, b"\x80", b"", b'"')
 
 
@@ -47,10 +49,14 @@ def mutate(stored: bytes, numbers: random.Random) -> bytes:
 
 
 def attack(file: Path, read, count: int, seed: str) -> list[str]:
-    """Read mutants of a file; return what went wrong."""
+    """Read mutants of a file, and what has no end in its place; return what went wrong."""
     stored, numbers, wrong = file.read_bytes(), random.Random(seed), []
-    for index in range(count):
-        file.write_bytes(mutate(stored, numbers))
+    for index in range(count + len(ENDLESS)):
+        if index < count:
+            file.write_bytes(mutate(stored, numbers))
+        else:
+            file.unlink()
+            ENDLESS[index - count](file)
         started = time.monotonic()
         try:
             read()
@@ -61,6 +67,7 @@ def attack(file: Path, read, count: int, seed: str) -> list[str]:
             wrong.append(f"{file.name} {index}: {error!r:.200} at {trace.filename}:{trace.lineno}")
         if time.monotonic() - started > SECONDS:
             wrong.append(f"{file.name} {index}: {time.monotonic() - started:.1f} s")
+    file.unlink()
     file.write_bytes(stored)
     return wrong
 
