@@ -271,7 +271,7 @@ class Views(TensorRecord):
             inverse = F.adaptive_max_pool2d((depths > 0) / depths.clamp_min(TINY), size)
             return (inverse > 0) / inverse.clamp_min(TINY)
 
-        methods = {"images": area, "masks": lambda masks: area(masks.float()) == 1}
+        methods = {"images": area, "masks": lambda masks: whole_pixels(masks, size)}
         methods |= {"depths": nearest, "disparities": nearest, "point_depths": nearest_point}
         resized = {}
         for name, method in methods.items():
@@ -321,6 +321,11 @@ class Views(TensorRecord):
                     f"has negative values: give {unit}, 0 if unknown",
                 )
         return self
+
+
+def whole_pixels(masks: Bool[Tensor, "B V H W"], size: tuple[int, int]) -> Bool[Tensor, "B V h w"]:
+    """Return masks of another size: True where all pixels that a pixel covers are."""
+    return F.interpolate(masks.float(), size, mode="area") == 1
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ class Lens:
             panorama's pixels per radian.
         model: name of a model of COLMAP that has a focal length, or PANORAMA.
         distortion: the model's other parameters, in COLMAP's order.
-        yaw: of a face, degrees to the right of the panorama's middle.
+        yaw: turn of a face to the right of the panorama's middle, in degrees.
 
     https://github.com/colmap/colmap/blob/main/src/colmap/sensor/models.h
     """

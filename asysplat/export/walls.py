@@ -28,7 +28,7 @@ def free_radii(
         gaussians: scene.
         outward: cam_to_world of each frame's look, from a point in free space.
         starts: radii of these points, `radius` at most.
-        radius: of the path without walls.
+        radius: radius of the path without walls.
     """
     # Here, as it would slow down import asysplat.
     from scipy.ndimage import minimum_filter1d, uniform_filter1d

@@ -128,7 +128,7 @@ class Results:
         """Write the cameras of inputs and held-out views in the world of the scene files."""
         photographs = self._photographs
         files = map(os.path.abspath, photographs.input_files + photographs.held_out_files)
-        cameras = photographs.frame.cameras_to_world(photographs.all_views().cameras)
+        cameras = photographs.frame.cameras_to_world(photographs.cameras)
         with atomic_write(self.folder / CAMERAS) as path:
             path.write_text(json.dumps(describe_cameras(cameras, list(files)), indent=1))
 

@@ -77,7 +77,7 @@ def video_cameras(video: DictConfig, photographs: Photographs, gaussians: Gaussi
     Both sides are even, as H.264 needs, unless they are those of the photographs.
     """
     frames = max(1, round(video.seconds * video.fps))
-    cameras = photographs.all_views().cameras.select(views_of(video, photographs))
+    cameras = photographs.cameras.select(views_of(video, photographs))
     if video.path == "orbit":
         path = orbit(cameras, frames, subject(gaussians, cameras), gaussians)
     else:

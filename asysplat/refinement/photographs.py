@@ -17,7 +17,7 @@ from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.selection.views import spread
 from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.errors import InputError
-from asysplat.scene import Views
+from asysplat.scene import Cameras, Views
 
 MATCHED_SIDE = 400  # pixels of the shorter side, to check the cameras
 ANY_SIZE = 8  # pixels a side: to read cameras, before the size is known
@@ -40,17 +40,22 @@ class Photographs:
     total: int = 0  # photographs of the scene
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # offset subtracted by `near_origin`
 
+    @property
+    def cameras(self) -> Cameras:
+        """The cameras of the inputs and then of the held-out views."""
+        parts = [views.cameras for views in (self.inputs, self.held_out) if views is not None]
+        return replace(
+            parts[0],
+            intrinsics=torch.cat([cameras.intrinsics for cameras in parts]),
+            cam_to_world=torch.cat([cameras.cam_to_world for cameras in parts]),
+        )
+
     def all_views(self) -> Views:
         """Return the inputs and the held-out views as one, without depths."""
         parts = [views for views in (self.inputs, self.held_out) if views is not None]
         masks = [views.masks for views in parts]
-        cameras = replace(
-            self.inputs.cameras,
-            intrinsics=torch.cat([views.cameras.intrinsics for views in parts]),
-            cam_to_world=torch.cat([views.cameras.cam_to_world for views in parts]),
-        )
         images = torch.cat([views.images for views in parts])
-        return Views(cameras, images, masks=None if None in masks else torch.cat(masks))
+        return Views(self.cameras, images, masks=None if None in masks else torch.cat(masks))
 
 
 def open_photographs(

@@ -78,7 +78,7 @@ class Refinement:
         size = (max(1, side // 2) for side in views.images.shape[-2:])
         self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
         self._view_order = self._random_order()
-        self._steps, self._rounds = 0, 0
+        self._steps = 0
         self._last_visible = torch.zeros(len(self.fields), dtype=torch.long)
         self._screen_gradients = ScreenGradients(self.fields)
         self._max_gaussians = settings.limit(views.images[:, 0].numel())
@@ -93,7 +93,7 @@ class Refinement:
         settings, views = self.settings, self._views(share)
         chosen = list(islice(self._view_order, settings.views_per_step or views.num_views))
         leaves, cool_down = self.fields.leaves(), settings.cool_down
-        # The factor of the rates: 1, then down to `decay` over the cool-down.
+        # The factor of the rates: 1, then down to `final_lr_factor` over the cool-down.
         cooled = max(0.0, (share - 1 + cool_down) / cool_down) if cool_down else 0
         factor = settings.final_lr_factor**cooled
         error, gradients = 0.0, None
@@ -118,10 +118,14 @@ class Refinement:
         return error
 
     @torch.no_grad()
-    def densify(self, share: float) -> None:
-        """Prune, add or relocate Gaussians, by the method of the settings; share: see `step`."""
-        settings, views, target = self.settings, self._views(share), self._next_count()
-        self._rounds += 1
+    def densify(self, share: float, number: int = 1) -> None:
+        """Prune, add or relocate Gaussians, by the method of the settings.
+
+        Args:
+            share: see `step`.
+            number: number of this round, from 1 on.
+        """
+        settings, views, target = self.settings, self._views(share), self._next_count(number)
         if settings.densify == "mcmc":
             relocate(self.fields, target, self._generator)
         elif settings.densify == "gradient":
@@ -153,9 +157,9 @@ class Refinement:
         """Lower all opacities, so that those that are not needed are pruned (Kerbl et al. 2023)."""
         self.fields.reset_opacities(MAX_RESET_OPACITY)
 
-    def _next_count(self) -> int:
-        """Return the number of Gaussians after this round, on an even growth to the limit."""
-        now, left = len(self.fields), self.settings.densify_rounds - self._rounds
+    def _next_count(self, number: int) -> int:
+        """Return the number of Gaussians after a round, on an even growth to the limit."""
+        now, left = len(self.fields), self.settings.densify_rounds - number + 1
         return round(now * (self._max_gaussians / now) ** (1 / max(1, left)))
 
     def _gradients(
@@ -234,7 +238,7 @@ def refine(
     while share < 1:
         due = rounds_until(step, share, settings) if share < settings.densify_until else 0
         if due > rounds:
-            refinement.densify(share)
+            refinement.densify(share, due)
             rounds = due
         every = settings.every
         if every and step and step % every.opacity_reset == 0 and share < settings.densify_until:

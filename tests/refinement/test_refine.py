@@ -286,7 +286,7 @@ def test_3dgs_densifies_resets_opacities_and_adds_sh_degrees_at_its_steps():
     views, rounds, resets = small_views(), [], []
 
     class Recorded(Refinement):
-        def densify(self, share):
+        def densify(self, share, number):
             rounds.append(self._steps)
 
         def reset_opacities(self):

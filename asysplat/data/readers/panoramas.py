@@ -1,6 +1,6 @@
 """Panoramas, equirectangular photographs of all directions, read as faces of a cube around them.
 
-Their axes are COLMAP's and nerfstudio's: the camera looks at the middle, and down is down.
+Their axes are COLMAP's and nerfstudio's: z points to the image's center, y to its lower border.
 """
 
 import math

@@ -21,7 +21,6 @@ from asysplat.models.prior.prior import (
     count_votes,
     fill_unknown,
     other_views,
-    whole_pixels,
 )
 from asysplat.models.prior.projections import (
     Projections,
@@ -31,7 +30,7 @@ from asysplat.models.prior.projections import (
     smallest_step,
 )
 from asysplat.ops.plane_sweep import Consistency, choose_backend, load_backend
-from asysplat.scene import Cameras, Views
+from asysplat.scene import Cameras, Views, whole_pixels
 
 PLANES = 48
 NEIGHBORS = 4

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from asysplat.models.prior.projections import Projections
 from asysplat.ops.plane_sweep import Consistency, load_backend
-from asysplat.scene import TensorRecord, Views
+from asysplat.scene import TensorRecord, Views, whole_pixels
 
 PRIOR_CHANNELS = 2
 UNKNOWN_DISTANCE = 10**0.5  # the middle of PhotographHead's range
@@ -131,11 +131,6 @@ def in_free_space(votes: Consistency) -> Bool[Tensor, "B V h w"]:
     what one other view denies.
     """
     return votes.contradicting > 2 * votes.agreeing + 1
-
-
-def whole_pixels(masks: Bool[Tensor, "B V H W"], size: tuple[int, int]) -> Bool[Tensor, "B V h w"]:
-    """Return masks of another size: True where all pixels that a pixel covers are."""
-    return F.interpolate(masks.float(), size, mode="area") == 1
 
 
 def other_views(views: int, scenes: int, device: torch.device) -> Int[Tensor, "B V K"]:
