@@ -36,7 +36,9 @@ def wait_for(found, process, seconds=300):
 
 def start_or_resume(train, name, *overrides):
     """Start a run, or resume it if an earlier process has left a checkpoint."""
-    checkpoints = list(train.logs.glob(f"{name}/*/checkpoints/*.ckpt"))
+    # Not best.ckpt, nor one that was being written: a run resumes from neither.
+    names = ("last.ckpt", "previous.ckpt")
+    checkpoints = [p for each in names for p in train.logs.glob(f"{name}/*/checkpoints/{each}")]
     resume = ["ckpt_path=last"] if checkpoints else []
     output = train.logs / f"{name}.txt"
     if not checkpoints:  # the earlier process was too short to write one
