@@ -9,6 +9,7 @@ torch.compile, autocast, the meta device and the FLOP counter take a scan as a w
     saved_state_shape(x, B) -> the shape of what the backward pass needs besides the inputs, in fp32
 """
 
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
@@ -30,6 +31,7 @@ from asysplat.ops.dispatch import (
 )
 from asysplat.ops.precision import without_autocast
 
+SIDES = {"P": "head_dim", "N": "state size"}  # in messages
 CountFlops = Callable[[tuple[int, ...], tuple[int, ...]], tuple[int, int]]
 
 
@@ -52,6 +54,7 @@ class Scan:
         axes: of each input, such as "B L N"; those of x and N give all sizes.
         forms: the functions in torch, by name.
         count_flops: (shape of x, shape of B) -> FLOPs of the forward and of the backward pass.
+        largest: the sides that "cuda" takes as powers of two, from 16 to this size.
     """
 
     def __init__(
@@ -60,8 +63,9 @@ class Scan:
         axes: Mapping[str, str],
         forms: Mapping[str, Callable[[ScanInputs], Tensor]],
         count_flops: CountFlops,
+        largest: Mapping[str, int],
     ):
-        self.name, self.forms = name, forms
+        self.name, self.forms, self.largest = name, forms, largest
         self.axes = {key: value.split() for key, value in axes.items()}
         self.run_kernels = _register_operator(name, count_flops)
 
@@ -75,9 +79,14 @@ class Scan:
         self._check(inputs)
         if backend == "auto":
             backend = fast_backend(inputs.x, "chunked")
+            if backend == "cuda" and (misfit := self._misfit(inputs)):
+                warnings.warn(f"{misfit}: computed by 'chunked', which is slower.", stacklevel=2)
+                backend = "chunked"
         with without_autocast(inputs.x):
             if backend in FAST:
                 check_fast_backend(self.name, backend, inputs.x)
+                if backend == "cuda" and (misfit := self._misfit(inputs)):
+                    raise InputError(f"{misfit}; change it, or choose backend 'chunked'.")
                 keep = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
                 dtype = inputs.x.dtype
                 tensors = (
@@ -94,6 +103,18 @@ class Scan:
             x, dt, A, B, C, D = arguments
             flipped = ScanInputs(x.flip(1), dt.flip(1), A, B.flip(1), C.flip(1), D)
             return form(flipped).flip(1).to(inputs.x.dtype)
+
+    def _misfit(self, inputs: ScanInputs) -> str | None:
+        """Return a sentence on the first size that the kernels of "cuda" cannot take."""
+        sizes = dict(zip(self.axes["x"], inputs.x.shape, strict=True)) | {"N": inputs.B.shape[-1]}
+        for axis, largest in self.largest.items():
+            size = sizes[axis]
+            if size < 16 or size > largest or size & (size - 1):
+                return (
+                    f"{self.name}'s backend 'cuda' got a {SIDES[axis]} of {size}: expected a power "
+                    f"of two from 16 to {largest}"
+                )
+        return None
 
     def _check(self, inputs: ScanInputs) -> None:
         x, B, axes = inputs.x, inputs.B, self.axes["x"]

@@ -1,12 +1,10 @@
-"""Helpers of the GPU kernels (Triton): how they are compiled, token indices and size checks."""
+"""Helpers of the GPU kernels (Triton): how they are compiled, and token indices."""
 
 import inspect
 from collections.abc import Callable
 
 import triton
 import triton.language as tl
-
-from asysplat.errors import InputError
 
 INTERPRETED = triton.knobs.runtime.interpret  # Triton runs on a CPU, in NumPy: for tests
 # A launch may fuse products and sums where no kernel decides between two results. The renderer
@@ -25,12 +23,3 @@ def tokens_at(position, length, REVERSE: tl.constexpr):
     position = tl.cast(position, tl.int64)
     token = length - 1 - position if REVERSE else position
     return token, position < length
-
-
-def check_size(operator: str, name: str, size: int, largest: int) -> None:
-    """Raise InputError unless `size` is a power of two from 16 to `largest`."""
-    if size < 16 or size > largest or size & (size - 1):
-        raise InputError(
-            f"{operator}'s backend 'cuda' got a {name} of {size}: expected a power of two from 16 "
-            f"to {largest}; change it, or choose backend 'chunked'."
-        )

@@ -190,7 +190,9 @@ def project_mean_gradient(g_xyz, g_rows, rows, projected, axes, focal):
     g_xyz are gradients of the center in pixels and of the depth; rows the Jacobian's rows;
     projected is offset, 1 / z, tangents and clamped tangents.
     """
-    (g_x, g_y, g_z), (g_row_x, g_row_y), (row_x, row_y) = g_xyz, g_rows, rows
+    g_x, g_y, g_z = g_xyz
+    g_row_x, g_row_y = g_rows
+    row_x, row_y = rows
     offset, inverse_z, tangents, clamped = projected
     fx, fy = focal
     g_z -= inverse_z * (dot(row_x, g_row_x) + dot(row_y, g_row_y))

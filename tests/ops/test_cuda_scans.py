@@ -114,6 +114,15 @@ def test_sizes_that_kernels_cannot_take(name, sizes, message):
         run(name, arguments(name, 3, **sizes), "cuda", False)
 
 
+@kernel
+def test_auto_takes_sizes_that_kernels_cannot_take(monkeypatch):
+    monkeypatch.setattr("asysplat.ops.scan.fast_backend", lambda x, in_torch: "cuda")
+    tensors = arguments("ssd", 3, head_dim=8)
+    with pytest.warns(UserWarning, match="head_dim of 8: .* computed by 'chunked'"):
+        got = run("ssd", tensors, "auto", False)
+    assert all(map(torch.equal, got, run("ssd", tensors, "chunked", False)))
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(INTERPRETED, reason="too large")
 @pytest.mark.parametrize("name", SCANS)

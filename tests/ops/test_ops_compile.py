@@ -49,6 +49,8 @@ def test_all_kernels_of_the_plane_sweep_compile(monkeypatch, architecture):
         *(torch.zeros(1, 2, 8, 12), neighbors, torch.zeros(1, 2, 4, 3, 4), torch.zeros(1, 2, 2)),
         planes=48,
     )
-    cuda.sgm(costs, torch.ones(1, 2, 8, 12), torch.zeros(1, 2, 2, 8, 12))
-    assert {name for name, _ in kernels} == {"cost_band", "add_paths"}
+    maps = torch.ones(1, 2, 8, 12)
+    cuda.sgm(costs, maps, torch.zeros(1, 2, 2, 8, 12))
+    cuda.consistency(maps, torch.ones(1, 2), maps, neighbors, torch.zeros(1, 2, 4, 3, 4))
+    assert {name for name, _ in kernels} == {"cost_band", "add_paths", "count_views"}
     assert all(kernel.asm["cubin"] for kernel in kernels.values())

@@ -1,6 +1,8 @@
 """The kernels of "cuda" compile for GPUs that are not at hand: what the interpreter takes, the
 compiler may not."""
 
+import ast
+
 import pytest
 import torch
 from compiler import collect_kernels
@@ -50,3 +52,21 @@ def test_all_kernels_compile(make_scene, monkeypatch, architecture, options):
     out.image.sum().backward()
     assert {kernel for kernel, *_ in launched} == KERNELS
     assert all(kernel.asm["cubin"] for kernel in launched.values())
+
+
+def test_kernels_unpack_no_tuple_within_a_tuple(repository):
+    """Triton 3.6, which torch 2.11 needs, does not read `(a, b), c = ...`."""
+    paths = [*(repository / "asysplat").rglob("cuda/*.py")]
+    kernels = [
+        node
+        for tree in (ast.parse(path.read_text()) for path in paths)
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef)
+        and any(isinstance(name, ast.Name) and name.id == "kernel" for name in node.decorator_list)
+    ]
+    formulas = ast.parse((repository / "asysplat/rendering/formulas.py").read_text())
+    assert kernels
+    for node in ast.walk(ast.Module([*kernels, formulas], [])):
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple):
+            names = node.targets[0].elts
+            assert not any(isinstance(name, ast.Tuple) for name in names), ast.unparse(node)

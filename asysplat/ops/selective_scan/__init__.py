@@ -22,6 +22,7 @@ _SCAN = Scan(
     axes={"x": "B L D", "dt": "B L D", "A": "D N", "B": "B L N", "C": "B L N", "D": "D"},
     forms={"chunked": selective_scan_chunked, "reference": selective_scan_reference},
     count_flops=count_flops,
+    largest={"N": 256},
 )
 
 
@@ -44,7 +45,8 @@ def selective_scan(
         B, C: input and output projections, shared by the channels.
         D: skip weight of each channel.
         backend: "cpu" or "cuda", "chunked" (torch, any device and float type), "reference", or
-            "auto": the kernels of the device, and "chunked" for float64.
+            "auto": the kernels of the device, and "chunked" for float64 and for sizes that "cuda"
+            cannot take.
         reverse: scan from the last token to the first.
 
     Raises:

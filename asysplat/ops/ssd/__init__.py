@@ -49,4 +49,5 @@ _SCAN = Scan(
     axes={"x": "B L H P", "dt": "B L H", "A": "H", "B": "B L N", "C": "B L N", "D": "H"},
     forms={"chunked": ssd_chunked, "reference": ssd_reference},
     count_flops=count_flops,
+    largest={"P": 128, "N": 256},
 )

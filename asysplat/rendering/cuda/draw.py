@@ -29,6 +29,7 @@ from asysplat.scene import Cameras, Gaussians
 INTERPRETED = triton.knobs.runtime.interpret  # on a CPU, in NumPy: for tests
 BLOCK = 128  # Gaussians of a program
 BACKWARD_BLOCK = 64
+SUM_BLOCK = 32  # splats of a program, whose pairs are summed
 # Splats of a step. In the interpreter an invalid splat takes as long as a valid one.
 FORWARD_STEP, BACKWARD_STEP = (2, 2) if INTERPRETED else (8, 4)
 # A tile's 64 pixels are two for each lane of one warp: sums stay within it.
@@ -312,13 +313,13 @@ def _project_backward(
         else None,
     )
     if blocks:
-        sum_pairs[(-(-len(lists.splats) // BLOCK),)](
+        sum_pairs[(-(-len(lists.splats) // SUM_BLOCK),)](
             counts=lists.counts,
             first_pair=lists.first_pair,
             grads=pair_grads,
             num_splats=len(lists.splats),
             CHANNELS=GRADIENT.value - (not has_depth),
-            BLOCK=BLOCK,
+            BLOCK=SUM_BLOCK,
             **PROJECT_OPTIONS,
         )
         project_backward[(blocks, frame.images // frame.views)](
@@ -336,6 +337,7 @@ def _project_backward(
             **needs,
             COUNT=frame.sh_count,
             BLOCK=BACKWARD_BLOCK,
+            num_warps=BACKWARD_BLOCK // 32,
             **PROJECT_OPTIONS,
         )
     return grads

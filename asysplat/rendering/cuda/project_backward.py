@@ -38,11 +38,11 @@ from asysplat.rendering.cuda.math import (
     unit_quaternion,
     whitening,
 )
-from asysplat.rendering.cuda.splat import GRADIENT
+from asysplat.rendering.cuda.splat import COLUMNS, GRADIENT
 
 LOG_2 = tl.constexpr(math.log(2))
 WHITEN_GRADIENT = tl.constexpr(math.log(2) * formulas.WHITEN_TO_LOG2)
-PAIRS = tl.constexpr(8)  # pairs of a splat that are summed at a time
+PAIRS = tl.constexpr(8)  # pairs of a splat that are loaded at a time
 
 
 @kernel
@@ -54,18 +54,17 @@ def sum_pairs(counts, first_pair, grads, num_splats, CHANNELS: tl.constexpr, BLO
     d = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     count = tl.load(counts + d, mask=d < num_splats, other=0)
     multiple = count > 1
-    max_count = tl.max(tl.where(multiple, count, 0), 0)
-    if max_count > 0:
-        row = grads + GRADIENT * tl.load(first_pair + d, mask=multiple, other=0).to(tl.int64)
-        step = tl.arange(0, PAIRS)
-        for channel in tl.static_range(CHANNELS):
-            total = tl.zeros((BLOCK,), tl.float64)
-            for start in range(0, max_count, PAIRS):
-                pair = start + step[None, :]
-                valid = multiple[:, None] & (pair < count[:, None])
-                values = tl.load(row[:, None] + GRADIENT * pair + channel, mask=valid, other=0.0)
-                total += tl.sum(values.to(tl.float64), 1)
-            tl.store(row + channel, total.to(tl.float32), mask=multiple)
+    count = tl.where(multiple, count, 0)
+    first = tl.load(first_pair + d, mask=multiple, other=0).to(tl.int64)
+    column = tl.arange(0, COLUMNS)[None, :]
+    row = grads + GRADIENT * first[:, None] + column
+    total = tl.zeros((BLOCK, COLUMNS), tl.float64)
+    for start in range(0, tl.max(count, 0), PAIRS):
+        for k in tl.static_range(PAIRS):  # loads of 8 pairs are on their way at a time
+            pair = start + k
+            valid = (pair < count)[:, None] & (column < CHANNELS)
+            total += tl.load(row + GRADIENT * pair, mask=valid, other=0.0).to(tl.float64)
+    tl.store(row, total.to(tl.float32), mask=multiple[:, None] & (column < CHANNELS))
 
 
 @kernel

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from asysplat.ops.triton_utils import kernel
 from asysplat.rendering.cuda.splat import (
+    COLUMNS,
     GRADIENT,
     TILE,
     color_pixels,
@@ -35,6 +36,16 @@ def alpha_at(u, v, log_opacity, alpha_min, alpha_max):
     alpha = tl.exp2(tl.fma(-u, u, tl.fma(-v, v, log_opacity)))
     alpha = tl.minimum(alpha, alpha_max)
     return tl.where(alpha >= alpha_min, alpha, 0.0)
+
+
+@kernel
+def store_row(grad, values, valid, CHANNELS: tl.constexpr):
+    """Write the first CHANNELS of the ten `values` next to each other, at once."""
+    column = tl.arange(0, COLUMNS)
+    row = tl.zeros((COLUMNS,), tl.float32)
+    for k in tl.static_range(CHANNELS):
+        row = tl.where(column == k, values[k], row)
+    tl.store(grad + column, row, mask=valid & (column < CHANNELS))
 
 
 @kernel
@@ -188,13 +199,22 @@ def rasterize_backward(
     end = tl.load(last_entry + tile)
     position = end - 1
     while position >= first:
+        # Loads first: they would wait for the stores of the splat before, which they may follow.
+        rows = ()
         for k in tl.static_range(STEP):
             valid = position - k >= first
-            rank = (position - k - first).to(tl.int32)
             d = tl.load(entries + position - k, mask=valid, other=0).to(tl.int64)
             grad = grads + GRADIENT * tl.load(pairs + position - k, mask=valid, other=0)
-            x, rest_x, y, rest_y, u, a, b, c, log_opacity = load_splat(splats, d, left, top, valid)
-            red, green, blue = load_color(splats, d, valid)
+            splat = load_splat(splats, d, left, top, valid) + load_color(splats, d, valid)
+            if DEPTH:
+                splat = splat + load_depth(splats, d, valid)
+            rows = rows + ((valid, grad, splat),)
+        for k in tl.static_range(STEP):
+            valid, grad, splat = rows[k]
+            rank = (position - k - first).to(tl.int32)
+            x, rest_x, y, rest_y, u = splat[0], splat[1], splat[2], splat[3], splat[4]
+            a, b, c, log_opacity = splat[5], splat[6], splat[7], splat[8]
+            red, green, blue = splat[9], splat[10], splat[11]
             dx = (x + lane_x) + rest_x
             dy = (y + lane_y) + rest_y
             v = c * dy
@@ -208,14 +228,12 @@ def rasterize_backward(
             weight = opacity * before
             remaining = before
             value = tl.fma(blue, g_blue, tl.fma(green, g_green, red * g_red))
+            g_z = 0.0
             if DEPTH:
-                z, rest_z = load_depth(splats, d, valid)
-                value = tl.fma((z - origin) + rest_z, g_depth, value)
-                tl.store(grad + 9, tl.sum(weight * g_depth, 0), mask=valid)
+                value = tl.fma((splat[12] - origin) + splat[13], g_depth, value)
+                g_z += tl.sum(weight * g_depth, 0)
             if MEDIAN:
-                tl.store(
-                    grad + 9, tl.sum(tl.where(rank == median_rank, g_depth, 0.0), 0), mask=valid
-                )
+                g_z += tl.sum(tl.where(rank == median_rank, g_depth, 0.0), 0)
             # alpha dL/dalpha; a clamped alpha is constant.
             e = tl.fma(weight, value, -opacity * inverse * light_behind)
             e = tl.where(opacity < alpha_max, e, 0.0)
@@ -224,15 +242,13 @@ def rasterize_backward(
             # relative to the center.
             eu, ey = e * u, e * dy
             sum_eu = tl.sum(eu, 0)
-            tl.store(grad, 2 * a * sum_eu, mask=valid)
-            tl.store(grad + 1, 2 * b * sum_eu + 2 * c * c * tl.sum(ey, 0), mask=valid)
-            tl.store(grad + 2, -2 * tl.sum(eu * dx, 0), mask=valid)
-            tl.store(grad + 3, -2 * tl.sum(eu * dy, 0), mask=valid)
-            tl.store(grad + 4, -2 * c * tl.sum(ey * dy, 0), mask=valid)
-            tl.store(grad + 5, tl.sum(e, 0), mask=valid)
-            tl.store(grad + 6, tl.sum(weight * g_red, 0), mask=valid)
-            tl.store(grad + 7, tl.sum(weight * g_green, 0), mask=valid)
-            tl.store(grad + 8, tl.sum(weight * g_blue, 0), mask=valid)
+            g_y = 2 * b * sum_eu + 2 * c * c * tl.sum(ey, 0)
+            g_a, g_b = -2 * tl.sum(eu * dx, 0), -2 * tl.sum(eu * dy, 0)
+            g_c = -2 * c * tl.sum(ey * dy, 0)
+            colors = (tl.sum(weight * g_red, 0), tl.sum(weight * g_green, 0))
+            colors = colors + (tl.sum(weight * g_blue, 0),)
+            values = (2 * a * sum_eu, g_y, g_a, g_b, g_c, tl.sum(e, 0)) + colors + (g_z,)
+            store_row(grad, values, valid, 10 if DEPTH or MEDIAN else 9)
         position -= STEP
     # Splats behind the stop have no gradient.
     lane = tl.arange(0, TILE * TILE)

@@ -15,6 +15,7 @@ SPLAT = tl.constexpr(16)
 # The gradient of a splat in a tile [10] float32: of x, y, a, b, c, log_opacity (without a factor
 # ln 2), color, depth.
 GRADIENT = tl.constexpr(10)
+COLUMNS = tl.constexpr(16)  # lanes for the columns of a splat's gradient: a power of two
 
 TILE = tl.constexpr(8)  # pixels a side
 HALF_TILE = tl.constexpr(4)

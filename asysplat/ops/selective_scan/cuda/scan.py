@@ -7,7 +7,7 @@ from torch import Tensor
 from asysplat.ops.scan import ScanInputs
 from asysplat.ops.selective_scan.cuda.backward import backward_chunk
 from asysplat.ops.selective_scan.cuda.forward import forward_chunk, pass_states, sum_chunk
-from asysplat.ops.triton_utils import FUSED, INTERPRETED, check_size
+from asysplat.ops.triton_utils import FUSED, INTERPRETED
 
 # Tokens of a chunk; the backward pass keeps all their states in registers.
 FORWARD_CHUNK, BACKWARD_CHUNK = (4, 4) if INTERPRETED else (16, 8)
@@ -24,12 +24,7 @@ def saved_state_shape(x: Float[Tensor, "B L D"], B: Float[Tensor, "B L N"]) -> t
 def forward(
     inputs: ScanInputs, reverse: bool, keep: bool
 ) -> tuple[Float[Tensor, "B L D"], Float[Tensor, "0"]]:
-    """Return y and an empty saved state; see `asysplat.ops.scan`.
-
-    Raises:
-        InputError: a state size that is no power of two from 16 to 256.
-    """
-    check_size("selective_scan", "state size", inputs.B.shape[-1], TILE)
+    """Return y and an empty saved state; see `asysplat.ops.scan`."""
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     y = torch.empty_like(x)
     with torch.cuda.device_of(x):

@@ -12,19 +12,25 @@ from asysplat.ops.ssd.chunked import CHUNK
 from asysplat.ops.ssd.cuda.backward import head_gradients, projection_gradients, score_gradients
 from asysplat.ops.ssd.cuda.chunk import ROWS, sum_decays
 from asysplat.ops.ssd.cuda.forward import forward_chunk, pass_states, score_chunk
-from asysplat.ops.triton_utils import FUSED, INTERPRETED, check_size
+from asysplat.ops.triton_utils import FUSED, INTERPRETED
 
 TOKENS = 16 if INTERPRETED else CHUNK  # tokens of a chunk; the slow interpreter, too, runs several
 BLOCK = 64  # columns of a state in a program
+PASS_WARPS = 4
+PASSED = 16  # columns of a state in a program that passes it on: programs for a whole GPU
 HEADS = 8  # heads in a program that sums decays
-LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}  # with fewer warps, fp32 products spill
-MAX_HEAD_DIM, MAX_STATE = 128, 256
-# The type of a product's factors: fp16 lacks the range of a state, TF32 has all of its bits.
+LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}
+# The type of a product's factors, and its precision: three products of TF32, 1e-6, are several
+# times as fast as one of fp32. fp16 lacks the range of a state.
+EXACT = {"DOT": tl.float32, "PRECISION": "tf32x3"}
 PRODUCTS = {
-    torch.float32: {"DOT": tl.float32, "PRECISION": "ieee"},
+    torch.float32: EXACT,
     torch.bfloat16: {"DOT": tl.bfloat16, "PRECISION": "ieee"},
-    torch.float16: {"DOT": tl.float32, "PRECISION": "tf32"},
+    torch.float16: EXACT,
 }
+# Compute capabilities whose products read their factors from shared memory. Elsewhere registers
+# hold them, three times as many for EXACT: those of half as many tokens.
+FROM_SHARED_MEMORY = (9, 10)
 
 
 def saved_state_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) -> tuple[int]:
@@ -35,17 +41,11 @@ def saved_state_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) ->
 def forward(
     inputs: ScanInputs, reverse: bool, keep: bool
 ) -> tuple[Float[Tensor, "B L H P"], Float[Tensor, "0"]]:
-    """Return y and an empty saved state; see `asysplat.ops.scan`.
-
-    Raises:
-        InputError: a head_dim or state size that is no power of two from 16 to 128 or 256.
-    """
-    check_size("ssd", "head_dim", inputs.x.shape[-1], MAX_HEAD_DIM)
-    check_size("ssd", "state size", inputs.B.shape[-1], MAX_STATE)
+    """Return y and an empty saved state; see `asysplat.ops.scan`."""
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     y = torch.empty_like(x)
     with torch.cuda.device_of(x):
-        sizes = _Sizes(*x.shape, B.shape[-1], x.dtype, reverse)
+        sizes = _Sizes(*x.shape, B.shape[-1], x.dtype, reverse, _tokens(x))
         decays = _decays(sizes, dt, A)
         scores = _scores(sizes, B, C)
         states = _states(sizes, x, B, decays, gradient=False)
@@ -65,7 +65,7 @@ def backward(
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     grad_output = grad_output.contiguous()
     with torch.cuda.device_of(x):
-        sizes = _Sizes(*x.shape, B.shape[-1], x.dtype, reverse)
+        sizes = _Sizes(*x.shape, B.shape[-1], x.dtype, reverse, _tokens(x))
         parts = (sizes.batch, sizes.chunks, sizes.heads)
         grads = ScanInputs(
             x=torch.empty_like(x),
@@ -111,10 +111,11 @@ class _Sizes(NamedTuple):
     state: int
     dtype: torch.dtype
     reverse: bool
+    tokens: int  # of a chunk
 
     @property
     def chunks(self) -> int:
-        return -(-self.length // TOKENS)
+        return -(-self.length // self.tokens)
 
     @property
     def block(self) -> int:
@@ -134,19 +135,28 @@ class _Sizes(NamedTuple):
             "HEAD_DIM": self.head_dim,
             "STATE": self.state,
             "BLOCK": self.block,
-            "CHUNK": TOKENS,
+            "CHUNK": self.tokens,
             **PRODUCTS[self.dtype],
         }
         return {name: size for name, size in sizes.items() if name in kernel.arg_names} | LAUNCH
 
 
+def _tokens(x: Tensor) -> int:
+    """Return the tokens of a chunk."""
+    if PRODUCTS[x.dtype] is not EXACT or not x.is_cuda:
+        return TOKENS
+    capability = torch.cuda.get_device_capability(x.device)[0]
+    return TOKENS if capability in FROM_SHARED_MEMORY else TOKENS // 2
+
+
 def _decays(sizes: _Sizes, dt: Tensor, A: Tensor) -> Float[Tensor, "B H rows positions"]:
     """Run `sum_decays`."""
-    decays = dt.new_empty(sizes.batch, sizes.heads, ROWS.value, sizes.chunks * TOKENS)
+    positions = sizes.chunks * sizes.tokens
+    decays = dt.new_empty(sizes.batch, sizes.heads, ROWS.value, positions)
     sum_decays[(sizes.chunks, -(-sizes.heads // HEADS), sizes.batch)](
         *(dt, A, decays, sizes.length, sizes.heads),
         REVERSE=sizes.reverse,
-        CHUNK=TOKENS,
+        CHUNK=sizes.tokens,
         HEADS=HEADS,
         **FUSED,
     )
@@ -159,15 +169,16 @@ def _states(
     """Return the state before each chunk, or with `gradient` the gradient of the state after it."""
     shape = (sizes.batch, sizes.chunks, sizes.heads, sizes.head_dim, sizes.state)
     states = decays.new_empty(shape)
-    pass_states[(sizes.blocks, sizes.heads, sizes.batch)](
-        values, projections, decays, states, GRADIENT=gradient, **sizes.launch_kwargs(pass_states)
+    options = sizes.launch_kwargs(pass_states) | {"BLOCK": PASSED, "num_warps": PASS_WARPS}
+    pass_states[(sizes.state // PASSED, sizes.heads, sizes.batch)](
+        values, projections, decays, states, GRADIENT=gradient, **options
     )
     return states
 
 
 def _scores(sizes: _Sizes, B: Tensor, C: Tensor) -> Float[Tensor, "B chunks t s"]:
     """Run `score_chunk`."""
-    shape = (sizes.batch, sizes.chunks, TOKENS, TOKENS)
+    shape = (sizes.batch, sizes.chunks, sizes.tokens, sizes.tokens)
     scores = torch.empty(shape, dtype=torch.float32, device=B.device)
     score_chunk[(sizes.chunks, sizes.batch)](B, C, scores, **sizes.launch_kwargs(score_chunk))
     return scores
