@@ -31,7 +31,7 @@ BLOCK = 128  # Gaussians of a program
 BACKWARD_BLOCK = 64
 SUM_BLOCK = 32  # splats of a program, whose pairs are summed
 # Splats of a step. In the interpreter an invalid splat takes as long as a valid one.
-FORWARD_STEP, BACKWARD_STEP = (2, 2) if INTERPRETED else (8, 4)
+FORWARD_STEP, BACKWARD_STEP = (2, 2) if INTERPRETED else (4, 2)
 # A tile's 64 pixels are two for each lane of one warp: sums stay within it.
 RASTER_OPTIONS = {"num_warps": 1, "enable_fp_fusion": False}
 PROJECT_OPTIONS = {"enable_fp_fusion": False}

@@ -24,7 +24,9 @@ def consistency(
     """Count in float32; see `reference.consistency`."""
     B, V, h, w = inverse.shape
     inputs = (each.contiguous() for each in (inverse, steps, trust, others, projections))
-    counts = reference.Consistency(*inverse.new_empty(4, B, V, h, w))
+    counts = reference.Consistency(
+        *(inverse.new_empty(B, V, h, w) for _ in reference.Consistency._fields)
+    )
     with torch.cuda.device_of(inverse):
         count_views[(triton.cdiv(h * w, PIXELS), B * V)](
             *(*inputs, *counts, tolerance),

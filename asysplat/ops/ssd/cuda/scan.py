@@ -17,7 +17,7 @@ from asysplat.ops.triton_utils import FUSED, INTERPRETED
 TOKENS = 16 if INTERPRETED else CHUNK  # tokens of a chunk; the slow interpreter, too, runs several
 BLOCK = 64  # columns of a state in a program
 PASS_WARPS = 4
-PASSED = 16  # columns of a state in a program that passes it on: programs for a whole GPU
+PASSED = 64  # columns of a state in a program that passes it on: programs for a whole GPU
 HEADS = 8  # heads in a program that sums decays
 LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}
 # The type of a product's factors, and its precision: three products of TF32, 1e-6, are several
@@ -169,8 +169,9 @@ def _states(
     """Return the state before each chunk, or with `gradient` the gradient of the state after it."""
     shape = (sizes.batch, sizes.chunks, sizes.heads, sizes.head_dim, sizes.state)
     states = decays.new_empty(shape)
-    options = sizes.launch_kwargs(pass_states) | {"BLOCK": PASSED, "num_warps": PASS_WARPS}
-    pass_states[(sizes.state // PASSED, sizes.heads, sizes.batch)](
+    block = min(PASSED, sizes.state)
+    options = sizes.launch_kwargs(pass_states) | {"BLOCK": block, "num_warps": PASS_WARPS}
+    pass_states[(sizes.state // block, sizes.heads, sizes.batch)](
         values, projections, decays, states, GRADIENT=gradient, **options
     )
     return states
