@@ -47,31 +47,22 @@ def pass_states(
     batch = tl.program_id(2).to(tl.int64)
     lane = tl.arange(0, CHUNK)
     state = tl.zeros((HEAD_DIM, BLOCK), tl.float32)
-    chunk = chunks - 1 if GRADIENT else 0
-    at, inside = rows_of_head(batch, chunk, head, length, heads, HEAD_DIM, REVERSE, CHUNK)
-    value = tl.load(values + at, mask=inside, other=0.0)
-    at, inside = rows_of_state(batch, chunk, first, length, STATE, BLOCK, REVERSE, CHUNK)
-    projection = tl.load(projections + at, mask=inside, other=0.0)
     for k in range(chunks):
         chunk = chunks - 1 - k if GRADIENT else k
+        part = (batch * chunks + chunk) * heads + head
+        tl.store(states + state_at(part, first, HEAD_DIM, STATE, BLOCK), state)
         row, positions = decays_of(decays, batch, head, heads, chunk, chunks, CHUNK)
         if GRADIENT:
             weight = tl.exp(tl.load(row + SINCE * positions + lane))
         else:
             weight = tl.exp(tl.load(row + TO_END * positions + lane))
             weight *= tl.load(row + STEP * positions + lane)
+        at, inside = rows_of_head(batch, chunk, head, length, heads, HEAD_DIM, REVERSE, CHUNK)
+        value = tl.load(values + at, mask=inside, other=0.0).to(tl.float32) * weight[:, None]
+        at, inside = rows_of_state(batch, chunk, first, length, STATE, BLOCK, REVERSE, CHUNK)
+        projection = tl.load(projections + at, mask=inside, other=0.0)
         decay = tl.exp(tl.load(row + SINCE * positions + CHUNK - 1))
-        # The next chunk is loaded while this one's product is computed.
-        after = tl.maximum(chunk - 1, 0) if GRADIENT else tl.minimum(chunk + 1, chunks - 1)
-        at, inside = rows_of_head(batch, after, head, length, heads, HEAD_DIM, REVERSE, CHUNK)
-        next_value = tl.load(values + at, mask=inside, other=0.0)
-        at, inside = rows_of_state(batch, after, first, length, STATE, BLOCK, REVERSE, CHUNK)
-        next_projection = tl.load(projections + at, mask=inside, other=0.0)
-        part = (batch * chunks + chunk) * heads + head
-        tl.store(states + state_at(part, first, HEAD_DIM, STATE, BLOCK), state)
-        weighted = tl.trans(value.to(tl.float32) * weight[:, None])
-        state = decay * state + product(weighted, projection, DOT, PRECISION)
-        value, projection = next_value, next_projection
+        state = decay * state + product(tl.trans(value), projection, DOT, PRECISION)
 
 
 @kernel

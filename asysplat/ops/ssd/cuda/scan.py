@@ -16,21 +16,17 @@ from asysplat.ops.triton_utils import FUSED, INTERPRETED
 
 TOKENS = 16 if INTERPRETED else CHUNK  # tokens of a chunk; the slow interpreter, too, runs several
 BLOCK = 64  # columns of a state in a program
-PASS_WARPS = 4
-PASSED = 64  # columns of a state in a program that passes it on: programs for a whole GPU
 HEADS = 8  # heads in a program that sums decays
 LAUNCH = {"num_warps": 8, "num_stages": 2, **FUSED}
-# The type of a product's factors, and its precision: three products of TF32, 1e-6, are several
-# times as fast as one of fp32. fp16 lacks the range of a state.
-EXACT = {"DOT": tl.float32, "PRECISION": "tf32x3"}
-PRODUCTS = {
-    torch.float32: EXACT,
-    torch.bfloat16: {"DOT": tl.bfloat16, "PRECISION": "ieee"},
-    torch.float16: EXACT,
-}
-# Compute capabilities whose products read their factors from shared memory. Elsewhere registers
-# hold them, three times as many for EXACT: those of half as many tokens.
-FROM_SHARED_MEMORY = (9, 10)
+# The type of a product's factors, and its precision; fp16 lacks the range of a state.
+BFLOAT16 = {"DOT": tl.bfloat16, "PRECISION": "ieee"}
+EXACT = {"DOT": tl.float32, "PRECISION": "ieee"}
+# Three products of TF32 are as precise, and several times as fast. Hopper reads their factors from
+# shared memory; elsewhere registers would not hold them. Of smaller factors, Triton 3.6 reads past
+# the end.
+EXACT_BY_TF32 = {"DOT": tl.float32, "PRECISION": "tf32x3"}
+HOPPER = (9, 0)
+TF32_HEAD_DIM, TF32_STATE = 64, 64  # the head_dim, and the smallest state size
 
 
 def saved_state_shape(x: Float[Tensor, "B L H P"], B: Float[Tensor, "B L N"]) -> tuple[int]:
@@ -45,7 +41,7 @@ def forward(
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     y = torch.empty_like(x)
     with torch.cuda.device_of(x):
-        sizes = _Sizes(*x.shape, B.shape[-1], x.dtype, reverse, _tokens(x))
+        sizes = _Sizes(*x.shape, B.shape[-1], reverse, *_products(x, B))
         decays = _decays(sizes, dt, A)
         scores = _scores(sizes, B, C)
         states = _states(sizes, x, B, decays, gradient=False)
@@ -65,7 +61,7 @@ def backward(
     x, dt, A, B, C, D = (tensor.contiguous() for tensor in inputs)
     grad_output = grad_output.contiguous()
     with torch.cuda.device_of(x):
-        sizes = _Sizes(*x.shape, B.shape[-1], x.dtype, reverse, _tokens(x))
+        sizes = _Sizes(*x.shape, B.shape[-1], reverse, *_products(x, B))
         parts = (sizes.batch, sizes.chunks, sizes.heads)
         grads = ScanInputs(
             x=torch.empty_like(x),
@@ -109,9 +105,9 @@ class _Sizes(NamedTuple):
     heads: int
     head_dim: int
     state: int
-    dtype: torch.dtype
     reverse: bool
     tokens: int  # of a chunk
+    products: dict[str, Any]  # the type of a product's factors, and its precision
 
     @property
     def chunks(self) -> int:
@@ -136,17 +132,20 @@ class _Sizes(NamedTuple):
             "STATE": self.state,
             "BLOCK": self.block,
             "CHUNK": self.tokens,
-            **PRODUCTS[self.dtype],
+            **self.products,
         }
         return {name: size for name, size in sizes.items() if name in kernel.arg_names} | LAUNCH
 
 
-def _tokens(x: Tensor) -> int:
-    """Return the tokens of a chunk."""
-    if PRODUCTS[x.dtype] is not EXACT or not x.is_cuda:
-        return TOKENS
-    capability = torch.cuda.get_device_capability(x.device)[0]
-    return TOKENS if capability in FROM_SHARED_MEMORY else TOKENS // 2
+def _products(x: Tensor, B: Tensor) -> tuple[int, dict[str, Any]]:
+    """Return the tokens of a chunk, and the type and precision of products."""
+    if x.dtype == torch.bfloat16:
+        return TOKENS, BFLOAT16
+    sizes_fit = x.shape[-1] == TF32_HEAD_DIM and B.shape[-1] >= TF32_STATE
+    if x.is_cuda and torch.cuda.get_device_capability(x.device) == HOPPER and sizes_fit:
+        return TOKENS, EXACT_BY_TF32
+    # Those of whole chunks would not fit into registers.
+    return max(16, TOKENS // 2), EXACT
 
 
 def _decays(sizes: _Sizes, dt: Tensor, A: Tensor) -> Float[Tensor, "B H rows positions"]:
@@ -169,9 +168,10 @@ def _states(
     """Return the state before each chunk, or with `gradient` the gradient of the state after it."""
     shape = (sizes.batch, sizes.chunks, sizes.heads, sizes.head_dim, sizes.state)
     states = decays.new_empty(shape)
-    block = min(PASSED, sizes.state)
-    options = sizes.launch_kwargs(pass_states) | {"BLOCK": block, "num_warps": PASS_WARPS}
-    pass_states[(sizes.state // block, sizes.heads, sizes.batch)](
+    options = sizes.launch_kwargs(pass_states)
+    if options["DOT"] == tl.float32:
+        options |= EXACT  # its one product waits for the chunk before: there TF32 is slower
+    pass_states[(sizes.blocks, sizes.heads, sizes.batch)](
         values, projections, decays, states, GRADIENT=gradient, **options
     )
     return states
