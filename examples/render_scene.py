@@ -11,8 +11,8 @@ import torch
 from asysplat import Gaussians, Views, render
 from asysplat.data import ProceduralScene
 from asysplat.evaluation.figures import comparison_figure
+from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.interrupts import handle_signals
-from asysplat.rendering.sh import SH_C0
 
 
 def gaussians_from_depths(views: Views) -> Gaussians:

@@ -22,11 +22,9 @@ BRITISH = (
 # Packages and modules of asysplat: each imports only from layers before its own.
 LAYERS = (
     ("errors", "interrupts", "later"),
-    ("files", "overrides", "scene", "terminal"),
-    ("ops",),
-    ("rendering",),
-    ("motion",),
-    ("models", "data"),
+    ("files", "kernels", "overrides", "scene", "terminal"),
+    ("geometry", "ops"),
+    ("data", "models", "rendering"),
     ("refinement",),
     ("evaluation",),
     ("training", "export"),

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.motion import transform
+from asysplat.geometry.motion import transform
 from asysplat.scene import Cameras, Gaussians, TensorRecord, Views
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.evaluation.backbones import find_backbone
-from asysplat.ops.precision import without_autocast
+from asysplat.kernels.precision import without_autocast
 
 MIN_SIDE = 32  # pixels
 

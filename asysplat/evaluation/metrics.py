@@ -9,7 +9,7 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from asysplat.errors import InputError
-from asysplat.ops.precision import without_autocast
+from asysplat.kernels.precision import without_autocast
 
 MSE_FLOOR = 1e-10  # PSNR of identical images is 100 dB, not infinity
 SSIM_WINDOWS = {"gaussian": 11, "uniform": 7}  # pixels on a side

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.export.walls import free_radii
-from asysplat.rendering.reference.project import rotations
+from asysplat.geometry.rotations import rotations
 from asysplat.scene import Cameras, Gaussians
 
 ROUNDING = 1e-6  # relative to coordinates, or in radians; smaller differences are rounding

@@ -15,7 +15,7 @@ from asysplat.data.readers import colmap, transforms
 from asysplat.data.sequence import MIN_EXTENT, FileSequence, ImageSequence
 from asysplat.errors import InputError
 from asysplat.export.gaussians import READERS, read_gaussians
-from asysplat.motion import fit_similarity, transform
+from asysplat.geometry.motion import fit_similarity, transform
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians
 

@@ -7,7 +7,7 @@ import torch
 
 from asysplat.errors import InputError
 from asysplat.export.checks import TINY, existing
-from asysplat.rendering.sh import SH_C0
+from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

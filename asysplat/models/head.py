@@ -13,9 +13,9 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from asysplat.geometry.spherical_harmonics import SH_C0
+from asysplat.kernels.precision import without_autocast
 from asysplat.models.prior import Prior
-from asysplat.ops.precision import without_autocast
-from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Gaussians, Views
 
 # With a prior the network's corrections are bounded: on scenes unlike those of its training it is

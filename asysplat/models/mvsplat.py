@@ -11,9 +11,9 @@ from einops import rearrange
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor, nn
 
+from asysplat.kernels.precision import without_autocast
 from asysplat.models.network import Network
 from asysplat.models.single_branch import refuse_ratio
-from asysplat.ops.precision import without_autocast
 from asysplat.scene import Cameras, Gaussians, Views
 
 STRIDE = 4  # pixels along a side of a feature

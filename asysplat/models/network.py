@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import is_fake
 
 from asysplat.errors import InputError
+from asysplat.kernels.precision import without_autocast
 from asysplat.models.early_exit import EXACT, EarlyExit
 from asysplat.models.head import GaussianHead
 from asysplat.models.layers import Layers
@@ -18,7 +19,6 @@ from asysplat.models.prior import PRIOR_CHANNELS, Prior
 from asysplat.models.prune import Prune
 from asysplat.models.shapes import Widths
 from asysplat.models.tokenizer import PIXEL_CHANNELS, pixel_features
-from asysplat.ops.precision import without_autocast
 from asysplat.scene import Gaussians, Views
 
 

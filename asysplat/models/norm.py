@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from asysplat.ops.precision import without_autocast
+from asysplat.kernels.precision import without_autocast
 
 
 class RMSNorm(nn.RMSNorm):

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.utils.flop_counter import register_flop_formula
 
 from asysplat.errors import InputError
-from asysplat.ops.dispatch import (
+from asysplat.kernels.dispatch import (
     FAST,
     check_device,
     check_fast_backend,
@@ -29,7 +29,7 @@ from asysplat.ops.dispatch import (
     load_kernels,
     pick_backend,
 )
-from asysplat.ops.precision import without_autocast
+from asysplat.kernels.precision import without_autocast
 
 SIDES = {"P": "head_dim", "N": "state size"}  # in messages
 CountFlops = Callable[[tuple[int, ...], tuple[int, ...]], tuple[int, int]]

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.rendering.sh import SH_C0
+from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Cameras, Gaussians
 
 

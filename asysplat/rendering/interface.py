@@ -10,7 +10,6 @@ from asysplat.errors import InputError
 
 DEPTHS = ("accumulated", "expected", "median")
 MAX_MAGNITUDE = 1e18  # limit of depths and SH coefficients: more is culled, as squares overflow
-MIN_SQUARED_DISTANCE = 1e-20  # below the square of any distance that matters, and normal in float32
 MAX_PAIRS = 2**31 - 1  # pairs of splat and tile that int32 can number
 MAX_SPLATS_PER_TILE = 2**24  # what float32 can count
 

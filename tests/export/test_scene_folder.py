@@ -14,7 +14,7 @@ from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.export import write_gaussians
 from asysplat.export.scene_folder import SceneFile, check_visible, find_files
-from asysplat.motion import transform
+from asysplat.geometry.motion import transform
 from asysplat.scene import Gaussians
 
 SCALE = 0.3  # of the other system's units

@@ -4,7 +4,7 @@ import torch
 
 from asysplat.errors import InputError
 from asysplat.export import read_splat
-from asysplat.rendering.sh import sh_colors
+from asysplat.geometry.spherical_harmonics import sh_colors
 
 
 def row(mean=(1, 2, 3), scale=(0.1, 0.2, 0.3), rgba=(255, 51, 0, 204), quat=(128, 0, 192, 128)):

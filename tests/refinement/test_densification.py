@@ -6,6 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from asysplat.geometry.rotations import rotations
+from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.refinement.densification.clone_split import (
     DENSIFY_GRAD_THRESHOLD,
     MAX_SCALE,
@@ -31,8 +33,6 @@ from asysplat.refinement.fields import Fields
 from asysplat.refinement.isotropic import isotropic_gaussians
 from asysplat.refinement.settings import Rates
 from asysplat.rendering import render
-from asysplat.rendering.reference.project import rotations
-from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Cameras, Views
 
 

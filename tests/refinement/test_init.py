@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from asysplat.errors import InputError
+from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.models.prior import Prior
 from asysplat.models.prior.prior import FREE_OPACITY
 from asysplat.refinement.init import (
@@ -16,7 +17,6 @@ from asysplat.refinement.init import (
 )
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import MAX_OPACITY, MIN_OPACITY, SPREAD, merge_cells, merge_to_limit
-from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Cameras, Views
 
 

@@ -228,7 +228,7 @@ def test_tensors_on_a_cpu_are_an_error(make_scene):
 
 def test_without_triton_an_error_says_what_to_install(make_scene, monkeypatch):
     for name in list(sys.modules):
-        if name.startswith(("asysplat.rendering.cuda.", "asysplat.ops.triton_utils")):
+        if name.startswith(("asysplat.rendering.cuda.", "asysplat.kernels.triton_utils")):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "triton", None)
     with pytest.raises(InputError, match="'cuda' needs triton: pip install triton"):

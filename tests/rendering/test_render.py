@@ -6,9 +6,9 @@ import pytest
 import torch
 from textbook import textbook_alphas
 
+from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.rendering import INRIA, render
 from asysplat.rendering.reference import rasterize
-from asysplat.rendering.sh import SH_C0
 
 
 def pixel_loop(gaussians, cameras, background):

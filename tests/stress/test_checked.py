@@ -13,9 +13,9 @@ import pytest
 from backends import INTERPRETED
 from poison import FILLS
 
-from asysplat.ops.simd.gathers import gather_pairs, gather_squares
-from asysplat.ops.simd.threads import kernel
-from asysplat.ops.simd.vectors import load, load_some, store, zeros
+from asysplat.kernels.simd.gathers import gather_pairs, gather_squares
+from asysplat.kernels.simd.threads import kernel
+from asysplat.kernels.simd.vectors import load, load_some, store, zeros
 from asysplat.rendering.cpu.math import sum_and_clear
 
 CHECKED = bool(numba.config.BOUNDSCHECK)

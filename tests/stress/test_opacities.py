@@ -8,8 +8,8 @@ import torch
 from backends import EXACT, assert_close, both_ways, random_gradient
 
 from asysplat.benchmark.scenes import random_scene
+from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.rendering import CONVENTIONS, INRIA
-from asysplat.rendering.sh import SH_C0
 from asysplat.scene import Cameras, Gaussians
 
 CENTER = (4, 5)  # of the pixel that the stack stands at

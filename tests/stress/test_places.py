@@ -6,8 +6,8 @@ import pytest
 import torch
 from backends import EXACT, assert_close, assert_same_bits, both_ways, facing, relative_error
 
+from asysplat.geometry.spherical_harmonics import sh_basis
 from asysplat.rendering import INRIA
-from asysplat.rendering.sh import sh_basis
 
 
 def test_no_direction_shows_the_dc_color(backend, make_scene):

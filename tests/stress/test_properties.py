@@ -17,7 +17,7 @@ from backends import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asysplat.motion import transform
+from asysplat.geometry.motion import transform
 from asysplat.scene import Cameras, Gaussians
 
 few = settings(max_examples=1 if INTERPRETED else 3, derandomize=True, deadline=None)

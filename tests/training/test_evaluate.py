@@ -15,7 +15,7 @@ from asysplat.data.procedural import ProceduralScene
 from asysplat.data.write import write_transforms
 from asysplat.evaluation import scenes
 from asysplat.export import read_gaussians, write_gaussians
-from asysplat.motion import transform
+from asysplat.geometry.motion import transform
 from asysplat.report.fill import fill_table, finished_runs
 from asysplat.report.paper import load_paper
 

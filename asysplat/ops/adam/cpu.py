@@ -14,10 +14,9 @@ import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
-from asysplat.ops.adam.reference import AdamSettings, Rows
-from asysplat.ops.simd.gathers import gather_pairs
-from asysplat.ops.simd.threads import even_bounds, inline, kernel, run_blocks
-from asysplat.ops.simd.vectors import (
+from asysplat.kernels.simd.gathers import gather_pairs
+from asysplat.kernels.simd.threads import even_bounds, inline, kernel, run_blocks
+from asysplat.kernels.simd.vectors import (
     LANES,
     ZERO,
     fma,
@@ -30,6 +29,7 @@ from asysplat.ops.simd.vectors import (
     where,
     zeros,
 )
+from asysplat.ops.adam.reference import AdamSettings, Rows
 
 BLOCK = 1024  # rows
 ROUNDING = 2.0**-25  # adding less does not change 1 in float32

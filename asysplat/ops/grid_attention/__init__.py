@@ -4,7 +4,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.ops.dispatch import check_device, check_float, check_shape, pick_backend
+from asysplat.kernels.dispatch import check_device, check_float, check_shape, pick_backend
 from asysplat.ops.grid_attention.reference import grid_attention_reference
 from asysplat.ops.grid_attention.sdpa import grid_attention_sdpa
 

@@ -5,15 +5,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.ops.dispatch import (
+from asysplat.kernels.dispatch import (
     check_device,
     check_fast_backend,
     check_float,
     check_shape,
     pick_backend,
 )
+from asysplat.kernels.precision import without_autocast
 from asysplat.ops.image_loss.reference import SIZE, image_loss_reference
-from asysplat.ops.precision import without_autocast
 
 
 def image_loss(

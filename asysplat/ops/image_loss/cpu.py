@@ -19,10 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from asysplat.ops.image_loss import reference
-from asysplat.ops.image_loss.reference import SIZE, window_weights
-from asysplat.ops.simd.threads import even_bounds, inline, kernel, run_blocks
-from asysplat.ops.simd.vectors import (
+from asysplat.kernels.simd.threads import even_bounds, inline, kernel, run_blocks
+from asysplat.kernels.simd.vectors import (
     LANES,
     ONE,
     ZERO,
@@ -34,6 +32,8 @@ from asysplat.ops.simd.vectors import (
     where,
     zeros,
 )
+from asysplat.ops.image_loss import reference
+from asysplat.ops.image_loss.reference import SIZE, window_weights
 
 BAND = 64  # rows of a task; for their gradients it also computes the windows that begin above
 REACH = SIZE - 1

@@ -11,7 +11,7 @@ from types import ModuleType
 from torch import Tensor
 from torch._subclasses.fake_tensor import is_fake
 
-from asysplat.ops.dispatch import (
+from asysplat.kernels.dispatch import (
     FAST,
     check_fast_backend,
     fast_backend,

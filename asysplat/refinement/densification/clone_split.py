@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from asysplat.geometry.rotations import rotations
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.rendering.reference.project import rotations
 from asysplat.scene import Cameras
 
 DENSIFY_GRAD_THRESHOLD = 2e-4  # mean screen-space gradient, in half images

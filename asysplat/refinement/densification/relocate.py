@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asysplat.geometry.rotations import rotations
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.rendering.reference.project import rotations
 from asysplat.scene import Gaussians
 
 REGULARIZER = 0.01  # weight of the mean opacity, and of the mean scale

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
-from asysplat.ops.simd.threads import even_bounds, run_blocks, weighted_bounds
+from asysplat.kernels.simd.threads import even_bounds, run_blocks, weighted_bounds
 from asysplat.rendering.cpu import project as projection
 from asysplat.rendering.cpu import rasterize as raster
 from asysplat.rendering.cpu.project import Projected, project

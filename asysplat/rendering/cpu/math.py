@@ -10,9 +10,10 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from asysplat.ops.simd.threads import inline
-from asysplat.ops.simd.vectors import FLOATS, LANES, sum_of, vector_at
-from asysplat.rendering import formulas, sh
+from asysplat.geometry import spherical_harmonics as sh
+from asysplat.kernels.simd.threads import inline
+from asysplat.kernels.simd.vectors import FLOATS, LANES, sum_of, vector_at
+from asysplat.rendering import formulas
 
 SQRT_2, TWO_OVER_LN_2 = math.sqrt(2), 2 / math.log(2)
 

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asysplat.ops.simd.threads import inline, kernel
+from asysplat.geometry.spherical_harmonics import MIN_SQUARED_DISTANCE
+from asysplat.kernels.simd.threads import inline, kernel
 from asysplat.rendering.cpu.math import (
     compensation,
     covariance,
@@ -27,7 +28,7 @@ from asysplat.rendering.cpu.math import (
 from asysplat.rendering.cpu.splat import RED, Ellipse, load_ellipse, store_ellipse
 from asysplat.rendering.cpu.tiles import compute_box, list_tiles
 from asysplat.rendering.formulas import CENTER, EXPONENT_MARGIN, PIXEL_MARGIN, WHITEN_TO_LOG2
-from asysplat.rendering.interface import MAX_MAGNITUDE, MIN_SQUARED_DISTANCE
+from asysplat.rendering.interface import MAX_MAGNITUDE
 
 # Counters of a block: tiles that the splats' boxes touch; Gaussians culled by each.
 BOX_TILES, CULLED_BY_OPACITY, CULLED_BY_FRUSTUM = range(3)

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from asysplat.ops.simd.threads import inline, kernel
+from asysplat.geometry.spherical_harmonics import MIN_SQUARED_DISTANCE
+from asysplat.kernels.simd.threads import inline, kernel
 from asysplat.rendering.cpu.math import (
     covariance,
     covariance_gradient,
@@ -34,7 +35,6 @@ from asysplat.rendering.cpu.splat import (
     GRADIENT,
 )
 from asysplat.rendering.formulas import CENTER, CX, CY, DOWN, FORWARD, FX, FY, RIGHT, WHITEN_TO_LOG2
-from asysplat.rendering.interface import MIN_SQUARED_DISTANCE
 
 LOG_2 = math.log(2)
 # Offsets of the gradients of mean, quaternion, scale and SH in a Gaussian's sums.

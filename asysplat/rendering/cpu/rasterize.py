@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asysplat.ops.simd.threads import inline, kernel
-from asysplat.ops.simd.vectors import LANES, ONE, ZERO, exp2, fma
+from asysplat.kernels.simd.threads import inline, kernel
+from asysplat.kernels.simd.vectors import LANES, ONE, ZERO, exp2, fma
 from asysplat.rendering.cpu import splat as col
 from asysplat.rendering.cpu.math import sum_and_clear, to_bits
 from asysplat.rendering.cpu.splat import (

@@ -9,8 +9,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from asysplat.ops.simd.threads import inline
-from asysplat.ops.simd.vectors import LANES, fma
+from asysplat.kernels.simd.threads import inline
+from asysplat.kernels.simd.vectors import LANES, fma
 from asysplat.rendering.formulas import MAX_CENTER_OFFSET, PIXEL_MARGIN
 
 # A splat is 16 float32, one cache line; BASE_* are int32, *_REST are rounding errors of float32.

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asysplat.ops.simd.threads import inline, kernel
+from asysplat.kernels.simd.threads import inline, kernel
 from asysplat.rendering.cpu.splat import DEPTH, DEPTH_REST, TILE
 from asysplat.rendering.formulas import PIXEL_MARGIN
 

@@ -7,8 +7,9 @@ from collections.abc import Callable
 
 import triton.language as tl
 
-from asysplat.ops.triton_utils import kernel
-from asysplat.rendering import formulas, interface, sh
+from asysplat.geometry import spherical_harmonics as sh
+from asysplat.kernels.triton_utils import kernel
+from asysplat.rendering import formulas
 
 RIGHT, DOWN = tl.constexpr(formulas.RIGHT), tl.constexpr(formulas.DOWN)
 FORWARD, CENTER = tl.constexpr(formulas.FORWARD), tl.constexpr(formulas.CENTER)
@@ -18,7 +19,7 @@ LOW_X, HIGH_X = tl.constexpr(formulas.LOW_X), tl.constexpr(formulas.HIGH_X)
 LOW_Y, HIGH_Y = tl.constexpr(formulas.LOW_Y), tl.constexpr(formulas.HIGH_Y)
 CAMERA = tl.constexpr(formulas.CAMERA)
 CAMERA_GRADIENT = tl.constexpr(formulas.CAMERA_GRADIENT)
-MIN_SQUARED_DISTANCE = tl.constexpr(interface.MIN_SQUARED_DISTANCE)
+MIN_SQUARED_DISTANCE = tl.constexpr(sh.MIN_SQUARED_DISTANCE)
 
 SH_C0, Y1 = tl.constexpr(sh.SH_C0), tl.constexpr(sh.Y1)
 Y2, Y2_0 = tl.constexpr(sh.Y2), tl.constexpr(sh.Y2_0)
@@ -127,7 +128,7 @@ def direction(offset):
 
 @kernel
 def sh_basis(x, y, z, COUNT: tl.constexpr):
-    """Evaluate the first COUNT (1, 4, 9 or 16) SH functions at unit directions; see `sh`."""
+    """Evaluate the first COUNT (1, 4, 9 or 16) SH functions at unit directions."""
     out = (tl.full(x.shape, SH_C0, tl.float32),)
     if COUNT > 1:
         out = out + (y * -Y1, z * Y1, x * -Y1)

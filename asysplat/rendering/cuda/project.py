@@ -2,7 +2,7 @@
 
 import triton.language as tl
 
-from asysplat.ops.triton_utils import kernel
+from asysplat.kernels.triton_utils import kernel
 from asysplat.rendering import formulas, interface
 from asysplat.rendering.cuda.math import (
     CAMERA,

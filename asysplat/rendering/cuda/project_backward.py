@@ -4,7 +4,7 @@ import math
 
 import triton.language as tl
 
-from asysplat.ops.triton_utils import kernel
+from asysplat.kernels.triton_utils import kernel
 from asysplat.rendering import formulas
 from asysplat.rendering.cuda.math import (
     CAMERA,

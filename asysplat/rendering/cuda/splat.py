@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import triton.language as tl
 
-from asysplat.ops.triton_utils import kernel
+from asysplat.kernels.triton_utils import kernel
 from asysplat.rendering import formulas
 
 # A splat [16] float32: alpha = 2^(log_opacity - (a dx + b dy)^2 - (c dy)^2). Columns 0 and 1 hold

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import triton.language as tl
 from torch import Tensor
 
-from asysplat.ops.triton_utils import kernel
+from asysplat.kernels.triton_utils import kernel
 from asysplat.rendering import formulas
 from asysplat.rendering.cuda.splat import TILE, load_ellipse
 

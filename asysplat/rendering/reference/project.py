@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asysplat.geometry.rotations import rotations
+from asysplat.geometry.spherical_harmonics import sh_colors
 from asysplat.rendering.interface import MAX_MAGNITUDE, RenderSettings
-from asysplat.rendering.sh import sh_colors
 from asysplat.scene import Cameras, Gaussians
 
 BOUNDS_MARGIN = 1e-3  # pixels, more than the rounding error of an extent
@@ -195,14 +196,3 @@ def whiten(row_x: Tensor, row_y: Tensor, settings: RenderSettings) -> tuple[Tens
     # sqrt(det(M M^T) / det(M M^T + eps I)), Yu et al. 2024, Eq. 10.
     share = (minors / det).clamp_min(settings.convention.compensation_min)
     return whitening, deviations, share.sqrt()
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """Convert quaternions [..., 4] wxyz of any length to rotations [..., 3, 3]."""
-    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = (
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))

@@ -7,10 +7,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.ops.plane_sweep import reference
-from asysplat.ops.simd.gathers import gather_pairs
-from asysplat.ops.simd.threads import even_bounds, kernel, run_blocks
-from asysplat.ops.simd.vectors import (
+from asysplat.kernels.simd.gathers import gather_pairs
+from asysplat.kernels.simd.threads import even_bounds, kernel, run_blocks
+from asysplat.kernels.simd.vectors import (
     LANES,
     ONE,
     ZERO,
@@ -21,6 +20,7 @@ from asysplat.ops.simd.vectors import (
     where,
     zeros,
 )
+from asysplat.ops.plane_sweep import reference
 
 HALF, FRONT = np.float32(0.5), np.float32(reference.FRONT)
 

@@ -10,12 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from asysplat.ops.plane_sweep import reference
-from asysplat.ops.plane_sweep.inputs import CostInputs, prepare
-from asysplat.ops.plane_sweep.reference import BEST, WINDOW
-from asysplat.ops.simd.gathers import gather_squares
-from asysplat.ops.simd.threads import even_bounds, inline, kernel, run_blocks
-from asysplat.ops.simd.vectors import (
+from asysplat.kernels.simd.gathers import gather_squares
+from asysplat.kernels.simd.threads import even_bounds, inline, kernel, run_blocks
+from asysplat.kernels.simd.vectors import (
     LANES,
     ONE,
     ZERO,
@@ -30,6 +27,9 @@ from asysplat.ops.simd.vectors import (
     where,
     zeros,
 )
+from asysplat.ops.plane_sweep import reference
+from asysplat.ops.plane_sweep.inputs import CostInputs, prepare
+from asysplat.ops.plane_sweep.reference import BEST, WINDOW
 
 assert BEST == 2 and WINDOW == 5  # the least cost and the one after; sums of five columns
 AROUND = WINDOW // 2

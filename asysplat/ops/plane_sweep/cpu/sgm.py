@@ -5,9 +5,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.plane_sweep import reference
-from asysplat.ops.simd.threads import even_bounds, inline, kernel, run_blocks
-from asysplat.ops.simd.vectors import (
+from asysplat.kernels.simd.threads import even_bounds, inline, kernel, run_blocks
+from asysplat.kernels.simd.vectors import (
     LANES,
     ZERO,
     least,
@@ -18,6 +17,7 @@ from asysplat.ops.simd.vectors import (
     where,
     zeros,
 )
+from asysplat.ops.plane_sweep import reference
 
 SMALL_STEP = np.float32(reference.SMALL_STEP)
 MIN_BEND = np.float32(reference.MIN_BEND)

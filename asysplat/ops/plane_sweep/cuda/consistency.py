@@ -6,8 +6,8 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asysplat.kernels.triton_utils import FUSED, INTERPRETED, kernel
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.triton_utils import FUSED, INTERPRETED, kernel
 
 FRONT = tl.constexpr(reference.FRONT)
 PIXELS = 8192 if INTERPRETED else 256  # of a program

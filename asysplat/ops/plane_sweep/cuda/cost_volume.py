@@ -9,9 +9,9 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asysplat.kernels.triton_utils import FUSED, INTERPRETED, kernel
 from asysplat.ops.plane_sweep import reference
 from asysplat.ops.plane_sweep.inputs import prepare
-from asysplat.ops.triton_utils import FUSED, INTERPRETED, kernel
 
 AROUND = tl.constexpr(reference.WINDOW // 2)
 EARLIER = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch

@@ -6,8 +6,8 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
+from asysplat.kernels.triton_utils import FUSED, INTERPRETED, kernel
 from asysplat.ops.plane_sweep import reference
-from asysplat.ops.triton_utils import FUSED, INTERPRETED, kernel
 
 SMALL_STEP, INFINITY = tl.constexpr(reference.SMALL_STEP), tl.constexpr(float("inf"))
 TILE = 8192 if INTERPRETED else 256  # lines x planes

@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 
-from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
-from asysplat.ops.simd.threads import kernel
-from asysplat.ops.simd.vectors import (
+from asysplat.kernels.simd.threads import kernel
+from asysplat.kernels.simd.vectors import (
     LANES,
     ZERO,
     decay2,
@@ -18,6 +17,7 @@ from asysplat.ops.simd.vectors import (
     total,
     zeros,
 )
+from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
 
 LN_2 = np.float32(math.log(2))
 

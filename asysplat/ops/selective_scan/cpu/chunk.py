@@ -6,7 +6,7 @@ import numpy as np
 import torch.nn.functional as F
 from torch import Tensor
 
-from asysplat.ops.simd.vectors import LANES
+from asysplat.kernels.simd.vectors import LANES
 
 CACHE_CHUNK = 32  # tokens: arrays of CACHE_CHUNK x LANES fit a core's first cache
 ROWS = (CACHE_CHUNK, LANES)

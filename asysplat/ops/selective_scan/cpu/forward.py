@@ -2,9 +2,18 @@
 
 import numpy as np
 
+from asysplat.kernels.simd.threads import kernel
+from asysplat.kernels.simd.vectors import (
+    LANES,
+    ZERO,
+    decay2,
+    fma,
+    load,
+    load_some,
+    store,
+    store_some,
+)
 from asysplat.ops.selective_scan.cpu.chunk import CACHE_CHUNK, ROWS
-from asysplat.ops.simd.threads import kernel
-from asysplat.ops.simd.vectors import LANES, ZERO, decay2, fma, load, load_some, store, store_some
 
 
 @kernel

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from asysplat.kernels.simd.threads import even_bounds, run_blocks
+from asysplat.kernels.simd.vectors import LANES
 from asysplat.ops.scan import ScanInputs
 from asysplat.ops.selective_scan.cpu.backward import backward_blocks
 from asysplat.ops.selective_scan.cpu.chunk import (
@@ -16,8 +18,6 @@ from asysplat.ops.selective_scan.cpu.chunk import (
     by_channel,
 )
 from asysplat.ops.selective_scan.cpu.forward import forward_blocks
-from asysplat.ops.simd.threads import even_bounds, run_blocks
-from asysplat.ops.simd.vectors import LANES
 
 LOG2_E = 1 / math.log(2)
 

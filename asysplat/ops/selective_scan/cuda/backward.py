@@ -2,8 +2,8 @@
 
 import triton.language as tl
 
+from asysplat.kernels.triton_utils import kernel
 from asysplat.ops.selective_scan.cuda.chunk import load_channels, load_projection, place, row_at
-from asysplat.ops.triton_utils import kernel
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 import triton.language as tl
 
-from asysplat.ops.triton_utils import kernel, tokens_at
+from asysplat.kernels.triton_utils import kernel, tokens_at
 
 
 @kernel

@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from asysplat.kernels.triton_utils import FUSED, INTERPRETED
 from asysplat.ops.scan import ScanInputs
 from asysplat.ops.selective_scan.cuda.backward import backward_chunk
 from asysplat.ops.selective_scan.cuda.forward import forward_chunk, pass_states, sum_chunk
-from asysplat.ops.triton_utils import FUSED, INTERPRETED
 
 # Tokens of a chunk; the backward pass keeps all their states in registers.
 FORWARD_CHUNK, BACKWARD_CHUNK = (4, 4) if INTERPRETED else (16, 8)

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asysplat.ops.simd.products import add_product, add_triangle, transpose
-from asysplat.ops.simd.threads import inline, kernel
-from asysplat.ops.simd.vectors import ONE, ZERO, fma
+from asysplat.kernels.simd.products import add_product, add_triangle, transpose
+from asysplat.kernels.simd.threads import inline, kernel
+from asysplat.kernels.simd.vectors import ONE, ZERO, fma
 from asysplat.ops.ssd.cpu.chunk import (
     dot_rows,
     scale_rows,

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.ops.simd.threads import inline
-from asysplat.ops.simd.vectors import LANES, ONE, ZERO, decay2, fma, load, total, zeros
+from asysplat.kernels.simd.threads import inline
+from asysplat.kernels.simd.vectors import LANES, ONE, ZERO, decay2, fma, load, total, zeros
 
 
 class Decays(NamedTuple):

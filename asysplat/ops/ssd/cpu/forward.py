@@ -6,9 +6,9 @@ for each token have the same width. The columns beyond the head_dim stay 0.
 
 import numpy as np
 
-from asysplat.ops.simd.products import add_product, add_triangle
-from asysplat.ops.simd.threads import kernel
-from asysplat.ops.simd.vectors import ZERO, fma
+from asysplat.kernels.simd.products import add_product, add_triangle
+from asysplat.kernels.simd.threads import kernel
+from asysplat.kernels.simd.vectors import ZERO, fma
 from asysplat.ops.ssd.cpu.chunk import scale_rows, take_rows, weigh_scores
 
 

@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from asysplat.kernels.simd.threads import run_blocks
+from asysplat.kernels.simd.vectors import LANES
 from asysplat.ops.scan import ScanInputs
-from asysplat.ops.simd.threads import run_blocks
-from asysplat.ops.simd.vectors import LANES
 from asysplat.ops.ssd.chunked import CHUNK
 from asysplat.ops.ssd.cpu.backward import GroupGradients, HeadGradients, backward_heads
 from asysplat.ops.ssd.cpu.chunk import Segment, sum_decays

@@ -2,6 +2,7 @@
 
 import triton.language as tl
 
+from asysplat.kernels.triton_utils import kernel
 from asysplat.ops.ssd.cuda.chunk import (
     SINCE,
     STEP,
@@ -14,7 +15,6 @@ from asysplat.ops.ssd.cuda.chunk import (
     square_at,
     state_at,
 )
-from asysplat.ops.triton_utils import kernel
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 import triton.language as tl
 
-from asysplat.ops.triton_utils import INTERPRETED, kernel, tokens_at
+from asysplat.kernels.triton_utils import INTERPRETED, kernel, tokens_at
 
 IN_INTERPRETER = tl.constexpr(INTERPRETED)
 # The rows of [B, H, ROWS, positions], fp32: log decay since the chunk's start, with the token's own

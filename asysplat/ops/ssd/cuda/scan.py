@@ -7,12 +7,12 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
+from asysplat.kernels.triton_utils import FUSED, INTERPRETED
 from asysplat.ops.scan import ScanInputs
 from asysplat.ops.ssd.chunked import CHUNK
 from asysplat.ops.ssd.cuda.backward import head_gradients, projection_gradients, score_gradients
 from asysplat.ops.ssd.cuda.chunk import ROWS, sum_decays
 from asysplat.ops.ssd.cuda.forward import forward_chunk, pass_states, score_chunk
-from asysplat.ops.triton_utils import FUSED, INTERPRETED
 
 TOKENS = 16 if INTERPRETED else CHUNK  # tokens of a chunk; the slow interpreter, too, runs several
 BLOCK = 64  # columns of a state in a program

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from asysplat.rendering.interface import MIN_SQUARED_DISTANCE
-
+MIN_SQUARED_DISTANCE = 1e-20  # below the square of any distance that matters, and normal in float32
 # Factors of the basis functions, by degree and order.
 SH_C0 = 0.5 / math.sqrt(math.pi)  # a constant color is 0.5 + SH_C0 * sh_0
 Y1 = math.sqrt(3 / (4 * math.pi))

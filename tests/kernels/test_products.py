@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from asysplat.ops.simd.products import ROWS, add_product, add_triangle, transpose
-from asysplat.ops.simd.threads import kernel
-from asysplat.ops.simd.vectors import LANES
+from asysplat.kernels.simd.products import ROWS, add_product, add_triangle, transpose
+from asysplat.kernels.simd.threads import kernel
+from asysplat.kernels.simd.vectors import LANES
 
 SIDE = 4 * ROWS
 

@@ -16,7 +16,7 @@ from numba.core.datamodel import models
 from numba.core.typeconv import Conversion
 from numba.extending import intrinsic, lower_cast, overload, register_model
 
-from asysplat.ops.simd.threads import inline
+from asysplat.kernels.simd.threads import inline
 
 LANES = 16  # one vector of AVX-512; two or four of older ones
 HAS_FMA = bool(llvmlite.binding.get_host_cpu_features().get("fma", True))

@@ -5,7 +5,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from asysplat.ops.simd.vectors import (
+from asysplat.kernels.simd.vectors import (
     FLOATS,
     INTEGERS,
     LANES,

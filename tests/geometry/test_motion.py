@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from asysplat.motion import fit_similarity, transform
+from asysplat.geometry.motion import fit_similarity, transform
 
 
 def test_means_and_orientations(make_scene):

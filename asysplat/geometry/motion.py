@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from asysplat.rendering.sh import sh_rotation
+from asysplat.geometry.spherical_harmonics import sh_rotation
 from asysplat.scene import Gaussians
 
 

@@ -11,8 +11,8 @@ from numba.core import cgutils
 from numba.core.base import BaseContext
 from numba.extending import intrinsic
 
-from asysplat.ops.simd.threads import inline
-from asysplat.ops.simd.vectors import FLOATS, INTEGERS, LANES, ONE, check_range, emit_fma, splat
+from asysplat.kernels.simd.threads import inline
+from asysplat.kernels.simd.vectors import FLOATS, INTEGERS, LANES, ONE, check_range, emit_fma, splat
 
 HAS_32_VECTORS = bool(llvmlite.binding.get_host_cpu_features().get("avx512f", False))
 ROWS = 8 if HAS_32_VECTORS else 4

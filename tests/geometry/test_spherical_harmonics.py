@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from asysplat.rendering.sh import SH_C0, sh_basis, sh_colors, sh_rotation
+from asysplat.geometry.spherical_harmonics import SH_C0, sh_basis, sh_colors, sh_rotation
 
 
 def test_basis_is_orthonormal_on_the_sphere():
