@@ -19,13 +19,13 @@ import hydra
 from omegaconf import DictConfig
 from rich.console import Console
 
-from asysplat.benchmark.compare import compare, read_old
-from asysplat.benchmark.options import describe_machine, find_suite
-from asysplat.benchmark.table import write_results
 from asysplat.errors import InputError, input_error_behind
 from asysplat.files import check_writable
 from asysplat.interrupts import handle_signals
 from asysplat.training.revision import revision
+from benchmarks.compare import compare, read_old
+from benchmarks.options import describe_machine, find_suite
+from benchmarks.table import write_results
 
 
 @hydra.main(config_path="conf", config_name="benchmark", version_base="1.3")

@@ -29,14 +29,16 @@ LAYERS = (
     ("evaluation",),
     ("training", "export"),
     ("load", "report"),
-    ("reconstruct", "benchmark"),
+    ("reconstruct",),
 )
 
 
 @pytest.fixture(scope="module")
 def sources(repository):
-    """Module name -> syntax tree, of asysplat and the scripts."""
-    paths = [*(repository / "asysplat").rglob("*.py"), *repository.glob("*.py")]
+    """Module name -> syntax tree, of asysplat, the benchmarks and the scripts."""
+    paths = [*repository.glob("*.py")]
+    for folder in ("asysplat", "benchmarks"):
+        paths += (repository / folder).rglob("*.py")
     names = {path: path.relative_to(repository).with_suffix("").parts for path in paths}
     return {
         ".".join(parts[:-1] if parts[-1] == "__init__" else parts): ast.parse(path.read_text())
@@ -131,7 +133,7 @@ def test_a_public_class_has_a_name_of_its_own(sources):
 
 def test_names_are_american(repository):
     files = [*repository.glob("*.py")]
-    for folder in ("asysplat", "conf", "sweeps"):
+    for folder in ("asysplat", "benchmarks", "conf", "sweeps"):
         files += [*(repository / folder).rglob("*.py"), *(repository / folder).rglob("*.yaml")]
     # Names in the files of finished runs stay what they were.
     texts = [path.read_text() for path in files if path.name != "old_names.py"]

@@ -4,10 +4,10 @@ import torch
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from asysplat.benchmark import bench
-from asysplat.benchmark.bench import Pair
-from asysplat.benchmark.compare import compare
-from asysplat.benchmark.options import describe_machine
+from benchmarks import bench
+from benchmarks.bench import Pair
+from benchmarks.compare import compare
+from benchmarks.options import describe_machine
 
 
 def measure(monkeypatch, *times):

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from asysplat.benchmark.compare import compare
-from asysplat.benchmark.options import SUITES, find_suite
-from asysplat.benchmark.table import dumps
+from benchmarks.compare import compare
+from benchmarks.options import SUITES, find_suite
+from benchmarks.table import dumps
 
 FOLDER = Path(__file__).parents[2] / "docs" / "results"
 FILES = [path for path in sorted(FOLDER.rglob("*.json")) if path.stem in SUITES]

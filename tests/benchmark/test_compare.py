@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import pytest
 from matplotlib.figure import Figure
 
-from asysplat.benchmark import compare as kinds
-from asysplat.benchmark import options
-from asysplat.benchmark.compare import Watched, compare, read_old
-from asysplat.benchmark.table import make_table, spread, text
 from asysplat.errors import InputError
+from benchmarks import compare as kinds
+from benchmarks import options
+from benchmarks.compare import Watched, compare, read_old
+from benchmarks.table import make_table, spread, text
 
 KINDS = {"seconds": kinds.TIME, "rate": kinds.RATE, "ratio": kinds.RATIO}
 KINDS |= dict.fromkeys(("wrong", "none"), kinds.ERROR) | {"psnr": kinds.DECIBELS}

@@ -2,9 +2,9 @@
 
 import pytest
 
-from asysplat.benchmark.data import CACHES, tables, write_photographs
 from asysplat.data import SceneOptions, open_scene
 from asysplat.data.images import content_hash
+from benchmarks.data import CACHES, tables, write_photographs
 
 pytestmark = pytest.mark.medium
 

@@ -3,9 +3,9 @@
 import pytest
 from hydra import initialize_config_dir
 
-from asysplat.benchmark.model import COMPONENTS, OPERATORS, OTHERS, make_net, tables
-from asysplat.benchmark.options import CPU
 from asysplat.errors import InputError
+from benchmarks.model import COMPONENTS, OPERATORS, OTHERS, make_net, tables
+from benchmarks.options import CPU
 
 pytestmark = pytest.mark.medium
 

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from asysplat.benchmark.ops import PASSES, SCANS
-from asysplat.benchmark.options import CPU, PRECISIONS, check_names, find_device
 from asysplat.errors import InputError
+from benchmarks.ops import PASSES, SCANS
+from benchmarks.options import CPU, PRECISIONS, check_names, find_device
 
 pytestmark = pytest.mark.medium
 

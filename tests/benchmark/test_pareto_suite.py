@@ -7,9 +7,13 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asysplat import load
-from asysplat.benchmark import pareto
-from asysplat.benchmark.data import write_photographs
-from asysplat.benchmark.pareto import (
+from asysplat.errors import InputError
+from asysplat.evaluation.measured_cost import memory_gb, reset_peak_memory
+from asysplat.evaluation.metrics import psnr
+from asysplat.rendering import render
+from benchmarks import pareto
+from benchmarks.data import write_photographs
+from benchmarks.pareto import (
     BASE,
     FAMILIES,
     find_families,
@@ -19,10 +23,6 @@ from asysplat.benchmark.pareto import (
     summarize,
     tables,
 )
-from asysplat.errors import InputError
-from asysplat.evaluation.measured_cost import memory_gb, reset_peak_memory
-from asysplat.evaluation.metrics import psnr
-from asysplat.rendering import render
 
 SIDE = 32
 KNOBS = {

@@ -6,8 +6,10 @@ import pytest
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from asysplat.benchmark.options import find_suite
-from asysplat.benchmark.render import (
+from asysplat.errors import InputError
+from asysplat.rendering import Culling
+from benchmarks.options import find_suite
+from benchmarks.render import (
     CULLING,
     FIELDS,
     errors,
@@ -18,9 +20,7 @@ from asysplat.benchmark.render import (
     run,
     run_exact,
 )
-from asysplat.benchmark.scenes import SCENES, SMALLER, pixel_aligned_scene, random_scene
-from asysplat.errors import InputError
-from asysplat.rendering import Culling
+from benchmarks.scenes import SCENES, SMALLER, pixel_aligned_scene, random_scene
 
 
 @pytest.fixture(scope="module")

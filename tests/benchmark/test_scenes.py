@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from asysplat.benchmark.scenes import ARC, DISTANCE, on_an_arc, pixel_aligned_scene, random_scene
+from benchmarks.scenes import ARC, DISTANCE, on_an_arc, pixel_aligned_scene, random_scene
 
 
 @pytest.mark.parametrize("make, count, num", [(random_scene, 9, 9), (pixel_aligned_scene, 20, 800)])

@@ -12,11 +12,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from asysplat.benchmark.stability.comparison import StabilityCase, compare_to_reference, unit
-from asysplat.benchmark.stability.hostile import HOSTILE_GAUSSIANS, hostile_views
-from asysplat.benchmark.stability.report import AREAS, measure, plot, tables, verdict
 from asysplat.errors import InputError
 from asysplat.models import head
+from benchmarks.stability.comparison import StabilityCase, compare_to_reference, unit
+from benchmarks.stability.hostile import HOSTILE_GAUSSIANS, hostile_views
+from benchmarks.stability.report import AREAS, measure, plot, tables, verdict
 
 TINY = {"scale": "laptop", "width": 0.125, "state_size": 8, "model.layers": "1m1s"}
 FEW = {

@@ -12,7 +12,7 @@ from asysplat.rendering import render
 
 PLAIN = """
 import torch
-from asysplat.benchmark.scenes import random_scene
+from benchmarks.scenes import random_scene
 from asysplat.rendering import render
 from asysplat.rendering.cpu.rasterize import rasterize
 

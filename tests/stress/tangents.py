@@ -4,13 +4,13 @@ import math
 
 import torch
 
-from asysplat.benchmark.scenes import random_scene
 from asysplat.rendering import INRIA
 from asysplat.rendering.cpu.splat import TILE
 from asysplat.rendering.formulas import EXPONENT_MARGIN, PIXEL_MARGIN
 from asysplat.rendering.interface import RenderSettings
 from asysplat.rendering.reference.project import project_footprints
 from asysplat.scene import Cameras, Gaussians
+from benchmarks.scenes import random_scene
 
 BAND = 2e-5  # pixels
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 from backends import EXACT, INPUTS, both_ways, random_gradient, relative_error
 
-from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
-from asysplat.benchmark.stability.boundary_band import boundary_band
 from asysplat.rendering.interface import RenderSettings
+from benchmarks.scenes import pixel_aligned_scene, random_scene
+from benchmarks.stability.boundary_band import boundary_band
 
 # Outputs that have a gradient, and options of `render`.
 CASES = {

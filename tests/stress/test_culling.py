@@ -6,8 +6,8 @@ import pytest
 import torch
 from backends import assert_same_bits, both_ways
 
-from asysplat.benchmark.scenes import pixel_aligned_scene, random_scene
 from asysplat.rendering import Culling
+from benchmarks.scenes import pixel_aligned_scene, random_scene
 
 
 def needles():

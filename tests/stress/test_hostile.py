@@ -3,8 +3,8 @@
 import pytest
 from backends import INTERPRETED
 
-from asysplat.benchmark.stability.hostile import HOSTILE_GAUSSIANS, HostileViews, hostile_views
-from asysplat.benchmark.stability.renderer import measure
+from benchmarks.stability.hostile import HOSTILE_GAUSSIANS, HostileViews, hostile_views
+from benchmarks.stability.renderer import measure
 
 CASES = {f"Gaussians {name}": (HostileViews(), name) for name in HOSTILE_GAUSSIANS}
 CASES |= {

@@ -7,10 +7,10 @@ import pytest
 import torch
 from backends import EXACT, assert_close, both_ways, random_gradient
 
-from asysplat.benchmark.scenes import random_scene
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.rendering import CONVENTIONS, INRIA
 from asysplat.scene import Cameras, Gaussians
+from benchmarks.scenes import random_scene
 
 CENTER = (4, 5)  # of the pixel that the stack stands at
 

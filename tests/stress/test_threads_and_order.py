@@ -5,8 +5,8 @@ import torch
 from backends import EXACT, FAST, FIELDS, INTERPRETED, assert_same_bits, both_ways, max_error
 from tangents import tangent_scene
 
-from asysplat.benchmark.scenes import random_scene
 from asysplat.scene import Cameras, Gaussians
+from benchmarks.scenes import random_scene
 
 
 @pytest.mark.medium

@@ -28,11 +28,6 @@ from rich.table import Table
 from torch import Tensor
 
 from asysplat import load
-from asysplat.benchmark import timing
-from asysplat.benchmark.compare import DECIBELS, LPIPS_DISTANCE, TIME, Watched
-from asysplat.benchmark.options import CPU, PRECISIONS, check_names, find_device
-from asysplat.benchmark.table import Columns, machine_note, make_table, number, spread, text
-from asysplat.benchmark.timing import Measurement, Result, summary
 from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.procedural.scene import split_seed
@@ -50,6 +45,11 @@ from asysplat.rendering import INRIA, render
 from asysplat.report.front import draw_front
 from asysplat.report.style import FAINT, OURS, STYLE
 from asysplat.scene import Views
+from benchmarks import timing
+from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TIME, Watched
+from benchmarks.options import CPU, PRECISIONS, check_names, find_device
+from benchmarks.table import Columns, machine_note, make_table, number, spread, text
+from benchmarks.timing import Measurement, Result, summary
 
 WHOLE = {"views", "side", "max_gaussians", "views_at_once", "steps"}  # numbers of a setting
 BASE = "base"  # the setting that each knob changes

@@ -11,9 +11,13 @@ import torch
 import torch.nn.functional as F
 from hydra.utils import instantiate
 
-from asysplat.benchmark.scenes import DISTANCE
-from asysplat.benchmark.stability.comparison import ALL_PRECISIONS, StabilityCase, make_row
-from asysplat.benchmark.stability.hostile import (
+from asysplat.refinement import Refinement, RefinementProgress, refine
+from asysplat.rendering import render
+from asysplat.scene import Gaussians, Views
+from asysplat.training.module import SplattingModule
+from benchmarks.scenes import DISTANCE
+from benchmarks.stability.comparison import ALL_PRECISIONS, StabilityCase, make_row
+from benchmarks.stability.hostile import (
     FIELDS,
     FOCALS,
     HOSTILE_GAUSSIANS,
@@ -23,11 +27,7 @@ from asysplat.benchmark.stability.hostile import (
     hostile_gaussians,
     scattered_gaussians,
 )
-from asysplat.benchmark.timing import Result
-from asysplat.refinement import Refinement, RefinementProgress, refine
-from asysplat.rendering import render
-from asysplat.scene import Gaussians, Views
-from asysplat.training.module import SplattingModule
+from benchmarks.timing import Result
 
 SMALL = ("width=0.125", "state_size=8", "model.layers=1m1s")
 COUNTS = (1, 2, 4)  # numbers of views

@@ -6,17 +6,17 @@ from functools import partial
 import torch
 
 from asysplat import ops
-from asysplat.benchmark.scenes import random_numbers
-from asysplat.benchmark.stability.comparison import (
+from asysplat.ops.adam import adam_step
+from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
+from benchmarks.scenes import random_numbers
+from benchmarks.stability.comparison import (
     ALL_PRECISIONS,
     StabilityCase,
     Tensors,
     compare_to_reference,
 )
-from asysplat.benchmark.stability.hostile import IMAGES, make_images
-from asysplat.benchmark.timing import Result
-from asysplat.ops.adam import adam_step
-from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
+from benchmarks.stability.hostile import IMAGES, make_images
+from benchmarks.timing import Result
 
 HUGE = 1e18  # its square is still a float32
 ALWAYS_FP32 = ("dt", "A", "D")  # inputs of a scan

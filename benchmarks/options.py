@@ -16,8 +16,8 @@ import torch
 from asysplat.errors import InputError
 
 NAMES = ("render", "ops", "model", "data", "pareto", "bench")
-SUITES = {name: f"asysplat.benchmark.{name}" for name in NAMES}
-SUITES["stability"] = "asysplat.benchmark.stability.report"
+SUITES = {name: f"benchmarks.{name}" for name in NAMES}
+SUITES["stability"] = "benchmarks.stability.report"
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
 CPU = torch.device("cpu")
 

@@ -7,20 +7,20 @@ from functools import partial
 import torch
 from torch.func import functional_call
 
-from asysplat.benchmark.model import make_net
-from asysplat.benchmark.stability.comparison import (
+from asysplat.models.network import Network
+from asysplat.models.prior import PlaneSweepPrior
+from asysplat.models.prior.plane_sweep import plane_sweep
+from asysplat.scene import Cameras, Views
+from benchmarks.model import make_net
+from benchmarks.stability.comparison import (
     ALL_PRECISIONS,
     ROUNDINGS,
     StabilityCase,
     Tensors,
     compare_to_reference,
 )
-from asysplat.benchmark.stability.hostile import FIELDS, HostileViews, hostile_views
-from asysplat.benchmark.timing import Result
-from asysplat.models.network import Network
-from asysplat.models.prior import PlaneSweepPrior
-from asysplat.models.prior.plane_sweep import plane_sweep
-from asysplat.scene import Cameras, Views
+from benchmarks.stability.hostile import FIELDS, HostileViews, hostile_views
+from benchmarks.timing import Result
 
 MIN_INVERSE_DEPTH = 1e-30  # avoids division by 0 where the plane sweep finds nothing
 WILD, WILD_FACTOR = "wild weights", 1e4  # factor of the decoder, as after a failed training

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from asysplat.benchmark.options import PRECISIONS
-from asysplat.benchmark.timing import Result
+from benchmarks.options import PRECISIONS
+from benchmarks.timing import Result
 
 ALL_PRECISIONS = PRECISIONS | {"fp16": torch.float16}
 ROUNDINGS = 256  # roundings of an operator in sequence

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from asysplat.benchmark.table import at, worst
-from asysplat.benchmark.timing import Result
 from asysplat.errors import InputError
+from benchmarks.table import at, worst
+from benchmarks.timing import Result
 
 MACHINE = ("cpu", "instructions", "cores", "threads", "gpu")  # what times depend on
 NO_ERROR = 1e-12  # errors below are taken for it

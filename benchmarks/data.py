@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from asysplat.benchmark.compare import RATE, Watched
-from asysplat.benchmark.options import CPU
-from asysplat.benchmark.table import machine_note, make_table, spread, text
-from asysplat.benchmark.timing import Measurement, Result, seconds_of, summary, time_in_rounds
 from asysplat.data import ImageCache, ProceduralScene, SceneOptions, files_data, open_scene
 from asysplat.data.readers.common import opencv_from_opengl
+from benchmarks.compare import RATE, Watched
+from benchmarks.options import CPU
+from benchmarks.table import machine_note, make_table, spread, text
+from benchmarks.timing import Measurement, Result, seconds_of, summary, time_in_rounds
 
 NO_CACHE, FILLED = CACHES = ("none", "filled")
 WATCHED = Watched(names=("cache",), alike=(), kinds={"frames_per_second": RATE}, rows="loading")

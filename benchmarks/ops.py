@@ -12,15 +12,15 @@ from rich.table import Table
 from torch import Tensor
 
 from asysplat import ops
-from asysplat.benchmark import timing
-from asysplat.benchmark.compare import ERROR, TIME, Watched
-from asysplat.benchmark.options import PRECISIONS, check_names, find_device
-from asysplat.benchmark.scenes import DISTANCE, FOCAL, camera_at_origin, on_an_arc, random_numbers
-from asysplat.benchmark.table import error, machine_note, make_table, number, spread, text
-from asysplat.benchmark.timing import Measurement, Result, relative_l2
 from asysplat.errors import InputError
 from asysplat.models.prior.plane_sweep import plane_sweep
 from asysplat.scene import Cameras
+from benchmarks import timing
+from benchmarks.compare import ERROR, TIME, Watched
+from benchmarks.options import PRECISIONS, check_names, find_device
+from benchmarks.scenes import DISTANCE, FOCAL, camera_at_origin, on_an_arc, random_numbers
+from benchmarks.table import error, machine_note, make_table, number, spread, text
+from benchmarks.timing import Measurement, Result, relative_l2
 
 PASSES = {"forward": "Forward", "forward_backward": "Forward and backward"}
 ERRORS = {"forward": "error.forward", "forward_backward": "error.gradients"}

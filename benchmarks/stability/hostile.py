@@ -7,8 +7,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from asysplat.benchmark.scenes import FOCAL, on_an_arc, random_numbers
 from asysplat.scene import Cameras, Gaussians, Views
+from benchmarks.scenes import FOCAL, on_an_arc, random_numbers
 
 SPACING = 1000.0  # between cameras that are kilometers apart; the unit is a meter
 MANY = 8  # more views have half as many pixels along a side, to save time

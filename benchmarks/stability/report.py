@@ -8,18 +8,18 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from asysplat.benchmark.compare import ERROR, Watched
-from asysplat.benchmark.options import check_names
-from asysplat.benchmark.plot import bars
-from asysplat.benchmark.stability.comparison import RULE, StabilityCase
-from asysplat.benchmark.stability.models import depth_cases, network_cases
-from asysplat.benchmark.stability.operators import operator_cases
-from asysplat.benchmark.stability.optimization import refinement_cases, training_cases
-from asysplat.benchmark.stability.renderer import renderer_cases
-from asysplat.benchmark.table import NOTHING, Columns, make_table, number, text
-from asysplat.benchmark.timing import Result
 from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
+from benchmarks.compare import ERROR, Watched
+from benchmarks.options import check_names
+from benchmarks.plot import bars
+from benchmarks.stability.comparison import RULE, StabilityCase
+from benchmarks.stability.models import depth_cases, network_cases
+from benchmarks.stability.operators import operator_cases
+from benchmarks.stability.optimization import refinement_cases, training_cases
+from benchmarks.stability.renderer import renderer_cases
+from benchmarks.table import NOTHING, Columns, make_table, number, text
+from benchmarks.timing import Result
 
 AREAS: dict[str, Callable[[DictConfig], Iterable[StabilityCase]]] = {
     "operators": lambda options: [*operator_cases(), *depth_cases(plane_sweep=True)],

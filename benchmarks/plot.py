@@ -6,9 +6,9 @@ import matplotlib
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from asysplat.benchmark.table import worst
-from asysplat.benchmark.timing import Result
 from asysplat.report.style import FAINT, INK, OURS, STYLE
+from benchmarks.table import worst
+from benchmarks.timing import Result
 
 COLORS = {"cpu": OURS, "cuda": INK, "reference": FAINT}
 MARKS = "osD^vPX*"

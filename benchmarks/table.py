@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from rich.box import ROUNDED
 from rich.table import Table
 
-from asysplat.benchmark.timing import BUSY, Result
 from asysplat.files import atomic_write
 from asysplat.report.markdown import escape
+from benchmarks.timing import BUSY, Result
 
 NOTHING = "-"  # for what was not measured
 WIDTH = 100  # characters of a line of JSON, above which a dictionary or list is split

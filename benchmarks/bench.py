@@ -13,14 +13,6 @@ from rich.console import Console
 from rich.table import Table
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from asysplat.benchmark.compare import RATIO, Watched
-from asysplat.benchmark.model import Workload, make_net, make_views
-from asysplat.benchmark.ops import make_path
-from asysplat.benchmark.options import CPU
-from asysplat.benchmark.render import Backend, prepare, run
-from asysplat.benchmark.scenes import random_scene
-from asysplat.benchmark.table import machine_note, make_table, spread, text
-from asysplat.benchmark.timing import Measurement, Result, Run, summary, time_in_rounds
 from asysplat.ops.adam.cpu import adam_step_cpu
 from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 from asysplat.ops.image_loss import image_loss
@@ -28,6 +20,14 @@ from asysplat.ops.ssd.chunked import CHUNK
 from asysplat.refinement import Refinement
 from asysplat.rendering import Culling
 from asysplat.scene import Views
+from benchmarks.compare import RATIO, Watched
+from benchmarks.model import Workload, make_net, make_views
+from benchmarks.ops import make_path
+from benchmarks.options import CPU
+from benchmarks.render import Backend, prepare, run
+from benchmarks.scenes import random_scene
+from benchmarks.table import machine_note, make_table, spread, text
+from benchmarks.timing import Measurement, Result, Run, summary, time_in_rounds
 
 aten = torch.ops.aten
 BEST_OF = 3  # runs in a round: interruptions only make a run slower

@@ -5,9 +5,12 @@ from functools import partial
 
 import torch
 
-from asysplat.benchmark.stability.boundary_band import boundary_band
-from asysplat.benchmark.stability.comparison import StabilityCase, Tensors, compare_to_reference
-from asysplat.benchmark.stability.hostile import (
+from asysplat.rendering import render
+from asysplat.rendering.interface import RenderSettings
+from asysplat.scene import Cameras, Gaussians
+from benchmarks.stability.boundary_band import boundary_band
+from benchmarks.stability.comparison import StabilityCase, Tensors, compare_to_reference
+from benchmarks.stability.hostile import (
     FIELDS,
     HOSTILE_GAUSSIANS,
     HostileViews,
@@ -15,10 +18,7 @@ from asysplat.benchmark.stability.hostile import (
     hostile_views,
     scattered_gaussians,
 )
-from asysplat.benchmark.timing import Result
-from asysplat.rendering import render
-from asysplat.rendering.interface import RenderSettings
-from asysplat.scene import Cameras, Gaussians
+from benchmarks.timing import Result
 
 
 def renderer_cases(counts: Sequence[int]) -> Iterator[StabilityCase]:

@@ -13,15 +13,15 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from asysplat.benchmark import timing
-from asysplat.benchmark.compare import ERROR, TIME, Watched
-from asysplat.benchmark.options import CPU, check_names
-from asysplat.benchmark.plot import time_against_error
-from asysplat.benchmark.scenes import SCENES, SMALLER, Scene
-from asysplat.benchmark.table import error, machine_note, make_table, number, spread, text
-from asysplat.benchmark.timing import Measurement, Result, now, relative_l2
 from asysplat.rendering import Culling, render
 from asysplat.scene import Cameras, Gaussians
+from benchmarks import timing
+from benchmarks.compare import ERROR, TIME, Watched
+from benchmarks.options import CPU, check_names
+from benchmarks.plot import time_against_error
+from benchmarks.scenes import SCENES, SMALLER, Scene
+from benchmarks.table import error, machine_note, make_table, number, spread, text
+from benchmarks.timing import Measurement, Result, now, relative_l2
 
 WATCHED = Watched(
     names=("scene", "backend", "without"),

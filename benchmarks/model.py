@@ -17,17 +17,17 @@ from rich.progress import track
 from rich.table import Table
 
 from asysplat import models, ops
-from asysplat.benchmark.compare import TIME, Watched
-from asysplat.benchmark.options import PRECISIONS, check_names, find_device
-from asysplat.benchmark.plot import bars
-from asysplat.benchmark.scenes import on_an_arc, random_scene
-from asysplat.benchmark.table import machine_note, make_table, number, spread, text
-from asysplat.benchmark.timing import Measurement, Result, Run, now, seconds_of, time_in_rounds
 from asysplat.evaluation.static_cost import count_parameters
 from asysplat.models.network import Network
 from asysplat.models.tokenizer import Tokenizer
 from asysplat.overrides import check_overrides
 from asysplat.scene import Gaussians, Views
+from benchmarks.compare import TIME, Watched
+from benchmarks.options import PRECISIONS, check_names, find_device
+from benchmarks.plot import bars
+from benchmarks.scenes import on_an_arc, random_scene
+from benchmarks.table import machine_note, make_table, number, spread, text
+from benchmarks.timing import Measurement, Result, Run, now, seconds_of, time_in_rounds
 
 WATCHED = Watched(
     names=("model", "views", "precision"),
