@@ -10,39 +10,25 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: who waits must not spin
 
-from asysplat.overrides import exit_at_unknown_overrides
+from asysplat.cli import check_command, command
 
 if __name__ == "__main__":
-    exit_at_unknown_overrides("benchmark")
+    check_command("benchmark")
 
-import hydra
 from omegaconf import DictConfig
 from rich.console import Console
 
-from asysplat.errors import InputError, input_error_behind
+from asysplat.errors import InputError
 from asysplat.files import check_writable
-from asysplat.interrupts import handle_signals
 from asysplat.training.revision import revision
 from benchmarks.compare import compare, read_old
 from benchmarks.options import describe_machine, find_suite
 from benchmarks.table import write_results
 
 
-@hydra.main(config_path="conf", config_name="benchmark", version_base="1.3")
-def main(options: DictConfig) -> None:
-    try:
-        worse = benchmark(options)
-    except Exception as error:
-        known = input_error_behind(error)
-        if known is None:
-            raise
-        sys.exit(f"error: {known}")
-    if worse:
-        sys.exit(1)
-
-
-def benchmark(options: DictConfig) -> bool:
-    """Measure, print the tables, write all; return whether anything is worse than in `compare`."""
+@command("benchmark")
+def benchmark(options: DictConfig) -> None:
+    """Measure, print the tables, write all; exit with 1 if anything is worse than in `compare`."""
     suite = find_suite(options.suite)
     if not isinstance(options.repeats, int) or options.repeats < 1:
         raise InputError(f"repeats={options.repeats} cannot be: give a whole number from 1.")
@@ -61,13 +47,13 @@ def benchmark(options: DictConfig) -> bool:
     if hasattr(suite, "verdict") and (complaint := suite.verdict(results)):
         sys.exit(complaint)
     if old is None:
-        return False
+        return
     found = compare(old, results, suite.WATCHED)
     for line in found.sentences():
         console.print(line, soft_wrap=True, markup=False, highlight=False)
-    return bool(found.worse)
+    if found.worse:
+        sys.exit(1)
 
 
 if __name__ == "__main__":
-    handle_signals()
-    main()
+    benchmark()

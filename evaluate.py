@@ -8,12 +8,11 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from asysplat.overrides import exit_at_unknown_overrides
+from asysplat.cli import check_command, command
 
 if __name__ == "__main__":
-    exit_at_unknown_overrides("evaluate")
+    check_command("evaluate")
 
-import hydra
 import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -32,25 +31,19 @@ from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.export import write_safetensors
 from asysplat.export.scene_folder import check_visible, find_files, origin_of
 from asysplat.files import check_writable, make_folder
-from asysplat.interrupts import handle_signals
 from asysplat.models.early_exit import EXACT
 from asysplat.models.network import Network
 from asysplat.scene import Gaussians, Views
 from asysplat.training.checkpoints import load_weights
 from asysplat.training.evaluation_target import find_target
-from asysplat.training.messages import exit_with_message, quiet_lightning
+from asysplat.training.messages import quiet_lightning
 from asysplat.training.runs import EVALUATION
 from asysplat.training.summary import print_evaluation, write_json
 
 Predictor = Callable[[Sample], Predict]  # prediction function for a sample's scene
 
 
-@hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
-def main(options: DictConfig) -> None:
-    with exit_with_message("stopped; the same command resumes with the scenes that are missing."):
-        evaluate(options)
-
-
+@command("evaluate", "stopped; the same command resumes with the scenes that are missing.")
 def evaluate(options: DictConfig) -> None:
     """Measure every scene that was not measured yet; write and print the results of all."""
     quiet_lightning()
@@ -180,5 +173,4 @@ def write_scenes(
 
 
 if __name__ == "__main__":
-    handle_signals()
-    main()
+    evaluate()

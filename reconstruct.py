@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read with torch: idle threads must not spin
-signal.signal(signal.SIGINT, signal.SIG_DFL)  # while modules load there is nothing to clean up
 
-from asysplat.overrides import as_overrides, exit_at_unknown_overrides
+from asysplat.cli import check_command, command
+from asysplat.overrides import as_overrides
 
 if __name__ == "__main__":
     sys.argv[1:] = as_overrides(sys.argv[1:])
-    exit_at_unknown_overrides("reconstruct")
+    check_command("reconstruct")
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -29,9 +28,8 @@ from rich.console import Console
 
 from asysplat import load
 from asysplat.data.cameras import CameraOptions
-from asysplat.errors import InputError, input_error_behind, plain_warnings
+from asysplat.errors import InputError
 from asysplat.export import read_gaussians
-from asysplat.interrupts import handle_signals
 from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
@@ -43,23 +41,11 @@ from asysplat.scene import Gaussians
 from asysplat.training.ranges import check_ranges, is_number
 
 
-@hydra.main(config_path="conf", config_name="reconstruct", version_base="1.3")
-def main(config: DictConfig) -> None:
-    for number in SIGNALS:
-        signal.signal(number, signal.default_int_handler)
-    plain_warnings()
-    try:
-        reconstruct(config)
-    except KeyboardInterrupt:
-        sys.exit("stopped.")
-    except Exception as error:
-        if input_error := input_error_behind(error):
-            sys.exit(f"error: {input_error}")
-        raise
-
-
+@command("reconstruct")
 def reconstruct(config: DictConfig) -> None:
     """Find or refine cameras, initialize Gaussians, refine them, write the results."""
+    for number in SIGNALS:
+        signal.signal(number, signal.default_int_handler)
     config = continue_run(config, given_options())
     if OmegaConf.is_missing(config, "path"):
         raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
@@ -165,5 +151,4 @@ def initialize(
 
 
 if __name__ == "__main__":
-    handle_signals()
-    main()
+    reconstruct()

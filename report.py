@@ -3,14 +3,13 @@
 python report.py table=layers costs=true
 """
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from asysplat.overrides import exit_at_unknown_overrides
+from asysplat.cli import check_command, command
 
 if __name__ == "__main__":
-    exit_at_unknown_overrides("report")
+    check_command("report")
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -18,9 +17,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import track
 
-from asysplat.errors import InputError
 from asysplat.files import atomic_write, make_folder
-from asysplat.interrupts import handle_signals
 from asysplat.overrides import check_overrides
 from asysplat.report.fill import fill_table, finished_runs, with_costs
 from asysplat.report.html import render_html
@@ -32,14 +29,7 @@ from asysplat.training.systems import find_systems
 OWN_OPTIONS = ("table", "costs", "overrides", "logs", "output")
 
 
-@hydra.main(config_path="conf", config_name="report", version_base="1.3")
-def main(options: DictConfig) -> None:
-    try:
-        report(options)
-    except InputError as error:
-        sys.exit(f"error: {error}")
-
-
+@command("report")
 def report(options: DictConfig) -> None:
     """Fill the tables, print them, write report.md and report.html."""
     tables, folder = find_tables(options.table), Path(options.output)
@@ -71,5 +61,4 @@ def compose_train(overrides: Sequence[str]) -> DictConfig:
 
 
 if __name__ == "__main__":
-    handle_signals()
-    main()
+    report()

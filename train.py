@@ -7,14 +7,11 @@ import sys
 import traceback
 from pathlib import Path
 
-from asysplat.interrupts import end_at_interrupt, handle_signals, interrupt_once
-from asysplat.overrides import exit_at_unknown_overrides
+from asysplat.cli import check_command, command, error_message, exit_with_message
 
 if __name__ == "__main__":
-    end_at_interrupt()
-    exit_at_unknown_overrides("train")
+    check_command("train")
 
-import hydra
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException
@@ -23,7 +20,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.files import check_writable
-from asysplat.training.messages import error_sentence, exit_with_message
 from asysplat.training.prepare import (
     PreparedRun,
     TrainingStage,
@@ -35,12 +31,11 @@ from asysplat.training.run_folder import job_name, run_folder, unused_removed
 from asysplat.training.runs import find_run
 
 
-@hydra.main(config_path="conf", config_name="train", version_base="1.3")
+@command("train")  # during the training, Checkpoints prints how to resume
 def main(config: DictConfig) -> float | None:
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         return train_in_sweep(config)
-    # During the training, Checkpoints prints how to resume.
-    with exit_with_message("stopped."), unused_removed(Path(config.paths.run)):
+    with unused_removed(Path(config.paths.run)):
         return train(config)
 
 
@@ -85,7 +80,7 @@ def train_in_sweep(config: DictConfig) -> float | None:
         print(f"job {job.num}: finished already{other}\nrun: {finished.folder}", flush=True)
         return finished.results.get(f"test/{config.data.name}/psnr")
     except Exception as error:
-        message = error_sentence(error)
+        message = error_message(error)
         if message is None:
             traceback.print_exc()
         sentence = f"failed: job {job.num}: {job.override_dirname}: {message or repr(error)}"
@@ -102,10 +97,8 @@ def logs_of(overrides: list[str]) -> Path:
 
 
 if __name__ == "__main__":
-    handle_signals()
-    interrupt_once()
     with exit_with_message("stopped."):
         check_writable(logs_of(sys.argv), "paths.logs")
-        OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
-        OmegaConf.register_new_resolver("job_name", job_name, replace=True)
-        main()  # SweepTable ends a sweep with how to resume
+    OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
+    OmegaConf.register_new_resolver("job_name", job_name, replace=True)
+    main()  # SweepTable ends a sweep with how to resume

@@ -18,11 +18,16 @@ def input_error_behind(error: BaseException) -> InputError | None:
     """
     seen: BaseException | None = error
     while seen is not None and not isinstance(seen, InputError):
-        seen = seen.__cause__ or seen.__context__
+        seen = cause_of(seen)
     if seen is None:
         return None
     # Data-loader workers prepend their traceback.
     return InputError(str(seen).rpartition(f"{InputError.__module__}.InputError: ")[2])
+
+
+def cause_of(error: BaseException) -> BaseException | None:
+    """Return the error that `error` was raised from, or while it was handled."""
+    return error.__cause__ or (None if error.__suppress_context__ else error.__context__)
 
 
 def plain_warnings() -> None:

@@ -2,14 +2,11 @@
 
 import contextlib
 import difflib
-import os
 import re
-import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
@@ -66,34 +63,6 @@ def as_overrides(words: list[str]) -> list[str]:
         quoted = re.sub(r"(\\+)(?='|$)", r"\1\1", words[0]).replace("'", "\\'")
         words[0] = f"path='{quoted}'"
     return words + view
-
-
-def exit_at_unknown_overrides(script: str) -> None:
-    """Run `check_overrides` on this process's command line; exit with the message on an error.
-
-    Scripts call it before they import torch, which takes seconds.
-    """
-    os.environ.setdefault("ASYSPLAT_SHARED", str(CONF.parents[1] / "shared"))
-    words = sys.argv[1:]
-    given, unknown = get_args_parser().parse_known_args(words)
-    other = given.config_dir or given.config_name or given.config_path or given.shell_completion
-    try:
-        _check_dashes(words, unknown)
-        if not other:  # configuration files, and a run
-            check_overrides(given.overrides, script)
-    except InputError as error:
-        sys.exit(f"error: {error}")
-
-
-def _check_dashes(words: Sequence[str], unknown: Collection[str]) -> None:
-    """Raise InputError if some of `words`, as in `--steps 20`, is `unknown` to Hydra."""
-    for word, following in zip(words, [*words[1:], ""], strict=True):
-        if word in unknown and word.startswith("-"):
-            name, _, value = word.partition("=")
-            if not value and following and not re.match("-|.*=", following):
-                value, word = following, f"{word} {following}"
-            override = f"{name.lstrip('-').replace('-', '_')}={value or 'true'}"
-            raise InputError(f"{word}: options are given as {override}.")
 
 
 def _parse(override: str) -> Override:

@@ -11,8 +11,9 @@ from hydra._internal.utils import get_args_parser
 from omegaconf import OmegaConf
 
 from asysplat import overrides
+from asysplat.cli import check_command
 from asysplat.errors import InputError
-from asysplat.overrides import CONF, check_overrides, exit_at_unknown_overrides
+from asysplat.overrides import CONF, check_overrides
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -115,7 +116,7 @@ DASHES = {
 def test_options_with_dashes_are_answered_by_how_they_are_given(given, monkeypatch):
     monkeypatch.setattr("sys.argv", ["train.py", *given.split()])
     with pytest.raises(SystemExit, match=f": options are given as {DASHES[given]}\\.$"):
-        exit_at_unknown_overrides("train")
+        check_command("train")
 
 
 COMMAND = re.compile(

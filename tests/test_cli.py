@@ -5,8 +5,8 @@ import os
 
 import pytest
 
+from asysplat.cli import error_message
 from asysplat.errors import InputError
-from asysplat.training.messages import error_sentence
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "logs/events")
 FULL_AS_CAUSE = RuntimeError("write")
@@ -22,11 +22,11 @@ SENTENCES = {
 
 
 @pytest.mark.parametrize("case", SENTENCES)
-def test_a_sentence(case):
+def test_a_known_error_is_a_sentence(case):
     error, sentence = SENTENCES[case]
-    assert sentence in error_sentence(error)
+    assert sentence in error_message(error)
 
 
 @pytest.mark.parametrize("error", [RuntimeError("shapes"), OSError(errno.EIO, "I/O"), KeyError(1)])
-def test_none(error):
-    assert error_sentence(error) is None
+def test_other_errors_have_no_message(error):
+    assert error_message(error) is None

@@ -1,0 +1,117 @@
+"""How a script begins and ends: options checked before it loads, signals, errors in a sentence."""
+
+import errno
+import functools
+import os
+import re
+import signal
+import sys
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+
+import hydra
+from hydra._internal.utils import get_args_parser
+from omegaconf import DictConfig
+
+from asysplat.errors import InputError, cause_of, input_error_behind, plain_warnings
+from asysplat.interrupts import end_at_interrupt, handle_signals, interrupt_once
+from asysplat.overrides import CONF, check_overrides
+
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def check_command(script: str) -> None:
+    """Check this process's command line; exit with the message on an error.
+
+    A script calls it before it imports torch, which takes seconds. Ctrl-C then ends the process.
+    """
+    end_at_interrupt()
+    os.environ.setdefault("ASYSPLAT_SHARED", str(CONF.parents[1] / "shared"))
+    words = sys.argv[1:]
+    given, unknown = get_args_parser().parse_known_args(words)
+    other = given.config_dir or given.config_name or given.config_path or given.shell_completion
+    try:
+        _check_dashes(words, unknown)
+        if not other:  # configuration files, and a run
+            check_overrides(given.overrides, script)
+    except InputError as error:
+        sys.exit(f"error: {error}")
+
+
+def command(
+    script: str, stopped: str = "stopped."
+) -> Callable[[Callable[[DictConfig], object]], Callable[[], object]]:
+    """Return a decorator that makes a function of a configuration the command of a script.
+
+    The command composes conf/<script>.yaml with the options of the command line and calls the
+    function; `exit_with_message` says how it ends.
+    """
+
+    def decorate(function: Callable[[DictConfig], object]) -> Callable[[], object]:
+        @hydra.main(config_path=str(CONF), config_name=script, version_base="1.3")
+        @functools.wraps(function)
+        def run(config: DictConfig) -> object:
+            with exit_with_message(stopped):
+                return function(config)
+
+        def main() -> object:
+            handle_signals()
+            interrupt_once()
+            plain_warnings()
+            with exit_with_message(stopped):
+                return run()
+
+        return main
+
+    return decorate
+
+
+@contextmanager
+def exit_with_message(stopped: str) -> Iterator[None]:
+    """End the process with the sentence `stopped` at Ctrl-C, or that of `error_message`."""
+    try:
+        yield
+    except (Exception, KeyboardInterrupt) as error:
+        message = stopped
+        if not isinstance(error, KeyboardInterrupt):
+            sentence = error_message(error)
+            if sentence is None:
+                raise
+            message = f"error: {sentence}"
+        # A second Ctrl-C would abort the interpreter, a lost loader print a traceback.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        sys.exit(message)
+
+
+def error_message(error: BaseException) -> str | None:
+    """Return the sentence of an InputError, a full disk or a lost loader; None for other errors.
+
+    `error` may also have been raised from one of them.
+    """
+    mistake = input_error_behind(error)
+    if mistake is not None:
+        return str(mistake)
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in NO_SPACE:
+            place = f" for {cause.filename}" if cause.filename else ""
+            return f"there is no space on the disk{place} ({cause.strerror}): free some."
+        if isinstance(cause, RuntimeError) and str(cause).startswith("DataLoader worker"):
+            return (
+                f"a process that loads data was lost ({cause}); if memory was short, set "
+                "data.num_workers lower."
+            )
+        cause = cause_of(cause)
+    return None
+
+
+def _check_dashes(words: Sequence[str], unknown: Collection[str]) -> None:
+    """Raise InputError if some of `words`, as in `--steps 20`, is `unknown` to Hydra."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        if word in unknown and word.startswith("-"):
+            name, _, value = word.partition("=")
+            if not value and following and not re.match("-|.*=", following):
+                value, word = following, f"{word} {following}"
+            override = f"{name.lstrip('-').replace('-', '_')}={value or 'true'}"
+            raise InputError(f"{word}: options are given as {override}.")
