@@ -9,7 +9,6 @@ from lpips import LPIPS
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import CostMeter
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.rows import ImageRow
@@ -41,11 +40,10 @@ class SceneResult:
     rows: list[ImageRow] = field(default_factory=list)
     early_exit: dict[str, float] = field(default_factory=dict)  # shares left out, see `Network`
 
-    def add(self, images: str, source: str, values: dict[str, Float[Tensor, "V"]]) -> None:
-        """Add a row for each view; `values` has one or more metrics."""
-        for view in range(len(next(iter(values.values())))):
-            numbers = {name: value[view].item() for name, value in values.items()}
-            self.rows.append({"images": images, "view": view, "source": source, **numbers})
+    def add(self, images: str, source: str, rows: Sequence[dict[str, float]]) -> None:
+        """Add a row of metrics for each view."""
+        for view, row in enumerate(rows):
+            self.rows.append({"images": images, "view": view, "source": source} | row)
 
 
 @dataclass(frozen=True)
@@ -99,9 +97,9 @@ class PostOptimization:
         if background is None:
             background = inputs.mean_color()
         result = SceneResult(scene)
-        for source, baseline in BASELINES.items():
-            metrics = self.protocol.image_metrics(baseline(inputs, targets), targets, self.lpips)
-            result.add("targets", source, metrics)
+        baselines = self.protocol.measure_baselines(inputs, targets, self.lpips)
+        for source, rows in baselines.items():
+            result.add("targets", source, rows)
         meter = CostMeter(inputs.images.device)
 
         def measure(step: int, gaussians: Gaussians) -> None:
@@ -111,11 +109,11 @@ class PostOptimization:
             if meter.gb:
                 result.costs[source]["gb"] = max(meter.gb)
             rendering = _render(gaussians, targets, background)
-            metrics = self.protocol.image_metrics(rendering.image, targets, self.lpips)
-            metrics |= self.protocol.depth_metrics(rendering.depth, targets)
-            result.add("targets", source, metrics)
+            drawn = rendering.image, rendering.depth
+            result.add("targets", source, self.protocol.measure_views(*drawn, targets, self.lpips))
             images = _render(gaussians, inputs, background).image
-            result.add("inputs", source, {"psnr": self.protocol.psnr(images, inputs)})
+            rows = self.protocol.measure_views(images, None, inputs, None, psnr_only=True)
+            result.add("inputs", source, rows)
             result.gaussians = gaussians.num_gaussians
             watch(step, rendering)
             meter.start()

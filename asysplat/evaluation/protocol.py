@@ -4,16 +4,16 @@ import warnings
 from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_type_hints
 
-import torch
+from jaxtyping import Float
 from lpips import LPIPS
 from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.evaluation import metrics
+from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.lpips import MIN_SIDE, lpips_distance
 from asysplat.evaluation.metrics import Depths, Images, PerView
-from asysplat.rendering import render
-from asysplat.scene import Gaussians, Views
+from asysplat.scene import Views
 
 BACKBONES = {"alex": "AlexNet", "vgg": "VGG16"}
 
@@ -110,19 +110,42 @@ class Protocol:
             "delta1": metrics.delta1(depth, target, self.depth_alignment),
         }
 
-    @torch.no_grad()
-    def view_metrics(
-        self, gaussians: Gaussians, views: Views, background: Tensor, lpips: LPIPS | None
+    def measure_views(
+        self,
+        rendered: Float[Tensor, "V 3 H W"],
+        depths: Float[Tensor, "V H W"] | None,
+        targets: Views,
+        lpips: LPIPS | None,
+        psnr_only: bool = False,
     ) -> list[dict[str, float]]:
-        """Render [V] views one by one before a background [3]; compute all metrics of each."""
+        """Compute the metrics of each view by itself, as SSIM of many takes much memory.
+
+        Args:
+            rendered, depths: renderings of the targets; without depths only images are measured.
+            targets: [V] views.
+            lpips: network, see `image_metrics`.
+            psnr_only: compute no other metric.
+        """
         rows = []
-        for view in range(views.num_views):
-            target = views.select([view])
-            out = render(gaussians, target.cameras, background)
-            values = self.image_metrics(out.image, target, lpips)
-            values |= self.depth_metrics(out.depth, target)
+        for view in range(targets.num_views):
+            image, target = rendered[[view]], targets.select([view])
+            if psnr_only:
+                values = {"psnr": self.psnr(image, target)}
+            else:
+                values = self.image_metrics(image, target, lpips)
+                if depths is not None:
+                    values |= self.depth_metrics(depths[[view]], target)
             rows.append({name: value.item() for name, value in values.items()})
         return rows
+
+    def measure_baselines(
+        self, inputs: Views, targets: Views, lpips: LPIPS | None, psnr_only: bool = False
+    ) -> dict[str, list[dict[str, float]]]:
+        """Compute the metrics of each of BASELINES, by name; see `measure_views`."""
+        return {
+            name: self.measure_views(draw(inputs, targets), None, targets, lpips, psnr_only)
+            for name, draw in BASELINES.items()
+        }
 
     def sentences(self) -> dict[str, str]:
         """Return the protocol's name and a sentence for each metric."""

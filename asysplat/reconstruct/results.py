@@ -19,7 +19,6 @@ from torch import Tensor
 
 from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
-from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.rows import average, write_csv
@@ -30,7 +29,7 @@ from asysplat.reconstruct.video import check_video, video_cameras
 from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.refine import RefinementProgress
 from asysplat.rendering import Rendering, render
-from asysplat.scene import Gaussians
+from asysplat.scene import Gaussians, Views
 from asysplat.training.summary import write_json
 
 SCENE = "scene.safetensors"
@@ -144,21 +143,27 @@ class Results:
         if held_out is not None:
             sets["held_out"] = (held_out, photographs.held_out_files)
         for name, (views, files) in sets.items():
-            arguments = gaussians, views, self._background, self._lpips
-            numbers = self._protocol.view_metrics(*arguments)
+            numbers = self._measure(gaussians, views)
             results |= _means(name, numbers)
             labels = ({"set": name, "file": file} for file in files)
             rows += [label | row for label, row in zip(labels, numbers, strict=True)]
-        for name, draw in BASELINES.items() if held_out is not None else ():
-            numbers = []
-            for view, image in enumerate(draw(inputs, held_out)):  # SSIM of all takes much memory
-                target = held_out.select([view])
-                metrics = self._protocol.image_metrics(image[None], target, self._lpips)
-                numbers.append({metric: value.item() for metric, value in metrics.items()})
-            results |= _means(f"baseline/{name}", numbers)
+        if held_out is not None:
+            baselines = self._protocol.measure_baselines(inputs, held_out, self._lpips)
+            for name, numbers in baselines.items():
+                results |= _means(f"baseline/{name}", numbers)
         write_json(self.folder / "metrics.json", results)
         write_csv(self.folder / "metrics.csv", rows)
         _print_table(results)
+
+    @torch.no_grad()
+    def _measure(self, gaussians: Gaussians, views: Views) -> list[dict[str, float]]:
+        """Compute the metrics of [V] views, which are rendered one by one to save memory."""
+        rows = []
+        for view in range(views.num_views):
+            target = views.select([view])
+            drawn = render(gaussians, target.cameras, self._background, masks=target.masks)
+            rows += self._protocol.measure_views(drawn.image, drawn.depth, target, self._lpips)
+        return rows
 
     @torch.no_grad()
     def _save_contact_sheet(self, name: str, gaussians: Gaussians) -> None:

@@ -142,6 +142,21 @@ def test_masked_pixels_are_not_in_image_metrics(protocols, name):
     assert (found["psnr"] > protocols[name].psnr(rendered, views(target)) + 1).all()
 
 
+def test_rows_of_views_are_the_metrics_of_all_at_once(protocols):
+    protocol, images = protocols["default"], synthetic()
+    targets = views(images, torch.ones(2, 54, 72), torch.rand(2, 54, 72) < 0.9)
+    rendered, depths = images + 0.1 * torch.randn_like(images), torch.full((2, 54, 72), 1.1)
+    values = protocol.image_metrics(rendered, targets, None)
+    values |= protocol.depth_metrics(depths, targets)
+    rows = protocol.measure_views(rendered, depths, targets, None)
+    assert rows == [{name: value[v].item() for name, value in values.items()} for v in (0, 1)]
+    psnrs = protocol.measure_views(rendered, None, targets, None, psnr_only=True)
+    assert psnrs == [{"psnr": row["psnr"]} for row in rows]
+    baselines = protocol.measure_baselines(targets, targets, None)
+    assert baselines["nearest_view"][0] == {"psnr": pytest.approx(100), "ssim": pytest.approx(1)}
+    assert baselines["mean_color"][0]["psnr"] < 30
+
+
 def test_eight_bits_of_pixelsplat_do_not_change_photographs(protocols):
     every = (torch.arange(256.0) / 255).expand(1, 3, 16, 256)
     assert protocols["pixelsplat"].psnr(every, views(every)).item() == pytest.approx(100)

@@ -1,18 +1,16 @@
 """Compute the metrics of every validation and test image, and of the baselines."""
 
 import warnings
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
-from torch import Tensor
 
-from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.rows import ImageRow, average, write_csv
-from asysplat.scene import Views
 from asysplat.training.prediction import Prediction
 
 IMAGE = ("set", "scene", "view")  # the columns that identify a row
@@ -46,26 +44,19 @@ class Metrics(lightning.Callback):
         if self.lpips is None and trainer.is_global_zero:
             warnings.warn(self.protocol.without_lpips(), stacklevel=1)
 
-    def measure(self, rendered: Tensor, targets: Views) -> dict[str, Tensor]:
-        """Compute the image metrics, each [B, V]."""
-        network = None if self.lpips is None else self.lpips.to(targets.images.device)
-        return self.protocol.image_metrics(rendered, targets, network)
-
     def _add(self, test_set: str, batch: Any, prediction: Prediction, validation: bool) -> None:
-        inputs, targets = batch["inputs"], batch["targets"]
-        values = self.measure(prediction.rendering.image, targets)
-        values |= self.protocol.depth_metrics(prediction.rendering.depth, targets)
-        for name, baseline in BASELINES.items():
-            images = baseline(inputs, targets)
-            if validation:  # the learning curve has no other metric of the baselines
-                values[f"{name}/psnr"] = self.protocol.psnr(images, targets)
-                continue
-            metrics = self.measure(images, targets)
-            values |= {f"{name}/{metric}": value for metric, value in metrics.items()}
+        lpips = None if self.lpips is None else self.lpips.to(prediction.rendering.image.device)
+        parts = batch["inputs"], batch["targets"], prediction.rendering
         for index, scene in enumerate(batch["scene"]):
-            for view in range(targets.num_views):
-                numbers = {name: value[index, view].item() for name, value in values.items()}
-                self.rows.append({"set": test_set, "scene": scene, "view": view, **numbers})
+            inputs, targets, drawn = (part.map(itemgetter(index)) for part in parts)
+            rows = self.protocol.measure_views(drawn.image, drawn.depth, targets, lpips)
+            # The learning curve has no other metric of the baselines.
+            options = {"lpips": lpips, "psnr_only": validation}
+            baselines = self.protocol.measure_baselines(inputs, targets, **options)
+            for view, row in enumerate(rows):
+                for name, numbers in baselines.items():
+                    row |= {f"{name}/{metric}": value for metric, value in numbers[view].items()}
+                self.rows.append({"set": test_set, "scene": scene, "view": view} | row)
 
     def on_validation_epoch_start(self, *_: Any) -> None:
         self.rows = []
