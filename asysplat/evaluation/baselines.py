@@ -23,7 +23,10 @@ def nearest_view_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch 
     return inputs.images.take_along_dim(nearest[..., None, None, None], dim=-4)
 
 
-BASELINES = {"mean_color": mean_color_images, "nearest_view": nearest_view_images}
+BASELINES = {  # name in results: title in tables, and what draws the targets
+    "mean_color": ("mean color", mean_color_images),
+    "nearest_view": ("nearest view, copied", nearest_view_images),
+}
 
 
 def _dissimilarity(targets: Cameras, inputs: Cameras) -> Float[Tensor, "*batch Vt Vi"]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from asysplat.evaluation.baselines import nearest_view_images
+from asysplat.evaluation.baselines import BASELINES, nearest_view_images
 from asysplat.evaluation.metrics import psnr
 from asysplat.rendering import Rendering
 from asysplat.scene import Views
@@ -64,20 +64,17 @@ def disparity(depth: Float[Tensor, "*views H W"]) -> Float[Tensor, "*views H W"]
 
 
 def learning_curve(rows: Sequence[Mapping[str, float | int]]) -> Figure:
-    """Draw the validation PSNR over training, and the PSNR of two baselines.
+    """Draw the validation PSNR over training, and that of the baselines.
 
     Args:
-        rows: one for each validation, with minutes, step, psnr, nearest_view/psnr and
-            mean_color/psnr.
+        rows: one for each validation, with minutes, step, psnr and each baseline's <name>/psnr.
     """
     figure = Figure(figsize=(6, 3.6), layout="constrained")
     axis = figure.subplots()
     minutes = [row["minutes"] for row in rows]
     axis.plot(minutes, [row["psnr"] for row in rows], "o-", label="trained")
-    axis.axhline(
-        rows[-1]["nearest_view/psnr"], color="tab:orange", ls="--", label="nearest view, copied"
-    )
-    axis.axhline(rows[-1]["mean_color/psnr"], color="tab:gray", ls=":", label="mean color")
+    for number, (name, (title, _)) in enumerate(BASELINES.items(), 1):
+        axis.axhline(rows[-1][f"{name}/psnr"], color=f"C{number}", ls="--", label=title)
     axis.set(xlabel="minutes of training", ylabel="validation PSNR (dB)")
     axis.set_title(f"{rows[-1]['step']:.0f} steps", fontsize=9)
     axis.legend(frameon=False)

@@ -16,6 +16,13 @@ SSIM_WINDOWS = {"gaussian": 11, "uniform": 7}  # pixels on a side
 SSIM_SIGMA = 1.5  # standard deviation of the Gaussian window, in pixels
 SSIM_K2 = 0.03
 DELTA = 1.25
+METRICS = {  # name in results: title in tables
+    "psnr": "PSNR (dB)",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "absrel": "AbsRel",
+    "delta1": f"delta<{DELTA}",
+}
 
 Window = Literal["gaussian", "uniform"]
 Covariance = Literal["biased", "sample"]

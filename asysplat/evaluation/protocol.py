@@ -144,7 +144,7 @@ class Protocol:
         """Compute the metrics of each of BASELINES, by name; see `measure_views`."""
         return {
             name: self.measure_views(draw(inputs, targets), None, targets, lpips, psnr_only)
-            for name, draw in BASELINES.items()
+            for name, (_, draw) in BASELINES.items()
         }
 
     def sentences(self) -> dict[str, str]:

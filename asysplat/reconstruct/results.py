@@ -19,8 +19,10 @@ from torch import Tensor
 
 from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
+from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
+from asysplat.evaluation.metrics import METRICS
 from asysplat.evaluation.rows import average, write_csv
 from asysplat.export import write_ply, write_safetensors, write_video
 from asysplat.export.viewer import CAMERAS
@@ -30,13 +32,12 @@ from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.refine import RefinementProgress
 from asysplat.rendering import Rendering, render
 from asysplat.scene import Gaussians, Views
-from asysplat.training.summary import write_json
+from asysplat.training.summary import metric_cells, write_json
 
 SCENE = "scene.safetensors"
 BYTES_PER_GAUSSIAN = 2 * 4 * 62  # size in scene.ply and scene.safetensors together, at most
 OTHER_BYTES = 20_000_000  # space for the figures and the video
 SHEET_ROWS = 4  # views in a contact sheet
-TABLE_ROWS = ("held_out", "inputs", "baseline/nearest_view", "baseline/mean_color")
 
 
 class Results:
@@ -219,12 +220,11 @@ def _means(name: str, rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def _print_table(results: dict[str, float | int | str]) -> None:
-    metrics = ("psnr", "ssim", "lpips", "absrel", "delta1")
-    columns = [m for m in metrics if any(f"{row}/{m}" in results for row in TABLE_ROWS)]
-    table = Table("", *columns)
-    for row in TABLE_ROWS:
+    rows = {"held out": "held_out", "inputs": "inputs"}
+    rows |= {title: f"baseline/{name}" for name, (title, _) in BASELINES.items()}
+    metrics = [m for m in METRICS if any(f"{row}/{m}" in results for row in rows.values())]
+    table = Table("", *(METRICS[metric] for metric in metrics))
+    for title, row in rows.items():
         if f"{row}/psnr" in results:
-            cells = (results.get(f"{row}/{metric}") for metric in columns)
-            cells = ("" if cell is None else f"{cell:.3f}" for cell in cells)
-            table.add_row(row.replace("_", " "), *cells)
+            table.add_row(title, *metric_cells(results, row, metrics))
     Console().print(table)

@@ -9,6 +9,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import PEAK_MEMORY
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.report.notes import rows_by_text
@@ -38,7 +39,6 @@ MEASURED = {
     "inference_seconds": ("cost/inference_seconds", "cost/post{}/seconds"),
     "inference_gb": ("cost/inference_gb", "cost/post{}/gb"),
 }
-BASELINES = {"mean_color": "mean color", "nearest_view": "nearest view, copied"}
 SIMILAR = 16  # options, at most, that the run named beside a row without one may have differently
 # Columns that are options of a run.
 OPTIONS = {"batch": "data.batch_size", "train_steps": "steps"}
@@ -278,7 +278,7 @@ def _baselines(sets: dict[str, str], runs: Sequence[Run]) -> str:
         for run in runs:
             psnrs = {k: run.results.get(f"baseline/{name}/{k}/psnr") for k in BASELINES}
             if None not in psnrs.values():
-                numbers = (f"{BASELINES[k]} {psnr:.2f} dB" for k, psnr in psnrs.items())
+                numbers = (f"{BASELINES[k][0]} {psnr:.2f} dB" for k, psnr in psnrs.items())
                 texts[name] = f"{name}: {', '.join(numbers)}"
     return "; ".join(texts.values())
 

@@ -8,19 +8,17 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import SECONDS
+from asysplat.evaluation.metrics import METRICS
 from asysplat.files import atomic_write
 from asysplat.terminal import print_table
 
 Results = dict[str, float | int | str]  # flat, as in metrics.json
 
-METRICS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "absrel": "AbsRel"}
-METRICS["delta1"] = "delta<1.25"
-BASELINES = {
-    "nearest view, copied": "baseline/{}/nearest_view",
-    "mean color": "baseline/{}/mean_color",
-}
-SOURCES = {"trained": "test/{}"} | BASELINES
+# Title of a row: prefix of its keys, with a place for the test set.
+BASELINE_ROWS = {title: f"baseline/{{}}/{name}" for name, (title, _) in BASELINES.items()}
+ROWS = {"trained": "test/{}"} | BASELINE_ROWS
 
 
 def write_json(path: Path, results: Results) -> None:
@@ -32,6 +30,11 @@ def write_json(path: Path, results: Results) -> None:
     finite["protocol/seconds"] = SECONDS
     with atomic_write(path) as partial:
         partial.write_text(json.dumps(finite, indent=2, sort_keys=True) + "\n")
+
+
+def metric_cells(results: Results, prefix: str, metrics: Iterable[str] = METRICS) -> list[str]:
+    """Format results["<prefix>/<metric>"] for a row of a table; empty if not measured."""
+    return _cells(results.get(f"{prefix}/{metric}") for metric in metrics)
 
 
 def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
@@ -71,15 +74,14 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
         tables = [Table("", *(METRICS[name] for name in metrics), title=title)]
         ending = f"/test/{data}/psnr"
         stages = [key.removesuffix(ending) for key in results if key.endswith(ending)]
-        sources = {f"after {stage}": f"{stage}/test/{{}}" for stage in stages} | SOURCES
+        sources = {f"after {stage}": f"{stage}/test/{{}}" for stage in stages} | ROWS
         for label, source in sources.items():
-            values = (results.get(f"{source.format(data)}/{name}") for name in metrics)
-            tables[0].add_row(label, *_cells(values))
+            tables[0].add_row(label, *metric_cells(results, source.format(data), metrics))
     others = [name for name in test_sets if name != data]
     if others:
-        tables.append(Table("", *SOURCES, title="other test sets, PSNR (dB)"))
+        tables.append(Table("", *ROWS, title="other test sets, PSNR (dB)"))
     for name in others:
-        values = (results[f"{source.format(name)}/psnr"] for source in SOURCES.values())
+        values = (results[f"{source.format(name)}/psnr"] for source in ROWS.values())
         tables[-1].add_row(name, *_cells(values))
     _print([*tables, cost_sentence(results)], folder, "test")
     print(f"run: {folder}")
@@ -96,13 +98,13 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
         title += f"{results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
         titles = ("steps", "seconds", "GB", "inputs (dB)", *(METRICS[m] for m in metrics))
         sources = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
-        sources |= {label: (prefix.format(name), "") for label, prefix in BASELINES.items()}
+        sources |= {label: (prefix.format(name), "") for label, prefix in BASELINE_ROWS.items()}
         rows = []
         for label, (prefix, source) in sources.items():
             spent = [results.get(f"{costs}/{source}/{unit}") for unit in ("seconds", "gb")]
-            values = [results.get(f"inputs/{name}/{source}/psnr")]
-            values += [results.get(f"{prefix}/{metric}") for metric in metrics]
-            rows.append([label, *_cells(spent, digits=2), *_cells(values)])
+            inputs = metric_cells(results, f"inputs/{name}/{source}", ["psnr"])
+            cells = metric_cells(results, prefix, metrics)
+            rows.append([label, *_cells(spent, digits=2), *inputs, *cells])
         print_table(Console(), titles, rows, title)
     _print((), folder, "evaluation")
     print(f"evaluation: {folder}")

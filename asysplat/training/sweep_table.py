@@ -10,8 +10,9 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Column, Table
 
+from asysplat.evaluation.metrics import METRICS
 from asysplat.training.runs import Run, find_run
-from asysplat.training.summary import BASELINES, METRICS
+from asysplat.training.summary import BASELINE_ROWS, metric_cells
 
 Job = tuple[dict[str, str], DictConfig, Run | None]  # overrides, configuration, its finished run
 
@@ -75,16 +76,11 @@ def sweep_table(jobs: Sequence[Job]) -> Table:
             *(overrides.get(key, "") for key in varied),
             size,
             "" if share is None else f"{share:.1%}",
-            *_metrics(results, f"test/{config.data.name}"),
+            *metric_cells(results, f"test/{config.data.name}"),
         )
     found = [run.results for *_, run in jobs if run is not None]
-    for label, prefix in BASELINES.items() if len(names) == 1 else ():
+    for label, prefix in BASELINE_ROWS.items() if len(names) == 1 else ():
         space = [""] * (len(varied) + 1)
-        cells = _metrics(found[-1], prefix.format(names[0]))
+        cells = metric_cells(found[-1], prefix.format(names[0]))
         table.add_row(label, *space, *cells)
     return table
-
-
-def _metrics(results: dict[str, Any], prefix: str) -> list[str]:
-    values = (results.get(f"{prefix}/{name}") for name in METRICS)
-    return ["" if value is None else f"{value:.3f}" for value in values]

@@ -8,6 +8,8 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
+from asysplat.evaluation.metrics import METRICS
+
 CHOICES = (
     *("geometry_ratio", "seed", "learning_rate", "model.layers", "steps"),
     *("name", "width", "state_size", "metrics.name"),
@@ -15,7 +17,6 @@ CHOICES = (
     *(f"training.loss.{key}" for key in ("ssim", "perceptual", "depth", "opacity")),
 )
 EVENTS = "events.out.tfevents.*"
-HPARAMS_METRICS = ("psnr", "ssim", "lpips", "absrel")
 TICKED = 5  # number of options that TensorBoard's hparams tab shows at first
 FIRST = ("train", "val", "test", "steps")  # groups of cards
 # In the group "steps", so that losses and metrics are the first cards of "train".
@@ -70,13 +71,13 @@ def log_choices(logger: Logger, config: DictConfig) -> None:
             f"{number}_{key}" if number <= TICKED else key: value
             for number, (key, value) in enumerate(choices.items(), 1)
         }
-        logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in HPARAMS_METRICS})
+        logger.log_hyperparams(choices, {f"hp/{name}": 0 for name in METRICS})
     else:
         logger.log_hyperparams(choices)
 
 
 def log_results(logger: Logger, results: Mapping[str, str | int | float], data: str) -> None:
     """Log the metrics of the test, for the hparams tab."""
-    values = {f"hp/{name}": results.get(f"test/{data}/{name}") for name in HPARAMS_METRICS}
+    values = {f"hp/{name}": results.get(f"test/{data}/{name}") for name in METRICS}
     logger.log_metrics({name: value for name, value in values.items() if value is not None})
     logger.save()

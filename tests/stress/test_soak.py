@@ -18,7 +18,7 @@ from backends import FAST, assert_same_bits, both_ways
 from poison import FILLS, poisoned
 
 from asysplat import Gaussians, Views, open_photographs, refine, render
-from asysplat.evaluation.baselines import BASELINES
+from asysplat.evaluation.baselines import mean_color_images
 from asysplat.evaluation.metrics import psnr
 from asysplat.refinement import RefinementSettings
 from asysplat.refinement.init import initial_gaussians
@@ -80,7 +80,7 @@ if __name__ == "__main__":
         start = initial_gaussians("plane_sweep", photographs, RefinementSettings())
         end = refine_and_draw(views, start, steps)
         images = [render(gaussians, views.cameras).image for gaussians in (start, end)]
-    flat = BASELINES["mean_color"](views, views)
+    flat = mean_color_images(views, views)
     before, after, flat = (psnr(image, views.images).mean().item() for image in (*images, flat))
     kind = " with checks, in poisoned memory" if checked else ""
     print(f"{scene}: {steps} steps{kind}, {before:.2f} to {after:.2f} dB, flat {flat:.2f} dB")

@@ -9,8 +9,6 @@ import lightning
 from asysplat.evaluation.figures import learning_curve
 from asysplat.evaluation.rows import write_csv
 
-COLUMNS = ("psnr", "nearest_view/psnr", "mean_color/psnr", "ssim", "lpips", "absrel")
-
 
 class Curve(lightning.Callback):
     """Writes a row for each validation; draws them after training.
@@ -35,11 +33,11 @@ class Curve(lightning.Callback):
         self._write(trainer)  # drops the rows after the checkpoint that a run resumes from
 
     def on_validation_end(self, trainer: Any, module: Any) -> None:
-        values = trainer.callback_metrics
-        if "val/psnr" not in values:  # without the callback Metrics
+        values = {k: v.item() for k, v in trainer.callback_metrics.items() if k.startswith("val/")}
+        if not values:  # without the callback Metrics
             return
         row = {"step": trainer.global_step, "minutes": (time.monotonic() - self.started) / 60}
-        row |= {name: values[f"val/{name}"].item() for name in COLUMNS if f"val/{name}" in values}
+        row |= {name.removeprefix("val/"): value for name, value in values.items()}
         self.rows.append(row)
         self._write(trainer)
 
