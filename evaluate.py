@@ -5,6 +5,7 @@ python evaluate.py run=last
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from hydra.utils import instantiate
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from rich.progress import track
-from torch import nn
+from torch import Tensor, nn
 
 from asysplat.data.datamodule import FixedTasks, Sample
 from asysplat.errors import InputError
@@ -29,6 +30,7 @@ from asysplat.evaluation.post_optimization import HOW, PostOptimization, Predict
 from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.export import write_safetensors
+from asysplat.export.gaussians import read_background
 from asysplat.export.scene_folder import check_visible, find_files, origin_of
 from asysplat.files import check_writable, make_folder
 from asysplat.models.early_exit import EXACT
@@ -68,7 +70,9 @@ def evaluate(options: DictConfig) -> None:
         predictor, early_exit = make_predictor(net, fabric), net.early_exit_shares
     else:
         tests = {data.name: data.tests[data.name]}
-        predictor, found = open_scenes(Path(options.scenes), tests[data.name], fabric.device)
+        opened = open_scenes(Path(options.scenes), tests[data.name], fabric.device)
+        predictor, found, backgrounds = opened
+        measure = replace(measure, backgrounds=backgrounds)
         described = described | found
 
     folders = target.folder, target.scene_folder
@@ -125,12 +129,13 @@ def make_predictor(net: Network, fabric: lightning.Fabric) -> Predictor:
 
 def open_scenes(
     path: Path, tests: FixedTasks, device: torch.device
-) -> tuple[Predictor, dict[str, float]]:
+) -> tuple[Predictor, dict[str, float], dict[str, Tensor]]:
     """Read and check the Gaussians of every scene of the data; return what reads one again.
 
     Returns:
         The scene's Gaussians in the frame of its sample, as a prediction; tested/scenes, their
-        number, and, if cameras were fitted, tested/residual, the largest (see `SceneFile.read`).
+        number, and, if cameras were fitted, tested/residual, the largest (see `SceneFile.read`);
+        the backgrounds [3] that the files name, by scene.
     """
     files = find_files(path, [task.sequence for task in tests.tasks])
 
@@ -154,7 +159,9 @@ def open_scenes(
         gaussians = read(sample)[0]
         return lambda inputs: gaussians
 
-    return predictor, described
+    colors = {name: read_background(file.path) for name, file in files.items()}
+    known = {name: color.to(device) for name, color in colors.items() if color is not None}
+    return predictor, described, known
 
 
 def write_scenes(

@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -24,11 +25,12 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 
-from asysplat import read_gaussians, render
+from asysplat import Gaussians, read_gaussians, render
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.readers.transforms import read_cameras
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
+from asysplat.export import write_ply
 from asysplat.overrides import CONF
 from asysplat.reconstruct.results import save_ply
 
@@ -158,6 +160,39 @@ def test_the_scene_is_in_the_world_of_the_files(command, views, tmp_path, unit):
     assert psnr.min() > 20
     expected = torch.tensor([float(row["psnr"]) for row in rows])
     torch.testing.assert_close(psnr, expected, atol=0.01, rtol=0)
+
+
+@pytest.mark.medium
+def test_masked_photographs_measure_alike_by_both_scripts(command, views, run_script, tmp_path):
+    """Before the background that both files name: the evaluation's own inputs have another."""
+    photographs = tmp_path / "masked"
+    images = views.images.clone()
+    images[..., : SIZE // 3, :] = 1
+    write_transforms(replace(views, images=images, depths=None), photographs)
+    mask = np.full((SIZE, SIZE), 255, np.uint8)
+    mask[: SIZE // 3] = 0
+    (photographs / "masks").mkdir()
+    for path in (photographs / "images").iterdir():
+        cv2.imwrite(str(photographs / "masks" / f"{path.stem}.png"), mask)
+    poses = views.cameras.cam_to_world
+    ones = torch.ones(len(poses))
+    before_each_camera = poses[:, :3, 3] + poses[:, :3, 2]
+    shape = torch.eye(4)[:1].expand(len(poses), 4), 0.1 * ones[:, None].expand(-1, 3)
+    start = Gaussians(before_each_camera, *shape, 0.5 * ones, ones[:, None, None].expand(-1, 1, 3))
+    write_ply(tmp_path / "start.ply", start)
+    init = f"init={tmp_path / 'start.ply'}"
+    finished(command(photographs, init, "steps=1", "video.path=none"))
+    expected = numbers_of(tmp_path / "run")
+    data = ["data=files", f"data.root={photographs}", "data.inputs=2"]
+    data += [f"data.height={SIZE}", f"data.width={SIZE}", "data.cache.folder=null", "steps=0"]
+    data += ["data.num_workers=0", f"paths.logs={tmp_path}"]
+    for suffix in ("ply", "safetensors"):
+        scene = tmp_path / "run" / f"scene.{suffix}"
+        folder = finished(run_script("evaluate.py", f"scenes={scene}", *data)).split()[-1]
+        found = json.loads((Path(folder) / "evaluation.json").read_text())
+        for metric in ("psnr", "ssim"):
+            reconstructed = expected[f"held_out/{metric}"]
+            assert found[f"test/files/post0/{metric}"] == pytest.approx(reconstructed, abs=1e-3)
 
 
 @pytest.mark.medium

@@ -1,6 +1,6 @@
 """Measure a scene before and after steps of the paper's post-optimization: images and costs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -58,6 +58,7 @@ class PostOptimization:
         protocol: of the metrics.
         lpips: as for `Protocol.image_metrics`.
         background: RGB in [0, 1] behind the Gaussians; None: the mean color of the inputs.
+        backgrounds: scene's name -> background of this scene, where another one is known.
 
     Raises:
         InputError: `steps` are not increasing whole numbers from 0 on.
@@ -67,6 +68,7 @@ class PostOptimization:
     protocol: Protocol
     lpips: LPIPS | None
     background: Float[Tensor, "3"] | None = None
+    backgrounds: Mapping[str, Float[Tensor, "3"]] = field(default_factory=dict)
 
     def __post_init__(self):
         valid = all(type(step) is int and step >= 0 for step in self.steps)
@@ -93,7 +95,7 @@ class PostOptimization:
             watch: called after each step with the number of steps and, at the steps to measure, the
                 rendering of the targets.
         """
-        background = self.background
+        background = self.backgrounds.get(scene, self.background)
         if background is None:
             background = inputs.mean_color()
         result = SceneResult(scene)

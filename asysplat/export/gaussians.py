@@ -6,9 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.export.ply import read_offset, read_ply, write_ply
+from asysplat.export.ply import read_comment, read_ply, write_ply
 from asysplat.export.splat import read_splat
 from asysplat.export.tensors import read_safetensors, write_safetensors
 from asysplat.scene import Gaussians
@@ -41,25 +43,35 @@ def read_gaussians(
     gaussians = _by_suffix(READERS, path, "read")(path, dtype)
     if origin is None:
         return gaussians
-    shift = torch.tensor(_offset(Path(path)), dtype=torch.float64)
-    shift -= torch.tensor(origin, dtype=torch.float64)
+    offset = _numbers(Path(path), "offset") or (0.0, 0.0, 0.0)
+    shift = torch.tensor(offset, dtype=torch.float64) - torch.tensor(origin, dtype=torch.float64)
     return replace(gaussians, means=(gaussians.means.double() + shift).to(dtype))
 
 
-def _offset(path: Path) -> list[float]:
-    """Read the offset of a file of Gaussians; 0 where it has none."""
+def read_background(path: Path) -> Float[Tensor, "3"] | None:
+    """Read the RGB that was behind a file's Gaussians when they were made; None if unknown.
+
+    Raises:
+        InputError: numbers that are not finite.
+    """
+    color = _numbers(path, "background")
+    return None if color is None else torch.tensor(color)
+
+
+def _numbers(path: Path, name: str) -> list[float] | None:
+    """Read three numbers from a file's comments or metadata; None where it has none."""
     text = ""
     if path.suffix.lower() == ".ply":
-        text = read_offset(path)
+        text = read_comment(path, name)
     elif path.suffix.lower() == ".safetensors":
-        text = read_safetensors(path)[1].get("offset", "")
+        text = read_safetensors(path)[1].get(name, "")
     try:
         x, y, z = map(float, text.split())
     except ValueError:
-        return [0.0, 0.0, 0.0]
+        return None
     if not all(map(math.isfinite, (x, y, z))):
         raise InputError(
-            f"{path} has the offset {text.strip()[:MAX_TEXT]}: give three finite numbers, or "
+            f"{path} has the {name} {text.strip()[:MAX_TEXT]}: give three finite numbers, or "
             "remove it."
         )
     return [x, y, z]

@@ -20,13 +20,15 @@ from asysplat.scene import Gaussians
 MEAN, NORMAL, COLOR = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
 SCALE, ROTATION = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
 REST_COUNTS = (0, 9, 24, 45)  # numbers of properties f_rest_*, for SH of degree 0 to 3
-MAX_HEADER = 65536  # bytes in which an offset is searched
-OFFSET = "comment offset"
+MAX_HEADER = 65536  # bytes in which comments are searched
 MAX_OPACITY = 1 - 1e-7  # the logit of 1 is infinite
 
 
 def write_ply(
-    path: str | Path, gaussians: Gaussians, offset: Sequence[float] = (0.0, 0.0, 0.0)
+    path: str | Path,
+    gaussians: Gaussians,
+    offset: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Sequence[float] = (),
 ) -> None:
     """Write one scene, without batch dimension, as binary little-endian PLY.
 
@@ -37,6 +39,7 @@ def write_ply(
         gaussians: [N].
         offset: to be added to the means, which float32 may not resolve: written as a comment,
             `comment offset X Y Z`, if it is not 0.
+        background: RGB in [0, 1] behind the Gaussians, if known: written as a comment likewise.
 
     Raises:
         InputError: invalid Gaussians, or a file that cannot be written.
@@ -56,7 +59,8 @@ def write_ply(
     rest = _rest(3 * (gaussians.sh.shape[1] - 1))
     names = [*MEAN, *NORMAL, *COLOR, *rest, "opacity", *SCALE, *ROTATION]
     header = ["ply", "format binary_little_endian 1.0"]
-    header += [f"{OFFSET} {' '.join(map(repr, offset))}"] * any(offset)
+    comments = {"offset": offset if any(offset) else (), "background": background}
+    header += [f"comment {k} {' '.join(map(repr, v))}" for k, v in comments.items() if v]
     header += [f"element vertex {len(table)}"]
     header += [*(f"property float {name}" for name in names), "end_header\n"]
     with atomic_write(path) as partial, open(partial, "wb") as file:
@@ -108,11 +112,12 @@ def read_ply(path: str | Path) -> Gaussians:
     return gaussians.validate(f"{path}: Gaussians")
 
 
-def read_offset(path: str | Path) -> str:
-    """Read the offset of a PLY file, see `write_ply`; "" where it has none."""
+def read_comment(path: str | Path, name: str) -> str:
+    """Read the rest of the line `comment <name>` of a PLY file; "" where it has none."""
     with open(path, "rb") as file:
         header = file.read(MAX_HEADER).partition(b"end_header")[0].decode("latin-1")
-    return next((line[len(OFFSET) :] for line in header.split("\n") if line.startswith(OFFSET)), "")
+    start = f"comment {name} "
+    return next((line[len(start) :] for line in header.split("\n") if line.startswith(start)), "")
 
 
 def _rest(count: int) -> list[str]:

@@ -88,9 +88,10 @@ class Results:
             InputError: a file cannot be written; the scene is elsewhere then, see `save_ply`.
         """
         world, origin = self._photographs.frame.to_world(gaussians), self._photographs.origin
-        save_ply(self.folder / "scene.ply", world, origin)
-        color = " ".join(f"{value:.6f}" for value in self._background.tolist())
-        metadata = {"background": color, "offset": " ".join(map(repr, origin))}
+        background = self._background.tolist()
+        save_ply(self.folder / "scene.ply", world, origin, background)
+        numbers = {"background": background, "offset": origin}
+        metadata = {name: " ".join(map(repr, values)) for name, values in numbers.items()}
         write_safetensors(self.folder / SCENE, world, metadata)
 
     def save(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
@@ -181,7 +182,9 @@ class Results:
             figure.savefig(path, dpi=110)
 
 
-def save_ply(path: Path, gaussians: Gaussians, offset: Sequence[float]) -> None:
+def save_ply(
+    path: Path, gaussians: Gaussians, offset: Sequence[float], background: Sequence[float] = ()
+) -> None:
     """Write a scene; where that fails, write it elsewhere, as the refinement took long.
 
     It is tried in the folders for temporary files and of the user, in `path` without view-dependent
@@ -193,7 +196,7 @@ def save_ply(path: Path, gaussians: Gaussians, offset: Sequence[float]) -> None:
     failure = None
     for place, scene in _attempts(path, gaussians):
         try:
-            write_ply(place, scene, offset)
+            write_ply(place, scene, offset, background)
         except InputError as error:
             failure = failure or error
             continue

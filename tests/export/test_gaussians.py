@@ -9,7 +9,8 @@ from safetensors.torch import load_file, save_file
 
 from asysplat import read_gaussians, write_gaussians
 from asysplat.errors import InputError
-from asysplat.export import read_safetensors, write_safetensors
+from asysplat.export import read_safetensors, write_ply, write_safetensors
+from asysplat.export.gaussians import read_background
 from asysplat.scene import Gaussians
 
 
@@ -141,3 +142,14 @@ def test_an_offset_that_is_not_finite_is_refused(scene, tmp_path, number):
     for name in ("scene.ply", "scene.safetensors"):
         with pytest.raises(InputError, match=rf"{name} has the offset {number} 0 0: give three"):
             read_gaussians(tmp_path / name, (0.0, 0.0, 0.0))
+
+
+def test_a_background_comes_back_as_it_was(scene, tmp_path):
+    black, blue = (0.0, 0.0, 0.0), torch.rand(3).tolist()
+    write_ply(tmp_path / "scene.ply", scene, background=black)
+    text = " ".join(map(repr, blue))
+    write_safetensors(tmp_path / "scene.safetensors", scene, {"background": text})
+    assert read_background(tmp_path / "scene.ply").tolist() == list(black)
+    assert read_background(tmp_path / "scene.safetensors").tolist() == blue
+    write_ply(tmp_path / "scene.ply", scene)
+    assert read_background(tmp_path / "scene.ply") is None
