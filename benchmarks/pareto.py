@@ -111,12 +111,12 @@ class FeedForward:
     max_gaussians: int | None = None  # cells grow until so few are left
     sh_degree: int | None = None  # greatest SH degree rendered; None: all
     views_at_once: int | None = None  # rendered; None: all
-    convention: Mapping[str, float] = field(default_factory=dict)  # fields of `Convention`
+    limits: Mapping[str, float] = field(default_factory=dict)  # fields of `BlendingLimits`
 
     def __post_init__(self):
         check_names("precision", [self.precision], [*PRECISIONS, EXACT])
-        if self.convention:
-            check_names("convention", self.convention, vars(INRIA))
+        if self.limits:
+            check_names("limits", self.limits, vars(INRIA))
 
     @property
     def trained(self) -> bool:
@@ -130,7 +130,7 @@ class FeedForward:
             net = deepcopy(net).to(device, dtype)
         half = PRECISIONS.get(self.precision) == torch.bfloat16
         options = {"sh_degree": self.sh_degree, "views_at_once": self.views_at_once}
-        options |= {"depth": False, "convention": replace(INRIA, **self.convention)}
+        options |= {"depth": False, "limits": replace(INRIA, **self.limits)}
 
         @torch.no_grad()
         def run(scene: Photographs) -> Drawn:

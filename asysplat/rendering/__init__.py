@@ -1,6 +1,14 @@
 """Render Gaussians to images: project, sort into tiles, rasterize."""
 
-from asysplat.rendering.interface import CONVENTIONS, GSPLAT_1_5, INRIA, Convention, Culling
+from asysplat.rendering.interface import BLENDING_LIMITS, GSPLAT_1_5, INRIA, BlendingLimits, Culling
 from asysplat.rendering.render import Rendering, render
 
-__all__ = ["CONVENTIONS", "GSPLAT_1_5", "INRIA", "Convention", "Culling", "Rendering", "render"]
+__all__ = [
+    "BLENDING_LIMITS",
+    "GSPLAT_1_5",
+    "INRIA",
+    "BlendingLimits",
+    "Culling",
+    "Rendering",
+    "render",
+]

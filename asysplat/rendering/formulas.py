@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from asysplat.rendering.interface import Convention, RenderOutputs, RenderSettings
+from asysplat.rendering.interface import BlendingLimits, RenderOutputs, RenderSettings
 from asysplat.scene import Cameras, Gaussians
 
 # Columns of a camera row: axes and center in the world; intrinsics in pixels; limits of x / z and
@@ -91,17 +91,17 @@ def camera_rows(
     cam_to_world: Float[Tensor, "B V 4 4"],
     intrinsics: Float[Tensor, "B V 3 3"],
     size: tuple[int, int],
-    convention: Convention,
+    limits: BlendingLimits,
 ) -> Float[Tensor, "I 20"]:
     """Pack each camera into a row of float64; `size` is height and width in pixels."""
     poses = cam_to_world.detach().double().flatten(0, 1)
     pinhole = intrinsics.detach().double().flatten(0, 1)
     focal, principal = pinhole[:, [0, 1], [0, 1]], pinhole[:, :2, 2]
     pixels = focal.new_tensor(size[::-1])
-    margin = convention.frustum_margin * pixels
+    margin = limits.frustum_margin * pixels
     low, high = (-principal - margin) / focal, (pixels - principal + margin) / focal
-    limits = torch.stack((low, high), -1).flatten(1)
-    return torch.cat((poses[:, :3].mT.flatten(1), focal, principal, limits), 1)
+    bounds = torch.stack((low, high), -1).flatten(1)
+    return torch.cat((poses[:, :3].mT.flatten(1), focal, principal, bounds), 1)
 
 
 def camera_gradients(

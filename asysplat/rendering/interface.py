@@ -24,7 +24,7 @@ def single(value: float) -> float:
 
 
 @dataclass(frozen=True)
-class Convention:
+class BlendingLimits:
     """The cut-offs of alpha compositing, which decide the value of a pixel; a PSNR depends on them.
 
     Args:
@@ -48,10 +48,10 @@ class Convention:
 
 
 # diff-gaussian-rasterization (Kerbl et al. 2023) and gsplat 1.6; their near planes differ.
-INRIA = Convention()
+INRIA = BlendingLimits()
 # gsplat 1.5.3 clamps alpha later.
-GSPLAT_1_5 = Convention(alpha_max=single(0.999))
-CONVENTIONS = {"inria": INRIA, "gsplat-1.5": GSPLAT_1_5}
+GSPLAT_1_5 = BlendingLimits(alpha_max=single(0.999))
+BLENDING_LIMITS = {"inria": INRIA, "gsplat-1.5": GSPLAT_1_5}
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class RenderSettings:
     """Settings of a rendering.
 
     Args:
-        convention: cut-offs of alpha compositing.
+        limits: cut-offs of alpha compositing.
         antialiased: lower the opacity by what eps2d adds to a splat's area (Yu et al. 2024).
         depth: one of DEPTHS, or None.
         culling: exact culling.
@@ -94,7 +94,7 @@ class RenderSettings:
         InputError: an unknown depth.
     """
 
-    convention: Convention = INRIA
+    limits: BlendingLimits = INRIA
     antialiased: bool = False
     depth: str | None = "expected"
     culling: Culling = Culling()

@@ -12,7 +12,13 @@ from asysplat.kernels.dispatch import check_device, check_float, fast_backend, p
 from asysplat.kernels.precision import without_autocast
 from asysplat.rendering import cpu, reference
 from asysplat.rendering.chunks import draw_in_chunks
-from asysplat.rendering.interface import INRIA, Convention, Culling, RenderOutputs, RenderSettings
+from asysplat.rendering.interface import (
+    INRIA,
+    BlendingLimits,
+    Culling,
+    RenderOutputs,
+    RenderSettings,
+)
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
 DEPTH_SWITCH = {True: "expected", False: None}  # meanings of depth=True and depth=False
@@ -60,7 +66,7 @@ def render(
     *,
     antialiased: bool = False,
     sh_degree: int | None = None,
-    convention: Convention = INRIA,
+    limits: BlendingLimits = INRIA,
     culling: Culling = Culling(),  # noqa: B008
     masks: Bool[Tensor, "*batch V H W"] | None = None,
     views_at_once: int | None = None,
@@ -83,7 +89,7 @@ def render(
             "median": z of the Gaussian that takes the transmittance to half or below. False: none.
         antialiased: lower opacities by what the dilation adds to a splat's area (Yu et al. 2024).
         sh_degree: ignore SH of higher degrees.
-        convention: cut-offs of alpha compositing; see `CONVENTIONS`.
+        limits: cut-offs of alpha compositing; see `BLENDING_LIMITS`.
         culling: exact culling; each kind can be switched off.
         masks: True where a pixel counts; the others show the background, and tiles without a pixel
             that counts cost nothing.
@@ -105,7 +111,7 @@ def render(
     batch = _check(gaussians, cameras, background, masks)
     dtype = torch.promote_types(gaussians.means.dtype, cameras.cam_to_world.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    settings = RenderSettings(convention, antialiased, DEPTH_SWITCH.get(depth, depth), culling)
+    settings = RenderSettings(limits, antialiased, DEPTH_SWITCH.get(depth, depth), culling)
     with without_autocast(gaussians.means):
         scenes = gaussians.map(lambda t: _one_batch(t.to(dtype), batch))
         if sh_degree is not None:

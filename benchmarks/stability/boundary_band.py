@@ -20,7 +20,7 @@ def boundary_band(gaussians: Gaussians, cameras: Cameras, settings: RenderSettin
     There some alpha is within rounding of alpha_min or alpha_max, or some transmittance of
     transmittance_min or, for the median depth, of 0.5.
     """
-    convention = settings.convention
+    limits = settings.limits
     scene = gaussians.map(lambda t: t[None].double())
     splats = project(scene, cameras.map(lambda t: t[None].double()), settings)
     band = torch.zeros(cameras.num_views, cameras.height, cameras.width, dtype=torch.bool)
@@ -38,15 +38,15 @@ def boundary_band(gaussians: Gaussians, cameras: Cameras, settings: RenderSettin
             def near(value, limit, rounding):
                 return (value / limit - 1).abs_() < rounding
 
-            jump = near(alpha, convention.alpha_min, ALPHA_ROUNDING)
-            jump |= near(alpha, convention.alpha_max, ALPHA_ROUNDING)
-            alpha.clamp_max_(convention.alpha_max).mul_(alpha >= convention.alpha_min)
+            jump = near(alpha, limits.alpha_min, ALPHA_ROUNDING)
+            jump |= near(alpha, limits.alpha_max, ALPHA_ROUNDING)
+            alpha.clamp_max_(limits.alpha_max).mul_(alpha >= limits.alpha_min)
             left = (1 - alpha).cumprod(0)
-            jump |= near(left, convention.transmittance_min, TRANSMITTANCE_ROUNDING)
+            jump |= near(left, limits.transmittance_min, TRANSMITTANCE_ROUNDING)
             if settings.depth == "median":
                 jump |= near(left, 0.5, ALPHA_ROUNDING)
             # Splats behind the stop are invisible.
             before = torch.cat((torch.ones_like(left[:1]), left[:-1]))
-            reached = before > convention.transmittance_min * (1 - TRANSMITTANCE_ROUNDING)
+            reached = before > limits.transmittance_min * (1 - TRANSMITTANCE_ROUNDING)
             band[view, rows] = (jump & reached).any(0)
     return band

@@ -66,7 +66,7 @@ CASES = {
     "opaque": ({"opaque": True}, RenderSettings(depth="accumulated")),
     "median": (
         {"opaque": True, "degree": 0},
-        RenderSettings(depth="median", convention=GSPLAT_1_5),
+        RenderSettings(depth="median", limits=GSPLAT_1_5),
     ),
     "a pixel": ({"height": 1, "width": 1, "degree": 3}, RenderSettings(depth="median")),
 }

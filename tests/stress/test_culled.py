@@ -59,7 +59,7 @@ def test_what_no_camera_shows_is_culled(backend, make_scene, name, values, antia
     scenes, clean, cameras = spoiled(make_scene, len(values), **{name: values})
     cameras = facing(cameras)
     near = float(torch.tensor(INRIA.near).to(backend.dtype))
-    options = {"convention": replace(INRIA, near=near), "antialiased": antialiased}
+    options = {"limits": replace(INRIA, near=near), "antialiased": antialiased}
     result = both_ways(backend, scenes, cameras, **options)
     assert result.is_finite()
     assert_as_without(result, both_ways(backend, clean, cameras, **options), 3)

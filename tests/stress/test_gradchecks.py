@@ -24,8 +24,8 @@ MODES = {
     "accumulated": Mode({"depth": "accumulated"}),
     "median": Mode({"depth": "median"}),
     "antialiased": Mode({"antialiased": True}),
-    "antialiased, below the floor": Mode({"antialiased": True, "convention": FLOOR}, scale=0.2),
-    "antialiased, above the floor": Mode({"antialiased": True, "convention": FLOOR}),
+    "antialiased, below the floor": Mode({"antialiased": True, "limits": FLOOR}, scale=0.2),
+    "antialiased, above the floor": Mode({"antialiased": True, "limits": FLOOR}),
     "degree 3": Mode({}, degree=3),
 }
 

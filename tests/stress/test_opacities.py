@@ -8,7 +8,7 @@ import torch
 from backends import EXACT, assert_close, both_ways, random_gradient
 
 from asysplat.geometry.spherical_harmonics import SH_C0
-from asysplat.rendering import CONVENTIONS, INRIA
+from asysplat.rendering import BLENDING_LIMITS, INRIA
 from asysplat.scene import Cameras, Gaussians
 from benchmarks.scenes import random_scene
 
@@ -30,35 +30,35 @@ def stack(opacities, dtype=torch.float32):
     return gaussians, Cameras(intrinsics, torch.eye(4, dtype=dtype)[None], 9, 11)
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("limits", BLENDING_LIMITS)
 @pytest.mark.parametrize("count, opacity", [(2, 1.0), (50, 0.9), (50, 1.0)])
-def test_stacks_of_opaque_splats(backend, count, opacity, convention):
+def test_stacks_of_opaque_splats(backend, count, opacity, limits):
     """1 / (1 - alpha) does not blow up, and what lies behind the stop has no gradient."""
     gaussians, cameras = stack([opacity] * count)
-    convention = CONVENTIONS[convention]
-    result = both_ways(backend, gaussians, cameras, convention=convention)
+    limits = BLENDING_LIMITS[limits]
+    result = both_ways(backend, gaussians, cameras, limits=limits)
     assert result.is_finite()
-    exact = both_ways(EXACT, gaussians, cameras, convention=convention)
+    exact = both_ways(EXACT, gaussians, cameras, limits=limits)
     assert_close(backend, result, exact, slack=50)  # rounding, times 1 / (1 - alpha) < 100
-    assert result.alpha.max() <= 1 - convention.transmittance_min * (1 - 1e-3)
+    assert result.alpha.max() <= 1 - limits.transmittance_min * (1 - 1e-3)
 
     def center(_, output):
         grad = torch.zeros_like(output)
         grad[..., CENTER[0], CENTER[1]] = 1
         return grad
 
-    result = both_ways(backend, gaussians, cameras, grad_output=center, convention=convention)
+    result = both_ways(backend, gaussians, cameras, grad_output=center, limits=limits)
     assert (result.grads["sh"][0] != 0).all()
     assert (result.grads["sh"][10:] == 0).all() and (result.grads["opacities"][10:] == 0).all()
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_a_single_opaque_gaussian_is_drawn(backend, convention):
+@pytest.mark.parametrize("limits", BLENDING_LIMITS)
+def test_a_single_opaque_gaussian_is_drawn(backend, limits):
     gaussians, cameras = stack([1.0])
-    convention = CONVENTIONS[convention]
-    result = both_ways(backend, gaussians, cameras, convention=convention)
+    limits = BLENDING_LIMITS[limits]
+    result = both_ways(backend, gaussians, cameras, limits=limits)
     row, column = CENTER
-    assert float(result.alpha[0, row, column]) == pytest.approx(convention.alpha_max, abs=1e-6)
+    assert float(result.alpha[0, row, column]) == pytest.approx(limits.alpha_max, abs=1e-6)
     beside = math.exp(-0.5 / (INRIA.eps2d + 0.01))
     assert float(result.alpha[0, row, column + 1]) == pytest.approx(beside, abs=1e-3)
     assert (result.grads["sh"] != 0).all() and (result.grads["means"] != 0).any()

@@ -16,13 +16,13 @@ def test_no_direction_shows_the_dc_color(backend, make_scene):
     cameras = facing(cameras)
     gaussians.means[:] = torch.tensor([0.0, 0.0, 1e-12])
     gaussians.scales.fill_(1e-12)
-    convention = replace(INRIA, near=0.0)
-    result = both_ways(backend, gaussians, cameras, 0 * gaussians.means[0], convention=convention)
+    limits = replace(INRIA, near=0.0)
+    result = both_ways(backend, gaussians, cameras, 0 * gaussians.means[0], limits=limits)
     assert result.is_finite()
     color = result.image[0, :, 7, 8] / result.alpha[0, 7, 8]
     dc = 0.5 + sh_basis(torch.zeros(3), 1) * gaussians.sh[0, 0]
     torch.testing.assert_close(color, dc.to(color.dtype), rtol=0, atol=0.02)
-    exact = both_ways(EXACT, gaussians, cameras, 0 * gaussians.means[0], convention=convention)
+    exact = both_ways(EXACT, gaussians, cameras, 0 * gaussians.means[0], limits=limits)
     assert_close(backend, result, exact, names=("opacities", "sh"))
 
 
@@ -56,10 +56,8 @@ def test_the_unit_of_length_does_not_matter(backend, make_scene, factor):
     gaussians, cameras = make_scene(views=2)
     before = both_ways(backend, gaussians, cameras, depth=False)
     cameras.cam_to_world[:, :3, 3] *= factor
-    convention = replace(INRIA, near=INRIA.near * factor)
-    after = both_ways(
-        backend, gaussians.scale_by(factor), cameras, depth=False, convention=convention
-    )
+    limits = replace(INRIA, near=INRIA.near * factor)
+    after = both_ways(backend, gaussians.scale_by(factor), cameras, depth=False, limits=limits)
     torch.testing.assert_close(after.image, before.image, rtol=0, atol=1e-6)
     for name, grad in before.grads.items():
         if name != "cam_to_world":

@@ -124,7 +124,7 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSet
     height, width = size
     blocks = max(1, min(-(-num // BLOCK), MAX_BLOCKS))
     columns = -(-width // TILE)
-    convention, culling = settings.convention, settings.culling
+    limits, culling = settings.limits, settings.culling
     return Frame(
         images=scenes * views,
         views=views,
@@ -136,11 +136,11 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSet
         columns=columns,
         tiles=-(-height // TILE) * columns,
         project=ProjectSettings(
-            alpha_min=convention.alpha_min,
-            log_alpha_min=math.log2(convention.alpha_min),
-            eps2d=convention.eps2d,
-            near=convention.near,
-            compensation_min=convention.compensation_min,
+            alpha_min=limits.alpha_min,
+            log_alpha_min=math.log2(limits.alpha_min),
+            eps2d=limits.eps2d,
+            near=limits.near,
+            compensation_min=limits.compensation_min,
             antialiased=settings.antialiased,
             cull_opacity=culling.opacity,
             cull_frustum=culling.frustum,
@@ -148,9 +148,9 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSet
             cull_ellipse=culling.ellipse,
         ),
         raster=RasterSettings(
-            alpha_min=np.float32(convention.alpha_min),
-            alpha_max=np.float32(convention.alpha_max),
-            transmittance_min=np.float32(convention.transmittance_min),
+            alpha_min=np.float32(limits.alpha_min),
+            alpha_max=np.float32(limits.alpha_max),
+            transmittance_min=np.float32(limits.transmittance_min),
             cull_rows=culling.rows,
             cull_opaque=culling.opaque,
         ),
@@ -160,7 +160,7 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSet
 def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Inputs:
     """Convert the fields of Gaussians, poses and intrinsics to arrays."""
     *fields, cam_to_world, intrinsics = tensors
-    cameras = camera_rows(cam_to_world, intrinsics, size, settings.convention)
+    cameras = camera_rows(cam_to_world, intrinsics, size, settings.limits)
     return Inputs(*(_array(field) for field in fields), cameras=cameras.numpy())
 
 

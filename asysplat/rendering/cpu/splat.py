@@ -30,7 +30,7 @@ MIDDLE = np.float32((LANES - 1) / 2)
 
 
 class ProjectSettings(NamedTuple):
-    """Settings of the projection; alpha_min to compensation_min as in `Convention`."""
+    """Settings of the projection; alpha_min to compensation_min as in `BlendingLimits`."""
 
     alpha_min: float
     log_alpha_min: float  # to base 2
@@ -45,7 +45,7 @@ class ProjectSettings(NamedTuple):
 
 
 class RasterSettings(NamedTuple):
-    """Settings of the rasterization; the cut-offs as in `Convention`."""
+    """Settings of the rasterization; the cut-offs as in `BlendingLimits`."""
 
     alpha_min: np.float32
     alpha_max: np.float32

@@ -100,8 +100,8 @@ class _Passes(torch.autograd.Function):
                 grad_depth=None if grad_depth is None else grad_depth.contiguous(),
                 grads=pair_grads,
                 **frame.grid,
-                alpha_min=settings.convention.alpha_min,
-                alpha_max=settings.convention.alpha_max,
+                alpha_min=settings.limits.alpha_min,
+                alpha_max=settings.limits.alpha_max,
                 **_kinds(settings),
                 STEP=BACKWARD_STEP,
                 **RASTER_OPTIONS,
@@ -141,7 +141,7 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
 def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Inputs:
     """Arrange the fields of Gaussians, poses and intrinsics for the kernels."""
     *fields, cam_to_world, intrinsics = tensors
-    cameras = camera_rows(cam_to_world, intrinsics, size, settings.convention)
+    cameras = camera_rows(cam_to_world, intrinsics, size, settings.limits)
     return Inputs(*(t.detach().contiguous().flatten(0, 1) for t in fields), cameras=cameras)
 
 
@@ -156,7 +156,7 @@ def _project(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute splats, depths and counters; see `project`."""
     total, blocks = frame.images * frame.num, -(-frame.num // BLOCK)
-    device, culling, convention = inputs.means.device, settings.culling, settings.convention
+    device, culling, limits = inputs.means.device, settings.culling, settings.limits
     splats = torch.empty(total, SPLAT.value, dtype=torch.float32, device=device)
     depths = torch.empty(total, dtype=torch.float32, device=device)
     counters = torch.empty(blocks * frame.images, COUNTERS, dtype=torch.int32, device=device)
@@ -170,11 +170,11 @@ def _project(
             views=frame.views,
             height=frame.height,
             width=frame.width,
-            alpha_min=convention.alpha_min,
-            log_alpha_min=math.log2(convention.alpha_min),
-            eps2d=convention.eps2d,
-            near=convention.near,
-            compensation_min=convention.compensation_min,
+            alpha_min=limits.alpha_min,
+            log_alpha_min=math.log2(limits.alpha_min),
+            eps2d=limits.eps2d,
+            near=limits.near,
+            compensation_min=limits.compensation_min,
             ANTIALIASED=settings.antialiased,
             CULL_OPACITY=culling.opacity,
             CULL_FRUSTUM=culling.frustum,
@@ -236,7 +236,7 @@ def _rasterize(
     frame: Frame, lists: Lists, settings: RenderSettings
 ) -> tuple[tuple[Tensor | None, ...], Saved]:
     """Draw image, alpha, transmittance, depth and its origins; also what backward needs."""
-    kinds, convention, splats = _kinds(settings), settings.convention, lists.splats
+    kinds, limits, splats = _kinds(settings), settings.limits, lists.splats
     shape = (frame.images, frame.height, frame.width)
     image, alpha = splats.new_empty(frame.images, 3, *shape[1:]), splats.new_empty(shape)
     depth = splats.new_empty(shape) if settings.depth else None
@@ -257,9 +257,9 @@ def _rasterize(
         depth=depth,
         **saved._asdict(),
         **frame.grid,
-        alpha_min=convention.alpha_min,
-        alpha_max=convention.alpha_max,
-        transmittance_min=convention.transmittance_min,
+        alpha_min=limits.alpha_min,
+        alpha_max=limits.alpha_max,
+        transmittance_min=limits.transmittance_min,
         MASKED=lists.active is not None,
         **kinds,
         CULL_OPAQUE=settings.culling.opaque,
@@ -330,8 +330,8 @@ def _project_backward(
             **{f"grad_{name}": grad for name, grad in grads._asdict().items()},
             num=frame.num,
             views=frame.views,
-            eps2d=settings.convention.eps2d,
-            compensation_min=settings.convention.compensation_min,
+            eps2d=settings.limits.eps2d,
+            compensation_min=settings.limits.compensation_min,
             ANTIALIASED=settings.antialiased,
             HAS_DEPTH=has_depth,
             **needs,

@@ -26,7 +26,7 @@ def draw(
     depths = (splats.depths[:, None],) if settings.depth else ()
     values = torch.cat((splats.colors, torch.ones_like(splats.colors[:, :1]), *depths), -1)
     median = settings.depth == "median"
-    tiles = rasterize(splats, values, lists, settings.convention, median)
+    tiles = rasterize(splats, values, lists, settings.limits, median)
     out = lists.to_images(tiles, *size)
     return RenderOutputs(
         image=out[:, :3],

@@ -57,7 +57,7 @@ def project(gaussians: Gaussians, cameras: Cameras, settings: RenderSettings) ->
     Args:
         gaussians: with one batch dimension, [B, N].
         cameras: [B, V], zero skew; image b * V + v is view v of scene b.
-        settings: convention and antialiasing.
+        settings: limits and antialiasing.
 
     Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel center within the extent,
     and Gaussians that do not project to finite numbers (NaN, infinity, a zero quaternion).
@@ -109,9 +109,9 @@ def select_visible(
     first, last = _pixel_range(footprint, opacities, size, settings)
     # Comparisons with NaN are false.
     visible = (
-        (footprint.depths > settings.convention.near)
+        (footprint.depths > settings.limits.near)
         & (footprint.depths < MAX_MAGNITUDE)
-        & (opacities >= settings.convention.alpha_min)
+        & (opacities >= settings.limits.alpha_min)
         & (gaussians.opacities[:, None] <= 1)
         & (first <= last).all(-1)
         & footprint.whitening.isfinite().all(-1)
@@ -147,7 +147,7 @@ def project_footprints(
     principal = intrinsics[..., :2, 2]
 
     size = focal.new_tensor(size)
-    margin = settings.convention.frustum_margin * size
+    margin = settings.limits.frustum_margin * size
     clamped = torch.clamp(
         tangents, (-principal - margin) / focal, (size - principal + margin) / focal
     )
@@ -165,7 +165,7 @@ def _pixel_range(
     footprint: Footprint, opacities: Tensor, size: tuple[int, int], settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
     """Compute the first and last pixel (x, y) whose center is in the box of alpha >= alpha_min."""
-    distance = (2 * (opacities / settings.convention.alpha_min).log().clamp_min(0)).sqrt()
+    distance = (2 * (opacities / settings.limits.alpha_min).log().clamp_min(0)).sqrt()
     extent = footprint.deviations * distance[..., None] + BOUNDS_MARGIN
     size = extent.new_tensor(size)
     zero = torch.zeros_like(size)
@@ -182,7 +182,7 @@ def whiten(row_x: Tensor, row_y: Tensor, settings: RenderSettings) -> tuple[Tens
     of squares (Cauchy-Binet), which cancels to zero for no needle; it is divided by Syy early, so
     that no large scale overflows.
     """
-    eps = settings.convention.eps2d
+    eps = settings.limits.eps2d
     xx, xy, yy = ((p * q).sum(-1) for p, q in ((row_x, row_x), (row_x, row_y), (row_y, row_y)))
     var_y = yy + eps
     deviation_y = var_y.sqrt()
@@ -194,5 +194,5 @@ def whiten(row_x: Tensor, row_y: Tensor, settings: RenderSettings) -> tuple[Tens
     if not settings.antialiased:
         return whitening, deviations, torch.ones_like(a)
     # sqrt(det(M M^T) / det(M M^T + eps I)), Yu et al. 2024, Eq. 10.
-    share = (minors / det).clamp_min(settings.convention.compensation_min)
+    share = (minors / det).clamp_min(settings.limits.compensation_min)
     return whitening, deviations, share.sqrt()

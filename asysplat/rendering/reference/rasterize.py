@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from asysplat.rendering.interface import Convention
+from asysplat.rendering.interface import BlendingLimits
 from asysplat.rendering.reference.project import Splats
 from asysplat.rendering.reference.tiles import Lists
 
@@ -23,7 +23,7 @@ def rasterize(
     splats: Splats,
     values: Float[Tensor, "M C"],
     lists: Lists,
-    convention: Convention,
+    limits: BlendingLimits,
     median: bool = False,
 ) -> Float[Tensor, "T C P"]:
     """Composite sum_i w_i values_i at every pixel of every tile, front to back.
@@ -34,21 +34,21 @@ def rasterize(
         splats: M splats, sorted by depth within their image.
         values: of each splat.
         lists: from `list_tiles`; P = size * size pixels a tile, row by row.
-        convention: the cut-offs.
+        limits: the cut-offs.
         median: take the last value from the splat at which the transmittance falls to half or
             below; 0 where it never does.
     """
     packed = torch.cat((splats.xy, splats.whitening, splats.opacities[:, None], values), -1)
     # The last row is the padding, with opacity 0.
     packed = torch.nn.functional.pad(packed, (0, 0, 0, 1))
-    return _Rasterize.apply(packed, lists, convention, median)
+    return _Rasterize.apply(packed, lists, limits, median)
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, packed: Tensor, lists: Lists, convention: Convention, median: bool) -> Tensor:
+    def forward(ctx, packed: Tensor, lists: Lists, limits: BlendingLimits, median: bool) -> Tensor:
         ctx.save_for_backward(packed)
-        ctx.lists, ctx.options = lists, (convention, median)
+        ctx.lists, ctx.options = lists, (limits, median)
         pixels = lists.size**2
         out = packed.new_zeros(len(lists.lengths), packed.shape[1] - 6, pixels)
         for tiles, _, block in _blocks(packed, lists, ctx.options):
@@ -68,7 +68,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _blocks(
-    packed: Tensor, lists: Lists, options: tuple[Convention, bool]
+    packed: Tensor, lists: Lists, options: tuple[BlendingLimits, bool]
 ) -> Iterator[tuple[Tensor, Tensor, "_Block"]]:
     """Yield tiles [t], their splats [t, K] and block, about GROUP_ELEMENTS pairs at a time.
 
@@ -101,10 +101,10 @@ class _Block:
     """K depth-ordered splats on each of t tiles: alphas, weights and their gradients."""
 
     def __init__(
-        self, packed: Tensor, origins: Tensor, size: int, convention: Convention, median: bool
+        self, packed: Tensor, origins: Tensor, size: int, limits: BlendingLimits, median: bool
     ):
         """Compute alphas [t, K, P] from packed [t, K, 6 + C] and origins [t, 2]."""
-        self.convention, self.median = convention, median
+        self.limits, self.median = limits, median
         self.x, self.y, self.a, self.b, self.c, self.opacity = packed[..., :6].unbind(-1)
         self.values = packed[..., 6:]
         corner = origins[:, None].to(packed.dtype) + 0.5
@@ -116,12 +116,12 @@ class _Block:
         self.u = torch.stack((self.a * self.dx + self.b * self.dy, self.a, self.b), -1) @ self.basis
         self.v = torch.stack((self.c * self.dy, self.c), -1) @ self.basis[::2]
         exponent = (self.u * self.u).addcmul_(self.v, self.v).mul_(-0.5)
-        self.alpha = exponent.exp_().mul_(self.opacity[..., None]).clamp_max_(convention.alpha_max)
-        _zero_below(self.alpha, self.alpha, convention.alpha_min)
+        self.alpha = exponent.exp_().mul_(self.opacity[..., None]).clamp_max_(limits.alpha_max)
+        _zero_below(self.alpha, self.alpha, limits.alpha_min)
         self.passing = 1 - self.alpha
         self.transmittance = self.passing.cumprod(1)  # behind each splat
         # It never grows: all behind the first splat below the limit is dropped too.
-        _zero_below(self.alpha, self.transmittance, convention.transmittance_min)
+        _zero_below(self.alpha, self.transmittance, limits.transmittance_min)
 
     def weights(self) -> Tensor:
         """Compute alpha times the transmittance in front of each splat."""
@@ -154,11 +154,11 @@ class _Block:
         light_behind = share.sum(1, keepdim=True) - share.cumsum(1)
         # alpha dL/dalpha; 0 where alpha is clamped.
         grad = share.addcmul_(light_behind, self.alpha / self.passing, value=-1)
-        if bool((self.opacity >= self.convention.alpha_max).any()):
-            grad.mul_(self.alpha < self.convention.alpha_max)
+        if bool((self.opacity >= self.limits.alpha_max).any()):
+            grad.mul_(self.alpha < self.limits.alpha_max)
         u0, a, b = -(self.u.mul_(grad) @ self.basis.T).movedim(-1, 0)
         v0, c = -(self.v.mul_(grad) @ self.basis[::2].T).movedim(-1, 0)
-        grad_opacity = grad.sum(-1) / self.opacity.clamp_min(self.convention.alpha_min)
+        grad_opacity = grad.sum(-1) / self.opacity.clamp_min(self.limits.alpha_min)
         grads = (
             -self.a * u0,
             -self.b * u0 - self.c * v0,
