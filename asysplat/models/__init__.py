@@ -4,7 +4,7 @@ from asysplat.models.asysplat import AsySplat, build_asysplat
 from asysplat.models.attention import FullAttention, SparseAttention
 from asysplat.models.bilateral import CoarseReadsFine, FineReadsCoarse, NoLink
 from asysplat.models.early_exit import EarlyExit
-from asysplat.models.head import GaussianHead, LongLRMHead, PhotographHead
+from asysplat.models.head import GaussianHead, LongLRMHead, ResidualHead
 from asysplat.models.mamba2 import BiMamba2
 from asysplat.models.mamba_vision import MambaVision
 from asysplat.models.mvsplat import MVSplat
@@ -30,10 +30,10 @@ __all__ = [
     "MambaVision",
     "MergedSource",
     "NoLink",
-    "PhotographHead",
     "PlaneSweepPrior",
     "PointsPrior",
     "Prune",
+    "ResidualHead",
     "SingleBranch",
     "SparseAttention",
     "StageShape",

@@ -122,8 +122,8 @@ class GaussianHead(nn.Module, ABC):
         """Return Gaussians [B, V, h, w] from decoded numbers and the network's input views."""
 
 
-class PhotographHead(GaussianHead):
-    """Our own head: an untrained model renders its input images at a middle distance.
+class ResidualHead(GaussianHead):
+    """Our own head, of residuals to the input images, which an untrained model renders unchanged.
 
     Training therefore starts from images. Colors are residuals to the downsampled image, sizes are
     in units of the pixel's footprint, distances logarithmic. The image bypasses both branches, so

@@ -229,7 +229,7 @@ def _costs(compose: Compose, run: tuple[str, ...], views: int, size: tuple[int, 
 
 
 def _head(config: DictConfig) -> str:
-    """Write the head of a model and its options, as `PhotographHead(sh_degree=3)`."""
+    """Write the head of a model and its options, as `ResidualHead(sh_degree=3)`."""
     head = OmegaConf.to_container(config.model, resolve=True).get("head")
     if head is None:
         return "the model's own"

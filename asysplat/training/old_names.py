@@ -7,9 +7,10 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-FORMAT = 4  # version of the files of a run; raise it with every line that is added below
+FORMAT = 5  # version of the files of a run; raise it with every line that is added below
 
 CLASSES = {
+    "asysplat.models.PhotographHead": "asysplat.models.ResidualHead",
     "asysplat.models.SceneSkips": "asysplat.models.EarlyExit",
     "asysplat.models.SweepPrior": "asysplat.models.PlaneSweepPrior",
     "asysplat.reconstruction.Rates": "asysplat.refinement.Rates",

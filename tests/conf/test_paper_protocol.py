@@ -107,7 +107,7 @@ def test_commands_of_the_paper_compose_its_network(compose_train, command):
     assert config.model.layers == "4m4s" and config.model.prior is None
     large = "scale=gpu" in command or "scale=paper" in command
     head = config.model.head
-    assert head._target_.endswith(".LongLRMHead" if large else ".PhotographHead")
+    assert head._target_.endswith(".LongLRMHead" if large else ".ResidualHead")
     assert head.sh_degree == 3  # 59 numbers
     assert (config.model.patch_coarse, config.model.patch_fine) == (16, 8)
     if "scale=paper" in command:

@@ -132,7 +132,7 @@ def test_one_gaussian_per_output_pixel_at_its_ray(build):
 
 def test_untrained_colors_are_those_of_the_images(build):
     views = make_views()
-    dc = build("model/head=photograph", *TINY)(views).sh[..., 0, :] * 0.28209479 + 0.5
+    dc = build("model/head=residual", *TINY)(views).sh[..., 0, :] * 0.28209479 + 0.5
     images = torch.nn.functional.avg_pool2d(views.images.flatten(0, 1), 2)
     expected = images.permute(0, 2, 3, 1).reshape(2, -1, 3)
     assert (dc - expected).abs().mean() < 0.02

@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from asysplat.models import LongLRMHead, PhotographHead
+from asysplat.models import LongLRMHead, ResidualHead
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Views
 
-HEADS = {"photograph": PhotographHead, "longlrm": LongLRMHead}
+HEADS = {"residual": ResidualHead, "longlrm": LongLRMHead}
 SIZE, FOCAL = 16, 20.0
 
 
@@ -39,7 +39,7 @@ def distances(gaussians, views):
 
 def test_untrained_photograph():
     views = make_views()
-    gaussians, _ = decode("photograph", torch.zeros(59), views)
+    gaussians, _ = decode("residual", torch.zeros(59), views)
     middle = math.sqrt(0.1 * 100)
     torch.testing.assert_close(distances(gaussians, views), torch.full((2, 64), middle))
     # Half the resolution has half the focal length in pixels.
@@ -79,7 +79,7 @@ def test_longlrm_lengths_are_in_units_of_the_largest_coordinate_of_an_input_came
 
 
 RANGES = {  # of distances, and of sizes at the farthest
-    "photograph": (0.1, 100.0, math.exp(3) * 100 / (FOCAL / 2)),
+    "residual": (0.1, 100.0, math.exp(3) * 100 / (FOCAL / 2)),
     "longlrm": (0.0, 500.0, math.exp(-1.2)),
 }
 

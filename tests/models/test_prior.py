@@ -9,7 +9,7 @@ from test_head import make_views
 from tiny import SIZE
 
 from asysplat.evaluation.static_cost import static_costs
-from asysplat.models import DepthPrior, LongLRMHead, PhotographHead, PlaneSweepPrior
+from asysplat.models import DepthPrior, LongLRMHead, PlaneSweepPrior, ResidualHead
 from asysplat.models.head import CONFIDENT_FACTOR, MAX_DEPTH_CORRECTION
 from asysplat.models.prior.prior import COVER, FREE_OPACITY, UNKNOWN_DISTANCE, Prior
 from asysplat.scene import Cameras, Views
@@ -79,7 +79,7 @@ def test_depths_of_one_view_are_unknown(name):
 
 def test_unknown_is_the_untrained_distance():
     views = make_views()
-    head = PhotographHead(8, 16, 8)
+    head = ResidualHead(8, 16, 8)
     torch.nn.init.zeros_(head.decode.weight)
     shape = (1, 2, 8, 8)
     unknown = Prior(torch.full(shape, UNKNOWN_DISTANCE), torch.zeros(shape), torch.full(shape, 0.5))
@@ -89,7 +89,7 @@ def test_unknown_is_the_untrained_distance():
     torch.testing.assert_close(with_prior.opacities, without.opacities)
 
 
-@pytest.mark.parametrize("head", [PhotographHead, LongLRMHead])
+@pytest.mark.parametrize("head", [ResidualHead, LongLRMHead])
 def test_gaussians_start_at_the_priors_distance(head):
     views = make_views()
     built = head(8, 16, 8)
@@ -107,13 +107,13 @@ def test_gaussians_start_at_the_priors_distance(head):
 @pytest.mark.parametrize("confident", [0.0, 1.0])
 def test_corrections_are_bounded_if_a_depth_is_known(confident):
     views, shape = make_views(), (1, 2, 8, 8)
-    head = PhotographHead(8, 16, 8)
+    head = ResidualHead(8, 16, 8)
     torch.nn.init.normal_(head.decode.weight, std=100.0)
     confidence = torch.full(shape, confident)
     confidence[0, 0, 0, 0] = 0.5
     prior = Prior(torch.full(shape, 3.0), confidence, torch.full(shape, 0.5))
     tokens = torch.randn(1, 2, 1, 1, 8)
-    start = PhotographHead(8, 16, 8)
+    start = ResidualHead(8, 16, 8)
     torch.nn.init.zeros_(start.decode.weight)
     corrected, before = head(tokens, views, prior), start(tokens, views, prior)
     origins = views.cameras.centers[0, :, None].expand(2, 64, 3).reshape(-1, 3)

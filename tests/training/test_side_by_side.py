@@ -30,7 +30,7 @@ def make_batch(scenes=SCENES):
 def module(build):
     torch.manual_seed(0)
     module = make_module(
-        build("width=0.125", "state_size=8", "model.layers=1m1s", "model/head=photograph")
+        build("width=0.125", "state_size=8", "model.layers=1m1s", "model/head=residual")
     )
     module.loss = SplattingLoss(mse=1.0, perceptual=0.0, depth=0.1)
     return module

@@ -138,7 +138,7 @@ def test_without_some_callbacks_the_rest_is_there(train, names, tmp_path, monkey
 @pytest.mark.medium
 def test_bfloat16_with_the_perceptual_term_and_a_protocol_by_name(train, shared):
     options = ["training.loss.perceptual=0.5", f"paths.shared={shared}", "metrics=longlrm"]
-    result = train("trainer.precision=bf16-mixed", "steps=2", "model/head=photograph", *options)
+    result = train("trainer.precision=bf16-mixed", "steps=2", "model/head=residual", *options)
     folder = finished(result)
     numbers = metrics(folder)
     assert numbers["test/procedural/psnr"] > numbers["baseline/procedural/mean_color/psnr"]

@@ -12,7 +12,7 @@ from asysplat.ops.plane_sweep import Consistency, load_backend
 from asysplat.scene import TensorRecord, Views, whole_pixels
 
 PRIOR_CHANNELS = 2
-UNKNOWN_DISTANCE = 10**0.5  # the middle of PhotographHead's range
+UNKNOWN_DISTANCE = 10**0.5  # the middle of ResidualHead's range
 VOTE_TOLERANCE = 0.05  # greatest relative difference of two inverse depths of the same surface
 COVER = 0.9  # joint opacity of all views that confirm a surface
 UNSURE_COVER = 0.7  # joint opacity of all views that may see a point whose depth is not sure
