@@ -40,7 +40,7 @@ COMPONENTS = {  # none within another
     "sparse attention": (models.SparseAttention,),
     "full attention": (models.FullAttention,),
     "MambaVision": (models.MambaVision,),
-    "cross-attention": (models.CoarseReadsFine, models.FineReadsCoarse),
+    "cross-attention": (models.FineToCoarse, models.CoarseToFine),
     "head": (models.GaussianHead,),
 }
 OTHERS = "others"

@@ -2,7 +2,7 @@
 
 from asysplat.models.asysplat import AsySplat, build_asysplat
 from asysplat.models.attention import FullAttention, SparseAttention
-from asysplat.models.bilateral import CoarseReadsFine, FineReadsCoarse, NoLink
+from asysplat.models.bilateral import CoarseToFine, FineToCoarse, NoLink
 from asysplat.models.early_exit import EarlyExit
 from asysplat.models.head import GaussianHead, LongLRMHead, ResidualHead
 from asysplat.models.mamba2 import BiMamba2
@@ -17,12 +17,12 @@ from asysplat.models.source import CoarseSource, FineSource, MergedSource
 __all__ = [
     "AsySplat",
     "BiMamba2",
-    "CoarseReadsFine",
     "CoarseSource",
+    "CoarseToFine",
     "DepthPrior",
     "EarlyExit",
-    "FineReadsCoarse",
     "FineSource",
+    "FineToCoarse",
     "FullAttention",
     "GaussianHead",
     "LongLRMHead",

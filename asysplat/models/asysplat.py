@@ -29,7 +29,7 @@ class AsySplat(TokenNetwork):
         blocks: letter -> component built from a StageShape.
         appearance_block: component built from the appearance branch's StageShape.
         appearance_layers: N_v.
-        coarse_reads_fine, fine_reads_coarse: components of the bilateral link.
+        fine_to_coarse, coarse_to_fine: components of the bilateral link.
         source: component that merges the branches.
         head: component that decodes Gaussians.
         patch_coarse, patch_fine: p_c, p_f; the first a multiple of the second.
@@ -47,8 +47,8 @@ class AsySplat(TokenNetwork):
         blocks: Mapping[str, Component],
         appearance_block: Component,
         appearance_layers: int,
-        coarse_reads_fine: Component,
-        fine_reads_coarse: Component,
+        fine_to_coarse: Component,
+        coarse_to_fine: Component,
         source: Component,
         head: Component,
         patch_coarse: int = 16,
@@ -71,7 +71,7 @@ class AsySplat(TokenNetwork):
                     Stage(previous.width, shape, layers, blocks)
                     for previous, shape in zip([shapes[0], *shapes], shapes, strict=False)
                 ),
-                "links": nn.ModuleList(coarse_reads_fine(shape, fine) for shape in shapes),
+                "links": nn.ModuleList(fine_to_coarse(shape, fine) for shape in shapes),
             }
         )
         self.appearance = nn.ModuleDict(
@@ -81,7 +81,7 @@ class AsySplat(TokenNetwork):
                     Layers(*(appearance_block(fine) for _ in range(appearance_layers)))
                     for _ in shapes
                 ),
-                "links": nn.ModuleList(fine_reads_coarse(shape, fine) for shape in shapes),
+                "links": nn.ModuleList(coarse_to_fine(shape, fine) for shape in shapes),
             }
         )
         self.source = source(widths.stages[-1], widths.fine, patch_coarse // patch_fine)
@@ -99,11 +99,11 @@ class AsySplat(TokenNetwork):
             self.appearance["links"],
             strict=True,
         )
-        for geometry, appearance, coarse_reads_fine, fine_reads_coarse in branches:
+        for geometry, appearance, fine_to_coarse, coarse_to_fine in branches:
             coarse, _ = geometry(coarse, skip_layers)  # [B, V, H / p_c, W / p_c, d_s]
             fine = appearance(fine, skip_layers)
             # Both links read the values from before the exchange (Eq. 3).
-            coarse, fine = coarse_reads_fine(coarse, fine), fine_reads_coarse(fine, coarse)
+            coarse, fine = fine_to_coarse(coarse, fine), coarse_to_fine(fine, coarse)
         return self.source(coarse, fine)  # [B, V, H / p_f, W / p_f, d], or of p_c
 
     @property

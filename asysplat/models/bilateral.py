@@ -7,14 +7,14 @@ from asysplat.models.attention import CrossAttention, SelfAttention
 from asysplat.models.shapes import StageShape
 
 
-class CoarseReadsFine(CrossAttention):
+class FineToCoarse(CrossAttention):
     """C^s = CrossAttn(C~, F~): details for the geometry branch; attention has width d_f."""
 
     def __init__(self, coarse: StageShape, fine: StageShape):
         super().__init__(coarse, context_width=fine.width, inner_width=fine.width)
 
 
-class FineReadsCoarse(nn.Module):
+class CoarseToFine(nn.Module):
     """F^s = SelfAttn(CrossAttn(F~, C~)): depth cues for the appearance branch."""
 
     def __init__(self, coarse: StageShape, fine: StageShape):

@@ -10,6 +10,8 @@ from typing import Any
 FORMAT = 5  # version of the files of a run; raise it with every line that is added below
 
 CLASSES = {
+    "asysplat.models.CoarseReadsFine": "asysplat.models.FineToCoarse",
+    "asysplat.models.FineReadsCoarse": "asysplat.models.CoarseToFine",
     "asysplat.models.PhotographHead": "asysplat.models.ResidualHead",
     "asysplat.models.SceneSkips": "asysplat.models.EarlyExit",
     "asysplat.models.SweepPrior": "asysplat.models.PlaneSweepPrior",
@@ -33,6 +35,8 @@ KEYS = {  # keys of the configuration; a new name has the same parent
     "callbacks.watch": "monitor",
     "data.num_frames": "num_images",
     "data.on_bad_frame": "on_bad_image",
+    "model.coarse_reads_fine": "fine_to_coarse",
+    "model.fine_reads_coarse": "coarse_to_fine",
     "model.prior.neighbours": "neighbors",
     "speed.known": "skip_network_above",
     "speed.sure": "skip_layers_above",
