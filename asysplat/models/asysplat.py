@@ -30,7 +30,7 @@ class AsySplat(TokenNetwork):
         appearance_block: component built from the appearance branch's StageShape.
         appearance_layers: N_v.
         fine_to_coarse, coarse_to_fine: components of the bilateral link.
-        source: component that merges the branches.
+        fusion: component that makes the tokens that Gaussians are predicted from.
         head: component that decodes Gaussians.
         patch_coarse, patch_fine: p_c, p_f; the first a multiple of the second.
         prior: see TokenNetwork.
@@ -49,7 +49,7 @@ class AsySplat(TokenNetwork):
         appearance_layers: int,
         fine_to_coarse: Component,
         coarse_to_fine: Component,
-        source: Component,
+        fusion: Component,
         head: Component,
         patch_coarse: int = 16,
         patch_fine: int = 8,
@@ -84,7 +84,8 @@ class AsySplat(TokenNetwork):
                 "links": nn.ModuleList(coarse_to_fine(shape, fine) for shape in shapes),
             }
         )
-        self.source = source(widths.stages[-1], widths.fine, patch_coarse // patch_fine)
+        # `source`, as the weights in checkpoints are named.
+        self.source = fusion(widths.stages[-1], widths.fine, patch_coarse // patch_fine)
         self.head = head(widths.stages[-1], patch_coarse, patch_fine)
 
     def tokens(

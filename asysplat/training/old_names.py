@@ -10,6 +10,9 @@ from typing import Any
 FORMAT = 5  # version of the files of a run; raise it with every line that is added below
 
 CLASSES = {
+    "asysplat.models.CoarseSource": "asysplat.models.CoarseTokens",
+    "asysplat.models.FineSource": "asysplat.models.FineTokens",
+    "asysplat.models.MergedSource": "asysplat.models.FusedTokens",
     "asysplat.models.CoarseReadsFine": "asysplat.models.FineToCoarse",
     "asysplat.models.FineReadsCoarse": "asysplat.models.CoarseToFine",
     "asysplat.models.PhotographHead": "asysplat.models.ResidualHead",
@@ -38,6 +41,7 @@ KEYS = {  # keys of the configuration; a new name has the same parent
     "model.coarse_reads_fine": "fine_to_coarse",
     "model.fine_reads_coarse": "coarse_to_fine",
     "model.prior.neighbours": "neighbors",
+    "model.source": "fusion",
     "speed.known": "skip_network_above",
     "speed.sure": "skip_layers_above",
 }

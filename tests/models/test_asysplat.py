@@ -172,7 +172,7 @@ def test_views_exchange_only_through_the_geometry_branch(build):
         return (net(views).opacities - net(other).opacities)[:first_view].abs().max()
 
     assert change() > 0
-    assert change("model/source=fine", "model/links=only_fine_to_coarse") == 0
+    assert change("model/fusion=fine", "model/links=only_fine_to_coarse") == 0
 
 
 def test_bfloat16_autocast_keeps_gaussians_in_fp32(build):

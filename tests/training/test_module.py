@@ -95,7 +95,7 @@ def test_a_step_with_a_gradient_above_5_times_the_clip_changes_nothing(build, no
 
 @pytest.mark.medium
 def test_a_branch_that_nothing_reads_is_not_trained(build):
-    overrides = ("model/source=fine", "model/links=only_fine_to_coarse", "width=0.125")
+    overrides = ("model/fusion=fine", "model/links=only_fine_to_coarse", "width=0.125")
     net = make_module(build(*overrides, "state_size=8")).net
     assert not any(p.requires_grad for p in net.geometry.parameters())
     assert all(p.requires_grad for p in net.appearance.parameters())

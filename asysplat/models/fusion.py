@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 
-class FineSource(nn.Module):
+class FineTokens(nn.Module):
     """Conv 3x3 of the fine tokens with stride p_c / p_f, to the coarse grid."""
 
     def __init__(self, coarse_width: int, fine_width: int, stride: int):
@@ -19,7 +19,7 @@ class FineSource(nn.Module):
         return rearrange(self.conv(maps), "(b v) d h w -> b v h w d", b=len(fine))
 
 
-class MergedSource(FineSource):
+class FusedTokens(FineTokens):
     """O_out = C_out + Conv(F_out), Eq. 4."""
 
     def forward(
@@ -28,7 +28,7 @@ class MergedSource(FineSource):
         return coarse + super().forward(coarse, fine)
 
 
-class CoarseSource(nn.Module):
+class CoarseTokens(nn.Module):
     """The coarse tokens alone."""
 
     def __init__(self, coarse_width: int, fine_width: int, stride: int):
