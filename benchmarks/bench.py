@@ -26,7 +26,7 @@ from benchmarks.ops import make_path
 from benchmarks.options import CPU
 from benchmarks.render import Backend, prepare, run
 from benchmarks.scenes import random_scene
-from benchmarks.table import machine_note, make_table, spread, text
+from benchmarks.table import machine_note, make_table, median_iqr_column, text
 from benchmarks.timing import Measurement, Result, Run, summary, time_in_rounds
 
 aten = torch.ops.aten
@@ -169,9 +169,9 @@ def tables(results: Result) -> list[Table]:
     columns = {
         "workload": text("{workload}"),
         "baseline": text("its {over}"),
-        "ms": spread("seconds", "{:.2f}"),
-        "baseline\nms": spread("baseline", "{:.2f}"),
-        "ratio": spread("ratio", "{:.3f}", unit=1.0),
+        "ms": median_iqr_column("seconds", "{:.2f}"),
+        "baseline\nms": median_iqr_column("baseline", "{:.2f}"),
+        "ratio": median_iqr_column("ratio", "{:.3f}", unit=1.0),
     }
     notes = (
         f"{machine_note(results)}\n"

@@ -58,8 +58,8 @@ class Value(NamedTuple):
     iqr: float
 
     def text(self, unit: str) -> str:
-        spread = f" ± {self.iqr:.2g}" if self.iqr else ""
-        return f"{self.median:.4g}{spread} {unit}".rstrip()
+        iqr = f" ± {self.iqr:.2g}" if self.iqr else ""
+        return f"{self.median:.4g}{iqr} {unit}".rstrip()
 
 
 @dataclass
@@ -108,7 +108,7 @@ def read_old(path: str | None, output: Path) -> Result | None:
 def compare(old: Result, new: Result, watched: Watched) -> ResultsComparison:
     """Compare all numbers that both results have.
 
-    A change counts where it is larger than its kind's threshold and than the spread of both.
+    A change counts where it is larger than its kind's threshold and than both interquartile ranges.
 
     Raises:
         InputError: the results have no row in common.

@@ -16,7 +16,7 @@ from asysplat.data import ImageCache, ProceduralScene, SceneOptions, files_data,
 from asysplat.data.readers.common import opencv_from_opengl
 from benchmarks.compare import RATE, Watched
 from benchmarks.options import CPU
-from benchmarks.table import machine_note, make_table, spread, text
+from benchmarks.table import machine_note, make_table, median_iqr_column, text
 from benchmarks.timing import Measurement, Result, seconds_of, summary, time_in_rounds
 
 NO_CACHE, FILLED = CACHES = ("none", "filled")
@@ -103,12 +103,13 @@ def tables(results: Result) -> list[Table]:
     scene = results["scene"]
     columns = {
         "cache on disk": text("{cache}"),
-        "frames / s": spread("frames_per_second", "{:.0f}", unit=1.0),
+        "frames / s": median_iqr_column("frames_per_second", "{:.0f}", unit=1.0),
     }
     photographs, views = ("x".join(map(str, scene[name])) for name in ("photographs", "views"))
     notes = (
         f"{machine_note(results)}\n"
         f"photographs of {photographs} for views of {views}, by {scene['workers']} workers\n"
-        f"opening a scene of {scene['frames']}: {spread('open')(results)} ms, no pixel read"
+        f"opening a scene of {scene['frames']}: {median_iqr_column('open')(results)} ms, "
+        "no pixel read"
     )
     return [make_table("Loading training tasks", columns, results["loading"], notes)]

@@ -26,7 +26,7 @@ from benchmarks.compare import TIME, Watched
 from benchmarks.options import PRECISIONS, check_names, find_device
 from benchmarks.plot import bars
 from benchmarks.scenes import on_an_arc, random_scene
-from benchmarks.table import machine_note, make_table, number, spread, text
+from benchmarks.table import machine_note, make_table, median_iqr_column, number, text
 from benchmarks.timing import Measurement, Result, Run, now, seconds_of, time_in_rounds
 
 WATCHED = Watched(
@@ -179,14 +179,14 @@ def tables(results: Result) -> list[Table]:
     networks = {
         "model": text("{model}"),
         "inputs": text("{views} x {height}x{width}, {precision}"),
-        "forward\nms": spread("forward"),
-        "step\nms": spread("step"),
+        "forward\nms": median_iqr_column("forward"),
+        "step\nms": median_iqr_column("step"),
     }
     components = {
         "model": text("{model}"),
         "inputs": text("{views} views, {precision}"),
         "component": text("{part}"),
-        "ms": spread("seconds"),
+        "ms": median_iqr_column("seconds"),
         "share\n%": number("share", "{:.1f}", unit=0.01),
     }
     part_notes = "of which: operators, within the components that call them"

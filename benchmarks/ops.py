@@ -19,7 +19,7 @@ from benchmarks import timing
 from benchmarks.compare import ERROR, TIME, Watched
 from benchmarks.options import PRECISIONS, check_names, find_device
 from benchmarks.scenes import DISTANCE, FOCAL, camera_at_origin, on_an_arc, random_numbers
-from benchmarks.table import error, machine_note, make_table, number, spread, text
+from benchmarks.table import error, machine_note, make_table, median_iqr_column, number, text
 from benchmarks.timing import Measurement, Result, relative_l2
 
 PASSES = {"forward": "Forward", "forward_backward": "Forward and backward"}
@@ -251,7 +251,7 @@ def tables(results: Result) -> list[Table]:
             "operator": text("{operator}"),
             "inputs": text("{precision}"),
             "path": text("{path}"),
-            "ms": spread(name),
+            "ms": median_iqr_column(name),
             "loop\n/ path": number(f"faster_than_loop.{name}", "{:.1f}"),
             "error": error(ERRORS[name]),
         }

@@ -31,8 +31,7 @@ from asysplat import load
 from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.procedural.scene import split_seed
-from asysplat.data.selection.views import spread as select_evenly
-from asysplat.data.selection.views import uniform_selection
+from asysplat.data.selection.views import evenly_spaced, uniform_selection
 from asysplat.errors import InputError, input_error_behind
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.measured_cost import PEAK_MEMORY, CostMeter
@@ -48,7 +47,7 @@ from asysplat.scene import Views
 from benchmarks import timing
 from benchmarks.compare import DECIBELS, LPIPS_DISTANCE, TIME, Watched
 from benchmarks.options import CPU, PRECISIONS, check_names, find_device
-from benchmarks.table import Columns, machine_note, make_table, number, spread, text
+from benchmarks.table import Columns, machine_note, make_table, median_iqr_column, number, text
 from benchmarks.timing import Measurement, Result, summary
 
 WHOLE = {"views", "side", "max_gaussians", "views_at_once", "steps"}  # numbers of a setting
@@ -301,7 +300,7 @@ def select_inputs(scene: Photographs, views: int | None, side: int | None) -> Ph
         raise InputError(
             f"pareto has a setting with side={side}: give at most pareto.side={cameras.height}."
         )
-    selected = select_evenly(range(cameras.num_views), min(views, cameras.num_views))
+    selected = evenly_spaced(range(cameras.num_views), min(views, cameras.num_views))
     inputs = _without_depths(scene.inputs.select(selected))
     if side != cameras.height:
         inputs = inputs.resized(side, side)
@@ -515,8 +514,8 @@ def plot(results: Result) -> Figure:
 
 ROWS: Columns = {
     "setting": text("{setting}"),
-    "ms": spread("seconds"),
-    "/ base": spread("over_base", "{:.2f}", unit=1.0),
+    "ms": median_iqr_column("seconds"),
+    "/ base": median_iqr_column("over_base", "{:.2f}", unit=1.0),
     "PSNR": number("psnr", "{:.2f}"),
     "LPIPS": number("lpips", "{:.3f}"),
     "Gaussians": number("gaussians", "{:,}"),

@@ -20,7 +20,7 @@ from benchmarks.compare import ERROR, TIME, Watched
 from benchmarks.options import CPU, check_names
 from benchmarks.plot import time_against_error
 from benchmarks.scenes import SCENES, SMALLER, Scene
-from benchmarks.table import error, machine_note, make_table, number, spread, text
+from benchmarks.table import error, machine_note, make_table, median_iqr_column, number, text
 from benchmarks.timing import Measurement, Result, now, relative_l2
 
 WATCHED = Watched(
@@ -171,8 +171,8 @@ def tables(results: Result) -> list[Table]:
     columns = {
         "scene": text("{scene}"),
         "backend": lambda r: f"  no {r['without']} culling" if r["without"] else r["backend"],
-        "forward\nms": spread("forward"),
-        "backward\nms": spread("backward"),
+        "forward\nms": median_iqr_column("forward"),
+        "backward\nms": median_iqr_column("backward"),
         "image\np99": error("error.image_p99"),
         "image\nmax": error("error.image_max"),
         "flips\n1e-6": number("error.flipped", "{:.0f}", unit=1e-6),

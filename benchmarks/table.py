@@ -74,7 +74,7 @@ def number(path: str, pattern: str, unit: float = 1.0) -> Write:
     return lambda row: NOTHING if at(row, path) is None else pattern.format(at(row, path) / unit)
 
 
-def spread(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> Write:
+def median_iqr_column(path: str, pattern: str = "{:.1f}", unit: float = 1e-3) -> Write:
     """Write median ± interquartile range, and "busy" where that is wide; seconds in ms."""
 
     def write(row: Result) -> str:

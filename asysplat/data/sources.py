@@ -235,7 +235,7 @@ class FilesSource:
 
     @cached_property
     def _validation(self) -> list[int]:
-        return views.spread(self._others, min(self.val_scenes, len(self._others)))
+        return views.evenly_spaced(self._others, min(self.val_scenes, len(self._others)))
 
     @cached_property
     def _training(self) -> list[int]:

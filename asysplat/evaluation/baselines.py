@@ -15,8 +15,8 @@ def mean_color_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt
 def nearest_view_images(inputs: Views, targets: Views) -> Float[Tensor, "*batch Vt 3 H W"]:
     """Copy the nearest input view for every target; all images have one size.
 
-    The nearest view minimizes distance / spread + angle / pi: the distance between the camera
-    centers, the spread (the largest distance between two input centers), and the angle between the
+    The nearest view minimizes distance / extent + angle / pi: the distance between the camera
+    centers, the extent (the largest distance between two input centers), and the angle between the
     viewing directions. If all inputs share one center, the angle alone decides.
     """
     nearest = _dissimilarity(targets.cameras, inputs.cameras).argmin(-1)
@@ -30,11 +30,11 @@ BASELINES = {  # name in results: title in tables, and what draws the targets
 
 
 def _dissimilarity(targets: Cameras, inputs: Cameras) -> Float[Tensor, "*batch Vt Vi"]:
-    spread = _distances(inputs.centers, inputs.centers).amax((-2, -1), keepdim=True)
+    extent = _distances(inputs.centers, inputs.centers).amax((-2, -1), keepdim=True)
     distance = _distances(targets.centers, inputs.centers)
     cosine = targets.cam_to_world[..., :3, 2] @ inputs.cam_to_world[..., :3, 2].mT
     angle = cosine.clamp(-1, 1).acos()
-    return distance / spread.where(spread > 0, torch.inf) + angle / torch.pi
+    return distance / extent.where(extent > 0, torch.inf) + angle / torch.pi
 
 
 def _distances(

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from asysplat.data.selection.views import spread
+from asysplat.data.selection.views import evenly_spaced
 from asysplat.errors import InputError
 from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
@@ -42,7 +42,9 @@ def initial_gaussians(
         InputError: `init` is none of INITS, or needs points or depths that the photographs lack.
     """
     inputs, pixels = photographs.inputs, 1.0
-    views = inputs.select(spread(range(inputs.num_views), min(DEPTH_VIEWS, inputs.num_views)))
+    views = inputs.select(
+        evenly_spaced(range(inputs.num_views), min(DEPTH_VIEWS, inputs.num_views))
+    )
     longest = max(views.cameras.height, views.cameras.width)
     if init == "points":
         if photographs.points is None:

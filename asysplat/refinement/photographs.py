@@ -14,7 +14,7 @@ from asysplat.data.cameras import CameraOptions, find_missing, refine_given
 from asysplat.data.check.matches import find_matches
 from asysplat.data.check.report import diagnose_cameras
 from asysplat.data.normalize import Normalization, normalize
-from asysplat.data.selection.views import spread
+from asysplat.data.selection.views import evenly_spaced
 from asysplat.data.sequence import FileSequence, SceneOptions
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
@@ -115,8 +115,8 @@ def open_photographs(
         )
     if views is None:
         views = max(2, MAX_BYTES // (height * width * BYTES_PER_PIXEL))
-    inputs = spread(rest, min(views, len(rest)))
-    held_out = spread(held_out, min(max_held_out, len(held_out))) if held_out else []
+    inputs = evenly_spaced(rest, min(views, len(rest)))
+    held_out = evenly_spaced(held_out, min(max_held_out, len(held_out))) if held_out else []
     if not found:
         used = sorted((*inputs, *held_out))
         part = refine_given(replace(scene, images=[scene.images[i] for i in used]), cameras, say)

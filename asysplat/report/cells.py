@@ -8,7 +8,7 @@ from asysplat.report.compare import (
     claim_value,
     cost_errors,
     fits,
-    mean_and_spread,
+    mean_and_std,
 )
 from asysplat.report.fill import COMPUTED
 from asysplat.report.notes import notes, protocol_notes, rho_text
@@ -104,7 +104,7 @@ def _measured_grid(filled: PaperTable) -> Grid:
             columns.append(_cells(texts, numbers, column, ["-"] * len(texts)))
         headings.append(Heading(filled.our_title(column) + arrow, "ours"))
         values = [row.values.get(column.key) for row in filled.rows]
-        means = [mean_and_spread(own)[0] if own else None for own in values]
+        means = [mean_and_std(own)[0] if own else None for own in values]
         texts = [_mean_text(own, column) if own else "" for own in values]
         missing = ["quoted" if row.quoted else "not run" for row in filled.rows]
         columns.append(_cells(texts, means, column, missing))
@@ -143,7 +143,7 @@ def _our_number(row: PaperRow, key: str) -> Number | None:
     """Return our count of a row or the mean of its seeds; None without."""
     if key in COMPUTED:
         return (row.costs or {}).get(key)
-    return mean_and_spread(row.values[key])[0] if row.values.get(key) else None
+    return mean_and_std(row.values[key])[0] if row.values.get(key) else None
 
 
 def _our_side(rows: Sequence[PaperRow], column: Column) -> str:
@@ -163,13 +163,13 @@ def _cells(
 
 
 def _mean_text(values: Sequence[Number], column: Column) -> str:
-    """Format mean ± spread, with as many decimals as the column's numbers."""
-    mean, spread = mean_and_spread(values)
+    """Format mean ± std, with as many decimals as the column's numbers."""
+    mean, std = mean_and_std(values)
     text = column.text(mean)
-    if spread is None:
+    if std is None:
         return text
     decimals = len(text.partition(".")[2])
-    return f"{text} ± {spread / column.unit:.{decimals}f}"
+    return f"{text} ± {std / column.unit:.{decimals}f}"
 
 
 def _best(numbers: Sequence[Number | None], column: Column) -> list[bool]:

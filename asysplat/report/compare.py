@@ -27,7 +27,7 @@ class RankAgreement(NamedTuple):
     signal: float | None
 
 
-def mean_and_spread(values: Sequence[Number]) -> tuple[float, float | None]:
+def mean_and_std(values: Sequence[Number]) -> tuple[float, float | None]:
     """Return mean and sample standard deviation over seeds; None for that of a single seed."""
     return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
 
@@ -37,7 +37,7 @@ def rank_agreement(filled: PaperTable, column: str) -> RankAgreement:
     both = [row for row in filled.rows if column in row.numbers and row.values.get(column)]
     ours = np.array([np.mean(row.values[column]) for row in both])
     paper = np.array([row.numbers[column] for row in both])
-    within = pooled_spread([row.values[column] for row in both])
+    within = pooled_std([row.values[column] for row in both])
     signal = None
     if len(both) > 1 and within is not None:
         seeds = float(np.mean([len(row.values[column]) for row in both]))
@@ -56,7 +56,7 @@ def spearman(first: np.ndarray, second: np.ndarray) -> float | None:
     return float(spearmanr(first, second).statistic)
 
 
-def pooled_spread(groups: Sequence[Sequence[Number]]) -> float | None:
+def pooled_std(groups: Sequence[Sequence[Number]]) -> float | None:
     """Return the standard deviation within groups, weighted by their degrees of freedom.
 
     None where each has a single value.

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from asysplat.report.cells import ARROWS
-from asysplat.report.compare import mean_and_spread
+from asysplat.report.compare import mean_and_std
 from asysplat.report.fill import COMPUTED
 from asysplat.report.front import draw_front
 from asysplat.report.paper import Column, PaperTable
@@ -49,7 +49,7 @@ def _seed_plot(filled: PaperTable, column: Column) -> tuple[str, Figure]:
         values = row.values.get(column.key, [])
         ours.plot(values, [y] * len(values), "o", color=OURS, ms=6, alpha=0.45, mew=0)
         if values:
-            ours.plot(mean_and_spread(values)[0], y, color=OURS, **bar)
+            ours.plot(mean_and_std(values)[0], y, color=OURS, **bar)
         else:
             text = "quoted" if row.quoted else "not run"
             across = ours.get_yaxis_transform()
@@ -77,12 +77,12 @@ def _ratio_plot(filled: PaperTable) -> tuple[str, Figure]:
     figure = Figure(figsize=(9, 0.6 + 2.2 * len(first)), layout="constrained")
     grid = figure.subplots(len(first), 2, squeeze=False, sharex=True)
     for (ours, paper), column in zip(grid, first.values(), strict=True):
-        summaries = []  # ratio, mean, spread
+        summaries = []  # ratio, mean, std
         for ratio, row in zip(ratios, filled.rows, strict=True):
             if values := row.values.get(column.key):
                 ours.plot([ratio] * len(values), values, "o", color=OURS, ms=6, alpha=0.45, mew=0)
-                mean, spread = mean_and_spread(values)
-                summaries.append((ratio, mean, spread or 0.0))
+                mean, std = mean_and_std(values)
+                summaries.append((ratio, mean, std or 0.0))
         ours.errorbar(*np.reshape(summaries, (-1, 3)).T, fmt="o-", color=OURS, capsize=3)
         pairs = zip(ratios, filled.rows, strict=True)
         points = {x: r.numbers[column.key] for x, r in pairs if column.key in r.numbers}
@@ -95,7 +95,7 @@ def _ratio_plot(filled: PaperTable) -> tuple[str, Figure]:
         axes.set_xlabel(RATIOS[filled.key])
         axes.set_xticks(ratios)
     return (
-        "Against the ratio: pale dots are seeds, the line joins the means ± their spread.",
+        "Against the ratio: pale dots are seeds, the line joins the means ± their std.",
         figure,
     )
 
@@ -109,7 +109,7 @@ def _pareto_plot(filled: PaperTable, quality: Column) -> list[tuple[str, Figure]
 
     ours, paper = [], []
     for row in filled.rows:
-        means = {key: mean_and_spread(values)[0] for key, values in row.values.items() if values}
+        means = {key: mean_and_std(values)[0] for key, values in row.values.items() if values}
         # The costs of its network at the paper's scale
         means |= {key: number for key, number in (row.costs or {}).items() if key in COMPUTED}
         for points, numbers in ((ours, means), (paper, row.numbers)):

@@ -10,7 +10,7 @@ from asysplat.errors import InputError
 from benchmarks import compare as kinds
 from benchmarks import options
 from benchmarks.compare import Watched, compare, read_old
-from benchmarks.table import make_table, spread, text
+from benchmarks.table import make_table, median_iqr_column, text
 
 KINDS = {"seconds": kinds.TIME, "rate": kinds.RATE, "ratio": kinds.RATIO}
 KINDS |= dict.fromkeys(("wrong", "none"), kinds.ERROR) | {"psnr": kinds.DECIBELS}
@@ -102,7 +102,7 @@ def run(monkeypatch, run_script, tmp_path):
     """benchmark.py with a suite that measures these rows."""
 
     def script(*rows, **words):
-        columns = {"scene": text("{scene}"), "ms": spread("seconds")}
+        columns = {"scene": text("{scene}"), "ms": median_iqr_column("seconds")}
         suite = SimpleNamespace(
             measure=lambda *_: {"rows": list(rows)},
             tables=lambda found: [make_table("Rows", columns, found["rows"])],

@@ -49,7 +49,7 @@ def test_the_nearest_view_is_that_of_the_nearest_center_then_of_the_direction():
     assert nearest(single, make_views([[0, 0, 0]], [180])) == [0]
 
 
-def test_the_nearest_view_weighs_distance_by_spread_and_angle_by_pi():
+def test_the_nearest_view_weighs_distance_by_extent_and_angle_by_pi():
     # Spread 10. Input 0: 4/10 + 0. Input 1: 0 + yaw/180: the winner changes at a yaw of 72.
     target = make_views([[4, 0, 0]], [0])
     assert nearest(make_views([[0, 0, 0], [4, 0, 0], [10, 0, 0]], [0, 71, 180]), target) == [1]

@@ -9,7 +9,7 @@ from asysplat.report.compare import (
     claim_value,
     cost_errors,
     fits,
-    pooled_spread,
+    pooled_std,
     rank_agreement,
     spearman,
 )
@@ -31,10 +31,10 @@ def filled(paper: list[float], ours: list[list[float]]) -> PaperTable:
     return PaperTable("t", "1", "title", "protocol", (PSNR,), rows, "dl3dv/psnr")
 
 
-def test_pooled_spread_weighs_by_degrees_of_freedom():
+def test_pooled_std_weighs_by_degrees_of_freedom():
     # Squares within: 2 of 1 degree, 2 of 2 degrees, none of a single seed.
-    assert pooled_spread([[0.0, 2.0], [4.0, 5.0, 6.0], [9.0]]) == pytest.approx(math.sqrt(4 / 3))
-    assert pooled_spread([[1.0], [2.0]]) is None
+    assert pooled_std([[0.0, 2.0], [4.0, 5.0, 6.0], [9.0]]) == pytest.approx(math.sqrt(4 / 3))
+    assert pooled_std([[1.0], [2.0]]) is None
 
 
 def test_spearman_of_two_rows_or_of_equal_rows_is_none():

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from asysplat.data.check.matches import epipolar_lines
 from asysplat.data.check.report import Report
-from asysplat.data.selection.views import spread
+from asysplat.data.selection.views import evenly_spaced
 from asysplat.scene import Cameras
 
 WIDTH, PATH_HEIGHT, MAX_IMAGE_HEIGHT, TITLE_HEIGHT = 12.0, 5.0, 4.5, 0.3  # inches
@@ -54,7 +54,7 @@ def draw_report(report: Report, title: str) -> Figure:
     paths, images = figure.subfigures(2, 1, height_ratios=(PATH_HEIGHT, pair_height))
     _draw_path(report, *paths.subplots(1, 2))
     all_pairs = report.matches.pairs
-    shown = spread(range(len(all_pairs)), min(MAX_PAIRS, len(all_pairs)))
+    shown = evenly_spaced(range(len(all_pairs)), min(MAX_PAIRS, len(all_pairs)))
     if pairs := [all_pairs[index] for index in shown]:
         columns = images.subplots(2, len(pairs), squeeze=False).T.tolist()
         for plots, pair in zip(columns, pairs, strict=True):
@@ -69,7 +69,7 @@ def _draw_path(report: Report, above: Axes, side: Axes) -> None:
     ahead = cameras.cam_to_world[:, :3, 2].double().numpy() @ axes
     sparse = np.empty((0, 3)) if points is None else points @ axes
     drawn = sparse[:: max(1, len(sparse) // MAX_POINTS)]
-    arrows = spread(range(len(centers)), min(MAX_ARROWS, len(centers)))
+    arrows = evenly_spaced(range(len(centers)), min(MAX_ARROWS, len(centers)))
     for plot, x, y, direction in ((above, 0, 1, "above"), (side, 1, 2, "the side")):
         plot.set_title(f"path from {direction}, dark to light; scene units")
         plot.scatter(drawn[:, x], drawn[:, y], s=1, c="0.7", linewidths=0)
@@ -88,7 +88,7 @@ def _draw_pair(report: Report, pair: tuple[int, int], plots: Sequence[Axes]) -> 
     height, width = sequence.cameras.height, sequence.cameras.width
     matches = report.matches.select((report.matches.indices == torch.tensor(pair)).all(-1))
     left_to_right = matches.points[:, 0, 0].argsort()
-    matches = matches.select(left_to_right[spread(range(len(matches)), MAX_LINES)])
+    matches = matches.select(left_to_right[evenly_spaced(range(len(matches)), MAX_LINES)])
     lines = epipolar_lines(sequence.cameras.to(torch.float64), matches)
     images = sequence.views(pair).images.permute(0, 2, 3, 1).numpy()
     for view, plot in enumerate(plots):

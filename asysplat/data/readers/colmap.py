@@ -26,7 +26,7 @@ from asysplat.errors import InputError
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 FOLDERS = ("images", "images_undistort", "images_2", "images_4", "images_8", ".")
 MAX_NAMES = 5  # in a warning
-SAME_WORLD = 1e-3  # greatest difference of rotations, and of positions over the cameras' spread
+SAME_WORLD = 1e-3  # greatest difference of rotations, and of positions over the cameras' extent
 
 
 def find_scenes(root: Path) -> list[Path]:
@@ -89,9 +89,9 @@ def points_beside(scene: Path, posed: Sequence[PosedImage]) -> Points | None:
         return None
     given = np.array([image.cam_to_world for image in posed])
     others = [_cam_to_world(images[image.file.name], model) for image in posed]
-    difference, spread = np.abs(given - others), np.ptp(given[:, :3, 3], axis=0).max()
+    difference, extent = np.abs(given - others), np.ptp(given[:, :3, 3], axis=0).max()
     rotation, translation = difference[:, :3, :3].max(), difference[:, :3, 3].max()
-    same_world = rotation < SAME_WORLD and translation < SAME_WORLD * spread
+    same_world = rotation < SAME_WORLD and translation < SAME_WORLD * extent
     return _points(colmap) if same_world else None
 
 

@@ -34,7 +34,7 @@ def uniform_selection(num_images: int, num_inputs: int, num_targets: int) -> Sel
     If there are fewer gaps than targets, the targets are spread over all images but the inputs.
     """
     _check_length(num_images, num_inputs, num_targets)
-    inputs = spread(range(num_images), num_inputs)
+    inputs = evenly_spaced(range(num_images), num_inputs)
     gaps = pairwise(inputs)
     candidates = [(before + after) // 2 for before, after in gaps if after - before > 1]
     if len(candidates) < num_targets:
@@ -72,7 +72,7 @@ def training_selection(
     length = int(rng.integers(min(shortest, num_images), min(longest, num_images) + 1))
     start = int(rng.integers(num_images - length + 1))
     images = range(start, start + length)
-    inputs = spread(images, num_inputs)
+    inputs = evenly_spaced(images, num_inputs)
     candidates = images if targets_may_be_inputs else sorted(set(images) - set(inputs))
     return Selection(inputs, sorted(rng.choice(candidates, num_targets, replace=False).tolist()))
 
@@ -103,7 +103,9 @@ def every_8th_selection(
     """Select inputs evenly over the training images, at most `num_targets` held-out targets."""
     images, targets = training_images(num_images), held_out(num_images, split)
     check_held_out(num_images, len(images), num_inputs, split)
-    return Selection(spread(images, num_inputs), spread(targets, min(num_targets, len(targets))))
+    return Selection(
+        evenly_spaced(images, num_inputs), evenly_spaced(targets, min(num_targets, len(targets)))
+    )
 
 
 def first_96_selection(
@@ -128,11 +130,11 @@ def paper_split(num_images: int, num_targets: int, split: Split) -> tuple[list[i
     """
     targets = held_out(num_images, split)
     if split == "val":
-        return training_images(num_images), spread(targets, min(num_targets, len(targets)))
+        return training_images(num_images), evenly_spaced(targets, min(num_targets, len(targets)))
     return sorted(set(range(num_images)) - set(targets)), targets
 
 
-def spread(images: Sequence[int], count: int) -> list[int]:
+def evenly_spaced(images: Sequence[int], count: int) -> list[int]:
     """Choose `count` different images at even distances, the first and the last among them."""
     positions = np.linspace(0, len(images) - 1, count)
     return [images[int(position + 0.5)] for position in positions]
