@@ -72,7 +72,7 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
         num_views, height, width: of the input.
 
     Returns:
-        parameters; geometry_share, of 1; gflops as the paper counts them (`module_flops`) and
+        parameters; geometry_ratio, of 1; gflops as the paper counts them (`module_flops`) and
         gflops_true as `true_flops` does, in 1e9; gaussians, their number; and `activation_gb`.
     """
     on_meta, products = copy.deepcopy(net).to("meta"), FlopCounterMode(display=False)
@@ -80,7 +80,7 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
         flops, gaussians = module_flops(on_meta, blank_views(num_views, height, width))
     return {
         "parameters": count_parameters(net),
-        "geometry_share": net.geometry_share(),
+        "geometry_ratio": net.geometry_ratio(),
         "gflops": flops / GIGA,
         "gflops_true": products.get_total_flops() / GIGA,
         "gaussians": gaussians.num_gaussians,

@@ -116,7 +116,7 @@ class AsySplat(TokenNetwork):
         geometry = (layer for stage in self.geometry["stages"][1:] for layer in stage.layers)
         return {*geometry, *(layer for stage in self.appearance["stages"][1:] for layer in stage)}
 
-    def geometry_share(self) -> float:
+    def geometry_ratio(self) -> float:
         """Return the share of parameters outside the appearance branch (paper: about 0.9)."""
         appearance = sum(p.numel() for p in self.appearance.parameters())
         return 1 - appearance / sum(p.numel() for p in self.parameters())

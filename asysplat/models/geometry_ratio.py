@@ -26,7 +26,7 @@ def solve_widths(
     one in the fine width: a few models on the meta device determine them, so the search is cheap.
 
     Args:
-        build: widths, appearance layers -> model with a `geometry_share()`.
+        build: widths, appearance layers -> model with a `geometry_ratio()`.
         base: the widths that define the total, together with `layers`.
         layers: N_v, the layers of an appearance stage.
         ratio: parameters of the geometry branch over all.
@@ -130,4 +130,4 @@ def _samples(columns: int) -> np.ndarray:
 def _count(model: nn.Module) -> tuple[int, float]:
     """Return the parameters of the model and of its geometry branch."""
     total = sum(p.numel() for p in model.parameters())
-    return total, total * model.geometry_share()
+    return total, total * model.geometry_ratio()

@@ -66,7 +66,7 @@ class Network(nn.Module, ABC):
     def predict(self, views: Views) -> Gaussians:
         """Predict Gaussians [B, N] from views [B, V]."""
 
-    def geometry_share(self) -> float:
+    def geometry_ratio(self) -> float:
         """Return the share of parameters outside an appearance branch: all."""
         return 1.0
 
@@ -192,6 +192,6 @@ class TokenNetwork(Network):
         """Return the number of parameters and the widths, in a line."""
         stages = "/".join(map(str, self.widths.stages))
         return (
-            f"{super().describe()}, {self.geometry_share():.1%} of them for geometry; "
+            f"{super().describe()}, {self.geometry_ratio():.1%} of them for geometry; "
             f"stages {stages} wide, heads {self.widths.head_dim}"
         )

@@ -32,7 +32,7 @@ COSTS = {
     "gflops": ("Module GFLOPs", 1, "{:,.0f}"),
     "gflops_true": ("True GFLOPs", 1, "{:,.0f}"),
     "gaussians": ("Gaussians (M)", 1e6, "{:.3g}"),
-    "geometry_share": ("Geometry (%)", 0.01, "{:.1f}"),
+    "geometry_ratio": ("Geometry (%)", 0.01, "{:.1f}"),
     "activation_gb": ("Activation (GB)", 1, "{:.3g}"),
 }
 COST_CAPTION = (

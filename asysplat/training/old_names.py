@@ -54,6 +54,7 @@ REMOVED = {  # with the value that had no effect
     "speed.faint": None,
 }
 RESULTS = {  # parts of the keys of metrics.json, as regular expressions
+    r"/geometry_share$": "/geometry_ratio",
     r"/mean_colour/": "/mean_color/",
     r"^mean_colour/": "mean_color/",
     r"^skip/(.+)/views$": r"early_exit/\1/network",

@@ -47,7 +47,7 @@ def cost_sentence(results: Results) -> str:
     if "cost/parameters" in results:
         costs += [
             f"{results['cost/parameters'] / 1e6:.2f}M parameters",
-            f"{results['cost/geometry_share']:.1%} of them in the geometry branch",
+            f"{results['cost/geometry_ratio']:.1%} of them in the geometry branch",
             f"{results['cost/gaussians']:.0f} Gaussians a scene",
         ]
     if "cost/seconds_per_step" in results:

@@ -71,7 +71,7 @@ def sweep_table(jobs: Sequence[Job]) -> Table:
         size = "not finished" if run is None else ""
         if "cost/parameters" in results:
             size = f"{results['cost/parameters'] / 1e6:.2f}M"
-        share = results.get("cost/geometry_share")
+        share = results.get("cost/geometry_ratio")
         table.add_row(
             *(overrides.get(key, "") for key in varied),
             size,

@@ -28,7 +28,7 @@ def test_static_costs_at_the_papers_scale_are_the_papers(build):
     assert costs["gflops_true"] > 1.2 * costs["gflops"]
     assert costs["gaussians"] == 32 * 128 * 128
     assert round(costs["parameters"] / 1e6, 2) == 98.11
-    assert round(costs["geometry_share"], 3) == 0.905
+    assert round(costs["geometry_ratio"], 3) == 0.905
     assert 20 < costs["activation_gb"] < 30
 
 

@@ -60,9 +60,9 @@ def test_parameters_and_head_at_full_width(build, model):
     assert type(net.head) is LongLRMHead  # one for all; at laptop scale tests/conf trains ours
 
 
-def test_geometry_share_of_the_paper(build):
+def test_geometry_ratio_of_the_paper(build):
     net = build("model=asysplat_4m4s", "scale=paper", device="meta")
-    assert abs(net.geometry_share() - 0.905) < 0.001
+    assert abs(net.geometry_ratio() - 0.905) < 0.001
 
 
 @pytest.mark.medium
@@ -72,7 +72,7 @@ def test_geometry_ratio(build, ratio, width):
     base = build(*model, device="meta")
     net = build(*model, f"geometry_ratio={ratio}", device="meta")
     total, expected = (sum(p.numel() for p in n.parameters()) for n in (net, base))
-    assert abs(net.geometry_share() - ratio) <= 0.015
+    assert abs(net.geometry_ratio() - ratio) <= 0.015
     assert abs(total / expected - 1) < 0.01
     assert all(width % net.widths.head_dim == 0 for width in (*net.widths.stages, net.widths.fine))
     stages = "/".join(map(str, net.widths.stages))

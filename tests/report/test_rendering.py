@@ -32,7 +32,7 @@ def make_row(name: str, run: tuple[str, ...] | None = ("model=x",), **fields) ->
 def costs(parameters: float) -> dict[str, int | float]:
     return {
         "parameters": int(parameters),
-        "geometry_share": 0.905,
+        "geometry_ratio": 0.905,
         "gflops": 2041.2,
         "gflops_true": 2600.4,
         "gaussians": 524288,

@@ -14,7 +14,7 @@ METRICS = {
     "baseline/rooms/nearest_view/psnr": 16.0,
     "baseline/rooms/mean_color/psnr": 13.0,
 }
-STATIC = {"cost/parameters": 2e6, "cost/geometry_share": 0.7, "cost/gaussians": 10}
+STATIC = {"cost/parameters": 2e6, "cost/geometry_ratio": 0.7, "cost/gaussians": 10}
 STEP = {"cost/seconds_per_step": 2.0}
 
 

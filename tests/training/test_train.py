@@ -26,7 +26,7 @@ def test_a_run_leaves_metrics_figures_curves_and_checkpoints(whole):
         assert isinstance(numbers[f"test/procedural/{name}"], float)
     assert numbers["baseline/procedural/mean_color/psnr"] < 30
     assert numbers["baseline/procedural/nearest_view/psnr"] < 30
-    expected = {"parameters", "geometry_share", "gflops", "gflops_true", "gaussians"}
+    expected = {"parameters", "geometry_ratio", "gflops", "gflops_true", "gaussians"}
     expected |= {"peak_gb", "seconds_per_step"}
     tests = ("inference", "rooms/inference", "outdoors/inference")
     expected |= {f"{test}_{unit}" for test in tests for unit in ("seconds", "gb")}
