@@ -59,7 +59,7 @@ def evaluate(options: DictConfig) -> None:
     except (ValueError, MisconfigurationException) as error:
         raise InputError(f"trainer: {error}") from error
     measure = make_measure(config, options, fabric.device)
-    net = load_network(config, fabric.device) if options.scenes is None else None
+    net = load_network(config, fabric.device) if options.gaussians is None else None
     data = instantiate(config.data)
     data.setup()
     data.check_sizes(measure.protocol.check_size)
@@ -70,22 +70,22 @@ def evaluate(options: DictConfig) -> None:
         predictor, early_exit = make_predictor(net, fabric), net.early_exit_shares
     else:
         tests = {data.name: data.tests[data.name]}
-        opened = open_scenes(Path(options.scenes), tests[data.name], fabric.device)
+        opened = open_gaussians(Path(options.gaussians), tests[data.name], fabric.device)
         predictor, found, backgrounds = opened
         measure = replace(measure, backgrounds=backgrounds)
         described = described | found
 
     folders = target.folder, target.scene_folder
     scenes = measure_scenes(tests, predictor, measure, fabric.device, *folders, early_exit)
-    if options.write_scenes is not None:
-        write_scenes(Path(options.write_scenes), tests[data.name], predictor, fabric.device)
+    if options.write_gaussians is not None:
+        write_predictions(Path(options.write_gaussians), tests[data.name], predictor, fabric.device)
 
     if options.run is None:  # a run has one
         OmegaConf.save(options, target.folder / "config.yaml", resolve=True)
     results = described | {"evaluation/post_optimization": HOW}
     results |= {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
     results |= set_results(scenes, measure.protocol.mean_over)
-    if options.scenes is not None:  # reading a file is no prediction
+    if options.gaussians is not None:  # reading a file is no prediction
         results = {k: v for k, v in results.items() if not k.startswith("cost/post0/")}
     write_csv(target.folder / "evaluation.csv", image_rows(scenes))
     write_json(target.folder / EVALUATION, results)
@@ -100,7 +100,8 @@ def make_measure(config: DictConfig, options: DictConfig, device: torch.device) 
         warnings.warn(protocol.without_lpips(), stacklevel=1)
     else:
         lpips.to(device)
-    steps = tuple(options.steps) if isinstance(options.steps, ListConfig) else (options.steps,)
+    steps = options.post_optimization_steps
+    steps = tuple(steps) if isinstance(steps, ListConfig) else (steps,)
     color = config.training.background
     background = None if color == "inputs" else torch.tensor(color, device=device)
     return PostOptimization(steps, protocol, lpips, background)
@@ -127,7 +128,7 @@ def make_predictor(net: Network, fabric: lightning.Fabric) -> Predictor:
     return lambda sample: partial(predict, sample["prune"])
 
 
-def open_scenes(
+def open_gaussians(
     path: Path, tests: FixedTasks, device: torch.device
 ) -> tuple[Predictor, dict[str, float], dict[str, Tensor]]:
     """Read and check the Gaussians of every scene of the data; return what reads one again.
@@ -164,11 +165,11 @@ def open_scenes(
     return predictor, described, known
 
 
-def write_scenes(
+def write_predictions(
     folder: Path, tests: FixedTasks, predictor: Predictor, device: torch.device
 ) -> None:
     """Write the Gaussians of every test scene, in the data's world, as <scene>.safetensors."""
-    make_folder(folder, "write_scenes")
+    make_folder(folder, "write_gaussians")
     for index in track(range(len(tests)), "writing scenes"):
         sample, sequence = tests[index], tests.tasks[index].sequence
         gaussians = predictor(sample)(sample["inputs"].to(device)).to(torch.float64)

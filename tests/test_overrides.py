@@ -87,8 +87,18 @@ def test_options_of_the_other_scripts():
     for script, known, unknown, nearest in (
         ("report", "table=[layers,geometry_ratio] costs=true logs=elsewhere", "cots=true", "costs"),
         ("benchmark", "suite=ops ops.ssd.length=512 model.names=[longlrm]", "repeat=3", "repeats"),
-        ("evaluate", "run=logs/asysplat/one steps=[0,5] paths.logs=elsewhere", "scens=a", "scenes"),
-        ("evaluate", "init_path=shipped data=files data.root=x scale=gpu", "scens=a.ply", "scenes"),
+        (
+            "evaluate",
+            "run=logs/asysplat/one post_optimization_steps=[0,5] paths.logs=elsewhere",
+            "gausians=a",
+            "gaussians",
+        ),
+        (
+            "evaluate",
+            "init_path=shipped data=files data.root=x scale=gpu",
+            "gausians=a.ply",
+            "gaussians",
+        ),
     ):
         check_overrides(known.split(), script)
         with pytest.raises(InputError, match=f"did you mean {nearest}"):

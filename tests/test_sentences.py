@@ -171,7 +171,7 @@ def test_refine_checks_photographs(make_scene, change):
 COMMANDS = {
     "report.py output={file}/report": "output",
     "train.py paths.logs={file}/logs": "paths.logs",
-    "evaluate.py scenes={scene}": "add data=files",
+    "evaluate.py gaussians={scene}": "add data=files",
     "reconstruct.py {photographs} layout=colmp": "colmp",
     "reconstruct.py {photographs} height=abc": "height=abc",
     "reconstruct.py {photographs} max_held_out=0": "max_held_out=0",

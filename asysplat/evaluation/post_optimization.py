@@ -74,8 +74,8 @@ class PostOptimization:
         valid = all(type(step) is int and step >= 0 for step in self.steps)
         if not self.steps or not valid or list(self.steps) != sorted(set(self.steps)):
             raise InputError(
-                f"steps={self.steps}: give whole numbers from 0 on, each above the one before, "
-                "such as [0,3,10]."
+                f"post_optimization_steps={self.steps}: give whole numbers from 0 on, each above "
+                "the one before, such as [0,3,10]."
             )
 
     def __call__(

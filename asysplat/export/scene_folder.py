@@ -110,7 +110,7 @@ def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, Sc
     Raises:
         InputError: not exactly one file for every scene, or a file of no scene.
     """
-    option, own = f"scenes={scenes}", {sequence.name: sequence for sequence in sequences}
+    option, own = f"gaussians={scenes}", {sequence.name: sequence for sequence in sequences}
     kinds = f"{', '.join(READERS)}"
     some = ", ".join(sorted(own)[:MAX_NAMES]) + ", ..." * (len(own) > MAX_NAMES)
     if scenes.is_file():

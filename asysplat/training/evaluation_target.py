@@ -14,7 +14,8 @@ from asysplat.training.runs import RESULTS, describe_run, find_runs, folder_of, 
 from asysplat.training.systems import describe_system
 
 CHECKPOINT = "checkpoints/last.ckpt"
-OWN_OPTIONS = ("run", "scenes", "system", "steps", "write_scenes")  # the others are train.py's
+# The others are train.py's.
+OWN_OPTIONS = ("run", "gaussians", "system", "post_optimization_steps", "write_gaussians")
 
 
 @dataclass(frozen=True)
@@ -35,37 +36,38 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
     """Find the target of evaluate.py from its options and the overrides of its command.
 
     Raises:
-        InputError: none of run, init_path and scenes is given, or several are; files do not exist;
-            options that do not go together; a value that is missing or out of range.
+        InputError: none of run, init_path and gaussians is given, or several are; files do not
+            exist; options that do not go together; a value that is missing or out of range.
     """
-    given = [name for name in ("run", "init_path", "scenes") if options[name] is not None]
+    given = [name for name in ("run", "init_path", "gaussians") if options[name] is not None]
     if len(given) != 1:
         raise InputError(
             f"{' and '.join(given) or 'nothing'} is given to evaluate: give one of run=last, "
-            "init_path=shipped and scenes=FOLDER."
+            "init_path=shipped and gaussians=FOLDER."
         )
-    if options.scenes is None and options.system is not None:
+    if options.gaussians is None and options.system is not None:
         raise InputError(
-            f"system={options.system} names the system that made scenes=...: give both, or neither."
+            f"system={options.system} names the system that made gaussians=...: give both, "
+            "or neither."
         )
-    if options.write_scenes is not None:
-        _check_new(Path(options.write_scenes), options)
-    if options.scenes is not None and not any(each.startswith("data") for each in overrides):
+    if options.write_gaussians is not None:
+        _check_new(Path(options.write_gaussians), options)
+    if options.gaussians is not None and not any(each.startswith("data") for each in overrides):
         raise InputError(
-            f"scenes={options.scenes} is measured on photographs of the same scenes: add "
+            f"gaussians={options.gaussians} is measured on photographs of the same scenes: add "
             "data=files data.root=my_scenes."
         )
     if options.run is not None:
         return _target_of_run(options, overrides)
     config = options.copy()
     with open_dict(config):
-        for name in set(OWN_OPTIONS) - {"steps"}:  # another option in train.py
+        for name in OWN_OPTIONS:
             del config[name]
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
-    check_ranges(OmegaConf.masked_copy(config, [key for key in config if key != "steps"]))
+    check_ranges(config)
     described = _describe(config, options)
-    stem = Path(options.scenes or options.init_path).stem
+    stem = Path(options.gaussians or options.init_path).stem
     folder = Path(options.paths.logs) / "evaluate" / f"{stem}-{hash_of(described)[:8]}"
     return EvaluationTarget(config, folder, described)
 
@@ -97,21 +99,21 @@ def _describe(config: DictConfig, options: DictConfig) -> dict[str, str | int]:
     """Describe what results depend on, under keys of the evaluation."""
     described = describe_run(config)
     described = {f"evaluation/{k.removeprefix('run/')}": v for k, v in described.items()}
-    described["evaluation/steps"] = str(options.steps)
-    if options.scenes is not None:
-        described |= describe_system(config, Path(options.scenes), options.system)
+    described["evaluation/post_optimization_steps"] = str(options.post_optimization_steps)
+    if options.gaussians is not None:
+        described |= describe_system(config, Path(options.gaussians), options.system)
     return described
 
 
 def _check_new(folder: Path, options: DictConfig) -> None:
     """Check that there is something to write to `folder`, and nothing there yet."""
-    if options.scenes is not None:
+    if options.gaussians is not None:
         raise InputError(
-            f"write_scenes={folder} writes what a model predicts, and scenes={options.scenes} are "
-            "files: leave one out."
+            f"write_gaussians={folder} writes what a model predicts, and "
+            f"gaussians={options.gaussians} are files: leave one out."
         )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
-            f"write_scenes={folder} exists and is not an empty folder: name a new one, nothing is "
-            "overwritten."
+            f"write_gaussians={folder} exists and is not an empty folder: name a new one, "
+            "nothing is overwritten."
         )

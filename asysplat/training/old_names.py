@@ -54,6 +54,8 @@ REMOVED = {  # with the value that had no effect
     "speed.faint": None,
 }
 RESULTS = {  # parts of the keys of metrics.json, as regular expressions
+    r"^evaluation/scenes$": "evaluation/gaussians",
+    r"^evaluation/steps$": "evaluation/post_optimization_steps",
     r"/geometry_share$": "/geometry_ratio",
     r"/mean_colour/": "/mean_color/",
     r"^mean_colour/": "mean_color/",

@@ -20,23 +20,25 @@ IMAGES = ("inputs", "targets", "height", "width", "selection")
 IMAGES += ("num_images", "test_scenes", "places")  # options of procedural scenes
 
 
-def describe_system(config: DictConfig, scenes: Path, system: str | None) -> dict[str, Any]:
+def describe_system(config: DictConfig, gaussians: Path, system: str | None) -> dict[str, Any]:
     """Describe the scenes of a system, and what they are measured on, for evaluation.json.
 
     Args:
         config: configuration of train.py.
-        scenes: a folder of files of Gaussians, or one file.
+        gaussians: a folder of files of Gaussians, or one file.
         system: its name; None: that of the folder or file.
     """
-    absolute = Path(os.path.abspath(scenes))
+    absolute = Path(os.path.abspath(gaussians))
     name = absolute.stem if absolute.is_file() else absolute.name
-    folder, stem = (scenes.parent, glob.escape(scenes.stem)) if scenes.is_file() else (scenes, "*")
+    folder, stem = gaussians, "*"
+    if gaussians.is_file():
+        folder, stem = gaussians.parent, glob.escape(gaussians.stem)
     files = [*folder.glob(f"{stem}.*"), *folder.glob(f"{stem}/*/*/*")]  # with their cameras
     content = {str(path.relative_to(folder)): content_of(path) for path in files if path.is_file()}
     tested = options_of_test(config, config.data.name)
     return {
         SYSTEM: name if system is None else str(system),
-        "evaluation/scenes": hash_of(content),
+        "evaluation/gaussians": hash_of(content),
         **{f"{TESTED}{key}": value for key, value in tested.items()},
     }
 

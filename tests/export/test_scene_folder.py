@@ -182,7 +182,7 @@ WRONG = [
 
 
 def test_find_files_refuses_files_that_are_not_those_of_the_scenes(sequences, tmp_path):
-    with pytest.raises(InputError, match=r"scenes=.* is not a file and no folder"):
+    with pytest.raises(InputError, match=r"gaussians=.* is not a file and no folder"):
         find_files(tmp_path / "absent", sequences)
     for number, (files, message) in enumerate(WRONG):
         folder = tmp_path / str(number)

@@ -21,7 +21,7 @@ from asysplat.report.paper import load_paper
 
 pytestmark = pytest.mark.medium
 
-STEPS = "steps=[0,3,10]"
+STEPS = "post_optimization_steps=[0,3,10]"
 MODEL = ["model=asysplat_4m4s", "metrics=longlrm", *SIZE]  # of Table 2
 
 
@@ -137,7 +137,7 @@ def test_an_interrupted_evaluation_resumes(whole, evaluated, evaluate, tmp_path,
     read_evaluation(evaluate(*command, STEPS))
     assert measured == []
     alone = "data.test_sets=null"
-    read_evaluation(evaluate(*command, "steps=[0,2]", alone))
+    read_evaluation(evaluate(*command, "post_optimization_steps=[0,2]", alone))
     assert measured == ["procedural-0", "procedural-1"]
 
 
@@ -157,8 +157,8 @@ ON_DISK = ["data=files", "data.cache.folder=null", "data.window=[12,24]", "data.
 def written(whole, photographs, tmp_path_factory, run_script) -> tuple[Path, dict]:
     """The folder of what the model predicts of that scene, and the model's numbers."""
     folder = tmp_path_factory.mktemp("written")
-    given = [f"init_path={whole}/checkpoints/last.ckpt", f"write_scenes={folder}/ours"]
-    data = [*ON_DISK, f"data.root={photographs}", *VIEWS, "steps=[0,2]"]
+    given = [f"init_path={whole}/checkpoints/last.ckpt", f"write_gaussians={folder}/ours"]
+    data = [*ON_DISK, f"data.root={photographs}", *VIEWS, "post_optimization_steps=[0,2]"]
     _, results = read_evaluation(
         run_script("evaluate.py", *given, *MODEL, *data, f"paths.logs={folder}")
     )
@@ -176,7 +176,9 @@ def test_what_a_model_writes_measures_as_the_model(written, photographs, evaluat
     (file,) = ours.iterdir()
     assert file.name == f"{photographs.name}.safetensors"
     data = [*ON_DISK, f"data.root={photographs}", *VIEWS, "metrics=longlrm"]
-    folder, found = read_evaluation(evaluate(f"scenes={ours}", *data, "steps=[0,2]"))
+    folder, found = read_evaluation(
+        evaluate(f"gaussians={ours}", *data, "post_optimization_steps=[0,2]")
+    )
     assert {"test/files/post0/psnr", "test/files/post2/ssim"} <= qualities(found).keys()
     assert qualities(found) == qualities(expected)
     assert found["evaluation/system"] == "ours" and found["tested/scenes"] == 1
@@ -185,7 +187,9 @@ def test_what_a_model_writes_measures_as_the_model(written, photographs, evaluat
 
     scene = tmp_path / "scene.ply"
     write_gaussians(scene, read_gaussians(file))
-    _, found = read_evaluation(evaluate(f"scenes={scene}", *data, "steps=[0,2]", "system=PLY"))
+    _, found = read_evaluation(
+        evaluate(f"gaussians={scene}", *data, "post_optimization_steps=[0,2]", "system=PLY")
+    )
     assert shown(found) == shown(expected) and found["evaluation/system"] == "PLY"
     assert qualities(found) == pytest.approx(qualities(expected), abs=1e-4)
 
@@ -201,7 +205,13 @@ def test_another_systems_coordinates(written, photographs, evaluate, tmp_path):
     system.mkdir()
     moved = transform(read_gaussians(file), motion).scale_by(2.5)
     write_gaussians(system / f"{photographs.name}.ply", moved)
-    data = [f"scenes={system}", *ON_DISK, f"data.root={photographs}", *VIEWS, "steps=0"]
+    data = [
+        f"gaussians={system}",
+        *ON_DISK,
+        f"data.root={photographs}",
+        *VIEWS,
+        "post_optimization_steps=0",
+    ]
     said = refusal(evaluate(*data))
     assert "other coordinates than the data: put its cameras beside it" in said
     assert not list(tmp_path.rglob("evaluation"))  # before any scene is measured
@@ -225,14 +235,14 @@ def test_files_that_do_not_fit_the_data(written, photographs, evaluate, tmp_path
     data = [*ON_DISK, f"data.root={photographs}", *VIEWS]
     (tmp_path / "lego.ply").touch()
     assert "lego.ply is named as no scene of the data" in refusal(
-        evaluate(f"scenes={tmp_path}", *data)
+        evaluate(f"gaussians={tmp_path}", *data)
     )
     assert "is not an empty folder: name a new one" in refusal(
-        evaluate("init_path=shipped", f"write_scenes={ours}", *data)
+        evaluate("init_path=shipped", f"write_gaussians={ours}", *data)
     )
     (tmp_path / "lego.ply").rename(tmp_path / f"{photographs.name}.ply")
-    assert f"{photographs.name}.ply" in refusal(evaluate(f"scenes={tmp_path}", *data))  # empty
-    synthetic = evaluate(f"scenes={next(ours.iterdir())}", *VIEWS, *TINY_SCENES)
+    assert f"{photographs.name}.ply" in refusal(evaluate(f"gaussians={tmp_path}", *data))  # empty
+    synthetic = evaluate(f"gaussians={next(ours.iterdir())}", *VIEWS, *TINY_SCENES)
     assert "is one scene, and the data has 2" in refusal(synthetic)
     assert not list(tmp_path.rglob("evaluation*.*"))
 
@@ -250,16 +260,22 @@ REFUSED = {
     "no run": (["run=nowhere"], "run=nowhere has no metrics.json"),
     "no runs": (["run=last"], "run=last found no finished run in"),
     "no weights": (["init_path=none.ckpt"], "init_path=none.ckpt does not exist"),
-    "no file": (["scenes=none.ply", "data.test_scenes=1"], "none.ply is not a file"),
-    "no data": (["scenes=none.ply"], "is measured on photographs of the same scenes: add data="),
+    "no file": (["gaussians=none.ply", "data.test_scenes=1"], "none.ply is not a file"),
+    "no data": (["gaussians=none.ply"], "is measured on photographs of the same scenes: add data="),
     "a name of nothing": (["init_path=shipped", "system=x"], "system=x names the system that made"),
-    "files to write": (["scenes=a", "data=files", "write_scenes=b"], "are files: leave one out"),
+    "files to write": (
+        ["gaussians=a", "data=files", "write_gaussians=b"],
+        "are files: leave one out",
+    ),
     "no folder": (["init_path=shipped", "data=files"], "add data.root=..."),
     "another model": (
         ["init_path=shipped", "width=0.125"],
         "the shipped weights do not fit this model, ",
     ),
-    "steps that do not increase": (["init_path=shipped", "steps=[3,3]"], "above the one before"),
+    "steps that do not increase": (
+        ["init_path=shipped", "post_optimization_steps=[3,3]"],
+        "above the one before",
+    ),
     "a size out of range": (["init_path=shipped", "data.height=0"], "data.height=0: give a whole"),
     "an unknown option": (["ryn=last"], "ryn is unknown"),
 }

@@ -97,7 +97,7 @@ def test_its_configuration_has_the_keys_of_today(old_run, config):
 @pytest.mark.medium
 def test_it_is_evaluated_resumed_and_started_from(old_run, config, run_script, train):
     last = old_run / "checkpoints" / "last.ckpt"
-    result = run_script("evaluate.py", f"run={old_run}", "steps=[0]")
+    result = run_script("evaluate.py", f"run={old_run}", "post_optimization_steps=[0]")
     assert result.returncode == 0, result.stderr
     found = json.loads((old_run / "evaluation.json").read_text())
     # Not what the run wrote: the prior is better since.
