@@ -17,10 +17,10 @@ from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.rendering import render
 from asysplat.training.losses import SplattingLoss
-from asysplat.training.parts import Parts
 from asysplat.training.prediction import Prediction
 from asysplat.training.side_by_side import Batch, SideBySide
 from asysplat.training.step_means import StepMeans
+from asysplat.training.step_timer import StepTimer
 
 
 class SplattingModule(lightning.LightningModule):
@@ -58,8 +58,8 @@ class SplattingModule(lightning.LightningModule):
         self.net, self.loss = net, loss
         self.optimizer, self.schedule = optimizer, schedule
         self.views_at_once, self.drop_above = views_at_once, drop_above
-        self.parts = Parts()  # parts of a step, timed by a callback
-        self._side_by_side = SideBySide(net, self.compute_terms, self.parts)
+        self.timer = StepTimer()  # started and stopped by a callback
+        self._side_by_side = SideBySide(net, self.compute_terms, self.timer)
         self._step_means = StepMeans(net)
         fixed = None if background == "inputs" else torch.tensor(background)
         self.register_buffer("background", fixed, persistent=False)
@@ -75,10 +75,10 @@ class SplattingModule(lightning.LightningModule):
     def forward(self, batch: Batch, depth: bool, net: nn.Module | None = None) -> Prediction:
         """Predict the Gaussians of the inputs, by `net` if given; render them at the targets."""
         net = self.net if net is None else net
-        with self.parts("network"):
+        with self.timer("network"):
             gaussians = net(batch["inputs"], prune=False)
         targets, background = batch["targets"], self.background_for(batch)
-        with self.parts("rendering"):
+        with self.timer("rendering"):
             options = {"masks": targets.masks, "views_at_once": self.views_at_once, "depth": depth}
             kept = net.select(gaussians) if batch.get("prune", True) else gaussians
             rendering = render(kept, targets.cameras, background, **options)
@@ -118,7 +118,7 @@ class SplattingModule(lightning.LightningModule):
         prediction = self(batch, depth=self.loss.needs_depth, net=net)
         targets = batch["targets"]
         image = targets.masked(prediction.rendering.image.detach())
-        with self.parts("loss"):
+        with self.timer("loss"):
             return {**self.loss(prediction, batch), "psnr": psnr(image, targets.images).mean()}
 
     def validation_step(self, batch: Batch, batch_idx: int) -> Prediction:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from asysplat.training.parts import Parts
+from asysplat.training.step_timer import StepTimer
 
 Batch = dict[str, Any]
 Terms = dict[str, Tensor]
@@ -26,7 +26,7 @@ class SideBySide:
     """Computes means over the scenes of a batch, and their gradients.
 
     Batch norms normalize each scene by itself, as if it had its own process; their running means
-    change by the mean over the scenes. `compute` returns terms, "loss" among them; `parts` measures
+    change by the mean over the scenes. `compute` returns terms, "loss" among them; `timer` measures
     the backward pass of each scene.
     """
 
@@ -34,9 +34,9 @@ class SideBySide:
         self,
         net: nn.Module,
         compute: Callable[[Batch, nn.Module], Terms],
-        parts: Parts | None = None,
+        timer: StepTimer | None = None,
     ):
-        self.net, self.compute, self.parts = net, compute, parts or Parts()
+        self.net, self.compute, self.timer = net, compute, timer or StepTimer()
         self.copies: list[nn.Module] = []  # one a scene, with the parameters of `net`
 
     def __call__(self, batch: Batch) -> Terms:
@@ -51,7 +51,7 @@ class SideBySide:
             # A cache would be shared by all threads.
             with torch.autocast("cpu", enabled=enabled, dtype=dtype, cache_enabled=False):
                 terms = self.compute(scene, net)
-            with self.parts("backward"):
+            with self.timer("backward"):
                 grads = torch.autograd.grad(terms["loss"], parameters, materialize_grads=True)
             return {name: term.detach() for name, term in terms.items()}, grads
 

@@ -14,10 +14,10 @@ from torch import nn
 
 from asysplat.evaluation import measured_cost
 from asysplat.evaluation.measured_cost import peak_flops
-from asysplat.training import parts
+from asysplat.training import step_timer
 from asysplat.training.callbacks import TrainingMonitor, monitor
 from asysplat.training.callbacks.monitor import gradient_norms, sentence
-from asysplat.training.parts import Parts
+from asysplat.training.step_timer import StepTimer
 
 CPU = torch.device("cpu")
 
@@ -37,7 +37,7 @@ class Clock(local):
 @pytest.fixture
 def clock(monkeypatch):
     clock = Clock()
-    for module in (monitor, parts):
+    for module in (monitor, step_timer):
         monkeypatch.setattr(module, "time", clock)
     return clock
 
@@ -52,7 +52,7 @@ class Run:
         self.monitor.first_step, self.monitor.begin_step = 0, None
         logger = SimpleNamespace(log_metrics=self.log)
         self.trainer = SimpleNamespace(global_step=0, world_size=2, loggers=[logger])
-        self.module = SimpleNamespace(parts=Parts(), device=CPU, net=nn.ModuleDict())
+        self.module = SimpleNamespace(timer=StepTimer(), device=CPU, net=nn.ModuleDict())
         views = [SimpleNamespace(num_views=count) for count in (3, 2)]
         self.batch = {"scene": ["a", "b"], "inputs": views[0], "targets": views[1]}
         self.monitor.on_train_epoch_start()
@@ -66,7 +66,7 @@ class Run:
             self.clock.wait(data)
             self.monitor.on_train_batch_start(*hooks, self.batch, batch)
             self.clock.wait(rest)
-            with self.module.parts("network"):
+            with self.module.timer("network"):
                 self.clock.wait(network)
             self.monitor.on_before_backward(*hooks, None)
             self.clock.wait(backward)
@@ -94,7 +94,7 @@ def test_shares_and_rates_of_measured_steps(clock):
     assert first["time/views_per_second"] == pytest.approx(2 * 2 * 2 * 5 / 30)
     assert first["time/gflops_per_second"] == pytest.approx(2 * 2 * 6 / 30)
     expected = {"data": 1, "network": 14, "backward": 3, "optimizer": 0.5, "other": 1.5}
-    for part in (*parts.PARTS, "other"):
+    for part in (*step_timer.PARTS, "other"):
         assert first[f"time/share_{part}"] == pytest.approx(expected.get(part, 0) / 20)
     assert "time/mfu" not in first and first["memory/peak_gb"] > 0
     text = sentence(second)
@@ -116,7 +116,7 @@ def test_a_step_of_several_micro_batches(clock):
 
 
 def test_seconds_of_parallel_threads_are_averaged(clock):
-    measured, together = Parts(), Barrier(2)
+    measured, together = StepTimer(), Barrier(2)
     with measured("network"):  # before the start
         clock.wait(1)
     measured.start(CPU)

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from asysplat.evaluation.measured_cost import memory_gb, peak_flops, peak_memory_gb, wait_for
 from asysplat.evaluation.static_cost import true_flops
 from asysplat.training.loggers import log_histogram
-from asysplat.training.parts import PARTS
 from asysplat.training.prediction import Prediction
+from asysplat.training.step_timer import PARTS
 
 GIGA = 1e9
 PASSES = 3  # forward, and a backward of about twice its products; recomputation does not count
@@ -54,21 +54,21 @@ class TrainingMonitor(Callback):
 
     def on_train_batch_start(self, trainer: Any, module: Any, *_: Any) -> None:
         due = self.begin_step is not None and (trainer.global_step + 1) % self.every == 0
-        if due and not module.parts.measuring:  # at the first micro-batch of the step
+        if due and not module.timer.measuring:  # at the first micro-batch of the step
             self.step, self.started = trainer.global_step, self.waiting_since
-            module.parts.start(module.device)
-        if module.parts.measuring:
-            module.parts.add("data", time.perf_counter() - self.waiting_since)
+            module.timer.start(module.device)
+        if module.timer.measuring:
+            module.timer.add("data", time.perf_counter() - self.waiting_since)
 
     def on_before_backward(self, trainer: Any, module: Any, *_: Any) -> None:
-        self.backward = module.parts("backward")
+        self.backward = module.timer("backward")
         self.backward.__enter__()
 
     def on_after_backward(self, *_: Any) -> None:
         self.backward.__exit__(None, None, None)
 
     def on_before_optimizer_step(self, trainer: Any, module: Any, _: Any) -> None:
-        if module.parts.measuring:
+        if module.timer.measuring:
             log(trainer, gradient_norms(module.net), self.step)
             wait_for(module.device)
             self.optimizer_since = time.perf_counter()
@@ -80,15 +80,15 @@ class TrainingMonitor(Callback):
             self._count(trainer, batch)
         elif trainer.global_step > self.first_step:
             self._begin(trainer)
-        if module.parts.measuring and trainer.global_step > self.step:
+        if module.timer.measuring and trainer.global_step > self.step:
             wait_for(module.device)
             now = time.perf_counter()
-            module.parts.add("optimizer", now - self.optimizer_since)
+            module.timer.add("optimizer", now - self.optimizer_since)
             if self.flops is None:
                 views = batch["inputs"]
                 size = (views.num_views, views.cameras.height, views.cameras.width)
                 self.flops = PASSES * true_flops(module.net, *size)
-            seconds, total = module.parts.stop(), now - self.started
+            seconds, total = module.timer.stop(), now - self.started
             shares = {name: spent / total for name, spent in seconds.items()}
             shares["other"] = max(0.0, 1 - sum(shares.values()))
             values = {f"time/share_{name}": share for name, share in shares.items()}

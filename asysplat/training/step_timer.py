@@ -13,7 +13,7 @@ from asysplat.evaluation.measured_cost import wait_for
 PARTS = ("data", "network", "rendering", "loss", "backward", "optimizer")
 
 
-class Parts:
+class StepTimer:
     """Measures the parts of a step between `start` and `stop`; in other steps it costs nothing.
 
     Parts do not overlap within a thread. Seconds of parallel threads are averaged. A part waits for
