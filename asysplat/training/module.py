@@ -17,8 +17,8 @@ from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.rendering import render
 from asysplat.training.losses import SplattingLoss
+from asysplat.training.parallel_scenes import Batch, ParallelScenes
 from asysplat.training.prediction import Prediction
-from asysplat.training.side_by_side import Batch, SideBySide
 from asysplat.training.step_means import StepMeans
 from asysplat.training.step_timer import StepTimer
 
@@ -59,7 +59,7 @@ class SplattingModule(lightning.LightningModule):
         self.optimizer, self.schedule = optimizer, schedule
         self.views_at_once, self.drop_above = views_at_once, drop_above
         self.timer = StepTimer()  # started and stopped by a callback
-        self._side_by_side = SideBySide(net, self.compute_terms, self.timer)
+        self._parallel_scenes = ParallelScenes(net, self.compute_terms, self.timer)
         self._step_means = StepMeans(net)
         fixed = None if background == "inputs" else torch.tensor(background)
         self.register_buffer("background", fixed, persistent=False)
@@ -109,12 +109,12 @@ class SplattingModule(lightning.LightningModule):
     def compute_terms(self, batch: Batch, net: nn.Module | None = None) -> dict[str, Tensor]:
         """Compute "loss", which has gradients, its terms and "psnr": means over the scenes.
 
-        Without `net`, copies of this module's network compute the scenes side by side on a CPU.
+        Without `net`, copies of this module's network compute the scenes in parallel on a CPU.
         """
         # The copies of a network whose parameters are sharded (FSDP) could not gather them.
         on_cpu = self.device.type == "cpu" and self.device_mesh is None
         if net is None and on_cpu and len(batch["scene"]) > 1:
-            return self._side_by_side(batch)
+            return self._parallel_scenes(batch)
         prediction = self(batch, depth=self.loss.needs_depth, net=net)
         targets = batch["targets"]
         image = targets.masked(prediction.rendering.image.detach())

@@ -5,7 +5,7 @@ import gc
 
 import pytest
 import torch
-from test_side_by_side import make_batch, module  # noqa: F401
+from test_parallel_scenes import make_batch, module  # noqa: F401
 
 from asysplat.evaluation.measured_cost import peak_memory_gb, reset_peak_memory
 from asysplat.rendering import render

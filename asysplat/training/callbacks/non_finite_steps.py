@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from asysplat.errors import InputError
+from asysplat.training.parallel_scenes import Batch, split
 from asysplat.training.random_states import RandomStates, random_states, set_random_states
-from asysplat.training.side_by_side import Batch, split
 
 
 class NonFiniteSteps(lightning.Callback):

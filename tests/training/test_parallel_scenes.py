@@ -6,8 +6,8 @@ from test_module import make_module
 from torch import nn
 
 from asysplat.scene import Cameras, Views
-from asysplat.training import SplattingLoss, side_by_side
-from asysplat.training.side_by_side import SideBySide, split
+from asysplat.training import SplattingLoss, parallel_scenes
+from asysplat.training.parallel_scenes import ParallelScenes, split
 
 SCENES = 3
 
@@ -62,7 +62,7 @@ def one_by_one(module, batch):
 def test_the_mean_over_scenes(module):
     batch = make_batch()
     expected, means = one_by_one(module, batch)
-    terms = module._side_by_side(batch)
+    terms = module._parallel_scenes(batch)
     (0.5 * terms["loss"]).backward()  # as for every second step of the optimizer
     assert terms["loss"].item() == pytest.approx(expected, rel=1e-6)
     parameters = dict(module.net.named_parameters())
@@ -89,13 +89,13 @@ def test_the_terms_of_a_batch_are_means_over_its_scenes(module):
 def test_any_number_of_workers_gives_the_same_bits(module, threads, monkeypatch):
     batch, found, kinds = make_batch(), [], []
     start = {name: buffer.clone() for name, buffer in module.net.named_buffers()}
-    pool = side_by_side._pool
-    monkeypatch.setattr(side_by_side, "_pool", lambda *kind: kinds.append(kind) or pool(*kind))
+    pool = parallel_scenes._pool
+    monkeypatch.setattr(parallel_scenes, "_pool", lambda *kind: kinds.append(kind) or pool(*kind))
     for count in (1, 2, 3):
         threads(count)
         module.net.load_state_dict(start, strict=False)
         module.zero_grad()
-        terms = module._side_by_side(batch)
+        terms = module._parallel_scenes(batch)
         terms["loss"].backward()
         found.append(state(module) | terms)
         assert torch.get_num_threads() == count
@@ -114,7 +114,7 @@ def test_it_computes_under_autocast_where_its_caller_does(module):
         types.append((torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu")))
         return {"loss": sum(p.sum() for p in net.parameters() if p.requires_grad)}
 
-    scenes = SideBySide(module.net, compute)
+    scenes = ParallelScenes(module.net, compute)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         scenes(make_batch())
     scenes(make_batch())
@@ -124,7 +124,7 @@ def test_it_computes_under_autocast_where_its_caller_does(module):
 
 def test_a_parameter_that_a_loss_does_not_see():
     net = nn.ModuleDict({"seen": nn.Linear(1, 1), "unseen": nn.Linear(1, 1)})
-    scenes = SideBySide(net, lambda batch, net: {"loss": net["seen"].weight.sum()})
+    scenes = ParallelScenes(net, lambda batch, net: {"loss": net["seen"].weight.sum()})
     scenes(make_batch())["loss"].backward()
     assert net["seen"].weight.grad == 1 and net["unseen"].weight.grad == 0
 
@@ -134,4 +134,4 @@ def test_an_error_in_a_scene_is_the_steps():
         raise ValueError(batch["scene"][0])
 
     with pytest.raises(ValueError, match="scene 0"):
-        SideBySide(nn.Linear(1, 1), fail)(make_batch())
+        ParallelScenes(nn.Linear(1, 1), fail)(make_batch())

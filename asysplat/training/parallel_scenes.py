@@ -1,4 +1,4 @@
-"""Compute the scenes of a batch side by side on a CPU, each in a thread.
+"""Compute the scenes of a batch in parallel on a CPU, each in a thread.
 
 The operators of a scene of low resolution are too short to be divided among the cores.
 The gradients of the scenes are averaged in the order of the scenes, so that the number of threads
@@ -22,7 +22,7 @@ Batch = dict[str, Any]
 Terms = dict[str, Tensor]
 
 
-class SideBySide:
+class ParallelScenes:
     """Computes means over the scenes of a batch, and their gradients.
 
     Batch norms normalize each scene by itself, as if it had its own process; their running means
