@@ -16,10 +16,10 @@ from asysplat.evaluation.static_cost import blank_views
 from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.rendering import render
+from asysplat.training.accumulated_metrics import AccumulatedMetrics
 from asysplat.training.losses import SplattingLoss
 from asysplat.training.parallel_scenes import Batch, ParallelScenes
 from asysplat.training.prediction import Prediction
-from asysplat.training.step_means import StepMeans
 from asysplat.training.step_timer import StepTimer
 
 
@@ -60,7 +60,7 @@ class SplattingModule(lightning.LightningModule):
         self.views_at_once, self.drop_above = views_at_once, drop_above
         self.timer = StepTimer()  # started and stopped by a callback
         self._parallel_scenes = ParallelScenes(net, self.compute_terms, self.timer)
-        self._step_means = StepMeans(net)
+        self._accumulated = AccumulatedMetrics(net)
         fixed = None if background == "inputs" else torch.tensor(background)
         self.register_buffer("background", fixed, persistent=False)
 
@@ -96,11 +96,11 @@ class SplattingModule(lightning.LightningModule):
         """Compute the loss of a micro-batch; log the means of a step at its last micro-batch."""
         accumulated = self.trainer.accumulate_grad_batches
         if batch_idx % accumulated == 0:
-            self._step_means.start()
+            self._accumulated.start()
         terms = self.compute_terms(batch)
-        self._step_means.add(terms)
+        self._accumulated.add(terms)
         if (batch_idx + 1) % accumulated == 0:
-            means = self._step_means.finish(self.trainer.strategy.reduce)
+            means = self._accumulated.finish(self.trainer.strategy.reduce)
             self.log("train/psnr", means.pop("psnr"), prog_bar=True)
             self.log_dict({f"train/{name}": term for name, term in means.items()})
             self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 
-class StepMeans:
+class AccumulatedMetrics:
     """Averages the terms of the loss and the running means of batch norms over an optimizer step.
 
     Both equal those of one process with the whole batch. Every micro-batch starts from the same
