@@ -1,6 +1,6 @@
-"""Run time against error: every knob of a prediction and of a refinement, one at a time.
+"""Run time against error: every variant of a prediction and of a refinement, one at a time.
 
-A setting renders all held-out views of a scene from photographs in memory. A knob is what a
+A setting renders all held-out views of a scene from photographs in memory. A variant is what a
 setting changes of the base of its family.
 """
 
@@ -51,7 +51,7 @@ from benchmarks.table import Columns, machine_note, make_table, median_iqr_colum
 from benchmarks.timing import Measurement, Result, summary
 
 WHOLE = {"views", "side", "max_gaussians", "views_at_once", "steps"}  # numbers of a setting
-BASE = "base"  # the setting that each knob changes
+BASE = "base"  # the setting that each variant changes
 EXACT = "fp64"
 SIZES = {"inputs": 16, "targets": 4}  # most views of a scene, unless its family says otherwise
 FRAMES = 96  # frames of a procedural scene
@@ -204,17 +204,17 @@ def _load_network(checkpoint: str | None, overrides: tuple[str, ...]) -> Network
 
 
 def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
-    """Return the settings of each family of `config.families`: the base, and those of its knobs.
+    """Return the settings of each family of `config.families`: the base, and those of its variants.
 
     Raises:
-        InputError: an unknown family, knob or field of a setting, or a value out of range.
+        InputError: an unknown family, variant or field of a setting, or a value out of range.
     """
     check_names("pareto.families", config["families"], FAMILIES)
     families = {}
     for family in config["families"]:
         kind, base = FAMILIES[family], config[family]["base"]
         families[family] = {}
-        for name, changes in ({BASE: {}} | (config[family]["knobs"] or {})).items():
+        for name, changes in ({BASE: {}} | (config[family]["variants"] or {})).items():
             where = f"pareto.{family}.{name}"
             if not isinstance(changes, Mapping):
                 raise InputError(f"{where}={changes} is no setting: give {{name: value}}.")
@@ -229,9 +229,9 @@ def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
                 families[family][name] = kind(**values)
             except InputError as error:
                 raise InputError(f"{where}: {error}") from error
-    if (chosen := config["knobs"]) != "all":
+    if (chosen := config["variants"]) != "all":
         names = dict.fromkeys(name for settings in families.values() for name in settings)
-        check_names("pareto.knobs", chosen, [*names, "all"])
+        check_names("pareto.variants", chosen, [*names, "all"])
         for settings in families.values():
             for name in settings.keys() - {BASE, *chosen}:
                 del settings[name]
@@ -397,7 +397,7 @@ def decibels(image: Tensor, exact: Tensor) -> float:
 
 
 def measure(options: DictConfig, console: Console) -> Result:
-    """Render the held-out views of `options.pareto.scenes` with every knob.
+    """Render the held-out views of `options.pareto.scenes` with every variant.
 
     All settings of a family take turns on a scene, in `options.repeats` rounds; those of seconds
     run once.

@@ -15,7 +15,7 @@ def make_options(repository):
     def options(suite, changes):
         with initialize_config_dir(str(repository / "conf"), version_base=None):
             config = compose("benchmark", [f"suite={suite}", "repeats=2", "device=cpu"])
-        OmegaConf.set_struct(config, False)  # a user adds overrides and knobs
+        OmegaConf.set_struct(config, False)  # a user adds overrides and variants
         return OmegaConf.merge(config, changes)
 
     return options

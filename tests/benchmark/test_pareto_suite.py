@@ -25,7 +25,7 @@ from benchmarks.pareto import (
 )
 
 SIDE = 32
-KNOBS = {
+VARIANTS = {
     "feed_forward": {
         "bf16": {"precision": "bf16"},
         "side_16": {"side": 16},
@@ -57,12 +57,12 @@ def make_pareto(make_options, tmp_path_factory):
         config = make_options("pareto", {"repeats": 1})
         wanted = config.pareto
         wanted.merge_with({"shared": str(nothing), "scenes": ["room", "fern"], "side": SIDE})
-        for family, knobs in KNOBS.items():
-            wanted[family].knobs = knobs
+        for family, variants in VARIANTS.items():
+            wanted[family].variants = variants
             wanted[family].base.merge_with(SMALL[family])
         sizes = {"side": SIDE, "inputs": 8, "targets": 2}
         wanted.reconstruct.merge_with({"scenes": ["room"], "photographs": sizes})
-        wanted.merge_with({"families": list(KNOBS)} | changes)
+        wanted.merge_with({"families": list(VARIANTS)} | changes)
         return config
 
     return options
@@ -79,10 +79,12 @@ def test_rows_are_complete_and_absences_are_named(measured):
     options, results = measured
     config = OmegaConf.to_container(options.pareto, resolve=True)
     rows = {(row["family"], row["setting"]): row for row in results["rows"]}
-    assert list(rows) == [(f, name) for f, knobs in KNOBS.items() for name in (BASE, *knobs)]
+    assert list(rows) == [
+        (f, name) for f, variants in VARIANTS.items() for name in (BASE, *variants)
+    ]
     for (family, name), row in rows.items():
         assert (row["scene"], row["side"]) == ("room", SIDE)
-        wanted = config[family]["base"] | config[family]["knobs"].get(name, {})
+        wanted = config[family]["base"] | config[family]["variants"].get(name, {})
         assert {key: row["values"][key] for key in wanted} == wanted
         if name in ABSENT:
             assert ABSENT[name] in row["not_measured"]
@@ -134,7 +136,7 @@ def test_the_bar_ends_with_the_last_run(make_pareto, monkeypatch, family):
     bars = []
     monkeypatch.setattr(pareto, "Progress", lambda **how: bars.append(Progress(**how)) or bars[0])
     options = make_pareto(families=[family], scenes=["room"])
-    options.pareto[family].knobs = {"start": {"seconds": None, "steps": 0}}
+    options.pareto[family].variants = {"start": {"seconds": None, "steps": 0}}
     pareto.measure(options, Console(quiet=True))
     assert bars[0].finished
 
@@ -196,27 +198,36 @@ def test_tables_and_figure_have_every_setting():
     assert list(line.get_xdata()) == [2.5, 4.0] and list(line.get_ydata()) == [24.25, 25.0]
 
 
-def knob(family, **changes):
-    return {family: {"knobs": {"a": changes}}}
+def variant(family, **changes):
+    return {family: {"variants": {"a": changes}}}
 
 
 MISTAKES = [
     ({"families": ["refine"]}, r"^pareto\.families=refine is unknown: choose from "),
-    ({"knobs": ["bf61"]}, r"^pareto\.knobs=bf61 is unknown: choose from base, bf16, "),
+    ({"variants": ["bf61"]}, r"^pareto\.variants=bf61 is unknown: choose from base, bf16, "),
     ({"scenes": ["ferns"]}, r"^pareto\.scenes=ferns is unknown: choose from room, "),
     ({"scenes": ["fern"]}, r"^pareto\.scenes=\['fern'\]: none is a folder of"),
-    ({"refined": {"knobs": {"a": 3}}}, r"^pareto\.refined\.a=3 is no setting"),
-    (knob("feed_forward", precison="bf16"), r"feed_forward\.a=precison is unknown: choose from v"),
-    (knob("feed_forward", precision="fp8"), r"feed_forward\.a: precision=fp8 is unknown: choose"),
-    (knob("feed_forward", overrides=["model.layers=8m"]), "not fit this model"),
-    (knob("feed_forward", overrides=["model.layer=8m"]), r"^model\.layer is unknown: did you mean"),
-    (knob("refined", views=0), r"refined\.a: views=0: give a whole number from 1\."),
+    ({"refined": {"variants": {"a": 3}}}, r"^pareto\.refined\.a=3 is no setting"),
     (
-        knob("refined", refinement={"half_resolution_until": 2.0}),
+        variant("feed_forward", precison="bf16"),
+        r"feed_forward\.a=precison is unknown: choose from v",
+    ),
+    (
+        variant("feed_forward", precision="fp8"),
+        r"feed_forward\.a: precision=fp8 is unknown: choose",
+    ),
+    (variant("feed_forward", overrides=["model.layers=8m"]), "not fit this model"),
+    (
+        variant("feed_forward", overrides=["model.layer=8m"]),
+        r"^model\.layer is unknown: did you mean",
+    ),
+    (variant("refined", views=0), r"refined\.a: views=0: give a whole number from 1\."),
+    (
+        variant("refined", refinement={"half_resolution_until": 2.0}),
         r"^refinement\.half_resolution_until=2\.0: give 0 to 1",
     ),
-    (knob("reconstruct", init="dust"), r"reconstruct\.a: init=dust is unknown: choose from"),
-    (knob("reconstruct", seconds=0), r"steps=None and seconds=0: give one of them, above 0\."),
+    (variant("reconstruct", init="dust"), r"reconstruct\.a: init=dust is unknown: choose from"),
+    (variant("reconstruct", seconds=0), r"steps=None and seconds=0: give one of them, above 0\."),
 ]
 
 
@@ -228,11 +239,11 @@ def test_mistakes_are_named(make_pareto, changes, sentence):
     assert "\n" not in str(raised.value)
 
 
-def test_every_knob_of_the_configuration_is_a_setting(make_options):
+def test_every_variant_of_the_configuration_is_a_setting(make_options):
     config = OmegaConf.to_container(make_options("pareto", {}).pareto, resolve=True)
     for family, settings in find_families(config | {"families": list(FAMILIES)}).items():
         assert len(settings) > 1
         same = [name for name in settings if settings[name] == settings[BASE]]
         assert same == [BASE], family
-    some = find_families(config | {"knobs": ["bf16"]})
+    some = find_families(config | {"variants": ["bf16"]})
     assert some["feed_forward"].keys() == {BASE, "bf16"} and some["refined"].keys() == {BASE}

@@ -42,16 +42,16 @@ def test_a_wall_is_where_it_is(name):
     assert prior.confidence[inner].mean() > 0.8
 
 
-@pytest.mark.parametrize("knob", [{"planes": 8}, {"neighbors": 1}, {"longest_side": 16}])
-def test_a_coarser_plane_sweep_is_less_exact(knob):
+@pytest.mark.parametrize("option", [{"planes": 8}, {"neighbors": 1}, {"longest_side": 16}])
+def test_a_coarser_plane_sweep_is_less_exact(option):
     views = wall()
     length = views.cameras.resized(16, 16).pixel_directions().norm(dim=-1)
 
-    def error(**knobs):
-        found = PlaneSweepPrior(**knobs)(views, (16, 16)).distance / length
+    def error(**options):
+        found = PlaneSweepPrior(**options)(views, (16, 16)).distance / length
         return (found[:, :, 2:-2, 4:-4] - 2).abs().mean()
 
-    assert 0 < error() < error(**knob) < 1
+    assert 0 < error() < error(**option) < 1
 
 
 @pytest.mark.parametrize("name", PRIORS)
