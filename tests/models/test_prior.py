@@ -11,7 +11,7 @@ from tiny import SIZE
 from asysplat.evaluation.static_cost import static_costs
 from asysplat.models import DepthPrior, LongLRMHead, PlaneSweepPrior, ResidualHead
 from asysplat.models.head import CONFIDENT_FACTOR, MAX_DEPTH_CORRECTION
-from asysplat.models.prior.prior import COVER, FREE_OPACITY, UNKNOWN_DISTANCE, Prior
+from asysplat.models.prior.prior import FREE_OPACITY, SURFACE_OPACITY, UNKNOWN_DISTANCE, Prior
 from asysplat.scene import Cameras, Views
 
 MODELS = ["asysplat_4m4s", "longlrm", "single_branch", "asysplat_pred_fine"]
@@ -151,7 +151,7 @@ def test_views_share_the_opacity_of_a_wall(name, views):
 def test_a_surface_in_one_view_alone_is_opaque():
     views = wall(2, step=1.5)  # three quarters of an image at the wall's distance
     prior = DepthPrior()(views, (16, 16))
-    assert (prior.opacity[:, 0, :, :11] - COVER).abs().max() < 1e-3
+    assert (prior.opacity[:, 0, :, :11] - SURFACE_OPACITY).abs().max() < 1e-3
     assert prior.opacity[:, 0, :, 13:].max() < 0.8
 
 

@@ -14,10 +14,10 @@ from asysplat.scene import TensorRecord, Views, whole_pixels
 PRIOR_CHANNELS = 2
 UNKNOWN_DISTANCE = 10**0.5  # the middle of ResidualHead's range
 VOTE_TOLERANCE = 0.05  # greatest relative difference of two inverse depths of the same surface
-COVER = 0.9  # joint opacity of all views that confirm a surface
-UNSURE_COVER = 0.7  # joint opacity of all views that may see a point whose depth is not sure
+SURFACE_OPACITY = 0.9  # joint opacity of all views that confirm a surface
+UNCERTAIN_SURFACE_OPACITY = 0.7  # the same of all views that may see a point of uncertain depth
 FREE_OPACITY = 1e-4  # opacity in free space, too small to be drawn
-SURROUNDINGS = 0.05  # weight of a pixel's surroundings against its own depth at full confidence
+NEIGHBORHOOD_WEIGHT = 0.05  # against the weight 1 of a pixel's own depth at full confidence
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,10 @@ class Prior(TensorRecord):
         """
         votes = depth.votes
         alone = (votes.containing == 0).to(depth.confidence)
-        sure = _share(COVER, votes.agreeing).logit()
-        unsure = _share(UNSURE_COVER, votes.containing - votes.occluding).logit()
+        sure = _per_view_opacity(SURFACE_OPACITY, votes.agreeing).logit()
+        unsure = _per_view_opacity(
+            UNCERTAIN_SURFACE_OPACITY, votes.containing - votes.occluding
+        ).logit()
         opacity = unsure + (sure - unsure) * torch.maximum(depth.confidence, alone)
         inverse, confidence, opacity = (
             F.interpolate(each, size, mode="bilinear")
@@ -159,10 +161,12 @@ def fill_unknown(
     filled = scene.expand_as(weights[-1])
     for weight, total in zip(reversed(weights), reversed(sums), strict=True):
         around = F.interpolate(filled, weight.shape[-2:], mode="bilinear")
-        filled = (total + SURROUNDINGS * around) / (weight + SURROUNDINGS)
+        filled = (total + NEIGHBORHOOD_WEIGHT * around) / (weight + NEIGHBORHOOD_WEIGHT)
     return filled
 
 
-def _share(cover: float, others: Float[Tensor, "B V h w"]) -> Float[Tensor, "B V h w"]:
-    """Return the opacity at which a view and `others` more reach the opacity `cover` together."""
-    return 1 - (1 - cover) ** (1 / (1 + others))
+def _per_view_opacity(
+    total: float, other_views: Float[Tensor, "B V h w"]
+) -> Float[Tensor, "B V h w"]:
+    """Return the opacity at which a view and `other_views` more reach the opacity `total`."""
+    return 1 - (1 - total) ** (1 / (1 + other_views))
