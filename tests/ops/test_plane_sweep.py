@@ -8,7 +8,11 @@ from compiler import DEVICE, INTERPRETED
 from surfaces import cameras_at, depth_of_plane, four_cameras, maps_of, slanted_plane, texture
 
 from asysplat.models.prior.plane_sweep import plane_sweep
-from asysplat.models.prior.projections import Projections, choose_neighbors, inverse_depth_range
+from asysplat.models.prior.projections import (
+    PairwiseProjections,
+    choose_neighbors,
+    inverse_depth_range,
+)
 from asysplat.ops.plane_sweep import reference
 
 FAST = [
@@ -35,11 +39,11 @@ def cost_arguments(height, width, scenes, views, neighbors, planes):
     angles = 0.1 * torch.randn(scenes, views, 3, 3, dtype=torch.float64)
     cameras.cam_to_world[..., :3, :3] = torch.linalg.matrix_exp(angles - angles.mT)
     cameras = cameras.to(torch.float32)
-    between = Projections.between(cameras)
+    between = PairwiseProjections.from_cameras(cameras)
     chosen = choose_neighbors(cameras, between, neighbors)
     ranges = inverse_depth_range(cameras, between, chosen)
     images = torch.rand(scenes, views, height, width)
-    return images, chosen, between.into(chosen, height, width), ranges, planes
+    return images, chosen, between.matrices(chosen, height, width), ranges, planes
 
 
 def converted(arguments, target):

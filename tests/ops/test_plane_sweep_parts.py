@@ -17,7 +17,7 @@ from asysplat.models.prior.prior import (
 )
 from asysplat.models.prior.projections import (
     MARGIN,
-    Projections,
+    PairwiseProjections,
     inverse_depth_range,
     observed_range,
 )
@@ -34,7 +34,9 @@ def wall(halved=(), trust=None):
     for view in halved:
         inverse[:, view] *= 2
     others = other_views(4, 1, torch.device("cpu"))
-    projections = Projections.between(CAMERAS).into(others, CAMERAS.height, CAMERAS.width)
+    projections = PairwiseProjections.from_cameras(CAMERAS).matrices(
+        others, CAMERAS.height, CAMERAS.width
+    )
     trust = torch.ones_like(inverse) if trust is None else trust
     return inverse, trust, others, projections
 
@@ -106,7 +108,7 @@ def test_views_from_which_a_point_is_hidden_leave_it_its_opacity():
 def test_no_neighbor_sees_no_depth():
     """An index of -1 is not the last view, nor the view itself where that is the last."""
     cameras = cameras_at([(0.1 * v, 0.0, 0.0) for v in range(3)])
-    projections = Projections.between(cameras)
+    projections = PairwiseProjections.from_cameras(cameras)
     padded = torch.tensor([[[1, -1, -1], [0, -1, -1], [1, -1, -1]]])
     found, expected = (
         inverse_depth_range(cameras, projections, chosen) for chosen in (padded, padded[..., :1])
@@ -163,9 +165,11 @@ def test_projections_for_images_of_any_size():
         cameras.intrinsics * torch.tensor([1, 1.2, 1])[:, None], cameras.cam_to_world, 24, 32
     )
     others = torch.tensor([[[1, 2], [3, -1], [0, 3], [2, 1]]])
-    matrix = Projections.between(cameras).into(others, 12, 8)
+    matrix = PairwiseProjections.from_cameras(cameras).matrices(others, 12, 8)
     small = cameras.resized(12, 8)
-    torch.testing.assert_close(matrix, Projections.between(small).into(others, 12, 8))
+    torch.testing.assert_close(
+        matrix, PairwiseProjections.from_cameras(small).matrices(others, 12, 8)
+    )
     pixel, depth = torch.tensor([3.5, 7.5, 1], dtype=torch.float64), 2.5
     for view, chosen in enumerate(others[0].tolist()):
         inside = torch.linalg.inv(small.intrinsics[0, view]) @ pixel * depth

@@ -23,7 +23,7 @@ from asysplat.models.prior.prior import (
     other_views,
 )
 from asysplat.models.prior.projections import (
-    Projections,
+    PairwiseProjections,
     choose_neighbors,
     inverse_depth_range,
     observed_range,
@@ -129,7 +129,7 @@ def _plane_sweep(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Sweep twice; one operator for torch, so that the meta device gets shapes without content."""
     cameras = Cameras(intrinsics, cam_to_world, *images.shape[-2:])
-    projections = Projections.between(cameras)
+    projections = PairwiseProjections.from_cameras(cameras)
     chosen = choose_neighbors(cameras, projections, neighbors)
     shortest = smallest_step(cameras, chosen)
     visible = inverse_depth_range(cameras, projections, chosen)
@@ -150,7 +150,7 @@ def _plane_sweep(
         """
         height, width = images.shape[-2:]
         gray = (images * images.new_tensor(LUMA)[:, None, None]).sum(-3)
-        into = projections.into(chosen, height, width)
+        into = projections.matrices(chosen, height, width)
         costs = kernels.cost_volume(gray, chosen, into, ranges, planes)
         borders = edges(images)
         first, last = ranges[..., None, None, :].unbind(-1)
@@ -177,7 +177,7 @@ def _plane_sweep(
     ranges = torch.where(observed[..., 1:] > 0, narrowed, ranges)
     inverse, steps, agreement = sweep(images, valid, ranges, aggregations=2)
     others = other_views(images.shape[1], images.shape[0], images.device)
-    into = projections.into(others, *images.shape[-2:])
+    into = projections.matrices(others, *images.shape[-2:])
     found = kernels.consistency(inverse, steps, agreement, others, into)
     agreement = agreement / (1 + CONTRADICTION * found.contradicting)
     squared = inverse**2  # how well a depth differs from the next plane's; 0 at infinity

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from asysplat.models.prior.projections import Projections
+from asysplat.models.prior.projections import PairwiseProjections
 from asysplat.ops.plane_sweep import Consistency, load_backend
 from asysplat.scene import TensorRecord, Views, whole_pixels
 
@@ -89,7 +89,7 @@ class Prior(TensorRecord):
         scenes, count, *size = inverse.shape
         inverse = fill_unknown(inverse, weight)
         others = other_views(count, scenes, inverse.device)
-        projections = Projections.between(views.cameras).into(others, *size)
+        projections = PairwiseProjections.from_cameras(views.cameras).matrices(others, *size)
         if views.masks is not None:
             confidence = confidence * whole_pixels(views.masks, tuple(size))
         votes = count_votes(inverse, confidence, others, projections)

@@ -19,30 +19,30 @@ SUBPIXEL = 0.25  # error of a match, pixels
 
 
 @dataclass(frozen=True)
-class Projections:
+class PairwiseProjections:
     """The projections between all pairs of views, for images of any size.
 
     Args:
-        unit: for images of width and height 1; see `into`.
-        dtype: of the cameras.
+        normalized: projections for images of width and height 1; see `matrices`.
+        dtype: data type of the cameras.
     """
 
-    unit: Float[Tensor, "B V V 3 4"]
+    normalized: Float[Tensor, "B V V 3 4"]
     dtype: torch.dtype
 
     @classmethod
-    def between(cls, cameras: Cameras) -> "Projections":
-        """Compute them in float64."""
+    def from_cameras(cls, cameras: Cameras) -> "PairwiseProjections":
+        """Compute the projections in float64."""
         poses = cameras.cam_to_world.to(torch.float64)
         size = poses.new_tensor([1 / cameras.width, 1 / cameras.height, 1])
         intrinsics = size[:, None] * cameras.intrinsics.to(torch.float64)
         relative = torch.linalg.inv(poses)[:, None] @ poses[:, :, None]
         rays = relative[..., :3, :3] @ torch.linalg.inv(intrinsics)[:, :, None]
         to_other = torch.cat((rays, relative[..., :3, 3:]), dim=-1)
-        unit = intrinsics[:, None] @ to_other
-        return cls(unit, cameras.intrinsics.dtype)
+        normalized = intrinsics[:, None] @ to_other
+        return cls(normalized, cameras.intrinsics.dtype)
 
-    def into(
+    def matrices(
         self, others: Int[Tensor, "B V K"], height: int, width: int
     ) -> Float[Tensor, "B V K 3 4"]:
         """Return M such that M (x, y, 1, inverse depth) is the homogeneous pixel in another view.
@@ -51,14 +51,14 @@ class Projections:
         coordinate is the depth in the other view over the depth in this one. The index -1 gives
         the first view.
         """
-        size = self.unit.new_tensor([width, height, 1])
+        size = self.normalized.new_tensor([width, height, 1])
         factors = torch.cat((1 / size, size.new_ones(1))) * size[:, None]
         index = others.clamp_min(0)[..., None, None].expand(-1, -1, -1, 3, 4)
-        return (self.unit.gather(2, index) * factors).to(self.dtype)
+        return (self.normalized.gather(2, index) * factors).to(self.dtype)
 
 
 def choose_neighbors(
-    cameras: Cameras, projections: Projections, count: int
+    cameras: Cameras, projections: PairwiseProjections, count: int
 ) -> Int[Tensor, "B V K"]:
     """Return for each view the neighbors with the most overlap and parallax; -1 for none.
 
@@ -86,7 +86,7 @@ def choose_neighbors(
 
 
 def inverse_depth_range(
-    cameras: Cameras, projections: Projections, neighbors: Int[Tensor, "B V K"]
+    cameras: Cameras, projections: PairwiseProjections, neighbors: Int[Tensor, "B V K"]
 ) -> Float[Tensor, "B V 2"]:
     """Return the least and greatest inverse depth at which a neighbor sees MIN_SHARE of a view.
 
@@ -136,10 +136,10 @@ def _farthest(cameras: Cameras, neighbors: Int[Tensor, "B V K"]) -> Float[Tensor
 
 
 def _inside(
-    projections: Projections, others: Int[Tensor, "B V K"], inverse: Float[Tensor, "B V n"]
+    projections: PairwiseProjections, others: Int[Tensor, "B V K"], inverse: Float[Tensor, "B V n"]
 ) -> Float[Tensor, "B V K p n"]:
     """Return 1 for p points of a view, each at n inverse depths, if another view contains them."""
-    u, v, z = projections.into(others, SAMPLES, SAMPLES).to(inverse).unbind(-2)
+    u, v, z = projections.matrices(others, SAMPLES, SAMPLES).to(inverse).unbind(-2)
     # A point is inside where all of these are positive; then its depth is, too.
     sides = torch.stack((u, SAMPLES * z - u, v, SAMPLES * z - v), dim=-2)
     right, down, corner, away = sides[..., None, None].unbind(-3)

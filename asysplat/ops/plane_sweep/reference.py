@@ -193,7 +193,7 @@ def consistency(
         steps: between the inverse depths that a view can distinguish.
         trust: in a view's depths, in [0, 1].
         others: the views to compare with; -1 for none.
-        projections: into those; see `asysplat.models.prior.projections.Projections.into`.
+        projections: into those; see `matrices` in asysplat/models/prior/projections.py.
         tolerance: relative difference up to which two inverse depths agree; half a step if that is
             more.
     """
