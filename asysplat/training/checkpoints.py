@@ -87,8 +87,8 @@ def _damage(path: Path) -> str | None:
     return None if damaged is None else f"is damaged, at {damaged}"
 
 
-def read_notes(path: Path) -> dict[str, Any]:
-    """Read what a run's checkpoint holds beside its weights, which stay on the disk.
+def read_metadata(path: Path) -> dict[str, Any]:
+    """Read the metadata of a run's checkpoint; its weights stay on the disk.
 
     `hyper_parameters` is the configuration, `callbacks` the states of the callbacks by their names.
 
@@ -96,8 +96,8 @@ def read_notes(path: Path) -> dict[str, Any]:
         InputError: the file cannot be read as a run's checkpoint.
     """
     try:
-        notes = torch.load(path, map_location="meta", mmap=True, weights_only=True)
-        return upgrade_checkpoint(notes)
+        metadata = torch.load(path, map_location="meta", mmap=True, weights_only=True)
+        return upgrade_checkpoint(metadata)
     except Exception as error:
         raise InputError(
             f"{path} cannot be read as a checkpoint to resume from: name a .ckpt file that a run "
@@ -105,17 +105,17 @@ def read_notes(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def config_diff(notes: Mapping[str, Any], config: Mapping[str, Any], revision: str) -> list[str]:
+def config_diff(metadata: Mapping[str, Any], config: Mapping[str, Any], revision: str) -> list[str]:
     """List the options that differ from those of a checkpoint: the bits of the runs will differ.
 
-    `notes` are the checkpoint's, see `read_notes`, and `revision` is that of the code.
+    `metadata` is the checkpoint's, see `read_metadata`, and `revision` that of the code.
     """
-    before, now = (flat_options(options) for options in (notes.get("hyper_parameters", {}), config))
+    before, now = flat_options(metadata.get("hyper_parameters", {})), flat_options(config)
     keys = [key for key in before.keys() & now.keys() if before[key] != now[key]]
     keys = [key for key in sorted(keys) if not key.startswith(WITHOUT_EFFECT)]
     differences = [f"{key}={now[key]}, it was {before[key]}" for key in keys]
-    if notes.get("revision", revision) != revision:
-        differences.append(f"the code is {revision}, it was {notes['revision']}")
+    if metadata.get("revision", revision) != revision:
+        differences.append(f"the code is {revision}, it was {metadata['revision']}")
     return differences
 
 

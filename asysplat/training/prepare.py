@@ -26,7 +26,7 @@ from asysplat.training.checkpoints import (
     find_checkpoint,
     has_checkpoints,
     load_weights,
-    read_notes,
+    read_metadata,
 )
 from asysplat.training.losses import report_missing
 from asysplat.training.messages import quiet_lightning
@@ -79,11 +79,11 @@ class TrainingStage:
 
         options = OmegaConf.to_container(config, resolve=True)
         module.save_hyperparameters(options, logger=False)
-        notes = {} if self.checkpoint is None else read_notes(self.checkpoint)
-        for difference in config_diff(notes, options, revision()):
+        metadata = {} if self.checkpoint is None else read_metadata(self.checkpoint)
+        for difference in config_diff(metadata, options, revision()):
             print(f"not as before: {difference}")
         resumes = has_checkpoints(folder)
-        cut_events(folder, notes["event_files"] if resumes else {})
+        cut_events(folder, metadata["event_files"] if resumes else {})
         try:
             logger = instantiate(config.logger)
         except InstantiationException as error:  # an optional package is missing

@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from asysplat.errors import InputError
-from asysplat.training.checkpoints import read_notes
+from asysplat.training.checkpoints import read_metadata
 from asysplat.training.ranges import check_ranges
 from asysplat.training.summary import Results
 
@@ -106,7 +106,7 @@ def resume_point(checkpoint: Path | None, stages: Sequence[DictConfig]) -> tuple
     if checkpoint is None:
         return 0, {}
     names = [stage.stage for stage in stages]
-    record = read_notes(checkpoint)["callbacks"].get(StageRecord.__qualname__, {})
+    record = read_metadata(checkpoint)["callbacks"].get(StageRecord.__qualname__, {})
     stage = record.get("stage", names[0])
     if stage not in names:
         raise InputError(

@@ -23,7 +23,7 @@ from asysplat.training.checkpoints import (
     config_diff,
     find_checkpoint,
     load_weights,
-    read_notes,
+    read_metadata,
 )
 from asysplat.training.tensorboard import cut_events
 
@@ -70,7 +70,7 @@ class Module(OneLayer):
 
 def fit(folder, module, steps=7, checkpoint=None, minutes=None):
     """Train with PER_EPOCH steps an epoch, a validation after each."""
-    cut_events(folder, {} if checkpoint is None else read_notes(checkpoint)["event_files"])
+    cut_events(folder, {} if checkpoint is None else read_metadata(checkpoint)["event_files"])
     checkpoints = Checkpoints(
         dirpath=folder / "checkpoints",
         minutes=minutes,
@@ -94,7 +94,7 @@ def fit(folder, module, steps=7, checkpoint=None, minutes=None):
 
 
 def steps_kept(folder) -> dict[str, int]:
-    return {path.stem: read_notes(path)["global_step"] for path in folder.rglob("*.ckpt")}
+    return {path.stem: read_metadata(path)["global_step"] for path in folder.rglob("*.ckpt")}
 
 
 KEPT = {

@@ -15,7 +15,7 @@ import pytest
 import torch
 from conftest import finished
 
-from asysplat.training.checkpoints import read_notes
+from asysplat.training.checkpoints import read_metadata
 
 OPTIONS = ["callbacks.checkpoints.minutes=0", "data.num_workers=1", "data.batch_size=2"]
 
@@ -140,7 +140,7 @@ def test_a_signal_to_all_processes_and_then_a_lost_loader(train):
     assert process.exitcode == 128 + signal.SIGTERM, text
     saved = int(re.search(r"SIGTERM: saved at step (\d+)", text)[1])
     last = folder_of(train, "noticed") / "checkpoints" / "last.ckpt"
-    assert read_notes(last)["global_step"] == saved >= 2
+    assert read_metadata(last)["global_step"] == saved >= 2
     assert f"stopped; to go on, add ckpt_path={last} to the same command" in text
 
     before = last.stat().st_mtime
