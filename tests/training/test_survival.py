@@ -132,19 +132,19 @@ def test_two_interrupts_of_all_processes_end_without_an_abort(train, seconds):
 @pytest.mark.medium
 def test_a_signal_to_all_processes_and_then_a_lost_loader(train):
     options = [*OPTIONS, "steps=1000", "validate_every=1000"]
-    process, output = start_or_resume(train, "noticed", *options)
-    wait_for(lambda: list(train.logs.glob("noticed/*/checkpoints/previous.ckpt")), process)
+    process, output = start_or_resume(train, "preempted", *options)
+    wait_for(lambda: list(train.logs.glob("preempted/*/checkpoints/previous.ckpt")), process)
     os.killpg(process.pid, signal.SIGTERM)
     process.join()
     text = output.read_text()
     assert process.exitcode == 128 + signal.SIGTERM, text
     saved = int(re.search(r"SIGTERM: saved at step (\d+)", text)[1])
-    last = folder_of(train, "noticed") / "checkpoints" / "last.ckpt"
+    last = folder_of(train, "preempted") / "checkpoints" / "last.ckpt"
     assert read_metadata(last)["global_step"] == saved >= 2
     assert f"stopped; to go on, add ckpt_path={last} to the same command" in text
 
     before = last.stat().st_mtime
-    process, output = start_or_resume(train, "noticed", *options)
+    process, output = start_or_resume(train, "preempted", *options)
     wait_for(lambda: last.exists() and last.stat().st_mtime > before, process)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     assert children

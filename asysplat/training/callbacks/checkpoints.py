@@ -19,7 +19,7 @@ from asysplat.training.revision import revision
 from asysplat.training.tensorboard import event_files
 
 # A scheduler sends one before it kills: SLURM SIGTERM, submitit SIGUSR2, others SIGUSR1.
-NOTICES = (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+PREEMPTION_SIGNALS = (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
 class Checkpoints(ModelCheckpoint):
@@ -27,7 +27,7 @@ class Checkpoints(ModelCheckpoint):
 
     `filename` and `monitor` in conf/callbacks/default.yaml name and select the best; it is not
     written if no callback logs `monitor`. last.ckpt is written after every validation, every
-    `minutes` between validations, and when a scheduler sends one of NOTICES. After the notice's
+    `minutes` between validations, and when a scheduler sends one of PREEMPTION_SIGNALS. After that
     checkpoint the signal's earlier handler runs (submitit's, for example), or the run ends with
     status 128 + the signal's number.
 
@@ -44,7 +44,7 @@ class Checkpoints(ModelCheckpoint):
     def __init__(self, dirpath: str | Path, minutes: int | float | None = None, **options: Any):
         super().__init__(dirpath=dirpath, **options)
         self.minutes = minutes
-        self.notice: int | None = None  # the signal's number
+        self.preempted_by: int | None = None  # the signal's number
         self.loaded_states: list[RandomStates] = []
         self.saved_step, self.save_due = 0, False
 
@@ -67,29 +67,30 @@ class Checkpoints(ModelCheckpoint):
 
     def on_fit_start(self, *_: Any) -> None:
         # Before Lightning sets its own handlers, which stop in the middle of a validation.
-        self.handlers = {number: signal.getsignal(number) for number in NOTICES}
+        self.handlers = {number: signal.getsignal(number) for number in PREEMPTION_SIGNALS}
 
     def on_train_start(self, trainer: Any, module: Any) -> None:
         for number, handler in self.handlers.items():
             if handler not in (signal.SIG_IGN, None):
-                signal.signal(number, self._take_notice)
+                signal.signal(number, self._on_preemption)
         self.saved_step, self.saved_at = trainer.global_step, time.monotonic()
         if len(self.loaded_states) == trainer.world_size:
             set_random_states(self.loaded_states[trainer.global_rank])
 
-    def _take_notice(self, number: int, _: Any) -> None:
-        self.notice = number
+    def _on_preemption(self, number: int, _: Any) -> None:
+        self.preempted_by = number
 
     def on_train_batch_start(self, trainer: Any, module: Any, _: Any, index: int) -> None:
         """Save here, where the previous step, its validation and its log are complete."""
         if index % trainer.accumulate_grad_batches:
             return
         waited = time.monotonic() - self.saved_at
-        if (self.minutes is not None and waited >= 60 * self.minutes) or self.notice is not None:
+        elapsed = self.minutes is not None and waited >= 60 * self.minutes
+        if elapsed or self.preempted_by is not None:
             self.save_due = True
         if trainer.strategy.reduce_boolean_decision(self.save_due, all=False):
             self._save_last(trainer)
-        self._follow_notice(trainer)
+        self._forward_preemption(trainer)
 
     def on_train_epoch_end(self, trainer: Any, module: Any) -> None:
         if self.monitor in trainer.callback_metrics:
@@ -115,11 +116,11 @@ class Checkpoints(ModelCheckpoint):
             os.replace(fresh, self.last)
         self.saved_step, self.saved_at, self.save_due = trainer.global_step, time.monotonic(), False
 
-    def _follow_notice(self, trainer: Any) -> None:
-        """Run the handler of the scheduler's notice, now that there is a checkpoint."""
-        if not trainer.strategy.reduce_boolean_decision(self.notice is not None, all=False):
+    def _forward_preemption(self, trainer: Any) -> None:
+        """Run the handler of the scheduler's signal, now that there is a checkpoint."""
+        if not trainer.strategy.reduce_boolean_decision(self.preempted_by is not None, all=False):
             return
-        number, self.notice = self.notice or signal.SIGTERM, None
+        number, self.preempted_by = self.preempted_by or signal.SIGTERM, None
         if trainer.is_global_zero:
             name = signal.Signals(number).name
             print(f"{name}: saved at step {trainer.global_step}", flush=True)
