@@ -176,7 +176,7 @@ def _runs_of(config: DictConfig, runs: Runs) -> tuple[DictConfig, list[Run], dic
     config = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
     read = data_of(config)
     same_options = runs.get(config_hash(config), [])
-    same = [run for run in same_options if run.agrees(read)]
+    same = [run for run in same_options if run.is_consistent_with(read)]
     by_seed = {run.seed: run for run in sorted(same, key=lambda run: run.covers(read))}
     return config, same_options, by_seed
 

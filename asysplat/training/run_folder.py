@@ -44,9 +44,9 @@ def job_name(overrides: Sequence[str], params: Mapping[str, str] | None) -> str:
     """Name a job of a sweep by its options that vary, for `hydra.sweep.subdir` of conf/train.yaml.
 
     Args:
-        overrides: of the job.
-        params: of `hydra.sweeper.params`; the command has more. A scheduler's processes do not have
-            the command: without any known to vary, all options are named.
+        overrides: the job's options.
+        params: `hydra.sweeper.params`. Options swept on the command line are read from sys.argv,
+            which a scheduler's processes lack; then every option is in the name.
     """
     command = dict(word.partition("=")[::2] for word in sys.argv[1:])
     given = {**(params or {}), **command}

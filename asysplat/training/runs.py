@@ -25,8 +25,8 @@ from asysplat.training.stages import stage_configs
 
 RESULTS = "metrics.json"
 EVALUATION = "evaluation.json"  # added to a run by evaluate.py
-# Names, paths, callbacks, keys that only other keys take their values from, and how a global batch
-# is divided.
+# Names, paths, callbacks, keys that are only interpolated into others, and keys that only split the
+# batch.
 NOT_HASHED = (
     *("name", "ckpt_path", "rerun", "paths", "callbacks", "logger"),
     *("stage", "stages", "earlier_stages", "selections", "windows"),
@@ -49,8 +49,8 @@ class Run:
     revision: str  # revision of the code that made it
     results: dict[str, Any]  # content of metrics.json and, if there is one, evaluation.json
 
-    def agrees(self, data: Mapping[str, str]) -> bool:
-        """Return whether the run and `data` (see `data_of`) contradict each other nowhere."""
+    def is_consistent_with(self, data: Mapping[str, str]) -> bool:
+        """Return whether no entry of `data` (see `data_of`) differs from the run's."""
         return all(self.results.get(key, value) == value for key, value in data.items())
 
     def covers(self, data: Mapping[str, str]) -> bool:
