@@ -63,7 +63,7 @@ def evaluate(options: DictConfig) -> None:
     data = instantiate(config.data)
     data.setup()
     data.check_sizes(measure.protocol.check_size)
-    tests, early_exit, described = data.tests, {}, target.described
+    tests, early_exit, fingerprint = data.tests, {}, target.fingerprint
     if net is not None:
         data.check_sizes(net.check_size)
         data.check_views(net.check_views)
@@ -73,7 +73,7 @@ def evaluate(options: DictConfig) -> None:
         opened = open_gaussians(Path(options.gaussians), tests[data.name], fabric.device)
         predictor, found, backgrounds = opened
         measure = replace(measure, backgrounds=backgrounds)
-        described = described | found
+        fingerprint = fingerprint | found
 
     folders = target.folder, target.scene_folder
     scenes = measure_scenes(tests, predictor, measure, fabric.device, *folders, early_exit)
@@ -82,7 +82,7 @@ def evaluate(options: DictConfig) -> None:
 
     if options.run is None:  # a run has one
         OmegaConf.save(options, target.folder / "config.yaml", resolve=True)
-    results = described | {"evaluation/post_optimization": HOW}
+    results = fingerprint | {"evaluation/post_optimization": HOW}
     results |= {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
     results |= set_results(scenes, measure.protocol.mean_over)
     if options.gaussians is not None:  # reading a file is no prediction

@@ -24,12 +24,12 @@ class EvaluationTarget:
 
     config: DictConfig  # as train.py takes it; its init_path names the weights
     folder: Path  # for the results
-    described: dict[str, str | int]  # everything that the results depend on
+    fingerprint: dict[str, str | int]  # everything that the results depend on
 
     @property
     def scene_folder(self) -> Path:
-        """The folder of the results of single scenes, another for everything `described`."""
-        return self.folder / "evaluation" / hash_of(self.described)
+        """The folder of the results of single scenes, another for every `fingerprint`."""
+        return self.folder / "evaluation" / hash_of(self.fingerprint)
 
 
 def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarget:
@@ -66,10 +66,10 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
     for key in OmegaConf.missing_keys(config):
         raise InputError(f"{key} is not set: add {key}=... to the command.")
     check_ranges(config)
-    described = _describe(config, options)
+    fingerprint = _describe(config, options)
     stem = Path(options.gaussians or options.init_path).stem
-    folder = Path(options.paths.logs) / "evaluate" / f"{stem}-{hash_of(described)[:8]}"
-    return EvaluationTarget(config, folder, described)
+    folder = Path(options.paths.logs) / "evaluate" / f"{stem}-{hash_of(fingerprint)[:8]}"
+    return EvaluationTarget(config, folder, fingerprint)
 
 
 def _target_of_run(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarget:

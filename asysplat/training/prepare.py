@@ -120,7 +120,7 @@ class PreparedRun:
     """A run that has its folder to itself."""
 
     config: DictConfig
-    described: Results  # see `describe_run`
+    fingerprint: Results  # see `describe_run`
     stages: Sequence[TrainingStage]  # stages that are still to be trained
     results: Results  # results of the stages that are finished
 
@@ -134,7 +134,7 @@ class PreparedRun:
         shown, is_last = self.results | new_results, stage is self.stages[-1]
         if is_last:
             losses = {"run/losses": trainer.lightning_module.loss.describe()}
-            self.results = shown = self.described | losses | shown
+            self.results = shown = self.fingerprint | losses | shown
         else:
             stored = {k: v for k, v in new_results.items() if k.startswith(("test/", "cost/"))}
             self.results |= {f"{stage.config.stage}/{key}": v for key, v in stored.items()}
@@ -162,7 +162,7 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
     folder = Path(config.paths.run)
     with locked(folder):
         quiet_lightning()
-        described = describe_run(config)  # now, since files may be edited during the training
+        fingerprint = describe_run(config)  # now, since files may be edited during the training
         runs = Path(config.paths.logs) / config.name
         checkpoint = find_checkpoint(config.ckpt_path, folder, runs)
         first, results = resume_point(checkpoint, configs)
@@ -174,7 +174,7 @@ def prepare_run(config: DictConfig) -> Iterator[PreparedRun]:
                 stage.paths.run = str(folder / stage.stage)
             stages.append(TrainingStage(stage, weights, checkpoint, results))
             weights, checkpoint = f"{stage.paths.run}/checkpoints/last.ckpt", None
-        yield PreparedRun(config, described, stages, results)
+        yield PreparedRun(config, fingerprint, stages, results)
 
 
 def check_start(config: DictConfig, checkpoint: Path | None, weights: str | None) -> None:
