@@ -26,7 +26,11 @@ from torch import Tensor, nn
 from asysplat.data.datamodule import FixedTasks, Sample
 from asysplat.errors import InputError
 from asysplat.evaluation.lpips import load_lpips
-from asysplat.evaluation.post_optimization import HOW, PostOptimization, Predict
+from asysplat.evaluation.post_optimization import (
+    POST_OPTIMIZATION_METHOD,
+    PostOptimization,
+    Predict,
+)
 from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.export import write_safetensors
@@ -82,7 +86,7 @@ def evaluate(options: DictConfig) -> None:
 
     if options.run is None:  # a run has one
         OmegaConf.save(options, target.folder / "config.yaml", resolve=True)
-    results = fingerprint | {"evaluation/post_optimization": HOW}
+    results = fingerprint | {"evaluation/post_optimization": POST_OPTIMIZATION_METHOD}
     results |= {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
     results |= set_results(scenes, measure.protocol.mean_over)
     if options.gaussians is not None:  # reading a file is no prediction

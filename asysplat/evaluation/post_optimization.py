@@ -16,7 +16,7 @@ from asysplat.refinement import PAPER, Refinement, RefinementProgress, refine
 from asysplat.rendering import Rendering, render
 from asysplat.scene import Gaussians, Views
 
-HOW = (
+POST_OPTIMIZATION_METHOD = (
     "each step renders all input views from the Gaussians and takes a step of Adam on their mean "
     f"squared error, with learning rates {PAPER.rates.means:g} of means (the farthest input camera "
     f"is at distance 1 from the middle of all) and {PAPER.rates.sh:g} of SH, 0 of the others; "
