@@ -34,7 +34,7 @@ from asysplat.data.normalize import normalize
 from asysplat.data.readers.transforms import read_cameras
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import disparity
-from asysplat.export import frame
+from asysplat.export import viewer_cameras
 from asysplat.export.gaussians import read_gaussians
 from asysplat.interrupts import handle_signals
 from asysplat.refinement.photographs import open_photographs
@@ -92,7 +92,7 @@ class Viewer:
         # A browser's near plane, navigation and float32 suit a scene of about size 1 only.
         views, _, self._frame = normalize(views, views)
         self._cameras = views.cameras
-        self._up = frame.mean_up(self._cameras)
+        self._up = viewer_cameras.mean_up(self._cameras)
         self._scene: tuple[Gaussians | None, str] = (None, WAITING)
         self._version = object()
         self._closed = Event()
@@ -172,7 +172,7 @@ class Viewer:
         scene.set_up_direction(self._up.numpy())
         parent = scene.add_frame("/cameras", show_axes=False)
         for view in range(self._cameras.num_views):
-            fov, aspect = frame.field_of_view(self._cameras, view)
+            fov, aspect = viewer_cameras.field_of_view(self._cameras, view)
             frustum = scene.add_camera_frustum(
                 f"/cameras/{view}",
                 fov=fov,
@@ -183,7 +183,7 @@ class Viewer:
                 thickness_units="screen",
                 color=(209, 98, 45),
                 image=_bytes(images[view]) if images[view, 0].numel() > 1 else None,
-                wxyz=frame.quaternion(self._cameras, view),
+                wxyz=viewer_cameras.quaternion(self._cameras, view),
                 position=self._cameras.centers[view].numpy(),
             )
             frustum.on_click(self._click)
@@ -191,10 +191,10 @@ class Viewer:
 
     def _click(self, event: Any) -> None:
         # The browser also reports clicks on frustums before its near plane, which are invisible.
-        camera, _ = frame.page_camera(event.client.camera, MAX_PIXELS)
+        camera, _ = viewer_cameras.client_camera(event.client.camera, MAX_PIXELS)
         start, ray = (torch.tensor(v).float() for v in (event.ray_origin, event.ray_direction))
         to_near = event.client.camera.near / (ray @ camera.cam_to_world[0, :3, 2])
-        view = frame.clicked_camera(self._cameras, FRUSTUM_LENGTH, start, to_near * ray)
+        view = viewer_cameras.clicked_camera(self._cameras, FRUSTUM_LENGTH, start, to_near * ray)
         if view is not None:
             page = event.client.camera
             with event.client.atomic():
@@ -211,7 +211,8 @@ class Viewer:
             distance = (gaussians.means.cpu() - position).norm(dim=-1).median()
         up = self._up - (self._up @ right) * right
         vectors = (position, position + distance * forward, up)
-        return *(vector.numpy() for vector in vectors), frame.field_of_view(self._cameras, view)[0]
+        fov, _ = viewer_cameras.field_of_view(self._cameras, view)
+        return *(vector.numpy() for vector in vectors), fov
 
     def _change(self) -> None:
         self._version = object()
@@ -244,7 +245,7 @@ class Viewer:
         if gaussians is None:
             return True
         try:
-            camera, in_full = frame.page_camera(client.camera, max_pixels)
+            camera, in_full = viewer_cameras.client_camera(client.camera, max_pixels)
             camera = camera.to(gaussians.means.device)
             image = draw_layer(gaussians, camera, *(handle.value for handle in self._settings))
             if client.client_id not in self._server.get_clients():  # closed meanwhile

@@ -17,8 +17,8 @@ import torch
 from asysplat import Views, write_gaussians
 from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
-from asysplat.export.frame import quaternion
 from asysplat.export.viewer import LAYERS, MAX_PIXELS, Viewer, cameras_beside, draw_layer, main
+from asysplat.export.viewer_cameras import quaternion
 
 pytest.importorskip("viser", minversion="1.1")
 from websockets.exceptions import InvalidStatus

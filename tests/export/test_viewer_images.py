@@ -11,8 +11,14 @@ import torch
 
 from asysplat import Cameras, Gaussians, render
 from asysplat.errors import InputError
-from asysplat.export.frame import clicked_camera, field_of_view, mean_up, page_camera, quaternion
 from asysplat.export.viewer import draw_layer
+from asysplat.export.viewer_cameras import (
+    clicked_camera,
+    client_camera,
+    field_of_view,
+    mean_up,
+    quaternion,
+)
 
 
 def test_up_is_the_mean_of_the_cameras(make_scene):
@@ -41,14 +47,14 @@ def test_a_page_at_an_input_camera_has_its_view(make_scene):
     focal = torch.tensor([[70.0, 0, 40], [0, 70, 30], [0, 0, 1]])
     cameras = replace(cameras, intrinsics=focal.repeat(3, 1, 1))
     for view in range(3):
-        camera, in_full = page_camera(page_of(cameras, view), 60 * 80)
+        camera, in_full = client_camera(page_of(cameras, view), 60 * 80)
         assert in_full and (camera.height, camera.width) == (60, 80)
         torch.testing.assert_close(camera.intrinsics[0], focal)
         torch.testing.assert_close(camera.cam_to_world[0], cameras.cam_to_world[view])
     assert field_of_view(cameras, 0)[1] == pytest.approx(80 / 60)
     # Fewer pixels keep the field of view.
     cameras = cameras.resized(600, 800)
-    camera, in_full = page_camera(page_of(cameras, 0), 30_000)
+    camera, in_full = client_camera(page_of(cameras, 0), 30_000)
     assert not in_full and (camera.height, camera.width) == (150, 200)
     expected = 2 * math.atan(75 / camera.intrinsics[0, 1, 1].item())
     assert expected == pytest.approx(field_of_view(cameras, 0)[0])
@@ -58,7 +64,7 @@ def test_a_page_of_any_size_takes_a_bounded_image(make_scene):
     page = page_of(make_scene(dtype=torch.float32)[1], 0)
     sizes, fields_of_view = [10**12, 1, -5], [0.0, 1.0, math.pi, 1e30, -1e30]
     for page.image_height, page.image_width, page.fov in product(sizes, sizes, fields_of_view):
-        camera, _ = page_camera(page, 30_000)
+        camera, _ = client_camera(page, 30_000)
         assert camera.height * camera.width <= 60_000, vars(page)
         camera.validate()
 
@@ -68,7 +74,7 @@ def test_a_page_that_is_no_camera_is_refused(make_scene):
         page = page_of(make_scene(dtype=torch.float32)[1], 0)
         setattr(page, field, np.full(np.shape(getattr(page, field)), np.nan))
         with pytest.raises((InputError, ValueError)):
-            page_camera(page, 30_000)
+            client_camera(page, 30_000)
 
 
 def test_a_click_hits_the_first_visible_image(make_scene):

@@ -10,7 +10,7 @@ import viser
 import zstandard
 from websockets.sync.client import connect
 
-from asysplat.export.frame import field_of_view, quaternion
+from asysplat.export.viewer_cameras import field_of_view, quaternion
 
 TOLERANCE = 6  # of 255, on average: what JPEG may change
 

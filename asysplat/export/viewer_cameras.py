@@ -1,4 +1,4 @@
-"""Cameras of the viewer's pages, and of the frustums in them."""
+"""Cameras of the viewer: of its clients, and of the frustums that they see."""
 
 import math
 from typing import Any
@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 
 from asysplat.scene import MAX_FIELD_OF_VIEW, Cameras
 
-MAX_SIDE = 16384  # pixels of a page
+MAX_SIDE = 16384  # pixels of a client's image
 MIN_FOV, MAX_FOV = 1e-3, 2.9  # radians
 
 
@@ -51,21 +51,23 @@ def clicked_camera(
     return steps.where(hit, torch.inf).argmin().item() if hit.any() else None
 
 
-def page_camera(page: Any, max_pixels: int) -> tuple[Cameras, bool]:
-    """Return the camera of viser's CameraHandle, and whether it has all pixels of the page.
+def client_camera(client: Any, max_pixels: int) -> tuple[Cameras, bool]:
+    """Return the camera of viser's CameraHandle, and whether it has all pixels of its window.
 
     Raises:
-        InputError: the page sent numbers that are no camera.
+        InputError: the client sent numbers that are no camera.
     """
-    height, width = (min(max(side, 1), MAX_SIDE) for side in (page.image_height, page.image_width))
-    focal = height / 2 / math.tan(min(max(page.fov, MIN_FOV), MAX_FOV) / 2)
+    height, width = (
+        min(max(side, 1), MAX_SIDE) for side in (client.image_height, client.image_width)
+    )
+    focal = height / 2 / math.tan(min(max(client.fov, MIN_FOV), MAX_FOV) / 2)
     width = max(1, min(width, int(MAX_FIELD_OF_VIEW * focal) - 1))
     cam_to_world = torch.eye(4)
-    rotation = Rotation.from_quat(page.wxyz, scalar_first=True).as_matrix()
+    rotation = Rotation.from_quat(client.wxyz, scalar_first=True).as_matrix()
     cam_to_world[:3, :3] = torch.from_numpy(rotation)
-    cam_to_world[:3, 3] = torch.from_numpy(page.position)
+    cam_to_world[:3, 3] = torch.from_numpy(client.position)
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    cameras = Cameras(intrinsics[None], cam_to_world[None], height, width).validate("page")
+    cameras = Cameras(intrinsics[None], cam_to_world[None], height, width).validate("client")
     factor = math.sqrt(min(1, max_pixels / (height * width)))
     if factor == 1:
         return cameras, True
