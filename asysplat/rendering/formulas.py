@@ -33,7 +33,7 @@ PIXEL_MARGIN = 1e-3
 MAX_CENTER_OFFSET = 2.0**30
 
 
-class Inputs(NamedTuple):
+class KernelInputs(NamedTuple):
     """Arrays or tensors of Gaussians and cameras, or their gradients.
 
     means [B * N, 3], quats [B * N, 4], scales [B * N, 3], opacities [B * N], sh [B * N, K, 3] of B

@@ -18,9 +18,9 @@ from asysplat.rendering.cpu.project_backward import project_backward
 from asysplat.rendering.cpu.rasterize import (
     BlendedDepth,
     Gradients,
-    Images,
     MedianDepth,
-    Saved,
+    OutputImages,
+    SavedForBackward,
     rasterize,
     rasterize_backward,
 )
@@ -32,10 +32,10 @@ from asysplat.rendering.cpu.splat import (
     ProjectSettings,
     RasterSettings,
 )
-from asysplat.rendering.cpu.tiles import Lists, scatter_pairs, start_positions
+from asysplat.rendering.cpu.tiles import TileLists, scatter_pairs, start_positions
 from asysplat.rendering.formulas import (
     CAMERA_GRADIENT,
-    Inputs,
+    KernelInputs,
     active_tiles,
     apply_passes,
     camera_gradients,
@@ -157,14 +157,16 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSet
     )
 
 
-def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Inputs:
+def _inputs(
+    tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings
+) -> KernelInputs:
     """Convert the fields of Gaussians, poses and intrinsics to arrays."""
     *fields, cam_to_world, intrinsics = tensors
     cameras = camera_rows(cam_to_world, intrinsics, size, settings.limits)
-    return Inputs(*(_array(field) for field in fields), cameras=cameras.numpy())
+    return KernelInputs(*(_array(field) for field in fields), cameras=cameras.numpy())
 
 
-def _project(frame: Frame, inputs: Inputs) -> tuple[Projected, list[np.ndarray]]:
+def _project(frame: Frame, inputs: KernelInputs) -> tuple[Projected, list[np.ndarray]]:
     """Compute the splats and, in parts, the tile of each pair."""
     projected = Projected(
         splats=np.empty((frame.images * frame.num, SPLAT), np.float32),
@@ -182,7 +184,7 @@ def _list_tiles(
     tiles: list[np.ndarray],
     masks: Tensor | None,
     stats: dict[str, int],
-) -> Lists:
+) -> TileLists:
     """Sort the pairs by tile."""
     histograms = projected.histograms
     first_entry = _starts(histograms.sum(1, dtype=np.int64).reshape(-1))
@@ -192,7 +194,7 @@ def _list_tiles(
     active = np.ones(len(lengths), np.bool_)
     if masks is not None:
         active = active_tiles(masks, TILE).numpy()
-    lists = Lists(
+    lists = TileLists(
         splats=projected.splats,
         first_pair=_starts(projected.counts),
         first_entry=first_entry,
@@ -215,11 +217,12 @@ def _list_tiles(
 
 
 def _rasterize(
-    frame: Frame, lists: Lists, depth: str | None, stats: dict[str, int]
-) -> tuple[tuple[Tensor | None, ...], Saved, np.ndarray | None]:
+    frame: Frame, lists: TileLists, depth: str | None, stats: dict[str, int]
+) -> tuple[tuple[Tensor | None, ...], SavedForBackward, np.ndarray | None]:
     """Draw image, alpha, transmittance, depth and its origins.
 
-    Also return `Saved` and the other array of the depth, see `_depths`, for the backward pass.
+    Also return what the backward pass needs: `SavedForBackward` and the other array of the depth,
+    see `_depths`.
     """
     image = torch.empty(frame.images, 3, frame.height, frame.width)
     alpha = torch.empty(frame.images, frame.height, frame.width)
@@ -229,13 +232,13 @@ def _rasterize(
     auxiliary = None if origins is None else origins.numpy()
     if depth == "median":
         auxiliary = np.empty(alpha.shape, np.float32)
-    saved = Saved(
+    saved = SavedForBackward(
         transmittance=transmittance.numpy(),
         stop_ranks=np.empty(alpha.shape, np.float32),
         last_entry=np.empty(frame.images * frame.tiles, np.int64),
         counters=np.empty((frame.images * frame.tiles, raster.COUNTERS), np.int64),
     )
-    images = Images(image.numpy(), alpha.numpy())
+    images = OutputImages(image.numpy(), alpha.numpy())
     depths = _depths(depth, drawn_depth, auxiliary)
     tiles = weighted_bounds(lists.first_entry)
     run_blocks(rasterize, tiles, lists, frame, images, saved, *depths)
@@ -250,7 +253,7 @@ def _rasterize(
 
 def _project_backward(
     frame: Frame,
-    inputs: Inputs,
+    inputs: KernelInputs,
     needs: tuple[bool, bool],
     pairs: tuple[np.ndarray, np.ndarray],
     tensors: Sequence[Tensor],
@@ -260,7 +263,7 @@ def _project_backward(
     field_grads = [_empty_like(field) for field in fields[:4]]
     field_grads.append(_empty_like(fields[4] if needs[0] else fields[4][:0]))
     camera_grads = np.empty((frame.images, frame.blocks, CAMERA_GRADIENT))
-    grads = Inputs(*(_array(grad) for grad in field_grads), cameras=camera_grads)
+    grads = KernelInputs(*(_array(grad) for grad in field_grads), cameras=camera_grads)
     flat = inputs._replace(quats=inputs.quats.reshape(-1), scales=inputs.scales.reshape(-1))
     blocks = even_bounds(frame.images // frame.views * frame.blocks)
     run_blocks(project_backward, blocks, flat, frame, *pairs, needs, grads)

@@ -63,14 +63,14 @@ SUM_E, SUM_EU, SUM_EUY, SUM_EY, SUM_EYY, SUM_EUX, SUM_RED, SUM_GREEN, SUM_BLUE, 
 BACKWARD_STATE = 10 * PLANE + 10 * LANES
 
 
-class Images(NamedTuple):
+class OutputImages(NamedTuple):
     """Image [images, 3, H, W] and alpha [images, H, W]."""
 
     image: np.ndarray
     alpha: np.ndarray
 
 
-class Saved(NamedTuple):
+class SavedForBackward(NamedTuple):
     """What `rasterize` saves for `rasterize_backward`.
 
     transmittance [images, H, W]; stop_ranks [images, H, W] the rank in the list of the first splat

@@ -18,7 +18,7 @@ RADIX = 256
 DIGITS = 4
 
 
-class Lists(NamedTuple):
+class TileLists(NamedTuple):
     """The splats of every tile.
 
     splats [images * N, 16], see `splat`; first_pair [images * N + 1] index of each splat's first
@@ -121,7 +121,7 @@ def scatter_pairs(start, stop, tiles, first_pair, positions, frame, entries):
     """Write every pair of splat and tile of blocks start to stop into the lists.
 
     tiles [pairs] is the tile of each pair, within its image; positions [images, blocks, tiles] the
-    index of a block's next entry of a tile; entries [pairs, 2], see `Lists`, is written.
+    index of a block's next entry of a tile; entries [pairs, 2], see `TileLists`, is written.
     """
     for index in range(start, stop):
         image, block = index // frame.blocks, index % frame.blocks

@@ -11,12 +11,12 @@ from torch.autograd.function import once_differentiable
 from asysplat.errors import InputError
 from asysplat.rendering.cuda.project import COUNTERS, project
 from asysplat.rendering.cuda.project_backward import project_backward, sum_pairs
-from asysplat.rendering.cuda.rasterize import Saved, rasterize, rasterize_backward
+from asysplat.rendering.cuda.rasterize import SavedForBackward, rasterize, rasterize_backward
 from asysplat.rendering.cuda.splat import GRADIENT, SPLAT, TILE, Frame
-from asysplat.rendering.cuda.tiles import Lists, list_tiles
+from asysplat.rendering.cuda.tiles import TileLists, list_tiles
 from asysplat.rendering.formulas import (
     CAMERA_GRADIENT,
-    Inputs,
+    KernelInputs,
     active_tiles,
     apply_passes,
     camera_gradients,
@@ -80,7 +80,8 @@ class _Passes(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_image, grad_alpha, grad_transmittance, grad_depth, _):
         tensors, rest = ctx.saved_tensors[:7], ctx.saved_tensors[7:]
-        lists, saved = Lists(*rest[: len(Lists._fields)]), Saved(*rest[len(Lists._fields) :])
+        count = len(TileLists._fields)
+        lists, saved = TileLists(*rest[:count]), SavedForBackward(*rest[count:])
         frame, settings = ctx.frame, ctx.settings
         grad_image, grad_transmittance = image_gradients(
             grad_image, grad_alpha, grad_transmittance, saved.transmittance
@@ -138,11 +139,13 @@ def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
     )
 
 
-def _inputs(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Inputs:
+def _inputs(
+    tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings
+) -> KernelInputs:
     """Arrange the fields of Gaussians, poses and intrinsics for the kernels."""
     *fields, cam_to_world, intrinsics = tensors
     cameras = camera_rows(cam_to_world, intrinsics, size, settings.limits)
-    return Inputs(*(t.detach().contiguous().flatten(0, 1) for t in fields), cameras=cameras)
+    return KernelInputs(*(t.detach().contiguous().flatten(0, 1) for t in fields), cameras=cameras)
 
 
 def _kinds(settings: RenderSettings) -> dict[str, bool]:
@@ -152,7 +155,7 @@ def _kinds(settings: RenderSettings) -> dict[str, bool]:
 
 
 def _project(
-    frame: Frame, inputs: Inputs, settings: RenderSettings
+    frame: Frame, inputs: KernelInputs, settings: RenderSettings
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute splats, depths and counters; see `project`."""
     total, blocks = frame.images * frame.num, -(-frame.num // BLOCK)
@@ -188,7 +191,7 @@ def _project(
 
 def _list_tiles(
     frame: Frame, splats: Tensor, depths: Tensor, masks: Tensor | None, cull_ellipse: bool
-) -> tuple[Lists, Tensor]:
+) -> tuple[TileLists, Tensor]:
     """Sort the pairs by tile and depth; also count the tiles that the splats' boxes would touch.
 
     Depths [images * N] are 0 where there is no splat. With `cull_ellipse`, tiles of a box that the
@@ -220,7 +223,7 @@ def _list_tiles(
         list_tiles[programs](box_tiles=None, **places, **common, WRITE=True)
     tile_of, numbers = torch.sort(tile_of, stable=True)
     starts = torch.arange(tiles + 1, dtype=key, device=device)
-    lists = Lists(
+    lists = TileLists(
         splats=splats,
         counts=counts,
         first_pair=first_pair,
@@ -233,14 +236,14 @@ def _list_tiles(
 
 
 def _rasterize(
-    frame: Frame, lists: Lists, settings: RenderSettings
-) -> tuple[tuple[Tensor | None, ...], Saved]:
+    frame: Frame, lists: TileLists, settings: RenderSettings
+) -> tuple[tuple[Tensor | None, ...], SavedForBackward]:
     """Draw image, alpha, transmittance, depth and its origins; also what backward needs."""
     kinds, limits, splats = _kinds(settings), settings.limits, lists.splats
     shape = (frame.images, frame.height, frame.width)
     image, alpha = splats.new_empty(frame.images, 3, *shape[1:]), splats.new_empty(shape)
     depth = splats.new_empty(shape) if settings.depth else None
-    saved = Saved(
+    saved = SavedForBackward(
         transmittance=splats.new_empty(shape),
         stop_ranks=splats.new_empty(shape, dtype=torch.int32),
         last_entry=torch.empty_like(lists.first_entry[:-1]),
@@ -271,8 +274,8 @@ def _rasterize(
 
 def _count(
     stats: dict[str, int],
-    lists: Lists,
-    saved: Saved,
+    lists: TileLists,
+    saved: SavedForBackward,
     counters: Tensor,
     box_tiles: Tensor,
     cull_ellipse: bool,
@@ -295,17 +298,17 @@ def _count(
 
 def _project_backward(
     frame: Frame,
-    inputs: Inputs,
-    lists: Lists,
+    inputs: KernelInputs,
+    lists: TileLists,
     pair_grads: Tensor,
     settings: RenderSettings,
     needs: dict[str, bool],
-) -> Inputs:
+) -> KernelInputs:
     """Compute the gradients of the inputs from those of the pairs; None where not required."""
     has_depth = settings.depth is not None
     blocks, device = -(-frame.num // BACKWARD_BLOCK), pair_grads.device
     shape = (frame.images, blocks, CAMERA_GRADIENT)
-    grads = Inputs(
+    grads = KernelInputs(
         *(torch.empty_like(field) for field in inputs[:4]),
         sh=torch.zeros_like(inputs.sh) if needs["SH_NEEDED"] else None,
         cameras=torch.zeros(shape, dtype=torch.float64, device=device)

@@ -20,8 +20,8 @@ from asysplat.rendering.cuda.splat import (
 NO_STOP = tl.constexpr(2**31 - 1)  # more than any rank
 
 
-class Saved(NamedTuple):
-    """See `cpu.rasterize.Saved`; median_ranks are -1 without a median depth."""
+class SavedForBackward(NamedTuple):
+    """See `cpu.rasterize.SavedForBackward`; median_ranks are -1 without a median depth."""
 
     transmittance: Tensor
     stop_ranks: Tensor

@@ -16,8 +16,8 @@ from asysplat.rendering.cuda.splat import TILE, load_ellipse
 PIXEL_MARGIN = tl.constexpr(formulas.PIXEL_MARGIN)
 
 
-class Lists(NamedTuple):
-    """The splats of every tile, by depth; see `cpu.tiles.Lists`.
+class TileLists(NamedTuple):
+    """The splats of every tile, by depth; see `cpu.tiles.TileLists`.
 
     counts [images * N] pairs of each splat; first_pair [images * N]; entries [pairs] the splat of
     each pair and pairs [pairs] its index, sorted by tile, then by depth; active None if all tiles

@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from asysplat.rendering.interface import BlendingLimits
 from asysplat.rendering.reference.project import Splats
-from asysplat.rendering.reference.tiles import Lists
+from asysplat.rendering.reference.tiles import TileLists
 
 TILE = 4  # pixels a side
 GROUP_ELEMENTS = 1 << 17  # (splat, pixel) pairs of one group: temporaries of 512 KiB
@@ -22,7 +22,7 @@ GROUP_ELEMENTS = 1 << 17  # (splat, pixel) pairs of one group: temporaries of 51
 def rasterize(
     splats: Splats,
     values: Float[Tensor, "M C"],
-    lists: Lists,
+    lists: TileLists,
     limits: BlendingLimits,
     median: bool = False,
 ) -> Float[Tensor, "T C P"]:
@@ -46,7 +46,9 @@ def rasterize(
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, packed: Tensor, lists: Lists, limits: BlendingLimits, median: bool) -> Tensor:
+    def forward(
+        ctx, packed: Tensor, lists: TileLists, limits: BlendingLimits, median: bool
+    ) -> Tensor:
         ctx.save_for_backward(packed)
         ctx.lists, ctx.options = lists, (limits, median)
         pixels = lists.size**2
@@ -68,7 +70,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _blocks(
-    packed: Tensor, lists: Lists, options: tuple[BlendingLimits, bool]
+    packed: Tensor, lists: TileLists, options: tuple[BlendingLimits, bool]
 ) -> Iterator[tuple[Tensor, Tensor, "_Block"]]:
     """Yield tiles [t], their splats [t, K] and block, about GROUP_ELEMENTS pairs at a time.
 

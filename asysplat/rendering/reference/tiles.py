@@ -11,7 +11,7 @@ from asysplat.rendering.reference.project import Splats
 
 
 @dataclass(frozen=True)
-class Lists:
+class TileLists:
     """Depth-ordered splats of every tile; tiles are numbered image by image, row by row.
 
     Args:
@@ -43,7 +43,7 @@ class Lists:
 
 
 @torch.no_grad()
-def list_tiles(splats: Splats, images: int, height: int, width: int, size: int) -> Lists:
+def list_tiles(splats: Splats, images: int, height: int, width: int, size: int) -> TileLists:
     """Sort the splats of `images` images into tiles of size x size pixels."""
     rows, columns = -(-height // size), -(-width // size)
     first, last = splats.first // size, splats.last // size
@@ -59,4 +59,4 @@ def list_tiles(splats: Splats, images: int, height: int, width: int, size: int) 
     # Splats come in depth order within their image, and a stable sort by tile keeps it.
     order = torch.argsort(tile, stable=True)
     lengths = torch.bincount(tile, minlength=images * rows * columns)
-    return Lists(size, images, rows, columns, splat[order], lengths)
+    return TileLists(size, images, rows, columns, splat[order], lengths)
