@@ -42,9 +42,9 @@ def draw_in_chunks(
     ) -> tuple[list[Tensor | None], dict[str, int]]:
         """Draw `views` from their inputs; return images as [B, views, ...], and statistics."""
         *fields, poses, intrinsics = inputs
-        some = Cameras(intrinsics, poses, cameras.height, cameras.width)
-        counts = None if masks is None else masks[:, views]
-        out = draw(Gaussians(*fields), some, settings, counts)
+        chunk_cameras = Cameras(intrinsics, poses, cameras.height, cameras.width)
+        chunk_masks = None if masks is None else masks[:, views]
+        out = draw(Gaussians(*fields), chunk_cameras, settings, chunk_masks)
         images = (out.image, out.alpha, out.transmittance, out.depth, out.depth_origin)
         shape = poses.shape[:2]
         return [None if image is None else image.unflatten(0, shape) for image in images], out.stats
@@ -81,9 +81,9 @@ class _Deferred(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         parts = []
         for views in slices:
-            images, counts = draw_views(views, _select(tensors, views))
+            images, chunk_stats = draw_views(views, _select(tensors, views))
             parts.append(images)
-            for name, count in counts.items():
+            for name, count in chunk_stats.items():
                 stats[name] = count + (0 if name in NOT_SUMMED else stats.get(name, 0))
         return tuple(
             None if images[0] is None else torch.cat(images, 1).flatten(0, 1)

@@ -119,8 +119,8 @@ def render(
         views = cameras.map(lambda t: _one_batch(t.to(dtype), batch))
         auto = BACKENDS[fast_backend(scenes.means, "reference")]
         draw = pick_backend("render", {"auto": auto, **BACKENDS}, backend)
-        counts = None if masks is None else _one_batch(masks, batch)
-        out = draw_in_chunks(draw, scenes, views, settings, counts, views_at_once)
+        view_masks = None if masks is None else _one_batch(masks, batch)
+        out = draw_in_chunks(draw, scenes, views, settings, view_masks, views_at_once)
 
         def shaped(images: Tensor) -> Tensor:
             return images.to(dtype).unflatten(0, (*batch, cameras.num_views))
