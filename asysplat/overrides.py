@@ -90,7 +90,7 @@ def _check_choices(override: Override) -> None:
             nearest = difflib.get_close_matches(choice, known, n=3, cutoff=0.4) or known
             raise InputError(
                 f"{group}={choice} is unknown: did you mean {', '.join(nearest)}? "
-                f"All are in {folder.resolve().relative_to(CONF.parent)}/."
+                f"All are in {folder.relative_to(CONF.parent)}/."
             )
 
 

@@ -68,7 +68,7 @@ UNKNOWN = {
     "qqq=1": "qqq is unknown: python train.py --cfg job shows all.",
     "model=longlrm,asysplat_4m4z": "model=asysplat_4m4z is unknown: did you mean asysplat_4m4",
     "model/links=bth": "did you mean both? All are in conf/model/links/.",
-    "sweeps=layer": "did you mean layers, asymmetry? All are in sweeps/.",
+    "sweeps=layer": "did you mean layers, asymmetry? All are in conf/sweeps/.",
     "steps": "steps sets nothing: write steps=value",
     "name=my (run": "needs quotes of its own",
 }
@@ -136,14 +136,13 @@ IN_A_TABLE = re.compile(r"\| `([\w./]+=[^`]+)`")
 
 
 def printed_commands(repository) -> list[tuple[str, str]]:
-    """List scripts and overrides in the documents and the comments under conf/ and sweeps/."""
-    folders = (".", "data", "docs", "examples")
+    """List scripts and overrides in the documents and the comments under conf/."""
+    folders = (".", "data", "docs", "examples", "sweeps")
     documents = [path for name in folders for path in sorted((repository / name).glob("*.md"))]
     texts = [path.read_text() for path in documents]
     found = {("train", overrides) for text in texts for overrides in IN_A_TABLE.findall(text)}
-    for folder in ("conf", "sweeps"):
-        for path in (repository / folder).rglob("*.yaml"):
-            texts += [line for line in path.read_text().splitlines() if line.startswith("# ")]
+    for path in (repository / "conf").rglob("*.yaml"):
+        texts += [line for line in path.read_text().splitlines() if line.startswith("# ")]
     for text in texts:
         found |= set(COMMAND.findall(text.replace("\\\n", " ")))
     return sorted(found)

@@ -99,7 +99,7 @@ class Claim:
 class PaperTable:
     """One table of the paper, or one of ours, and the sweep of the same key that reproduces it."""
 
-    key: str  # name of the file in sweeps/, or "claims"
+    key: str  # name of the file in conf/sweeps/, or "claims"
     number: str | None  # in the paper, such as "6b" or "A3"; None for claims and tables of ours
     title: str  # what it compares
     protocol: str  # how the paper measured it

@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-CODE = ("asysplat", "conf", "sweeps", "train.py")
+CODE = ("asysplat", "conf", "train.py")
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Every file under conf/ and sweeps/ composes, builds its model, trains a step, and starts with its
+"""Every file under conf/ composes, builds its model, trains a step, and starts with its
 command."""
 
 import math
@@ -18,14 +18,14 @@ from asysplat.refinement import PAPER, PUBLISHED_3DGS, RefinementSettings
 from asysplat.report.paper import find_tables
 
 ROOT = Path(__file__).parents[2]
-CONF, SWEEPS = ROOT / "conf", ROOT / "sweeps"
-FILES = sorted(CONF.rglob("*.yaml")) + sorted(SWEEPS.glob("*.yaml"))
+CONF, SWEEPS = ROOT / "conf", ROOT / "conf" / "sweeps"
+FILES = sorted(CONF.rglob("*.yaml"))
 # Parts that several files share.
 PARTS = {"model=asysplat", "model=blocks", "model=one_branch", "data=views", "data=disk"}
 CHOICES = {
     f"{path.parent.relative_to(CONF)}={path.stem}"
     for path in CONF.rglob("*.yaml")
-    if path.parent not in (CONF, CONF / "refinement", CONF / "quality")
+    if path.parent not in (CONF, CONF / "refinement", CONF / "quality", SWEEPS)
 }
 CHOICES = sorted(CHOICES - PARTS)
 STAGES = ("stage1", "stage2", "stage3", "ablation")
