@@ -35,15 +35,15 @@ class SceneResult:
     # "post<steps>" -> the seconds of the prediction and that many steps together and, where it can
     # be measured, their peak memory, gb.
     costs: dict[str, dict[str, float]] = field(default_factory=dict)
-    # A row for each image: `images` (targets or inputs), `view`, `source` (post<steps> or a
+    # A row for each image: `images` (targets or inputs), `view`, `method` (post<steps> or a
     # baseline) and its metrics.
     rows: list[ImageRow] = field(default_factory=list)
     early_exit: dict[str, float] = field(default_factory=dict)  # shares left out, see `Network`
 
-    def add(self, images: str, source: str, rows: Sequence[dict[str, float]]) -> None:
+    def add(self, images: str, method: str, rows: Sequence[dict[str, float]]) -> None:
         """Add a row of metrics for each view."""
         for view, row in enumerate(rows):
-            self.rows.append({"images": images, "view": view, "source": source} | row)
+            self.rows.append({"images": images, "view": view, "method": method} | row)
 
 
 @dataclass(frozen=True)
@@ -100,22 +100,22 @@ class PostOptimization:
             background = inputs.mean_color()
         result = SceneResult(scene)
         baselines = self.protocol.measure_baselines(inputs, targets, self.lpips)
-        for source, rows in baselines.items():
-            result.add("targets", source, rows)
+        for method, rows in baselines.items():
+            result.add("targets", method, rows)
         meter = CostMeter(inputs.images.device)
 
         def measure(step: int, gaussians: Gaussians) -> None:
             meter.stop()
-            source = f"post{step}"
-            result.costs[source] = {"seconds": sum(meter.seconds)}
+            method = f"post{step}"
+            result.costs[method] = {"seconds": sum(meter.seconds)}
             if meter.gb:
-                result.costs[source]["gb"] = max(meter.gb)
+                result.costs[method]["gb"] = max(meter.gb)
             rendering = _render(gaussians, targets, background)
             drawn = rendering.image, rendering.depth
-            result.add("targets", source, self.protocol.measure_views(*drawn, targets, self.lpips))
+            result.add("targets", method, self.protocol.measure_views(*drawn, targets, self.lpips))
             images = _render(gaussians, inputs, background).image
             rows = self.protocol.measure_views(images, None, inputs, None, psnr_only=True)
-            result.add("inputs", source, rows)
+            result.add("inputs", method, rows)
             result.gaussians = gaussians.num_gaussians
             watch(step, rendering)
             meter.start()

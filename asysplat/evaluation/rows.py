@@ -11,7 +11,7 @@ from asysplat.files import atomic_write
 
 ImageRow = dict[str, str | float | int]
 # Columns that name the image of a row; the others are numbers.
-LABELS = ("set", "scene", "images", "view", "source")
+LABELS = ("set", "scene", "images", "view", "method")
 
 
 def average(rows: Sequence[ImageRow], over: Literal["images", "scenes"]) -> dict[str, float]:

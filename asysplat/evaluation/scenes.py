@@ -73,8 +73,8 @@ def measure_scenes(
             result.early_exit.update(early_exit)
             sentence = f"{name} {result.scene}, PSNR after steps of post-optimization: "
             sentence += ", ".join(
-                f"{source[4:]}: {_means(result.rows, 'targets', source, 'images')['psnr']:.2f}"
-                for source in result.costs
+                f"{method[4:]}: {_means(result.rows, 'targets', method, 'images')['psnr']:.2f}"
+                for method in result.costs
             )
             bars.console.print(sentence, soft_wrap=True, highlight=False)
             return result
@@ -126,20 +126,20 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
         averages[f"{costs}/gaussians"] = sum(r.gaussians for r in results) / len(results)
         for name, share in average([dict(r.early_exit) for r in results], "images").items():
             averages[f"early_exit/{test_set}/{name}"] = share
-        for source in dict.fromkeys(row["source"] for row in rows):
-            tested = "test" if source in results[0].costs else "baseline"
+        for method in dict.fromkeys(row["method"] for row in rows):
+            tested = "test" if method in results[0].costs else "baseline"
             for kind, images in ((tested, "targets"), ("inputs", "inputs")):
-                for name, value in _means(rows, images, source, over).items():
-                    averages[f"{kind}/{test_set}/{source}/{name}"] = value
-        for source in results[0].costs:
-            every = [result.costs[source] for result in results]
-            averages[f"{costs}/{source}/seconds"] = mean_but_longest([c["seconds"] for c in every])
+                for name, value in _means(rows, images, method, over).items():
+                    averages[f"{kind}/{test_set}/{method}/{name}"] = value
+        for method in results[0].costs:
+            every = [result.costs[method] for result in results]
+            averages[f"{costs}/{method}/seconds"] = mean_but_longest([c["seconds"] for c in every])
             if all("gb" in each for each in every):
-                averages[f"{costs}/{source}/gb"] = max(each["gb"] for each in every)
+                averages[f"{costs}/{method}/gb"] = max(each["gb"] for each in every)
     return averages
 
 
 def _means(
-    rows: Sequence[ImageRow], images: str, source: str, over: Literal["images", "scenes"]
+    rows: Sequence[ImageRow], images: str, method: str, over: Literal["images", "scenes"]
 ) -> dict[str, float]:
-    return average([r for r in rows if (r["images"], r["source"]) == (images, source)], over)
+    return average([r for r in rows if (r["images"], r["method"]) == (images, method)], over)

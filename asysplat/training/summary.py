@@ -74,14 +74,14 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
         tables = [Table("", *(METRICS[name] for name in metrics), title=title)]
         ending = f"/test/{data}/psnr"
         stages = [key.removesuffix(ending) for key in results if key.endswith(ending)]
-        sources = {f"after {stage}": f"{stage}/test/{{}}" for stage in stages} | ROWS
-        for label, source in sources.items():
-            tables[0].add_row(label, *metric_cells(results, source.format(data), metrics))
+        methods = {f"after {stage}": f"{stage}/test/{{}}" for stage in stages} | ROWS
+        for label, method in methods.items():
+            tables[0].add_row(label, *metric_cells(results, method.format(data), metrics))
     others = [name for name in test_sets if name != data]
     if others:
         tables.append(Table("", *ROWS, title="other test sets, PSNR (dB)"))
     for name in others:
-        values = (results[f"{source.format(name)}/psnr"] for source in ROWS.values())
+        values = (results[f"{method.format(name)}/psnr"] for method in ROWS.values())
         tables[-1].add_row(name, *_cells(values))
     _print([*tables, cost_sentence(results)], folder, "test")
     print(f"run: {folder}")

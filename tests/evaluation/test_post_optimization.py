@@ -38,7 +38,7 @@ def scene(make_scene):
 def psnrs(result, images):
     """The mean PSNR of each step's images."""
     return [
-        torch.tensor([r["psnr"] for r in result.rows if (r["images"], r["source"]) == (images, s)])
+        torch.tensor([r["psnr"] for r in result.rows if (r["images"], r["method"]) == (images, s)])
         .mean()
         .item()
         for s in result.costs
@@ -64,7 +64,7 @@ def test_intermediate_steps_equal_a_shorter_refinement(scene):
         refined = refine(gaussians, inputs, PAPER, steps=steps, background=BLACK)
         with torch.no_grad():
             image = render(refined, targets.cameras, BLACK).image
-        found = [r["psnr"] for r in result.rows if r["source"] == f"post{steps}"][:2]
+        found = [r["psnr"] for r in result.rows if r["method"] == f"post{steps}"][:2]
         assert found == PROTOCOL.psnr(image, targets).tolist(), steps
 
 
@@ -72,13 +72,13 @@ def test_post_optimization_has_a_row_with_metrics_for_every_image(scene):
     gaussians, inputs, targets = scene
     result = PostOptimization((0, 2), PROTOCOL, None)("a", lambda _: gaussians, inputs, targets)
     counts = {
-        key: sum((r["images"], r["source"]) == key for r in result.rows)
+        key: sum((r["images"], r["method"]) == key for r in result.rows)
         for key in itertools.product(
             ("targets", "inputs"), ("post0", "post2", "nearest_view", "mean_color")
         )
     }
     assert list(counts.values()) == [2, 2, 2, 2, 4, 4, 0, 0]
-    (first, *_) = (r for r in result.rows if r["source"] == "post0")
+    (first, *_) = (r for r in result.rows if r["method"] == "post0")
     assert {"psnr", "ssim", "absrel", "delta1"} <= first.keys()
 
 
@@ -104,7 +104,7 @@ def test_costs_of_post_optimization_do_not_include_the_metrics(scene, monkeypatc
         now[0] += 0 if rendering is None else 100
 
     result = PostOptimization((0, 1, 3), PROTOCOL, None)("a", predict, inputs, targets, watch)
-    seconds = {source: costs["seconds"] for source, costs in result.costs.items()}
+    seconds = {method: costs["seconds"] for method, costs in result.costs.items()}
     assert seconds == {"post0": 1, "post1": 11, "post3": 31}
 
 

@@ -9,11 +9,11 @@ from asysplat.evaluation.scenes import image_rows, set_results
 def result(scene, psnrs, seconds):
     """A scene with a target for each PSNR, and an input that is 1 dB better."""
     rows = []
-    for source, gain in (("post0", 0.0), ("post3", 2.0)):
+    for method, gain in (("post0", 0.0), ("post3", 2.0)):
         for view, psnr in enumerate(psnrs):
-            rows.append({"images": "targets", "view": view, "source": source, "psnr": psnr + gain})
-        rows.append({"images": "inputs", "view": 0, "source": source, "psnr": psnrs[0] + gain + 1})
-    rows.append({"images": "targets", "view": 0, "source": "mean_color", "psnr": 5.0})
+            rows.append({"images": "targets", "view": view, "method": method, "psnr": psnr + gain})
+        rows.append({"images": "inputs", "view": 0, "method": method, "psnr": psnrs[0] + gain + 1})
+    rows.append({"images": "targets", "view": 0, "method": "mean_color", "psnr": 5.0})
     costs = {
         "post0": {"seconds": seconds, "gb": 1.0},
         "post3": {"seconds": 2 * seconds, "gb": seconds},

@@ -81,7 +81,7 @@ def test_a_run_has_its_evaluation_beside_its_results(whole, evaluated):
 def test_a_file_has_every_image(whole, evaluated):
     with (whole / "evaluation.csv").open() as file:
         rows = list(csv.DictReader(file))
-    of_set = [row for row in rows if row["set"] == "rooms" and row["source"] == "post3"]
+    of_set = [row for row in rows if row["set"] == "rooms" and row["method"] == "post3"]
     # 2 scenes of 2 targets and 3 inputs.
     assert Counter(row["images"] for row in of_set) == {"targets": 4, "inputs": 6}
     mean = sum(float(row["psnr"]) for row in of_set if row["images"] == "targets") / 4
