@@ -97,12 +97,12 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
         title = f"test scenes: {name}, metrics: {results['protocol/name']}, "
         title += f"{results[f'{costs}/gaussians']:,.0f} Gaussians a scene"
         titles = ("steps", "seconds", "GB", "inputs (dB)", *(METRICS[m] for m in metrics))
-        sources = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
-        sources |= {label: (prefix.format(name), "") for label, prefix in BASELINE_ROWS.items()}
+        methods = {str(step): (f"test/{name}/post{step}", f"post{step}") for step in steps}
+        methods |= {label: (prefix.format(name), "") for label, prefix in BASELINE_ROWS.items()}
         rows = []
-        for label, (prefix, source) in sources.items():
-            spent = [results.get(f"{costs}/{source}/{unit}") for unit in ("seconds", "gb")]
-            inputs = metric_cells(results, f"inputs/{name}/{source}", ["psnr"])
+        for label, (prefix, method) in methods.items():
+            spent = [results.get(f"{costs}/{method}/{unit}") for unit in ("seconds", "gb")]
+            inputs = metric_cells(results, f"inputs/{name}/{method}", ["psnr"])
             cells = metric_cells(results, prefix, metrics)
             rows.append([label, *_cells(spent, digits=2), *inputs, *cells])
         print_table(Console(), titles, rows, title)
