@@ -20,7 +20,7 @@ from rich.console import Console
 
 from asysplat.errors import InputError
 from asysplat.files import check_writable
-from asysplat.training.revision import revision
+from asysplat.runs.revision import revision
 from benchmarks.compare import compare, read_old
 from benchmarks.options import describe_machine, find_suite
 from benchmarks.table import write_results

@@ -39,12 +39,12 @@ from asysplat.export.scene_folder import check_visible, find_files, origin_of
 from asysplat.files import check_writable, make_folder
 from asysplat.models.early_exit import EXACT
 from asysplat.models.network import Network
+from asysplat.runs.checkpoints import load_weights
+from asysplat.runs.evaluation_target import find_target
+from asysplat.runs.runs import EVALUATION
+from asysplat.runs.summary import print_evaluation, write_json
 from asysplat.scene import Gaussians, Views
-from asysplat.training.checkpoints import load_weights
-from asysplat.training.evaluation_target import find_target
 from asysplat.training.messages import quiet_lightning
-from asysplat.training.runs import EVALUATION
-from asysplat.training.summary import print_evaluation, write_json
 
 Predictor = Callable[[Sample], Predict]  # prediction function for a sample's scene
 

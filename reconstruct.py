@@ -28,6 +28,7 @@ from rich.console import Console
 
 from asysplat import load
 from asysplat.data.cameras import CameraOptions
+from asysplat.data.photographs import Photographs, open_photographs
 from asysplat.errors import InputError
 from asysplat.export import read_gaussians
 from asysplat.reconstruct.continuation import continue_run
@@ -36,9 +37,8 @@ from asysplat.reconstruct.results import Results
 from asysplat.reconstruct.video import views_of
 from asysplat.refinement import RefinementSettings, refine
 from asysplat.refinement.init import INITS, initial_gaussians
-from asysplat.refinement.photographs import Photographs, open_photographs
+from asysplat.runs.ranges import check_ranges, is_number
 from asysplat.scene import Gaussians
-from asysplat.training.ranges import check_ranges, is_number
 
 
 @command("reconstruct")

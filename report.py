@@ -24,7 +24,7 @@ from asysplat.report.html import render_html
 from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import find_tables
 from asysplat.report.terminal import render_terminal
-from asysplat.training.systems import find_systems
+from asysplat.runs.systems import find_systems
 
 OWN_OPTIONS = ("table", "costs", "overrides", "logs", "output")
 

@@ -20,15 +20,15 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.files import check_writable
+from asysplat.runs.revision import revision
+from asysplat.runs.run_folder import job_name, run_folder, unused_removed
+from asysplat.runs.runs import find_run
 from asysplat.training.prepare import (
     PreparedRun,
     TrainingStage,
     prepare_run,
     without_missing_network,
 )
-from asysplat.training.revision import revision
-from asysplat.training.run_folder import job_name, run_folder, unused_removed
-from asysplat.training.runs import find_run
 
 
 @command("train")  # during the training, Checkpoints prints how to resume

@@ -13,7 +13,7 @@ LATER = {
     "Gaussians": "asysplat.scene",
     "Views": "asysplat.scene",
     "load": "asysplat.load",
-    "open_photographs": "asysplat.refinement.photographs",
+    "open_photographs": "asysplat.data.photographs",
     "read_gaussians": "asysplat.export",
     "refine": "asysplat.refinement",
     "render": "asysplat.rendering",

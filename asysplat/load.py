@@ -15,8 +15,8 @@ from torch import nn
 from asysplat.errors import InputError, input_error_behind
 from asysplat.models.network import Network
 from asysplat.overrides import CONF, check_overrides
-from asysplat.training.checkpoints import load_weights
-from asysplat.training.run_config import read_config
+from asysplat.runs.checkpoints import load_weights
+from asysplat.runs.run_config import read_config
 
 SHIPPED_MODEL = "model=asysplat_plane_sweep"
 

@@ -29,6 +29,7 @@ from torch import Tensor
 
 from asysplat import load
 from asysplat.data.normalize import Normalization, normalize
+from asysplat.data.photographs import Photographs, open_photographs
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.procedural.scene import split_seed
 from asysplat.data.selection.views import evenly_spaced, uniform_selection
@@ -39,7 +40,6 @@ from asysplat.evaluation.protocol import Protocol
 from asysplat.models.network import Network
 from asysplat.refinement import merge_to_limit, refine
 from asysplat.refinement.init import INITS, initial_gaussians
-from asysplat.refinement.photographs import Photographs, open_photographs
 from asysplat.rendering import INRIA, render
 from asysplat.report.front import draw_front
 from asysplat.report.style import FAINT, OURS, STYLE

@@ -8,9 +8,9 @@ from omegaconf import OmegaConf
 
 from asysplat.data import ProceduralScene
 from asysplat.data.normalize import Normalization
+from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
 from asysplat.reconstruct.video import _view_of, subject, video_cameras
-from asysplat.refinement.photographs import Photographs
 
 
 @pytest.fixture(scope="module")

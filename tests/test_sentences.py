@@ -20,9 +20,9 @@ from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
 from asysplat.refinement import photographs
 from asysplat.refinement.adam import SelectiveAdam
-from asysplat.training.checkpoints import load_weights
-from asysplat.training.run_folder import locked
-from asysplat.training.runs import find_runs
+from asysplat.runs.checkpoints import load_weights
+from asysplat.runs.run_folder import locked
+from asysplat.runs.runs import find_runs
 
 SIZE = SceneOptions(24, 32)
 

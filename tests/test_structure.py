@@ -28,7 +28,8 @@ LAYERS = (
     ("data", "models", "rendering"),
     ("refinement",),
     ("evaluation",),
-    ("training", "export"),
+    ("runs", "export"),
+    ("training",),
     ("load", "report"),
     ("reconstruct",),
 )
@@ -100,6 +101,13 @@ def test_the_cpu_renderer_has_few_files(sources):
     files = closure("asysplat.rendering.cpu.draw", sources)
     assert "asysplat.scene" in files  # the closure is not empty by mistake
     assert len(files) <= MAX_FILES, sorted(files)
+
+
+def test_loading_a_network_needs_no_lightning(sources):
+    files = closure("asysplat.load", sources)
+    assert "asysplat.runs.checkpoints" in files
+    names = {name for file in files for name in imported(sources[file], sources)}
+    assert not any(name.startswith("lightning") for name in names)
 
 
 def test_calls_have_few_positional_arguments(sources):

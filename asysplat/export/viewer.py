@@ -31,13 +31,13 @@ from numpy import ndarray
 from torch import Tensor
 
 from asysplat.data.normalize import normalize
+from asysplat.data.photographs import open_photographs
 from asysplat.data.readers.transforms import read_cameras
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import disparity
 from asysplat.export import viewer_cameras
 from asysplat.export.gaussians import read_gaussians
 from asysplat.interrupts import handle_signals
-from asysplat.refinement.photographs import open_photographs
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
 

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from asysplat.data.photographs import Photographs
 from asysplat.data.write import describe_cameras
 from asysplat.errors import InputError
 from asysplat.evaluation.baselines import BASELINES
@@ -28,11 +29,10 @@ from asysplat.export import write_ply, write_safetensors, write_video
 from asysplat.export.viewer import CAMERAS
 from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.reconstruct.video import check_video, video_cameras
-from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.refine import RefinementProgress
 from asysplat.rendering import Rendering, render
+from asysplat.runs.summary import metric_cells, write_json
 from asysplat.scene import Gaussians, Views
-from asysplat.training.summary import metric_cells, write_json
 
 SCENE = "scene.safetensors"
 BYTES_PER_GAUSSIAN = 2 * 4 * 62  # size in scene.ply and scene.safetensors together, at most

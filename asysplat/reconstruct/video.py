@@ -9,12 +9,12 @@ from jaxtyping import Float
 from omegaconf import DictConfig, ListConfig
 from torch import Tensor
 
+from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
 from asysplat.export import orbit, smoothed_path
-from asysplat.refinement.photographs import Photographs
 from asysplat.rendering import render
+from asysplat.runs.ranges import is_number, is_whole
 from asysplat.scene import Cameras, Gaussians
-from asysplat.training.ranges import is_number, is_whole
 
 MAX_HEIGHT = 4320  # pixels of 8K, the most that decoders of H.264 take
 CAMERA_PATHS = ("own", "orbit", "none")

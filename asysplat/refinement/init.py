@@ -6,13 +6,13 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from asysplat.data.photographs import Photographs
 from asysplat.data.selection.views import evenly_spaced
 from asysplat.errors import InputError
 from asysplat.models.network import Network
 from asysplat.models.prior import DepthPrior, PlaneSweepPrior, Prior
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import SPREAD, merge_to_limit
-from asysplat.refinement.photographs import Photographs
 from asysplat.refinement.settings import RefinementSettings
 from asysplat.rendering import INRIA
 from asysplat.scene import Gaussians, Views

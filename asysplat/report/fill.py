@@ -24,8 +24,8 @@ from asysplat.report.paper import (
     stage_hours,
 )
 from asysplat.report.systems import system_rows
-from asysplat.training.runs import Run, config_hash, data_of, differences, find_runs
-from asysplat.training.stages import describe_stage, stage_configs
+from asysplat.runs.runs import Run, config_hash, data_of, differences, find_runs
+from asysplat.runs.stages import describe_stage, stage_configs
 from asysplat.training.tensorboard import CHOICES
 
 # Overrides of train.py -> its configuration, the node `hydra` included.

@@ -7,8 +7,8 @@ from dataclasses import replace
 from omegaconf import DictConfig
 
 from asysplat.report.paper import Number, PaperRow, PaperTable
-from asysplat.training.runs import Run
-from asysplat.training.systems import SYSTEM, TESTED, options_of_test
+from asysplat.runs.runs import Run
+from asysplat.runs.systems import SYSTEM, TESTED, options_of_test
 
 
 def system_rows(

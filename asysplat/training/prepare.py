@@ -18,8 +18,7 @@ from torch import nn
 from asysplat.data.datamodule import SceneDataModule
 from asysplat.errors import InputError
 from asysplat.models.early_exit import EarlyExit
-from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
-from asysplat.training.checkpoints import (
+from asysplat.runs.checkpoints import (
     check_checkpoint,
     config_diff,
     existing_weights,
@@ -28,20 +27,21 @@ from asysplat.training.checkpoints import (
     load_weights,
     read_metadata,
 )
-from asysplat.training.losses import report_missing
-from asysplat.training.messages import quiet_lightning
-from asysplat.training.module import SplattingModule
-from asysplat.training.revision import revision
-from asysplat.training.run_folder import locked
-from asysplat.training.runs import RESULTS, describe_run
-from asysplat.training.stages import (
-    StageRecord,
+from asysplat.runs.revision import revision
+from asysplat.runs.run_folder import locked
+from asysplat.runs.runs import RESULTS, describe_run
+from asysplat.runs.stages import (
     check_stages,
     describe_stage,
     resume_point,
     stage_configs,
 )
-from asysplat.training.summary import Results, print_summary, write_json
+from asysplat.runs.summary import Results, print_summary, write_json
+from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
+from asysplat.training.callbacks.stage_record import StageRecord
+from asysplat.training.losses import report_missing
+from asysplat.training.messages import quiet_lightning
+from asysplat.training.module import SplattingModule
 from asysplat.training.tensorboard import cut_events, log_choices, log_results
 
 Callbacks = Mapping[str, lightning.Callback]

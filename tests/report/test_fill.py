@@ -12,9 +12,9 @@ from asysplat.report.compare import check_costs, fits
 from asysplat.report.fill import fill_table, finished_runs, with_costs
 from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import find_tables, load_paper
-from asysplat.training.revision import revision
-from asysplat.training.runs import describe_run, find_run
-from asysplat.training.stages import stage_configs
+from asysplat.runs.revision import revision
+from asysplat.runs.runs import describe_run, find_run
+from asysplat.runs.stages import stage_configs
 
 OVERRIDES = ["steps=7"]
 

@@ -8,7 +8,7 @@ import pytest
 from asysplat.report.fill import fill_table
 from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import load_paper
-from asysplat.training.systems import find_systems, options_of_test
+from asysplat.runs.systems import find_systems, options_of_test
 
 RE10K = ["data=realestate10k", "data.test_root=/a/re10k/test", "data.root=/a/re10k/train"]
 TWO_VIEWS = ["experiment=two_views", "metrics=pixelsplat", *RE10K]

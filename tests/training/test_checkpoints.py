@@ -17,14 +17,14 @@ from torch.utils.data import DataLoader
 
 from asysplat.data.loader import EpochLoader, batches_done
 from asysplat.errors import InputError
-from asysplat.training.callbacks import Checkpoints
-from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
-from asysplat.training.checkpoints import (
+from asysplat.runs.checkpoints import (
     config_diff,
     find_checkpoint,
     load_weights,
     read_metadata,
 )
+from asysplat.training.callbacks import Checkpoints
+from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
 from asysplat.training.tensorboard import cut_events
 
 PER_EPOCH = 3

@@ -8,8 +8,8 @@ import pytest
 from omegaconf import OmegaConf, open_dict
 
 from asysplat.evaluation.protocol import Protocol
+from asysplat.runs.runs import config_hash
 from asysplat.training.callbacks import Metrics
-from asysplat.training.runs import config_hash
 
 
 def logged(shares_of_sets):

@@ -12,6 +12,7 @@ from torchvision.models import vgg19 as torchvision_vgg19
 
 from asysplat.errors import InputError
 from asysplat.rendering import Rendering
+from asysplat.runs.runs import config_hash
 from asysplat.scene import Cameras, Gaussians, Views
 from asysplat.training import InputDisparity, Prediction, RenderedDisparity, SplattingLoss
 from asysplat.training.disparity import (
@@ -22,7 +23,6 @@ from asysplat.training.disparity import (
 )
 from asysplat.training.perceptual import longlrm, vgg16
 from asysplat.training.prepare import without_missing_network
-from asysplat.training.runs import config_hash
 
 MEAN = torch.tensor([0.485, 0.456, 0.406])[:, None, None]
 STD = torch.tensor([0.229, 0.224, 0.225])[:, None, None]

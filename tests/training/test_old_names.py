@@ -17,9 +17,9 @@ from omegaconf import OmegaConf
 from asysplat import load, render
 from asysplat.evaluation.metrics import psnr
 from asysplat.report.fill import finished_runs
-from asysplat.training.old_names import CLASSES, KEYS
-from asysplat.training.run_config import read_config
-from asysplat.training.runs import config_hash, find_run
+from asysplat.runs.old_names import CLASSES, KEYS
+from asysplat.runs.run_config import read_config
+from asysplat.runs.runs import config_hash, find_run
 
 OLD_RUN = Path(__file__).parent / "old_run"
 LATER = {"allow_missing_losses", "training.loss.allow_missing"}  # options without effect on it

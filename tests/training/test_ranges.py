@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
-from asysplat.training.ranges import RANGES, check_ranges
+from asysplat.runs.ranges import RANGES, check_ranges
 
 REFUSED = {
     "steps=-5": "steps=-5: give a whole number of at least 1.",

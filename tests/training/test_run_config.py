@@ -7,13 +7,13 @@ import yaml
 
 from asysplat import load
 from asysplat.errors import InputError
-from asysplat.training.run_config import read_config
+from asysplat.runs.run_config import read_config
 
 OLD_RUN = Path(__file__).parent / "old_run"
 TARGETS = "os.system subprocess.run builtins.eval builtins.exec builtins.__import__ pickle.loads"
 TARGETS += " sympy.sympify torch.load joblib.load numpy.load shutil.rmtree runpy.run_path"
 TARGETS += " importlib.import_module hydra.utils.get_method hydra.utils.instantiate torch.hub.load"
-TARGETS += " asysplat.training.checkpoints.torch.load asysplat.load omegaconf.OmegaConf.load"
+TARGETS += " asysplat.runs.checkpoints.torch.load asysplat.load omegaconf.OmegaConf.load"
 TARGETS += " lightning.pytorch.cli.LightningCLI path:os.system"
 TARGETS += " torch.nn.Identity.__init__.__globals__"
 

@@ -5,9 +5,9 @@ import subprocess
 
 import pytest
 
-from asysplat.training import revision as revisions
-from asysplat.training.evaluation_target import find_target
-from asysplat.training.runs import config_hash, data_of, describe_run, find_run, find_runs
+from asysplat.runs import revision as revisions
+from asysplat.runs.evaluation_target import find_target
+from asysplat.runs.runs import config_hash, data_of, describe_run, find_run, find_runs
 
 DL3DV = ["data=dl3dv", "data.root=/a/DL3DV", "data.test_root=/a/Benchmark"]
 
@@ -220,5 +220,5 @@ def test_other_options_are_another_evaluation(scene_folder, files, case):
 def test_another_revision_of_the_code_is_another_evaluation(scene_folder, files, monkeypatch):
     command = (f"init_path={files[0]}", *GARDEN)
     first = scene_folder(*command)
-    monkeypatch.setattr("asysplat.training.runs.revision", lambda: "other")
+    monkeypatch.setattr("asysplat.runs.runs.revision", lambda: "other")
     assert scene_folder(*command) != first

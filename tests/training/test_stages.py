@@ -13,9 +13,9 @@ from omegaconf import OmegaConf
 from tiny import NETWORK, SCENES
 
 from asysplat.errors import InputError
+from asysplat.runs.runs import config_hash, find_run, find_runs
+from asysplat.runs.stages import check_stages, resume_point, stage_configs
 from asysplat.training import SplattingModule
-from asysplat.training.runs import config_hash, find_run, find_runs
-from asysplat.training.stages import check_stages, resume_point, stage_configs
 
 NAMES = ["stage1", "stage2", "stage3"]
 THREE = ["experiment=three_stages", "paths.run=runs/a"]

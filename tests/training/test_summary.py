@@ -6,7 +6,7 @@ import math
 import pytest
 
 from asysplat.evaluation.rows import average
-from asysplat.training.summary import print_evaluation, print_summary, write_json
+from asysplat.runs.summary import print_evaluation, print_summary, write_json
 
 METRICS = {
     "protocol/name": "longlrm",

@@ -15,7 +15,7 @@ import pytest
 import torch
 from conftest import finished
 
-from asysplat.training.checkpoints import read_metadata
+from asysplat.runs.checkpoints import read_metadata
 
 OPTIONS = ["callbacks.checkpoints.minutes=0", "data.num_workers=1", "data.batch_size=2"]
 

@@ -9,9 +9,9 @@ import torch
 from hydra.utils import instantiate
 from tiny import NETWORK, QUIET, SCENES, VIEWS
 
+from asysplat.runs.summary import print_summary
 from asysplat.training.callbacks import Figures, Metrics
 from asysplat.training.callbacks.metrics import gather
-from asysplat.training.summary import print_summary
 
 pytestmark = pytest.mark.medium
 

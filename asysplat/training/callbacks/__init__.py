@@ -9,6 +9,7 @@ from asysplat.training.callbacks.metrics import Metrics
 from asysplat.training.callbacks.monitor import TrainingMonitor
 from asysplat.training.callbacks.non_finite_steps import NonFiniteSteps
 from asysplat.training.callbacks.progress import TrainingProgressBar
+from asysplat.training.callbacks.stage_record import StageRecord
 
 __all__ = [
     "BadScenes",
@@ -18,6 +19,7 @@ __all__ = [
     "Figures",
     "Metrics",
     "NonFiniteSteps",
+    "StageRecord",
     "TrainingMonitor",
     "TrainingProgressBar",
 ]

@@ -12,10 +12,10 @@ from hydra.types import RunMode
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from asysplat.training.checkpoints import LAST, PREVIOUS, atomic_save
-from asysplat.training.old_names import upgrade_checkpoint
+from asysplat.runs.checkpoints import LAST, PREVIOUS, atomic_save
+from asysplat.runs.old_names import upgrade_checkpoint
+from asysplat.runs.revision import revision
 from asysplat.training.random_states import RandomStates, random_states, set_random_states
-from asysplat.training.revision import revision
 from asysplat.training.tensorboard import event_files
 
 # A scheduler sends one before it kills: SLURM SIGTERM, submitit SIGUSR2, others SIGUSR1.

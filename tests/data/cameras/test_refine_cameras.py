@@ -10,9 +10,9 @@ import torch
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.cameras import CameraOptions, refine_cameras, refine_given
 from asysplat.data.cameras.refine import LEAST_OF_LENS, LEAST_POINTS
+from asysplat.data.photographs import open_photographs
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
-from asysplat.refinement.photographs import open_photographs
 from asysplat.scene import Views
 
 COUNT, HEIGHT, WIDTH = 12, 240, 320

@@ -14,10 +14,10 @@ from asysplat.data.bad_images import BadImages
 from asysplat.data.cameras.choose import CameraOptions, refine_given
 from asysplat.data.check.report import check_scene
 from asysplat.data.images import PANORAMA, undistort
+from asysplat.data.photographs import open_photographs
 from asysplat.data.readers.panoramas import YAWS, panorama
 from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
-from asysplat.refinement.photographs import open_photographs
 
 WIDTH, HEIGHT = 256, 128
 NAMES = [f"{index}.png" for index in range(3)]

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from asysplat.evaluation.metrics import METRICS
-from asysplat.training.runs import Run, find_run
-from asysplat.training.summary import BASELINE_ROWS, metric_cells
+from asysplat.runs.runs import Run, find_run
+from asysplat.runs.summary import BASELINE_ROWS, metric_cells
 
 Job = tuple[dict[str, str], DictConfig, Run | None]  # overrides, configuration, its finished run
 

@@ -17,11 +17,11 @@ from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
 from asysplat.data.build import tested_sets
 from asysplat.errors import InputError
-from asysplat.training.checkpoints import weights_file
-from asysplat.training.old_names import FORMAT, upgrade_results
-from asysplat.training.revision import revision
-from asysplat.training.run_config import flat_options, read_config
-from asysplat.training.stages import stage_configs
+from asysplat.runs.checkpoints import weights_file
+from asysplat.runs.old_names import FORMAT, upgrade_results
+from asysplat.runs.revision import revision
+from asysplat.runs.run_config import flat_options, read_config
+from asysplat.runs.stages import stage_configs
 
 RESULTS = "metrics.json"
 EVALUATION = "evaluation.json"  # added to a run by evaluate.py

@@ -10,8 +10,8 @@ from typing import Any
 
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from asysplat.training.old_names import upgrade_results
-from asysplat.training.runs import EVALUATION, Run, content_of, hash_of, name_of
+from asysplat.runs.old_names import upgrade_results
+from asysplat.runs.runs import EVALUATION, Run, content_of, hash_of, name_of
 
 SYSTEM = "evaluation/system"
 TESTED = "tested/"

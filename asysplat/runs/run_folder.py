@@ -12,8 +12,8 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from asysplat.errors import InputError
 from asysplat.files import make_folder, refuse_links
-from asysplat.training.checkpoints import LAST, has_checkpoints, newest_folder
-from asysplat.training.runs import RESULTS
+from asysplat.runs.checkpoints import LAST, has_checkpoints, newest_folder
+from asysplat.runs.runs import RESULTS
 
 LOCK = ".lock"  # in the folder of each run
 HYDRA = ".hydra"  # where Hydra writes the configuration

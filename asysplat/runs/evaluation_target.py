@@ -8,10 +8,10 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from asysplat.errors import InputError
 from asysplat.files import refuse_links
-from asysplat.training.ranges import check_ranges
-from asysplat.training.run_config import read_config
-from asysplat.training.runs import RESULTS, describe_run, find_runs, folder_of, hash_of
-from asysplat.training.systems import describe_system
+from asysplat.runs.ranges import check_ranges
+from asysplat.runs.run_config import read_config
+from asysplat.runs.runs import RESULTS, describe_run, find_runs, folder_of, hash_of
+from asysplat.runs.systems import describe_system
 
 CHECKPOINT = "checkpoints/last.ckpt"
 # The others are train.py's.

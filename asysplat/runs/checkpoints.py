@@ -15,8 +15,8 @@ from torch import nn
 
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
-from asysplat.training.old_names import upgrade_checkpoint
-from asysplat.training.run_config import flat_options
+from asysplat.runs.old_names import upgrade_checkpoint
+from asysplat.runs.run_config import flat_options
 
 SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_plane_sweep.safetensors"
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # checkpoints of a run to resume from

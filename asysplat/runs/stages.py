@@ -2,17 +2,17 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import lightning
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from asysplat.errors import InputError
-from asysplat.training.checkpoints import read_metadata
-from asysplat.training.ranges import check_ranges
-from asysplat.training.summary import Results
+from asysplat.runs.checkpoints import read_metadata
+from asysplat.runs.ranges import check_ranges
+from asysplat.runs.summary import Results
+
+STAGE_RECORD = "StageRecord"  # the callback in whose state a checkpoint names its stage
 
 
 def stage_configs(config: DictConfig) -> list[DictConfig]:
@@ -77,24 +77,6 @@ def describe_stage(config: DictConfig) -> str:
     return f"{config.steps} steps of batch {data.batch_size} at {data.height}x{data.width}"
 
 
-class StageRecord(lightning.Callback):
-    """Saves the name of the stage and the results of the stages before it in each checkpoint.
-
-    A later stage writes its first checkpoint before its first step, which saves the results of the
-    stage before it.
-    """
-
-    def __init__(self, stage: str, earlier: Results):
-        self.stage, self.earlier = stage, earlier
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"stage": self.stage, "earlier": self.earlier}
-
-    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        if self.earlier and trainer.global_step == 0:
-            trainer.save_checkpoint(trainer.checkpoint_callback.last)
-
-
 def resume_point(checkpoint: Path | None, stages: Sequence[DictConfig]) -> tuple[int, Results]:
     """Find where a run resumes: the index of the checkpoint's stage, and the results before it.
 
@@ -106,7 +88,7 @@ def resume_point(checkpoint: Path | None, stages: Sequence[DictConfig]) -> tuple
     if checkpoint is None:
         return 0, {}
     names = [stage.stage for stage in stages]
-    record = read_metadata(checkpoint)["callbacks"].get(StageRecord.__qualname__, {})
+    record = read_metadata(checkpoint)["callbacks"].get(STAGE_RECORD, {})
     stage = record.get("stage", names[0])
     if stage not in names:
         raise InputError(

@@ -1,0 +1,1 @@
+"""Runs: their configurations, folders, checkpoints, stages and results; no Lightning."""
