@@ -23,6 +23,8 @@ CLASSES = {
     "asysplat.training.Reconstruction": "asysplat.training.SplattingModule",
     "asysplat.training.ReconstructionLoss": "asysplat.training.SplattingLoss",
     "asysplat.training.tensorboard.make_logger": "asysplat.training.tensorboard.TensorBoard",
+    "asysplat.training.perceptual.longlrm": "asysplat.training.losses.perceptual.longlrm",
+    "asysplat.training.perceptual.vgg16": "asysplat.training.losses.perceptual.vgg16",
     "lightning.pytorch.loggers.TensorBoardLogger": "asysplat.training.tensorboard.TensorBoard",
     "asysplat.training.loggers.make_wandb_logger": "lightning.pytorch.loggers.WandbLogger",
     "asysplat.training.callbacks.Pictures": "asysplat.training.callbacks.Figures",

@@ -1,7 +1,7 @@
 """Training: the LightningModule, its losses and its callbacks."""
 
-from asysplat.training.disparity import InputDisparity, RenderedDisparity
-from asysplat.training.losses import SplattingLoss
+from asysplat.training.losses.disparity import InputDisparity, RenderedDisparity
+from asysplat.training.losses.splatting import SplattingLoss
 from asysplat.training.module import SplattingModule
 from asysplat.training.prediction import Prediction
 from asysplat.training.sharded import ShardedStrategy

@@ -17,7 +17,7 @@ from asysplat.models.layers import Layers
 from asysplat.models.network import Network
 from asysplat.rendering import render
 from asysplat.training.accumulated_metrics import AccumulatedMetrics
-from asysplat.training.losses import SplattingLoss
+from asysplat.training.losses.splatting import SplattingLoss
 from asysplat.training.parallel_scenes import Batch, ParallelScenes
 from asysplat.training.prediction import Prediction
 from asysplat.training.step_timer import StepTimer

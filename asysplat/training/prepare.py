@@ -39,7 +39,7 @@ from asysplat.runs.stages import (
 from asysplat.runs.summary import Results, print_summary, write_json
 from asysplat.training.callbacks.checkpoints import AtomicCheckpointIO
 from asysplat.training.callbacks.stage_record import StageRecord
-from asysplat.training.losses import report_missing
+from asysplat.training.losses.splatting import report_missing
 from asysplat.training.messages import quiet_lightning
 from asysplat.training.module import SplattingModule
 from asysplat.training.tensorboard import cut_events, log_choices, log_results

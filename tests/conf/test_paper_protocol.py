@@ -132,7 +132,7 @@ def test_long_lrm_is_as_published(compose_train):
     loss = config.training.loss
     assert (loss.mse, loss.perceptual, loss.opacity, loss.depth) == (1.0, 1.0, 0.1, 0.01)
     assert loss.depth_term._target_ == "asysplat.training.InputDisparity"
-    assert loss.perceptual_term._target_ == "asysplat.training.perceptual.longlrm"
+    assert loss.perceptual_term._target_ == "asysplat.training.losses.perceptual.longlrm"
     assert config.training.background == [1, 1, 1] and config.trainer.gradient_clip_val == 10
     assert (config.model.prune.prune_ratio, config.model.prune.random_ratio) == (0.5, 0.1)
     assert config.training.drop_above == 5 and config.data.window is None

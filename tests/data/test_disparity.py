@@ -18,7 +18,7 @@ from asysplat.errors import InputError
 from asysplat.rendering import Rendering
 from asysplat.scene import Gaussians
 from asysplat.training import Prediction, RenderedDisparity
-from asysplat.training.disparity import disparity_distance, reference_disparities
+from asysplat.training.losses.disparity import disparity_distance, reference_disparities
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 12
 

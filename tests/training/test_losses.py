@@ -15,13 +15,13 @@ from asysplat.rendering import Rendering
 from asysplat.runs.runs import config_hash
 from asysplat.scene import Cameras, Gaussians, Views
 from asysplat.training import InputDisparity, Prediction, RenderedDisparity, SplattingLoss
-from asysplat.training.disparity import (
+from asysplat.training.losses.disparity import (
     disparity_distance,
     normalized_disparity,
     own_depths,
     reference_disparities,
 )
-from asysplat.training.perceptual import longlrm, vgg16
+from asysplat.training.losses.perceptual import longlrm, vgg16
 from asysplat.training.prepare import without_missing_network
 
 MEAN = torch.tensor([0.485, 0.456, 0.406])[:, None, None]

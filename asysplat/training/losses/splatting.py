@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import ssim
-from asysplat.training.disparity import InputDisparity, RenderedDisparity
-from asysplat.training.perceptual import PerceptualDistance, vgg16
+from asysplat.training.losses.disparity import InputDisparity, RenderedDisparity
+from asysplat.training.losses.perceptual import PerceptualDistance, vgg16
 from asysplat.training.prediction import Prediction
 
 
