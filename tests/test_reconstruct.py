@@ -188,7 +188,7 @@ def test_masked_photographs_measure_alike_by_both_scripts(command, views, run_sc
     data += ["data.num_workers=0", f"paths.logs={tmp_path}"]
     for suffix in ("ply", "safetensors"):
         scene = tmp_path / "run" / f"scene.{suffix}"
-        folder = finished(run_script("evaluate.py", f"scenes={scene}", *data)).split()[-1]
+        folder = finished(run_script("evaluate.py", f"gaussians={scene}", *data)).split()[-1]
         found = json.loads((Path(folder) / "evaluation.json").read_text())
         for metric in ("psnr", "ssim"):
             reconstructed = expected[f"held_out/{metric}"]

@@ -199,7 +199,7 @@ def test_weights_are_compared_by_content(scene_folder, files):
 
 
 OTHER_EVALUATION = {
-    "steps": [*GARDEN, "steps=[0,3]"],
+    "steps": [*GARDEN, "post_optimization_steps=[0,3]"],
     "data": ["data=files", "data.root=/a/bicycle"],
     "frames": [*GARDEN, "data.inputs=16"],
     "protocol": [*GARDEN, "metrics=longlrm"],
