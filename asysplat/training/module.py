@@ -59,7 +59,7 @@ class SplattingModule(lightning.LightningModule):
         self.optimizer, self.schedule = optimizer, schedule
         self.views_at_once, self.drop_above = views_at_once, drop_above
         self.timer = StepTimer()  # started and stopped by a callback
-        self._parallel_scenes = ParallelScenes(net, self.compute_terms, self.timer)
+        self._parallel_scenes = ParallelScenes(net, self.scene_terms, self.timer)
         self._accumulated = AccumulatedMetrics(net)
         fixed = None if background == "inputs" else torch.tensor(background)
         self.register_buffer("background", fixed, persistent=False)
@@ -106,15 +106,19 @@ class SplattingModule(lightning.LightningModule):
             self.log("train/learning_rate", self.lr_schedulers().get_last_lr()[0])
         return terms["loss"]
 
-    def compute_terms(self, batch: Batch, net: nn.Module | None = None) -> dict[str, Tensor]:
+    def compute_terms(self, batch: Batch) -> dict[str, Tensor]:
         """Compute "loss", which has gradients, its terms and "psnr": means over the scenes.
 
-        Without `net`, copies of this module's network compute the scenes in parallel on a CPU.
+        On a CPU, copies of the network compute the scenes in parallel.
         """
         # The copies of a network whose parameters are sharded (FSDP) could not gather them.
         on_cpu = self.device.type == "cpu" and self.device_mesh is None
-        if net is None and on_cpu and len(batch["scene"]) > 1:
+        if on_cpu and len(batch["scene"]) > 1:
             return self._parallel_scenes(batch)
+        return self.scene_terms(batch, self.net)
+
+    def scene_terms(self, batch: Batch, net: nn.Module) -> dict[str, Tensor]:
+        """Compute the terms of scenes that one network predicts."""
         prediction = self(batch, depth=self.loss.needs_depth, net=net)
         targets = batch["targets"]
         image = targets.masked(prediction.rendering.image.detach())

@@ -24,7 +24,7 @@ def step(module):  # noqa: F811
 
     module.zero_grad()
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        loss = module.compute_terms(batch, module.net)["loss"]
+        loss = module.scene_terms(batch, module.net)["loss"]
     loss.backward()
     grads = torch.cat([p.grad.flatten() for p in module.parameters() if p.requires_grad])
     return grads, sum(storage.nbytes() for storage in kept.values())

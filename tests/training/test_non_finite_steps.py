@@ -37,14 +37,14 @@ class Module(lightning.LightningModule):
 
     net = None
 
-    def compute_terms(self, batch, net=None):
+    def scene_terms(self, batch, net=None):
         values = self.layer(batch["inputs"].images.mean((0, 2, 3, 4))[:, None])
         size, spread = values.square().sum().sqrt(), self.norm(values).square().sum()
         return {"loss": size + spread, "size": size}
 
     def training_step(self, batch, index):
         self.history.append({k: v.clone() for k, v in self.state_dict().items()})
-        return self.compute_terms(batch)["loss"]
+        return self.scene_terms(batch)["loss"]
 
     def configure_optimizers(self):
         return torch.optim.AdamW(self.parameters(), lr=0.1)

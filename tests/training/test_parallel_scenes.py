@@ -49,7 +49,7 @@ def one_by_one(module, batch):
     for scene in split(batch):
         module.zero_grad()
         module.net.load_state_dict(start, strict=False)
-        terms = module.compute_terms(scene, module.net)
+        terms = module.scene_terms(scene, module.net)
         terms["loss"].backward()
         losses.append(terms["loss"].item())
         states.append(state(module))
@@ -77,8 +77,8 @@ def test_the_mean_over_scenes(module):
 def test_the_terms_of_a_batch_are_means_over_its_scenes(module):
     batch, net = make_batch(), module.net.eval()
     with torch.no_grad():
-        whole = module.compute_terms(batch, net)
-        scenes = [module.compute_terms(scene, net) for scene in split(batch)]
+        whole = module.scene_terms(batch, net)
+        scenes = [module.scene_terms(scene, net) for scene in split(batch)]
     assert whole.keys() == {"loss", "mse", "depth", "psnr"} and whole["depth"] > 0
     for name, term in whole.items():
         mean = torch.stack([each[name] for each in scenes]).mean()

@@ -98,7 +98,7 @@ def first_non_finite(module: lightning.LightningModule, batch: Batch) -> str | N
 
     The order is: inputs, outputs of modules (inner before outer ones), terms of the loss, gradients
     at those outputs from the last to the first, gradients of parameters. `module` has
-    `compute_terms(batch, net)`, whose "loss" is minimized; it is left as it was.
+    `scene_terms(batch, net)`, whose "loss" is minimized; it is left as it was.
     """
     names: list[str] = []
 
@@ -122,7 +122,7 @@ def first_non_finite(module: lightning.LightningModule, batch: Batch) -> str | N
     buffers = [buffer.clone() for buffer in module.buffers()]
     try:
         with torch.enable_grad():
-            terms = module.compute_terms(batch, module.net)
+            terms = module.scene_terms(batch, module.net)
             for name, term in terms.items():
                 check(f"the term {name} of the loss", term)
             trained = {name: p for name, p in module.named_parameters() if p.requires_grad}
