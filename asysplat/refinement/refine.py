@@ -18,20 +18,15 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.ops.image_loss import image_loss
 from asysplat.refinement.corrections import Corrections, correct_exposure, correct_poses
-from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY, ScreenGradients
-from asysplat.refinement.densification.relocate import (
-    inject_position_noise,
-    mcmc_regularizer,
-    relocate,
-)
-from asysplat.refinement.densification.spawn import MIN_OPACITY, spawn_at_errors
+from asysplat.refinement.densification.clone_split import MAX_RESET_OPACITY, CloneSplitDensifier
+from asysplat.refinement.densification.densifier import Densifier
+from asysplat.refinement.densification.relocate import McmcDensifier
+from asysplat.refinement.densification.spawn import ErrorDensifier
 from asysplat.refinement.fields import MAX_SH_DEGREE, Fields, Parameters
 from asysplat.refinement.isotropic import footprints
 from asysplat.refinement.settings import RefinementSettings
 from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
-
-VIEWS_PER_ROUND = 8  # rendered to find pixels with large errors
 
 
 @dataclass(frozen=True)
@@ -52,7 +47,8 @@ class Refinement:
         gaussians: [N], initial values.
         views: the input views, [V].
         background: RGB; None: the mean color of the views.
-        settings, seed: the seed is of the order of the views and of new Gaussians.
+        settings: what is optimized, and how.
+        seed: seed of the order of views and of new Gaussians.
 
     Raises:
         InputError: no Gaussians, or invalid values.
@@ -79,9 +75,8 @@ class Refinement:
         self._half_views = views.resized(*size) if settings.half_resolution_until > 0 else views
         self._view_order = self._random_order()
         self._steps = 0
-        self._last_visible = torch.zeros(len(self.fields), dtype=torch.long)
-        self._screen_gradients = ScreenGradients(self.fields)
         self._max_gaussians = settings.limit(views.images[:, 0].numel())
+        self._densifier = self._make_densifier()
 
     @property
     def gaussians(self) -> Gaussians:
@@ -99,8 +94,7 @@ class Refinement:
         error, gradients = 0.0, None
         for view in chosen:
             mse, of_view = self._gradients(views.select([view]), view, leaves, factor)
-            if settings.densify == "gradient":
-                self._screen_gradients.add(of_view[0], views.cameras.select([view]))
+            self._densifier.observe_view(of_view[0], views.cameras.select([view]))
             gradients = of_view if gradients is None else list(map(torch.add, gradients, of_view))
             error += mse / len(chosen)
         gradients = dict(zip(leaves, gradients, strict=True))
@@ -110,14 +104,10 @@ class Refinement:
         visible = self.fields.step(
             gradients, settings.rates, factor, settings.decay_means_alone, degree
         )
-        if settings.densify == "mcmc":
-            inject_position_noise(self.fields, factor, self._generator)
+        self._densifier.observe_step(visible, factor)
         self._steps += 1
-        if settings.densify == "error":
-            self._last_visible[visible] = self._steps
         return error
 
-    @torch.no_grad()
     def densify(self, share: float, number: int = 1) -> None:
         """Prune, add or relocate Gaussians, by the method of the settings.
 
@@ -125,33 +115,18 @@ class Refinement:
             share: see `step`.
             number: number of this round, from 1 on.
         """
-        settings, views, target = self.settings, self._views(share), self._next_count(number)
-        if settings.densify == "mcmc":
-            relocate(self.fields, target, self._generator)
-        elif settings.densify == "gradient":
-            reset = settings.every is not None and self._steps > settings.every.opacity_reset
-            self._screen_gradients.clone_and_split(self._max_gaussians, self._generator, reset)
-        if settings.densify != "error":
-            return
-        opacities = self.fields.parameters["logits"].sigmoid()
-        # Every view has been used twice since.
-        unseen = self._steps - self._last_visible > 2 * views.num_views
-        useful = (opacities > MIN_OPACITY) & ~unseen
-        useful[opacities.argmax()] = True  # never prune all
-        rows = torch.nonzero(useful)[:, 0]
-        self.fields.keep(rows)
-        self._last_visible = self._last_visible[rows]
-        count = target - len(self.fields)
-        if count > 0:
-            order = torch.randperm(views.num_views, generator=self._generator)
-            views, now = views.select(order[:VIEWS_PER_ROUND]), self.gaussians
-            each = (views.cameras.select([view]) for view in range(views.num_views))
-            outs = [render(now, camera, self.background, depth="median") for camera in each]
-            images, depths = torch.cat([o.image for o in outs]), torch.cat([o.depth for o in outs])
-            new = spawn_at_errors(views, images, depths, count, self._generator)
-            self.fields.append(new, self._units(new.means))
-            visible = self._last_visible.new_full((new.num_gaussians,), self._steps)
-            self._last_visible = torch.cat((self._last_visible, visible))
+        self._densifier.densify(self._views(share), self._next_count(number))
+
+    def _make_densifier(self) -> Densifier:
+        every, both = self.settings.every, (self.fields, self._generator)
+        if self.settings.densify == "error":
+            return ErrorDensifier(*both, self.background, self._units)
+        if self.settings.densify == "mcmc":
+            return McmcDensifier(*both)
+        if self.settings.densify == "gradient":
+            first_reset = None if every is None else every.opacity_reset
+            return CloneSplitDensifier(*both, self._max_gaussians, first_reset)
+        return Densifier()
 
     def reset_opacities(self) -> None:
         """Lower all opacities, so that those that are not needed are pruned (Kerbl et al. 2023)."""
@@ -177,8 +152,7 @@ class Refinement:
             loss = F.mse_loss(target.masked(image), target.images)
         else:
             loss = image_loss(image, target.images, self.settings.ssim, target.masks).sum()
-        if self.settings.densify == "mcmc":
-            loss = loss + mcmc_regularizer(gaussians)
+        loss = loss + self._densifier.regularizer(gaussians)
         gradients = torch.autograd.grad(loss, [*leaves.values(), *correction.values()])
         if correction:
             own = dict(zip(correction, gradients[len(leaves) :], strict=True))

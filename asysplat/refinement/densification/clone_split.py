@@ -7,13 +7,14 @@ the constants of its code.
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.geometry.rotations import rotations
+from asysplat.refinement.densification.densifier import Densifier
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.scene import Cameras
+from asysplat.scene import Cameras, Views
 
 DENSIFY_GRAD_THRESHOLD = 2e-4  # mean screen-space gradient, in half images
 SPLIT_SCALE = 0.011  # scale above which a Gaussian is split: 1 % of the scene extent of 1.1
@@ -21,6 +22,37 @@ SPLIT_FACTOR = 1.6  # factor by which the two halves are smaller
 MAX_SCALE = 0.11  # above it a Gaussian is pruned, after the first opacity reset: 10 % of the extent
 MAX_RADIUS = 20.0  # likewise, in pixels of any image: three standard deviations
 MAX_RESET_OPACITY = 0.01
+
+
+class CloneSplitDensifier(Densifier):
+    """Clones and splits by the gradients since the last round.
+
+    Args:
+        fields: the Gaussians.
+        generator: random generator.
+        max_gaussians: limit of their number.
+        first_reset: step of the first opacity reset, after which large ones are pruned; None: none.
+    """
+
+    def __init__(
+        self,
+        fields: Fields,
+        generator: torch.Generator,
+        max_gaussians: int,
+        first_reset: int | None,
+    ):
+        self.generator, self.max_gaussians, self.first_reset = generator, max_gaussians, first_reset
+        self._gradients, self._steps = ScreenGradients(fields), 0
+
+    def observe_view(self, gradients: Float[Tensor, "N 3"], cameras: Cameras) -> None:
+        self._gradients.add(gradients, cameras)
+
+    def observe_step(self, visible: Bool[Tensor, "N"], factor: float) -> None:
+        self._steps += 1
+
+    def densify(self, views: Views, target: int) -> None:
+        prune_large = self.first_reset is not None and self._steps > self.first_reset
+        self._gradients.clone_and_split(self.max_gaussians, self.generator, prune_large)
 
 
 class ScreenGradients:

@@ -6,19 +6,41 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from asysplat.geometry.rotations import rotations
+from asysplat.refinement.densification.densifier import Densifier
 from asysplat.refinement.densification.spawn import MIN_OPACITY
 from asysplat.refinement.fields import Fields
-from asysplat.scene import Gaussians
+from asysplat.scene import Gaussians, Views
 
 REGULARIZER = 0.01  # weight of the mean opacity, and of the mean scale
 NOISE = 80.0  # the paper's factor, 5e5, times its learning rate of means, 1.6e-4
 SHARPNESS = 100  # steepness of the sigmoid of opacity that gates the noise
 NOISE_MAX_OPACITY = 0.1  # above it the gate is below 1e-4, and the noise is left out
 MAX_COPIES = 51  # Gaussians at one position for which Eq. 9 is evaluated, as in the paper's code
+
+
+class McmcDensifier(Densifier):
+    """Relocates dead Gaussians and adds copies; noise explores positions.
+
+    Args:
+        fields: the Gaussians.
+        generator: random generator.
+    """
+
+    def __init__(self, fields: Fields, generator: torch.Generator):
+        self.fields, self.generator = fields, generator
+
+    def regularizer(self, gaussians: Gaussians) -> Tensor:
+        return mcmc_regularizer(gaussians)
+
+    def observe_step(self, visible: Bool[Tensor, "N"], factor: float) -> None:
+        inject_position_noise(self.fields, factor, self.generator)
+
+    def densify(self, views: Views, target: int) -> None:
+        relocate(self.fields, target, self.generator)
 
 
 def mcmc_regularizer(gaussians: Gaussians) -> Tensor:
@@ -34,9 +56,9 @@ def relocate(fields: Fields, target: int, generator: torch.Generator) -> None:
     and originals is reset.
 
     Args:
-        fields: of the Gaussians; changed ones are moved to the end.
+        fields: the Gaussians; changed ones are moved to the end.
         target: number of Gaussians to which copies are added.
-        generator: of random numbers.
+        generator: random generator.
     """
     alive = fields.gaussians().opacities > MIN_OPACITY
     if alive.any():

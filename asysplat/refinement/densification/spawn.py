@@ -1,17 +1,71 @@
 """Densification by rendering errors: spawn Gaussians at pixels with a large error."""
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from asysplat.refinement.densification.densifier import Densifier
+from asysplat.refinement.fields import Fields
 from asysplat.refinement.isotropic import isotropic_gaussians
+from asysplat.rendering import render
 from asysplat.scene import Gaussians, Views
 
 MIN_OPACITY = 0.005  # Gaussians below it are pruned (Kerbl et al. 2023)
 SPAWN_SIZE = 0.5  # standard deviation of a new Gaussian, in pixels
 SPAWN_OPACITY = 0.1
 ERROR_WINDOW = 3  # pixels over which errors are averaged, as a single one may be noise
+VIEWS_PER_ROUND = 8  # rendered to find pixels with large errors
+
+
+class ErrorDensifier(Densifier):
+    """Prunes faint and unseen Gaussians, and spawns others at pixels with a large error.
+
+    Args:
+        fields: the Gaussians.
+        generator: random generator.
+        background: RGB behind the Gaussians.
+        units: function that computes the unit of the offsets at positions, see `Fields`.
+    """
+
+    def __init__(
+        self,
+        fields: Fields,
+        generator: torch.Generator,
+        background: Float[Tensor, "3"],
+        units: Callable[[Tensor], Tensor],
+    ):
+        self.fields, self.generator, self.background = fields, generator, background
+        self.units, self._steps = units, 0
+        self._last_visible = torch.zeros(len(fields), dtype=torch.long)
+
+    def observe_step(self, visible: Bool[Tensor, "N"], factor: float) -> None:
+        self._steps += 1
+        self._last_visible[visible] = self._steps
+
+    @torch.no_grad()
+    def densify(self, views: Views, target: int) -> None:
+        opacities = self.fields.parameters["logits"].sigmoid()
+        # Every view has been used twice since.
+        unseen = self._steps - self._last_visible > 2 * views.num_views
+        useful = (opacities > MIN_OPACITY) & ~unseen
+        useful[opacities.argmax()] = True  # never prune all
+        rows = torch.nonzero(useful)[:, 0]
+        self.fields.keep(rows)
+        self._last_visible = self._last_visible[rows]
+        count = target - len(self.fields)
+        if count > 0:
+            order = torch.randperm(views.num_views, generator=self.generator)
+            views, now = views.select(order[:VIEWS_PER_ROUND]), self.fields.gaussians()
+            cameras = (views.cameras.select([view]) for view in range(views.num_views))
+            outs = [render(now, camera, self.background, depth="median") for camera in cameras]
+            images, depths = torch.cat([o.image for o in outs]), torch.cat([o.depth for o in outs])
+            new = spawn_at_errors(views, images, depths, count, self.generator)
+            self.fields.append(new, self.units(new.means))
+            visible = self._last_visible.new_full((new.num_gaussians,), self._steps)
+            self._last_visible = torch.cat((self._last_visible, visible))
 
 
 @torch.no_grad()
