@@ -54,6 +54,7 @@ def command(
             with exit_with_message(stopped):
                 return function(config)
 
+        @functools.wraps(function)
         def main() -> object:
             handle_signals()
             interrupt_once()

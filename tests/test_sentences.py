@@ -13,12 +13,11 @@ from torch import nn
 
 import asysplat
 from asysplat import load, read_gaussians, refine
-from asysplat.data import ProceduralScene, SceneOptions, open_scene
+from asysplat.data import ProceduralScene, SceneOptions, open_scene, photographs
 from asysplat.data.bad_images import BadImages
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.overrides import check_overrides
-from asysplat.refinement import photographs
 from asysplat.refinement.adam import SelectiveAdam
 from asysplat.runs.checkpoints import load_weights
 from asysplat.runs.run_folder import locked
