@@ -121,7 +121,7 @@ def new_folder(path: Path, room: int) -> Path:
     """Create a folder that was not there: `path`, or else `path`-2, -3, ...
 
     Args:
-        path: of the folder.
+        path: the folder.
         room: bytes that must be free on its disk.
 
     Raises:

@@ -49,7 +49,7 @@ def bars(
 
     Args:
         parts: the lengths of a part in all bars; one that is 0 everywhere is left out.
-        label: of the lengths.
+        label: label of the lengths.
     """
     colors = matplotlib.colormaps["tab10"].colors
     with matplotlib.rc_context(STYLE):

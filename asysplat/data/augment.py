@@ -99,7 +99,7 @@ def center_crop(views: Views, share: float) -> Views:
 
     Args:
         views: [V, ...].
-        share: of the sides to keep, in (0, 1].
+        share: fraction of each side to keep, in (0, 1].
     """
     height, width = views.cameras.height, views.cameras.width
     rows, columns = max(1, round(share * height)), max(1, round(share * width))

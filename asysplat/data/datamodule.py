@@ -47,7 +47,7 @@ class SceneDataModule(lightning.LightningDataModule):
         height, width: size in pixels of every view from `source`; test sets may have another.
         batch_size: scenes of an optimizer step, of all processes together.
         num_workers: number of processes that load ahead; 0 loads in the training process.
-        seed: of the training tasks.
+        seed: seed of the training tasks.
         steps_per_epoch: steps between two validations.
         test_sets: further test sets by name, each a function that returns its tasks; one with the
             data set's name replaces the source's test.

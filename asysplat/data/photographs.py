@@ -74,7 +74,7 @@ def open_photographs(
 
     Args:
         path, layout, on_bad_image: see `open_scene`.
-        height, width: of the views, in pixels; width None keeps the first photograph's aspect
+        height, width: size of the views in pixels; width None keeps the first photograph's aspect
             ratio.
         views, max_held_out: number of input and of held-out views, at most; views None: as many
             input views as MAX_BYTES hold.

@@ -20,7 +20,7 @@ def depths_of_points(points: Points, cameras: Cameras) -> Float[Tensor, "V H W"]
 
     Args:
         points: in the world of the cameras.
-        cameras: of one scene, [V].
+        cameras: one scene's cameras, [V].
     """
     points = torch.as_tensor(points, dtype=torch.float64)
     exact = cameras.to(torch.float64)

@@ -100,7 +100,7 @@ class PosedScene:
         name: unique within the data set.
         images: in the order they were taken.
         read_points: reads sparse points of the scene's surfaces; None where the files have none.
-        origin: of the poses and points, in the coordinates of the files; see `near_origin`.
+        origin: origin of the poses and points, in the coordinates of the files; see `near_origin`.
     """
 
     name: str

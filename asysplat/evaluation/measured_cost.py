@@ -54,7 +54,7 @@ class CostMeter:
     All meters share the process's peak, so their intervals must not overlap.
 
     Args:
-        device: of the work.
+        device: device of the work.
     """
 
     def __init__(self, device: torch.device):

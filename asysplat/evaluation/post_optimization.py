@@ -55,7 +55,7 @@ class PostOptimization:
 
     Args:
         steps: after which to measure, increasing; 0: as predicted.
-        protocol: of the metrics.
+        protocol: how views are measured.
         lpips: as for `Protocol.image_metrics`.
         background: RGB in [0, 1] behind the Gaussians; None: the mean color of the inputs.
         backgrounds: scene's name -> background of this scene, where another one is known.

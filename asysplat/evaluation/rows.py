@@ -18,7 +18,7 @@ def average(rows: Sequence[ImageRow], over: Literal["images", "scenes"]) -> dict
     """Average every numeric column over the images that have it; NaN is left out.
 
     Args:
-        rows: of one test set.
+        rows: images of one test set.
         over: "images": all at once, or "scenes": the images of each scene first, then the scenes.
     """
     if over == "scenes":

@@ -69,7 +69,7 @@ def static_costs(net: nn.Module, num_views: int, height: int, width: int) -> dic
 
     Args:
         net: on any device; its costs are counted on a copy on the meta device.
-        num_views, height, width: of the input.
+        num_views, height, width: number and size of the input views.
 
     Returns:
         parameters; geometry_ratio, of 1; gflops as the paper counts them (`module_flops`) and

@@ -32,8 +32,8 @@ def read_gaussians(
     """Read a scene from a .ply, .splat or .safetensors file.
 
     Args:
-        path: of the file.
-        origin: of the coordinates of the means; None: the file's own, whose offset (see
+        path: the file.
+        origin: origin of the means' coordinates; None: the file's own, whose offset (see
             `write_ply`) is left out.
         dtype: the result's type; only .safetensors may hold more than float32.
 

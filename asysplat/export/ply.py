@@ -35,7 +35,7 @@ def write_ply(
     Quaternions are normalized, and an opacity of 1 is written as 1 - 1e-7.
 
     Args:
-        path: of the file.
+        path: the file.
         gaussians: [N].
         offset: to be added to the means, which float32 may not resolve: written as a comment,
             `comment offset X Y Z`, if it is not 0.

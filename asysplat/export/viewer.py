@@ -74,7 +74,7 @@ class Viewer:
     Args:
         views: input views, [V]; of images of one pixel, frames alone are drawn.
         gaussians: [N]; None to `show` them later.
-        port: of this machine; the next free one is used if it is taken; 0: any free one.
+        port: port of this machine; the next free one is used if it is taken; 0: any free one.
 
     Raises:
         InputError: viser is not installed; views or Gaussians with batch dimensions.

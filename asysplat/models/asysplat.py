@@ -23,7 +23,7 @@ class AsySplat(TokenNetwork):
     Every component is a callable that builds a module, so that a configuration can replace it.
 
     Args:
-        widths: of both branches.
+        widths: both branches' widths.
         stage_ratios: r_s of each network stage.
         layers: the layer mix of every stage, such as "4m4s": counts and letters of `blocks`.
         blocks: letter -> component built from a StageShape.

@@ -111,7 +111,7 @@ class CrossAttention(nn.Module):
     """x + o(attn(q(LN x), kv(LN context))), then x + MLP(LN x), within each view.
 
     Args:
-        shape: of the attending tokens.
+        shape: shape of the attending tokens.
         context_width: width of the attended tokens.
         inner_width: width of queries, keys and values.
     """

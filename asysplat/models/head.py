@@ -130,7 +130,7 @@ class ResidualHead(GaussianHead):
     the appearance branch contributes less than in a head without it.
 
     Args:
-        width, patch_coarse, patch_fine, opacity_bias: of GaussianHead.
+        width, patch_coarse, patch_fine, opacity_bias: see GaussianHead.
         sh_degree: 0 to 3; None: the colors are those of the image.
         near, far: distances along the ray lie between them, in units of the normalized scene.
         scale_bias: log of an untrained size, in pixel footprints.
@@ -186,7 +186,7 @@ class LongLRMHead(GaussianHead):
     does, and a far one at 1e6, beyond every prediction.
 
     Args:
-        width, patch_coarse, patch_fine, sh_degree, opacity_bias: of GaussianHead.
+        width, patch_coarse, patch_fine, sh_degree, opacity_bias: see GaussianHead.
         farthest: greatest distance, in that unit.
         scale_bias: log of an untrained size.
         largest: log of the largest size.

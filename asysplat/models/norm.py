@@ -12,7 +12,7 @@ class RMSNorm(nn.RMSNorm):
     If weights and inputs differ in type, torch does not use its fused kernel.
 
     Args:
-        width: of the last dimension.
+        width: size of the last dimension.
     """
 
     def __init__(self, width: int):

@@ -19,7 +19,7 @@ class SingleBranch(TokenNetwork):
     """Tokens of one patch size through all stages; every pixel gives a Gaussian.
 
     Args:
-        widths: of the network stages; `widths.fine` is not used.
+        widths: the network stages' widths; `widths.fine` is not used.
         stage_ratios: MLP ratio of each stage.
         stage_layers: layer mix of each stage, counts and letters of `blocks`.
         merges: whether 2 x 2 tokens become one, before each stage.

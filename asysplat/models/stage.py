@@ -22,8 +22,8 @@ class Stage(nn.Module):
     The layers see global tokens and the others as one sequence.
 
     Args:
-        previous_width: of the incoming tokens.
-        shape: of this stage.
+        previous_width: width of the incoming tokens.
+        shape: shape of this stage.
         layers: the layer mix, counts and letters of `blocks`.
         blocks: letter -> component built from a StageShape, as in conf/model/blocks.yaml.
         merge: whether 2 x 2 tokens become one.

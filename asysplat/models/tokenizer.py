@@ -27,7 +27,7 @@ class Tokenizer(nn.Module):
     Args:
         patch: p_c or p_f, in pixels.
         width: d_c or d_f.
-        channels: of a pixel, PIXEL_CHANNELS plus those of the prior.
+        channels: channels of a pixel, PIXEL_CHANNELS plus those of the prior.
         bias: whether the LayerNorm has one.
     """
 

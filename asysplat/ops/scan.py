@@ -51,7 +51,7 @@ class Scan:
 
     Args:
         name: "ssd" or "selective_scan".
-        axes: of each input, such as "B L N"; those of x and N give all sizes.
+        axes: axes of each input, such as "B L N"; those of x and N give all sizes.
         forms: the functions in torch, by name.
         count_flops: (shape of x, shape of B) -> FLOPs of the forward and of the backward pass.
         largest: the sides that "cuda" takes as powers of two, from 16 to this size.

@@ -65,8 +65,8 @@ def fill_table(
 
     Args:
         table: the paper's.
-        overrides: of the command that started the sweep, without `sweeps=`. Paths may be left out;
-            a given path must have the same name as the run's.
+        overrides: options of the command that started the sweep, without `sweeps=`. Paths may be
+            left out; a given path must have the same name as the run's.
         compose: returns train.py's configuration.
         runs: to select from.
         systems: evaluations of other systems, see `system_rows`.

@@ -37,7 +37,7 @@ def draw_front(
     Args:
         points: at least one.
         better: "higher" or "lower", of the quality.
-        color: of the front.
+        color: color of the front.
         hollow: names of points to leave unfilled.
     """
     front = pareto_front(points, better)

@@ -76,8 +76,9 @@ def hashed_options(
     Missing values (`???`) are allowed.
 
     Args:
-        config: of a run.
-        earlier: of its stages before the last, whose hashes are returned; None: `stage_configs`.
+        config: a run's configuration.
+        earlier: configurations of its stages before the last, whose hashes are returned; None: those
+            of `stage_configs`.
     """
     earlier = stage_configs(config)[:-1] if earlier is None else earlier
     config = config.copy()

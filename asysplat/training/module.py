@@ -28,7 +28,7 @@ class SplattingModule(lightning.LightningModule):
 
     Args:
         net: views -> Gaussians; see `freeze_unused`.
-        loss: of an prediction against its batch.
+        loss: compares a prediction with its batch.
         optimizer: parameter groups -> optimizer; only `decaying` parameters have weight decay.
         schedule: optimizer -> its learning rates, one for each step.
         background: RGB in [0, 1] behind the Gaussians, or "inputs": the mean color of the input

@@ -75,13 +75,13 @@ def compare_to_reference(
     Args:
         fast: the function under test, from named tensors to named tensors.
         exact: the same function, for float64.
-        inputs: of `fast`; `exact` gets the same numbers.
+        inputs: inputs of `fast`; `exact` gets the same numbers.
         leaves: names of the inputs whose gradients are compared too.
         arithmetic: the float type in which `fast` computes, whatever its inputs are.
-        network: of `exact`, to perturb the outputs and gradients of its layers.
+        network: network of `exact`, to perturb the outputs and gradients of its layers.
         roundings: number of roundings in sequence.
         exponent: the largest argument of an exponential: e^s errs by s roundings.
-        magnitude: of an output's numbers; errors of smaller outputs are relative to it.
+        magnitude: magnitude of an output's numbers; errors of smaller outputs are relative to it.
 
     Returns:
         See `make_row`. "worst" names the tensor with the largest ratio of error and tolerance;

@@ -45,7 +45,7 @@ def measure(
     Pixels of the `boundary_band` are excluded: rounding may decide about a cut-off there.
 
     Args:
-        name: of HOSTILE_GAUSSIANS.
+        name: a key of HOSTILE_GAUSSIANS.
     """
     cameras = hostile.cameras()
     gaussians = scattered_gaussians(cameras)

@@ -36,7 +36,7 @@ class Matches:
     """Points matched between two images, one pair of images after the other.
 
     Args:
-        indices: of the two images of each match.
+        indices: indices of the two images of each match.
         points: x, y in both images, in pixels, the first pixel's center at +0.5.
     """
 

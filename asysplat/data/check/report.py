@@ -67,7 +67,7 @@ class Verdict:
     Args:
         fits: whether the cameras as read fit the images.
         sentence: the same in words; if they do not fit, the reason and what to do.
-        fit: of the cameras as read; None with too few matches.
+        fit: fit of the cameras as read; None with too few matches.
     """
 
     fits: bool

@@ -31,7 +31,7 @@ class FloorPlan:
         shell: materials of the walls at +-x, +-y, ceiling and floor; outdoors that of the ground.
         heights: [N, N] of the terrain; None in a room.
         light: position of the lamp or sun, [3].
-        irradiance: of a surface that faces the light from close by, linear RGB [3].
+        irradiance: irradiance of a surface that faces the light from close by, linear RGB [3].
         falloff: distance at which the light is half as strong.
         ambient: light from all directions, linear RGB [3].
         occupied: (spot, radius) of objects on the ground.

@@ -28,7 +28,7 @@ class Cone:
     """A cone around rays from one point, to cull objects outside of it.
 
     Args:
-        axis: of length 1.
+        axis: unit vector.
         angle: between the axis and the side, radians.
     """
 

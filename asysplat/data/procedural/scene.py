@@ -50,7 +50,7 @@ class ProceduralScene:
 
     Args:
         seed: any integer >= 0; see `split_seed`.
-        height, width: of the images, pixels.
+        height, width: size of the images in pixels.
         num_images: along the path.
         device: computes the images.
         places: rooms or outdoors; with both, the seed decides.

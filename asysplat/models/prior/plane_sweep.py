@@ -48,7 +48,7 @@ class PlaneSweepPrior(nn.Module):
 
     Args:
         planes, neighbors: see `plane_sweep`.
-        longest_side: of the swept images, pixels.
+        longest_side: longest side of the swept images in pixels.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ def plane_sweep(
 
     Args:
         images: RGB in [0, 1].
-        cameras: of the images, [B, V].
+        cameras: the images' cameras, [B, V].
         planes: number of inverse depths, at least 4.
         neighbors: most views that each view is compared with.
         backend: "reference" (torch, any device and float type), "cpu", "cuda", or "auto": the

@@ -13,7 +13,7 @@ class Rows(NamedTuple):
 
     Args:
         parameter: updated in place, like `mean`, `square` and `steps`.
-        gradient: of the loss.
+        gradient: gradient of the loss.
         mean, square: the decaying averages of the gradient and of its square.
         steps: number of updates of each row.
         rates: learning rate of each number of a row, >= 0.

@@ -121,7 +121,7 @@ def compare_bands(start, stop, images, weights, sums, gradient):
         images, weights: see `ImagePair` and `Weights`.
         sums: [bands, 2], written: of |d| over a band's pixels, and of 1 - SSIM over the windows
             that begin in the band.
-        gradient: of the loss, shaped as `images.rendered`, written; or None.
+        gradient: gradient of the loss, shaped as `images.rendered`, written; or None.
     """
     _, H, W = images.rendered.shape
     bands = -(-H // BAND)

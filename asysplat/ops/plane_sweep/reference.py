@@ -130,7 +130,7 @@ def sgm(
     A step between neighboring pixels costs less where the color changes.
 
     Args:
-        weights: of the pixels' costs, in [0, 1].
+        weights: weights of the pixels' costs, in [0, 1].
         edges: color differences to the left pixel, and to the pixel above.
     """
     costs = costs * weights[..., None].clamp_min(MIN_WEIGHT)

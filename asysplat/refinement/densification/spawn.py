@@ -85,7 +85,7 @@ def spawn_at_errors(
         rendered: their renderings.
         depth: rendered depth, 0 at the background.
         count: number of samples; fewer where fewer pixels have an error.
-        generator: of random numbers.
+        generator: random generator.
     """
     error = (views.masked(rendered) - views.images).abs().mean(1)
     error = F.avg_pool2d(error, ERROR_WINDOW, stride=1, padding=ERROR_WINDOW // 2) * (depth > 0)

@@ -32,7 +32,7 @@ def rasterize(
 
     Args:
         splats: M splats, sorted by depth within their image.
-        values: of each splat.
+        values: values of each splat.
         lists: from `list_tiles`; P = size * size pixels a tile, row by row.
         limits: the cut-offs.
         median: take the last value from the splat at which the transmittance falls to half or

@@ -36,8 +36,8 @@ class Checkpoints(ModelCheckpoint):
 
     Args:
         dirpath: the folder.
-        minutes: of training after which last.ckpt is written between validations; 0: after every
-            step; None: only after validations.
+        minutes: minutes of training after which last.ckpt is written between validations; 0: after
+            every step; None: only after validations.
         options: Lightning's.
     """
 

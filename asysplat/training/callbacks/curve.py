@@ -14,7 +14,7 @@ class Curve(lightning.Callback):
     """Writes a row for each validation; draws them after training.
 
     Args:
-        folder: of the run.
+        folder: the run's folder.
     """
 
     def __init__(self, folder: str):

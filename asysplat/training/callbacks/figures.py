@@ -14,7 +14,7 @@ class Figures(lightning.Callback):
     """Draws a `comparison_figure` of the first scenes of each validation and first test set.
 
     Args:
-        folder: of the run; the PNG files are written to its sub-folder `figures`.
+        folder: the run's folder; the PNG files are written to its sub-folder `figures`.
         scenes: how many scenes to draw.
     """
 

@@ -23,8 +23,8 @@ class Metrics(lightning.Callback):
     network's early exit left out, early_exit/<set>/<what>, means over scenes; none if exact.
 
     Args:
-        protocol: of the metrics.
-        folder: of the run; metrics.csv is written there after the test.
+        protocol: how views are measured.
+        folder: the run's folder; metrics.csv is written there after the test.
         backbone_dir: folder of LPIPS' backbone; without the backbone there is no LPIPS.
         download: whether to download a missing backbone.
     """

@@ -74,7 +74,7 @@ def count_views(start, stop, inputs, views, counts):
 
     Args:
         inputs: see `ConsistencyInputs`.
-        views: of a scene.
+        views: number of views of a scene.
         counts: see `reference.Consistency`, each [n, h, w].
     """
     h, w = inputs.maps.shape[1:3]

@@ -10,7 +10,7 @@ from asysplat.kernels.triton_utils import FUSED, INTERPRETED, kernel
 from asysplat.ops.plane_sweep import reference
 
 FRONT = tl.constexpr(reference.FRONT)
-PIXELS = 8192 if INTERPRETED else 256  # of a program
+PIXELS = 8192 if INTERPRETED else 256  # pixels of a program
 
 
 def consistency(
@@ -62,7 +62,7 @@ def count_views(
 
     Args:
         inverse, steps, trust, others, projections: see `reference.consistency`.
-        views, neighbors: of a scene, and of each view.
+        views, neighbors: number of views of a scene, and of other views of each.
     """
     view = tl.program_id(1).to(tl.int64)
     first = view // views * views

@@ -106,7 +106,7 @@ class _Sizes(NamedTuple):
     head_dim: int
     state: int
     reverse: bool
-    tokens: int  # of a chunk
+    tokens: int  # tokens of a chunk
     products: dict[str, Any]  # the type of a product's factors, and its precision
 
     @property
