@@ -77,8 +77,8 @@ def hashed_options(
 
     Args:
         config: a run's configuration.
-        earlier: configurations of its stages before the last, whose hashes are returned; None: those
-            of `stage_configs`.
+        earlier: configurations of its stages before the last, whose hashes are returned; None:
+            those of `stage_configs`.
     """
     earlier = stage_configs(config)[:-1] if earlier is None else earlier
     config = config.copy()
