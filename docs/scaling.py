@@ -35,7 +35,7 @@ def tables() -> dict[str, str]:
     cpu_seconds = {row["views"]: row["forward"]["median"] for row in growth}
     parts = model["rows"][0]["components"]
     all_parts = sum(part["seconds"]["median"] for part in parts.values())
-    step_seconds = model["rows"][1]["step"]["median"]  # of 32 views of 256x256, in bf16
+    step_seconds = model["rows"][1]["step"]["median"]  # median of 32 views of 256x256, in bf16
     flops = {
         (row["height"], row["width"]): PASSES * 1e9 * row["gflops_true"]
         for row in network
