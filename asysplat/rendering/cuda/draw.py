@@ -4,11 +4,11 @@ import math
 from collections.abc import Sequence
 
 import torch
-import triton
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from asysplat.errors import InputError
+from asysplat.kernels.triton_utils import INTERPRETED
 from asysplat.rendering.cuda.project import COUNTERS, project
 from asysplat.rendering.cuda.project_backward import project_backward, sum_pairs
 from asysplat.rendering.cuda.rasterize import SavedForBackward, rasterize, rasterize_backward
@@ -26,7 +26,6 @@ from asysplat.rendering.formulas import (
 from asysplat.rendering.interface import RenderOutputs, RenderSettings, check_pairs
 from asysplat.scene import Cameras, Gaussians
 
-INTERPRETED = triton.knobs.runtime.interpret  # on a CPU, in NumPy: for tests
 BLOCK = 128  # Gaussians of a program
 BACKWARD_BLOCK = 64
 SUM_BLOCK = 32  # splats of a program, whose pairs are summed
