@@ -140,7 +140,7 @@ def initialize(
         network = load(config.checkpoint)
         network.early_exit = instantiate(config.speed)
     if init not in INITS and Path(str(init)).suffix:
-        gaussians = photographs.frame.to_network(read_gaussians(init, photographs.origin))
+        gaussians = photographs.normalization.to_network(read_gaussians(init, photographs.origin))
     else:
         gaussians = initial_gaussians(init, photographs, settings, network)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")

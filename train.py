@@ -26,6 +26,7 @@ from asysplat.runs.runs import find_run
 from asysplat.training.prepare import (
     PreparedRun,
     TrainingStage,
+    instantiate_option,
     prepare_run,
     without_missing_network,
 )
@@ -55,7 +56,14 @@ def train_stage(run: PreparedRun, stage: TrainingStage) -> None:
     net = instantiate(config.model)
     module = instantiate(config.training, net=net)
     early_exit = instantiate(config.speed)
-    trainer, callbacks = stage.prepare(data, module, early_exit)
+    stage.check(data, module, early_exit)
+    stage.load(module)
+    logger = instantiate_option(config, "logger")
+    callbacks = instantiate(config.get("callbacks") or {})
+    callbacks = {name: callback for name, callback in callbacks.items() if callback is not None}
+    options = stage.trainer_options(callbacks, logger)
+    trainer = instantiate_option(config, "trainer", **options)
+    stage.begin(trainer, data)
     trainer.fit(module, data, ckpt_path=stage.checkpoint, weights_only=True)
     net.early_exit = early_exit
     trainer.test(module, data, verbose=False)
@@ -80,25 +88,25 @@ def train_in_sweep(config: DictConfig) -> float | None:
         print(f"job {job.num}: finished already{other}\nrun: {finished.folder}", flush=True)
         return finished.results.get(f"test/{config.data.name}/psnr")
     except Exception as error:
-        message = error_message(error)
-        if message is None:
+        reason = error_message(error)
+        if reason is None:
             traceback.print_exc()
-        sentence = f"failed: job {job.num}: {job.override_dirname}: {message or repr(error)}"
-        print(sentence, file=sys.stderr, flush=True)
-        raise CompactHydraException(sentence) from None
+        message = f"failed: job {job.num}: {job.override_dirname}: {reason or repr(error)}"
+        print(message, file=sys.stderr, flush=True)
+        raise CompactHydraException(message) from None
 
 
-def logs_of(overrides: list[str]) -> Path:
+def find_logs(overrides: list[str]) -> Path:
     """Return paths.logs of a command, whose folder Hydra writes to before `main`."""
-    given = (
+    folders = (
         word.partition("=")[2] for word in reversed(overrides) if word.startswith("paths.logs=")
     )
-    return Path(next(given, "logs"))
+    return Path(next(folders, "logs"))
 
 
 if __name__ == "__main__":
     with exit_with_message("stopped."):
-        check_writable(logs_of(sys.argv), "paths.logs")
+        check_writable(find_logs(sys.argv), "paths.logs")
     OmegaConf.register_new_resolver("run_folder", run_folder, replace=True, use_cache=True)
     OmegaConf.register_new_resolver("job_name", job_name, replace=True)
     main()  # SweepTable ends a sweep with how to resume

@@ -3,7 +3,7 @@
 photographs = asysplat.open_photographs("my_scene", height=128, width=128, views=8)
 gaussians = asysplat.load("shipped")(photographs.inputs)
 gaussians = asysplat.refine(gaussians, photographs.inputs, seconds=10.0)
-asysplat.write_gaussians("scene.ply", photographs.frame.to_world(gaussians))
+asysplat.write_gaussians("scene.ply", photographs.normalization.to_world(gaussians))
 """
 
 from asysplat.later import import_later

@@ -15,12 +15,12 @@ from asysplat.data.check.matches import find_matches
 from asysplat.data.check.report import diagnose_cameras
 from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.selection.views import evenly_spaced
-from asysplat.data.sequence import FileSequence, SceneOptions
+from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Views
 
 MATCHED_SIDE = 400  # pixels of the shorter side, to check the cameras
-ANY_SIZE = 8  # pixels a side: to read cameras, before the size is known
+ANY_SIZE = 8  # pixels a side: bad images are decoded at it, before the size is known
 MAX_BYTES = 2 * 10**9  # size of all input views; a refinement takes about as much again
 BYTES_PER_PIXEL = 15  # float32 RGB, and the same at half the size
 GIVEN = CameraOptions()
@@ -35,7 +35,7 @@ class Photographs:
     held_out: Views | None
     input_files: list[str]
     held_out_files: list[str]
-    frame: Normalization  # the network's frame, in the world of the files
+    normalization: Normalization  # from the world of the files to the network's frame
     points: Float[Tensor, "P 3"] | None
     total: int = 0  # photographs of the scene
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # offset subtracted by `near_origin`
@@ -85,14 +85,7 @@ def open_photographs(
     Raises:
         InputError: fewer than two input views; see `open_scene`.
     """
-    counts = (height, width or 1, 2 if views is None else views, held_out_every or 2, max_held_out)
-    whole = all(isinstance(count, int) for count in counts)
-    if not whole or min(counts[:2]) < 1 or min(counts[2:4]) < 2 or max_held_out < 1 or width == 0:
-        raise InputError(
-            f"height={height}, width={width}, views={views}, held_out_every={held_out_every} and "
-            f"max_held_out={max_held_out}: give whole numbers, at least 1 pixel, 2 views, 1 "
-            "held-out view, and held_out_every of 2 or more, or null."
-        )
+    _check_counts(height, width, views, held_out_every, max_held_out)
     if found := find_missing(path, layout, on_bad_image, cameras):
         say(f"cameras: found, see {found}")
         path, layout = found, "auto"
@@ -105,45 +98,78 @@ def open_photographs(
             say(f"height={height}: the photographs have {lens.height} pixels, which are used.")
             height = lens.height
         width = max(1, round(height * lens.width / lens.height))
-    indices = list(range(len(scene.images)))
-    held_out = indices[::held_out_every] if held_out_every else []
-    rest = sorted(set(indices) - set(held_out))
-    if len(rest) < 2:
-        raise InputError(
-            f"{path} has {len(indices)} photographs, of which held_out_every={held_out_every} "
-            f"leaves {len(rest)}: set held_out_every=null, or give more photographs."
-        )
     if views is None:
         views = max(2, MAX_BYTES // (height * width * BYTES_PER_PIXEL))
+    held_out = list(range(len(scene.images)))[::held_out_every] if held_out_every else []
+    rest = sorted(set(range(len(scene.images))) - set(held_out))
+    if len(rest) < 2:
+        raise InputError(
+            f"{path} has {len(scene.images)} photographs, of which held_out_every={held_out_every} "
+            f"leaves {len(rest)}: set held_out_every=null, or give more photographs."
+        )
     inputs = evenly_spaced(rest, min(views, len(rest)))
     held_out = evenly_spaced(held_out, min(max_held_out, len(held_out))) if held_out else []
     if not found:
-        used = sorted((*inputs, *held_out))
-        part = refine_given(replace(scene, images=[scene.images[i] for i in used]), cameras, say)
-        images = dict(enumerate(scene.images)) | dict(zip(used, part.images, strict=True))
+        selected = sorted((*inputs, *held_out))
+        part = refine_given(
+            replace(scene, images=[scene.images[i] for i in selected]), cameras, say
+        )
+        images = dict(enumerate(scene.images)) | dict(zip(selected, part.images, strict=True))
         scene = replace(part, images=list(images.values()))
+    _warn_of_wrong_cameras(scene, say)
     sequence = FileSequence(scene, SceneOptions(height, width))
+    both = (sequence.views(index).validate(str(path)) for index in (inputs, held_out or inputs[:1]))
+    input_views, targets, normalization = normalize(*both)
     files = [str(image.file) for image in scene.images]
-    input_files = [files[index] for index in inputs]
-    # All photographs: neighbors among the inputs may be too far apart to match.
-    share = MATCHED_SIDE / min(lens.height, lens.width)
-    size = (max(1, round(min(1.0, share) * side)) for side in (lens.height, lens.width))
+    return Photographs(
+        name=scene.name,
+        inputs=input_views,
+        held_out=targets if held_out else None,
+        input_files=[files[index] for index in inputs],
+        held_out_files=[files[index] for index in held_out],
+        normalization=normalization,
+        points=_normalized_points(scene, normalization),
+        total=len(scene.images),
+        origin=scene.origin,
+    )
+
+
+def _check_counts(
+    height: int, width: int | None, views: int | None, held_out_every: int | None, max_held_out: int
+) -> None:
+    counts = (height, width or 1, 2 if views is None else views, held_out_every or 2, max_held_out)
+    whole = all(isinstance(count, int) for count in counts)
+    if not whole or min(counts[:2]) < 1 or min(counts[2:4]) < 2 or max_held_out < 1 or width == 0:
+        raise InputError(
+            f"height={height}, width={width}, views={views}, held_out_every={held_out_every} and "
+            f"max_held_out={max_held_out}: give whole numbers, at least 1 pixel, 2 views, 1 "
+            "held-out view, and held_out_every of 2 or more, or null."
+        )
+
+
+def _warn_of_wrong_cameras(scene: PosedScene, say: Callable[[str], None]) -> None:
+    """Warn if matching points of the photographs show that the cameras do not fit them.
+
+    All photographs are matched: neighbors among the inputs may be too far apart.
+    """
+    lens = scene.images[0].lens
+    scale = min(1.0, MATCHED_SIDE / min(lens.height, lens.width))
+    size = (max(1, round(scale * side)) for side in (lens.height, lens.width))
     matched = FileSequence(scene, SceneOptions(*size))
+    files = [str(image.file) for image in scene.images]
     verdict = diagnose_cameras(matched.cameras, find_matches(matched), files)
     if not verdict.fits and verdict.fit is not None:  # else too few points match to tell
         say(
             f"warning: {verdict.sentence}; python -m asysplat.data.check shows it at full size. "
             "The reconstruction goes on."
         )
-    both = (sequence.views(index).validate(str(path)) for index in (inputs, held_out or inputs[:1]))
-    input_views, targets, frame = normalize(*both)
-    points = None
-    if scene.points is not None and len(scene.points):
-        pose = frame.world_to_mean
-        points = torch.as_tensor(scene.points, dtype=torch.float64)
-        points = ((points @ pose[:3, :3].mT + pose[:3, 3]) * frame.scale).float()
-    held_out_files = [files[index] for index in held_out]
-    targets = targets if held_out else None
-    files = input_files, held_out_files
-    total, origin = len(indices), scene.origin
-    return Photographs(scene.name, input_views, targets, *files, frame, points, total, origin)
+
+
+def _normalized_points(
+    scene: PosedScene, normalization: Normalization
+) -> Float[Tensor, "P 3"] | None:
+    if scene.points is None or not len(scene.points):
+        return None
+    pose = normalization.world_to_mean
+    points = torch.as_tensor(scene.points, dtype=torch.float64)
+    return ((points @ pose[:3, :3].mT + pose[:3, 3]) * normalization.scale).float()

@@ -324,7 +324,7 @@ def main(scene: str, folder: str | None) -> None:
         if folder is not None:
             photographs = open_photographs(folder, height=FRUSTUM_HEIGHT)
             gaussians = read_gaussians(scene, photographs.origin)
-            views, gaussians = photographs.inputs, photographs.frame.to_network(gaussians)
+            views, gaussians = photographs.inputs, photographs.normalization.to_network(gaussians)
         else:
             gaussians = read_gaussians(scene)
             cameras = cameras_beside(Path(scene), gaussians) or _camera_before(gaussians)

@@ -2,10 +2,8 @@
 
 import json
 import os
-import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from hydra.utils import instantiate
 from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from asysplat.data.photographs import Photographs
@@ -33,6 +30,7 @@ from asysplat.refinement.refine import RefinementProgress
 from asysplat.rendering import Rendering, render
 from asysplat.runs.summary import metric_cells, write_json
 from asysplat.scene import Gaussians, Views
+from asysplat.terminal import print_table
 
 SCENE = "scene.safetensors"
 BYTES_PER_GAUSSIAN = 2 * 4 * 62  # size in scene.ply and scene.safetensors together, at most
@@ -87,7 +85,10 @@ class Results:
         Raises:
             InputError: a file cannot be written; the scene is elsewhere then, see `save_ply`.
         """
-        world, origin = self._photographs.frame.to_world(gaussians), self._photographs.origin
+        world, origin = (
+            self._photographs.normalization.to_world(gaussians),
+            self._photographs.origin,
+        )
         background = self._background.tolist()
         save_ply(self.folder / "scene.ply", world, origin, background)
         numbers = {"background": background, "offset": origin}
@@ -129,7 +130,7 @@ class Results:
         """Write the cameras of inputs and held-out views in the world of the scene files."""
         photographs = self._photographs
         files = map(os.path.abspath, photographs.input_files + photographs.held_out_files)
-        cameras = photographs.frame.cameras_to_world(photographs.cameras)
+        cameras = photographs.normalization.cameras_to_world(photographs.cameras)
         with atomic_write(self.folder / CAMERAS) as path:
             path.write_text(json.dumps(describe_cameras(cameras, list(files)), indent=1))
 
@@ -187,35 +188,21 @@ def save_ply(
 ) -> None:
     """Write a scene; where that fails, write it elsewhere, as the refinement took long.
 
-    It is tried in the folders for temporary files and of the user, in `path` without view-dependent
-    colors, and in the folders that the user types, where there is a terminal.
-
     Raises:
-        InputError: the scene is not at `path`, or not complete; the message names its place.
+        InputError: the scene is not at `path`; the message names where it is instead: in the folder
+            for temporary files, or else the user's.
     """
-    failure = None
-    for place, scene in _attempts(path, gaussians):
-        try:
-            write_ply(place, scene, offset, background)
-        except InputError as error:
-            failure = failure or error
-            continue
-        if failure is None:
-            return
-        left_out = ", without view-dependent colors" if scene is not gaussians else ""
-        raise InputError(f"{failure} The scene was written to {place}{left_out}.")
-    raise failure
-
-
-def _attempts(path: Path, gaussians: Gaussians) -> Iterator[tuple[Path, Gaussians]]:
-    yield path, gaussians
-    name = f"{path.parent.name}-{path.name}"
-    for folder in (Path(tempfile.gettempdir()), Path.home()):
-        yield folder / name, gaussians
-    yield path, replace(gaussians, sh=gaussians.sh[:, :1])
-    while sys.stdin.isatty():
-        folder = input(f"The disks are full. Folder to write {name} to (Ctrl-C to give up): ")
-        yield Path(folder).expanduser() / name, gaussians
+    try:
+        write_ply(path, gaussians, offset, background)
+    except InputError as failure:
+        for folder in (Path(tempfile.gettempdir()), Path.home()):
+            rescued = folder / f"{path.parent.name}-{path.name}"
+            try:
+                write_ply(rescued, gaussians, offset, background)
+            except InputError:
+                continue
+            raise InputError(f"{failure} The scene was written to {rescued}.") from None
+        raise
 
 
 def _means(name: str, rows: list[dict[str, float]]) -> dict[str, float]:
@@ -226,8 +213,9 @@ def _print_table(results: dict[str, float | int | str]) -> None:
     rows = {"held out": "held_out", "inputs": "inputs"}
     rows |= {title: f"baseline/{name}" for name, (title, _) in BASELINES.items()}
     metrics = [m for m in METRICS if any(f"{row}/{m}" in results for row in rows.values())]
-    table = Table("", *(METRICS[metric] for metric in metrics))
-    for title, row in rows.items():
-        if f"{row}/psnr" in results:
-            table.add_row(title, *metric_cells(results, row, metrics))
-    Console().print(table)
+    cells = [
+        [title, *metric_cells(results, row, metrics)]
+        for title, row in rows.items()
+        if f"{row}/psnr" in results
+    ]
+    print_table(Console(), ["", *(METRICS[metric] for metric in metrics)], cells)

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from asysplat.evaluation.baselines import BASELINES
 from asysplat.evaluation.measured_cost import SECONDS
@@ -41,7 +40,7 @@ def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
     return ["" if value is None else f"{value:.{digits}f}" for value in values]
 
 
-def cost_sentence(results: Results) -> str:
+def describe_costs(results: Results) -> str:
     """Write the measured costs as a sentence; empty if none were measured."""
     costs = []
     if "cost/parameters" in results:
@@ -67,23 +66,29 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
     """
     keys = [key.split("/") for key in results]
     test_sets = [key[1] for key in keys if key[0] == "test" and key[2] == "psnr"]
-    tables = []
+    console = Console()
     if data in test_sets:
         metrics = [name for name in METRICS if f"test/{data}/{name}" in results]
-        title = f"test scenes: {data}, metrics: {results['protocol/name']}"
-        tables = [Table("", *(METRICS[name] for name in metrics), title=title)]
         ending = f"/test/{data}/psnr"
         stages = [key.removesuffix(ending) for key in results if key.endswith(ending)]
         methods = {f"after {stage}": f"{stage}/test/{{}}" for stage in stages} | ROWS
-        for label, method in methods.items():
-            tables[0].add_row(label, *metric_cells(results, method.format(data), metrics))
+        rows = [
+            [label, *metric_cells(results, method.format(data), metrics)]
+            for label, method in methods.items()
+        ]
+        title = f"test scenes: {data}, metrics: {results['protocol/name']}"
+        print_table(console, ["", *(METRICS[name] for name in metrics)], rows, title)
     others = [name for name in test_sets if name != data]
     if others:
-        tables.append(Table("", *ROWS, title="other test sets, PSNR (dB)"))
-    for name in others:
-        values = (results[f"{method.format(name)}/psnr"] for method in ROWS.values())
-        tables[-1].add_row(name, *_cells(values))
-    _print([*tables, cost_sentence(results)], folder, "test")
+        psnrs = {
+            name: [results[f"{method.format(name)}/psnr"] for method in ROWS.values()]
+            for name in others
+        }
+        rows = [[name, *_cells(values)] for name, values in psnrs.items()]
+        print_table(console, ["", *ROWS], rows, "other test sets, PSNR (dB)")
+    if costs := describe_costs(results):
+        print(costs)
+    _print_figures(folder, "test")
     print(f"run: {folder}")
 
 
@@ -106,14 +111,10 @@ def print_evaluation(results: Results, sets: Sequence[str], folder: Path) -> Non
             cells = metric_cells(results, prefix, metrics)
             rows.append([label, *_cells(spent, digits=2), *inputs, *cells])
         print_table(Console(), titles, rows, title)
-    _print((), folder, "evaluation")
+    _print_figures(folder, "evaluation")
     print(f"evaluation: {folder}")
 
 
-def _print(parts: Sequence[Table | str], folder: Path, figures: str) -> None:
-    console = Console()
-    for part in parts:
-        if part:
-            console.print(part, soft_wrap=isinstance(part, str))
-    for path in sorted((folder / "figures").glob(f"{figures}-*.png")):
+def _print_figures(folder: Path, kind: str) -> None:
+    for path in sorted((folder / "figures").glob(f"{kind}-*.png")):
         print(f"figure: {path}")

@@ -7,11 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
@@ -56,63 +58,84 @@ class TrainingStage:
     checkpoint: Path | None  # checkpoint to resume from
     earlier: Results  # results of the stages before it
 
-    def prepare(
-        self, data: SceneDataModule, module: SplattingModule, early_exit: EarlyExit | None
-    ) -> tuple[lightning.Trainer, Callbacks]:
-        """Check the parts, load the weights, build callbacks and trainer, write config.yaml.
+    @property
+    def folder(self) -> Path:
+        """The stage's folder."""
+        return Path(self.config.paths.run)
 
-        A stage that is resumed drops the events that it logged after the checkpoint, since it will
-        log them again. The trainer accumulates the micro-batches of each process.
+    def check(
+        self, data: SceneDataModule, module: SplattingModule, early_exit: EarlyExit | None
+    ) -> None:
+        """Check that data, model and metrics fit each other.
 
         Raises:
-            InputError: sizes or weights do not fit the model, the trainer refuses an option, or a
-                device does not exist.
+            InputError: a size or a number of views does not fit the model.
         """
-        config, net, folder = self.config, module.net, Path(self.config.paths.run)
+        net = module.net
         net.check_early_exit(early_exit)
         data.check_sizes(net.check_size)
         data.check_views(net.check_views)
-        data.check_sizes(instantiate(config.metrics).check_size)
-        load_weights(self.weights, module)
-        print(f"{config.stage}: {describe_stage(config)}")
-        print(f"model: {net.describe()}")
+        data.check_sizes(instantiate(self.config.metrics).check_size)
 
-        options = OmegaConf.to_container(config, resolve=True)
+    def load(self, module: SplattingModule) -> None:
+        """Load the weights to start from, and say what is trained.
+
+        A stage that is resumed drops the events that it logged after the checkpoint, since it will
+        log them again.
+
+        Raises:
+            InputError: the weights do not fit the model.
+        """
+        load_weights(self.weights, module)
+        print(f"{self.config.stage}: {describe_stage(self.config)}")
+        print(f"model: {module.net.describe()}")
+        options = OmegaConf.to_container(self.config, resolve=True)
         module.save_hyperparameters(options, logger=False)
         metadata = {} if self.checkpoint is None else read_metadata(self.checkpoint)
         for difference in config_diff(metadata, options, revision()):
             print(f"not as before: {difference}")
-        resumes = has_checkpoints(folder)
-        cut_events(folder, metadata["event_files"] if resumes else {})
-        try:
-            logger = instantiate(config.logger)
-        except InstantiationException as error:  # an optional package is missing
-            raise InputError(f"logger: {error.__cause__}") from error
-        callbacks = instantiate(config.get("callbacks") or {})
-        callbacks = {name: each for name, each in callbacks.items() if each is not None}
-        try:
-            trainer = instantiate(
-                config.trainer,
-                callbacks=[*callbacks.values(), StageRecord(config.stage, self.earlier)],
-                logger=logger or False,
-                # Otherwise Lightning adds its own callbacks.
-                enable_checkpointing="checkpoints" in callbacks,
-                plugins=[AtomicCheckpointIO()],
-                enable_progress_bar="progress" in callbacks,
-            )
-        except InstantiationException as error:
-            raise InputError(f"trainer: {error.__cause__}") from error
+        cut_events(self.folder, metadata["event_files"] if has_checkpoints(self.folder) else {})
+
+    def trainer_options(self, callbacks: Callbacks, logger: Logger | None) -> dict[str, Any]:
+        """Return the trainer's arguments that conf/trainer does not have."""
+        return {
+            "callbacks": [*callbacks.values(), StageRecord(self.config.stage, self.earlier)],
+            "logger": logger or False,
+            # Otherwise Lightning adds its own callbacks.
+            "enable_checkpointing": "checkpoints" in callbacks,
+            "plugins": [AtomicCheckpointIO()],
+            "enable_progress_bar": "progress" in callbacks,
+        }
+
+    def begin(self, trainer: lightning.Trainer, data: SceneDataModule) -> None:
+        """Divide the batches between the processes, and write config.yaml.
+
+        The last check is before it: an option that is refused leaves no folder.
+
+        Raises:
+            InputError: the devices cannot divide a batch.
+        """
         split = data.split(trainer.world_size)
         trainer.accumulate_grad_batches = split.accumulated
         if trainer.is_global_zero:
             print(split)
+        resumes = has_checkpoints(self.folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(self.config, self.folder / "config.yaml", resolve=True)
+        if trainer.logger is not None and not resumes:
+            log_choices(trainer.logger, self.config)
 
-        # Last: an option that is refused leaves nothing.
-        folder.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(config, folder / "config.yaml", resolve=True)
-        if logger is not None and not resumes:
-            log_choices(logger, config)
-        return trainer, callbacks
+
+def instantiate_option(config: DictConfig, key: str, **arguments: object) -> Any:
+    """Instantiate `config[key]`, an object of a library.
+
+    Raises:
+        InputError: the library refuses an option, or is not installed.
+    """
+    try:
+        return instantiate(config[key], **arguments)
+    except InstantiationException as error:
+        raise InputError(f"{key}: {error.__cause__}") from error
 
 
 @dataclass
@@ -130,7 +153,7 @@ class PreparedRun:
         """Collect what a tested stage measured; write metrics.json after the last; print it."""
         new_results = dict(callbacks["costs"].values) if "costs" in callbacks else {}
         new_results |= callbacks["metrics"].results if "metrics" in callbacks else {}
-        data, folder = self.config.data.name, Path(stage.config.paths.run)
+        data, folder = self.config.data.name, stage.folder
         shown, is_last = self.results | new_results, stage is self.stages[-1]
         if is_last:
             losses = {"run/losses": trainer.lightning_module.loss.describe()}
