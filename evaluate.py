@@ -71,7 +71,7 @@ def evaluate(options: DictConfig) -> None:
     if net is not None:
         data.check_sizes(net.check_size)
         data.check_views(net.check_views)
-        predictor, early_exit = make_predictor(net, fabric), net.early_exit_shares
+        predictor, early_exit = make_predictor(net, fabric), net.early_exit_fractions
     else:
         tests = {data.name: data.tests[data.name]}
         opened = open_gaussians(Path(options.gaussians), tests[data.name], fabric.device)

@@ -144,9 +144,10 @@ def initialize(
     else:
         gaussians = initial_gaussians(init, photographs, settings, network)
     print(f"start: {gaussians.num_gaussians:,} Gaussians by init={init}")
-    if network is not None and network.early_exit_shares:
-        shares = (f"{share:.0%} of {name}" for name, share in network.early_exit_shares.items())
-        print(f"early exit left out {', '.join(shares)}")
+    if network is not None and network.early_exit_fractions:
+        fractions = network.early_exit_fractions.items()
+        skipped = (f"{fraction:.0%} of {name}" for name, fraction in fractions)
+        print(f"early exit left out {', '.join(skipped)}")
     return gaussians
 
 

@@ -48,7 +48,7 @@ def measure_scenes(
         folder: for figures/evaluation-post<steps>.png: the first scene at the first and the last
             of the steps.
         scene_folder: the results of single scenes are read from it and written to it.
-        early_exit: the shares that the last prediction left out, see `Network`.
+        early_exit: the fractions that the last prediction left out, see `TokenNetwork`.
     """
     make_folder(scene_folder, "paths.logs")
     make_folder(folder / "figures", "paths.logs")

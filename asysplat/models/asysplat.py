@@ -117,7 +117,7 @@ class AsySplat(TokenNetwork):
         return {*geometry, *(layer for stage in self.appearance["stages"][1:] for layer in stage)}
 
     def geometry_ratio(self) -> float:
-        """Return the share of parameters outside the appearance branch (paper: about 0.9)."""
+        """Return the fraction of parameters outside the appearance branch (paper: about 0.9)."""
         appearance = sum(p.numel() for p in self.appearance.parameters())
         return 1 - appearance / sum(p.numel() for p in self.parameters())
 
@@ -141,7 +141,7 @@ def build_asysplat(
 ) -> AsySplat:
     """Build an AsySplat of the given widths times `width`.
 
-    With a `geometry_ratio`, choose the widths that give the geometry branch that share of the
+    With a `geometry_ratio`, choose the widths that give the geometry branch that fraction of the
     parameters, at the same total.
 
     Args:

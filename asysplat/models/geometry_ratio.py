@@ -1,4 +1,4 @@
-"""Find widths that give the geometry branch its share of parameters, the geometry_ratio."""
+"""Find widths that give the geometry branch a fraction of the parameters, the geometry_ratio."""
 
 from collections.abc import Callable
 from itertools import combinations_with_replacement
@@ -9,7 +9,7 @@ from torch import nn
 from asysplat.errors import InputError
 from asysplat.models.shapes import Widths
 
-SHARE_TOLERANCE = 0.015
+RATIO_TOLERANCE = 0.015
 TOTAL_TOLERANCE = 0.0095  # any two totals are then within 2 %
 ATTEMPTS = 10  # models built and counted, for each number of layers
 
@@ -37,7 +37,7 @@ def solve_widths(
             the closest.
     """
     if not 0 < ratio < 1:
-        raise InputError(f"geometry_ratio={ratio}: give a share between 0 and 1, such as 0.9.")
+        raise InputError(f"geometry_ratio={ratio}: give a fraction between 0 and 1, such as 0.9.")
     target = budget * _count(build(base, layers))[0]
     candidates = _candidates(base)
     heads = candidates / base.head_dim
@@ -51,16 +51,16 @@ def solve_widths(
 
     def errors(total: np.ndarray | int, geometry: np.ndarray | float) -> np.ndarray | float:
         """Return the larger error, in units of its tolerance."""
-        share = np.abs(geometry / total - ratio) / SHARE_TOLERANCE
-        return np.maximum(share, np.abs(total / target - 1) / TOTAL_TOLERANCE)
+        ratio_error = np.abs(geometry / total - ratio) / RATIO_TOLERANCE
+        return np.maximum(ratio_error, np.abs(total / target - 1) / TOTAL_TOLERANCE)
 
     closest, description = np.inf, ""
     for count in sorted(range(1, 3 * layers + 1), key=lambda n: (abs(n - layers), -n)):
         if count != layers and added is None:
             more = _counts(build, base, layers + 1, samples[fine_alone]) - counts[fine_alone]
             added = _quadratic_fit(samples[fine_alone, -1:], more, heads[:, -1:])
-        here = predicted if count == layers else predicted + (count - layers) * added
-        error = errors(*here.T)
+        parameters = predicted if count == layers else predicted + (count - layers) * added
+        error = errors(*parameters.T)
         rank = np.where(error < 1, error / 2 + shape_error, 1e3 + error)
         order = np.argsort(rank, kind="stable")  # the same widths on every machine
         # The polynomial ignores rounding and stages of equal width, so build and count the best
@@ -80,9 +80,9 @@ def solve_widths(
                     f"{count} layers a stage, with {geometry / total:.3f} of {total / 1e6:.2f}M"
                 )
     raise InputError(
-        f"geometry_ratio={ratio} cannot be met within {SHARE_TOLERANCE} at "
+        f"geometry_ratio={ratio} cannot be met within {RATIO_TOLERANCE} at "
         f"{target / 1e6:.2f}M parameters with head_dim {base.head_dim}: closest come "
-        f"{description}; ask for that share, or for another width."
+        f"{description}; ask for that ratio, or for another width."
     )
 
 

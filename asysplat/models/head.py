@@ -104,9 +104,9 @@ class GaussianHead(nn.Module, ABC):
                 bound = MAX_DEPTH_CORRECTION * (1 - (1 - CONFIDENT_FACTOR) * prior.confidence)
                 has_depth = (prior.confidence > 0).flatten(1).any(-1)[:, None, None, None]
                 bound = torch.where(has_depth, bound, MAX_DEPTH_WITHOUT_PRIOR)
-                depth_logit = (expected + bounded(depth_logit[..., 0], bound))[..., None]
+                depth_logit = (expected + squash(depth_logit[..., 0], bound))[..., None]
                 opacities = prior.opacity
-                scales = bounded(scales, MAX_SIZE_CORRECTION)
+                scales = squash(scales, MAX_SIZE_CORRECTION)
             sh = sh.unflatten(-1, (self.sh_bands, 3))
             decoded = Decoded(depth_logit.sigmoid(), quats, scales, opacities, sh)
             return self.activate(decoded, views).map(lambda field: field.flatten(1, 3))
@@ -210,11 +210,11 @@ class LongLRMHead(GaussianHead):
     def depth_fraction(
         self, distance: Float[Tensor, "B V h w"], views: Views
     ) -> Float[Tensor, "B V h w"]:
-        return distance / (self.farthest * unit_of(views)[..., 0])
+        return distance / (self.farthest * compute_unit(views)[..., 0])
 
     def activate(self, raw: Decoded, views: Views) -> Gaussians:
         origins, directions = views.cameras.resized(*raw.opacities.shape[2:]).rays()
-        unit = unit_of(views)
+        unit = compute_unit(views)
         sizes = (raw.scales + self.scale_bias).clamp(max=self.largest).exp() * unit
         return Gaussians(
             means=origins + self.farthest * unit * raw.depth_fraction * directions,
@@ -226,15 +226,15 @@ class LongLRMHead(GaussianHead):
         )
 
 
-def unit_of(views: Views) -> Float[Tensor, "B 1 1 1 1"]:
-    """Return Long-LRM's unit of length: the largest coordinate of the views' cameras.
+def compute_unit(views: Views) -> Float[Tensor, "B 1 1 1 1"]:
+    """Compute Long-LRM's unit of length: the largest coordinate of the views' cameras.
 
-    At least 1/sqrt(3), which is its least value in a normalized scene with different positions.
+    It is at least 1/sqrt(3), the minimum in a normalized scene with different positions.
     """
     largest = views.cameras.centers.abs().amax((-2, -1))
     return largest.clamp_min(3**-0.5)[:, None, None, None, None]
 
 
-def bounded(values: Tensor, bound: Tensor | float) -> Tensor:
+def squash(values: Tensor, bound: Tensor | float) -> Tensor:
     """Squash numbers into [-bound, bound]; small ones hardly change."""
     return bound * (values / bound).tanh()

@@ -198,15 +198,15 @@ class CrossViewLayer(nn.Module):
         back = [-s for s in shift]
         visible = same_region(x.shape[2:4], shift, x.device)
         x = torch.roll(x, back, (2, 3))
-        own = windows(x)
-        own = own + self.within(own, own, visible)
+        tokens = windows(x)
+        tokens = tokens + self.within(tokens, tokens, visible)
         count = x.shape[1]
-        others = (torch.arange(count)[:, None] + torch.arange(1, count)) % count
-        context = rearrange(own[:, others], "b v k n l c -> b v n (k l) c")
-        message = self.across(own, context, visible.repeat(1, 1, count - 1))
-        own = own + self.mlp(torch.cat((own, message), dim=-1))
+        other_views = (torch.arange(count)[:, None] + torch.arange(1, count)) % count
+        context = rearrange(tokens[:, other_views], "b v k n l c -> b v n (k l) c")
+        message = self.across(tokens, context, visible.repeat(1, 1, count - 1))
+        tokens = tokens + self.mlp(torch.cat((tokens, message), dim=-1))
         size = {"p": WINDOWS, "i": x.shape[2] // WINDOWS}
-        x = rearrange(own, "b v (p q) (i j) c -> b v (p i) (q j) c", **size)
+        x = rearrange(tokens, "b v (p q) (i j) c -> b v (p i) (q j) c", **size)
         return torch.roll(x, shift, (2, 3))
 
 
@@ -274,21 +274,21 @@ def cost_volume(
     with without_autocast(features):
         features = features.to(cameras.intrinsics)
         poses = cameras.cam_to_world
-        own = flat(features)
+        reference = flat(features)
         directions = cameras.pixel_directions()
         size = features.new_tensor([2 / w, 2 / h])
         total = torch.zeros(B * V, len(inverse), h, w).to(features)
         for step in range(1, V):
-            others = torch.roll(torch.arange(V), -step)
-            relative = torch.linalg.inv(poses[:, others]) @ poses
+            other_views = torch.roll(torch.arange(V), -step)
+            relative = torch.linalg.inv(poses[:, other_views]) @ poses
             rays = torch.einsum("bvxy,bvhwy->bvhwx", relative[..., :3, :3], directions)
             moves = inverse[:, None, None, None] * relative[..., None, None, None, :3, 3]
             points = rays[:, :, None] + moves  # times the inverse depth
-            points = torch.einsum("bvxy,bvdhwy->bvdhwx", cameras.intrinsics[:, others], points)
+            points = torch.einsum("bvxy,bvdhwy->bvdhwx", cameras.intrinsics[:, other_views], points)
             grid = points[..., :2] / points[..., 2:].clamp_min(1e-6) * size - 1
             grid = torch.where(points[..., 2:] > 1e-6, grid, 2.0).flatten(0, 1).flatten(1, 2)
-            warped = F.grid_sample(flat(features[:, others]), grid, align_corners=False)
-            total = total + (own[:, :, None] * warped.unflatten(2, (-1, h))).sum(1)
+            warped = F.grid_sample(flat(features[:, other_views]), grid, align_corners=False)
+            total = total + (reference[:, :, None] * warped.unflatten(2, (-1, h))).sum(1)
         return (total / ((V - 1) * c**0.5)).unflatten(0, (B, V))
 
 
@@ -420,7 +420,7 @@ def multiply(
     p: Float[Tensor, "*#batch 4"], q: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*#batch 4"]:
     """Compute the products of quaternions: the rotation q, then p."""
-    (pw, pv), (qw, qv) = (each.split((1, 3), dim=-1) for each in (p, q))
+    (pw, pv), (qw, qv) = (quaternion.split((1, 3), dim=-1) for quaternion in (p, q))
     scalar = pw * qw - (pv * qv).sum(-1, keepdim=True)
     vector = pw * qv + qw * pv + torch.linalg.cross(*torch.broadcast_tensors(pv, qv))
     return torch.cat((scalar, vector), dim=-1)

@@ -37,7 +37,7 @@ class Network(nn.Module, ABC):
         super().__init__()
         self.patch, self.prior, self.prune = patch, prior, prune
         self._early_exit = EXACT
-        self.early_exit_shares: dict[str, float] = {}
+        self.early_exit_fractions: dict[str, float] = {}
 
     def forward(self, views: Views, prune: bool = True) -> Gaussians:
         """Predict Gaussians [..., N] from views [..., V]; all of them if not `prune`.
@@ -52,7 +52,7 @@ class Network(nn.Module, ABC):
         if not (self.training or views.images.is_meta or is_fake(views.images)):
             views.validate("the network's views")  # in training the data module does
         batch = views.images.shape[:-4]
-        self.early_exit_shares.clear()
+        self.early_exit_fractions.clear()
         gaussians = self.predict(views.map(lambda x: x.reshape(-1, *x.shape[len(batch) :])))
         if prune:
             gaussians = self.select(gaussians)
@@ -67,7 +67,7 @@ class Network(nn.Module, ABC):
         """Predict Gaussians [B, N] from views [B, V]."""
 
     def geometry_ratio(self) -> float:
-        """Return the share of parameters outside an appearance branch: all."""
+        """Return the fraction of parameters outside an appearance branch: all."""
         return 1.0
 
     @property
@@ -133,8 +133,8 @@ class TokenNetwork(Network):
     """A network of tokens, which a head decodes to a grid of Gaussians for each view.
 
     Outside of training it exits early at the thresholds of `early_exit`, by default never;
-    `early_exit_shares` has the shares that the last prediction skipped, of the network (0 or 1) and
-    of its layers.
+    `early_exit_fractions` has the fractions that the last prediction skipped: of the network (0 or
+    1) and of its layers.
 
     Args:
         widths: widths of the stages.
@@ -169,12 +169,12 @@ class TokenNetwork(Network):
         thresholds = (speed.skip_network_above, speed.skip_layers_above)
         skip_network, skip_layers = (limit and confidence >= limit for limit in thresholds)
         if skip_network:
-            self.early_exit_shares |= {"network": 1.0, "layers": 1.0}
+            self.early_exit_fractions |= {"network": 1.0, "layers": 1.0}
             gaussians = self.head(None, views, prior)
             return replace(gaussians, sh=gaussians.sh[..., :1, :])  # the others are 0
         skipped = self.skippable_layers if skip_layers else ()
         layers = sum(len(m) for m in self.modules() if isinstance(m, Layers))
-        self.early_exit_shares |= {"network": 0.0, "layers": len(skipped) / layers}
+        self.early_exit_fractions |= {"network": 0.0, "layers": len(skipped) / layers}
         return self.head(self.tokens(pixel_features(views, prior), skipped), views, prior)
 
     @abstractmethod

@@ -10,16 +10,16 @@ from asysplat.scene import Gaussians
 
 @dataclass(frozen=True)
 class Prune:
-    """Keep the most opaque Gaussians, and a few of the others, so that those learn too.
+    """Keep the most opaque Gaussians and a few of the rest, so that these learn too.
 
     The public settings are 0.6 and 0.1 (arthurhero/Long-LRM,
-    configs/dl3dv_i540_32input_8target.yaml), the paper's Table 4 keeps half. There the others are
-    drawn at random; here they are evenly spaced by opacity, so that the same views give the same
+    configs/dl3dv_i540_32input_8target.yaml), the paper's Table 4 keeps half. There the rest is
+    drawn at random; here it is evenly spaced by opacity, so that the same views give the same
     Gaussians.
 
     Args:
-        prune_ratio: share of the Gaussians to drop, in [0, 1).
-        random_ratio: share of the kept ones that is not chosen by opacity, in [0, 1].
+        prune_ratio: fraction of the Gaussians to drop, in [0, 1).
+        random_ratio: fraction of the kept ones that is not chosen by opacity, in [0, 1].
 
     Raises:
         InputError: a ratio out of range.
@@ -41,11 +41,11 @@ class Prune:
         kept = max(1, int(count * (1 - self.prune_ratio)))
         if kept == count:
             return gaussians
-        others = int(kept * self.random_ratio)
-        opaque = kept - others
+        spaced = int(kept * self.random_ratio)
+        opaque = kept - spaced
         order = gaussians.opacities.argsort(dim=-1, descending=True, stable=True)
-        steps = torch.arange(others, device=order.device)
-        ranks = opaque + steps * (count - opaque) // max(1, others)
+        steps = torch.arange(spaced, device=order.device)
+        ranks = opaque + steps * (count - opaque) // max(1, spaced)
         chosen = torch.cat((order[:, :opaque], order[:, ranks]), -1)
         rows = torch.arange(len(chosen), device=chosen.device)[:, None]
         return gaussians.map(lambda field: field[rows, chosen])

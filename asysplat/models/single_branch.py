@@ -72,11 +72,11 @@ class SingleBranch(TokenNetwork):
         self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()
     ) -> Float[Tensor, "B V h w d"]:
         tokens = self.tokenizer(pixels)
-        extra = None
+        global_tokens = None
         if self.global_tokens is not None:
-            extra = self.tokenizer.norm(self.global_tokens).expand(len(tokens), -1, -1)
+            global_tokens = self.tokenizer.norm(self.global_tokens).expand(len(tokens), -1, -1)
         for stage in self.stages:
-            tokens, extra = stage(tokens, skip_layers, extra)
+            tokens, global_tokens = stage(tokens, skip_layers, global_tokens)
         return tokens
 
 
@@ -88,7 +88,7 @@ def build_single_branch(
     parameter_budget: float = 1.0,
     **components,
 ) -> SingleBranch:
-    """Build a SingleBranch of the given widths times `width`.
+    """Build a SingleBranch whose widths are multiplied by `width`.
 
     Args:
         stage_widths, head_dim: at width 1.

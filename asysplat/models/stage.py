@@ -55,16 +55,16 @@ class Stage(nn.Module):
         self,
         tokens: Float[Tensor, "B V h w d"],
         skip_layers: Collection[nn.Module] = (),
-        extra: Float[Tensor, "B G d"] | None = None,
+        global_tokens: Float[Tensor, "B G d"] | None = None,
     ) -> tuple[Float[Tensor, "B V h2 w2 e"], Float[Tensor, "B G e"] | None]:
-        """Return the tokens, and the global tokens `extra` if there are any, after this stage."""
+        """Return the tokens, and the global tokens if there are any, after this stage."""
         tokens = self.project(tokens) if self.merge is None else self.merge(tokens)
-        if extra is None:
+        if global_tokens is None:
             return self.layers(tokens, skip_layers), None
-        sequence = torch.cat((self.project(extra), tokens.flatten(1, 3)), dim=1)
+        sequence = torch.cat((self.project(global_tokens), tokens.flatten(1, 3)), dim=1)
         # As one row of one image: none of these layers depends on the tokens' places.
         sequence = self.layers(sequence[:, None, None], skip_layers)[:, 0, 0]
-        count = extra.shape[1]
+        count = global_tokens.shape[1]
         return sequence[:, count:].reshape(tokens.shape), sequence[:, :count]
 
 

@@ -1,4 +1,4 @@
-"""Early exit: exact when off, skips what its thresholds name, and reports the shares."""
+"""Early exit: exact when off, skips what its thresholds name, and reports the fractions."""
 
 import math
 from dataclasses import fields, replace
@@ -45,7 +45,7 @@ def same_bits(one, other):
 def test_off_is_exact_and_reports_nothing(net, composed):
     exact = predict(net, wall())
     assert instantiate(composed("speed=exact").speed) == EXACT == net.early_exit
-    assert net.early_exit_shares == {}
+    assert net.early_exit_fractions == {}
     assert same_bits(exact, net.predict(wall()))
 
 
@@ -53,7 +53,7 @@ def test_off_is_exact_and_reports_nothing(net, composed):
 def test_a_threshold_that_no_scene_reaches_changes_no_bit(net, threshold):
     exact = predict(net, wall())
     assert same_bits(exact, predict(net, wall(), **{threshold: NEVER}))
-    assert set(net.early_exit_shares.values()) == {0.0}
+    assert set(net.early_exit_fractions.values()) == {0.0}
 
 
 @torch.no_grad()
@@ -62,7 +62,7 @@ def test_training_skips_nothing(net):
     for net.early_exit in (EXACT, EarlyExit(skip_network_above=ALWAYS)):
         torch.manual_seed(0)
         results.append(net.train()(wall()))
-        assert net.early_exit_shares == {}
+        assert net.early_exit_fractions == {}
     assert same_bits(*results)
 
 
@@ -78,8 +78,8 @@ def test_skipped_layers_are_those_after_the_first_stage(net):
     called.clear()
     found = predict(net, wall(), skip_layers_above=ALWAYS)
     assert called == []
-    assert math.isclose(net.early_exit_shares["layers"], 2 / 3)
-    assert net.early_exit_shares["network"] == 0
+    assert math.isclose(net.early_exit_fractions["layers"], 2 / 3)
+    assert net.early_exit_fractions["network"] == 0
     assert not torch.equal(found.means, exact.means)
 
 
@@ -92,7 +92,7 @@ def test_without_the_network_gaussians_are_those_of_the_prior(net):
     distance = (found.means.unflatten(1, prior.distance.shape[1:]) - origins).norm(dim=-1)
     torch.testing.assert_close(distance, prior.distance, rtol=1e-4, atol=1e-4)
     assert found.sh.shape[-2] == 1
-    assert net.early_exit_shares == {"network": 1, "layers": 1}
+    assert net.early_exit_fractions == {"network": 1, "layers": 1}
     # The omitted SH bands are 0: the images are those of all bands.
     net.head.decode.weight.data.zero_()
     images = [
@@ -106,16 +106,16 @@ def test_without_the_network_gaussians_are_those_of_the_prior(net):
 def test_presets_skip_where_the_prior_is_confident(net, composed):
     textured = wall()
     flat = replace(textured, images=torch.full_like(textured.images, 0.4))
-    shares = {}
+    skipped = {}
     for name in ("balanced", "fast"):
         net.early_exit = instantiate(composed(f"speed={name}").speed)
         for scene, views in (("flat", flat), ("textured", textured)):
             with torch.no_grad():
                 net(Views(views.cameras, views.images))
-            shares[name, scene] = net.early_exit_shares["layers"]
-    assert shares["balanced", "flat"] == shares["fast", "flat"] == 0
-    assert shares["balanced", "textured"] > 0.3
-    assert shares["fast", "textured"] == 1
+            skipped[name, scene] = net.early_exit_fractions["layers"]
+    assert skipped["balanced", "flat"] == skipped["fast", "flat"] == 0
+    assert skipped["balanced", "textured"] > 0.3
+    assert skipped["fast", "textured"] == 1
 
 
 @pytest.mark.parametrize("value", [0.0, -0.1, 1.5, float("nan")], ids=str)

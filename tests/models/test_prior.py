@@ -65,7 +65,7 @@ def test_a_masked_pixel_neither_votes_nor_is_kept(name):
     valid[:, 1, :8] = valid[:, 0, 15, 15] = False
     assert (prior.opacity == FREE_OPACITY).eq(~valid).all()
     assert not prior.confidence[:, 1, :6].any()
-    # The views that remain have a larger share of the wall's opacity.
+    # The views that remain have a larger part of the wall's opacity.
     others = (slice(None), [0, 2, 3], slice(1, 6), slice(5, 11))
     assert prior.opacity[others].mean() > 1.1 * whole.opacity[others].mean()
 

@@ -23,7 +23,7 @@ def test_keeps_the_most_opaque_and_a_few_of_all_others():
     for old, new, means in zip(opacities, kept.opacities, kept.means, strict=True):
         top, others = old.sort(descending=True).values.split((360, 640))
         assert torch.equal(new[:360], top)
-        # 40 of the 640 others: none twice, from the whole range, the same share of each quarter.
+        # 40 of the 640 others: none twice, from the whole range, the same fraction of each quarter.
         assert len(means.unique(dim=0)) == 400
         quarters = [torch.isin(new[360:], part).sum() for part in others.split(160)]
         assert quarters == [10, 10, 10, 10]

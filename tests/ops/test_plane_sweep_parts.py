@@ -79,7 +79,7 @@ def test_what_three_views_see_through_is_in_free_space_and_hardly_opaque():
     assert free[:, 3, 4:-4, 12:-12].all() and not free[:, :3].any()
     estimate = DepthEstimate(inverse, torch.ones_like(inverse), votes)
     views = Views(CAMERAS, torch.rand(1, 4, 3, CAMERAS.height, CAMERAS.width))
-    opacity = Prior.of_estimate(estimate, views, (CAMERAS.height, CAMERAS.width)).opacity
+    opacity = Prior.from_estimate(estimate, views, (CAMERAS.height, CAMERAS.width)).opacity
     assert (opacity[free] == FREE_OPACITY).all() and opacity[~free].min() > 0.4
 
 
@@ -97,7 +97,7 @@ def test_views_from_which_a_point_is_hidden_leave_it_its_opacity():
     assert (votes.occluding[:, :3][INNER] == 1).all() and not votes.occluding[:, 3].any()
     views = Views(CAMERAS, torch.rand(1, 4, 3, CAMERAS.height, CAMERAS.width))
     hidden, seen = (
-        Prior.of_estimate(
+        Prior.from_estimate(
             DepthEstimate(inverse, torch.zeros_like(inverse), each), views, inverse.shape[-2:]
         ).opacity
         for each in (votes, clear)

@@ -1,4 +1,4 @@
-"""Early-exit shares are logged for each test set, and `speed` changes a run's hash."""
+"""Early-exit fractions are logged for each test set, and `speed` changes a run's hash."""
 
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -12,20 +12,20 @@ from asysplat.runs.runs import config_hash
 from asysplat.training.callbacks import Metrics
 
 
-def logged(shares_of_sets):
-    """Results and log of the callback after a test with these shares of its scenes."""
+def logged(tests):
+    """Results and log of the callback after a test with these fractions for each scene."""
     log = {}
-    module = SimpleNamespace(net=SimpleNamespace(early_exit_shares={}), log_dict=log.update)
-    data = SimpleNamespace(tests=shares_of_sets)
+    module = SimpleNamespace(net=SimpleNamespace(early_exit_fractions={}), log_dict=log.update)
+    data = SimpleNamespace(tests=tests)
     trainer = Mock(lightning.Trainer, datamodule=data, world_size=1, is_global_zero=False)
     callback = Metrics(
         Mock(Protocol, sentences=dict, mean_over="images"), "unused", backbone_dir="unused"
     )
     callback._add = Mock()
     callback.on_test_epoch_start()
-    for index, shares in enumerate(shares_of_sets.values()):
-        for number, share in enumerate(shares):
-            module.net.early_exit_shares = share
+    for index, scenes in enumerate(tests.values()):
+        for number, fractions in enumerate(scenes):
+            module.net.early_exit_fractions = fractions
             batch = {"scene": [f"scene {number}"]}
             callback.on_test_batch_end(trainer, module, None, batch, number, index)
     callback.on_test_epoch_end(trainer, module)

@@ -15,8 +15,8 @@ class DepthPrior(nn.Module):
     """The depth maps of the data, if there are any; gaps are filled from their surroundings."""
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
-        inverse, share = _block_means(views.depths, views, size)
-        return Prior.of_given_depths(inverse, share, share, views)
+        inverse, known_fraction = _block_means(views.depths, views, size)
+        return Prior.from_depths(inverse, known_fraction, known_fraction, views)
 
 
 class PointsPrior(nn.Module):
@@ -26,20 +26,20 @@ class PointsPrior(nn.Module):
     """
 
     def forward(self, views: Views, size: tuple[int, int]) -> Prior:
-        inverse, share = _block_means(views.point_depths, views, size)
-        known = (share > 0).to(share)
+        inverse, known_fraction = _block_means(views.point_depths, views, size)
+        known = (known_fraction > 0).to(known_fraction)
         spread = [F.max_pool2d(known, 2 * r + 1, stride=1, padding=r) for r in SPREAD]
-        return Prior.of_given_depths(inverse, known, torch.stack(spread).mean(0), views)
+        return Prior.from_depths(inverse, known, torch.stack(spread).mean(0), views)
 
 
 def _block_means(
     depths: Float[Tensor, "B V H W"] | None, views: Views, size: tuple[int, int]
 ) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V h w"]]:
-    """Return the mean inverse depth of each block of pixels, and the share of known pixels."""
+    """Return the mean inverse depth of each block of pixels, and the fraction of known pixels."""
     if depths is None:
         depths = torch.zeros_like(views.images[:, :, 0])
     known = (depths > 0).to(depths)
     stride = depths.shape[-2] // size[0]
-    share = F.avg_pool2d(known, stride)
-    inverse = F.avg_pool2d(known / depths.clamp_min(1e-6), stride) / share.clamp_min(1e-6)
-    return inverse, share
+    known_fraction = F.avg_pool2d(known, stride)
+    inverse = F.avg_pool2d(known / depths.clamp_min(1e-6), stride) / known_fraction.clamp_min(1e-6)
+    return inverse, known_fraction

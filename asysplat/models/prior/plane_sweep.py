@@ -73,7 +73,7 @@ class PlaneSweepPrior(nn.Module):
             masks = whole_pixels(masks, (small.height, small.width))
         options = {"planes": self.planes, "neighbors": self.neighbors}
         estimate = plane_sweep(images, small, ranges=ranges, masks=masks, **options)
-        return Prior.of_estimate(estimate, views, size)
+        return Prior.from_estimate(estimate, views, size)
 
 
 def plane_sweep(
@@ -160,8 +160,8 @@ def _plane_sweep(
         for _ in range(aggregations):
             best = kernels.sgm(costs, agreement, borders)
             inverse = first + best.plane * spacing
-            found = kernels.consistency(inverse, steps, valid, chosen, into)
-            agree, contradict = found.agreeing, found.contradicting
+            consistency = kernels.consistency(inverse, steps, valid, chosen, into)
+            agree, contradict = consistency.agreeing, consistency.contradicting
             agreement = valid * (2 * agree / (agree + contradict + 1)).clamp_max(1)
         return inverse, steps, agreement * (best.contrast / FULL_CONTRAST).clamp(0, 1)
 
@@ -178,8 +178,8 @@ def _plane_sweep(
     inverse, steps, agreement = sweep(images, valid, ranges, aggregations=2)
     others = other_views(images.shape[1], images.shape[0], images.device)
     into = projections.matrices(others, *images.shape[-2:])
-    found = kernels.consistency(inverse, steps, agreement, others, into)
-    agreement = agreement / (1 + CONTRADICTION * found.contradicting)
+    consistency = kernels.consistency(inverse, steps, agreement, others, into)
+    agreement = agreement / (1 + CONTRADICTION * consistency.contradicting)
     squared = inverse**2  # how well a depth differs from the next plane's; 0 at infinity
     precision = squared / (squared + steps[..., None, None] ** 2).clamp_min(1e-30)
     inverse = fill_unknown(inverse, agreement * precision)

@@ -51,10 +51,10 @@ class Prior(TensorRecord):
     opacity: Float[Tensor, "B V h w"]
 
     @classmethod
-    def of_estimate(cls, depth: DepthEstimate, views: Views, size: tuple[int, int]) -> "Prior":
-        """Return the prior of estimated depths, resized to the grid's size.
+    def from_estimate(cls, depth: DepthEstimate, views: Views, size: tuple[int, int]) -> "Prior":
+        """Compute the prior of estimated depths, resized to the grid's size.
 
-        Each view's share of a surface's opacity follows from the number of views that confirm it;
+        A view's part of a surface's opacity follows from the number of views that confirm it;
         where no depth is sure, from the number of views that contain the point and do not see
         another surface in front of it. In free space, and in pixels that are masked out, wholly or
         in part, it is FREE_OPACITY.
@@ -67,8 +67,8 @@ class Prior(TensorRecord):
         ).logit()
         opacity = unsure + (sure - unsure) * torch.maximum(depth.confidence, alone)
         inverse, confidence, opacity = (
-            F.interpolate(each, size, mode="bilinear")
-            for each in (depth.inverse_depth, depth.confidence, opacity)
+            F.interpolate(values, size, mode="bilinear")
+            for values in (depth.inverse_depth, depth.confidence, opacity)
         )
         length = views.cameras.resized(*size).pixel_directions().norm(dim=-1)
         distance = torch.where(inverse > 0, length / inverse.clamp_min(1e-6), UNKNOWN_DISTANCE)
@@ -78,14 +78,14 @@ class Prior(TensorRecord):
         return cls(distance, confidence, opacity.sigmoid().masked_fill(dropped, FREE_OPACITY))
 
     @classmethod
-    def of_given_depths(
+    def from_depths(
         cls,
         inverse: Float[Tensor, "B V h w"],
         weight: Float[Tensor, "B V h w"],
         confidence: Float[Tensor, "B V h w"],
         views: Views,
     ) -> "Prior":
-        """Return the prior of given inverse depths, filled where their weight is less than 1."""
+        """Compute the prior of known inverse depths, filled where their weight is less than 1."""
         scenes, count, *size = inverse.shape
         inverse = fill_unknown(inverse, weight)
         others = other_views(count, scenes, inverse.device)
@@ -93,7 +93,7 @@ class Prior(TensorRecord):
         if views.masks is not None:
             confidence = confidence * whole_pixels(views.masks, tuple(size))
         votes = count_votes(inverse, confidence, others, projections)
-        return cls.of_estimate(DepthEstimate(inverse, confidence, votes), views, tuple(size))
+        return cls.from_estimate(DepthEstimate(inverse, confidence, votes), views, tuple(size))
 
     def features(self, height: int, width: int) -> Float[Tensor, "B V H W 2"]:
         """Return the log distance relative to the scene's median, and the confidence.
@@ -104,7 +104,7 @@ class Prior(TensorRecord):
         median = ordered[:, (ordered.shape[1] - 1) // 2, None, None, None]
         maps = ((self.distance / median).log().clamp(-4, 4) / 2, self.confidence * 2 - 1)
         return torch.stack(
-            [F.interpolate(each, (height, width), mode="bilinear") for each in maps], dim=-1
+            [F.interpolate(values, (height, width), mode="bilinear") for values in maps], dim=-1
         )
 
 
@@ -129,8 +129,8 @@ def count_votes(
 def in_free_space(votes: Consistency) -> Bool[Tensor, "B V h w"]:
     """Return the pixels whose point other views see through, to a surface behind it.
 
-    They exceed twice those that confirm it by more than one: what a single view knows is kept, and
-    what one other view denies.
+    The views that see through a point must outnumber twice those that confirm it by more than one.
+    A point that only one view sees is kept, and so is one that only one other view contradicts.
     """
     return votes.contradicting > 2 * votes.agreeing + 1
 

@@ -11,8 +11,8 @@ from asysplat.scene import Cameras
 SAMPLES = 6  # points along each side of a view that stand for all its pixels
 USEFUL_PARALLAX = 0.1  # parallax in image widths, beyond which more adds nothing
 WIDE_PARALLAX = 0.5  # parallax in image widths, beyond which two views look too different
-MIN_SHARE = 0.2  # share of a view that a neighbor must see at the nearest and farthest plane
-OUTLIERS = 0.02  # share of the known depths at either end that a range ignores
+MIN_OVERLAP = 0.2  # fraction of a view that a neighbor must see at the nearest and farthest plane
+OUTLIERS = 0.02  # fraction of the known depths at either end that a range ignores
 MIN_POINTS = 16  # known depths that a range needs
 MARGIN = 1.5  # factor that widens a range: surfaces without texture have no known depth
 SUBPIXEL = 0.25  # error of a match, pixels
@@ -62,9 +62,10 @@ def choose_neighbors(
 ) -> Int[Tensor, "B V K"]:
     """Return for each view the neighbors with the most overlap and parallax; -1 for none.
 
-    The score of two views is the share of pixels that both contain, over inverse depths from 0 to
-    many times the inverse of their distance, weighted by how useful the parallax is. K is at most
-    `count` and V - 1, at least 1.
+    At each of several inverse depths, from 0 to many times the inverse of the views' distance,
+    the overlap of two views is the fraction of pixels that both contain. Their score is the sum of
+    the overlaps, each weighted by how useful the parallax is. K is at most `count` and V - 1, at
+    least 1.
     """
     V = cameras.num_views
     apart = torch.cdist(cameras.centers, cameras.centers)
@@ -88,7 +89,7 @@ def choose_neighbors(
 def inverse_depth_range(
     cameras: Cameras, projections: PairwiseProjections, neighbors: Int[Tensor, "B V K"]
 ) -> Float[Tensor, "B V 2"]:
-    """Return the least and greatest inverse depth at which a neighbor sees MIN_SHARE of a view.
+    """Return the least and greatest inverse depth at which a neighbor sees MIN_OVERLAP of a view.
 
     Both are 0 for a view without neighbors; the least is 0 if the neighbors see points at infinity.
     """
@@ -97,8 +98,8 @@ def inverse_depth_range(
     focal = cameras.intrinsics[..., 0, 0] / cameras.width
     inverse = steps / (distance.clamp_min(1e-12) * focal)[..., None]
     seen = _inside(projections, neighbors, inverse) * (neighbors >= 0)[..., None, None]
-    share = seen.amax(2).mean(-2)
-    enough = share >= MIN_SHARE
+    overlap = seen.amax(2).mean(-2)
+    enough = overlap >= MIN_OVERLAP
     first = enough.int().argmax(-1, keepdim=True)
     last = enough.shape[-1] - 1 - enough.flip(-1).int().argmax(-1, keepdim=True)
     least = inverse.gather(-1, first).masked_fill(first == 0, 0)
@@ -121,8 +122,8 @@ def observed_range(
     """Return the range of the known inverse depths with a margin; 0 and 0 if there are too few."""
     ordered = inverse.masked_fill(~known, torch.inf).sort(dim=-1).values
     count = known.sum(-1, keepdim=True)
-    shares = inverse.new_tensor([OUTLIERS, 1 - OUTLIERS])
-    index = (shares * (count - 1)).round().long().clamp(0, ordered.shape[-1] - 1)
+    quantiles = inverse.new_tensor([OUTLIERS, 1 - OUTLIERS])
+    index = (quantiles * (count - 1)).round().long().clamp(0, ordered.shape[-1] - 1)
     ranges = ordered.gather(-1, index) * ordered.new_tensor([1 / MARGIN, MARGIN])
     return torch.where(count >= MIN_POINTS, ranges, 0)
 
@@ -142,13 +143,13 @@ def _inside(
     u, v, z = projections.matrices(others, SAMPLES, SAMPLES).to(inverse).unbind(-2)
     # A point is inside where all of these are positive; then its depth is, too.
     sides = torch.stack((u, SAMPLES * z - u, v, SAMPLES * z - v), dim=-2)
-    right, down, corner, away = sides[..., None, None].unbind(-3)
+    right, down, corner, per_depth = sides[..., None, None].unbind(-3)
     pixels = torch.arange(SAMPLES, device=inverse.device) + 0.5
     flat = right * pixels + down * pixels[:, None] + corner
-    bound = -flat / away
-    never = (away == 0) & (flat <= 0)
-    least = torch.where(away > 0, bound, torch.where(never, torch.inf, -torch.inf)).amax(3)
-    greatest = torch.where(away < 0, bound, torch.inf).amin(3)
+    bound = -flat / per_depth
+    never = (per_depth == 0) & (flat <= 0)
+    least = torch.where(per_depth > 0, bound, torch.where(never, torch.inf, -torch.inf)).amax(3)
+    greatest = torch.where(per_depth < 0, bound, torch.inf).amin(3)
     least, greatest = least.flatten(-2)[..., None], greatest.flatten(-2)[..., None]
     inverse = inverse[:, :, None, None]
     return ((inverse > least) & (inverse < greatest)).to(inverse)

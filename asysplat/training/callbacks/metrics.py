@@ -19,8 +19,8 @@ IMAGE = ("set", "scene", "view")  # the columns that identify a row
 class Metrics(lightning.Callback):
     """Computes PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image, for loggers and a CSV.
 
-    `results` holds the means of every test set, the protocol's sentences, and the shares that the
-    network's early exit left out, early_exit/<set>/<what>, means over scenes; none if exact.
+    `results` holds the means of every test set, the protocol's descriptions, and the fractions that
+    the network's early exit left out, early_exit/<set>/<what>, means over scenes; none if exact.
 
     Args:
         protocol: how views are measured.
@@ -33,7 +33,7 @@ class Metrics(lightning.Callback):
         self.protocol, self.folder = protocol, Path(folder)
         self.backbone_dir, self.download = Path(backbone_dir), download
         self.rows: list[ImageRow] = []
-        self.shares: list[ImageRow] = []
+        self.early_exit_rows: list[ImageRow] = []
         sentences = protocol.sentences()
         self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in sentences.items()}
 
@@ -62,7 +62,7 @@ class Metrics(lightning.Callback):
         self.rows = []
 
     def on_test_epoch_start(self, *_: Any) -> None:
-        self.rows, self.shares = [], []
+        self.rows, self.early_exit_rows = [], []
 
     def on_validation_batch_end(
         self, trainer: Any, module: Any, outputs: Prediction, batch: Any, *_: Any
@@ -74,25 +74,25 @@ class Metrics(lightning.Callback):
     ) -> None:
         test_set = list(trainer.datamodule.tests)[set_index]
         self._add(test_set, batch, outputs, validation=False)
-        if module.net.early_exit_shares:
+        if module.net.early_exit_fractions:
             row: ImageRow = {"set": test_set, "scene": batch["scene"][0], "view": 0}
-            self.shares.append(row | module.net.early_exit_shares)
+            self.early_exit_rows.append(row | module.net.early_exit_fractions)
 
     def on_validation_epoch_end(self, trainer: Any, module: Any) -> None:
         means = average(gather(trainer, self.rows), self.protocol.mean_over)
         module.log_dict({f"val/{name}": value for name, value in means.items()})
 
     def on_test_epoch_end(self, trainer: Any, module: Any) -> None:
-        rows, shares = gather(trainer, self.rows), gather(trainer, self.shares)
+        rows, early_exit_rows = gather(trainer, self.rows), gather(trainer, self.early_exit_rows)
         results = {}
         for test_set in trainer.datamodule.tests:
             of_set = [row for row in rows if row["set"] == test_set]
             for name, value in average(of_set, self.protocol.mean_over).items():
                 kind = "baseline" if "/" in name else "test"
                 results[f"{kind}/{test_set}/{name}"] = value
-            of_set = [row for row in shares if row["set"] == test_set]
-            for name, share in average(of_set, "images").items():
-                results[f"early_exit/{test_set}/{name}"] = share
+            of_set = [row for row in early_exit_rows if row["set"] == test_set]
+            for name, fraction in average(of_set, "images").items():
+                results[f"early_exit/{test_set}/{name}"] = fraction
         module.log_dict(results)
         self.results |= results
         if trainer.is_global_zero:
