@@ -28,6 +28,7 @@ if INTERPRETED:
     import interpreter  # noqa: F401
 
 REPO = Path(__file__).resolve().parents[1]
+pytest_plugins = ["tiny_runs"]
 
 
 @pytest.fixture(scope="session")

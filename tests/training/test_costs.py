@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import lightning
 import pytest
 import torch
-from conftest import COSTS
 from tiny import QUIET
+from tiny_runs import COSTS
 from torch import nn
 from torch.utils.data import DataLoader
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import events
 import pytest
 import torch
-from conftest import finished
+from tiny_runs import finished
 
 FEW = [
     *("trainer.accelerator=cpu", "steps=2", "validate_every=1", "data.batch_size=4"),

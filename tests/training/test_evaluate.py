@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import COSTS, TINY_SCENES, finished
 from tiny import SIZE, VIEWS
 from tiny import STEPS as TRAINING
+from tiny_runs import COSTS, TINY_SCENES, finished
 
 from asysplat.data.procedural import ProceduralScene
 from asysplat.data.write import write_transforms

@@ -13,7 +13,7 @@ import events
 import processes
 import pytest
 import torch
-from conftest import finished
+from tiny_runs import finished
 
 from asysplat.runs.checkpoints import read_metadata
 

@@ -1,4 +1,4 @@
-"""train.py as a user runs it, on tiny synthetic scenes."""
+"""Fixtures that run train.py as a user does, on tiny synthetic scenes."""
 
 import os
 import signal

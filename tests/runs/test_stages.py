@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from conftest import finished
 from omegaconf import OmegaConf
 from tiny import NETWORK, SCENES
+from tiny_runs import finished
 
 from asysplat.errors import InputError
 from asysplat.runs.runs import config_hash, find_run, find_runs

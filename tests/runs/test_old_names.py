@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import finished
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
+from tiny_runs import finished
 
 from asysplat import load, render
 from asysplat.evaluation.metrics import psnr
