@@ -64,7 +64,7 @@ UNKNOWN = {
     "batch_sizes=2,4": "did you mean data.batch_size?",
     "callbacks.pictres.scenes=1": "did you mean callbacks.figures.scenes?",
     "~callbacks.cots": "callbacks.cots is unknown: did you mean callbacks.costs?",
-    "data.root=my_scene": "data.root is unknown: it is an option of data=colmap, ",
+    "data.root=my_scene": "data.root is unknown: it is an option of data=deep_blending, ",
     "qqq=1": "qqq is unknown: python train.py --cfg job shows all.",
     "model=longlrm,asysplat_4m4z": "model=asysplat_4m4z is unknown: did you mean asysplat_4m4",
     "model/links=bth": "did you mean both? All are in conf/model/links/.",

@@ -205,7 +205,7 @@ REFUSED = {
         ["trainer.accelerator=cpu", "trainer.devices=2", "data.batch_size=3"],
         "error: data.batch_size=3 scenes do not divide among 2 processes",
     ),
-    "a missing folder": (["data=transforms", "data.root=nowhere"], "data.root=nowhere"),
+    "a missing folder": (["data=files", "data.root=nowhere"], "data.root=nowhere"),
     "no checkpoint": (["ckpt_path=last", "name=new"], "leave ckpt_path out"),
     "too many views": (["data.inputs=30"], "has 24 images"),
 }
