@@ -18,7 +18,6 @@ from asysplat.ops.adam.reference import AdamSettings, Rows, adam_step_reference
 from asysplat.ops.image_loss import image_loss
 from asysplat.ops.ssd.chunked import CHUNK
 from asysplat.refinement import Refinement
-from asysplat.rendering import Culling
 from asysplat.scene import Views
 from benchmarks.compare import RATIO, Watched
 from benchmarks.model import Workload, make_net, make_views
@@ -64,7 +63,7 @@ def make_pairs() -> Iterator[Pair]:
     # Both passes of the renderer, and a step of the refinement
     gaussians, camera = random_scene(GAUSSIANS, SIDE, SIDE)
     inputs = prepare((gaussians, camera))
-    passes = {name: partial(run, Backend(name), Culling(), inputs) for name in ("cpu", "reference")}
+    passes = {name: partial(run, Backend(name), inputs) for name in ("cpu", "reference")}
     yield Pair("render", "reference", passes["cpu"], passes["reference"])
     generator = torch.Generator().manual_seed(0)
     photograph = Views(camera, torch.rand(1, 3, SIDE, SIDE, generator=generator))

@@ -1,6 +1,6 @@
 """Every backend of the renderer, and every culling switched off: seconds, memory, error."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import partial
 from typing import NamedTuple
 
@@ -13,7 +13,8 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from asysplat.rendering import Culling, render
+from asysplat.rendering import render
+from asysplat.rendering.interface import Culling, without_culling
 from asysplat.scene import Cameras, Gaussians
 from benchmarks import timing
 from benchmarks.compare import ERROR, TIME, Watched
@@ -81,12 +82,13 @@ def prepare(scene: Scene, device: torch.device = CPU, ignored: Tensor | None = N
     return leaves, cameras, weights.to(gaussians.means)
 
 
-def run(backend: Backend, culling: Culling, inputs: Inputs) -> Outputs:
-    """Render without background, and compute the gradients."""
+def run(backend: Backend, inputs: Inputs, *off: str) -> Outputs:
+    """Render without background and the culling that is `off`, and compute the gradients."""
     gaussians, cameras, weights = inputs
     leaves = [getattr(gaussians, name) for name in FIELDS]
     start = now(backend.device)
-    out = render(gaussians, cameras, backend=backend.name, culling=culling, depth=False)
+    with without_culling(*off):
+        out = render(gaussians, cameras, backend=backend.name, depth=False)
     middle = now(backend.device)
     gradients = torch.autograd.grad(out.image, leaves, weights)
     seconds = {"forward": middle - start, "backward": now(backend.device) - middle}
@@ -96,7 +98,7 @@ def run(backend: Backend, culling: Culling, inputs: Inputs) -> Outputs:
 def run_exact(scene: Scene, ignored: Tensor | None = None) -> Outputs:
     """Render the scene by the reference in float64."""
     exact = tuple(part.to(torch.float64) for part in scene)
-    return run(Backend("reference"), Culling(), prepare(exact, ignored=ignored))
+    return run(Backend("reference"), prepare(exact, ignored=ignored))
 
 
 def flips(outputs: Outputs, exact: Outputs) -> Tensor:
@@ -137,7 +139,7 @@ def _measure_scene(name: str, repeats: int) -> list[Result]:
     small = SMALLER[name]() if name in SMALLER else scene
     # Where the rounding of any backend decides about a cut-off, more than rounding differs.
     exact = run_exact(small)
-    fast = [run(b, Culling(), prepare(small, b.device)) for b in backends]
+    fast = [run(b, prepare(small, b.device)) for b in backends]
     ignored = torch.stack([flips(outputs, exact) for outputs in fast]).any(0)
     exact = run_exact(small, ignored)
     measurements = []
@@ -145,9 +147,9 @@ def _measure_scene(name: str, repeats: int) -> list[Result]:
         inputs = prepare(scene, backend.device)
         small_inputs = prepare(small, backend.device, ignored)
         for off in (None, *backend.culling):
-            culling = replace(Culling(), **{off: False}) if off else Culling()
-            run_once = partial(run, backend, culling, inputs)
-            error = errors(run(backend, culling, small_inputs), exact, ignored)
+            kinds = [] if off is None else [off]
+            run_once = partial(run, backend, inputs, *kinds)
+            error = errors(run(backend, small_inputs, *kinds), exact, ignored)
             row = {"scene": name, "backend": backend.name, "without": off, **_sizes(scene)}
             row["error"] = {"measured_on": _sizes(small), **error}
             row["stats"] = run_once().stats

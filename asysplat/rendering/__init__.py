@@ -1,6 +1,6 @@
 """Render Gaussians to images: project, sort into tiles, rasterize."""
 
-from asysplat.rendering.interface import BLENDING_LIMITS, GSPLAT_1_5, INRIA, BlendingLimits, Culling
+from asysplat.rendering.interface import BLENDING_LIMITS, GSPLAT_1_5, INRIA, BlendingLimits
 from asysplat.rendering.render import Rendering, render
 
 __all__ = [
@@ -8,7 +8,6 @@ __all__ = [
     "GSPLAT_1_5",
     "INRIA",
     "BlendingLimits",
-    "Culling",
     "Rendering",
     "render",
 ]

@@ -1,6 +1,8 @@
 """The arguments and results of a rendering backend."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -58,7 +60,7 @@ BLENDING_LIMITS = {"inria": INRIA, "gsplat-1.5": GSPLAT_1_5}
 class Culling:
     """Exact culling: work that can be left out without changing a bit of an image or a gradient.
 
-    Each kind can be switched off.
+    `without_culling` switches kinds off.
 
     Args:
         opacity: cull Gaussians below alpha_min before the projection.
@@ -80,6 +82,20 @@ class Culling:
     opaque: bool = True
 
 
+_culling = Culling()
+
+
+@contextmanager
+def without_culling(*kinds: str) -> Iterator[None]:
+    """Switch kinds of culling off while the block runs, to test and to time what they save."""
+    global _culling
+    before, _culling = _culling, replace(_culling, **dict.fromkeys(kinds, False))
+    try:
+        yield
+    finally:
+        _culling = before
+
+
 @dataclass(frozen=True)
 class RenderSettings:
     """Settings of a rendering.
@@ -97,7 +113,7 @@ class RenderSettings:
     limits: BlendingLimits = INRIA
     antialiased: bool = False
     depth: str | None = "expected"
-    culling: Culling = Culling()
+    culling: Culling = field(default_factory=lambda: _culling)
 
     def __post_init__(self):
         if self.depth is not None and self.depth not in DEPTHS:

@@ -15,7 +15,6 @@ from asysplat.rendering.chunks import draw_in_chunks
 from asysplat.rendering.interface import (
     INRIA,
     BlendingLimits,
-    Culling,
     RenderOutputs,
     RenderSettings,
 )
@@ -67,7 +66,6 @@ def render(
     antialiased: bool = False,
     sh_degree: int | None = None,
     limits: BlendingLimits = INRIA,
-    culling: Culling = Culling(),  # noqa: B008
     masks: Bool[Tensor, "*batch V H W"] | None = None,
     views_at_once: int | None = None,
     validate: bool = False,
@@ -90,7 +88,6 @@ def render(
         antialiased: lower opacities by what the dilation adds to a splat's area (Yu et al. 2024).
         sh_degree: ignore SH of higher degrees.
         limits: cut-offs of alpha compositing; see `BLENDING_LIMITS`.
-        culling: exact culling; each kind can be switched off.
         masks: True where a pixel counts; the others show the background, and tiles without a pixel
             that counts cost nothing.
         views_at_once: draw this many views of each scene at a time, keep only the inputs, and draw
@@ -111,7 +108,7 @@ def render(
     batch = _check(gaussians, cameras, background, masks)
     dtype = torch.promote_types(gaussians.means.dtype, cameras.cam_to_world.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    settings = RenderSettings(limits, antialiased, DEPTH_SWITCH.get(depth, depth), culling)
+    settings = RenderSettings(limits, antialiased, DEPTH_SWITCH.get(depth, depth))
     with without_autocast(gaussians.means):
         scenes = gaussians.map(lambda t: _one_batch(t.to(dtype), batch))
         if sh_degree is not None:

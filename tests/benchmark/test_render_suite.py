@@ -7,7 +7,6 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from asysplat.errors import InputError
-from asysplat.rendering import Culling
 from benchmarks.options import find_suite
 from benchmarks.render import (
     CULLING,
@@ -55,7 +54,7 @@ def test_rows_are_complete_and_culling_leaves_the_error_unchanged(results):
 def test_errors_are_those_of_image_and_gradients():
     scene = random_scene(200, 20, 20)
     exact = run_exact(scene)
-    outputs = run(find_backends()[0], Culling(), prepare(scene))
+    outputs = run(find_backends()[0], prepare(scene))
     none = flips(exact, exact)
     close = errors(outputs, exact, none)
     assert not none.any() and 0 < close["image_max"] < 1e-3

@@ -6,7 +6,7 @@ import pytest
 import torch
 from backends import assert_same_bits, both_ways
 
-from asysplat.rendering import Culling
+from asysplat.rendering.interface import Culling, without_culling
 from benchmarks.scenes import pixel_aligned_scene, random_scene
 
 
@@ -46,8 +46,8 @@ def test_each_kind_saves_work_and_changes_no_bit(fast_backend, scene):
     names = [field.name for field in fields(Culling)]
     assert names == list(GAINS)
     for off in (*([name] for name in names), names):
-        culling = Culling(**dict.fromkeys(off, False))
-        without = both_ways(fast_backend, gaussians, cameras, culling=culling, **options)
+        with without_culling(*off):
+            without = both_ways(fast_backend, gaussians, cameras, **options)
         assert_same_bits(without, plain, f"without {off}: ")
         if scene == "needles" and len(off) == 1:
             gain = GAINS[off[0]]

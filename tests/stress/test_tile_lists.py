@@ -8,11 +8,12 @@ import pytest
 import torch
 from tangents import tangent_scene
 
-from asysplat.rendering import Culling, render
+from asysplat.rendering import render
 from asysplat.rendering.cpu import splat as col
 from asysplat.rendering.cpu.splat import TILE, Frame, ProjectSettings, load_ellipse
 from asysplat.rendering.cpu.tiles import compute_box, list_tiles, scatter_pairs
 from asysplat.rendering.formulas import PIXEL_MARGIN
+from asysplat.rendering.interface import without_culling
 from asysplat.scene import Cameras
 
 SLACK = 1e-6  # pixels, of the margins themselves
@@ -136,7 +137,8 @@ def test_boxes_and_several_views(lists_of):
     views.intrinsics[1, 0, 2] += 7.3
     exact = lists_of(gaussians, views)
     check_lists(exact, 100, 120)
-    boxes = lists_of(gaussians, views, culling=Culling(ellipse=False))
+    with without_culling("ellipse"):
+        boxes = lists_of(gaussians, views)
     assert len(boxes.entries) > len(exact.entries)
     assert (np.bincount(boxes.entries[:, 1]) == 1).all()
 
