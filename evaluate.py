@@ -87,7 +87,7 @@ def evaluate(options: DictConfig) -> None:
     if options.run is None:  # a run has one
         OmegaConf.save(options, target.folder / "config.yaml", resolve=True)
     results = fingerprint | {"evaluation/post_optimization": POST_OPTIMIZATION_METHOD}
-    results |= {f"protocol/{k}": v for k, v in measure.protocol.sentences().items()}
+    results |= {f"protocol/{k}": v for k, v in measure.protocol.describe().items()}
     results |= set_results(scenes, measure.protocol.mean_over)
     if options.gaussians is not None:  # reading a file is no prediction
         results = {k: v for k, v in results.items() if not k.startswith("cost/post0/")}

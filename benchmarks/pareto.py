@@ -441,7 +441,7 @@ def measure(options: DictConfig, console: Console) -> Result:
             rows += [where | row for row in found]
     for row in [row for row in rows if row["not_measured"]]:
         absent["{family}, {scene}, {setting}".format(**row)] = row["not_measured"]
-    return {"protocol": protocol.sentences(), "not_measured": absent, "rows": rows}
+    return {"protocol": protocol.describe(), "not_measured": absent, "rows": rows}
 
 
 def summarize(rows: Sequence[Result]) -> list[Result]:

@@ -34,7 +34,7 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
     if targets.depths is not None:
         maps["true inverse depth"] = disparity(targets.depths)
     if targets.masks is not None:
-        maps = {name: each.where(targets.masks, torch.nan) for name, each in maps.items()}
+        maps = {name: values.where(targets.masks, torch.nan) for name, values in maps.items()}
     titles = (*images, *maps)
     quality = psnr(targets.masked(rendering.image), targets.images)
     aspect = targets.cameras.height / targets.cameras.width
@@ -47,7 +47,7 @@ def comparison_figure(inputs: Views, targets: Views, rendering: Rendering) -> Fi
         for axis, image in zip(row, images.values(), strict=False):
             axis.imshow(image[view].clamp(0, 1).permute(1, 2, 0).cpu().float().numpy())
         row[2].set_xlabel(f"{quality[view]:.1f} dB", fontsize=8)
-        error, *disparities = (each[view].cpu().float() for each in maps.values())
+        error, *disparities = (values[view].cpu().float() for values in maps.values())
         row[3].imshow(error.numpy(), cmap="magma", vmin=0, vmax=MAX_ERROR)
         near = disparities[-1].flatten().nanquantile(0.99).nan_to_num().item()
         for axis, values in zip(row[4:], disparities, strict=True):

@@ -107,7 +107,7 @@ def abs_rel(depth: Depths, target_depth: Depths, alignment: Alignment = "none") 
 
 
 def delta1(depth: Depths, target_depth: Depths, alignment: Alignment = "none") -> PerView:
-    """Compute the share of pixels with max(depth / target, target / depth) < 1.25.
+    """Compute the fraction of pixels with max(depth / target, target / depth) < 1.25.
 
     Only pixels with target > 0 count. Arguments and NaN as in `abs_rel`.
     """

@@ -90,7 +90,7 @@ class Protocol:
         """Return a warning that LPIPS is not computed, and how to get its backbone."""
         return (
             f"{BACKBONES[self.lpips_net]} is neither in torch's hub cache nor in paths.weights: "
-            "the run goes on without LPIPS; paths.download=true fetches it."
+            "the run continues without LPIPS; paths.download=true fetches it."
         )
 
     def _prepare(self, rendered: Images, targets: Views) -> Images:
@@ -147,8 +147,8 @@ class Protocol:
             for name, (_, draw) in BASELINES.items()
         }
 
-    def sentences(self) -> dict[str, str]:
-        """Return the protocol's name and a sentence for each metric."""
+    def describe(self) -> dict[str, str]:
+        """Describe each metric, after the protocol's name."""
         size = metrics.SSIM_WINDOWS[self.ssim_window]
         window = f"{self.ssim_window} window {size}x{size}"
         if self.ssim_window == "gaussian":

@@ -39,15 +39,15 @@ def measure_scenes(
     """Measure every scene that has no result yet, with a progress bar, and draw the first.
 
     Args:
-        tests: by test set, the data set's own first, its scenes: their name, `scene`, and `inputs`
-            and `targets`.
+        tests: test set -> its scenes, the data set's own set first; a scene has its name, `scene`,
+            `inputs` and `targets`.
         predictor: returns the `predict` of a scene, whose costs are measured; see
             `PostOptimization`.
         measure: measures a scene.
         device: that computes.
-        folder: for figures/evaluation-post<steps>.png: the first scene at the first and the last
-            of the steps.
-        scene_folder: the results of single scenes are read from it and written to it.
+        folder: folder for figures/evaluation-post<steps>.png, which show the first scene at the
+            first and the last of the steps.
+        scene_folder: folder of the results of single scenes, which are read and written there.
         early_exit: the fractions that the last prediction left out, see `TokenNetwork`.
     """
     make_folder(scene_folder, "paths.logs")
@@ -71,12 +71,12 @@ def measure_scenes(
 
             result = measure(sample["scene"], predictor(sample), inputs, targets, show)
             result.early_exit.update(early_exit)
-            sentence = f"{name} {result.scene}, PSNR after steps of post-optimization: "
-            sentence += ", ".join(
+            message = f"{name} {result.scene}, PSNR after steps of post-optimization: "
+            message += ", ".join(
                 f"{method[4:]}: {_means(result.rows, 'targets', method, 'images')['psnr']:.2f}"
                 for method in result.costs
             )
-            bars.console.print(sentence, soft_wrap=True, highlight=False)
+            bars.console.print(message, soft_wrap=True, highlight=False)
             return result
 
         results: dict[str, list[SceneResult]] = {name: [] for name in tests}
@@ -122,20 +122,20 @@ def set_results(scenes: Scenes, over: Literal["images", "scenes"]) -> dict[str, 
     main = next(iter(scenes))
     for test_set, results in scenes.items():
         rows = image_rows({test_set: results})
-        costs = "cost" if test_set == main else f"cost/{test_set}"
-        averages[f"{costs}/gaussians"] = sum(r.gaussians for r in results) / len(results)
-        for name, share in average([dict(r.early_exit) for r in results], "images").items():
-            averages[f"early_exit/{test_set}/{name}"] = share
+        prefix = "cost" if test_set == main else f"cost/{test_set}"
+        averages[f"{prefix}/gaussians"] = sum(r.gaussians for r in results) / len(results)
+        for name, fraction in average([dict(r.early_exit) for r in results], "images").items():
+            averages[f"early_exit/{test_set}/{name}"] = fraction
         for method in dict.fromkeys(row["method"] for row in rows):
             tested = "test" if method in results[0].costs else "baseline"
             for kind, images in ((tested, "targets"), ("inputs", "inputs")):
                 for name, value in _means(rows, images, method, over).items():
                     averages[f"{kind}/{test_set}/{method}/{name}"] = value
         for method in results[0].costs:
-            every = [result.costs[method] for result in results]
-            averages[f"{costs}/{method}/seconds"] = mean_but_longest([c["seconds"] for c in every])
-            if all("gb" in each for each in every):
-                averages[f"{costs}/{method}/gb"] = max(each["gb"] for each in every)
+            rows = [result.costs[method] for result in results]
+            averages[f"{prefix}/{method}/seconds"] = mean_but_longest([r["seconds"] for r in rows])
+            if all("gb" in row for row in rows):
+                averages[f"{prefix}/{method}/gb"] = max(row["gb"] for row in rows)
     return averages
 
 

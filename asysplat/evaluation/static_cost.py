@@ -117,11 +117,11 @@ def activation_gb(net: nn.Module, num_views: int, height: int, width: int) -> fl
         state = {name: torch.empty(t.shape, dtype=t.dtype) for name, t in tensors.items()}
         for name, _ in net.named_parameters():
             state[name].requires_grad_()
-        own = {tensor.untyped_storage()._cdata for tensor in state.values()}
+        state_storages = {tensor.untyped_storage()._cdata for tensor in state.values()}
 
         def save(tensor: Tensor) -> Tensor:
             storage = tensor.untyped_storage()
-            if storage._cdata not in own:
+            if storage._cdata not in state_storages:
                 storages[storage._cdata] = storage
             return tensor
 

@@ -138,8 +138,8 @@ class Results:
         """Write metrics.json and metrics.csv, and print the table."""
         results: dict[str, float | int | str] = {"gaussians": gaussians.num_gaussians}
         results |= {"steps": progress.step, "seconds": progress.seconds}
-        sentences = self._protocol.sentences()
-        results |= {f"protocol/{name}": sentence for name, sentence in sentences.items()}
+        descriptions = self._protocol.describe()
+        results |= {f"protocol/{name}": description for name, description in descriptions.items()}
         photographs, rows = self._photographs, []
         inputs, held_out = photographs.inputs, photographs.held_out
         sets = {"inputs": (inputs, photographs.input_files)}

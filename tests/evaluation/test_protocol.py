@@ -172,25 +172,25 @@ WORDS = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_sentences_of_protocols_describe_their_options(protocols, name):
-    sentences = protocols[name].sentences()
-    assert set(sentences) == {"name", "psnr", "ssim", "lpips", "absrel", "delta1"}
-    assert sentences["name"] == name
+def test_descriptions_of_protocols_name_their_options(protocols, name):
+    descriptions = protocols[name].describe()
+    assert set(descriptions) == {"name", "psnr", "ssim", "lpips", "absrel", "delta1"}
+    assert descriptions["name"] == name
     images, window, covariance, net, mean = WORDS[name]
-    assert images in sentences["psnr"] and f"{covariance} covariance" in sentences["ssim"]
-    assert images + window in sentences["ssim"] and net in sentences["lpips"]
-    assert images.removesuffix(", ") in sentences["lpips"]
-    assert all(mean in sentences[metric] for metric in ("psnr", "ssim", "lpips"))
+    assert images in descriptions["psnr"] and f"{covariance} covariance" in descriptions["ssim"]
+    assert images + window in descriptions["ssim"] and net in descriptions["lpips"]
+    assert images.removesuffix(", ") in descriptions["lpips"]
+    assert all(mean in descriptions[metric] for metric in ("psnr", "ssim", "lpips"))
     for metric in ("absrel", "delta1"):
-        assert "not aligned" in sentences[metric] and "mask" in sentences[metric]
+        assert "not aligned" in descriptions[metric] and "mask" in descriptions[metric]
 
 
-def test_every_option_of_a_protocol_changes_a_sentence(protocols):
+def test_every_option_of_a_protocol_changes_a_description(protocols):
     plain = protocols["default"]
     changes = [
         *({"eight_bit": True}, {"ssim_window": "uniform"}, {"ssim_covariance": "sample"}),
         *({"lpips_net": "vgg"}, {"mean_over": "scenes"}, {"depth_alignment": "median"}),
     ]
     assert {key for change in changes for key in change} == set(vars(plain)) - {"name"}
-    texts = [replace(plain, **change).sentences() for change in [{}, *changes]]
+    texts = [replace(plain, **change).describe() for change in [{}, *changes]]
     assert len({tuple(text.values()) for text in texts}) == len(texts)

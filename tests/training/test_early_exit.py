@@ -19,7 +19,7 @@ def logged(tests):
     data = SimpleNamespace(tests=tests)
     trainer = Mock(lightning.Trainer, datamodule=data, world_size=1, is_global_zero=False)
     callback = Metrics(
-        Mock(Protocol, sentences=dict, mean_over="images"), "unused", backbone_dir="unused"
+        Mock(Protocol, describe=dict, mean_over="images"), "unused", backbone_dir="unused"
     )
     callback._add = Mock()
     callback.on_test_epoch_start()

@@ -34,8 +34,8 @@ class Metrics(lightning.Callback):
         self.backbone_dir, self.download = Path(backbone_dir), download
         self.rows: list[ImageRow] = []
         self.early_exit_rows: list[ImageRow] = []
-        sentences = protocol.sentences()
-        self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in sentences.items()}
+        descriptions = protocol.describe()
+        self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in descriptions.items()}
 
     def setup(self, trainer: Any, module: Any, stage: str) -> None:
         if hasattr(self, "lpips"):
