@@ -23,14 +23,14 @@ class Augmentation:
 
     Args:
         reverse, shuffle: probability of inputs in reverse order, and in random order.
-        crop: least share of the sides that a crop keeps; 1 crops nothing.
-        exposure: greatest change in stops of a whole task, inputs and targets alike.
+        crop: least fraction of the sides that a crop keeps; 1 crops nothing.
+        exposure: greatest change in stops of a task, the same for its inputs and targets.
         white_balance: greatest change in stops of a task's red and blue, relative to its green.
         flicker: greatest change in stops of one input, relative to the other views.
         noise: greatest standard deviation of the noise in a task's inputs.
 
     Raises:
-        InputError: a number outside [0, 1], or a share of 0.
+        InputError: a number outside [0, 1], or a crop of 0.
     """
 
     reverse: float = 0.0
@@ -58,8 +58,8 @@ class Augmentation:
             rng.shuffle(ordered)
         return ordered
 
-    def share(self, rng: np.random.Generator) -> float:
-        """Draw the share of the sides that a crop keeps, the same for all views of a task."""
+    def draw_crop(self, rng: np.random.Generator) -> float:
+        """Draw the fraction of the sides that a crop keeps, the same for all views of a task."""
         return float(rng.uniform(self.crop, 1.0))
 
     def expose(
@@ -91,7 +91,7 @@ def brighten(views: Views, stops: Float[np.ndarray, "#V 3"]) -> Views:
     return replace(views, images=(views.images * gains[..., None, None]).clamp(max=1))
 
 
-def center_crop(views: Views, share: float) -> Views:
+def center_crop(views: Views, fraction: float) -> Views:
     """Crop every view around its center at whole pixels, and enlarge it to the original size.
 
     Images are resampled bilinearly, depths and masks by nearest neighbor. The intrinsics change
@@ -99,10 +99,10 @@ def center_crop(views: Views, share: float) -> Views:
 
     Args:
         views: [V, ...].
-        share: fraction of each side to keep, in (0, 1].
+        fraction: fraction of each side to keep, in (0, 1].
     """
     height, width = views.cameras.height, views.cameras.width
-    rows, columns = max(1, round(share * height)), max(1, round(share * width))
+    rows, columns = max(1, round(fraction * height)), max(1, round(fraction * width))
     if (rows, columns) == (height, width):
         return views
     top, left = (height - rows) // 2, (width - columns) // 2

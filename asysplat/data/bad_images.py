@@ -44,17 +44,17 @@ class BadImages:
                 results.append(read(*item))
         return results
 
-    def report(self, scene: str, left: int) -> None:
+    def report(self, scene: str, usable: int) -> None:
         """Report the collected errors, after all images of a scene were read.
 
         Args:
             scene: its name, for the message.
-            left: number of its images that can be used.
+            usable: number of its images that can be used.
 
         Raises:
             InputError: there are errors and the policy is "fail", or too few images are left.
         """
-        bad, total = len(self.errors), left + len(self.errors)
+        bad, total = len(self.errors), usable + len(self.errors)
         different = list(dict.fromkeys(self.errors))
         listed = "".join(f"\n  {error}" for error in different[:MAX_LISTED])
         more = len(different) - MAX_LISTED
@@ -64,9 +64,9 @@ class BadImages:
                 f"{scene}: {bad} of {total} images cannot be used; fix them, or leave them out "
                 f"with on_bad_image=skip:{listed}"
             )
-        if left < MIN_IMAGES:
+        if usable < MIN_IMAGES:
             raise InputError(
-                f"{scene} has {left} usable image(s) of {total}: a scene needs at least "
+                f"{scene} has {usable} usable image(s) of {total}: a scene needs at least "
                 f"{MIN_IMAGES}.{listed}"
             )
         if bad:

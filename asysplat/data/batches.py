@@ -32,22 +32,22 @@ def split_batch(batch_size: int, micro_batch: int | None, processes: int) -> Bat
     Args:
         batch_size: scenes of an optimizer step.
         micro_batch: the most scenes that a process may hold at a time; fewer where these do not
-            divide its share; None: all of its share.
+            divide its scenes; None: all of its scenes.
         processes: number of processes that train together.
 
     Raises:
         InputError: the batch does not divide among the processes.
     """
-    share, left = divmod(batch_size, processes)
-    if left:
+    scenes, remainder = divmod(batch_size, processes)
+    if remainder:
         fewer = largest_divisor(batch_size, processes)
         raise InputError(
             f"data.batch_size={batch_size} scenes do not divide among {processes} processes "
             f"(trainer.devices x trainer.num_nodes): use {fewer} processes, or set "
-            f"data.batch_size={processes * (share + 1)}."
+            f"data.batch_size={processes * (scenes + 1)}."
         )
-    largest = largest_divisor(share, micro_batch or share)
-    return BatchSplit(processes, largest, share // largest)
+    largest = largest_divisor(scenes, micro_batch or scenes)
+    return BatchSplit(processes, largest, scenes // largest)
 
 
 def largest_divisor(number: int, limit: int) -> int:

@@ -86,9 +86,9 @@ def _data_module(
         main["height"], main["width"] = test_size
         sets[name] = partial(_test_tasks, make_source, **main)
     changeable = ("inputs", "targets", "prune", *SIZE, *changeable)
-    for other, changes in test_sets.items():
-        where = f"data.test_sets.{other}"
-        if other == name:
+    for test_set, changes in test_sets.items():
+        where = f"data.test_sets.{test_set}"
+        if test_set == name:
             raise InputError(f"{where} has the name of the data set itself: give it another name.")
         if not isinstance(changes, Mapping):
             raise InputError(
@@ -100,7 +100,7 @@ def _data_module(
                     f"{where}.{option} is no option of a test set: give any of "
                     f"{', '.join(changeable)}."
                 )
-        sets[other] = partial(_test_tasks, make_source, **{**main, **changes})
+        sets[test_set] = partial(_test_tasks, make_source, **{**main, **changes})
     return SceneDataModule(source=make_source(**scenes), test_sets=sets, **size, **module)
 
 
@@ -116,9 +116,9 @@ def tested_sets(test_sets: Mapping[str, Any] | None, name: str, on_disk: bool) -
         on_disk: whether the data set is read from disk.
     """
     return {
-        other: options
-        for other, options in (test_sets or {}).items()
-        if not _has_root(options) or (on_disk and options["root"] is not None and other != name)
+        test_set: options
+        for test_set, options in (test_sets or {}).items()
+        if not _has_root(options) or (on_disk and options["root"] is not None and test_set != name)
     }
 
 

@@ -18,7 +18,7 @@ from numpy import ndarray
 
 GIGABYTE = 2**30
 KEY = re.compile("[0-9a-f]{32}-[0-9a-f]{16}")  # keys of images, see FileSequence
-SHARE_AFTER_CLEARING = 0.9  # share of the limit to which a full disk cache is cleared
+FILL_AFTER_CLEARING = 0.9  # fraction of the limit to which a full disk cache is cleared
 
 
 class ImageCache:
@@ -85,7 +85,7 @@ class ImageCache:
         entries = sorted(self._files())
         self._on_disk = sum(size for _, size, _ in entries)
         for _, size, file in entries:
-            if self._on_disk <= SHARE_AFTER_CLEARING * self.disk_bytes:
+            if self._on_disk <= FILL_AFTER_CLEARING * self.disk_bytes:
                 break
             file.unlink(missing_ok=True)
             self._on_disk -= size

@@ -55,7 +55,7 @@ class SceneDataModule(lightning.LightningDataModule):
         points: whether the inputs have the depths of the scene's sparse points.
         on_bad_scene: where the files of a training scene cannot be used: "fail", or "skip" to draw
             another scene. A batch's `bad_scenes` lists the errors.
-        micro_batch: the most scenes that a process holds at a time; None: all of its share.
+        micro_batch: the most scenes that a process holds at a time; None: all of its scenes.
         growth_steps: optimizer steps in which the window of the training tasks grows.
 
     Raises:
@@ -91,9 +91,9 @@ class SceneDataModule(lightning.LightningDataModule):
         if not self.evaluation:
             counts = (self.inputs, self.targets)
             # All images are selected before any is read, since an index may not fit the scenes.
-            own = {self.name: partial(self.source.evaluation, "test", *counts)}
+            main_set = {self.name: partial(self.source.evaluation, "test", *counts)}
             tests: dict[str, list[Task]] = {}
-            for name, make_tasks in (own | self.test_sets).items():
+            for name, make_tasks in (main_set | self.test_sets).items():
                 with self._naming(name):
                     tests[name] = make_tasks()
             validation = self.source.evaluation("val", *counts)
@@ -198,8 +198,8 @@ class SceneDataModule(lightning.LightningDataModule):
         rank, processes = self._process
         turns = range(-(-len(scenes) // processes))
         last = max(range(rank, len(scenes), processes), default=0)
-        own = [min(turn * processes + rank, last) for turn in turns]
-        return DataLoader(Subset(scenes, own), collate_fn=collate)
+        indices = [min(turn * processes + rank, last) for turn in turns]
+        return DataLoader(Subset(scenes, indices), collate_fn=collate)
 
 
 class TrainingTasks(Dataset):
@@ -231,9 +231,9 @@ class TrainingTasks(Dataset):
         grown = min(1.0, index / self.growing_tasks) if self.growing_tasks else 1.0
         task = self.source.training(self.inputs, self.targets, rng, grown)
         inputs = self.augmentation.order(task.selection.inputs, rng)
-        share = self.augmentation.share(rng)
+        crop = self.augmentation.draw_crop(rng)
         task = Task(task.sequence, Selection(inputs, task.selection.targets))
-        sample = load(task, share, self.points)
+        sample = load(task, crop, self.points)
         inputs, targets = self.augmentation.expose(sample["inputs"], sample["targets"], rng)
         return {"scene": sample["scene"], "inputs": inputs, "targets": targets}
 
@@ -266,8 +266,8 @@ class FixedTasks(Dataset):
         return load(self.tasks[index], points=self.points)
 
 
-def load(task: Task, share: float = 1.0, points: bool = False) -> Sample:
-    """Read a task's views, validate, crop to `share` of their sides, and normalize them.
+def load(task: Task, crop: float = 1.0, points: bool = False) -> Sample:
+    """Read a task's views, validate, crop by `center_crop`, and normalize them.
 
     With `points`, the inputs have the depths of the sequence's sparse points, if it has any. The
     sample's `frame` is the Normalization.
@@ -275,7 +275,7 @@ def load(task: Task, share: float = 1.0, points: bool = False) -> Sample:
     inputs, targets = task.selection.inputs, task.selection.targets
     # An image that is both input and target is decoded once.
     indices = list(dict.fromkeys(inputs + targets))
-    views = center_crop(task.sequence.views(indices).validate(task.sequence.name), share)
+    views = center_crop(task.sequence.views(indices).validate(task.sequence.name), crop)
     inputs, targets = (
         views.select([indices.index(index) for index in chosen]) for chosen in (inputs, targets)
     )

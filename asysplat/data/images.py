@@ -28,7 +28,7 @@ HEIF = (".heic", ".heif")  # suffixes of what phones save
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 END_MARKERS = {"JPEG": b"\xff\xd9", "PNG": b"IEND"}
 TAIL_BYTES = 4096  # some cameras append data after the end marker
-WHOLE = 0.9999  # share of a pixel, as rounded, from which all of it is covered
+WHOLE = 0.9999  # fraction of a pixel, as rounded, from which all of it is covered
 PANORAMA = "EQUIRECTANGULAR"  # COLMAP's model of an image of all directions
 OUTSIDE = -1.0  # a position beyond the border of every image
 TWO_FOCALS = {  # COLMAP's models with one focal length; with two, more parameters follow, all 0
@@ -82,7 +82,7 @@ class Lens:
     yaw: float = 0.0
 
     @staticmethod
-    def of(camera: pycolmap.Camera) -> "Lens":
+    def from_camera(camera: pycolmap.Camera) -> "Lens":
         """Return the lens of COLMAP's camera, which must have a focal length."""
         return Lens(
             camera.width,
@@ -199,9 +199,9 @@ def resize_and_crop(
     """
     _, *box = _centered_box(pixels.shape[1], pixels.shape[0], height, width)
     if pixels.dtype == bool:
-        share = Image.fromarray(pixels.astype(np.float32))
-        share = share.resize((width, height), Image.Resampling.BOX, tuple(box))
-        return np.asarray(share) > WHOLE
+        coverage = Image.fromarray(pixels.astype(np.float32))
+        coverage = coverage.resize((width, height), Image.Resampling.BOX, tuple(box))
+        return np.asarray(coverage) > WHOLE
     method = Image.Resampling.NEAREST if nearest else Image.Resampling.LANCZOS
     return np.asarray(Image.fromarray(pixels).resize((width, height), method, tuple(box)))
 
@@ -262,11 +262,11 @@ def content_hash(file: ImageFile) -> str:
         return hashlib.blake2b(file.data.tobytes(), digest_size=16).hexdigest()
     _check_exists(file)
     stat = file.stat()
-    return _hash_of(file, stat.st_size, stat.st_mtime_ns)
+    return _hash_file(file, stat.st_size, stat.st_mtime_ns)
 
 
 @lru_cache(maxsize=65536)
-def _hash_of(path: Path, size: int, modified: int) -> str:
+def _hash_file(path: Path, size: int, modified: int) -> str:
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from asysplat.data.procedural import ProceduralScene, split_seed
 from asysplat.data.readers import find_scenes, open_scene
 from asysplat.data.selection import named_selection, views
-from asysplat.data.selection.index import read_index, selection_of
+from asysplat.data.selection.index import read_index, select_from_index
 from asysplat.data.selection.views import Selection, Split
 from asysplat.data.sequence import FileSequence, ImageSequence, SceneOptions
 from asysplat.errors import InputError
@@ -41,7 +41,7 @@ class Source(Protocol):
     ) -> Task:
         """Draw a random training task; the same state of `rng` gives the same task.
 
-        `grown` is the share, in [0, 1], by which the window has grown from its first size.
+        `grown` is the fraction, in [0, 1], by which the window has grown from its first size.
         """
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
@@ -224,7 +224,7 @@ class FilesSource:
         return [folder[index] for index, names in enumerate(named) if names]
 
     @cached_property
-    def _others(self) -> list[int]:
+    def _untested(self) -> list[int]:
         """The scenes of `root` that may train and validate."""
         scenes = range(len(self.training_folder))
         if not self.split_by_scenes:
@@ -235,7 +235,7 @@ class FilesSource:
 
     @cached_property
     def _validation(self) -> list[int]:
-        return views.evenly_spaced(self._others, min(self.val_scenes, len(self._others)))
+        return views.evenly_spaced(self._untested, min(self.val_scenes, len(self._untested)))
 
     @cached_property
     def _training(self) -> list[int]:
@@ -245,21 +245,24 @@ class FilesSource:
                     f"data.selection={self.selection} would test images that are trained on: name "
                     "the scenes to test with data.test_root, or use every_8th, kmeans or first_96."
                 )
-            return self._others
-        left = sorted(set(self._others) - set(self._validation))
-        if not left:
+            return self._untested
+        training_scenes = sorted(set(self._untested) - set(self._validation))
+        if not training_scenes:
             raise InputError(
-                f"data.root has {len(self._others)} scenes that data.test_root does not test, "
+                f"data.root has {len(self._untested)} scenes that data.test_root does not test, "
                 f"and data.val_scenes is {self.val_scenes}: give more scenes, or validate fewer."
             )
-        return left
+        return training_scenes
 
     def _index_tasks(self, inputs: int) -> list[Task]:
         index = read_index(self.index, inputs)
         tasks = [
-            Task(each, selection_of(index, self.index, each.name, each.num_images, inputs))
-            for each in self._tests
-            if each.name in index
+            Task(
+                sequence,
+                select_from_index(index, self.index, sequence.name, sequence.num_images, inputs),
+            )
+            for sequence in self._tests
+            if sequence.name in index
         ]
         if not tasks:
             raise InputError(

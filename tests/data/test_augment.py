@@ -30,11 +30,11 @@ def make_views(count=3) -> Views:
     )
 
 
-@pytest.mark.parametrize("share", [0.77, 0.995])
-def test_a_crop_keeps_directions_and_content(share):
+@pytest.mark.parametrize("fraction", [0.77, 0.995])
+def test_a_crop_keeps_directions_and_content(fraction):
     """The direction through each pixel of the crop is that of the position it shows."""
     views = make_views()
-    crop = center_crop(views, share)
+    crop = center_crop(views, fraction)
     assert crop.images.shape == views.images.shape
     old = views.cameras.intrinsics[:, None, None]
     x, y = crop.images[:, 0] * WIDTH, crop.images[:, 1] * HEIGHT
@@ -50,15 +50,15 @@ def test_a_crop_keeps_directions_and_content(share):
 
 
 def test_a_crop_takes_the_nearest_depths_and_masks():
-    views, share = make_views(), 0.6  # no center on a border between pixels
-    crop = center_crop(views, share)
+    views, fraction = make_views(), 0.6  # no center on a border between pixels
+    crop = center_crop(views, fraction)
     x = (crop.images[0, 0, 20] * WIDTH).floor().long()
     y = (crop.images[0, 1, :, 40] * HEIGHT).floor().long()
     inner = (slice(None), slice(1, -1), slice(1, -1))
     for name in ("depths", "masks", "disparities"):
         maps, found = getattr(views, name), getattr(crop, name)
         assert torch.equal(found[inner], maps[:, y[:, None], x][inner])
-    bare = center_crop(replace(views, depths=None, masks=None, disparities=None), share)
+    bare = center_crop(replace(views, depths=None, masks=None, disparities=None), fraction)
     assert bare.depths is None and bare.masks is None and bare.disparities is None
     assert torch.equal(bare.images, crop.images)
 
@@ -76,14 +76,14 @@ def test_orders_of_inputs_follow_their_probabilities():
     assert Augmentation(reverse=1.0).order(inputs, rng) == inputs[::-1]
 
 
-def test_shares_of_crops_fill_their_range_and_follow_the_seed():
+def test_fractions_of_crops_fill_their_range_and_follow_the_seed():
     crops = Augmentation(crop=0.77)
     rng = np.random.default_rng(0)
-    shares = [crops.share(rng) for _ in range(200)]
-    assert 0.77 <= min(shares) < 0.78 and 0.99 < max(shares) <= 1
+    fractions = [crops.draw_crop(rng) for _ in range(200)]
+    assert 0.77 <= min(fractions) < 0.78 and 0.99 < max(fractions) <= 1
     again = np.random.default_rng(0)
-    assert [crops.share(again) for _ in range(200)] == shares
-    assert Augmentation().share(rng) == 1
+    assert [crops.draw_crop(again) for _ in range(200)] == fractions
+    assert Augmentation().draw_crop(rng) == 1
 
 
 def test_a_task_has_one_exposure():

@@ -82,7 +82,7 @@ def test_images_are_undistorted_to_a_thousandth_of_a_pixel_as_by_opencv(lens):
 
 def test_a_lens_is_colmap_s_camera_and_back():
     lens = Lens(160, 120, 100.0, 100.0, 82.0, 57.5, "RADIAL", (0.1, -0.02))
-    assert Lens.of(lens.camera()) == lens
+    assert Lens.from_camera(lens.camera()) == lens
     # Two focal lengths need a model that has them.
     scaled = Lens(160, 120, 100.0, 105.0, 82.0, 57.5, "RADIAL", (0.1, -0.02))
     camera = scaled.camera()

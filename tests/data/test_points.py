@@ -81,8 +81,8 @@ def test_a_slanted_surface_keeps_its_points():
 def test_loaded_inputs_have_point_depths_in_their_own_frame():
     sequence = SequenceWithPoints(frame=5)
     task = Task(sequence, Selection([9, 5, 1], [7]))
-    plain = load(task, share=0.8)
-    sample = load(task, share=0.8, points=True)
+    plain = load(task, crop=0.8)
+    sample = load(task, crop=0.8, points=True)
     inputs = sample["inputs"].validate()
     assert sample["targets"].point_depths is None
     known = inputs.point_depths > 0

@@ -7,7 +7,7 @@ import torch
 from asysplat.data import ProceduralScene
 from asysplat.data.selection import kmeans_selection, named_selection
 from asysplat.data.selection.__main__ import main as index_command
-from asysplat.data.selection.index import Entry, read_index, selection_of, write_index
+from asysplat.data.selection.index import Entry, read_index, select_from_index, write_index
 from asysplat.data.selection.kmeans import nearest_to_centers, pose_features
 from asysplat.data.selection.views import (
     Selection,
@@ -220,7 +220,7 @@ def test_kmeans_gives_the_published_inputs_of_a_real_walk(shared):
     frames = json.loads(file.read_text())["frames"]
     poses = np.linalg.inv([frame["w2c"] for frame in frames])
     cameras = Cameras(torch.eye(3).double().repeat(498, 1, 1), torch.tensor(poses), 4, 4)
-    published = selection_of(read_index(file, 32), file, "mydesk", 498, 32)
+    published = select_from_index(read_index(file, 32), file, "mydesk", 498, 32)
     assert kmeans_selection(cameras, 32, 8, "test") == published
     assert published.targets == list(range(0, 498, 8)) and len(published.inputs) == 32
 
@@ -230,11 +230,11 @@ def test_pixelsplat_s_index_gives_inputs_and_targets(tmp_path):
     file.write_text('{"5aca": {"context": [2, 9], "target": [2, 4, 9]}, "322": null}')
     index = read_index(file, 2)
     assert list(index) == ["5aca"]
-    assert selection_of(index, file, "5aca", 10, 2) == Selection([2, 9], [2, 4, 9])
+    assert select_from_index(index, file, "5aca", 10, 2) == Selection([2, 9], [2, 4, 9])
     with pytest.raises(InputError, match=r"index\.json, scene 5aca has 2 inputs and data\.inputs"):
-        selection_of(index, file, "5aca", 10, 3)
+        select_from_index(index, file, "5aca", 10, 3)
     with pytest.raises(InputError, match="names image 9, and the scene has 9 images"):
-        selection_of(index, file, "5aca", 9, 2)
+        select_from_index(index, file, "5aca", 9, 2)
 
 
 def test_long_lrm_s_lists_give_inputs_and_every_8th_target(tmp_path):
@@ -246,7 +246,7 @@ def test_long_lrm_s_lists_give_inputs_and_every_8th_target(tmp_path):
     index = read_index(tmp_path, 2)
     assert index == {"a": expected, "b": expected}
     assert read_index(tmp_path / "a/opencv_cameras.json", 2) == {"a": expected}
-    assert selection_of(index, tmp_path, "a", 20, 2) == Selection([3, 12], [0, 8, 16])
+    assert select_from_index(index, tmp_path, "a", 20, 2) == Selection([3, 12], [0, 8, 16])
     with pytest.raises(InputError, match=r"no list fold_8_kmeans_4_input .*fold_8_kmeans_2_input"):
         read_index(tmp_path, 4)
 
@@ -261,9 +261,9 @@ def test_long_lrm_s_published_file_is_read(tmp_path):
     ]
     file.write_text(json.dumps(scenes))
     index = read_index(file, 2)
-    assert selection_of(index, file, "0569", 18, 2) == Selection([5, 17], [0, 8, 16])
+    assert select_from_index(index, file, "0569", 18, 2) == Selection([5, 17], [0, 8, 16])
     with pytest.raises(InputError, match="scene 0569 names image 17, and the scene has 17 images"):
-        selection_of(index, file, "0569", 17, 2)
+        select_from_index(index, file, "0569", 17, 2)
     with pytest.raises(InputError, match="scene 0569 has no list fold_8_kmeans_3_input"):
         read_index(file, 3)
 
@@ -272,7 +272,7 @@ def test_an_index_is_written_once(tmp_path):
     file = tmp_path / "index.json"
     selected = kmeans_selection(line(), 4, 4, "test")
     write_index(file, {"walk": selected})
-    assert selection_of(read_index(file, 4), file, "walk", 100, 4) == selected
+    assert select_from_index(read_index(file, 4), file, "walk", 100, 4) == selected
     with pytest.raises(InputError, match=r"index\.json exists"):
         write_index(file, {})
 
@@ -297,7 +297,7 @@ def test_the_command_writes_an_index_outside_of_the_data_set(folder, tmp_path, c
     index_command([scenes, str(file), "--inputs", "4"])
     assert "2 scenes" in capsys.readouterr().out
     expected = kmeans_selection(ProceduralScene(4, 8, 8, num_images=24).cameras, 4, 8, "test")
-    assert selection_of(read_index(file, 4), file, "s4", 24, 4) == expected
+    assert select_from_index(read_index(file, 4), file, "s4", 24, 4) == expected
     with pytest.raises(SystemExit, match="lies in the data set"):
         index_command([scenes, f"{scenes}/index.json", "--inputs", "4"])
     assert sorted(path.name for path in (tmp_path / "scenes").iterdir()) == ["s3", "s4"]

@@ -15,7 +15,7 @@ from asysplat.data.sequence import PosedScene
 from asysplat.errors import InputError
 
 CHOICES = ("auto", "given", "refined", "found")
-LEAST_GAIN = 0.01  # share of the reprojection error; refined cameras that gain less are not used
+LEAST_GAIN = 0.01  # fraction of the reprojection error; refined cameras that gain less are not used
 
 
 @dataclass(frozen=True)

@@ -28,12 +28,12 @@ from asysplat.data.cameras.folder import (
 from asysplat.data.frames import SUFFIXES, save_sharp_frames
 from asysplat.data.images import image_size
 from asysplat.data.readers import open_scene, photographs_in
-from asysplat.data.readers.masks import mask_of
+from asysplat.data.readers.masks import find_mask
 from asysplat.data.sequence import SceneOptions
 from asysplat.errors import InputError
 
-MIN_FOUND = 0.25  # share of the photographs; with fewer there is no scene
-ENOUGH = 0.9  # share of the photographs; with fewer the next attempt is made
+MIN_FOUND = 0.25  # fraction of the photographs; with fewer there is no scene
+ENOUGH = 0.9  # fraction of the photographs; with fewer the next attempt is made
 LEAST_PHOTOGRAPHS = 3
 
 
@@ -90,9 +90,9 @@ def find_cameras(
     video = source.is_file() and source.suffix.lower() in SUFFIXES
     files = [source] if video else _photographs(source, on_bad_image)
     lenses = {} if video else _lenses(files, source, on_bad_image)
-    masks = {file: mask for file in lenses if (mask := mask_of(file)) is not None}
-    beside = [mask for file, mask in masks.items() if mask != file]
-    folder = where / f"{source.stem}-{digest(f'{ATTEMPTS} {frames}', [*files, *beside])}"
+    masks = {file: mask for file in lenses if (mask := find_mask(file)) is not None}
+    separate_masks = [mask for file, mask in masks.items() if mask != file]
+    folder = where / f"{source.stem}-{digest(f'{ATTEMPTS} {frames}', [*files, *separate_masks])}"
     if folder.is_dir():
         return folder
     with work_folder(where, frames if video else len(files), console) as (work, progress):
@@ -130,20 +130,20 @@ def _photographs(source: Path, on_bad_image: Policy) -> list[Path]:
 
 
 def _lenses(files: Sequence[Path], source: Path, on_bad_image: Policy) -> dict[Path, tuple]:
-    """Return for each photograph what tells its camera from others."""
+    """Read what tells the camera of each photograph from others, see `_read_lens`."""
     if len(files) < LEAST_PHOTOGRAPHS:
         raise InputError(
             f"{source} has {len(files)} photographs without camera poses: cameras are found from "
             f"at least {LEAST_PHOTOGRAPHS} that overlap."
         )
     bad = BadImages(on_bad_image)
-    lenses = dict(bad.read_each(lambda file: (file, _lens_of(file)), ((file,) for file in files)))
+    lenses = dict(bad.read_each(lambda file: (file, _read_lens(file)), ((file,) for file in files)))
     bad.report(str(source), len(lenses))
     return lenses
 
 
-def _lens_of(file: Path) -> tuple:
-    """Return the size upright, and the make, model and focal length that the file names."""
+def _read_lens(file: Path) -> tuple:
+    """Read the size upright, and the make, model and focal length that the file names."""
     size = image_size(file)
     with Image.open(file) as image:
         exif = image.getexif()

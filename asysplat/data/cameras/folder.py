@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asysplat.data.images import HEIF, image_size, load_mask
-from asysplat.data.readers.common import beside
+from asysplat.data.readers.common import check_map_size
 from asysplat.data.readers.masks import FOLDER as MASKS
 from asysplat.files import check_room, make_folder
 
@@ -85,7 +85,7 @@ def save_mask(mask: Path | None, image: Path) -> None:
     if mask is None:
         return
     size = image_size(image)
-    kept = Image.fromarray(load_mask(beside(mask, size, str(image))))
+    kept = Image.fromarray(load_mask(check_map_size(mask, size, str(image))))
     target = image.parents[1] / MASKS / f"{image.name}.png"
     target.parent.mkdir(exist_ok=True)
     kept.resize(size, Image.Resampling.NEAREST).convert("L").save(target)

@@ -28,7 +28,7 @@ from asysplat.data.cameras.folder import (
     work_folder,
 )
 from asysplat.data.readers import colmap
-from asysplat.data.readers.common import inverted
+from asysplat.data.readers.common import invert_pose
 from asysplat.data.sequence import PosedImage, PosedScene
 
 ROUNDS = 2  # rounds of triangulation and bundle adjustment
@@ -38,7 +38,7 @@ LEAST_OF_LENS = 10  # photographs of a lens, for its focal length and distortion
 
 @dataclass(frozen=True)
 class RefinedCameras:
-    """Refined cameras, and how well the given ones and they fit the same points.
+    """Refined cameras, and how well they and the original ones fit the same points.
 
     Args:
         scene: scene with the refined cameras.
@@ -73,9 +73,9 @@ def refine_cameras(
     where = Path(where).absolute()
     images = {image.file: image for image in scene.images}
     names = colmap_names(images)
-    given = [(image.lens, image.cam_to_world.tolist()) for image in scene.images]
+    cameras = [(image.lens, image.cam_to_world.tolist()) for image in scene.images]
     masks = [image.mask for image in scene.images if image.mask not in (None, image.file)]
-    method = f"{USUAL} {LEAST_OF_LENS} {given}"
+    method = f"{USUAL} {LEAST_OF_LENS} {cameras}"
     folder = where / f"{scene.name}-refined-{digest(method, [*images, *masks])}"
     if not folder.is_dir():
         with work_folder(where, len(images), console) as (work, progress):
@@ -87,13 +87,15 @@ def refine_cameras(
     errors = json.loads((folder / ERRORS).read_text())
     if not errors["features"]:
         return RefinedCameras(scene, **errors)
-    found = colmap.read_scene(folder, BadImages())
-    refined = {image.file.name: image for image in found.images}
+    refined_scene = colmap.read_scene(folder, BadImages())
+    refined = {image.file.name: image for image in refined_scene.images}
     changed = []
     for file, image in images.items():
-        other = refined[names[file]]
-        changed.append(replace(image, lens=other.lens, cam_to_world=other.cam_to_world))
-    new = replace(scene, images=changed, read_points=lambda: found.points + scene.origin)
+        refined_image = refined[names[file]]
+        changed.append(
+            replace(image, lens=refined_image.lens, cam_to_world=refined_image.cam_to_world)
+        )
+    new = replace(scene, images=changed, read_points=lambda: refined_scene.points + scene.origin)
     return RefinedCameras(new, **errors)
 
 
@@ -139,7 +141,7 @@ def _posed_model(
             model.add_camera_with_trivial_rig(camera)
         for image in stored.read_all_images():
             names = {"name": image.name, "camera_id": image.camera_id, "image_id": image.image_id}
-            pose = pycolmap.Rigid3d(inverted(poses[image.name])[:3])
+            pose = pycolmap.Rigid3d(invert_pose(poses[image.name])[:3])
             model.add_image_with_trivial_frame(pycolmap.Image(**names), pose)
     return model
 
@@ -161,19 +163,21 @@ def _adjust(model: pycolmap.Reconstruction) -> None:
 
 
 def _move_back(model: pycolmap.Reconstruction, poses: Mapping[str, Float[ndarray, "4 4"]]) -> None:
-    """Move a model by the similarity that brings its cameras to the given ones."""
+    """Move a model by the similarity that brings its cameras to `poses`."""
     images = {image.name: image for image in model.images.values()}
-    given = np.stack([poses[name] for name in images])
-    found = np.stack([image.cam_from_world().inverse().matrix() for image in images.values()])
+    old_poses = np.stack([poses[name] for name in images])
+    new_poses = np.stack([image.cam_from_world().inverse().matrix() for image in images.values()])
     # From the rotations: positions alone, if in a line, leave a turn about it free.
-    left, _, right = np.linalg.svd((given[:, :3, :3] @ found[:, :3, :3].swapaxes(1, 2)).sum(0))
+    products = old_poses[:, :3, :3] @ new_poses[:, :3, :3].swapaxes(1, 2)
+    left, _, right = np.linalg.svd(products.sum(0))
     rotation = left @ right
-    means = [each[:, :3, 3].mean(0) for each in (given, found)]
-    centers, turned = given[:, :3, 3] - means[0], (found[:, :3, 3] - means[1]) @ rotation.T
+    means = [poses[:, :3, 3].mean(0) for poses in (old_poses, new_poses)]
+    centers = old_poses[:, :3, 3] - means[0]
+    turned = (new_poses[:, :3, 3] - means[1]) @ rotation.T
     square = np.square(turned).sum()
     scale = (centers * turned).sum() / square if square else 1.0
     translation = means[0] - scale * rotation @ means[1]
     model.transform(pycolmap.Sim3d(np.column_stack([scale * rotation, translation])))
     for name, image in images.items():
         if image.num_points3D < LEAST_POINTS:
-            image.frame.rig_from_world = pycolmap.Rigid3d(inverted(poses[name])[:3])
+            image.frame.rig_from_world = pycolmap.Rigid3d(invert_pose(poses[name])[:3])

@@ -84,7 +84,7 @@ def find_matches(sequence: ImageSequence, console: Console | None = None) -> Mat
         while len(farther := match_with_gap(first, 2 * gap)) >= MIN_MATCHES:
             gap *= 2
             pair = farther
-        if len(pair) >= MIN_MATCHES and pair.pairs not in [other.pairs for other in pairs]:
+        if len(pair) >= MIN_MATCHES and pair.pairs not in [previous.pairs for previous in pairs]:
             pairs.append(pair)
     with_parallax = [pair for pair in pairs if _has_parallax(pair)]
     pairs = with_parallax if 2 * len(with_parallax) > len(pairs) else pairs

@@ -20,10 +20,10 @@ def read_pixels(
     """Decode every image once; arguments and errors as for `check_scene`.
 
     Returns:
-        The sequence without the damaged images; and the share of the pixels with a known depth
+        The sequence without the damaged images; and the fraction of the pixels with a known depth
         under "depths", and of those that masks keep under "masks", where there are such files.
     """
-    intact, shares = [], {}
+    intact, fractions = [], {}
     bar = {"console": console, "transient": True, "disable": console is None}
     for index, image in enumerate(track(sequence.scene.images, "decoding", **bar)):
         with bad.collect():
@@ -31,9 +31,10 @@ def read_pixels(
             intact.append(image)
             for name in ("depths", "masks"):
                 if (values := getattr(views, name)) is not None:
-                    shares.setdefault(name, []).append(float((values > 0).double().mean()))
+                    fractions.setdefault(name, []).append(float((values > 0).double().mean()))
     bad.report(sequence.name, len(intact))
-    return sequence.with_images(intact), {name: fmean(each) for name, each in shares.items()}
+    means = {name: fmean(per_image) for name, per_image in fractions.items()}
+    return sequence.with_images(intact), means
 
 
 def compare_depths(sequence: ImageSequence, matches: Matches) -> tuple[float, int]:

@@ -56,33 +56,33 @@ def common_mistakes(names: Sequence[str]) -> list[Mistake]:
         "fx and fy": lambda focal, center: (focal.flip(-1), center),
         "fx and fy, cx and cy": lambda focal, center: (focal.flip(-1), center.flip(-1)),
     }
-    lenses = [_of_lenses(f"{pair} are exchanged", exchange, exchanged[pair]) for pair in exchanged]
+    lenses = [_lens_mistake(f"{pair} are exchanged", exchange, exchanged[pair]) for pair in exchanged]
     axes = _swapped_axes()
-    inverse = _of_poses(
+    inverse = _pose_mistake(
         "world-to-camera matrices were taken for camera-to-world",
         "invert them",
         lambda r, c: (r.mT, -(r.mT @ c[..., None])[..., 0]),
     )
     both = [
         Mistake(
-            f"{inverse.name}, and {each.name}",
-            f"{inverse.fix}; then {each.fix}",
-            lambda cameras, correct=each.correct: correct(inverse.correct(cameras)),
+            f"{inverse.name}, and {swap.name}",
+            f"{inverse.fix}; then {swap.fix}",
+            lambda cameras, correct=swap.correct: correct(inverse.correct(cameras)),
         )
-        for each in axes
+        for swap in axes
     ]
     rotations_or_positions = [
-        _of_poses(
+        _pose_mistake(
             "the rotations are transposed, the positions are not",
             "transpose the 3x3 rotations alone",
             lambda r, c: (r.mT, c),
         ),
-        _of_poses(
+        _pose_mistake(
             "the translations of world-to-camera were taken for positions",
             "with R of camera-to-world, positions are -R t",
             lambda r, c: (r, -(r @ c[..., None])[..., 0]),
         ),
-        _of_poses("the positions are negated", "negate them", lambda r, c: (r, -c)),
+        _pose_mistake("the positions are negated", "negate them", lambda r, c: (r, -c)),
     ]
     poses = [*axes, inverse, *both, *rotations_or_positions]
     return [*resolutions, *lenses, *poses, *_orders(names)]
@@ -91,7 +91,7 @@ def common_mistakes(names: Sequence[str]) -> list[Mistake]:
 def other_resolution(factor: float) -> Mistake:
     """Return the mistake that the intrinsics belong to images `factor` times as large."""
     times = f"{factor:.4g} times" if factor >= 1 else f"1/{1 / factor:.4g}"
-    return _of_lenses(
+    return _lens_mistake(
         f"the intrinsics are those of images {times} the size",
         f"divide fx, fy, cx and cy by {factor:.4g}, or give the images they were made for",
         lambda focal, center: (focal / factor, center / factor),
@@ -100,7 +100,7 @@ def other_resolution(factor: float) -> Mistake:
 
 def other_focal(factor: float) -> Mistake:
     """Return the mistake that the focal lengths are `factor` times too large."""
-    return _of_lenses(
+    return _lens_mistake(
         f"the focal lengths are {factor:.4g} times what the images show",
         f"divide fx and fy by {factor:.4g}",
         lambda focal, center: (focal / factor, center),
@@ -141,7 +141,7 @@ def _swapped_axes() -> list[Mistake]:
         def correct(r: Tensor, c: Tensor, turn: Tensor = turn, mirror: Tensor = mirror) -> tuple[Tensor, Tensor]:
             return mirror * r @ turn, mirror * c
 
-        mistakes.append(_of_poses(name, fix, correct))
+        mistakes.append(_pose_mistake(name, fix, correct))
     return mistakes
 
 
@@ -173,7 +173,7 @@ def _orders(names: Sequence[str]) -> list[Mistake]:
     ]
 
 
-def _of_lenses(name: str, fix: str, change: Change) -> Mistake:
+def _lens_mistake(name: str, fix: str, change: Change) -> Mistake:
     def correct(cameras: Cameras) -> Cameras:
         intrinsics = cameras.intrinsics.clone()
         diagonal = (slice(None), (0, 1), (0, 1))
@@ -184,7 +184,7 @@ def _of_lenses(name: str, fix: str, change: Change) -> Mistake:
     return Mistake(name, fix, correct)
 
 
-def _of_poses(name: str, fix: str, change: Change) -> Mistake:
+def _pose_mistake(name: str, fix: str, change: Change) -> Mistake:
     def correct(cameras: Cameras) -> Cameras:
         poses = cameras.cam_to_world.clone()
         rotations, positions = change(poses[:, :3, :3], poses[:, :3, 3])

@@ -46,8 +46,8 @@ class Fit:
 
     Args:
         error: median distance to the epipolar lines, in pixels.
-        under_1px: share of the matches with a distance below 1 pixel.
-        behind_camera: share of the triangulated points behind a camera.
+        under_1px: fraction of the matches with a distance below 1 pixel.
+        behind_camera: fraction of the triangulated points behind a camera.
     """
 
     error: float
@@ -99,14 +99,14 @@ def diagnose_cameras(cameras: Cameras, matches: Matches, names: Sequence[str]) -
     improved = fit.penalty > max(MIN_IMPROVEMENT * corrected.penalty, MATCH_PRECISION)
     if improved and corrected.penalty < MAX_ERROR:
         error = f"{corrected.error:.2f} px"
-        sentence = f"{mistake.name} (corrected, the error is {error}): {mistake.fix}"
+        message = f"{mistake.name} (corrected, the error is {error}): {mistake.fix}"
     elif fit.penalty < MAX_ERROR:
         return Verdict(True, "the cameras fit the images", fit)
     elif fit.error < MAX_ERROR:
-        sentence = "the points that the images share lie behind the cameras: see check.png"
+        message = "the points that the images share lie behind the cameras: see check.png"
     else:
-        sentence = ROUGH_FIT if fit.penalty < ROUGH_ERROR else NO_MISTAKE_FOUND
-    return Verdict(False, sentence, fit)
+        message = ROUGH_FIT if fit.penalty < ROUGH_ERROR else NO_MISTAKE_FOUND
+    return Verdict(False, message, fit)
 
 
 def measure_fit(cameras: Cameras, matches: Matches) -> Fit:
@@ -182,12 +182,12 @@ def check_scene(scene: PosedScene, bad: BadImages, console: Console | None = Non
     depths = _describe_depths(sequence, known, matches, verdict)
     rows += [("points", "none" if points is None else str(len(points)))]
     rows += [("masks", masks), ("depth maps", depths)]
-    rows += [("left out", sentence) for sentence in bad.errors]
+    rows += [("left out", error) for error in bad.errors]
     rows += [("matches", f"{len(matches)} of {len(matches.pairs)} pairs of images")]
     if fit := verdict.fit:
         text = f"{fit.error:.2f} px in the median, {fit.under_1px:.0%} under 1 px"
-        share_behind = f"; {fit.behind_camera:.0%} lie behind a camera"
-        rows.append(("epipolar error", text + (share_behind if fit.behind_camera >= 0.01 else "")))
+        behind = f"; {fit.behind_camera:.0%} lie behind a camera"
+        rows.append(("epipolar error", text + (behind if fit.behind_camera >= 0.01 else "")))
     return Report(sequence, rows, matches, verdict)
 
 

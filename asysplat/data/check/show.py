@@ -35,9 +35,9 @@ def print_report(report: Report, title: str, console: Console) -> None:
     for name, text in report.rows:
         table.add_row(name, Text(text))
     console.print(table)
-    sentence = report.verdict.sentence
+    message = report.verdict.sentence
     style = "bold green" if report.verdict.fits else "bold red"
-    console.print(Text(f"{sentence[0].upper()}{sentence[1:]}.", style))
+    console.print(Text(f"{message[0].upper()}{message[1:]}.", style))
 
 
 def draw_report(report: Report, title: str) -> Figure:

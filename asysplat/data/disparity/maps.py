@@ -59,8 +59,8 @@ def write_map(path: Path, disparity: Float[ndarray, "h w"]) -> None:
     if not np.isfinite(disparity).all():
         raise InputError(f"{path} would hold NaN or infinity: name another --model.")
     low, high = float(disparity.min()), float(disparity.max())
-    share = (disparity - low) / max(high - low, np.finfo(np.float32).tiny)
-    levels = (1 + np.round(share * (LEVELS - 1))).astype(np.uint16)
+    fraction = (disparity - low) / max(high - low, np.finfo(np.float32).tiny)
+    levels = (1 + np.round(fraction * (LEVELS - 1))).astype(np.uint16)
     with atomic_write(path) as partial:
         Image.fromarray(levels).save(partial)
 

@@ -11,7 +11,7 @@ from asysplat.data.procedural.floor_plan import TRIES, FloorPlan, any_material, 
 from asysplat.data.procedural.textures import Material
 
 UNDERGROUND = 0.5  # meters of a pole below the floor, as ground outdoors is not level
-GLOSSY_SHARE = 0.5  # probability that a material is glossy
+GLOSSY_PROBABILITY = 0.5  # probability that a material is glossy
 
 
 def add_clutter(plan: FloorPlan, rng: Generator) -> None:
@@ -31,7 +31,7 @@ def polish(plan: FloorPlan, rng: Generator) -> None:
     """Make some of the materials glossy."""
     polished = {material: material for material in plan.materials()}
     for material in polished:
-        if rng.random() <= GLOSSY_SHARE:
+        if rng.random() <= GLOSSY_PROBABILITY:
             gloss, shininess = rng.uniform(0.2, 1.2), np.exp(rng.uniform(2, 5))
             polished[material] = replace(material, gloss=gloss, shininess=shininess)
     plan.boxes = [(*box, polished[material]) for *box, material in plan.boxes]

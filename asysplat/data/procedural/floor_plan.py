@@ -60,12 +60,12 @@ class FloorPlan:
         solids = (*self.boxes, *self.spheres)
         return list(dict.fromkeys([*(solid[-1] for solid in solids), *self.shell]))
 
-    def claim(self, spots: Float[np.ndarray, "K 2"], radius: float) -> np.ndarray | None:
+    def place(self, spots: Float[np.ndarray, "K 2"], radius: float) -> np.ndarray | None:
         """Occupy the first spot with room for a disc; None if there is none."""
         to_walk = np.linalg.norm(spots[:, None] - self.walk, axis=-1).min(1)
         free = to_walk > radius + CLEARANCE
-        for spot, other in self.occupied:
-            free &= np.linalg.norm(spots - spot, axis=-1) > 0.85 * (radius + other)
+        for spot, occupied_radius in self.occupied:
+            free &= np.linalg.norm(spots - spot, axis=-1) > 0.85 * (radius + occupied_radius)
         if not free.any():
             return None
         self.occupied.append((spots[free.argmax()], radius))
@@ -143,7 +143,7 @@ def scatter(
     """Add one object of each (kind, smallest size, largest size), if there is a free spot."""
     for kind, smallest, largest in kinds:
         size = rng.uniform(smallest, largest)
-        spot = plan.claim(spots(), size)
+        spot = plan.place(spots(), size)
         if spot is not None:
             kind(plan, rng, *spot, size)
 
@@ -169,7 +169,7 @@ def furnished_room(rng: Generator, walk: Float[np.ndarray, "T 2"], half: np.ndar
     height = 2 * half[2]
     wall = (textures.plaster, textures.bricks, textures.planks, textures.plaster)[rng.integers(4)]
     wallpaper = wall(rng)
-    other = textures.cloth(rng) if rng.random() < 0.4 else textures.plaster(rng)
+    accent = textures.cloth(rng) if rng.random() < 0.4 else textures.plaster(rng)
     floor = (textures.planks, textures.tiles)[rng.integers(2)](rng)
     lamp = np.array([*rng.uniform(-0.5, 0.5, 2) * half[:2], height - 0.5])
     plan = FloorPlan(
@@ -178,7 +178,7 @@ def furnished_room(rng: Generator, walk: Float[np.ndarray, "T 2"], half: np.ndar
         irradiance=np.array([1.0, 0.9, 0.78]),
         falloff=rng.uniform(1.5, 3.0),
         ambient=rng.uniform(0.15, 0.3) * np.array([0.9, 0.95, 1.0]),
-        shell=[wallpaper, other, wallpaper, wallpaper, textures.plaster(rng), floor],
+        shell=[wallpaper, accent, wallpaper, wallpaper, textures.plaster(rng), floor],
         room=(np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], height])),
     )
     decorate_walls(plan, rng, half)

@@ -22,7 +22,7 @@ from asysplat.data.procedural.geometry import (
 from asysplat.data.procedural.textures import Material, albedo, fractal_noise, noise_lattice
 
 OCCLUSION_DISTANCE = 0.4  # meters over which a near surface reduces ambient light
-MIN_AMBIENT = 0.25  # share of the ambient light in a corner
+MIN_AMBIENT = 0.25  # fraction of the ambient light in a corner
 SHADOW_OFFSET = 2e-3  # meters from a surface to the start of its shadow rays
 SPHERE_AXES = ((0.8, 0.1, 0.6), (-0.2, 0.95, 0.25))  # texture axes
 ZENITH = (0.25, 0.45, 0.9)
@@ -153,7 +153,7 @@ class World:
         return t, torch.where(t >= sky_t, SKY, surface)
 
     def _direct(self, points: Points, normals: Points) -> PerRay:
-        """Compute the share of the light that arrives directly from its source."""
+        """Compute the fraction of the light that arrives directly from its source."""
         to_light = self._light - points
         distance = (to_light * to_light).sum(0).sqrt()
         direct = (normals * to_light).sum(0).clamp(min=0) / distance
@@ -172,11 +172,11 @@ class World:
 
     def _near(self, cone: Cone, margin: float = 0.0) -> tuple[Boxes, Spheres]:
         return tuple(
-            each.select(each.within(cone, margin)) for each in (self._boxes, self._spheres)
+            objects.select(objects.within(cone, margin)) for objects in (self._boxes, self._spheres)
         )
 
     def _openness(self, points: Points, normals: Points, cone: Cone) -> PerRay:
-        """Compute the share of the ambient light that arrives: less near other objects."""
+        """Compute the fraction of the ambient light that arrives: less near other objects."""
         points = points + OCCLUSION_DISTANCE * normals
         if self._room is not None:
             shell = self._room.distance(points)

@@ -55,7 +55,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
 
     def read(image: pycolmap.Image) -> PosedImage:
         path = folder / image.name
-        lens = common.scaled(lenses[image.camera_id], image_size(path), str(path))
+        lens = common.scale_lens(lenses[image.camera_id], image_size(path), str(path))
         return PosedImage(path, lens, _cam_to_world(image, model))
 
     images = bad.read_each(read, ((image,) for image in registered))
@@ -71,7 +71,7 @@ def read_poses(model: Path) -> list[tuple[str, Float[ndarray, "4 4"]]]:
     return [(image.name, _cam_to_world(image, model)) for image in images if image.has_pose]
 
 
-def points_beside(scene: Path, posed: Sequence[PosedImage]) -> Points | None:
+def read_model_points(scene: Path, posed: Sequence[PosedImage]) -> Points | None:
     """Read the sparse points of a model beside images whose poses were read elsewhere.
 
     None if there is no model, or if its poses of the images with the same names differ: then its
@@ -87,9 +87,9 @@ def points_beside(scene: Path, posed: Sequence[PosedImage]) -> Points | None:
     posed = [image for image in posed if image.file.name in images]
     if not posed:
         return None
-    given = np.array([image.cam_to_world for image in posed])
-    others = [_cam_to_world(images[image.file.name], model) for image in posed]
-    difference, extent = np.abs(given - others), np.ptp(given[:, :3, 3], axis=0).max()
+    poses = np.array([image.cam_to_world for image in posed])
+    model_poses = [_cam_to_world(images[image.file.name], model) for image in posed]
+    difference, extent = np.abs(poses - model_poses), np.ptp(poses[:, :3, 3], axis=0).max()
     rotation, translation = difference[:, :3, :3].max(), difference[:, :3, 3].max()
     same_world = rotation < SAME_WORLD and translation < SAME_WORLD * extent
     return _points(colmap) if same_world else None
@@ -104,7 +104,7 @@ def _find_model(scene: Path) -> Path | None:
 def _cam_to_world(image: pycolmap.Image, model: Path) -> Float[ndarray, "4 4"]:
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()
-    return common.inverted(common.rigid(pose, f"{model}, pose of {image.name}"))
+    return common.invert_pose(common.check_rigid(pose, f"{model}, pose of {image.name}"))
 
 
 def _points(colmap: pycolmap.Reconstruction | Path) -> Points | None:
@@ -116,7 +116,7 @@ def _points(colmap: pycolmap.Reconstruction | Path) -> Points | None:
 def _lens(camera: pycolmap.Camera, where: str) -> Lens:
     if camera.is_spherical():
         return panorama(*(round(side) for side in camera.params), where)
-    return Lens.of(camera)
+    return Lens.from_camera(camera)
 
 
 def _images_folder(scene: Path, model: Path, names: Sequence[str]) -> Path:
@@ -136,12 +136,14 @@ def _images_folder(scene: Path, model: Path, names: Sequence[str]) -> Path:
 def _warn_of_unregistered(model: Path, registered: Sequence[Path]) -> None:
     used = set(registered)
     folders = sorted({path.parent for path in registered})
-    left = [path for folder in folders for path in common.images_in(folder) if path not in used]
-    if left:
-        names = ", ".join(path.name for path in left[:MAX_NAMES])
+    unregistered = [
+        path for folder in folders for path in common.images_in(folder) if path not in used
+    ]
+    if unregistered:
+        names = ", ".join(path.name for path in unregistered[:MAX_NAMES])
         warnings.warn(
-            f"{model} has not registered {len(left)} of {len(left) + len(used)} images, which are "
-            f"left out: {names}{', ...' * (len(left) > MAX_NAMES)}; photograph what lies between "
-            "them and the others to use them, too",
+            f"{model} has not registered {len(unregistered)} of {len(unregistered) + len(used)} "
+            f"images, which are left out: {names}{', ...' * (len(unregistered) > MAX_NAMES)}; "
+            "photograph what lies between them and the others to use them, too",
             stacklevel=2,
         )

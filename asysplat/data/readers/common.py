@@ -105,51 +105,51 @@ def images_in(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
 
 
-def scaled(lens: Lens, size: tuple[int, int], where: str) -> Lens:
+def scale_lens(lens: Lens, size: tuple[int, int], where: str) -> Lens:
     """Scale a lens to an image of another size and the same field of view.
 
     Raises:
         InputError: intrinsics of no lens, or an image of other proportions.
     """
     # Integers from JSON may be too large for a float.
-    (width, height), given = size, tuple(min(side, 10**9) for side in (lens.width, lens.height))
-    numbers, longest = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion), max(given)
+    (width, height), lens_size = size, tuple(min(side, 10**9) for side in (lens.width, lens.height))
+    numbers, longest = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion), max(lens_size)
     usable = 0 < min(lens.fx, lens.fy) <= max(lens.fx, lens.fy) < MAX_FOCAL * longest
     usable &= max(abs(lens.cx), abs(lens.cy)) < MAX_CENTER * longest
     if not (usable and all(abs(number) < MAX_DISTORTION for number in lens.distortion)):
-        found = ", ".join(f"{min(number, MAX_NUMBER):g}" for number in numbers)
+        values = ", ".join(f"{min(number, MAX_NUMBER):g}" for number in numbers)
         raise InputError(
-            f"{where} has intrinsics {found}: give focal "
+            f"{where} has intrinsics {values}: give focal "
             f"lengths in pixels, above 0 and below {MAX_FOCAL:g} image sides, a principal point "
             f"within {MAX_CENTER:g} of them, and distortions below {MAX_DISTORTION:g}."
         )
     # To a pixel of the smaller one, whose size was rounded.
-    if min(given) < 1 or not same_proportions(*sorted((size, given))):
-        refuse_turned(size, given)
+    if min(lens_size) < 1 or not same_proportions(*sorted((size, lens_size))):
+        refuse_turned(size, lens_size)
         raise InputError(
-            f"{where} is {width} x {height} and its intrinsics are for {given[0]} x {given[1]}: "
-            "give images with those proportions, or the images' own intrinsics."
+            f"{where} is {width} x {height} and its intrinsics are for {lens_size[0]} x "
+            f"{lens_size[1]}: give images with those proportions, or the images' own intrinsics."
         )
-    x, y = width / given[0], height / given[1]
+    x, y = width / lens_size[0], height / lens_size[1]
     focal = {"fx": lens.fx * x, "fy": lens.fy * y, "cx": lens.cx * x, "cy": lens.cy * y}
     return replace(lens, width=width, height=height, **focal)
 
 
-def refuse_turned(size: tuple[int, int], given: tuple[int | float, int | float]) -> None:
-    """Check that an image is not stored turned against intrinsics for the size `given`.
+def refuse_turned(size: tuple[int, int], lens_size: tuple[int | float, int | float]) -> None:
+    """Check that an image is not stored turned against intrinsics for `lens_size`.
 
     Raises:
-        InputError: it is; the same sentence for all images, which is shown once.
+        InputError: it is; the message is the same for all images, and shown once.
     """
-    if given == size[::-1] and given != size:
+    if lens_size == size[::-1] and lens_size != size:
         raise InputError(
             f"photographs are stored as {size[0]} x {size[1]}, with an orientation tag, and their "
-            f"intrinsics are for {given[0]} x {given[1]}: save them upright (magick mogrify "
-            "-auto-orient), or have their cameras found with cameras=found."
+            f"intrinsics are for {lens_size[0]} x {lens_size[1]}: save them upright (magick "
+            "mogrify -auto-orient), or have their cameras found with cameras=found."
         )
 
 
-def beside(path: Path, size: tuple[int, int], where: str) -> Path:
+def check_map_size(path: Path, size: tuple[int, int], where: str) -> Path:
     """Return the path of a depth map or mask, after checking that it shows the whole image."""
     width, height = image_size(path)
     if not same_proportions((width, height), size):
@@ -160,7 +160,7 @@ def beside(path: Path, size: tuple[int, int], where: str) -> Path:
     return path
 
 
-def array_of(stored: Any) -> Float[ndarray, "..."]:
+def to_array(stored: Any) -> Float[ndarray, "..."]:
     """Convert nested lists to float64; empty where they are no numbers or ragged."""
     try:
         return np.array(stored, dtype=np.float64)
@@ -168,9 +168,9 @@ def array_of(stored: Any) -> Float[ndarray, "..."]:
         return np.empty(0)
 
 
-def rigid(stored: Any, where: str) -> Float[ndarray, "4 4"]:
+def check_rigid(stored: Any, where: str) -> Float[ndarray, "4 4"]:
     """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal."""
-    matrix = array_of(stored)
+    matrix = to_array(stored)
     if matrix.shape != (4, 4):
         raise InputError(f"{where} is not 4x4: give four rows of four numbers.")
     if not np.isfinite(matrix).all():
@@ -195,7 +195,7 @@ def opencv_from_opengl(cam_to_world: Float[ndarray, "4 4"]) -> Float[ndarray, "4
     return cam_to_world * (1, -1, -1, 1)
 
 
-def inverted(pose: Float[ndarray, "4 4"]) -> Float[ndarray, "4 4"]:
+def invert_pose(pose: Float[ndarray, "4 4"]) -> Float[ndarray, "4 4"]:
     """Invert a rigid matrix; the result is exactly rigid."""
     result = np.eye(4)
     result[:3, :3] = pose[:3, :3].T

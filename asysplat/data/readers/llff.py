@@ -11,8 +11,8 @@ from numpy import ndarray
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
-from asysplat.data.readers.colmap import points_beside
-from asysplat.data.readers.common import folders_with, images_in, rigid, scaled
+from asysplat.data.readers.colmap import read_model_points
+from asysplat.data.readers.common import check_rigid, folders_with, images_in, scale_lens
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -68,7 +68,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
         pose = np.eye(4)
         pose[:3] = np.stack((right, down, -backward, center), axis=-1)
-        return PosedImage(image, scaled(lens, size, where), rigid(pose, where))
+        return PosedImage(image, scale_lens(lens, size, where), check_rigid(pose, where))
 
     images = bad.read_each(read, enumerate(fitting))
-    return PosedScene(scene.name, images, partial(points_beside, scene, images))
+    return PosedScene(scene.name, images, partial(read_model_points, scene, images))

@@ -10,7 +10,7 @@ from typing import Any
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
 from asysplat.data.readers import common
-from asysplat.data.readers.colmap import points_beside
+from asysplat.data.readers.colmap import read_model_points
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -44,16 +44,16 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         where = common.frame_label(file, index, entry)
         image = file.parent / entry["file_path"]
         size = image_size(image)
-        pose = common.inverted(common.rigid(entry.get("w2c"), f"{where}: w2c"))
+        pose = common.invert_pose(common.check_rigid(entry.get("w2c"), f"{where}: w2c"))
         try:
-            given = (round(entry["w"]), round(entry["h"]))
-            lens = Lens(*given, *(float(entry[name]) for name in ("fx", "fy", "cx", "cy")))
+            lens_size = (round(entry["w"]), round(entry["h"]))
+            lens = Lens(*lens_size, *(float(entry[name]) for name in ("fx", "fy", "cx", "cy")))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(
                 f"{where} needs the numbers w, h, fx, fy, cx and cy in pixels: one is missing or "
                 f"not a number ({error!r})."
             ) from error
-        return PosedImage(image, common.scaled(lens, size, where), pose)
+        return PosedImage(image, common.scale_lens(lens, size, where), pose)
 
     images = bad.read_each(read, enumerate(common.read_frames(file)["frames"]))
-    return PosedScene(file.parent.name, images, partial(points_beside, file.parent, images))
+    return PosedScene(file.parent.name, images, partial(read_model_points, file.parent, images))

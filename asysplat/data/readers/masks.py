@@ -5,14 +5,14 @@ from pathlib import Path
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import has_alpha
-from asysplat.data.readers.common import beside
+from asysplat.data.readers.common import check_map_size
 from asysplat.data.sequence import PosedImage, PosedScene
 
 FOLDER = "masks"
 
 
 def with_masks(scene: PosedScene, bad: BadImages) -> PosedScene:
-    """Return a scene whose images have masks where there are any, see `mask_of`.
+    """Return a scene whose images have masks where there are any, see `find_mask`.
 
     Masks that the files of a scene name themselves stay. Errors of single images are collected.
     """
@@ -20,14 +20,14 @@ def with_masks(scene: PosedScene, bad: BadImages) -> PosedScene:
     def read(image: PosedImage) -> PosedImage:
         if image.mask is not None or not isinstance(image.file, Path):
             return image
-        mask = mask_of(image.file)
+        mask = find_mask(image.file)
         size = (image.lens.width, image.lens.height)
-        return replace(image, mask=mask and beside(mask, size, str(image.file)))
+        return replace(image, mask=mask and check_map_size(mask, size, str(image.file)))
 
     return replace(scene, images=bad.read_each(read, ((image,) for image in scene.images)))
 
 
-def mask_of(photograph: Path) -> Path | None:
+def find_mask(photograph: Path) -> Path | None:
     """Return the mask of a photograph, which is 0 where a pixel must be ignored; None without one.
 
     Of images/a/b.jpg it is masks/a/b.jpg.png (as COLMAP names it), masks/a/b.png (nerfstudio) or

@@ -37,10 +37,10 @@ def with_faces(scene: PosedScene, bad: BadImages) -> PosedScene:
     They follow the other images: the first faces of all panoramas, then the second ones, and so on,
     so that consecutive images overlap. Errors of single panoramas are collected.
     """
-    others = [image for image in scene.images if image.lens.model != PANORAMA]
+    plain_images = [image for image in scene.images if image.lens.model != PANORAMA]
     panoramas = ((image,) for image in scene.images if image.lens.model == PANORAMA)
     sides = zip(*bad.read_each(_faces, panoramas), strict=True)
-    return replace(scene, images=others + [face for side in sides for face in side])
+    return replace(scene, images=plain_images + [face for side in sides for face in side])
 
 
 def _faces(image: PosedImage) -> list[PosedImage]:

@@ -12,8 +12,15 @@ from numpy import ndarray
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
-from asysplat.data.readers.colmap import points_beside
-from asysplat.data.readers.common import MILLIMETERS, beside, folders_with, images_in, rigid, scaled
+from asysplat.data.readers.colmap import read_model_points
+from asysplat.data.readers.common import (
+    MILLIMETERS,
+    check_map_size,
+    check_rigid,
+    folders_with,
+    images_in,
+    scale_lens,
+)
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -52,18 +59,21 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         )
 
     def read(index: int, image: Path) -> PosedImage:
-        pose = rigid(poses[index].reshape(4, 4), f"{file}, pose {index} ({image.name})")
+        pose = check_rigid(poses[index].reshape(4, 4), f"{file}, pose {index} ({image.name})")
         size, where = image_size(image), str(image)
+        lens, depth = scale_lens(Lens(*size, fx, fy, cx, cy), size, where), None
+        if depths.is_dir():
+            depth = check_map_size(depths / f"{image.stem}.png", size, where)
         return PosedImage(
             file=image,
-            lens=scaled(Lens(*size, fx, fy, cx, cy), size, where),
+            lens=lens,
             cam_to_world=pose,
-            depth=beside(depths / f"{image.stem}.png", size, where) if depths.is_dir() else None,
+            depth=depth,
             depth_unit=MILLIMETERS,
         )
 
     posed = bad.read_each(read, enumerate(images))
-    return PosedScene(scene.name, posed, partial(points_beside, scene, posed))
+    return PosedScene(scene.name, posed, partial(read_model_points, scene, posed))
 
 
 def _read_numbers(file: Path, columns: int) -> Float[ndarray, "rows columns"]:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import EncodedImage, Lens, image_size
-from asysplat.data.readers.common import inverted, read_json, rigid
+from asysplat.data.readers.common import check_rigid, invert_pose, read_json
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -82,7 +82,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         return PosedImage(
             file=encoded,
             lens=Lens(width, height, fx * width, fy * height, cx * width, cy * height),
-            cam_to_world=inverted(rigid(world_to_cam, f"{where}: its world-to-camera")),
+            cam_to_world=invert_pose(check_rigid(world_to_cam, f"{where}: its world-to-camera")),
         )
 
     return PosedScene(key, bad.read_each(read, enumerate(images)))

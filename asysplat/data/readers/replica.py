@@ -11,7 +11,13 @@ from pathlib import Path
 
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import Lens, image_size
-from asysplat.data.readers.common import beside, folders_with, number, read_json, rigid
+from asysplat.data.readers.common import (
+    check_map_size,
+    check_rigid,
+    folders_with,
+    number,
+    read_json,
+)
 from asysplat.data.sequence import PosedImage, PosedScene
 from asysplat.errors import InputError
 
@@ -69,8 +75,8 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         return PosedImage(
             file=image,
             lens=lens,
-            cam_to_world=rigid(pose, f"{trajectory}, row {index + 1}"),
-            depth=beside(depth, size, str(image)) if has_depths else None,
+            cam_to_world=check_rigid(pose, f"{trajectory}, row {index + 1}"),
+            depth=check_map_size(depth, size, str(image)) if has_depths else None,
             depth_unit=1 / scale,
         )
 

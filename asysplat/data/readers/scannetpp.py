@@ -165,7 +165,7 @@ def _arkit(
         image = folder / images / f"{name}.jpg"
         size = image_size(image)
         stored = entry.get("intrinsic")
-        matrix = common.array_of(stored)
+        matrix = common.to_array(stored)
         if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or (np.diag(matrix) <= 0).any():
             raise InputError(
                 f"{where}: intrinsic is {stored}: give 3x3 numbers, fx and fy above 0, in pixels."
@@ -173,10 +173,10 @@ def _arkit(
         return PosedImage(
             file=image,
             lens=Lens(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
-            cam_to_world=common.rigid(entry.get("aligned_pose"), f"{where}: aligned_pose"),
-            depth=depths and common.beside(depths / f"{name}.png", size, where),
+            cam_to_world=common.check_rigid(entry.get("aligned_pose"), f"{where}: aligned_pose"),
+            depth=depths and common.check_map_size(depths / f"{name}.png", size, where),
             depth_unit=common.MILLIMETERS,
-            mask=masks and common.beside(masks / f"{name}.png", size, where),
+            mask=masks and common.check_map_size(masks / f"{name}.png", size, where),
         )
 
     return bad.read_each(read, sorted(content.items()))

@@ -37,8 +37,8 @@ def _with_depths(scene: Path) -> list[Path]:
         return scannetpp.find_scenes(scene)
     for key, (images, _, depths, _) in scannetpp.PARTS.items():
         camera = scene / key.split("/")[0]
-        found = [(camera / folder).is_dir() for folder in (images, depths) if folder]
-        if (scene / key).is_file() and found == [True, True]:
+        has_folders = [(camera / folder).is_dir() for folder in (images, depths) if folder]
+        if (scene / key).is_file() and has_folders == [True, True]:
             return [scene / key]
     raise InputError(
         f"{scene} has no depth maps, which are measured here: render the reflex camera's with the "

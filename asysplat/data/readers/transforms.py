@@ -18,7 +18,7 @@ from numpy import ndarray
 from asysplat.data.bad_images import BadImages
 from asysplat.data.images import PANORAMA, Lens, image_size
 from asysplat.data.readers import common
-from asysplat.data.readers.colmap import points_beside
+from asysplat.data.readers.colmap import read_model_points
 from asysplat.data.readers.common import number
 from asysplat.data.readers.panoramas import panorama
 from asysplat.data.sequence import PosedImage, PosedScene
@@ -47,7 +47,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     """
     file = scene if scene.suffix == ".json" else scene / "transforms.json"
     images = read_images(common.read_frames(file), file, bad)
-    return PosedScene(file.parent.name, images, partial(points_beside, file.parent, images))
+    return PosedScene(file.parent.name, images, partial(read_model_points, file.parent, images))
 
 
 def read_images(
@@ -85,23 +85,25 @@ def read_images(
                     "images of one size, or w, h and intrinsics for every image."
                 )
         fields = {**content, **entry}
-        pose = common.rigid(fields.get("transform_matrix"), f"{where}: transform_matrix")
+        pose = common.check_rigid(fields.get("transform_matrix"), f"{where}: transform_matrix")
 
-        def beside(key: str) -> Path | None:
+        def optional_map(key: str) -> Path | None:
             """Return the depth map or mask under `key`; None where there is none."""
             name = fields.get(key)
             if not isinstance(name, str | None):
                 raise InputError(f"{where}: {key} is {name!r}: give a file name, or leave it out.")
-            return None if name is None else common.beside(folder / name, size, f"{where}: {key}")
+            if name is None:
+                return None
+            return common.check_map_size(folder / name, size, f"{where}: {key}")
 
         unit = number(fields, "depth_unit_scale_factor", where, default=common.MILLIMETERS)
         return PosedImage(
             file=image,
             lens=_lens(fields, size, resized, where),
             cam_to_world=common.opencv_from_opengl(pose),
-            depth=beside("depth_file_path"),
+            depth=optional_map("depth_file_path"),
             depth_unit=unit,
-            mask=beside("mask_path"),
+            mask=optional_map("mask_path"),
         )
 
     images = bad.read_each(read, enumerate(content["frames"]))
@@ -118,7 +120,7 @@ def read_poses(file: Path) -> list[tuple[str, Float[ndarray, "4 4"]]]:
     poses = []
     for index, entry in enumerate(common.read_frames(file)["frames"]):
         where = common.frame_label(file, index, entry)
-        pose = common.rigid(entry.get("transform_matrix"), f"{where}: transform_matrix")
+        pose = common.check_rigid(entry.get("transform_matrix"), f"{where}: transform_matrix")
         poses.append((entry["file_path"], common.opencv_from_opengl(pose)))
     return poses
 
@@ -144,11 +146,11 @@ def read_cameras(file: Path) -> Cameras:
 
 def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: str) -> Lens:
     """Return the lens of an image of (width, height) `size`."""
-    given = {"w": size[0], "h": size[1], **fields}
-    if (given["w"], given["h"]) != size and not resized:
-        common.refuse_turned(size, (given["w"], given["h"]))
+    sized = {"w": size[0], "h": size[1], **fields}
+    if (sized["w"], sized["h"]) != size and not resized:
+        common.refuse_turned(size, (sized["w"], sized["h"]))
         raise InputError(
-            f"{where}: w x h is {given['w']} x {given['h']}, but the image is {size[0]} x "
+            f"{where}: w x h is {sized['w']} x {sized['h']}, but the image is {size[0]} x "
             f"{size[1]}: give intrinsics for the images' own resolution."
         )
     model = "OPENCV_FISHEYE" if fields.get("is_fisheye") else fields.get("camera_model", "OPENCV")
@@ -158,9 +160,9 @@ def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: s
             f"{where}: camera_model is {model!r}: undistort the images to PINHOLE, or use one of "
             f"{', '.join(known)}."
         )
-    width, height = (round(number(given, key, where)) for key in ("w", "h"))
+    width, height = (round(number(sized, key, where)) for key in ("w", "h"))
     if model == PANORAMA:
-        return common.scaled(panorama(width, height, where), size, where)
+        return common.scale_lens(panorama(width, height, where), size, where)
     if model in (*PERSPECTIVE_MODELS, "OPENCV"):
         # The formats disagree about what k4 means for them.
         if number(fields, "k4", where, default=0.0) != 0:
@@ -179,7 +181,7 @@ def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: s
         model=model,
         distortion=tuple(number(fields, name, where, default=0.0) for name in names),
     )
-    return common.scaled(lens, size, where)
+    return common.scale_lens(lens, size, where)
 
 
 def _focal(fields: dict[str, Any], width: int, height: int, where: str) -> tuple[float, float]:

@@ -48,8 +48,8 @@ def read_index(path: Path | str, num_inputs: int) -> dict[str, Entry]:
             )
         return dict(_long_lrm_entry(file, read_frames(file), num_inputs) for file in files)
     content = read_json(path)
-    if isinstance(content, list) and content and all(isinstance(each, dict) for each in content):
-        return dict(_long_lrm_entry(path, each, num_inputs) for each in content)
+    if isinstance(content, list) and content and all(isinstance(entry, dict) for entry in content):
+        return dict(_long_lrm_entry(path, entry, num_inputs) for entry in content)
     if not isinstance(content, dict):
         raise InputError(f'{path} is no index: give {{"scene": {{"context": [], "target": []}}}}.')
     if isinstance(content.get("frames"), list):
@@ -67,10 +67,10 @@ def read_index(path: Path | str, num_inputs: int) -> dict[str, Entry]:
     return index
 
 
-def selection_of(
+def select_from_index(
     index: Mapping[str, Entry], path: Path | str, scene: str, num_images: int, num_inputs: int
 ) -> Selection:
-    """Return the selection of a scene in the index that was read from `path`.
+    """Look up the selection of a scene in the index that was read from `path`.
 
     Raises:
         InputError: the index was made for another number of inputs, or names an image that the

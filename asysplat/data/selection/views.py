@@ -80,7 +80,7 @@ def training_selection(
 def grown_window(
     first: Sequence[int] | None, last: Sequence[int] | None, grown: float
 ) -> tuple[int, int] | None:
-    """Return the window at a share of its growth from `first` to `last`; without one, `last`."""
+    """Return the window at a fraction of its growth from `first` to `last`; without one, `last`."""
     if first is None or last is None:
         return None if last is None else tuple(last)
     return tuple(round(a + grown * (b - a)) for a, b in zip(first, last, strict=True))
@@ -140,11 +140,11 @@ def evenly_spaced(images: Sequence[int], count: int) -> list[int]:
     return [images[int(position + 0.5)] for position in positions]
 
 
-def check_held_out(num_images: int, left: int, num_inputs: int, split: Split) -> None:
-    """Check that there are targets, and enough images `left` to choose the inputs from."""
-    if left < num_inputs or not held_out(num_images, split):
+def check_held_out(num_images: int, num_candidates: int, num_inputs: int, split: Split) -> None:
+    """Check that there are targets, and enough candidates for the inputs."""
+    if num_candidates < num_inputs or not held_out(num_images, split):
         raise InputError(
-            f"The sequence has {num_images} images, of which {left} are not held out for "
+            f"The sequence has {num_images} images, of which {num_candidates} are not held out for "
             f"{split}: set data.inputs to at most that, or give a longer sequence."
         )
 

@@ -281,7 +281,7 @@ def test_points_of_another_world_are_ignored(scene, change):
         edit(scene / "sparse/0/images.txt", lambda text: text.replace(".png", ".jpg"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert colmap.points_beside(scene, images) is None
+        assert colmap.read_model_points(scene, images) is None
 
 
 def renumber(points):
