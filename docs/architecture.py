@@ -253,6 +253,14 @@ def marker(name: str, size: float, ink: str) -> str:
     )
 
 
+def describe() -> str:
+    """Count the layers, from the scripts down, and the lines of asysplat."""
+    units = find_units()
+    layers = find_layers(units, count_imports(units))
+    lines = sum(len(path.read_text().splitlines()) for path in PACKAGE.rglob("*.py"))
+    return f"{max(layers.values()) + 1} layers, {lines:,} lines"
+
+
 if __name__ == "__main__":
     FIGURE.write_text(draw())
-    print(FIGURE)
+    print(f"{FIGURE}: {describe()}")
