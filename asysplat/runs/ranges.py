@@ -19,7 +19,7 @@ def is_number(value: object) -> bool:
 
 
 def is_window(value: object, low: int | float = -math.inf) -> bool:
-    return isinstance(value, ListConfig) and [is_whole(each, low) for each in value] == [True] * 2
+    return isinstance(value, ListConfig) and [is_whole(number, low) for number in value] == [True] * 2
 
 
 # The expected value, its check, and the options.
@@ -62,7 +62,7 @@ RANGES: tuple[tuple[str, Callable[[object], bool], Sequence[str]], ...] = (
         ),
     ),
     (
-        "a share between 0 and 1, such as 0.9, or null for the model's own",
+        "a fraction between 0 and 1, such as 0.9, or null for the model's own",
         lambda value: value is None or (is_number(value) and 0 < value < 1),
         ["geometry_ratio"],
     ),

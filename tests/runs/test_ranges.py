@@ -35,8 +35,8 @@ REFUSED = {
     "data.on_bad_scene=drop": "data.on_bad_scene=drop: give fail or skip.",
     "data.test_size=64": "data.test_size=64: give height and width in pixels, such as [64,96]",
     "data.test_size=[0,64]": "data.test_size=[0, 64]: give height and width in pixels",
-    "geometry_ratio=1.5": "geometry_ratio=1.5: give a share between 0 and 1",
-    "geometry_ratio=half": "geometry_ratio=half: give a share between 0 and 1",
+    "geometry_ratio=1.5": "geometry_ratio=1.5: give a fraction between 0 and 1",
+    "geometry_ratio=half": "geometry_ratio=half: give a fraction between 0 and 1",
 }
 
 
