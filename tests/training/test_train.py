@@ -50,39 +50,53 @@ def test_a_run_leaves_metrics_figures_curves_and_checkpoints(whole):
     with (folder / "curve.csv").open() as file:
         assert [row["step"] for row in csv.DictReader(file)] == ["0", "2", "4", "6"]
     assert (folder / "figures" / "curve.png").stat().st_size > 5_000
-    check_tensorboard(folder / "tensorboard", numbers)
 
 
-def check_tensorboard(folder: Path, numbers: dict) -> None:
-    events = EventAccumulator(str(folder), size_guidance={"histograms": 0})
-    events.Reload()
-    tags = events.Tags()
-    scalars = set(tags["scalars"])
+@pytest.fixture(scope="module")
+def events(whole) -> EventAccumulator:
+    """What the run wrote for TensorBoard."""
+    folder = str(whole / "tensorboard")
+    return EventAccumulator(folder, size_guidance={"histograms": 0}).Reload()
+
+
+def test_tensorboard_shows_training_validation_test_and_steps_first(events):
+    scalars = set(events.Tags()["scalars"])
     names = ("1_train/psnr", "2_val/psnr", "3_test/procedural/psnr", "4_steps/learning_rate")
     assert {*names, "cost/parameters", "baseline/procedural/mean_color/psnr"} <= scalars
     groups = sorted({tag.partition("/")[0] for tag in scalars if "/" in tag})
-    # The order of TensorBoard's cards
     assert groups[:4] == ["1_train", "2_val", "3_test", "4_steps"]
     assert not any(name.startswith("1_train/") and "bad" in name for name in scalars)
+
+
+def test_the_parts_of_every_measured_step_add_up_to_all_of_it(events):
     for name in ("time/share_data", "gradient/geometry", "gradient/head", "memory/peak_gb"):
         assert [event.step for event in events.Scalars(name)] == [1, 3, 5]
-    shares = [tag for tag in scalars if tag.startswith("time/share_")]
+    shares = [tag for tag in events.Tags()["scalars"] if tag.startswith("time/share_")]
     assert len(shares) == 7
     for step in range(3):
         values = {tag: events.Scalars(tag)[step].value for tag in shares}
         assert sum(values.values()) == pytest.approx(1, abs=1e-5)
         parts = ("network", "rendering", "loss", "backward", "optimizer")
         assert all(values[f"time/share_{part}"] > 0 for part in parts)
-    assert set(tags["histograms"]) == {
+
+
+def test_every_validation_has_histograms_of_its_gaussians(events, whole):
+    assert set(events.Tags()["histograms"]) == {
         f"gaussians/{name}" for name in ("opacity", "log10_scale", "log10_depth")
     }
     counted = events.Histograms("gaussians/opacity")
     assert [event.step for event in counted] == [0, 2, 4, 6]
-    assert counted[-1].histogram_value.num == numbers["cost/gaussians"]
+    assert counted[-1].histogram_value.num == metrics(whole)["cost/gaussians"]
     assert 0 < events.Scalars("gaussians/opacity_median")[-1].value < 1
+
+
+def test_tensorboard_has_the_result_and_images(events, whole):
     last = events.Scalars("hp/psnr")[-1].value
-    assert abs(last - numbers["test/procedural/psnr"]) < 1e-3
-    assert any(tag.startswith("val/") for tag in tags["images"])
+    assert abs(last - metrics(whole)["test/procedural/psnr"]) < 1e-3
+    assert any(tag.startswith("val/") for tag in events.Tags()["images"])
+
+
+def test_tensorboard_ticks_the_options_that_studies_vary(events):
     started = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
     options = metadata.parse_session_start_info_plugin_data(started).hparams
     ticked = [name.partition("_")[2] for name in sorted(options)[:5]]
