@@ -25,13 +25,14 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 
-from asysplat import Gaussians, read_gaussians, render
+from asysplat import Gaussians, open_photographs, read_gaussians, render
 from asysplat.data import ProceduralScene, SceneOptions, open_scene
 from asysplat.data.readers.transforms import read_cameras
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.export import write_ply
 from asysplat.overrides import CONF
+from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.results import save_ply
 
 SIZE = 48
@@ -353,26 +354,12 @@ def test_as_overrides_names_the_path_and_reads_view_flags(script):
 REFUSED = {
     "": "no photographs: python reconstruct.py my_scene",
     "heigth=9": "heigth is unknown: did you mean height?",
-    "init=swep": "init=swep: choose network, plane_sweep, points, depth, or a",
-    "init=absent.ply": "absent.ply",
-    "init=points": "has no sparse points; choose plane_sweep",
-    "seconds=5 steps=3": "seconds=5 and steps=3: give one of them",
-    "steps=0.5": "steps=0.5: give a number above 0",
     "last_fit=2": "last_fit=2: give a number from 0 to 1",
-    "video.path=spiral": "video.path=spiral: choose own, orbit, none, or photographs",
-    "video.path=[]": "video.path=[]: choose own, orbit, none, or photographs",
-    "video.path=[1,2]": "video.path=[1, 2]: choose own, orbit, none, or photographs",
-    "video.path=[00001.png,x.png]": "video.path: x.png is the name of none of the 14 photographs",
+    "init=absent.ply": "absent.ply",
     "video.height=0": "video.height=0: give a whole number from 2 to 4320, or null for the",
-    "video.height=-5": "video.height=-5: give a whole number from 2 to 4320, or null for the",
-    "video.height=big": "video.height=big: give a whole number from 2 to 4320, or null for the",
-    "video.fps=0": "video.fps=0: give a number above 0",
-    "cameras=best": "cameras=best: choose auto, given, refined, found",
-    "height=0": "height=0, width=None",
+    "video.path=[00001.png,x.png]": "video.path: x.png is the name of none of the 14 photographs",
     "refinement.densify_until=2.5": "refinement.densify_until=2.5: give 0 to 1",
     "run=nowhere": "run=nowhere has no metrics.json: name the folder of a finished run",
-    "run=last paths.logs=nowhere": "run=last found no finished run in nowhere",
-    "path=absent": "absent does not exist: name a scene",
 }
 
 
@@ -385,23 +372,45 @@ def check_refusal(result, message):
 @pytest.mark.medium
 @pytest.mark.parametrize("overrides", REFUSED)
 def test_a_mistake_is_one_sentence_and_status_1(command, photographs, tmp_path, overrides):
-    path = None if overrides in ("", "path=absent") else photographs
-    check_refusal(command(path, *overrides.split()), REFUSED[overrides])
+    result = command(photographs if overrides else None, *overrides.split())
+    check_refusal(result, REFUSED[overrides])
     assert not list(tmp_path.rglob("scene.*"))
 
 
-def test_read_limit_takes_a_number_above_0(script, monkeypatch):
-    hydra = OmegaConf.create({"overrides": {"task": []}})
-    monkeypatch.setattr(script.HydraConfig, "get", lambda: hydra)
-    for steps, seconds, message in (
-        (None, None, "seconds=None: give a number above 0"),
-        (None, 0, "seconds=0: give a number above 0"),
-        (None, -3, "seconds=-3: give a number above 0"),
-        (None, "long", "seconds=long: give a number above 0"),
-        (0, None, "steps=0: give a number above 0"),
-    ):
-        with pytest.raises(InputError, match=message):
-            script.read_limit(OmegaConf.create({"steps": steps, "seconds": seconds}))
+LIMITS = [
+    (None, None, "seconds=None: give a number above 0"),
+    (None, 0, "seconds=0: give a number above 0"),
+    (None, -3, "seconds=-3: give a number above 0"),
+    (None, "long", "seconds=long: give a number above 0"),
+    (0, None, "steps=0: give a number above 0"),
+    (0.5, None, "steps=0.5: give a number above 0"),
+]
+
+
+@pytest.mark.parametrize(("steps", "seconds", "message"), LIMITS)
+def test_read_limit_takes_a_number_above_0(script, monkeypatch, steps, seconds, message):
+    monkeypatch.setattr(script, "given_options", set)
+    with pytest.raises(InputError, match=message):
+        script.read_limit(OmegaConf.create({"steps": steps, "seconds": seconds}))
+
+
+def test_steps_and_seconds_are_not_given_together(script, monkeypatch):
+    monkeypatch.setattr(script, "given_options", lambda: {"steps", "seconds"})
+    with pytest.raises(InputError, match="seconds=5 and steps=3: give one of them"):
+        script.read_limit(OmegaConf.create({"steps": 3, "seconds": 5}))
+
+
+def test_run_last_without_any_run_names_the_folder(tmp_path):
+    config = OmegaConf.create({"run": "last", "paths": {"logs": f"{tmp_path}/nowhere"}})
+    with pytest.raises(InputError, match=r"run=last found no finished run in .*nowhere"):
+        continue_run(config, given=())
+
+
+def test_photographs_that_are_not_there_or_have_no_size_are_refused(photographs):
+    with pytest.raises(InputError, match="absent does not exist: name a scene"):
+        open_photographs("absent", height=SIZE)
+    with pytest.raises(InputError, match="height=0, width=None"):
+        open_photographs(photographs, height=0)
 
 
 def test_too_few_photographs(command, views, tmp_path):

@@ -1,5 +1,6 @@
 """The cameras of a reconstruction's video."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from asysplat.data import ProceduralScene
 from asysplat.data.normalize import Normalization
 from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
-from asysplat.reconstruct.video import _view_of, subject, video_cameras
+from asysplat.reconstruct.video import _view_of, check_video, subject, video_cameras
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +85,21 @@ def test_a_video_passes_the_photographs_in_the_order_of_their_names(video, views
 def test_names_of_no_photograph_or_of_several_are_refused(files, name, message):
     with pytest.raises(InputError, match=message):
         _view_of(name, files)
+
+
+PATHS, HEIGHTS = "choose own, orbit, none, or photographs", "give a whole number from 2 to 4320, or"
+OPTIONS = [
+    ("path", "spiral", f"video.path=spiral: {PATHS}"),
+    ("path", [], f"video.path=[]: {PATHS}"),
+    ("path", [1, 2], f"video.path=[1, 2]: {PATHS}"),
+    *(("height", value, f"video.height={value}: {HEIGHTS}") for value in (0, -5, "big")),
+    ("fps", 0, "video.fps=0: give a number above 0"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "message"), OPTIONS)
+def test_options_out_of_range_are_named(name, value, message):
+    options = {"path": "own", "height": None, "seconds": 5, "fps": 30}
+    check_video(OmegaConf.create(options))
+    with pytest.raises(InputError, match=re.escape(message)):
+        check_video(OmegaConf.create(options | {name: value}))

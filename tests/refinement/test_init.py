@@ -5,6 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from asysplat.data.normalize import Normalization
+from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.models.prior import Prior
@@ -13,10 +15,12 @@ from asysplat.refinement.init import (
     POINT_OPACITY,
     gaussians_from_points,
     gaussians_from_prior,
+    initial_gaussians,
     sample_colors,
 )
 from asysplat.refinement.isotropic import footprints, isotropic_gaussians
 from asysplat.refinement.merge import MAX_OPACITY, MIN_OPACITY, SPREAD, merge_cells, merge_to_limit
+from asysplat.refinement.settings import RefinementSettings
 from asysplat.scene import Cameras, Views
 
 
@@ -282,3 +286,18 @@ def test_merging_gives_the_same_bits_on_any_number_of_threads(threads):
         found.append(merge_to_limit(gaussians, camera(), 1.0, 5000))
     assert_equal(found[1], found[0])
     assert_equal(found[2], found[0])
+
+
+@pytest.mark.parametrize(
+    ("init", "message"),
+    [
+        ("swep", "init=swep: choose network, plane_sweep, points, depth, or a"),
+        ("points", "init=points: scene has no sparse points; choose plane_sweep"),
+        ("depth", "init=depth: scene has no depth maps; choose plane_sweep or points"),
+    ],
+)
+def test_a_start_from_what_photographs_lack_is_refused(init, message):
+    views, frame = front_views(), Normalization(torch.eye(4, dtype=torch.float64), 1.0)
+    photographs = Photographs("scene", views, None, ["a.png"], [], frame, None)
+    with pytest.raises(InputError, match=message):
+        initial_gaussians(init, photographs, RefinementSettings())
