@@ -37,6 +37,7 @@ from asysplat.reconstruct.results import Results
 from asysplat.reconstruct.video import views_of
 from asysplat.refinement import RefinementSettings, refine
 from asysplat.refinement.init import INITS, initial_gaussians
+from asysplat.root import typed
 from asysplat.runs.ranges import check_ranges, is_number
 from asysplat.scene import Gaussians
 
@@ -48,7 +49,7 @@ def reconstruct(config: DictConfig) -> None:
         signal.signal(number, signal.default_int_handler)
     config = continue_run(config, given_options())
     if OmegaConf.is_missing(config, "path"):
-        raise InputError("no photographs: python reconstruct.py my_scene, a folder.")
+        raise InputError(f"no photographs: {typed('reconstruct')} my_scene, a folder.")
     check_ranges(OmegaConf.masked_copy(config, "speed"))
     if not is_number(config.last_fit) or not 0 <= config.last_fit <= 1:
         raise InputError(f"last_fit={config.last_fit}: give a number from 0 to 1.")

@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import zip_longest
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -15,7 +16,8 @@ from omegaconf import DictConfig
 
 from asysplat.errors import InputError, cause_of, input_error_behind, plain_warnings
 from asysplat.interrupts import end_at_interrupt, handle_signals, interrupt_once
-from asysplat.overrides import CONF, check_overrides
+from asysplat.overrides import check_overrides
+from asysplat.root import CONF, ROOT
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -23,13 +25,17 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 def check_command(script: str) -> None:
     """Check this process's command line; exit with the message on an error.
 
-    A script calls it before it imports torch, which takes seconds. Ctrl-C then ends the process.
+    A script calls it before it imports torch, which takes seconds; --help needs none. Ctrl-C then
+    ends the process.
     """
     end_at_interrupt()
-    os.environ.setdefault("ASYSPLAT_SHARED", str(CONF.parents[1] / "shared"))
+    os.environ.setdefault("ASYSPLAT_SHARED", str(ROOT.parent / "shared"))
     words = sys.argv[1:]
     given, unknown = get_args_parser().parse_known_args(words)
     other = given.config_dir or given.config_name or given.config_path or given.shell_completion
+    if given.help or given.hydra_help or given.shell_completion:
+        hydra.main(config_path=str(CONF), config_name=script, version_base="1.3")(lambda _: None)()
+        sys.exit()
     try:
         _check_dashes(words, unknown)
         if not other:  # configuration files, and a run
@@ -109,7 +115,7 @@ def error_message(error: BaseException) -> str | None:
 
 def _check_dashes(words: Sequence[str], unknown: Collection[str]) -> None:
     """Raise InputError if some of `words`, as in `--steps 20`, is `unknown` to Hydra."""
-    for word, following in zip(words, [*words[1:], ""], strict=True):
+    for word, following in zip_longest(words, words[1:], fillvalue=""):
         if word in unknown and word.startswith("-"):
             name, _, value = word.partition("=")
             if not value and following and not re.match("-|.*=", following):

@@ -14,7 +14,8 @@ from torch import nn
 
 from asysplat.errors import InputError, input_error_behind
 from asysplat.models.network import Network
-from asysplat.overrides import CONF, check_overrides
+from asysplat.overrides import check_overrides
+from asysplat.root import CONF
 from asysplat.runs.checkpoints import load_weights
 from asysplat.runs.run_config import read_config
 

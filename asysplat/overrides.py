@@ -14,8 +14,8 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from asysplat.errors import InputError
+from asysplat.root import CONF, typed
 
-CONF = Path(__file__).parents[1] / "conf"
 MIN_SIMILARITY = 0.8  # difflib's ratio of widht and width
 
 
@@ -133,7 +133,7 @@ def _hint(key: str, known: Collection[str], script: str) -> str:
     having = [c for c in choices if key in _paths(_compose(script, [_parse(f"{group}={c}")]))]
     if having:
         return f"it is an option of {group}={', '.join(having)}."
-    return f"python {script}.py --cfg job shows all."
+    return f"{typed(script)} --cfg job shows all."
 
 
 def _nearest(key: str, known: Collection[str]) -> str | None:

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from asysplat.cli import error_message
+from asysplat.cli import check_command, error_message
 from asysplat.errors import InputError
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "logs/events")
@@ -30,3 +30,13 @@ def test_a_known_error_is_a_sentence(case):
 @pytest.mark.parametrize("error", [RuntimeError("shapes"), OSError(errno.EIO, "I/O"), KeyError(1)])
 def test_other_errors_have_no_message(error):
     assert error_message(error) is None
+
+
+@pytest.mark.parametrize("script", ["benchmark", "evaluate", "reconstruct", "report", "train"])
+def test_a_script_takes_a_command_without_options(script, monkeypatch):
+    monkeypatch.setattr("sys.argv", [f"{script}.py"])
+    monkeypatch.setattr("asysplat.cli.end_at_interrupt", lambda: None)
+    check_command(script)
+    monkeypatch.setattr("sys.argv", [f"{script}.py", "--steps", "20"])
+    with pytest.raises(SystemExit, match="--steps 20: options are given as steps=20"):
+        check_command(script)

@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 from asysplat import overrides
 from asysplat.cli import check_command
 from asysplat.errors import InputError
-from asysplat.overrides import CONF, check_overrides
+from asysplat.overrides import check_overrides
+from asysplat.root import CONF
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -31,9 +31,9 @@ from asysplat.data.readers.transforms import read_cameras
 from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.export import write_ply
-from asysplat.overrides import CONF
 from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.results import save_ply
+from asysplat.root import CONF
 
 SIZE = 48
 LAYOUTS = Path(__file__).parent / "data" / "readers"  # writers of them

@@ -21,7 +21,7 @@ BRITISH = (
 )
 # Packages and modules of asysplat: each imports only from layers before its own.
 LAYERS = (
-    ("errors", "interrupts", "later"),
+    ("errors", "interrupts", "later", "root"),
     ("files", "kernels", "overrides", "scene", "terminal"),
     ("cli",),
     ("geometry", "ops"),

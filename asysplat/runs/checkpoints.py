@@ -15,10 +15,11 @@ from torch import nn
 
 from asysplat.errors import InputError
 from asysplat.files import atomic_write
+from asysplat.root import CHECKPOINTS
 from asysplat.runs.old_names import upgrade_checkpoint
 from asysplat.runs.run_config import flat_options
 
-SHIPPED = Path(__file__).parents[2] / "checkpoints" / "asysplat_plane_sweep.safetensors"
+SHIPPED = CHECKPOINTS / "asysplat_plane_sweep.safetensors"
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"  # checkpoints of a run to resume from
 # Options that change no weight.
 WITHOUT_EFFECT = ("ckpt_path", "paths.", "callbacks.", "trainer.num_sanity_val_steps")

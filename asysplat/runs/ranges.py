@@ -19,7 +19,9 @@ def is_number(value: object) -> bool:
 
 
 def is_window(value: object, low: int | float = -math.inf) -> bool:
-    return isinstance(value, ListConfig) and [is_whole(number, low) for number in value] == [True] * 2
+    return (
+        isinstance(value, ListConfig) and [is_whole(number, low) for number in value] == [True] * 2
+    )
 
 
 # The expected value, its check, and the options.

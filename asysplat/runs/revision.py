@@ -4,9 +4,9 @@ import hashlib
 import subprocess
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from asysplat.root import ROOT
+
 CODE = ("asysplat", "conf", "train.py")
 
 

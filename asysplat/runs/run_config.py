@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from asysplat.errors import InputError
 from asysplat.files import check_regular
-from asysplat.overrides import CONF
+from asysplat.root import CONF
 from asysplat.runs.old_names import upgrade_config
 
 MAX_BYTES, MAX_NODES = 2**20, 100_000  # size of a configuration: ours have 10 KB and 500 values
