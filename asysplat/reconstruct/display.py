@@ -52,15 +52,17 @@ class RefinementDisplay:
         if self._viewer is not None:
             self._viewer.close()
 
-    def __call__(self, now: RefinementProgress, refinement: Refinement) -> bool:
+    def __call__(self, progress: RefinementProgress, refinement: Refinement) -> bool:
         """Show the progress; return whether to stop."""
-        self.last = now
-        text = f"step {now.step}, PSNR {now.psnr:.2f} dB, {now.gaussians:,} Gaussians"
-        self._bar.update(self._task, completed=now.share, text=text)
+        self.last = progress
+        text = (
+            f"step {progress.step}, PSNR {progress.psnr:.2f} dB, {progress.gaussians:,} Gaussians"
+        )
+        self._bar.update(self._task, completed=progress.fraction, text=text)
         clock = time.monotonic()
         if not self._terminal and clock - self._printed > PRINT_SECONDS:
             self._printed = clock
-            print(f"{now.seconds:.0f} s: {text}", flush=True)
+            print(f"{progress.seconds:.0f} s: {text}", flush=True)
         if self._viewer is not None and clock - self._shown > VIEWER_SECONDS:
             self._shown = clock
             self._viewer.show(refinement.gaussians, text)

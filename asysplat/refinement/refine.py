@@ -34,7 +34,7 @@ class RefinementProgress:
     """Progress of a refinement."""
 
     step: int  # steps so far
-    share: float  # share of the refinement that is done, in [0, 1]
+    fraction: float  # fraction of the refinement that is done, in [0, 1]
     seconds: float  # since its start
     psnr: float  # mean over the last steps, one for each input image, each before its update
     gaussians: int  # their number
@@ -83,13 +83,13 @@ class Refinement:
         """The current Gaussians, copied."""
         return self.fields.gaussians().map(lambda field: field.detach().clone())
 
-    def step(self, share: float) -> float:
-        """Take a step at a share of the refinement, in [0, 1]; return its mean squared error."""
-        settings, views = self.settings, self._views(share)
+    def step(self, progress: float) -> float:
+        """Take a step at a progress in [0, 1]; return its mean squared error."""
+        settings, views = self.settings, self._views(progress)
         chosen = list(islice(self._view_order, settings.views_per_step or views.num_views))
         leaves, cool_down = self.fields.leaves(), settings.cool_down
         # The factor of the rates: 1, then down to `final_lr_factor` over the cool-down.
-        cooled = max(0.0, (share - 1 + cool_down) / cool_down) if cool_down else 0
+        cooled = max(0.0, (progress - 1 + cool_down) / cool_down) if cool_down else 0
         factor = settings.final_lr_factor**cooled
         error, gradients = 0.0, None
         for view in chosen:
@@ -108,23 +108,23 @@ class Refinement:
         self._steps += 1
         return error
 
-    def densify(self, share: float, number: int = 1) -> None:
+    def densify(self, progress: float, number: int = 1) -> None:
         """Prune, add or relocate Gaussians, by the method of the settings.
 
         Args:
-            share: see `step`.
-            number: number of this round, from 1 on.
+            progress: see `step`.
+            number: number of this round, counted from 1.
         """
-        self._densifier.densify(self._views(share), self._next_count(number))
+        self._densifier.densify(self._views(progress), self._next_count(number))
 
     def _make_densifier(self) -> Densifier:
-        every, both = self.settings.every, (self.fields, self._generator)
+        schedule, both = self.settings.every, (self.fields, self._generator)
         if self.settings.densify == "error":
             return ErrorDensifier(*both, self.background, self._units)
         if self.settings.densify == "mcmc":
             return McmcDensifier(*both)
         if self.settings.densify == "gradient":
-            first_reset = None if every is None else every.opacity_reset
+            first_reset = None if schedule is None else schedule.opacity_reset
             return CloneSplitDensifier(*both, self._max_gaussians, first_reset)
         return Densifier()
 
@@ -134,8 +134,8 @@ class Refinement:
 
     def _next_count(self, number: int) -> int:
         """Return the number of Gaussians after a round, on an even growth to the limit."""
-        now, left = len(self.fields), self.settings.densify_rounds - number + 1
-        return round(now * (self._max_gaussians / now) ** (1 / max(1, left)))
+        count, remaining_rounds = len(self.fields), self.settings.densify_rounds - number + 1
+        return round(count * (self._max_gaussians / count) ** (1 / max(1, remaining_rounds)))
 
     def _gradients(
         self, target: Views, view: int, leaves: Parameters, factor: float
@@ -155,13 +155,13 @@ class Refinement:
         loss = loss + self._densifier.regularizer(gaussians)
         gradients = torch.autograd.grad(loss, [*leaves.values(), *correction.values()])
         if correction:
-            own = dict(zip(correction, gradients[len(leaves) :], strict=True))
-            self.corrections.step(view, own, factor)
+            correction_gradients = dict(zip(correction, gradients[len(leaves) :], strict=True))
+            self.corrections.step(view, correction_gradients, factor)
         mse = F.mse_loss(target.masked(image.detach()), target.images).item()
         return mse, gradients[: len(leaves)]
 
-    def _views(self, share: float) -> Views:
-        return self._half_views if share < self.settings.half_resolution_until else self.views
+    def _views(self, progress: float) -> Views:
+        return self._half_views if progress < self.settings.half_resolution_until else self.views
 
     def _random_order(self) -> Iterator[int]:
         """Yield views in a random order; all are used before one is used again."""
@@ -207,30 +207,31 @@ def refine(
         small.densify(0.0)
     max_steps = settings.max_steps(views.num_views)
     errors: deque[float] = deque(maxlen=views.num_views)
-    step, rounds, share = 0, 0, 0.0
+    step, rounds, progress = 0, 0, 0.0
     clock = time.perf_counter()
-    while share < 1:
-        due = rounds_until(step, share, settings) if share < settings.densify_until else 0
+    while progress < 1:
+        densifying = progress < settings.densify_until
+        due = rounds_until(step, progress, settings) if densifying else 0
         if due > rounds:
-            refinement.densify(share, due)
+            refinement.densify(progress, due)
             rounds = due
-        every = settings.every
-        if every and step and step % every.opacity_reset == 0 and share < settings.densify_until:
+        schedule = settings.every
+        if schedule and step and step % schedule.opacity_reset == 0 and densifying:
             refinement.reset_opacities()
-        errors.append(refinement.step(share))
+        errors.append(refinement.step(progress))
         step += 1
         passed = time.perf_counter() - clock
         used = step / steps if seconds is None else passed / seconds
-        share = min(1.0, max(used, step / max_steps))
+        progress = min(1.0, max(used, step / max_steps))
         psnr = -10 * math.log10(max(sum(errors) / len(errors), 1e-10))
-        progress = RefinementProgress(step, share, passed, psnr, len(refinement.fields))
-        if watch is not None and watch(progress, refinement):
+        status = RefinementProgress(step, progress, passed, psnr, len(refinement.fields))
+        if watch is not None and watch(status, refinement):
             break
     return refinement.gaussians
 
 
-def rounds_until(step: int, share: float, settings: RefinementSettings) -> int:
+def rounds_until(step: int, progress: float, settings: RefinementSettings) -> int:
     """Return the number of rounds of densification that are due by now."""
     if settings.every is None:
-        return int(share / settings.densify_until * (settings.densify_rounds + 1))
+        return int(progress / settings.densify_until * (settings.densify_rounds + 1))
     return max(0, (step - settings.every.first_round) // settings.every.round + 1)

@@ -37,7 +37,7 @@ class Rates:
 
 @dataclass(frozen=True)
 class StepSchedule:
-    """What happens every so many steps, not at shares of the refinement (Kerbl et al. 2023)."""
+    """What happens every so many steps, not at fractions of the refinement (Kerbl et al. 2023)."""
 
     round: int = 100  # steps from one round of densification to the next
     first_round: int = 500
@@ -63,27 +63,27 @@ class RefinementSettings:
     ssim: float | None = 0.2  # weight of 1 - SSIM beside L1; None: the mean squared error alone
     views_per_step: int | None = 1  # input views rendered in a step; None: all
     sh_degree: int | None = 1  # 0 to 3; None keeps the degree of the Gaussians
-    half_resolution_until: float = 0.25  # initial share of the refinement at half the image size
+    half_resolution_until: float = 0.25  # initial part of the refinement, at half the image size
     # "error": spawn Gaussians at pixels with a large error; "mcmc": relocate dead ones (Kheradmand
     # et al. 2024); "gradient": clone and split by screen-space gradients (Kerbl et al. 2023).
     densify: Densify = "error"
     # Lower if all input images have fewer than 8 pixels for each; None: no other limit.
     max_gaussians: int | None = 150_000
-    initial_fraction: float = 0.19  # share of max_gaussians to start with, at most
+    initial_fraction: float = 0.19  # fraction of max_gaussians to start with, at most
     densify_rounds: int = 12  # each multiplies the number of Gaussians by the same factor
-    densify_until: float = 0.6  # initial share of the refinement with densification
+    densify_until: float = 0.6  # initial part of the refinement, with densification
     # Schedule of densify="gradient"; None: `densify_rounds`, evenly.
     every: StepSchedule | None = None
     final_lr_factor: float = 0.05  # factor of the rates at the end of the cool-down
     decay_means_alone: bool = False  # True: only the rate of means decays
-    cool_down: float = 0.5  # last share of the refinement, in which the rates fall
+    cool_down: float = 0.5  # last part of the refinement, in which the rates fall
     # Steps with each input image that end it, whatever time is left: more would fit noise.
     max_steps_per_image: int | None = 400
 
     def __post_init__(self):
         """Check the ranges."""
-        shares = ("half_resolution_until", "initial_fraction", "densify_until")
-        for name in (*shares, "final_lr_factor", "cool_down"):
+        fractions = ("half_resolution_until", "initial_fraction", "densify_until")
+        for name in (*fractions, "final_lr_factor", "cool_down"):
             self._check(name, 0 <= getattr(self, name) <= 1, "give 0 to 1")
         choices = get_args(Densify)
         self._check("densify", self.densify in choices, f"choose {', '.join(choices)}")

@@ -286,7 +286,7 @@ def test_3dgs_densifies_resets_opacities_and_adds_sh_degrees_at_its_steps():
     views, rounds, resets = small_views(), [], []
 
     class Recorded(Refinement):
-        def densify(self, share, number):
+        def densify(self, progress, number):
             rounds.append(self._steps)
 
         def reset_opacities(self):
@@ -318,7 +318,7 @@ def test_watch_may_end_a_refinement():
     settings, records = RefinementSettings(densify="none"), []
     stop = lambda now, _: records.append(now) or now.step == 3  # noqa: E731
     refine(small_scene(), small_views(), settings, steps=10, watch=stop)
-    found = [(now.step, now.share, now.gaussians) for now in records]
+    found = [(now.step, now.fraction, now.gaussians) for now in records]
     assert found == [(1, 0.1, 20), (2, 0.2, 20), (3, 0.3, 20)]
 
 
@@ -339,7 +339,7 @@ def test_seconds_end_a_refinement():
     start = small_scene()
     found, records = watched(start, small_views(), RefinementSettings(), seconds=0.3)
     assert records and not same_bits(found, start)
-    assert all(progress.share < 1 for progress in records[:-1]) and records[-1].share == 1
+    assert all(progress.fraction < 1 for progress in records[:-1]) and records[-1].fraction == 1
     assert all(b.seconds >= a.seconds >= 0 for a, b in pairwise(records))
     assert records[-1].seconds >= 0.3
 
@@ -473,8 +473,8 @@ def test_max_steps_per_image_ends_the_refinement():
     for limit, asked, taken in ((None, 6, 6), (3, 200, 6), (3, 4, 4)):
         settings = RefinementSettings(max_steps_per_image=limit)
         found[asked], records = watched(scene, views, settings, steps=asked)
-        shares = [progress.share for progress in records]
-        assert shares == pytest.approx([(step + 1) / taken for step in range(taken)])
+        fractions = [progress.fraction for progress in records]
+        assert fractions == pytest.approx([(step + 1) / taken for step in range(taken)])
     assert same_bits(found[6], found[200]) and not same_bits(found[6], found[4])
     settings = RefinementSettings(max_steps_per_image=5, views_per_step=None, densify="none")
     _, records = watched(scene, views, settings, seconds=1000)

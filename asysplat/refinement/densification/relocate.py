@@ -86,19 +86,19 @@ def inject_position_noise(fields: Fields, factor: float, generator: torch.Genera
 def split_opacity_and_scale(
     opacities: Float[Tensor, "N"], scales: Float[Tensor, "N 3"], counts: Int[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
-    """Compute opacity and scale of n copies that render together as their original (Eq. 9).
+    """Compute the opacity and the scale of n copies that render together as their original (Eq. 9).
 
     The paper's double sum of binomials is sum_k C(n, k) (-1)^(k+1) o^k / sqrt(k), k = 1 to n. More
     copies than MAX_COPIES count as that many; `counts` are >= 1.
     """
     counts, before = counts.clamp(max=MAX_COPIES), opacities.double().clamp(max=1 - 1e-6)
-    each = 1 - (1 - before) ** (1 / counts)
-    term, total = -torch.ones_like(each), torch.zeros_like(each)
+    reduced = 1 - (1 - before) ** (1 / counts)
+    term, total = -torch.ones_like(reduced), torch.zeros_like(reduced)
     for k in range(1, int(counts.max()) + 1):
-        term = -term * each * (counts - k + 1) / k  # C(n, k) (-1)^(k+1) o^k, 0 where k > n
+        term = -term * reduced * (counts - k + 1) / k  # C(n, k) (-1)^(k+1) o^k, 0 where k > n
         total = total + term / k**0.5
     factors = (before / total).to(scales)
-    return each.to(opacities).clamp_min(MIN_OPACITY), scales * factors[:, None]
+    return reduced.to(opacities).clamp_min(MIN_OPACITY), scales * factors[:, None]
 
 
 def _copy(fields: Fields, rows: Int[Tensor, "M"], count: int, generator: torch.Generator) -> None:

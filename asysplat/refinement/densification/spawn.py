@@ -58,9 +58,11 @@ class ErrorDensifier(Densifier):
         count = target - len(self.fields)
         if count > 0:
             order = torch.randperm(views.num_views, generator=self.generator)
-            views, now = views.select(order[:VIEWS_PER_ROUND]), self.fields.gaussians()
+            views, gaussians = views.select(order[:VIEWS_PER_ROUND]), self.fields.gaussians()
             cameras = (views.cameras.select([view]) for view in range(views.num_views))
-            outs = [render(now, camera, self.background, depth="median") for camera in cameras]
+            outs = [
+                render(gaussians, camera, self.background, depth="median") for camera in cameras
+            ]
             images, depths = torch.cat([o.image for o in outs]), torch.cat([o.depth for o in outs])
             new = spawn_at_errors(views, images, depths, count, self.generator)
             self.fields.append(new, self.units(new.means))
