@@ -34,7 +34,7 @@ from asysplat.export import read_gaussians
 from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.display import SIGNALS, RefinementDisplay
 from asysplat.reconstruct.results import Results
-from asysplat.reconstruct.video import views_of
+from asysplat.reconstruct.video import find_views
 from asysplat.refinement import RefinementSettings, refine
 from asysplat.refinement.init import INITS, initial_gaussians
 from asysplat.root import typed
@@ -63,7 +63,7 @@ def reconstruct(config: DictConfig) -> None:
     where = Path(config.paths.logs) / "cameras"
     options["cameras"] = CameraOptions(config.cameras, where, config.frames, Console())
     photographs = open_photographs(config.path, **options)
-    views_of(config.video, photographs)  # an error of names comes before the work
+    find_views(config.video, photographs)  # an error of names comes before the work
     print(describe(config, photographs, limit))
     gaussians = initialize(config, photographs, settings)
     background = photographs.inputs.mean_color()
@@ -99,23 +99,23 @@ def fit_to_all(
     gaussians: Gaussians,
     photographs: Photographs,
     settings: RefinementSettings,
-    share: float,
+    fraction: float,
     options: dict[str, Any],
 ) -> Gaussians:
-    """Refine Gaussians on all photographs for a share of the limit, without new Gaussians."""
+    """Refine Gaussians on all photographs for a fraction of the limit, without new Gaussians."""
     views = photographs.all_views()
     print(f"last fit: {views.num_views} photographs, the held-out ones too, after the measurement")
     settings = replace(
         settings, half_resolution_until=0.0, densify="none", every=None, cool_down=1.0
     )
     for name in {"steps", "seconds"} & options.keys():
-        options = options | {name: type(options[name])(max(1, share * options[name]))}
+        options = options | {name: type(options[name])(max(1, fraction * options[name]))}
     return refine(gaussians, views, settings, **options)
 
 
 def given_options() -> set[str]:
     """Return the names of the options on the command line."""
-    return {each.lstrip("+").partition("=")[0] for each in HydraConfig.get().overrides.task}
+    return {override.lstrip("+").partition("=")[0] for override in HydraConfig.get().overrides.task}
 
 
 def read_limit(config: DictConfig) -> dict[str, float]:

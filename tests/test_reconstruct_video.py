@@ -11,7 +11,7 @@ from asysplat.data import ProceduralScene
 from asysplat.data.normalize import Normalization
 from asysplat.data.photographs import Photographs
 from asysplat.errors import InputError
-from asysplat.reconstruct.video import _view_of, check_video, subject, video_cameras
+from asysplat.reconstruct.video import _find_view, check_video, subject, video_cameras
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_a_video_passes_the_photographs_in_the_order_of_their_names(video, views
 )
 def test_names_of_no_photograph_or_of_several_are_refused(files, name, message):
     with pytest.raises(InputError, match=message):
-        _view_of(name, files)
+        _find_view(name, files)
 
 
 PATHS, HEIGHTS = "choose own, orbit, none, or photographs", "give a whole number from 2 to 4320, or"

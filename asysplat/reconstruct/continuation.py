@@ -15,7 +15,7 @@ OF_PHOTOGRAPHS += ("views", "held_out_every", "max_held_out")
 OF_QUALITY = ("height", "views")  # those that quality= sets
 
 
-def continue_run(config: DictConfig, given: Collection[str]) -> DictConfig:
+def continue_run(config: DictConfig, options: Collection[str]) -> DictConfig:
     """Take the photographs and the scene of the reconstruction `config.run`, which may be None.
 
     The refinement then begins at full resolution. Nothing else is taken: a run may come from a
@@ -23,7 +23,7 @@ def continue_run(config: DictConfig, given: Collection[str]) -> DictConfig:
 
     Args:
         config: configuration of reconstruct.py; it is left as it is.
-        given: names of the options on the command line, which stay.
+        options: names of the options on the command line, which stay.
 
     Raises:
         InputError: no finished reconstruction.
@@ -42,7 +42,7 @@ def continue_run(config: DictConfig, given: Collection[str]) -> DictConfig:
             raise InputError(f"{file}: {key} is {value}: expected a word or a whole number.")
     taken |= {"run": str(folder), "init": str(folder / SCENE)}
     taken |= {"refinement.half_resolution_until": 0.0}
-    kept = {*given, *(OF_QUALITY if "quality" in given else ())} - {"run"}
+    kept = {*options, *(OF_QUALITY if "quality" in options else ())} - {"run"}
     config = config.copy()
     for key, value in taken.items():
         if key not in kept:

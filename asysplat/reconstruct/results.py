@@ -53,9 +53,9 @@ class Results:
             self._protocol.lpips_net, Path(config.paths.weights), config.paths.download
         )
         check_video(config.video)
-        wanted = config.video.path != "none"
-        self._has_video = wanted and find_spec("av") is not None
-        if wanted and not self._has_video:
+        has_path = config.video.path != "none"
+        self._has_video = has_path and find_spec("av") is not None
+        if has_path and not self._has_video:
             print("no video: it needs PyAV, pip install 'asysplat[video]'.")
         if self._lpips is None:
             print("no LPIPS: its weights are missing; paths.download=true downloads them.")

@@ -21,7 +21,7 @@ CAMERA_PATHS = ("own", "orbit", "none")
 
 
 def check_video(video: DictConfig) -> None:
-    """Check the options of a video, except for the names of photographs, see `views_of`.
+    """Check the options of a video, except for the names of photographs, see `find_views`.
 
     Raises:
         InputError: an unknown path, or a number that is out of range.
@@ -44,7 +44,7 @@ def check_video(video: DictConfig) -> None:
         )
 
 
-def views_of(video: DictConfig, photographs: Photographs) -> list[int]:
+def find_views(video: DictConfig, photographs: Photographs) -> list[int]:
     """Find the views that the camera path passes, in its order, among the inputs and held-out ones.
 
     A photograph is named by its file, or by the end of its path where files share a name.
@@ -55,19 +55,19 @@ def views_of(video: DictConfig, photographs: Photographs) -> list[int]:
     inputs, held_out = photographs.input_files, photographs.held_out_files
     if isinstance(video.path, str):
         return list(range(len(inputs)))
-    return [_view_of(name, [*inputs, *held_out]) for name in video.path]
+    return [_find_view(name, [*inputs, *held_out]) for name in video.path]
 
 
-def _view_of(name: str, files: Sequence[str]) -> int:
+def _find_view(name: str, files: Sequence[str]) -> int:
     parts = Path(name).parts
-    found = [view for view, file in enumerate(files) if Path(file).parts[-len(parts) :] == parts]
-    if len(found) == 1:
-        return found[0]
+    matches = [view for view, file in enumerate(files) if Path(file).parts[-len(parts) :] == parts]
+    if len(matches) == 1:
+        return matches[0]
     like = get_close_matches(name, sorted({Path(file).name for file in files}), cutoff=0)
-    like = [files[view] for view in found[:3]] or like
+    like = [files[view] for view in matches[:3]] or like
     raise InputError(
-        f"video.path: {name} is the name of {len(found) or 'none'} of the {len(files)} photographs "
-        f"used (views=): name one of them, such as {', '.join(like)}."
+        f"video.path: {name} is the name of {len(matches) or 'none'} of the {len(files)} "
+        f"photographs used (views=): name one of them, such as {', '.join(like)}."
     )
 
 
@@ -77,7 +77,7 @@ def video_cameras(video: DictConfig, photographs: Photographs, gaussians: Gaussi
     Both sides are even, as H.264 needs, unless they are those of the photographs.
     """
     frames = max(1, round(video.seconds * video.fps))
-    cameras = photographs.cameras.select(views_of(video, photographs))
+    cameras = photographs.cameras.select(find_views(video, photographs))
     if video.path == "orbit":
         path = orbit(cameras, frames, subject(gaussians, cameras), gaussians)
     else:
