@@ -35,7 +35,7 @@ from asysplat.evaluation.rows import write_csv
 from asysplat.evaluation.scenes import image_rows, measure_scenes, set_results
 from asysplat.export import write_safetensors
 from asysplat.export.gaussians import read_background
-from asysplat.export.scene_folder import check_visible, find_files, origin_of
+from asysplat.export.scene_folder import check_visible, find_files, world_origin
 from asysplat.files import check_writable, make_folder
 from asysplat.models.early_exit import EXACT
 from asysplat.models.network import Network
@@ -177,7 +177,7 @@ def write_predictions(
     for index in track(range(len(tests)), "writing scenes"):
         sample, sequence = tests[index], tests.tasks[index].sequence
         gaussians = predictor(sample)(sample["inputs"].to(device)).to(torch.float64)
-        path, offset = folder / f"{sample['scene']}.safetensors", origin_of(sequence)
+        path, offset = folder / f"{sample['scene']}.safetensors", world_origin(sequence)
         metadata = {"offset": " ".join(map(repr, offset))}
         # In float64, which comes back from the world to the very same float32.
         write_safetensors(path, sample["frame"].to_world(gaussians), metadata, torch.float64)

@@ -61,19 +61,19 @@ def smoothed_path(cameras: Cameras, frames: int, as_given: bool = False) -> Came
 
 
 def _short_order(vectors: Float[ndarray, "V 12"]) -> Int[ndarray, " V"]:
-    """Return the given order, or that of nearest neighbors if it is far shorter.
+    """Choose the original order, or that of nearest neighbors if it is far shorter.
 
     The latter starts with the view farthest from the mean, an end of the path.
     """
-    given = np.arange(len(vectors))
+    original = np.arange(len(vectors))
     order = [int(_lengths(vectors - vectors.mean(0)).argmax())]
-    left = np.delete(given, order[0])
-    while len(left):
-        nearest = _lengths(vectors[left] - vectors[order[-1]]).argmin()
-        order.append(int(left[nearest]))
-        left = np.delete(left, nearest)
-    as_given, short = (_lengths(np.diff(vectors[o], axis=0)).sum() for o in (given, order))
-    return np.array(order) if as_given > MAX_DETOUR * short else given
+    remaining = np.delete(original, order[0])
+    while len(remaining):
+        nearest = _lengths(vectors[remaining] - vectors[order[-1]]).argmin()
+        order.append(int(remaining[nearest]))
+        remaining = np.delete(remaining, nearest)
+    length, shortcut = (_lengths(np.diff(vectors[o], axis=0)).sum() for o in (original, order))
+    return np.array(order) if length > MAX_DETOUR * shortcut else original
 
 
 def _smoothed(

@@ -10,15 +10,15 @@ from asysplat.scene import Gaussians
 TINY = torch.finfo(torch.float32).tiny  # replaces scales and opacities that round to 0
 
 
-def existing(path: str | Path) -> Path:
-    """Return the path of an existing file; raise InputError if there is none."""
+def require_file(path: str | Path) -> Path:
+    """Check that a file exists and return its path; raise InputError if there is none."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} is not a file: name an existing one.")
     return path
 
 
-def as_written(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:
+def prepare_for_export(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:
     """Convert one scene to `dtype`, on the CPU and without gradients.
 
     Raises:

@@ -12,7 +12,7 @@ import torch
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from asysplat.errors import InputError
-from asysplat.export.checks import TINY, as_written, existing
+from asysplat.export.checks import TINY, prepare_for_export, require_file
 from asysplat.export.ply_table import read_vertices
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
@@ -44,7 +44,7 @@ def write_ply(
     Raises:
         InputError: invalid Gaussians, or a file that cannot be written.
     """
-    gaussians = as_written(gaussians)
+    gaussians = prepare_for_export(gaussians)
     opacities = gaussians.opacities.double().clamp_max(MAX_OPACITY)
     columns = (
         gaussians.means,
@@ -76,7 +76,7 @@ def read_ply(path: str | Path) -> Gaussians:
     Raises:
         InputError: not a PLY file, a truncated one, a missing property, or invalid Gaussians.
     """
-    path = existing(path)
+    path = require_file(path)
     vertices = read_vertices(path)
     properties = vertices.dtype.names
     count = sum(name.startswith("f_rest_") for name in properties)

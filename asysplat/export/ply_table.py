@@ -52,10 +52,10 @@ def read_vertices(path: Path) -> ndarray:
         if count == 0 or not types:
             raise InputError(f"{path} has no vertices: expected one or more, with properties.")
         # Before allocating: a damaged header may declare any number.
-        left = path.stat().st_size - file.tell()
+        remaining = path.stat().st_size - file.tell()
         smallest = row.itemsize if byte_order else 2 * len(row)
-        if count * smallest > left + (not byte_order):
-            raise _truncated(path, count, f"{left} bytes")
+        if count * smallest > remaining + (not byte_order):
+            raise _truncated(path, count, f"{remaining} bytes")
         if byte_order:
             return np.fromfile(file, row, count)
         try:
@@ -91,9 +91,9 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
             case ["property", kind, name] if elements and kind in TYPES and name not in types:
                 types[name] = TYPES[kind]
             case words:
-                found = repr(" ".join(words)[:80]) if line else "no end_header"
+                text = repr(" ".join(words)[:80]) if line else "no end_header"
                 raise InputError(
-                    f"{path} has {found} in its header: expected format, element, property and "
+                    f"{path} has {text} in its header: expected format, element, property and "
                     "end_header as PLY 1.0 has them; write it again."
                 )
     if byte_order is None:
@@ -101,7 +101,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
     return byte_order, elements
 
 
-def _truncated(path: Path, count: int, found: str, kind: str = "vertices") -> InputError:
+def _truncated(path: Path, count: int, rest: str, kind: str = "vertices") -> InputError:
     return InputError(
-        f"{path} is cut off: its header declares {count} {kind}, but {found} follow; copy it again."
+        f"{path} is cut off: its header declares {count} {kind}, but {rest} follow; copy it again."
     )

@@ -21,9 +21,9 @@ from asysplat.scene import Cameras, Gaussians
 
 CAMERAS = ".cameras.json"  # suffix of <scene>.cameras.json beside <scene>.ply, a transforms.json
 MODEL = "sparse/0"  # COLMAP model in the folder <scene>/, in place of <scene>.cameras.json
-MAX_RESIDUAL = 0.1  # greatest residual of fitted cameras, as a share of their spread
+MAX_RESIDUAL = 0.1  # greatest residual of fitted cameras, as a fraction of their spread
 MAX_NAMES = 5  # scene names of the data in a message
-# A view shows nothing if it has Gaussians in a smaller share of its pixels, at a height and
+# A view shows nothing if it has Gaussians in a smaller fraction of its pixels, at a height and
 # width of COVERAGE_SIZE; half of the views must show something.
 MIN_COVERAGE, COVERAGE_SIZE = 0.01, 64
 VISIBLE = 0.05  # alpha of a pixel that has Gaussians
@@ -41,15 +41,15 @@ class SceneFile:
         """Read the Gaussians in float64 in the data's world, to which their cameras are fitted.
 
         Returns:
-            The Gaussians; the root mean square residual of the fit, as a share of the spread of the
-            cameras, or None without cameras: the file is then in the data's world.
+            The Gaussians; the root mean square residual of the fit, as a fraction of the spread of
+            the cameras, or None without cameras: the file is then in the data's world.
 
         Raises:
             InputError: damaged files; cameras that do not fit.
         """
         cameras = self._cameras()
         if cameras is None:
-            return read_gaussians(self.path, origin_of(self.sequence), torch.float64), None
+            return read_gaussians(self.path, world_origin(self.sequence), torch.float64), None
         where, poses = cameras
         source, target = self._matched(where, poses)
         origin = source[:, :3, 3].mean(0)  # float32 may not resolve the file's own coordinates
@@ -81,9 +81,9 @@ class SceneFile:
     ) -> tuple[Float[Tensor, "V 4 4"], Float[Tensor, "V 4 4"]]:
         """Match poses to the data's by the names of their images, without folder and suffix."""
         images = self.sequence.scene.images if isinstance(self.sequence, FileSequence) else ()
-        given = [(PurePosixPath(name).stem, pose) for name, pose in poses]
-        own = [(PurePosixPath(str(image.file)).stem, image.cam_to_world) for image in images]
-        unique = [_unique(named) for named in (given, own)]
+        file_poses = [(PurePosixPath(name).stem, pose) for name, pose in poses]
+        data_poses = [(PurePosixPath(str(image.file)).stem, image.cam_to_world) for image in images]
+        unique = [_unique(named) for named in (file_poses, data_poses)]
         names = sorted(unique[0].keys() & unique[1].keys())
         stacked = (np.array([named[name] for name in names], dtype=np.float64) for named in unique)
         source, target = (torch.tensor(stack).reshape(len(names), 4, 4) for stack in stacked)
@@ -92,9 +92,10 @@ class SceneFile:
         # Also where there is no camera, and the spread of none is NaN.
         if not all(s > MIN_EXTENT * d for s, d in zip(spreads, distances, strict=True)):
             raise InputError(
-                f"{where} has {len(names)} of the {len(own)} images of {self.sequence.name}, by "
-                "their file names, in one place or none: give cameras of two or more, in different "
-                "places, so that rotation, translation and scale can be fitted."
+                f"{where} has {len(names)} of the {len(data_poses)} images of "
+                f"{self.sequence.name}, by their file names, in one place or none: give cameras of "
+                "two or more, in different places, so that rotation, translation and scale can be "
+                "fitted."
             )
         return source, target
 
@@ -110,41 +111,41 @@ def find_files(scenes: Path, sequences: Sequence[ImageSequence]) -> dict[str, Sc
     Raises:
         InputError: not exactly one file for every scene, or a file of no scene.
     """
-    option, own = f"gaussians={scenes}", {sequence.name: sequence for sequence in sequences}
+    option, data = f"gaussians={scenes}", {sequence.name: sequence for sequence in sequences}
     kinds = f"{', '.join(READERS)}"
-    some = ", ".join(sorted(own)[:MAX_NAMES]) + ", ..." * (len(own) > MAX_NAMES)
+    listed = ", ".join(sorted(data)[:MAX_NAMES]) + ", ..." * (len(data) > MAX_NAMES)
     if scenes.is_file():
-        if len(own) != 1:
+        if len(data) != 1:
             raise InputError(
-                f"{option} is one scene, and the data has {len(own)} to test: name the folder of "
+                f"{option} is one scene, and the data has {len(data)} to test: name the folder of "
                 "that scene as data.root, or a folder with a file for each scene."
             )
-        return {name: SceneFile(scenes, sequence) for name, sequence in own.items()}
+        return {name: SceneFile(scenes, sequence) for name, sequence in data.items()}
     if not scenes.is_dir():
         raise InputError(f"{option} is not a file and no folder: name an existing one.")
     files = sorted(path for path in scenes.iterdir() if path.suffix.lower() in READERS)
     if not files:
-        raise InputError(f"{option} has no scene ({kinds}): write one for each of {some}.")
-    found: dict[str, Path] = {}
+        raise InputError(f"{option} has no scene ({kinds}): write one for each of {listed}.")
+    paths: dict[str, Path] = {}
     for path in files:
-        if path.stem in found:
+        if path.stem in paths:
             raise InputError(
-                f"{option} has two files of one scene, {found[path.stem].name} and {path.name}: "
+                f"{option} has two files of one scene, {paths[path.stem].name} and {path.name}: "
                 "remove one."
             )
-        if path.stem not in own:
+        if path.stem not in data:
             raise InputError(
                 f"{path} is named as no scene of the data: rename or remove it; the scenes are "
-                f"{some}."
+                f"{listed}."
             )
-        found[path.stem] = path
-    missing = sorted(own.keys() - found.keys())
+        paths[path.stem] = path
+    missing = sorted(data.keys() - paths.keys())
     if missing:
         raise InputError(
-            f"{option} has no file of {len(missing)} of the {len(own)} scenes, {', '.join(missing)}"
-            f": add them ({kinds}), or leave these scenes out of the data."
+            f"{option} has no file of {len(missing)} of the {len(data)} scenes, "
+            f"{', '.join(missing)}: add them ({kinds}), or leave these scenes out of the data."
         )
-    return {name: SceneFile(found[name], sequence) for name, sequence in own.items()}
+    return {name: SceneFile(paths[name], sequence) for name, sequence in data.items()}
 
 
 def check_visible(gaussians: Gaussians, cameras: Cameras, file: SceneFile, fitted: bool) -> None:
@@ -176,7 +177,7 @@ def check_visible(gaussians: Gaussians, cameras: Cameras, file: SceneFile, fitte
         )
 
 
-def origin_of(sequence: ImageSequence) -> tuple[float, float, float]:
+def world_origin(sequence: ImageSequence) -> tuple[float, float, float]:
     """Return the origin of the data's world, in the coordinates of its files."""
     return sequence.scene.origin if isinstance(sequence, FileSequence) else (0.0, 0.0, 0.0)
 

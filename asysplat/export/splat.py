@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from asysplat.errors import InputError
-from asysplat.export.checks import TINY, existing
+from asysplat.export.checks import TINY, require_file
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians
 
@@ -22,7 +22,7 @@ def read_splat(path: str | Path) -> Gaussians:
     Raises:
         InputError: no file, a size that is no multiple of a row, or invalid Gaussians.
     """
-    path = existing(path)
+    path = require_file(path)
     size = path.stat().st_size
     if size == 0 or size % ROW.itemsize:
         raise InputError(

@@ -8,7 +8,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from asysplat.errors import InputError
-from asysplat.export.checks import as_written, existing
+from asysplat.export.checks import prepare_for_export, require_file
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 
@@ -26,7 +26,7 @@ def write_safetensors(
     Raises:
         InputError: invalid Gaussians, or a file that cannot be written.
     """
-    gaussians = as_written(gaussians, dtype)
+    gaussians = prepare_for_export(gaussians, dtype)
     content = save({name: getattr(gaussians, name).contiguous() for name in NAMES}, metadata)
     with atomic_write(path) as partial:
         partial.write_bytes(content)
@@ -40,7 +40,7 @@ def read_safetensors(
     Raises:
         InputError: no such file, a missing field, or invalid Gaussians.
     """
-    path = existing(path)
+    path = require_file(path)
     try:
         with safe_open(path, "pt") as file:
             tensors = {name: file.get_tensor(name).to(dtype) for name in file.keys()}  # noqa: SIM118

@@ -46,7 +46,7 @@ LAYERS = ("color", "depth", "alpha")
 FRUSTUM_LENGTH = 0.1  # in the page's unit
 FRUSTUM_HEIGHT = 128  # pixels of its image, in the command
 CAMERAS = "transforms.json"  # beside a file of Gaussians
-MIN_IN_VIEW = 0.5  # share of the Gaussians that its cameras see, if they are the scene's
+MIN_IN_VIEW = 0.5  # fraction of the Gaussians that its cameras see, if they are the scene's
 MAX_SAMPLES = 10_000  # pixels from which the range of disparities is computed
 WAITING = "Waiting for the first rendering; kernels may have to compile, for minutes."
 POLL_SECONDS = 0.01  # between two checks for changes
@@ -352,8 +352,8 @@ def cameras_beside(scene: Path, gaussians: Gaussians) -> Cameras | None:
     seen = torch.zeros(gaussians.num_gaussians, dtype=torch.bool)
     for view in range(cameras.num_views):
         seen |= cameras.select([view]).project(gaussians.means)[2][0]
-    if (share := seen.float().mean().item()) < MIN_IN_VIEW:
-        print(f"without cameras: those of {file} have {share:.0%} of the Gaussians in view.")
+    if (visible := seen.float().mean().item()) < MIN_IN_VIEW:
+        print(f"without cameras: those of {file} have {visible:.0%} of the Gaussians in view.")
         return None
     return cameras
 

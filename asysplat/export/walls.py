@@ -10,8 +10,8 @@ from asysplat.scene import Cameras, Gaussians
 
 HEIGHT, WIDTH = 4, 16  # pixels of a look outward, which is flat, as the ground is no wall
 FOCAL = 16.0  # pixels: 27 degrees to either side, 7 up and down
-CLEARANCE = 0.5  # share of the way to a wall that may be gone
-WINDOW = 0.05  # share of the frames, before and after a wall, in which a path evades it
+CLEARANCE = 0.5  # fraction of the way to a wall that may be gone
+WINDOW = 0.05  # fraction of the frames, before and after a wall, in which a path evades it
 
 
 def free_radii(
