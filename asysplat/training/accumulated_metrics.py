@@ -33,9 +33,10 @@ class AccumulatedMetrics:
 
     def finish(self, reduce: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         """Update the running means; return the mean of every term; `reduce`: over processes."""
-        self._set([reduce(torch.stack(each).mean(0)) for each in zip(*self.updated, strict=True)])
+        updated = zip(*self.updated, strict=True)
+        self._set([reduce(torch.stack(values).mean(0)) for values in updated])
         names = list(self.terms[0])
-        means = torch.stack([torch.stack([each[n] for each in self.terms]).mean() for n in names])
+        means = torch.stack([torch.stack([terms[n] for terms in self.terms]).mean() for n in names])
         return dict(zip(names, reduce(means), strict=True))
 
     def _set(self, values: list[Tensor]) -> None:

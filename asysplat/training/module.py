@@ -135,8 +135,8 @@ class SplattingModule(lightning.LightningModule):
         decay = set(decaying(self.net))
         trained = [p for p in self.parameters() if p.requires_grad]
         decayed = {"params": [p for p in trained if p in decay]}
-        others = {"params": [p for p in trained if p not in decay], "weight_decay": 0.0}
-        optimizer = self.optimizer([decayed, others])
+        undecayed = {"params": [p for p in trained if p not in decay], "weight_decay": 0.0}
+        optimizer = self.optimizer([decayed, undecayed])
         schedule = {"scheduler": self.schedule(optimizer), "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": schedule}
 

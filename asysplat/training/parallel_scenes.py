@@ -60,8 +60,8 @@ class ParallelScenes:
         results = list(_pool(workers, cores // workers).map(differentiate, scenes, copies))
         self._update_buffers(copies)
         terms, grads = zip(*results, strict=True)
-        means = {name: torch.stack([each[name] for each in terms]).mean() for name in terms[0]}
-        sums = [reduce(torch.add, each) for each in zip(*grads, strict=True)]
+        means = {name: torch.stack([row[name] for row in terms]).mean() for name in terms[0]}
+        sums = [reduce(torch.add, gradients) for gradients in zip(*grads, strict=True)]
         means["loss"] = _WithGradients.apply(means["loss"], sums, len(scenes), *parameters)
         return means
 
@@ -83,7 +83,7 @@ class ParallelScenes:
         buffers = zip(self.net.buffers(), *(net.buffers() for net in copies), strict=True)
         for buffer, *changed in buffers:
             if buffer.is_floating_point():
-                buffer += torch.stack([other - buffer for other in changed]).mean(0)
+                buffer += torch.stack([copied - buffer for copied in changed]).mean(0)
             else:
                 buffer.copy_(changed[0])
 

@@ -16,7 +16,7 @@ from asysplat.evaluation import measured_cost
 from asysplat.evaluation.measured_cost import peak_flops
 from asysplat.training import step_timer
 from asysplat.training.callbacks import TrainingMonitor, monitor
-from asysplat.training.callbacks.monitor import gradient_norms, sentence
+from asysplat.training.callbacks.monitor import gradient_norms, summary
 from asysplat.training.step_timer import StepTimer
 
 CPU = torch.device("cpu")
@@ -97,7 +97,7 @@ def test_shares_and_rates_of_measured_steps(clock):
     for part in (*step_timer.PARTS, "other"):
         assert first[f"time/share_{part}"] == pytest.approx(expected.get(part, 0) / 20)
     assert "time/mfu" not in first and first["memory/peak_gb"] > 0
-    text = sentence(second)
+    text = summary(second)
     assert "took 10 s, 2 views/s: data 10%, network 40%" in text
     assert "MFU not measured" in text
 
@@ -112,7 +112,7 @@ def test_a_step_of_several_micro_batches(clock):
     assert found["time/share_network"] == pytest.approx(8 / 19.5)
     assert found["time/share_data"] == pytest.approx(2 / 19.5)
     assert found["time/mfu"] == pytest.approx(4 * 6 / 19.5 / 12)
-    assert "MFU 10.3%" in sentence(found)
+    assert "MFU 10.3%" in summary(found)
 
 
 def test_seconds_of_parallel_threads_are_averaged(clock):

@@ -70,7 +70,7 @@ def test_a_validation_before_the_first_step(tmp_path, capsys):
 
 def test_lines_between_validations(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(progress, "LINE_SECONDS", 0)
-    monkeypatch.setattr(progress, "LINE_SHARE", 0.5)
+    monkeypatch.setattr(progress, "LINE_FRACTION", 0.5)
     fit(tmp_path, 2)
     output = lines(capsys.readouterr().out)
     steps = [line.split(",")[0].split(":")[0] for line in output]

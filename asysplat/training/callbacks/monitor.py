@@ -25,9 +25,10 @@ class TrainingMonitor(Callback):
     """Logs the costs of one in `every` steps and statistics of each validation's Gaussians.
 
     - time/: views_per_second, seconds_per_step and gflops_per_second of all steps since the last
-      measured one; mfu, their share of the device's peak, where that is known; and of the measured
-      step share_<part>, the share of its seconds of each of PARTS and of the rest, other.
-    - memory/: peak_gb, see `peak_memory_gb`; on a GPU also its share of the GPU's memory.
+      measured one; mfu, the fraction of the device's peak, where that is known. Of the measured
+      step, share_<part> is the fraction of its seconds spent in each of PARTS, share_other in the
+      rest.
+    - memory/: peak_gb, see `peak_memory_gb`; on a GPU also peak_share, the fraction of its memory.
     - gradient/: the norm of each part of the network, before it is clipped.
     - gaussians/: histograms and medians, over the scenes of the first process, of opacities, of
       scales (the geometric mean of a Gaussian's three) and of depths as rendered at the targets, in
@@ -82,16 +83,16 @@ class TrainingMonitor(Callback):
             self._begin(trainer)
         if module.timer.measuring and trainer.global_step > self.step:
             wait_for(module.device)
-            now = time.perf_counter()
-            module.timer.add("optimizer", now - self.optimizer_since)
+            finished = time.perf_counter()
+            module.timer.add("optimizer", finished - self.optimizer_since)
             if self.flops is None:
                 views = batch["inputs"]
                 size = (views.num_views, views.cameras.height, views.cameras.width)
                 self.flops = PASSES * true_flops(module.net, *size)
-            seconds, total = module.timer.stop(), now - self.started
-            shares = {name: spent / total for name, spent in seconds.items()}
-            shares["other"] = max(0.0, 1 - sum(shares.values()))
-            values = {f"time/share_{name}": share for name, share in shares.items()}
+            seconds, total = module.timer.stop(), finished - self.started
+            fractions = {name: spent / total for name, spent in seconds.items()}
+            fractions["other"] = max(0.0, 1 - sum(fractions.values()))
+            values = {f"time/share_{name}": fraction for name, fraction in fractions.items()}
             values |= self._rates(trainer)
             values["memory/peak_gb"] = peak_memory_gb(module.device)
             if module.device.type == "cuda":
@@ -104,7 +105,7 @@ class TrainingMonitor(Callback):
     def on_fit_end(self, trainer: Any, module: Any) -> None:
         if self.measurements and trainer.is_global_zero:
             names = self.measurements[-1]
-            print(sentence({n: statistics.fmean(m[n] for m in self.measurements) for n in names}))
+            print(summary({n: statistics.fmean(m[n] for m in self.measurements) for n in names}))
 
     def on_validation_epoch_start(self, trainer: Any, module: Any) -> None:
         self.samples: dict[str, list[Tensor]] = defaultdict(list)
@@ -116,8 +117,8 @@ class TrainingMonitor(Callback):
             "log10_scale": gaussians.scales.log10().mean(-1).flatten(),
             "log10_depth": rendering.depth[rendering.alpha > MIN_ALPHA].log10(),
         }
-        for name, each in values.items():
-            sample = each[:: max(1, len(each) // SAMPLES)].float()
+        for name, numbers in values.items():
+            sample = numbers[:: max(1, len(numbers) // SAMPLES)].float()
             self.samples[name].append(sample[sample.isfinite()].cpu())
 
     def on_validation_epoch_end(self, trainer: Any, module: Any) -> None:
@@ -166,8 +167,8 @@ def gradient_norms(net: nn.Module) -> dict[str, float]:
     return norms
 
 
-def sentence(means: dict[str, float]) -> str:
-    """Write the means of the measurements as a sentence."""
+def summary(means: dict[str, float]) -> str:
+    """Summarize the means of the measurements in a line."""
     parts = ", ".join(f"{name} {means[f'time/share_{name}']:.0%}" for name in (*PARTS, "other"))
     mfu = f"{means['time/mfu']:.1%}" if "time/mfu" in means else "not measured"
     return (

@@ -76,7 +76,7 @@ class NonFiniteSteps(lightning.Callback):
 
     def _recompute(self, trainer: Any, module: Any) -> tuple[str, list[str]] | None:
         """Return the tensor and the scene; None if all is finite now."""
-        now = random_states()
+        current_states = random_states()
         try:
             for batch, states in self.batches:
                 set_random_states(states)
@@ -86,7 +86,7 @@ class NonFiniteSteps(lightning.Callback):
                     if first is not None:
                         return first, scene["scene"]
         finally:
-            set_random_states(now)
+            set_random_states(current_states)
         return None
 
     def on_train_epoch_end(self, trainer: Any, module: Any) -> None:
@@ -146,8 +146,8 @@ def tensors(value: Any, part: str = "") -> Iterator[tuple[str, Tensor]]:
         for field in fields(value):
             yield from tensors(getattr(value, field.name), f"{part}.{field.name}")
     elif isinstance(value, Mapping):
-        for key, each in value.items():
-            yield from tensors(each, f"{part}.{key}")
+        for key, item in value.items():
+            yield from tensors(item, f"{part}.{key}")
     elif isinstance(value, list | tuple):
-        for index, each in enumerate(value):
-            yield from tensors(each, f"{part}[{index}]")
+        for index, item in enumerate(value):
+            yield from tensors(item, f"{part}[{index}]")

@@ -11,7 +11,7 @@ from rich.console import Console
 
 REFRESH_SECONDS = 0.2
 SPEED_SECONDS = 3600  # period of training from which the remaining time is estimated
-LINE_SECONDS, LINE_SHARE = 60, 0.01  # minimum time and share of the steps between two lines
+LINE_SECONDS, LINE_FRACTION = 60, 0.01  # least time and fraction of steps from a line to the next
 
 
 class TrainingProgressBar(ProgressBar):
@@ -36,7 +36,7 @@ class TrainingProgressBar(ProgressBar):
     def on_train_start(self, trainer: Any, module: Any) -> None:
         step = trainer.global_step
         self.bars.reset(self.training, completed=step)
-        self._draw(trainer, now=True)
+        self._draw(trainer, force=True)
         self.printed_step, self.printed_at = step, time.monotonic()
 
     def on_train_batch_end(self, trainer: Any, module: Any, *_: Any) -> None:
@@ -44,7 +44,7 @@ class TrainingProgressBar(ProgressBar):
         self.bars.update(self.training, completed=step)
         self._draw(trainer)
         waited = time.monotonic() - self.printed_at
-        if waited > LINE_SECONDS and step - self.printed_step >= LINE_SHARE * total:
+        if waited > LINE_SECONDS and step - self.printed_step >= LINE_FRACTION * total:
             self._print_line(trainer)
 
     def on_validation_start(self, trainer: Any, module: Any) -> None:
@@ -64,7 +64,7 @@ class TrainingProgressBar(ProgressBar):
     def on_test_start(self, trainer: Any, module: Any) -> None:
         self._open()
         self.testing = self._add("test", total=sum(trainer.num_test_batches))
-        self._draw(trainer, now=True)
+        self._draw(trainer, force=True)
 
     def on_test_batch_end(self, trainer: Any, module: Any, *_: Any) -> None:
         self.bars.advance(self.testing)
@@ -97,14 +97,14 @@ class TrainingProgressBar(ProgressBar):
         self.drawn_at = time.monotonic()
 
     def _close(self, trainer: Any) -> None:
-        self._draw(trainer, now=True)
+        self._draw(trainer, force=True)
         self.bars.stop()
 
     def _add(self, name: str, **counts: int) -> progress.TaskID:
         return self.bars.add_task(name, quality="", **counts)
 
-    def _draw(self, trainer: Any, now: bool = False) -> None:
-        due = now or time.monotonic() - self.drawn_at > REFRESH_SECONDS
+    def _draw(self, trainer: Any, force: bool = False) -> None:
+        due = force or time.monotonic() - self.drawn_at > REFRESH_SECONDS
         if self.bars.disable or not due:
             return
         for task in self.bars.tasks:
@@ -118,8 +118,8 @@ class TrainingProgressBar(ProgressBar):
             return
         self.printed_step, self.printed_at = trainer.global_step, time.monotonic()
         seconds = self.bars.tasks[0].time_remaining
-        left = "" if seconds is None else f", {timedelta(seconds=round(seconds))} left"
-        line = f"step {self.printed_step} of {trainer.max_steps}{left}: {quality(trainer)}"
+        remaining = "" if seconds is None else f", {timedelta(seconds=round(seconds))} left"
+        line = f"step {self.printed_step} of {trainer.max_steps}{remaining}: {quality(trainer)}"
         print(line.removesuffix(": "), flush=True)
 
 

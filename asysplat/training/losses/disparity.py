@@ -98,9 +98,9 @@ def own_depths(gaussians: Gaussians, inputs: Views) -> Float[Tensor, "*batch V h
             "take training/depth=rendered."
         )
     means = gaussians.means.unflatten(-2, (inputs.num_views, height, width))
-    away = means - cameras.centers[..., None, None, :]
+    offsets = means - cameras.centers[..., None, None, :]
     # A matrix product would be rounded to half precision by autocast.
-    return (away * cameras.cam_to_world[..., None, None, :3, 2]).sum(-1)
+    return (offsets * cameras.cam_to_world[..., None, None, :3, 2]).sum(-1)
 
 
 def disparity_distance(
