@@ -22,5 +22,7 @@ def test_a_batch_is_divided_among_processes(given, expected):
 def test_processes_that_do_not_divide_a_batch_are_refused():
     with pytest.raises(InputError, match=r"batch_size=24 .* among 5 processes .*: use 4 processes"):
         split_batch(24, 8, 5)
+    with pytest.raises(InputError, match=r"data\.batch_size=3 scenes do not divide among 2 proc"):
+        split_batch(3, None, 2)
     with pytest.raises(InputError, match=r"or set data\.batch_size=8\."):
         split_batch(4, None, 8)

@@ -68,6 +68,8 @@ def test_training_stays_in_its_window_shares_no_image_and_is_repeated_by_its_see
 def test_too_short_a_sequence_or_window_is_refused():
     with pytest.raises(InputError, match=r"has 6 images.*data\.inputs and data\.targets.*6"):
         uniform_selection(6, num_inputs=4, num_targets=3)
+    with pytest.raises(InputError, match="has 24 images"):
+        uniform_selection(24, num_inputs=30, num_targets=2)
     for count, window in ((6, (8, 9)), (50, (6, 20)), (50, (20, 10))):
         with pytest.raises(InputError, match="has 6 images" if count == 6 else r"data\.window"):
             training_selection(count, 4, 3, window, np.random.default_rng(0))

@@ -52,6 +52,8 @@ def test_images_that_test_or_validate_are_not_trained_on(folder):
 def test_folders_without_scenes_are_refused(tmp_path, written):
     with pytest.raises(InputError, match=r"data\.root"):
         FilesSource(str(tmp_path), SIZE, (12, 24))
+    with pytest.raises(InputError, match=r"data\.root=nowhere"):
+        FilesSource("nowhere", SIZE, (12, 24))
     with pytest.raises(InputError, match=r"data\.test_root=.*nowhere"):
         FilesSource(str(written), SIZE, (12, 24), test_root=f"{tmp_path}/nowhere")
 

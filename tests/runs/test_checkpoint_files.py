@@ -60,7 +60,17 @@ def test_a_changed_bit_is_detected(tmp_path, run, capsys):
         find_checkpoint("last", tmp_path / "new", tmp_path)
 
 
-def test_config_diff():
+def test_checkpoints_that_are_none_are_named(tmp_path, repository):
+    text = str(repository / "README.md")
+    with pytest.raises(InputError, match=r"README\.md cannot be read as a checkpoint"):
+        find_checkpoint(text, tmp_path / "new", tmp_path)
+    with pytest.raises(InputError, match=r"ckpt_path=last found no .* leave ckpt_path out"):
+        find_checkpoint("last", tmp_path / "new", tmp_path)
+    with pytest.raises(InputError, match=r"init_path=none\.ckpt does not exist"):
+        load_weights("none.ckpt", torch.nn.Linear(2, 1))
+
+
+def test_options_that_differ_from_a_checkpoint_s_are_listed():
     notes = {"revision": "a", "hyper_parameters": {"steps": 6, "data": {"seed": 1, "root": "x"}}}
     assert config_diff(notes, notes["hyper_parameters"] | {"ckpt_path": "last"}, "a") == []
     options = {"steps": 9, "data": {"seed": 2, "root": "x"}, "paths": {"logs": "y"}}

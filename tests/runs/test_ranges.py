@@ -10,6 +10,7 @@ REFUSED = {
     "steps=-5": "steps=-5: give a whole number of at least 1.",
     "steps=0": "steps=0: give a whole number of at least 1.",
     "steps=1e3": "steps=1000.0: give a whole number",
+    "steps=abc": "steps=abc: give a whole number of at least 1.",
     "steps=null": "steps=null: give a whole number",
     "validate_every=true": "validate_every=True: give a whole number",
     "stages.stage1.batch_size=0": "data.batch_size=0: give a whole number of at least 1.",

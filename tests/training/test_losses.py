@@ -222,6 +222,11 @@ def test_a_missing_network_turns_the_term_off_or_is_refused(
         without_missing_network(config)
 
 
+def test_a_loss_without_any_term_is_refused():
+    with pytest.raises(InputError, match=r"training\.loss has no term that is on"):
+        make_loss(mse=0.0, ssim=0.0, perceptual=0.0, depth=0.0)
+
+
 def test_what_ran_is_described(distances):
     distance, _ = distances["longlrm"]
     options = {"ssim": 0.05, "perceptual_term": lambda: distance}
