@@ -86,7 +86,9 @@ def rows_of(folder):
 
 
 @pytest.mark.medium
-def test_the_result_folder(command, views, photographs, tmp_path):
+def test_the_result_folder_has_every_file_and_beats_the_baselines(
+    command, views, photographs, tmp_path
+):
     said = finished(command(photographs))
     folder = tmp_path / "run"
     assert {path.name for path in folder.iterdir()} == FILES
@@ -413,7 +415,7 @@ def test_photographs_that_are_not_there_or_have_no_size_are_refused(photographs)
         open_photographs(photographs, height=0)
 
 
-def test_too_few_photographs(command, views, tmp_path):
+def test_too_few_photographs_are_refused(command, views, tmp_path):
     write_transforms(views.select([0, 5]), tmp_path / "two")
     message = "has 2 photographs, of which held_out_every=8 leaves 1"
     check_refusal(command(tmp_path / "two"), message)
@@ -429,7 +431,7 @@ def test_a_checkpoint_of_another_model(command, photographs, tmp_path):
 
 
 @pytest.mark.medium
-def test_cameras_without_overlap(command, views, tmp_path):
+def test_cameras_without_overlap_end_without_an_error(command, views, tmp_path):
     poses = views.cameras.cam_to_world.clone()
     poses[:, :3, 3] += 100 * torch.arange(len(poses))[:, None]
     apart = replace(views, cameras=replace(views.cameras, cam_to_world=poses), depths=None)
@@ -438,7 +440,7 @@ def test_cameras_without_overlap(command, views, tmp_path):
 
 
 @pytest.mark.medium
-def test_logs_that_cannot_be_written(command, photographs, tmp_path):
+def test_logs_that_cannot_be_written_are_refused(command, photographs, tmp_path):
     (tmp_path / "run").write_text("a file")
     check_refusal(command(photographs), str(tmp_path / "run"))
 

@@ -43,26 +43,26 @@ NUMBERS = {"5,000 digits": "9" * 5000, "10^400": "1" + "0" * 400, "1e400": "1e40
 
 @pytest.mark.parametrize("key", ["w", "fl_x", "cx"])
 @pytest.mark.parametrize("number", NUMBERS)
-def test_numbers_that_no_computer_holds(scene, key, number):
+def test_numbers_beyond_a_float_are_refused_with_the_file_s_name(scene, key, number):
     edit(scene, **{key: "here"}, text=('"here"', NUMBERS[number]))
     with pytest.raises(InputError, match=r"transforms\.json"):
         open_scene(scene, SIZE).views([0])
 
 
 @pytest.mark.parametrize("values", [{"k1": 1e300}, {"cx": 1e30}, {"fl_x": 1e30, "fl_y": 1e30}])
-def test_lenses_that_no_camera_has(scene, values):
+def test_impossible_lenses_are_refused_with_the_file_s_name(scene, values):
     edit(scene, **values)
     with pytest.raises(InputError, match=r"transforms\.json"):
         open_scene(scene, SIZE).views([0]).validate()
 
 
-def test_nesting_that_python_does_not_read(scene):
+def test_nesting_too_deep_for_python_is_refused_with_the_file_s_name(scene):
     (scene / "transforms.json").write_text("[" * 100_000)
     with pytest.raises(InputError, match=r"transforms\.json"):
         open_scene(scene, SIZE)
 
 
-def test_names_that_no_file_has(scene):
+def test_file_names_longer_than_any_file_s_are_refused(scene):
     frames = json.loads((scene / "transforms.json").read_text())["frames"]
     edit(scene, frames=[frame | {"file_path": "a" * 300 + ".png"} for frame in frames])
     with pytest.raises(InputError, match="aaa"):
@@ -171,10 +171,7 @@ COMMANDS = {
     "report.py output={file}/report": "output",
     "train.py paths.logs={file}/logs": "paths.logs",
     "evaluate.py gaussians={scene}": "add data=files",
-    "reconstruct.py {photographs} layout=colmp": "colmp",
     "reconstruct.py {photographs} height=abc": "height=abc",
-    "reconstruct.py {photographs} max_held_out=0": "max_held_out=0",
-    "reconstruct.py {empty}": "camera poses",
     "reconstruct.py {bare} paths.logs={empty}": "found cameras for 0 of 4",
 }
 
@@ -204,7 +201,18 @@ def test_a_wrong_command_ends_with_a_sentence_and_status_1(
     assert "Traceback" not in result.stderr
 
 
-def test_more_pixels_than_the_photographs_have(scene):
+def test_photographs_that_cannot_be_opened_as_asked_are_refused(scene, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for folder, options, message in (
+        (scene, {"layout": "colmp"}, "colmp"),
+        (scene, {"max_held_out": 0}, "max_held_out=0"),
+        (tmp_path / "empty", {}, "camera poses"),
+    ):
+        with pytest.raises(InputError, match=message):
+            asysplat.open_photographs(folder, height=24, **options)
+
+
+def test_a_height_above_the_photographs_is_lowered_to_theirs(scene):
     said = []
     opened = asysplat.open_photographs(scene, height=3000, views=2, say=said.append)
     assert opened.inputs.cameras.height == 24

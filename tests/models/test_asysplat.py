@@ -65,7 +65,7 @@ def test_geometry_ratio_of_the_paper(build):
 
 @pytest.mark.medium
 @pytest.mark.parametrize(("width", "ratio"), [(0.125, 0.95), (0.25, 0.7), (1.0, 0.3)])
-def test_geometry_ratio(build, ratio, width):
+def test_a_geometry_ratio_is_met_at_the_same_total(build, ratio, width):
     model = ("model=asysplat_4m4s", f"width={width}")
     base = build(*model, device="meta")
     net = build(*model, f"geometry_ratio={ratio}", device="meta")
@@ -78,7 +78,7 @@ def test_geometry_ratio(build, ratio, width):
 
 
 @pytest.mark.medium
-def test_parameter_budget(build):
+def test_a_parameter_budget_scales_the_total(build):
     base = build(device="meta")
     net = build("geometry_ratio=0.8", "parameter_budget=0.5", device="meta")
     total, expected = (sum(p.numel() for p in n.parameters()) for n in (net, base))
@@ -196,7 +196,7 @@ def test_token_maps_of_any_size(build, model):
 @pytest.mark.parametrize(
     ("mix", "layers"), [("4m4s", "mmmmssss"), ("7m+1t", "mmmmmmmt"), ("1s2m", "smm")]
 )
-def test_layer_mix(mix, layers):
+def test_a_layer_mix_names_each_layer_by_its_letter(mix, layers):
     assert "".join(parse_layer_mix(mix, {"m", "s", "t"})) == layers
 
 

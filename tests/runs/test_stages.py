@@ -86,7 +86,7 @@ def test_a_mistake_in_any_stage_is_refused_at_once(composed, case):
         check_stages(stage_configs(composed(*overrides)))
 
 
-def test_resume_point(composed, tmp_path):
+def test_a_run_resumes_in_the_stage_of_its_checkpoint(composed, tmp_path):
     stages, path = stage_configs(composed()), tmp_path / "last.ckpt"
 
     def saved(**record):
