@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
+from asysplat.interrupts import handle_signals
 from asysplat.root import ROOT
 
 # Word: the script or module that it starts, and what it does.
@@ -84,4 +85,5 @@ def complete(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
+    handle_signals()
     main()

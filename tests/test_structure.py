@@ -32,6 +32,7 @@ LAYERS = (
     ("training",),
     ("load", "report"),
     ("reconstruct",),
+    ("doctor", "__main__"),
 )
 
 
