@@ -9,6 +9,7 @@ asysplat.write_gaussians("scene.ply", photographs.normalization.to_world(gaussia
 from asysplat.later import import_later
 
 LATER = {
+    "__version__": "asysplat.root",
     "Cameras": "asysplat.scene",
     "Gaussians": "asysplat.scene",
     "Views": "asysplat.scene",

@@ -8,10 +8,9 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 
 from asysplat.interrupts import handle_signals
-from asysplat.root import ROOT
+from asysplat.root import ROOT, __version__
 
 # Word: the script or module that it starts, and what it does.
 COMMANDS = {
@@ -34,7 +33,7 @@ def main() -> None:
     if name in ("-h", "--help"):
         print(usage())
     elif name == "--version":
-        print(version("asysplat"))
+        print(__version__)
     elif name in COMPLETION:
         complete(words)
     elif name in COMMANDS:

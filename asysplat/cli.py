@@ -12,13 +12,14 @@ from itertools import zip_longest
 
 import hydra
 from hydra._internal.utils import get_args_parser
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError, cause_of, input_error_behind, plain_warnings
 from asysplat.interrupts import end_at_interrupt, handle_signals, interrupt_once
 from asysplat.overrides import check_overrides
-from asysplat.root import CONF, ROOT
+from asysplat.root import CONF, ROOT, typed
 
+OmegaConf.register_new_resolver("typed", typed, replace=True)  # in the texts of --help
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

@@ -1,5 +1,6 @@
-"""Where the files beside the code are: configurations, shipped weights, scripts."""
+"""The version, and where the files beside the code are: configurations, weights, scripts."""
 
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent
@@ -8,6 +9,10 @@ INSTALLED = PACKAGE / "installed"
 ROOT = INSTALLED if INSTALLED.is_dir() else PACKAGE.parent
 CONF = ROOT / "conf"
 CHECKPOINTS = ROOT / "checkpoints"
+try:
+    __version__ = version("asysplat")
+except PackageNotFoundError:  # a copy that is not installed
+    __version__ = "unknown"
 
 
 def typed(script: str) -> str:

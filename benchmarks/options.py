@@ -2,17 +2,16 @@
 
 import os
 import platform
-import re
 from collections.abc import Iterable
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
-from pathlib import Path
 from types import ModuleType
 
 import llvmlite.binding
 import torch
 
+from asysplat.doctor import processor
 from asysplat.errors import InputError
 
 NAMES = ("render", "ops", "model", "data", "pareto", "bench")
@@ -49,10 +48,8 @@ def find_device(name: str) -> torch.device:
 
 def describe_machine() -> dict[str, str | int]:
     """Return the processor, cores, torch's threads, the GPU if any, and versions of packages."""
-    info = Path("/proc/cpuinfo")  # Linux alone
-    model = info.exists() and re.search(r"model name\s*:\s*(.+)", info.read_text())
     machine = {
-        "cpu": model[1] if model else platform.processor() or platform.machine(),
+        "cpu": processor(),
         "instructions": llvmlite.binding.get_host_cpu_name(),  # what Numba compiles for
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),

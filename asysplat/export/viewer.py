@@ -6,7 +6,7 @@ python -m asysplat.export.viewer scene.ply [PHOTOGRAPHS]
 from argparse import ArgumentParser
 
 if __name__ == "__main__":  # now, since torch takes seconds
-    parser = ArgumentParser("python -m asysplat.export.viewer", description=__doc__.split("\n")[0])
+    parser = ArgumentParser("asysplat view", description=__doc__.split("\n")[0])
     parser.add_argument("scene", help="a file of Gaussians: .ply, .splat or .safetensors")
     parser.add_argument("photographs", nargs="?", help="a folder to show the scene among")
     arguments = parser.parse_args()

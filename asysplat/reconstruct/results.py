@@ -123,7 +123,7 @@ class Results:
         print(f"figure: {self.folder / 'contact.png'}")
         if self._has_video:
             print(f"video: {self.folder / 'path.mp4'}")
-        print(f"viewer: python -m asysplat.export.viewer {self.folder / 'scene.ply'}")
+        print(f"viewer: asysplat view {self.folder / 'scene.ply'}")
         print(f"scene: {self.folder / 'scene.ply'}")
 
     def _save_cameras(self) -> None:

@@ -3,9 +3,8 @@
 import hashlib
 import subprocess
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 
-from asysplat.root import ROOT
+from asysplat.root import ROOT, __version__
 
 CODE = ("asysplat", "conf", "train.py")
 
@@ -21,10 +20,7 @@ def revision() -> str:
     changes = _git("diff", "HEAD", "--", *CODE)
     # A package installed below somebody else's repository is not part of it.
     if _git("rev-parse", "--show-cdup") != b"\n" or commit is None or changes is None:
-        try:
-            return f"version {version('asysplat')}"
-        except PackageNotFoundError:
-            return "unknown"
+        return __version__ if __version__ == "unknown" else f"version {__version__}"
     mark = f"+{hashlib.sha256(changes).hexdigest()[:8]}" if changes else ""
     return commit.decode().strip() + mark
 

@@ -1,6 +1,6 @@
 """Find the cameras of photographs or of a video: structure from motion.
 
-python -m asysplat.data.cameras my_photographs
+asysplat cameras my_photographs
 """
 
 import sys
@@ -16,7 +16,7 @@ from asysplat.interrupts import handle_signals
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = ArgumentParser(prog="python -m asysplat.data.cameras", description=__doc__)
+    parser = ArgumentParser(prog="asysplat cameras", description=__doc__)
     parser.add_argument("path", type=Path, help="a folder of photographs, or a video")
     parser.add_argument("--out", type=Path, default=Path("logs/cameras"), help="outside of it")
     parser.add_argument("--frames", type=int, default=100, help="of a video, at most")

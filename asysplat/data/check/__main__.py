@@ -26,7 +26,7 @@ MAX_SCENES = 3  # checked of a folder of more
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = ArgumentParser(prog="python -m asysplat.data.check", description=__doc__)
+    parser = ArgumentParser(prog="asysplat check", description=__doc__)
     parser.add_argument(
         "path", type=Path, help=f"a scene, or a folder of scenes, of which {MAX_SCENES} are checked"
     )

@@ -17,6 +17,7 @@ from numba import njit
 from numba.core.caching import UserProvidedCacheLocator
 
 PACKAGE = Path(__file__).parents[2]
+FOLDERS = ("kernels", "ops", "rendering")  # the sources of kernels
 Result = TypeVar("Result")
 PER_THREAD = 4  # portions of the work for each thread: the fast threads take more of them
 
@@ -57,7 +58,7 @@ class CacheBySources(UserProvidedCacheLocator):
 def _cache_folder(parent: str) -> str:
     """Return the folder for this version of the sources; bounds-checked kernels have their own."""
     # Numba compares only a kernel's own file, not its parts in other files.
-    paths = [path for folder in ("ops", "rendering") for path in (PACKAGE / folder).rglob("*.py")]
+    paths = [path for folder in FOLDERS for path in (PACKAGE / folder).rglob("*.py")]
     sources = b"".join(path.read_bytes() for path in sorted(paths))
     checks = "-checked" if numba.config.BOUNDSCHECK else ""
     name = f"kernels-{hashlib.sha256(sources).hexdigest()[:16]}{checks}"
