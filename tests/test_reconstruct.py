@@ -422,7 +422,7 @@ def test_too_few_photographs_are_refused(command, views, tmp_path):
 
 
 @pytest.mark.medium
-def test_a_checkpoint_of_another_model(command, photographs, tmp_path):
+def test_a_checkpoint_of_another_model_is_refused(command, photographs, tmp_path):
     file = tmp_path / "other.safetensors"
     save_file({"net.layer": torch.zeros(2)}, file)
     result = command(photographs, "init=network", f"checkpoint={file}")

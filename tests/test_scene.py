@@ -88,7 +88,7 @@ def test_scenes_of_different_sizes_do_not_stack():
         Cameras.stack([cameras(height=4), cameras(height=8)])
 
 
-def test_project():
+def test_project_gives_pixels_depth_and_whether_they_are_inside():
     intrinsics = torch.tensor([[5.0, 0, 5.0], [0, 5.0, 4.0], [0, 0, 1]]).repeat(2, 1, 1)
     poses = torch.eye(4).repeat(2, 1, 1)
     poses[1, 0, 3] = 1
@@ -138,7 +138,7 @@ def test_bad_cameras_name_field_and_view(complaint):
         views.validate()
 
 
-def test_bad_images():
+def test_images_of_another_shape_or_range_are_refused():
     images = torch.rand(2, 3, 4, 6)
     with pytest.raises(InputError, match="expected \\(2, 3, 4, 6\\)"):
         Views(cameras(), images[..., :5])
@@ -151,7 +151,7 @@ def test_bad_images():
     ("field", "value", "complaint"),
     [("scales", 0.0, "exp"), ("opacities", 1.5, "sigmoid"), ("means", float("inf"), "infinity")],
 )
-def test_bad_gaussians(field, value, complaint):
+def test_gaussians_out_of_range_are_named(field, value, complaint):
     scene = gaussians()
     getattr(scene, field)[3] = value
     with pytest.raises(InputError, match=rf"{field}\[3\].*{complaint}"):

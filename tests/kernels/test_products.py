@@ -35,7 +35,7 @@ def assert_close(found, expected):
 
 @pytest.mark.parametrize("rows", [1, ROWS, 2 * ROWS + 3])
 @pytest.mark.parametrize("terms, columns", [(1, LANES), (64, 3 * LANES), (70, LANES)])
-def test_product(rows, terms, columns):
+def test_product_adds_to_a_multiple_of_the_output(rows, terms, columns):
     out, a, b = draw(rows, columns), draw(rows, terms), draw(terms, columns)
     expected = 0.5 * out.astype(float) + a.astype(float) @ b
     product(out, a, b, np.float32(0.5))
@@ -61,7 +61,7 @@ def test_triangle_reads_no_zero_outside_the_diagonal_tiles(upper):
 
 
 @pytest.mark.parametrize("rows", [1, LANES, 2 * LANES + 5])
-def test_transpose(rows):
+def test_transposed_fills_the_rest_with_zeros(rows):
     matrix = draw(rows, 2 * LANES)
     out = np.zeros((2 * LANES, 3 * LANES), np.float32)
     transposed(matrix, out)

@@ -46,7 +46,7 @@ def test_tokens_in_half_precision():
         assert (result.float() - value).norm() <= 1e-2 * value.norm()
 
 
-def test_no_bias():
+def test_a_convolution_may_have_no_bias():
     tokens, weight, _ = inputs(3)
     expected = as_sequences(tokens, weight, None, 1)
     torch.testing.assert_close(depthwise_conv(tokens, weight, None, 1), expected)

@@ -37,7 +37,7 @@ def distances(gaussians, views):
     return (gaussians.means.reshape(len(centers), -1, 3) - centers).norm(dim=-1)
 
 
-def test_untrained_photograph():
+def test_an_untrained_residual_head_starts_in_the_middle_of_the_depths():
     views = make_views()
     gaussians, _ = decode("residual", torch.zeros(59), views)
     middle = math.sqrt(0.1 * 100)

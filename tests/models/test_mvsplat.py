@@ -102,7 +102,7 @@ def test_shifted_windows_see_only_neighbors(size):
     assert unshifted.all() and not visible.all()
 
 
-def test_quaternions():
+def test_quaternions_are_those_of_scipy():
     one, other = Rotation.random(500, random_state=0), Rotation.random(500, random_state=1)
     half_turns = Rotation.from_rotvec(math.pi * torch.eye(3).numpy())
 

@@ -61,7 +61,7 @@ def test_wide_heads_and_states(name):
 @kernel
 @pytest.mark.parametrize("name", SCANS)
 @pytest.mark.parametrize("dtype, tolerance", [(torch.bfloat16, 1e-2), (torch.float16, 1e-3)])
-def test_half_precision(name, dtype, tolerance):
+def test_half_precision_agrees_with_the_reference(name, dtype, tolerance):
     check(name, arguments(name, 17, dtype=dtype), tolerance=tolerance)
 
 

@@ -82,7 +82,7 @@ def test_identical_images_have_no_loss_and_no_gradient(size):
     assert (loss == 0).all() and (grad == 0).all()
 
 
-def test_constant_images():
+def test_the_loss_of_constant_images_is_that_of_their_means():
     """Without contrast SSIM compares the means; the gradient sums to its derivative."""
     x, y, C1 = 0.6, 0.5, 1e-4
     similarity = (2 * x * y + C1) / (x**2 + y**2 + C1)

@@ -120,7 +120,7 @@ def test_shapes_on_the_meta_device():
     ],
     ids=str,
 )
-def test_bad_input(change, message):
+def test_images_and_cameras_that_do_not_fit_are_named(change, message):
     arguments = {"images": torch.zeros(1, 4, 3, 24, 32).double(), "cameras": four_cameras()}
     with pytest.raises(InputError, match=message):
         # Without the tests' type checker, which would raise first.

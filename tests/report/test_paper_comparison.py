@@ -86,7 +86,7 @@ def test_limits_of_a_fit():
     assert not fits(paper, {"parameters": 100e6, "gflops": 1938.0})
 
 
-def test_check_costs():
+def test_costs_near_the_paper_s_fit():
     paper = row(parameters=100e6)
     good, bad = {"parameters": 101e6}, {"parameters": 110e6}
     unverified = replace(paper, unverified="no layers are named")

@@ -284,7 +284,7 @@ def test_a_narrow_terminal_has_all_of_a_wide_table(table):
     assert "…" not in "".join(tables)
 
 
-def test_pareto_front():
+def test_the_pareto_front_has_what_nothing_cheaper_beats():
     points = [("a", 1.0, 5.0), ("b", 2.0, 4.0), ("c", 3.0, 7.0), ("d", 3.0, 6.0), ("e", 4.0, 7.0)]
     assert [name for name, _, _ in pareto_front(points, "higher")] == ["a", "c"]
     assert [name for name, _, _ in pareto_front(points, "lower")] == ["a", "b"]

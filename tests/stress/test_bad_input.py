@@ -22,7 +22,7 @@ def test_shapes_of_gaussians(make_scene):
 
 
 @pytest.mark.parametrize("height, width", [(0, 4), (4, -1)])
-def test_empty_images(make_scene, height, width):
+def test_empty_images_are_refused(make_scene, height, width):
     _, cameras = make_scene()
     with pytest.raises(InputError, match="an image needs at least one pixel"):
         replace(cameras, height=height, width=width)
@@ -38,7 +38,7 @@ def test_incompatible_batches_and_backgrounds(make_scene):
 
 
 @pytest.mark.parametrize("name", ["means", "opacities", "intrinsics", "background"])
-def test_integer_tensors(make_scene, name):
+def test_integer_tensors_are_refused(make_scene, name):
     gaussians, cameras = make_scene()
     background = torch.zeros(3, dtype=torch.int64 if name == "background" else torch.float64)
     for owner in (gaussians, cameras):
@@ -48,7 +48,7 @@ def test_integer_tensors(make_scene, name):
         render(gaussians, cameras, background)
 
 
-def test_different_devices(make_scene):
+def test_different_devices_are_refused(make_scene):
     gaussians, cameras = make_scene()
     with pytest.raises(InputError, match=r"cameras.intrinsics is on meta and gaussians.means on"):
         render(gaussians, cameras.to("meta"))
@@ -81,7 +81,7 @@ def test_opacities_out_of_range(make_scene, opacity):
     ],
     ids=str,
 )
-def test_unknown_options(make_scene, options, message):
+def test_unknown_options_are_refused(make_scene, options, message):
     gaussians, cameras = make_scene()
     with pytest.raises(InputError, match=message):
         render(gaussians, cameras, **options)

@@ -121,7 +121,9 @@ def test_cropping_an_image(make_scene, backend, seed, left, top):
     depth=st.sampled_from([False, "expected", "accumulated", "median"]),
     antialiased=st.booleans(),
 )
-def test_deferred_backpropagation(make_scene, backend, seed, views, at_once, depth, antialiased):
+def test_deferred_backpropagation_has_the_gradient_of_all_views_at_once(
+    make_scene, backend, seed, views, at_once, depth, antialiased
+):
     """Drawing a few views at a time, twice, gives the gradient of all at once."""
     gaussians, cameras = make_scene(views=views, seed=seed)
     options = {"depth": depth, "antialiased": antialiased}

@@ -14,7 +14,7 @@ from asysplat.scene import Cameras, Gaussians
 
 
 @pytest.mark.parametrize("height, width", [(1, 1), (1, 4096), (33, 1)])
-def test_odd_sizes(backend, make_scene, height, width):
+def test_odd_sizes_agree_with_the_reference(backend, make_scene, height, width):
     gaussians, cameras = make_scene(count=6, height=height, width=width, dtype=torch.float32)
     result = both_ways(backend, gaussians, cameras)
     assert result.image.shape == (1, 3, height, width)

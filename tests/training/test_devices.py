@@ -64,14 +64,14 @@ def check_the_same(found, expected) -> None:
 
 
 @pytest.mark.medium
-def test_accumulated(train, one):
+def test_accumulated_micro_batches_take_the_same_steps(train, one):
     result = train("name=accumulated", "trainer.devices=1", "data.micro_batch=1", *FEW)
     assert "global batch 4 = 1 process x 1 scene x 4 accumulated" in result.stdout
     check_the_same(read_run(result), one)
 
 
 @pytest.mark.medium
-def test_two_processes(train, one):
+def test_two_processes_take_the_same_steps(train, one):
     """Each accumulates, and validates and tests a share of three scenes."""
     result = train.alone("name=two", "trainer=ddp", TWO, "data.micro_batch=1", *FEW)
     assert "global batch 4 = 2 processes x 1 scene x 2 accumulated" in result.stdout
@@ -79,7 +79,7 @@ def test_two_processes(train, one):
 
 
 @pytest.mark.slow
-def test_divided_weights(train, one):
+def test_divided_weights_take_the_same_steps(train, one):
     """FSDP takes the same steps, and one process goes on from its checkpoint."""
     saving = ["training.checkpoint_layers=true", "training.views_at_once=1"]
     result = train.alone("name=fsdp", "trainer=fsdp", TWO, "data.micro_batch=1", *saving, *FEW)

@@ -321,7 +321,7 @@ def test_perceptual_term_has_the_same_bits_under_autocast(distances, name):
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_perceptual_term(distances, name):
+def test_the_perceptual_term_is_0_for_equal_images_and_trains_only_the_prediction(distances, name):
     distance, _ = distances[name]
     loss = make_loss(perceptual=1.0, perceptual_term=lambda: distance)
     prediction, batch = pair()

@@ -51,7 +51,7 @@ def measure(module, lpips, batch):
 
 @pytest.mark.medium
 @pytest.mark.parametrize("most", [8, pytest.param(32, marks=pytest.mark.slow)])
-def test_real_photographs(module, shared, most):
+def test_real_photographs_are_better_than_the_baselines(module, shared, most):
     """PSNR above the nearest view's and the mean color's everywhere, LPIPS on half the scenes."""
     lpips = load_lpips("alex", shared / "weights")
     if lpips is None:

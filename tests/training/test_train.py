@@ -228,7 +228,7 @@ def test_a_mistake_is_one_sentence_and_status_1(train, case, tmp_path):
 
 @pytest.mark.medium
 @pytest.mark.parametrize("option", ["ckpt_path", "init_path"])
-def test_a_checkpoint_of_another_model(train, whole, tmp_path, option):
+def test_a_checkpoint_of_another_model_is_refused(train, whole, tmp_path, option):
     path = whole / "checkpoints" / "last.ckpt"
     result = train("width=0.25", f"{option}={path}")
     assert result.returncode != 0 and "Traceback" not in result.stderr

@@ -142,7 +142,7 @@ def test_frames_of_a_video_are_the_sharp_ones(video, views, tmp_path):
 
 
 @pytest.mark.medium
-def test_a_video(video, tmp_path):
+def test_cameras_of_a_video_are_found_for_its_frames(video, tmp_path):
     found = find_cameras(video, tmp_path, frames=COUNT)
     assert found.name.startswith("walk-") and len(list((found / "images").iterdir())) == COUNT
     assert len(read_poses(found / "sparse" / "0")) == COUNT

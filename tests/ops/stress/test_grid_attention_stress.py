@@ -65,14 +65,14 @@ def assert_exact(backend, qkv, grid=2, bound=None):
     "batch, views, height, width",
     [(1, 1, 6, 12), (3, 2, 6, 12), (2, 3, 1, 1), (2, 3, 1, 5), (2, 3, 5, 7)],
 )
-def test_every_grid(backend, dtype, grid, batch, views, height, width):
+def test_every_grid_is_exact(backend, dtype, grid, batch, views, height, width):
     """Padding has no effect, not even where a grid place has no token."""
     assert_exact(backend, make_qkv(batch, views, height, width, dtype=dtype), grid)
 
 
 @per_backend
 @pytest.mark.parametrize("heads, head_dim", [(1, 1), (1, 64), (5, 3)])
-def test_every_width(backend, heads, head_dim):
+def test_every_width_is_exact(backend, heads, head_dim):
     assert_exact(backend, make_qkv(heads=heads, head_dim=head_dim))
 
 
@@ -99,7 +99,7 @@ def test_scores_of_every_size(backend):
 
 
 @per_backend
-def test_constants(backend):
+def test_constants_are_averaged(backend):
     """Each token gets the mean of the others; a common shift of all scores has gradient 0."""
     ones = [torch.ones_like(t) for t in make_qkv()]
     results = by_backend(backend, ones, torch.ones_like(ones[0]))
@@ -152,7 +152,7 @@ def test_any_number_of_threads_gives_the_same_bits(threads):
 
 
 @pytest.mark.parametrize("name", range(3), ids="qkv".__getitem__)
-def test_bad_input(name):
+def test_tensors_that_do_not_fit_are_named(name):
     wrong = {
         r"has shape \(.*\): expected [([]": lambda t: t[0],
         "is torch.int64: give floating-point numbers": torch.Tensor.long,

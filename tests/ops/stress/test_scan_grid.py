@@ -42,12 +42,12 @@ def test_every_step_and_rate(path, steps, rates, reverse):
 
 
 @pytest.mark.parametrize("steps, rates", [("1e-8", "1e4"), ("spread", "spread"), ("mixed", "1")])
-def test_bfloat16(path, steps, rates, reverse):
+def test_bfloat16_is_exact(path, steps, rates, reverse):
     arguments = make_arguments(path[0], 131, steps, rates, dtype=torch.bfloat16)
     assert_exact(path, arguments, reverse=reverse)
 
 
-def test_float16(path, reverse):
+def test_float16_is_exact(path, reverse):
     assert_exact(path, make_arguments(path[0], 131, dtype=torch.float16), reverse=reverse)
 
 
@@ -72,14 +72,14 @@ def test_any_sizes_steps_and_rates(path, sizes, reverse):
 
 
 @pytest.mark.parametrize("length", LENGTHS)
-def test_every_length(path, length, reverse):
+def test_every_length_is_exact(path, length, reverse):
     assert_exact(path, make_arguments(path[0], length), reverse=reverse)
 
 
 @pytest.mark.parametrize(
     "batch, channels, head_dim, state", [(1, 1, 1, 1), (3, 1, 5, 7), (1, 9, 1, 1), (3, 2, 33, 19)]
 )
-def test_every_size(path, batch, channels, head_dim, state, reverse):
+def test_every_size_is_exact(path, batch, channels, head_dim, state, reverse):
     arguments = make_arguments(
         path[0], 67, batch=batch, channels=channels, head_dim=head_dim, state=state
     )

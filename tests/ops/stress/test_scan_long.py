@@ -15,19 +15,19 @@ def long_arguments(path, length, steps, rates="1"):
     return make_arguments(path[0], length, steps, rates, batch=1, channels=2, head_dim=1, state=2)
 
 
-def test_long_sequences(path, reverse):
+def test_long_sequences_are_exact(path, reverse):
     assert_exact(path, long_arguments(path, 65_280, "mixed"), reverse=reverse)
 
 
-def test_longer_sequences(path):
+def test_a_quarter_of_a_million_steps_are_exact(path):
     assert_exact(path, long_arguments(path, 262_144, "1e-2"))
 
 
-def test_long_memory(path):
+def test_slow_decay_over_a_long_sequence_is_exact(path):
     assert_exact(path, long_arguments(path, 65_280, "1e-8", "1e-4"), slack=SLACK)
 
 
-def test_long_constants(path):
+def test_long_constants_are_exact(path):
     x, dt, A, B, C, D = (torch.ones_like(a) for a in long_arguments(path, 65_280, "1"))
     constants = (x, dt, -1e-4 * A, B, C, D)
     assert_exact(path, constants, torch.ones_like(x), slack=SLACK)

@@ -29,18 +29,18 @@ def scaled(path, names, factor):
 
 
 @pytest.mark.parametrize("zero", [*NAMES, "y", NAMES])
-def test_zeros(path, zero):
+def test_zeros_are_exact(path, zero):
     assert_exact(path, *scaled(path, zero, 0))
 
 
 @pytest.mark.parametrize("steps", [1e-8, 0.1, 1e3])
-def test_constants(path, steps, reverse):
+def test_constants_are_exact(path, steps, reverse):
     x, dt, A, B, C, D = (torch.ones_like(a) for a in make_arguments(path[0], 131))
     assert_exact(path, (x, steps * dt, -0.5 * A, B, C, D), torch.ones_like(x), reverse)
 
 
 @pytest.mark.parametrize("huge", ["x", "D", "y", "xB", "xC", "BC", "xy", "By"])
-def test_huge_numbers(path, huge):
+def test_huge_numbers_are_exact(path, huge):
     """Two factors of 1e18 at once, as much as float32 can hold."""
     arguments, grad_output = scaled(path, huge, HUGE)
     exact = by_loop(path, arguments, grad_output).named()
