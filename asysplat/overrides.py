@@ -87,7 +87,7 @@ def _check_choices(override: Override) -> None:
     choices = (choice for value in _values(override) for choice in value.strip("[]").split(","))
     for choice in choices:
         if choice and choice not in known:
-            nearest = difflib.get_close_matches(choice, known, n=3, cutoff=0.4) or known
+            nearest = difflib.get_close_matches(choice, known, n=3, cutoff=0.5) or known
             raise InputError(
                 f"{group}={choice} is unknown: did you mean {', '.join(nearest)}? "
                 f"All are in {folder.relative_to(CONF.parent)}/."

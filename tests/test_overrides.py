@@ -70,6 +70,8 @@ UNKNOWN = {
     "model=longlrm,asysplat_4m4z": "model=asysplat_4m4z is unknown: did you mean asysplat_4m4",
     "model/links=bth": "did you mean both? All are in conf/model/links/.",
     "sweeps=layer": "did you mean layers, asymmetry? All are in conf/sweeps/.",
+    "model=asysplat_sweep": "did you mean asysplat_plane_sweep",
+    "data=colmap": "did you mean deep_blending, disk, dl3dv, files, ",  # all of them
     "steps": "steps sets nothing: write steps=value",
     "name=my (run": "needs quotes of its own",
 }
