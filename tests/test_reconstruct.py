@@ -405,7 +405,7 @@ def test_steps_and_seconds_are_not_given_together(script, monkeypatch):
 def test_run_last_without_any_run_names_the_folder(tmp_path):
     config = OmegaConf.create({"run": "last", "paths": {"logs": f"{tmp_path}/nowhere"}})
     with pytest.raises(InputError, match=r"run=last found no finished run in .*nowhere"):
-        continue_run(config, given=())
+        continue_run(config, ())
 
 
 def test_photographs_that_are_not_there_or_have_no_size_are_refused(photographs):
