@@ -48,10 +48,10 @@ def benchmark(options: DictConfig) -> None:
         sys.exit(complaint)
     if old is None:
         return
-    found = compare(old, results, suite.WATCHED)
-    for line in found.sentences():
+    comparison = compare(old, results, suite.WATCHED)
+    for line in comparison.lines():
         console.print(line, soft_wrap=True, markup=False, highlight=False)
-    if found.worse:
+    if comparison.worse:
         sys.exit(1)
 
 

@@ -144,10 +144,11 @@ def measure(options: DictConfig, console: Console) -> Result:
         torch.set_num_threads(threads)
     rows = []
     for pair, timed in zip(pairs, rounds, strict=True):
-        own, baseline = timed.seconds["workload"], timed.seconds["baseline"]
+        seconds, baseline = timed.seconds["workload"], timed.seconds["baseline"]
         row = {"workload": pair.name, "over": pair.over}
-        row |= {"seconds": summary(own), "baseline": summary(baseline)}
-        rows.append(row | {"ratio": summary([a / b for a, b in zip(own, baseline, strict=True)])})
+        row |= {"seconds": summary(seconds), "baseline": summary(baseline)}
+        ratios = [a / b for a, b in zip(seconds, baseline, strict=True)]
+        rows.append(row | {"ratio": summary(ratios)})
     return {"rows": rows}
 
 

@@ -64,7 +64,7 @@ class Value(NamedTuple):
 
 @dataclass
 class ResultsComparison:
-    """The differences of two files, in sentences."""
+    """The differences of two files, in words."""
 
     worse: list[str] = field(default_factory=list)  # beyond noise
     better: list[str] = field(default_factory=list)
@@ -72,8 +72,8 @@ class ResultsComparison:
     notes: list[str] = field(default_factory=list)  # on what could not be compared
     compared: int = 0  # numbers
 
-    def sentences(self) -> list[str]:
-        """Return all sentences, the verdict last."""
+    def lines(self) -> list[str]:
+        """Return all lines, the verdict last."""
         missing = [f"not measured any more: {what}" for what in self.missing]
         count = f"{len(self.worse)} of" if self.worse else "green: none of"
         verdict = f"{count} {self.compared} numbers became slower or less exact beyond noise."
@@ -121,7 +121,7 @@ def compare(old: Result, new: Result, watched: Watched) -> ResultsComparison:
         )
     comparison = ResultsComparison()
     machines = [(key, old["machine"].get(key), new["machine"].get(key)) for key in MACHINE]
-    changed = [f"{key} {then} then and {now} now" for key, then, now in machines if then != now]
+    changed = [f"{key} {was} then and {value} now" for key, was, value in machines if was != value]
     if changed:
         note = f"another machine: {', '.join(changed)}; seconds are not compared."
         comparison.notes.append(note)
@@ -136,10 +136,10 @@ def compare(old: Result, new: Result, watched: Watched) -> ResultsComparison:
             change = kind.change(was.median, is_now.median)
             beyond_noise = abs(is_now.median - was.median) > was.iqr + is_now.iqr
             if beyond_noise and abs(change) > kind.min_change:
-                sentences = comparison.worse if change > 0 else comparison.better
+                lines = comparison.worse if change > 0 else comparison.better
                 word = kind.worse if change > 0 else kind.better
                 values = f"{is_now.text(kind.unit)}, was {was.text(kind.unit)}"
-                sentences.append(f"{word}: {name}, {path}: {values}")
+                lines.append(f"{word}: {name}, {path}: {values}")
     return comparison
 
 

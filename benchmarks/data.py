@@ -17,7 +17,7 @@ from asysplat.data.readers.common import opencv_from_opengl
 from benchmarks.compare import RATE, Watched
 from benchmarks.options import CPU
 from benchmarks.table import machine_note, make_table, median_iqr_column, text
-from benchmarks.timing import Measurement, Result, seconds_of, summary, time_in_rounds
+from benchmarks.timing import Measurement, Result, measure_run, summary, time_in_rounds
 
 NO_CACHE, FILLED = CACHES = ("none", "filled")
 WATCHED = Watched(names=("cache",), alike=(), kinds={"frames_per_second": RATE}, rows="loading")
@@ -79,12 +79,12 @@ def measure(options: DictConfig, console: Console) -> Result:
                 steps_per_epoch=1,
                 cache=cache,
             )
-            return seconds_of(lambda: list(data.tasks(0, count)), CPU) / (count * frames)
+            return measure_run(lambda: list(data.tasks(0, count)), CPU) / (count * frames)
 
         def seconds() -> dict[str, float]:
             with TemporaryDirectory(dir=folder) as fresh:
                 open_views = partial(open_scene, root, SceneOptions(height, width))
-                times = {"open": seconds_of(open_views, CPU), NO_CACHE: loading(None)}
+                times = {"open": measure_run(open_views, CPU), NO_CACHE: loading(None)}
                 loading(ImageCache(fresh))  # fills it
                 times[FILLED] = loading(ImageCache(fresh))
                 return times

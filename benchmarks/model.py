@@ -27,7 +27,7 @@ from benchmarks.options import PRECISIONS, check_names, find_device
 from benchmarks.plot import bars
 from benchmarks.scenes import on_an_arc, random_scene
 from benchmarks.table import machine_note, make_table, median_iqr_column, number, text
-from benchmarks.timing import Measurement, Result, Run, now, seconds_of, time_in_rounds
+from benchmarks.timing import Measurement, Result, Run, device_time, measure_run, time_in_rounds
 
 WATCHED = Watched(
     names=("model", "views", "precision"),
@@ -117,13 +117,13 @@ def part_seconds(forward: Run, device: torch.device) -> dict[str, float]:
             layer = frame.f_locals.get("self")
             name = next((n for n, kinds in COMPONENTS.items() if isinstance(layer, kinds)), None)
         if name is not None and event in ("call", "return"):
-            clock = -now(device) if event == "call" else now(device)
+            clock = -device_time(device) if event == "call" else device_time(device)
             seconds[name] = seconds.get(name, 0.0) + clock
 
     previous = sys.getprofile()
     sys.setprofile(profile)
     try:
-        total = seconds_of(forward, device)
+        total = measure_run(forward, device)
     finally:
         sys.setprofile(previous)
     return seconds | {OTHERS: total - sum(seconds.get(name, 0) for name in COMPONENTS)}
@@ -161,9 +161,9 @@ def measure(options: DictConfig, console: Console) -> Result:
 
 
 def _seconds(workload: Workload, step: bool) -> dict[str, float]:
-    seconds = {"forward": seconds_of(workload.forward, workload.device)}
+    seconds = {"forward": measure_run(workload.forward, workload.device)}
     if step:
-        seconds["step"] = seconds_of(workload.step, workload.device)
+        seconds["step"] = measure_run(workload.step, workload.device)
     return seconds | part_seconds(workload.forward, workload.device)
 
 
@@ -171,11 +171,11 @@ def tables(results: Result) -> list[Table]:
     """Show every network, and what its forward pass consists of."""
     rows, parts = results["rows"], []
     for row in rows:
-        own = {name: part["seconds"] for name, part in row["components"].items()}
-        own |= {f"  of which {name}": seconds for name, seconds in row["operators"].items()}
-        for name, seconds in own.items():
-            share = seconds["median"] / row["forward"]["median"]
-            parts.append(row | {"part": name, "seconds": seconds, "share": share})
+        timed = {name: part["seconds"] for name, part in row["components"].items()}
+        timed |= {f"  of which {name}": seconds for name, seconds in row["operators"].items()}
+        for name, seconds in timed.items():
+            fraction = seconds["median"] / row["forward"]["median"]
+            parts.append(row | {"part": name, "seconds": seconds, "share": fraction})
     networks = {
         "model": text("{model}"),
         "inputs": text("{views} x {height}x{width}, {precision}"),

@@ -134,7 +134,7 @@ class Path:
     def seconds(self) -> dict[str, float]:
         """Time each pass once."""
         names = list(PASSES)[: 1 if self.operator == PLANE_SWEEP else 2]
-        return {n: timing.seconds_of(getattr(self, n), self.weights.device) for n in names}
+        return {n: timing.measure_run(getattr(self, n), self.weights.device) for n in names}
 
     def exact(self) -> tuple[Tensor, Tensors]:
         """Run the reference in float64 on the CPU, on inputs rounded as this path's are."""
@@ -156,8 +156,8 @@ def make_path(
     """Make a path on the inputs of an operator, in `dtype` but for FP32_INPUTS."""
     inputs = {}
     for name, tensor in make_inputs(operator, sizes).items():
-        own = torch.float32 if name in FP32_INPUTS else dtype
-        inputs[name] = tensor.to(device, own).requires_grad_()
+        input_dtype = torch.float32 if name in FP32_INPUTS else dtype
+        inputs[name] = tensor.to(device, input_dtype).requires_grad_()
     first = next(iter(inputs.values()))  # the output has its shape and type
     weights = torch.randn(first.shape, generator=torch.Generator().manual_seed(1))
     return Path(operator, sizes, backend, inputs, weights.to(first))
@@ -179,10 +179,10 @@ def measure(options: DictConfig, console: Console) -> Result:
     cases += [(ATTENTION, sizes[ATTENTION] | {"grid": grid}) for grid in grids]
     cases.append((PLANE_SWEEP, sizes[PLANE_SWEEP]))
     results: list[Result] = []
-    for operator, own in track(cases, "operators", console=console):
-        exact = own | sizes["exact"][operator]
+    for operator, case_sizes in track(cases, "operators", console=console):
+        exact = case_sizes | sizes["exact"][operator]
         tokens, precisions = sizes["loop_tokens"], sizes["precisions"]
-        measurements = list(make_rows(operator, own, exact, precisions, tokens, device))
+        measurements = list(make_rows(operator, case_sizes, exact, precisions, tokens, device))
         timing.time_in_rounds(measurements, options.repeats)
         rows = [
             timed.row | {n: timed.summary(n) if n in timed.seconds else None for n in PASSES}
@@ -224,8 +224,8 @@ def make_rows(
             except InputError:  # the operator has no such backend, or it cannot run here
                 continue
             path = make_path(operator, sizes, backend, dtype, device)
-            own = {"precision": precision, "path": backend, "error": errors}
-            yield Measurement(path.seconds, row | own)
+            values = {"precision": precision, "path": backend, "error": errors}
+            yield Measurement(path.seconds, row | values)
     if operator in SCANS:  # the reference in fp32, which takes one token after the other
         reference = make_path(operator, exact_sizes, REFERENCE, torch.float32, device)
         length = min(loop_tokens, sizes["length"])
@@ -236,8 +236,8 @@ def make_rows(
             return {name: scale * value for name, value in path.seconds().items()}
 
         errors = reference.errors(reference.exact())
-        own = {"precision": "fp32", "path": LOOP, "error": errors, "loop_tokens": length}
-        yield Measurement(seconds, row | own)
+        values = {"precision": "fp32", "path": LOOP, "error": errors, "loop_tokens": length}
+        yield Measurement(seconds, row | values)
 
 
 def tables(results: Result) -> list[Table]:

@@ -219,7 +219,7 @@ def find_families(config: Mapping[str, Any]) -> dict[str, dict[str, Setting]]:
             if not isinstance(changes, Mapping):
                 raise InputError(f"{where}={changes} is no setting: give {{name: value}}.")
             values = base | changes
-            check_names(where, values, [each.name for each in fields(kind)])
+            check_names(where, values, [field.name for field in fields(kind)])
             for count in WHOLE & values.keys():
                 value, minimum = values[count], int(count != "steps")
                 if value is not None and (type(value) is not int or value < minimum):
@@ -360,9 +360,9 @@ def _measure_scene(
         empty = ("seconds", "over_base", "error", "psnr", "ssim", "lpips", "gaussians", "peak_gb")
         row |= dict.fromkeys(empty)
         if name in measurements:
-            own, of_base = (measurements[n].seconds["seconds"] for n in (name, BASE))
-            ratios = [a / b for a, b in zip(own, of_base, strict=True)]
-            row |= {"seconds": summary(own), "over_base": summary(ratios)}
+            seconds, base_seconds = (measurements[n].seconds["seconds"] for n in (name, BASE))
+            ratios = [a / b for a, b in zip(seconds, base_seconds, strict=True)]
+            row |= {"seconds": summary(seconds), "over_base": summary(ratios)}
             row["gaussians"] = drawn[name].gaussians
             row["peak_gb"] = max(meters[name].gb, default=None)
             exact = base
@@ -415,9 +415,9 @@ def measure(options: DictConfig, console: Console) -> Result:
     protocol = instantiate(options.metrics)
     lpips = load_lpips(protocol.lpips_net, shared / "weights")
     device = find_device(options.device)
-    every = [(family, *each) for family, settings in families.items() for each in settings.items()]
+    loads = [(family, *pair) for family, settings in families.items() for pair in settings.items()]
     renderers: dict[str, dict[str, RenderScene]] = {family: {} for family in families}
-    for family, name, setting in track(every, "loading", console=console, transient=True):
+    for family, name, setting in track(loads, "loading", console=console, transient=True):
         renderers[family][name] = setting.prepare(options.refinement, device)
     scenes, absent = find_scenes(config["scenes"], shared / "data")
     common = (protocol, lpips, options.refinement, device, options.repeats)
@@ -435,10 +435,12 @@ def measure(options: DictConfig, console: Console) -> Result:
         for name, family in parts:
             sizes = {"side": config["side"]} | SIZES | (config[family].get("photographs") or {})
             scene, settings = scenes[name](**sizes), families[family]
-            found = _measure_scene(scene, settings, renderers[family], *common, advance=advance)
-            console.print(f"{name}: {family}, {len(found)} settings", highlight=False)
+            scene_rows = _measure_scene(
+                scene, settings, renderers[family], *common, advance=advance
+            )
+            console.print(f"{name}: {family}, {len(scene_rows)} settings", highlight=False)
             where = {"family": family, "scene": name, "side": sizes["side"]}
-            rows += [where | row for row in found]
+            rows += [where | row for row in scene_rows]
     for row in [row for row in rows if row["not_measured"]]:
         absent["{family}, {scene}, {setting}".format(**row)] = row["not_measured"]
     return {"protocol": protocol.describe(), "not_measured": absent, "rows": rows}

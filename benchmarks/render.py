@@ -22,7 +22,7 @@ from benchmarks.options import CPU, check_names
 from benchmarks.plot import time_against_error
 from benchmarks.scenes import SCENES, SMALLER, Scene
 from benchmarks.table import error, machine_note, make_table, median_iqr_column, number, text
-from benchmarks.timing import Measurement, Result, now, relative_l2
+from benchmarks.timing import Measurement, Result, device_time, relative_l2
 
 WATCHED = Watched(
     names=("scene", "backend", "without"),
@@ -86,12 +86,12 @@ def run(backend: Backend, inputs: Inputs, *off: str) -> Outputs:
     """Render without background and the culling that is `off`, and compute the gradients."""
     gaussians, cameras, weights = inputs
     leaves = [getattr(gaussians, name) for name in FIELDS]
-    start = now(backend.device)
+    start = device_time(backend.device)
     with without_culling(*off):
         out = render(gaussians, cameras, backend=backend.name, depth=False)
-    middle = now(backend.device)
+    middle = device_time(backend.device)
     gradients = torch.autograd.grad(out.image, leaves, weights)
-    seconds = {"forward": middle - start, "backward": now(backend.device) - middle}
+    seconds = {"forward": middle - start, "backward": device_time(backend.device) - middle}
     return Outputs(out.image.detach(), gradients, seconds, out.stats)
 
 
@@ -109,7 +109,7 @@ def flips(outputs: Outputs, exact: Outputs) -> Tensor:
 def errors(outputs: Outputs, exact: Outputs, ignored: Tensor) -> Result:
     """Compare images and gradients, in L2, outside the pixels `ignored`, [V, H, W].
 
-    Returns also the share of these pixels, "flipped".
+    Returns also the fraction of these pixels, "flipped".
     """
     differences = (outputs.image.cpu().double() - exact.image).abs() * ~ignored[:, None]
     gradients = map(relative_l2, outputs.gradients, exact.gradients)

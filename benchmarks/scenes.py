@@ -89,7 +89,7 @@ def _scene(
 ) -> Scene:
     """Make a camera of height and width `size`, and Gaussians that project to `position`.
 
-    Positions are in shares of the image, deviations `sigma` in pixels.
+    Positions are in fractions of the image, deviations `sigma` in pixels.
     """
     height, width = size
     focal = FOCAL * width

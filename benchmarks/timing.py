@@ -54,17 +54,17 @@ def summary(values: Sequence[float]) -> Result:
     return {"median": median, "iqr": high - low, "busy": high - low > BUSY * median}
 
 
-def now(device: torch.device) -> float:
+def device_time(device: torch.device) -> float:
     """Return the clock's seconds at which the device has finished its work."""
     wait_for(device)
     return time.perf_counter()
 
 
-def seconds_of(run: Run, device: torch.device) -> float:
+def measure_run(run: Run, device: torch.device) -> float:
     """Return the seconds of one run, until the device has finished it."""
-    start = now(device)
+    start = device_time(device)
     run()
-    return now(device) - start
+    return device_time(device) - start
 
 
 def relative_l2(tensor: Tensor, exact: Tensor) -> float:

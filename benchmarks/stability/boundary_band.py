@@ -25,15 +25,15 @@ def boundary_band(gaussians: Gaussians, cameras: Cameras, settings: RenderSettin
     splats = project(scene, cameras.map(lambda t: t[None].double()), settings)
     band = torch.zeros(cameras.num_views, cameras.height, cameras.width, dtype=torch.bool)
     for view in range(cameras.num_views):
-        own = splats.images == view
-        xy, (a, b, c) = splats.xy[own], splats.whitening[own].unbind(-1)
+        in_view = splats.images == view
+        xy, (a, b, c) = splats.xy[in_view], splats.whitening[in_view].unbind(-1)
         dx = torch.arange(cameras.width) + 0.5 - xy[:, :1]
         for top in range(0, cameras.height, ROWS):
             rows = torch.arange(top, min(top + ROWS, cameras.height))
             dy = (rows + 0.5 - xy[:, 1:])[..., None]  # [M, rows, 1]
             u = a[:, None, None] * dx[:, None] + b[:, None, None] * dy
             alpha = (u.square() + (c[:, None, None] * dy).square()).mul_(-0.5).exp_()
-            alpha *= splats.opacities[own, None, None]
+            alpha *= splats.opacities[in_view, None, None]
 
             def near(value, limit, rounding):
                 return (value / limit - 1).abs_() < rounding
@@ -41,12 +41,12 @@ def boundary_band(gaussians: Gaussians, cameras: Cameras, settings: RenderSettin
             jump = near(alpha, limits.alpha_min, ALPHA_ROUNDING)
             jump |= near(alpha, limits.alpha_max, ALPHA_ROUNDING)
             alpha.clamp_max_(limits.alpha_max).mul_(alpha >= limits.alpha_min)
-            left = (1 - alpha).cumprod(0)
-            jump |= near(left, limits.transmittance_min, TRANSMITTANCE_ROUNDING)
+            transmittance = (1 - alpha).cumprod(0)
+            jump |= near(transmittance, limits.transmittance_min, TRANSMITTANCE_ROUNDING)
             if settings.depth == "median":
-                jump |= near(left, 0.5, ALPHA_ROUNDING)
+                jump |= near(transmittance, 0.5, ALPHA_ROUNDING)
             # Splats behind the stop are invisible.
-            before = torch.cat((torch.ones_like(left[:1]), left[:-1]))
+            before = torch.cat((torch.ones_like(transmittance[:1]), transmittance[:-1]))
             reached = before > limits.transmittance_min * (1 - TRANSMITTANCE_ROUNDING)
             band[view, rows] = (jump & reached).any(0)
     return band

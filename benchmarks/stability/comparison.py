@@ -21,7 +21,7 @@ RULE = (
     f"the last place of the result. R = {ROUNDINGS**0.5:g}, a random walk of {ROUNDINGS} "
     "roundings; for a network in fp32 32, of 1,024"
 )
-NEGLIGIBLE = 1e-12  # share of all gradients: a smaller one that consists of noise is 0 in truth
+NEGLIGIBLE = 1e-12  # fraction of all gradients: a smaller one that consists of noise is 0 in truth
 
 Tensors = dict[str, Tensor]
 Function = Callable[[Tensors], Tensors]
@@ -90,8 +90,8 @@ def compare_to_reference(
     results = forward_backward(fast, inputs, leaves)
     inputs = {name: tensor.double() for name, tensor in inputs.items()}
     truth = forward_backward(exact, inputs, leaves)
-    share = roundings**0.5  # as many roundings, all to one side, err as much
-    step = share * unit(arithmetic)
+    growth = roundings**0.5  # as many roundings, all to one side, err as much
+    step = growth * unit(arithmetic)
     perturbed = [
         _perturb(exact, inputs, leaves, network, step, seed) for seed in range(PERTURBATIONS)
     ]
@@ -100,14 +100,15 @@ def compare_to_reference(
     numbers = []
     for name, true in truth.items():
         result, root = results[name], true.numel() ** 0.5
-        sensitivity = torch.stack([(other[name] - true).norm() for other in perturbed]).max()
+        differences = [(perturbation[name] - true).norm() for perturbation in perturbed]
+        sensitivity = torch.stack(differences).max()
         norm = true.norm().clamp_min(magnitude * root)
-        own = exponent * unit(result.dtype) * norm
+        rounding_error = exponent * unit(result.dtype) * norm
         if 0 < norm <= NEGLIGIBLE * total and sensitivity >= norm / 2:
-            own = unit(result.dtype) * total
+            rounding_error = unit(result.dtype) * total
         # Products that nearly underflow err by the smallest step between numbers.
         limits = torch.finfo(result.dtype)
-        tolerance = float(sensitivity + share * (own + limits.tiny * limits.eps * root))
+        tolerance = float(sensitivity + growth * (rounding_error + limits.tiny * limits.eps * root))
         error = float((result.double() - true).norm())
         ratio = error / tolerance
         numbers.append((math.inf if math.isnan(ratio) else ratio, name, error, tolerance, norm))
@@ -132,11 +133,11 @@ def forward_backward(function: Function, inputs: Tensors, leaves: Collection[str
         torch.randn(output.shape, generator=generator).bfloat16().to(output)
         for output, generator in zip(outputs.values(), random, strict=True)
     ]
-    own = [inputs[name] for name in leaves]
+    leaf_inputs = [inputs[name] for name in leaves]
     # Where the network has a prior, its opacities and colors depend on no leaf.
     pairs = zip(outputs.values(), weights, strict=True)
     ends, weights = zip(*(pair for pair in pairs if pair[0].requires_grad), strict=True)
-    grads = torch.autograd.grad(ends, own, weights, materialize_grads=True)
+    grads = torch.autograd.grad(ends, leaf_inputs, weights, materialize_grads=True)
     named = {f"gradient of {name}": grad for name, grad in zip(leaves, grads, strict=True)}
     return {name: output.detach() for name, output in outputs.items()} | named
 

@@ -97,19 +97,19 @@ def scattered_gaussians(cameras: Cameras) -> Gaussians:
     """
     uniform, normal = random_numbers(0)
     views = cameras.num_views
-    each = -(-NUM_GAUSSIANS // views)
+    count = -(-NUM_GAUSSIANS // views)
     poses, focal = cameras.cam_to_world.double(), cameras.intrinsics[:, 0, 0].double()
-    depths = 2 + 8 * uniform(views, each, 1)
-    place = (uniform(views, each, 2) - 0.5) * cameras.width / focal[:, None, None]
+    depths = 2 + 8 * uniform(views, count, 1)
+    place = (uniform(views, count, 2) - 0.5) * cameras.width / focal[:, None, None]
     local = torch.cat((place * depths, depths), -1)
     means = (poses[:, None, :3, :3] @ local[..., None])[..., 0] + poses[:, None, :3, 3]
-    sizes = 2 * depths / focal[:, None, None] * (0.6 * normal(views, each, 3)).exp()
+    sizes = 2 * depths / focal[:, None, None] * (0.6 * normal(views, count, 3)).exp()
     return Gaussians(
         means=means.flatten(0, 1),
-        quats=normal(views * each, 4),
+        quats=normal(views * count, 4),
         scales=sizes.flatten(0, 1),
-        opacities=0.05 + 0.9 * uniform(views * each),
-        sh=0.5 * normal(views * each, 4, 3),
+        opacities=0.05 + 0.9 * uniform(views * count),
+        sh=0.5 * normal(views * count, 4, 3),
     ).to(torch.float32)
 
 

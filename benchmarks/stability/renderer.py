@@ -63,8 +63,8 @@ def measure(
         image, alpha, depth = out.image * inside[:, None], out.alpha * inside, out.depth * inside
         return {"image": image, "alpha": alpha, "depth": depth}
 
-    share = inside.double().mean().item()
-    note = f"at {share:.1%} of the pixels: at the others rounding decides about a cut-off"
+    fraction = inside.double().mean().item()
+    note = f"at {fraction:.1%} of the pixels: at the others rounding decides about a cut-off"
     fast, exact = partial(draw, backend), partial(draw, "reference")
     row = compare_to_reference(fast, exact, inputs, tuple(inputs))
     return row | {"compared": f"{row['compared']}; {note}"}

@@ -95,11 +95,12 @@ def summary(rows: Sequence[Result]) -> list[Result]:
     """
     areas = []
     for area in dict.fromkeys(row["area"] for row in rows):
-        own = [row for row in rows if row["area"] == area]
+        cases = [row for row in rows if row["area"] == area]
+        ratios = (row["error"] / row["tolerance"] for row in cases if row["error"])
         areas.append(
-            {"area": area, "cases": len(own), "red": sum(not row["green"] for row in own)}
-            | {name: sum(row[name] for row in own) for name in ("nan", "inf")}
-            | {"share": max((r["error"] / r["tolerance"] for r in own if r["error"]), default=None)}
+            {"area": area, "cases": len(cases), "red": sum(not row["green"] for row in cases)}
+            | {name: sum(row[name] for row in cases) for name in ("nan", "inf")}
+            | {"share": max(ratios, default=None)}
         )
     return areas
 
@@ -113,8 +114,8 @@ def tables(results: Result) -> list[Table]:
     notes = f"{state}\nrevision {results.get('revision')}; {machine}\n{RULE}"
     shown = [make_table("Stability", SUMMARY, areas, notes)]
     for area in [row["area"] for row in areas]:
-        own = [row for row in rows if row["area"] == area]
-        shown.append(make_table(area.capitalize(), COLUMNS, own, names=3))
+        cases = [row for row in rows if row["area"] == area]
+        shown.append(make_table(area.capitalize(), COLUMNS, cases, names=3))
     return shown
 
 
@@ -122,5 +123,5 @@ def plot(results: Result) -> Figure:
     """Plot each area's largest error over its tolerance."""
     areas = summary(results["rows"])
     names = [f"{row['area']}: {row['cases'] - row['red']} of {row['cases']} green" for row in areas]
-    shares = {"largest error": [row["share"] or 0.0 for row in areas]}
-    return bars(names, shares, "error / tolerance", tolerance=1.0)
+    errors = {"largest error": [row["share"] or 0.0 for row in areas]}
+    return bars(names, errors, "error / tolerance", tolerance=1.0)

@@ -62,7 +62,7 @@ def test_missing_numbers_are_named_and_are_no_change():
     assert comparison.worse == comparison.better == []
     missing = ["a, psnr: was 30 dB", "b, wrong: was 1e-06", "b, psnr: was 30 dB"]
     assert comparison.missing == missing and comparison.compared == 2
-    first, *_, verdict = comparison.sentences()
+    first, *_, verdict = comparison.lines()
     assert verdict.startswith("green: none of 2 numbers") and "any more" in first
 
 
