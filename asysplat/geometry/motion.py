@@ -45,8 +45,8 @@ def fit_similarity(
         source, target: not all in one place.
     """
     source, target = source.double(), target.double()
-    centered, wanted = source - source.mean(0), target - target.mean(0)
-    left, values, right = torch.linalg.svd(wanted.mT @ centered)
+    centered, centered_target = source - source.mean(0), target - target.mean(0)
+    left, values, right = torch.linalg.svd(centered_target.mT @ centered)
     signs = torch.tensor([1.0, 1.0, 1.0]).to(source)
     signs[2] = torch.linalg.det(left @ right).sign()  # no mirroring
     scale = (values * signs).sum() / centered.square().sum()
