@@ -121,15 +121,15 @@ class Scan:
         if x.ndim != len(axes):
             check_shape(self.name, "x", x, f"[{', '.join(axes)}]")
         sizes = dict(zip(axes, x.shape, strict=True)) | {"N": B.shape[-1]}
-        given = f"x has shape {tuple(x.shape)} and B {tuple(B.shape)}"
+        shapes = f"x has shape {tuple(x.shape)} and B {tuple(B.shape)}"
         for (name, axes), tensor in zip(self.axes.items(), inputs, strict=True):
             shape = tuple(sizes[axis] for axis in axes)
-            check_shape(self.name, name, tensor, shape, f", as {given}")
+            check_shape(self.name, name, tensor, shape, f", as {shapes}")
             check_device(self.name, name, tensor, "x", x)
         for name, tensor in inputs._asdict().items():
             check_float(self.name, name, tensor)
         if x.numel() == 0 or B.numel() == 0:
-            raise InputError(f"{self.name}'s {given}: every side must be at least 1.")
+            raise InputError(f"{self.name}'s {shapes}: every side must be at least 1.")
 
 
 def _register_operator(name: str, count_flops: CountFlops) -> Callable[..., tuple[Tensor, Tensor]]:

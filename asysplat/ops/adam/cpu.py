@@ -151,9 +151,9 @@ def _drop_not_finite(alive, tensor, first):
         if total(nothing) == 0:
             continue
         for i in range(begin, end):
-            here = i // numbers - first
-            if alive[here] and not np.isfinite(tensor.gradient[i]):
-                alive[here] = False
+            local_row = i // numbers - first
+            if alive[local_row] and not np.isfinite(tensor.gradient[i]):
+                alive[local_row] = False
                 dropped += 1
     return dropped
 

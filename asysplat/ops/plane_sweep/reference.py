@@ -69,10 +69,11 @@ def cost_volume(
             first, last = ranges[b, v]
             steps = torch.arange(planes, device=ranges.device).to(ranges)
             inverse = first + steps * ((last - first) / (planes - 1))
+            pairs = zip(neighbors[b, v].tolist(), projections[b, v], strict=True)
             matched = [
-                _compare(images[b, v], images[b, other], matrix, pixels, inverse)
-                for other, matrix in zip(neighbors[b, v].tolist(), projections[b, v], strict=True)
-                if other >= 0
+                _compare(images[b, v], images[b, neighbor], matrix, pixels, inverse)
+                for neighbor, matrix in pairs
+                if neighbor >= 0
             ]
             unseen = images.new_full((planes, H, W), torch.inf)
             while len(matched) < BEST:
@@ -86,7 +87,7 @@ def cost_volume(
 
 def _compare(
     image: Float[Tensor, "H W"],
-    other: Float[Tensor, "H W"],
+    neighbor: Float[Tensor, "H W"],
     matrix: Float[Tensor, "3 4"],
     pixels: Float[Tensor, "3 H W"],
     inverse: Float[Tensor, "D"],
@@ -101,7 +102,7 @@ def _compare(
     visible = (z > FRONT) & (x > 0) & (x < W) & (y > 0) & (y < H)
     places = torch.stack((x / W, y / H), dim=-1).clamp(-1, 2) * 2 - 1
     warped = F.grid_sample(
-        other.expand(len(places), 1, H, W), places, padding_mode="border", align_corners=False
+        neighbor.expand(len(places), 1, H, W), places, padding_mode="border", align_corners=False
     )[:, 0]
     mean, other_mean = patch_mean(image), patch_mean(warped)
     both = patch_mean(image * warped) - mean * other_mean
@@ -219,11 +220,11 @@ def consistency(
         contradict, occlude = inside & (nearer > apart), inside & (nearer < -apart)
         weight = trust[place]
         counts = (agree * weight, contradict * weight, occlude * weight, inside.to(weight))
-        return Consistency(*(each.sum(2) for each in counts))
+        return Consistency(*(values.sum(2) for values in counts))
 
     chunk = max(1, PIXELS_AT_ONCE // inverse.numel())
     chunks = zip(others.split(chunk, dim=2), projections.split(chunk, dim=2), strict=True)
-    parts = [count(*each) for each in chunks]
+    parts = [count(*part) for part in chunks]
     return Consistency(*(torch.stack(counts).sum(0) for counts in zip(*parts, strict=True)))
 
 

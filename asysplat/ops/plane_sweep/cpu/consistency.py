@@ -63,7 +63,7 @@ def consistency(
     result = reference.Consistency(
         *(torch.empty(B, V, h, w) for _ in reference.Consistency._fields)
     )
-    arrays = reference.Consistency(*(each.flatten(0, 1).numpy() for each in result))
+    arrays = reference.Consistency(*(counts.flatten(0, 1).numpy() for counts in result))
     run_blocks(count_views, even_bounds(B * V), inputs, V, arrays)
     return result
 
@@ -83,16 +83,16 @@ def count_views(start, stop, inputs, views, counts):
     for n in range(start, stop):
         for y in range(h):
             row = np.float32(y) + HALF
-            own = inputs.maps[n, y, :, 0].copy()
+            view_depths = inputs.maps[n, y, :, 0].copy()
             for x in range(0, w, LANES):
                 count = min(LANES, w - x)
-                column, depth = load_some(columns, x, count), load_some(own, x, count)
+                column, depth = load_some(columns, x, count), load_some(view_depths, x, count)
                 agreeing, contradicting = zeros(), zeros()
                 occluding, containing = zeros(), zeros()
                 for k in range(inputs.others.shape[1]):
                     if inputs.others[n, k] < 0:
                         continue
-                    other = n // views * views + inputs.others[n, k]
+                    other_view = n // views * views + inputs.others[n, k]
                     m = inputs.projections[n, k]
                     z = fma(depth, m[2, 3], fma(column, m[2, 0], fma(m[2, 1], row, m[2, 2])))
                     scale = ONE / max(z, FRONT)
@@ -103,9 +103,9 @@ def count_views(start, stop, inputs, views, counts):
                     inside = inside & less(FRONT, z)
                     u = min(max(u, ZERO), right - ONE)
                     v = min(max(v, ZERO), bottom - ONE)
-                    stored, trust = gather_pairs(inputs.maps[other], v, u)
+                    stored, trust = gather_pairs(inputs.maps[other_view], v, u)
                     nearer = depth * scale - stored
-                    limit = max(stored * inputs.tolerance, inputs.steps[other] * HALF)
+                    limit = max(stored * inputs.tolerance, inputs.steps[other_view] * HALF)
                     weight = where(inside, trust, ZERO)
                     farther = ZERO - nearer
                     apart = max(nearer, farther)

@@ -100,7 +100,7 @@ def cost_planes(start, stop, inputs, costs):
             for k in range(K):
                 if inputs.neighbors[view, k] < 0:
                     continue
-                other = inputs.padded[inputs.neighbors[view, k]]
+                neighbor = inputs.padded[inputs.neighbors[view, k]]
                 matrix = inputs.projections[view, k]
                 for row in range(0 if y == 0 else y + AROUND, min(y + AROUND + 2, H)):
                     begin, end = W, 0  # the columns of this row that patches need
@@ -109,7 +109,7 @@ def cost_planes(start, stop, inputs, costs):
                     columns = range(max(begin - AROUND, 0), min(end + AROUND, W))
                     place = row % BUFFER
                     _warp_row(
-                        warped[k, place], visible[k, place], other, matrix, row, depth, columns
+                        warped[k, place], visible[k, place], neighbor, matrix, row, depth, columns
                     )
                 patches = (image, offsets, scales)
                 _compare_rows(first, second, patches, y, warped[k], visible[k], spans[k])
@@ -143,16 +143,16 @@ def _find_span(span, matrix, y, depth, H, W):
             high = min(rest / -slope, high)
         else:
             high = where(less(ZERO, rest), high, ZERO)
-    some = less(low, high)
-    low, high = where(some, low, np.float32(W)), where(some, ZERO - high, ZERO)
+    crossed = less(low, high)
+    low, high = where(crossed, low, np.float32(W)), where(crossed, ZERO - high, ZERO)
     span[0] = max(np.int64(least(low)) - 1, 0)
     span[1] = min(np.int64(-least(high)) + 2, W)
 
 
 @inline
-def _warp_row(warped, visible, other, matrix, y, depth, columns):
+def _warp_row(warped, visible, neighbor, matrix, y, depth, columns):
     """Write a neighbor's warped pixels of a row, [W, LANES], and which are inside its image."""
-    bottom, right = np.float32(other.shape[0] - 1), np.float32(other.shape[1] - 1)
+    bottom, right = np.float32(neighbor.shape[0] - 1), np.float32(neighbor.shape[1] - 1)
     row = np.float32(y) + HALF
     x_row = fma(depth, matrix[0, 3], fma(matrix[0, 1], row, matrix[0, 2]))
     y_row = fma(depth, matrix[1, 3], fma(matrix[1, 1], row, matrix[1, 2]))
@@ -167,7 +167,7 @@ def _warp_row(warped, visible, other, matrix, y, depth, columns):
         visible[x] = inside & less(FRONT, z)
         u = min(max(u - HALF, ZERO), right - ONE)
         v = min(max(v - HALF, ZERO), bottom - ONE)
-        a, b, c, d, v, u = gather_squares(other, v, u)
+        a, b, c, d, v, u = gather_squares(neighbor, v, u)
         a, c = fma(b - a, u, a), fma(d - c, u, c)
         store(warped, x, fma(c - a, v, a))
 

@@ -38,7 +38,7 @@ def sgm(
         costs.flatten(0, 1).contiguous().numpy(),
         weights.clamp_min(reference.MIN_WEIGHT).flatten(0, 1).contiguous().numpy(),
         (reference.LARGE_STEP / (1 + edges / reference.EDGE)).flatten(0, 1).contiguous().numpy(),
-        *(each.flatten(0, 1).numpy() for each in best),
+        *(field.flatten(0, 1).numpy() for field in best),
     )
     return best
 

@@ -23,7 +23,7 @@ def consistency(
 ) -> reference.Consistency:
     """Count in float32; see `reference.consistency`."""
     B, V, h, w = inverse.shape
-    inputs = (each.contiguous() for each in (inverse, steps, trust, others, projections))
+    inputs = (tensor.contiguous() for tensor in (inverse, steps, trust, others, projections))
     counts = reference.Consistency(
         *(inverse.new_empty(B, V, h, w) for _ in reference.Consistency._fields)
     )
@@ -74,8 +74,8 @@ def count_views(
     agree = tl.zeros((PIXELS,), tl.float32)
     contradict, occlude, contain = agree, agree, agree
     for k in range(neighbors):
-        other = tl.load(others + view * neighbors + k)
-        if other >= 0:
+        other_view = tl.load(others + view * neighbors + k)
+        if other_view >= 0:
             m = projections + (view * neighbors + k) * 12
             u = tl.load(m) * x + tl.load(m + 1) * y + tl.load(m + 2) + tl.load(m + 3) * depth
             v = tl.load(m + 4) * x + tl.load(m + 5) * y + tl.load(m + 6) + tl.load(m + 7) * depth
@@ -85,11 +85,11 @@ def count_views(
             inside = (z > FRONT) & (u > 0) & (u < width) & (v > 0) & (v < height)
             column = tl.minimum(tl.maximum(u, 0.0), width - 1.0).to(tl.int32)
             row = tl.minimum(tl.maximum(v, 0.0), height - 1.0).to(tl.int32)
-            there = ((first + other) * height + row) * width + column
+            there = ((first + other_view) * height + row) * width + column
             stored = tl.load(inverse + there)
             weight = tl.where(inside, tl.load(trust + there), 0.0)
             nearer = depth * scale - stored
-            limit = tl.maximum(stored * tolerance, tl.load(steps + first + other) * 0.5)
+            limit = tl.maximum(stored * tolerance, tl.load(steps + first + other_view) * 0.5)
             agree += tl.where(tl.abs(nearer) <= limit, weight, 0.0)
             contradict += tl.where(nearer > limit, weight, 0.0)
             occlude += tl.where(nearer < -limit, weight, 0.0)

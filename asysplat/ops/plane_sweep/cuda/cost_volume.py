@@ -15,7 +15,7 @@ from asysplat.ops.plane_sweep.inputs import prepare
 
 AROUND = tl.constexpr(reference.WINDOW // 2)
 EARLIER = tl.constexpr(reference.WINDOW - 1)  # rows before the last of a patch
-SHARE = tl.constexpr(1 / reference.WINDOW**2)  # weight of a pixel in a patch's mean
+PIXEL_WEIGHT = tl.constexpr(1 / reference.WINDOW**2)  # weight of a pixel in a patch's mean
 FRONT, NOISE = tl.constexpr(reference.FRONT), tl.constexpr(reference.NOISE)
 UNMATCHED, SECOND = tl.constexpr(reference.UNMATCHED), tl.constexpr(reference.SECOND)
 INFINITY = tl.constexpr(float("inf"))
@@ -104,10 +104,10 @@ def cost_band(
         buffered = ()
         for k in tl.static_range(K):
             neighbor = tl.load(neighbors + view * K + k).to(tl.int64)
-            other = padded + tl.maximum(neighbor, 0) * (height + 1) * (width + 1)
+            neighbor_image = padded + tl.maximum(neighbor, 0) * (height + 1) * (width + 1)
             matrix = projections + (view * K + k) * 12
             line = images + (view * height + row) * width
-            a, b, c = add_row(line, other, matrix, x, row, depth, height, width)
+            a, b, c = add_row(line, neighbor_image, matrix, x, row, depth, height, width)
             total_a, total_b, total_c = a, b, c
             for j in tl.static_range(EARLIER):
                 earlier = sums[k * EARLIER + j]
@@ -119,9 +119,9 @@ def cost_band(
             buffered = buffered + ((a, b, c),)
             u, v, z = project(factors_at(matrix, middle), x, depth)
             visible = (z > FRONT) & (u > 0) & (u < width) & (v > 0) & (v < height)
-            other_mean = total_a * SHARE
-            both = total_c * SHARE - mean * other_mean
-            variance = tl.maximum(total_b * SHARE - other_mean * other_mean, 0.0) + NOISE
+            other_mean = total_a * PIXEL_WEIGHT
+            both = total_c * PIXEL_WEIGHT - mean * other_mean
+            variance = tl.maximum(total_b * PIXEL_WEIGHT - other_mean * other_mean, 0.0) + NOISE
             cost = 1 - both * scale / tl.sqrt(variance)
             cost = tl.where(visible & (neighbor >= 0), cost, INFINITY)
             second = tl.minimum(second, tl.maximum(first, cost))
@@ -135,7 +135,7 @@ def cost_band(
 
 
 @kernel
-def add_row(line, other, matrix, x, row, depth, height, width):
+def add_row(line, neighbor_image, matrix, x, row, depth, height, width):
     """Return the sums of a neighbor, its square, and its product with `line` along a patch's row.
 
     The border's pixels continue beyond it.
@@ -149,7 +149,7 @@ def add_row(line, other, matrix, x, row, depth, height, width):
         v = tl.minimum(tl.maximum(v - 0.5, 0.0), height - 1.0)
         left, top = u.to(tl.int32), v.to(tl.int32)
         u, v = u - left, v - top
-        place = other + top * (width + 1) + left
+        place = neighbor_image + top * (width + 1) + left
         above, below = tl.load(place), tl.load(place + width + 1)
         above += (tl.load(place + 1) - above) * u
         below += (tl.load(place + width + 2) - below) * u

@@ -123,9 +123,9 @@ def backward_heads(
                 add_product(part_B[chunk, group], inputs, state_T, part_of_others)
 
                 # Through the state before the chunk: what remains of it, and what the tokens read.
-                left = 0.0
+                remaining = 0.0
                 for n in range(state_size):
-                    left += dot_rows(states[chunk], grad_state, n)
+                    remaining += dot_rows(states[chunk], grad_state, n)
                 add_product(read, C[chunk], states[chunk], ZERO)
                 for t in range(size):
                     after[t] = dot_rows(read, grads, t) * from_start[t]
@@ -135,7 +135,7 @@ def backward_heads(
                 add_product(part_C[chunk, group], read, state_T, part_of_others)
                 add_product(grad_state, C[chunk].T, read, across)
 
-                grad_logs += left * across
+                grad_logs += remaining * across
                 add_sums(before, after, reverse, grad_logs)
                 for t in range(size):
                     step = dt[begin + t, head]

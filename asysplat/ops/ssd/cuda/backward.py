@@ -8,7 +8,7 @@ from asysplat.ops.ssd.cuda.chunk import (
     STEP,
     TO_END,
     decay_between,
-    decays_of,
+    locate_decays,
     product,
     rows_of_head,
     rows_of_state,
@@ -61,7 +61,7 @@ def head_gradients(
     chunk, head = tl.program_id(0) // heads, tl.program_id(0) % heads
     batch = tl.program_id(1).to(tl.int64)
     lane = tl.arange(0, CHUNK)
-    row, positions = decays_of(decays, batch, head, heads, chunk, chunks, CHUNK)
+    row, positions = locate_decays(decays, batch, head, heads, chunk, chunks, CHUNK)
     step = tl.load(row + STEP * positions + lane)
     part = (batch * chunks + chunk) * heads + head
 
@@ -134,7 +134,7 @@ def score_gradients(
         at, inside = rows_of_head(batch, chunk, head, length, heads, HEAD_DIM, REVERSE, CHUNK)
         value = tl.load(x + at, mask=inside, other=0.0)
         out = tl.load(grad_output + at, mask=inside, other=0.0)
-        row, positions = decays_of(decays, batch, head, heads, chunk, chunks, CHUNK)
+        row, positions = locate_decays(decays, batch, head, heads, chunk, chunks, CHUNK)
         step = tl.load(row + STEP * positions + tl.arange(0, CHUNK))
         weight = decay_between(row, positions, CHUNK) * step[None, :]
         total += weight * product(out, tl.trans(value), DOT, PRECISION)
@@ -181,7 +181,7 @@ def projection_gradients(
         square = tl.trans(square)
     total = product(square, projection, DOT, PRECISION)
     for head in range(heads):
-        row, positions = decays_of(decays, batch, head, heads, chunk, chunks, CHUNK)
+        row, positions = locate_decays(decays, batch, head, heads, chunk, chunks, CHUNK)
         if OF_B:
             weight = tl.exp(tl.load(row + TO_END * positions + lane))
             weight *= tl.load(row + STEP * positions + lane)

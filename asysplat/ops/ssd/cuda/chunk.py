@@ -87,7 +87,7 @@ def sum_decays(
 
 
 @kernel
-def decays_of(decays, batch, head, heads, chunk, chunks, CHUNK: tl.constexpr):
+def locate_decays(decays, batch, head, heads, chunk, chunks, CHUNK: tl.constexpr):
     """Return the place of a chunk's first position in a head's rows, and the length of a row."""
     positions = tl.cast(chunks, tl.int64) * CHUNK
     return decays + (batch * heads + head) * ROWS * positions + chunk * CHUNK, positions

@@ -8,7 +8,7 @@ from asysplat.ops.ssd.cuda.chunk import (
     STEP,
     TO_END,
     decay_between,
-    decays_of,
+    locate_decays,
     product,
     rows_of_head,
     rows_of_state,
@@ -51,7 +51,7 @@ def pass_states(
         chunk = chunks - 1 - k if GRADIENT else k
         part = (batch * chunks + chunk) * heads + head
         tl.store(states + state_at(part, first, HEAD_DIM, STATE, BLOCK), state)
-        row, positions = decays_of(decays, batch, head, heads, chunk, chunks, CHUNK)
+        row, positions = locate_decays(decays, batch, head, heads, chunk, chunks, CHUNK)
         if GRADIENT:
             weight = tl.exp(tl.load(row + SINCE * positions + lane))
         else:
@@ -121,7 +121,7 @@ def forward_chunk(
     chunk, head = tl.program_id(0) // heads, tl.program_id(0) % heads
     batch = tl.program_id(1).to(tl.int64)
     lane = tl.arange(0, CHUNK)
-    row, positions = decays_of(decays, batch, head, heads, chunk, chunks, CHUNK)
+    row, positions = locate_decays(decays, batch, head, heads, chunk, chunks, CHUNK)
     part = (batch * chunks + chunk) * heads + head
     total = tl.zeros((CHUNK, HEAD_DIM), tl.float32)
     for first in range(0, STATE, BLOCK):
