@@ -89,7 +89,7 @@ class _Image:
         self._check(index, kind)
         pointer = self.array.data
         pointers, bits = ir.VectorType(pointer.type, HALF), ir.VectorType(PAIR, HALF)
-        every = ir.Constant(ir.VectorType(ir.IntType(1), HALF), [1] * HALF)
+        all_lanes = ir.Constant(ir.VectorType(ir.IntType(1), HALF), [1] * HALF)
         name = f"llvm.masked.gather.v{HALF}i64.v{HALF}p0"
         first = builder.insert_element(
             ir.Constant(pointers, ir.Undefined), pointer, ir.IntType(32)(0)
@@ -97,11 +97,11 @@ class _Image:
         base = builder.shuffle_vector(first, first, ir.Constant(lanes(0, HALF).type, [0] * HALF))
         halves = []
         for begin in (0, HALF):
-            some = builder.shuffle_vector(index, index, lanes(begin, begin + HALF))
-            places = builder.gep(base, [some], source_etype=kind)
+            half = builder.shuffle_vector(index, index, lanes(begin, begin + HALF))
+            places = builder.gep(base, [half], source_etype=kind)
             nothing = ir.Constant(bits, [0] * HALF)
             align = ir.IntType(32)(4)
-            gathered = call_llvm(builder, bits, name, places, align, every, nothing)
+            gathered = call_llvm(builder, bits, name, places, align, all_lanes, nothing)
             halves.append(builder.bitcast(gathered, FLOATS))
         return [builder.shuffle_vector(*halves, lanes(k, 2 * LANES, 2)) for k in (0, 1)]
 
