@@ -75,9 +75,9 @@ def evaluate(options: DictConfig) -> None:
     else:
         tests = {data.name: data.tests[data.name]}
         opened = open_gaussians(Path(options.gaussians), tests[data.name], fabric.device)
-        predictor, found, backgrounds = opened
+        predictor, file_results, backgrounds = opened
         measure = replace(measure, backgrounds=backgrounds)
-        fingerprint = fingerprint | found
+        fingerprint = fingerprint | file_results
 
     folders = target.folder, target.scene_folder
     scenes = measure_scenes(tests, predictor, measure, fabric.device, *folders, early_exit)

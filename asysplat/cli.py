@@ -32,15 +32,15 @@ def check_command(script: str) -> None:
     end_at_interrupt()
     os.environ.setdefault("ASYSPLAT_SHARED", str(ROOT.parent / "shared"))
     words = sys.argv[1:]
-    given, unknown = get_args_parser().parse_known_args(words)
-    other = given.config_dir or given.config_name or given.config_path or given.shell_completion
-    if given.help or given.hydra_help or given.shell_completion:
+    args, unknown = get_args_parser().parse_known_args(words)
+    hydra_option = args.config_dir or args.config_name or args.config_path or args.shell_completion
+    if args.help or args.hydra_help or args.shell_completion:
         hydra.main(config_path=str(CONF), config_name=script, version_base="1.3")(lambda _: None)()
         sys.exit()
     try:
         _check_dashes(words, unknown)
-        if not other:  # configuration files, and a run
-            check_overrides(given.overrides, script)
+        if not hydra_option:  # configuration files, and a run
+            check_overrides(args.overrides, script)
     except InputError as error:
         sys.exit(f"error: {error}")
 
@@ -76,16 +76,16 @@ def command(
 
 @contextmanager
 def exit_with_message(stopped: str) -> Iterator[None]:
-    """End the process with the sentence `stopped` at Ctrl-C, or that of `error_message`."""
+    """End the process with the message `stopped` at Ctrl-C, or with that of `error_message`."""
     try:
         yield
     except (Exception, KeyboardInterrupt) as error:
         message = stopped
         if not isinstance(error, KeyboardInterrupt):
-            sentence = error_message(error)
-            if sentence is None:
+            summary = error_message(error)
+            if summary is None:
                 raise
-            message = f"error: {sentence}"
+            message = f"error: {summary}"
         # A second Ctrl-C would abort the interpreter, a lost loader print a traceback.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)

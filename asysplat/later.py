@@ -12,8 +12,8 @@ def import_later(package: str, places: Mapping[str, str]) -> Callable[[str], obj
         if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         # Stored, since importing asysplat.load leaves the module under the name of its function.
-        found = getattr(import_module(places[name]), name)
-        setattr(sys.modules[package], name, found)
-        return found
+        value = getattr(import_module(places[name]), name)
+        setattr(sys.modules[package], name, value)
+        return value
 
     return find

@@ -50,8 +50,8 @@ def check_overrides(overrides: Iterable[str], script: str = "train") -> None:
             raise InputError(f"{key} is unknown: {_hint(key, options, script)}")
         for stage in _values(override) if key == "stage" else ():
             if stage not in config["stages"]:
-                *others, last = config["stages"]
-                raise InputError(f"stage={stage} is unknown: choose {', '.join(others)} or {last}.")
+                *stages, last = config["stages"]
+                raise InputError(f"stage={stage} is unknown: choose {', '.join(stages)} or {last}.")
 
 
 def as_overrides(words: list[str]) -> list[str]:
@@ -104,17 +104,17 @@ def _values(override: Override) -> list[str]:
 
 def _compose(script: str, overrides: Sequence[Override]) -> dict:
     """Compose the configuration with these overrides, with the first value of each sweep."""
-    given = [override.input_line for override in overrides if override.is_delete()]
+    lines = [override.input_line for override in overrides if override.is_delete()]
     for override in overrides:
         if not override.is_delete():
-            given += [f"{override.get_key_element()}={value}" for value in _values(override)[:1]]
+            lines += [f"{override.get_key_element()}={value}" for value in _values(override)[:1]]
     with contextlib.ExitStack() as stack:
         if not GlobalHydra.instance().is_initialized():
             stack.enter_context(hydra.initialize_config_dir(str(CONF), version_base="1.3"))
         try:
-            return OmegaConf.to_container(hydra.compose(script, given))
+            return OmegaConf.to_container(hydra.compose(script, lines))
         except HydraException as error:
-            raise InputError(f"{' '.join(given)}: {str(error).splitlines()[0]}") from error
+            raise InputError(f"{' '.join(lines)}: {str(error).splitlines()[0]}") from error
 
 
 def _paths(config: dict, prefix: str = "") -> Iterator[str]:

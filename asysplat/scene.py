@@ -287,7 +287,7 @@ class Views(TensorRecord):
         if self.masks is None:
             return colors.flatten(-4, -2).mean(-2)
         weights = self.masks[..., None].to(colors)
-        total, count = (each.flatten(-4, -2).sum(-2) for each in (colors * weights, weights))
+        total, count = (values.flatten(-4, -2).sum(-2) for values in (colors * weights, weights))
         return (total / count).nan_to_num(0.5)
 
     def masked(self, rendered: Float[Tensor, "*batch V 3 H W"]) -> Float[Tensor, "*batch V 3 H W"]:
@@ -390,8 +390,8 @@ class Gaussians(TensorRecord):
 
 def _check_float(name: str, tensor: Tensor) -> None:
     if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
-        found = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
-        raise InputError(f"{name} is {found}: give a torch tensor of floating-point numbers.")
+        actual = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
+        raise InputError(f"{name} is {actual}: give a torch tensor of floating-point numbers.")
 
 
 def _check_shape(name: str, tensor: Tensor, last: tuple[int, ...]) -> None:

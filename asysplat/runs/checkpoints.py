@@ -111,10 +111,10 @@ def config_diff(metadata: Mapping[str, Any], config: Mapping[str, Any], revision
 
     `metadata` is the checkpoint's, see `read_metadata`, and `revision` that of the code.
     """
-    before, now = flat_options(metadata.get("hyper_parameters", {})), flat_options(config)
-    keys = [key for key in before.keys() & now.keys() if before[key] != now[key]]
+    before, current = flat_options(metadata.get("hyper_parameters", {})), flat_options(config)
+    keys = [key for key in before.keys() & current.keys() if before[key] != current[key]]
     keys = [key for key in sorted(keys) if not key.startswith(WITHOUT_EFFECT)]
-    differences = [f"{key}={now[key]}, it was {before[key]}" for key in keys]
+    differences = [f"{key}={current[key]}, it was {before[key]}" for key in keys]
     if metadata.get("revision", revision) != revision:
         differences.append(f"the code is {revision}, it was {metadata['revision']}")
     return differences
@@ -145,7 +145,9 @@ def check_checkpoint(path: Path | None, module: nn.Module) -> None:
     names = sorted(expected.keys() | shapes.keys())
     pairs = [(name, shapes.get(name), expected.get(name)) for name in names]
     lines = [
-        f"{name} is {there} there and {here} here" for name, there, here in pairs if there != here
+        f"{name} is {stored} there and {shape} here"
+        for name, stored, shape in pairs
+        if stored != shape
     ]
     if not lines:
         return

@@ -39,10 +39,10 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
         InputError: none of run, init_path and gaussians is given, or several are; files do not
             exist; options that do not go together; a value that is missing or out of range.
     """
-    given = [name for name in ("run", "init_path", "gaussians") if options[name] is not None]
-    if len(given) != 1:
+    sources = [name for name in ("run", "init_path", "gaussians") if options[name] is not None]
+    if len(sources) != 1:
         raise InputError(
-            f"{' and '.join(given) or 'nothing'} is given to evaluate: give one of run=last, "
+            f"{' and '.join(sources) or 'nothing'} is given to evaluate: give one of run=last, "
             "init_path=shipped and gaussians=FOLDER."
         )
     if options.gaussians is None and options.system is not None:
@@ -52,7 +52,8 @@ def find_target(options: DictConfig, overrides: Sequence[str]) -> EvaluationTarg
         )
     if options.write_gaussians is not None:
         _check_new(Path(options.write_gaussians), options)
-    if options.gaussians is not None and not any(each.startswith("data") for each in overrides):
+    names_data = any(override.startswith("data") for override in overrides)
+    if options.gaussians is not None and not names_data:
         raise InputError(
             f"gaussians={options.gaussians} is measured on photographs of the same scenes: add "
             "data=files data.root=my_scenes."

@@ -55,9 +55,9 @@ def _count_nodes(node: yaml.Node | None, known: dict[int, int]) -> int:
     if id(node) not in known:
         known[id(node)] = MAX_NODES + 1  # until it is counted: a node may contain itself
         pairs = (
-            node.value if isinstance(node, yaml.MappingNode) else [[each] for each in node.value]
+            node.value if isinstance(node, yaml.MappingNode) else [[child] for child in node.value]
         )
-        known[id(node)] = 1 + sum(_count_nodes(each, known) for pair in pairs for each in pair)
+        known[id(node)] = 1 + sum(_count_nodes(child, known) for pair in pairs for child in pair)
     return known[id(node)]
 
 

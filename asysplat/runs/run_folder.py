@@ -49,8 +49,8 @@ def job_name(overrides: Sequence[str], params: Mapping[str, str] | None) -> str:
             which a scheduler's processes lack; then every option is in the name.
     """
     command = dict(word.partition("=")[::2] for word in sys.argv[1:])
-    given = {**(params or {}), **command}
-    swept = {key for key, value in given.items() if re.match(r"[^\[{'\"]*[,(]", str(value))}
+    assigned = {**(params or {}), **command}
+    swept = {key for key, value in assigned.items() if re.match(r"[^\[{'\"]*[,(]", str(value))}
     options = dict(override.partition("=")[::2] for override in overrides)
     named = {key: options[key] for key in options if key in swept} or options
     words = (f"{key.rpartition('/')[2]}={value.rpartition('/')[2]}" for key, value in named.items())

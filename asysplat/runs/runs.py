@@ -246,9 +246,9 @@ def differences(run: Run, config: DictConfig) -> dict[str, tuple[Any, Any]]:
     Keys are dotted, those with fewer dots first; empty if the run's configuration is not readable.
     """
     before = _options_of(run.folder)
-    now = flat_options(hashed_options(config, ()))
-    keys = sorted(before.keys() & now.keys(), key=lambda key: (key.count("."), key))
-    return {key: (before[key], now[key]) for key in keys if before[key] != now[key]}
+    current = flat_options(hashed_options(config, ()))
+    keys = sorted(before.keys() & current.keys(), key=lambda key: (key.count("."), key))
+    return {key: (before[key], current[key]) for key in keys if before[key] != current[key]}
 
 
 @cache

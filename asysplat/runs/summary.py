@@ -41,7 +41,7 @@ def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
 
 
 def describe_costs(results: Results) -> str:
-    """Write the measured costs as a sentence; empty if none were measured."""
+    """Describe the measured costs in a line; empty if none were measured."""
     costs = []
     if "cost/parameters" in results:
         costs += [
@@ -78,11 +78,11 @@ def print_summary(results: Results, data: str, folder: Path) -> None:
         ]
         title = f"test scenes: {data}, metrics: {results['protocol/name']}"
         print_table(console, ["", *(METRICS[name] for name in metrics)], rows, title)
-    others = [name for name in test_sets if name != data]
-    if others:
+    other_sets = [name for name in test_sets if name != data]
+    if other_sets:
         psnrs = {
             name: [results[f"{method.format(name)}/psnr"] for method in ROWS.values()]
-            for name in others
+            for name in other_sets
         }
         rows = [[name, *_cells(values)] for name, values in psnrs.items()]
         print_table(console, ["", *ROWS], rows, "other test sets, PSNR (dB)")

@@ -71,16 +71,16 @@ def sweep_table(jobs: Sequence[Job]) -> Table:
         size = "not finished" if run is None else ""
         if "cost/parameters" in results:
             size = f"{results['cost/parameters'] / 1e6:.2f}M"
-        share = results.get("cost/geometry_ratio")
+        fraction = results.get("cost/geometry_ratio")
         table.add_row(
             *(overrides.get(key, "") for key in varied),
             size,
-            "" if share is None else f"{share:.1%}",
+            "" if fraction is None else f"{fraction:.1%}",
             *metric_cells(results, f"test/{config.data.name}"),
         )
-    found = [run.results for *_, run in jobs if run is not None]
+    results_of_runs = [run.results for *_, run in jobs if run is not None]
     for label, prefix in BASELINE_ROWS.items() if len(names) == 1 else ():
         space = [""] * (len(varied) + 1)
-        cells = metric_cells(found[-1], prefix.format(names[0]))
+        cells = metric_cells(results_of_runs[-1], prefix.format(names[0]))
         table.add_row(label, *space, *cells)
     return table
