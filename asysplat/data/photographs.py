@@ -160,7 +160,7 @@ def _warn_of_wrong_cameras(scene: PosedScene, say: Callable[[str], None]) -> Non
     verdict = diagnose_cameras(matched.cameras, find_matches(matched), files)
     if not verdict.fits and verdict.fit is not None:  # else too few points match to tell
         say(
-            f"warning: {verdict.sentence}; asysplat check shows it at full size. "
+            f"warning: {verdict.summary}; asysplat check shows it at full size. "
             "The reconstruction goes on."
         )
 

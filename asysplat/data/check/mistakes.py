@@ -56,7 +56,9 @@ def common_mistakes(names: Sequence[str]) -> list[Mistake]:
         "fx and fy": lambda focal, center: (focal.flip(-1), center),
         "fx and fy, cx and cy": lambda focal, center: (focal.flip(-1), center.flip(-1)),
     }
-    lenses = [_lens_mistake(f"{pair} are exchanged", exchange, exchanged[pair]) for pair in exchanged]
+    lenses = [
+        _lens_mistake(f"{pair} are exchanged", exchange, exchanged[pair]) for pair in exchanged
+    ]
     axes = _swapped_axes()
     inverse = _pose_mistake(
         "world-to-camera matrices were taken for camera-to-world",
@@ -138,7 +140,9 @@ def _swapped_axes() -> list[Mistake]:
         if mirror < 0:
             fix += ", and mirror the positions as well, since the world is left-handed"
 
-        def correct(r: Tensor, c: Tensor, turn: Tensor = turn, mirror: Tensor = mirror) -> tuple[Tensor, Tensor]:
+        def correct(
+            r: Tensor, c: Tensor, turn: Tensor = turn, mirror: Tensor = mirror
+        ) -> tuple[Tensor, Tensor]:
             return mirror * r @ turn, mirror * c
 
         mistakes.append(_pose_mistake(name, fix, correct))

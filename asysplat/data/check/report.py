@@ -1,7 +1,7 @@
 """Diagnose the cameras of a scene, and collect all measurements in a report."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from asysplat.data.bad_images import BadImages
 from asysplat.data.check.matches import Matches, epipolar_distances, find_matches, triangulate
 from asysplat.data.check.measurements import compare_depths, read_pixels
 from asysplat.data.check.mistakes import Mistake, common_mistakes, other_focal, other_resolution
-from asysplat.data.images import Lens, content_hash
+from asysplat.data.images import content_hash
 from asysplat.data.sequence import FileSequence, PosedScene, SceneOptions
 from asysplat.scene import Cameras
 
@@ -66,12 +66,12 @@ class Verdict:
 
     Args:
         fits: whether the cameras as read fit the images.
-        sentence: the same in words; if they do not fit, the reason and what to do.
+        summary: the same in words; if they do not fit, the reason and what to do.
         fit: fit of the cameras as read; None with too few matches.
     """
 
     fits: bool
-    sentence: str
+    summary: str
     fit: Fit | None = None
 
 

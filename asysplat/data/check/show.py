@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-import torch
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -35,7 +34,7 @@ def print_report(report: Report, title: str, console: Console) -> None:
     for name, text in report.rows:
         table.add_row(name, Text(text))
     console.print(table)
-    message = report.verdict.sentence
+    message = report.verdict.summary
     style = "bold green" if report.verdict.fits else "bold red"
     console.print(Text(f"{message[0].upper()}{message[1:]}.", style))
 
@@ -50,7 +49,7 @@ def draw_report(report: Report, title: str) -> Figure:
     image_height = min(WIDTH / MAX_PAIRS * cameras.height / cameras.width, MAX_IMAGE_HEIGHT)
     pair_height = 2 * (image_height + TITLE_HEIGHT)
     figure = Figure(figsize=(WIDTH, PATH_HEIGHT + pair_height), layout="constrained")
-    figure.suptitle(f"{title}: {report.verdict.sentence}", wrap=True)
+    figure.suptitle(f"{title}: {report.verdict.summary}", wrap=True)
     paths, images = figure.subfigures(2, 1, height_ratios=(PATH_HEIGHT, pair_height))
     _draw_path(report, *paths.subplots(1, 2))
     all_pairs = report.matches.pairs

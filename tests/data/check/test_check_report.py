@@ -96,7 +96,7 @@ SLIGHT = [
 
 def test_cameras_as_published_fit(real):
     verdict = diagnose_cameras(*real)
-    assert verdict.fits and verdict.sentence == "the cameras fit the images"
+    assert verdict.fits and verdict.summary == "the cameras fit the images"
     assert verdict.fit.error < 0.6 < MAX_ERROR
     assert verdict.fit.under_1px > 0.8 and verdict.fit.behind_camera < 0.01
     assert len(real[1].pairs) >= 8
@@ -108,17 +108,17 @@ def test_mistakes_of_cameras_are_named(real, mistakes):
     cameras, matches, names = real
     for broken, name in mistakes:
         verdict = diagnose_cameras(broken(cameras), matches, names)
-        assert not verdict.fits and name in verdict.sentence, name
+        assert not verdict.fits and name in verdict.summary, name
         if mistakes is SEVERE:
             assert verdict.fit.error > 5, name
-            assert "(corrected, the error is" in verdict.sentence, name
+            assert "(corrected, the error is" in verdict.summary, name
 
 
 @pytest.mark.medium
 def test_other_resolutions_are_fitted(real):
     cameras, matches, names = real
     verdict = diagnose_cameras(scaled(1.4, 1.4)(cameras), matches, names)
-    factor = re.search(r"those of images (.+) times the size", verdict.sentence)[1]
+    factor = re.search(r"those of images (.+) times the size", verdict.summary)[1]
     assert not verdict.fits and float(factor) == pytest.approx(1.4, rel=0.01)
 
 
@@ -140,7 +140,7 @@ def test_shuffled_poses_match_no_mistake(real):
     order = torch.randperm(cameras.num_views)
     shuffled = replace(cameras, cam_to_world=cameras.cam_to_world[order])
     verdict = diagnose_cameras(shuffled, matches, names)
-    assert not verdict.fits and "no usual mistake explains it" in verdict.sentence
+    assert not verdict.fits and "no usual mistake explains it" in verdict.summary
 
 
 @pytest.mark.medium
@@ -152,4 +152,4 @@ def test_poses_sorted_as_strings_are_named(real):
     verdict = diagnose_cameras(
         replace(cameras, cam_to_world=cameras.cam_to_world[order]), matches, names
     )
-    assert "sorted by their numbers, the poses as strings" in verdict.sentence
+    assert "sorted by their numbers, the poses as strings" in verdict.summary
