@@ -7,9 +7,9 @@ asysplat.write_gaussians("scene.ply", photographs.normalization.to_world(gaussia
 """
 
 from asysplat.later import import_later
+from asysplat.root import __version__
 
 LATER = {
-    "__version__": "asysplat.root",
     "Cameras": "asysplat.scene",
     "Gaussians": "asysplat.scene",
     "Views": "asysplat.scene",
@@ -21,5 +21,5 @@ LATER = {
     "write_gaussians": "asysplat.export",
 }
 
-__all__ = list(LATER)
+__all__ = ["__version__", *LATER]
 __getattr__ = import_later(__name__, LATER)

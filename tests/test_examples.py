@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -52,6 +53,18 @@ def test_a_scene_is_reconstructed(run_example, few_steps, tmp_path, monkeypatch,
     count = read_gaussians("reconstructed.ply").num_gaussians
     assert f"{count:,} Gaussians" in capsys.readouterr().out
     assert cv2.imread("reconstructed.png").std() > 20
+
+
+@pytest.mark.medium
+def test_the_blocks_of_the_readme_run(repository, few_steps, run_example, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_example("write_scene", "my_scene")
+    blocks = re.findall(r"```python\n(.*?)```", (repository / "README.md").read_text(), re.DOTALL)
+    names = {}
+    for block in blocks:
+        exec(block, names)
+    assert read_gaussians("scene.ply").num_gaussians > 1000
+    assert names["picture"].shape == (3, 64, 64) and names["picture"].requires_grad
 
 
 @pytest.fixture

@@ -133,7 +133,8 @@ def test_options_with_dashes_are_answered_by_how_they_are_given(given, monkeypat
 
 
 COMMAND = re.compile(
-    r"python (train|evaluate|reconstruct|report|benchmark)\.py((?: [^\s#`:,;()]+(?:,[^\s`]+)*)*)"
+    r"(?:python |asysplat )(train|evaluate|reconstruct|report|benchmark)(?:\.py)?"
+    r"((?: [^\s#`:,;()]+(?:,[^\s`]+)*)*)"
 )
 IN_A_TABLE = re.compile(r"\| `([\w./]+=[^`]+)`")
 

@@ -1,6 +1,6 @@
 """A viewer in the browser: the server renders each open page's camera.
 
-python -m asysplat.export.viewer scene.ply [PHOTOGRAPHS]
+asysplat view scene.ply [PHOTOGRAPHS]
 """
 
 from argparse import ArgumentParser

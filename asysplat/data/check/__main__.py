@@ -1,6 +1,6 @@
 """Check a scene: print its measurements on one screen, and draw them as a figure.
 
-python -m asysplat.data.check path/to/scene
+asysplat check path/to/scene
 
 Exits with 0 if the cameras fit the images, with 1 if they do not, and with 2 if the scene cannot be
 read.

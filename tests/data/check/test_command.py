@@ -1,4 +1,4 @@
-"""`python -m asysplat.data.check`: output, files and exit codes."""
+"""`asysplat check`: output, files and exit codes."""
 
 import json
 import shutil
