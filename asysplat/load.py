@@ -34,6 +34,13 @@ def load(checkpoint: str | None = "shipped", overrides: Sequence[str] = ()) -> N
 
     Raises:
         InputError: no such file, the weights of another model, or an unknown override.
+
+    Example:
+        >>> from asysplat import load, open_photographs
+        >>> photographs = open_photographs("my_scene", height=64, views=4)
+        >>> gaussians = load("shipped")(photographs.inputs)
+        >>> gaussians.means.shape[-1]
+        3
     """
     path = Path(checkpoint or "")
     if path.suffix == ".ckpt" and path.is_file():

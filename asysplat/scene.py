@@ -74,6 +74,15 @@ class Cameras(TensorRecord):
         intrinsics: [..., V, 3, 3] in pixels.
         cam_to_world: [..., V, 4, 4] rigid transforms, in scene units.
         height, width: image size in pixels, shared by all views.
+
+    Example:
+        >>> import torch
+        >>> from asysplat import Cameras
+        >>> intrinsics = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+        >>> cameras = Cameras(intrinsics[None], torch.eye(4)[None], height=48, width=64)
+        >>> origins, directions = cameras.rays()
+        >>> directions.shape
+        torch.Size([1, 48, 64, 3])
     """
 
     intrinsics: Float[Tensor, "*batch V 3 3"]
@@ -213,6 +222,15 @@ class Views(TensorRecord):
         point_depths: [..., V, H, W] depths of the scene's sparse points; 0 in pixels without one.
         disparities: [..., V, H, W] estimated inverse depths, up to a scale and a shift of each
             view; 0 if unknown.
+
+    Example:
+        >>> import torch
+        >>> from asysplat import Cameras, Views
+        >>> intrinsics = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]).repeat(2, 1, 1)
+        >>> cameras = Cameras(intrinsics, torch.eye(4).repeat(2, 1, 1), height=48, width=64)
+        >>> views = Views(cameras, torch.rand(2, 3, 48, 64)).validate()
+        >>> views.select([1]).num_views
+        1
     """
 
     cameras: Cameras
@@ -338,6 +356,19 @@ class Gaussians(TensorRecord):
         scales: [..., N, 3] standard deviations > 0, in scene units.
         opacities: [..., N] in (0, 1).
         sh: [..., N, K, 3] spherical harmonics, K = 1, 4, 9 or 16; color = 0.5 + sum_k sh_k Y_k.
+
+    Example:
+        >>> import torch
+        >>> from asysplat import Gaussians
+        >>> gaussians = Gaussians(
+        ...     means=torch.tensor([[0.0, 0, 4], [1, 0, 4]]),
+        ...     quats=torch.tensor([[1.0, 0, 0, 0], [1, 0, 0, 0]]),
+        ...     scales=torch.full((2, 3), 0.1),
+        ...     opacities=torch.tensor([0.5, 0.9]),
+        ...     sh=torch.ones(2, 1, 3),
+        ... ).validate()
+        >>> gaussians.num_gaussians
+        2
     """
 
     means: Float[Tensor, "*batch N 3"]

@@ -84,6 +84,14 @@ def open_photographs(
 
     Raises:
         InputError: fewer than two input views; see `open_scene`.
+
+    Example:
+        >>> from asysplat import open_photographs
+        >>> photographs = open_photographs("my_scene", height=64, views=4, held_out_every=3)
+        >>> photographs.inputs.num_views
+        4
+        >>> len(photographs.held_out_files)
+        4
     """
     _check_counts(height, width, views, held_out_every, max_held_out)
     if found := find_missing(path, layout, on_bad_image, cameras):

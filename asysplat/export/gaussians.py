@@ -39,6 +39,12 @@ def read_gaussians(
 
     Raises:
         InputError: another suffix, or see the format's reader.
+
+    Example:
+        >>> from asysplat import read_gaussians
+        >>> gaussians = read_gaussians("scene.ply")
+        >>> gaussians.means.shape
+        torch.Size([1000, 3])
     """
     gaussians = _by_suffix(READERS, path, "read")(path, dtype)
     if origin is None:
@@ -84,6 +90,10 @@ def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
 
     Raises:
         InputError: another suffix, or see the format's writer.
+
+    Example:
+        >>> from asysplat import read_gaussians, write_gaussians
+        >>> write_gaussians("scene.safetensors", read_gaussians("scene.ply"))
     """
     _by_suffix(WRITERS, path, "written")(path, gaussians)
 

@@ -196,6 +196,11 @@ def refine(
 
     Raises:
         InputError: neither seconds nor steps, or both; see `Refinement`.
+
+    Example:
+        >>> from asysplat import load, open_photographs, refine
+        >>> views = open_photographs("my_scene", height=64, views=4).inputs
+        >>> gaussians = refine(load("shipped")(views), views, steps=5)
     """
     if (seconds is None) == (steps is None) or not (steps if seconds is None else seconds) > 0:
         raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")

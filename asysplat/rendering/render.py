@@ -99,6 +99,15 @@ def render(
         InputError: an unknown backend or depth; incompatible shapes, devices or types; more pairs
             of Gaussian and tile than a list can number; with `validate`, everything that
             `Gaussians.validate` and `Cameras.validate` refuse.
+
+    Example:
+        >>> from asysplat import load, open_photographs, render
+        >>> views = open_photographs("my_scene", height=64, views=4).inputs
+        >>> out = render(load("shipped")(views), views.cameras)
+        >>> out.image.shape
+        torch.Size([4, 3, 64, 64])
+        >>> out.depth.shape
+        torch.Size([4, 64, 64])
     """
     if sh_degree not in (None, 0, 1, 2, 3):
         raise InputError(f"render's sh_degree is {sh_degree!r}: choose 0, 1, 2, 3 or None.")
