@@ -1,4 +1,4 @@
-.PHONY: install demo quick test bench slow style format
+.PHONY: install demo quick test bench slow docs style format
 PYTHON ?= python3
 ENV := .venv/.ready
 # Two worker processes of one thread each; a file's tests share a process, and so their fixtures.
@@ -24,6 +24,10 @@ bench: $(ENV) ## check for slowdowns: ratios within one process, against docs/re
 
 slow: $(ENV) ## tests of an hour or two: long runs on real scenes, two processes for every model
 	$(PYTEST) -m slow
+
+docs: $(ENV) ## the pages of docs/ and the API, searchable, in logs/docs
+	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict
+	@echo "page: logs/docs/index.html"
 
 style: $(ENV)
 	.venv/bin/ruff check .

@@ -2,12 +2,17 @@
 
 import re
 import runpy
+import subprocess
+import sys
 
 import pytest
 
-PAGES = ("architecture", "benchmarks", "options", "questions", "scaling", "tables")
+import asysplat
+
+PAGES = ("api", "architecture", "benchmarks", "options", "questions", "scaling", "tables")
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", "examples/README.md", "data/README.md"]
 DOCUMENTS += [f"docs/{page}.md" for page in PAGES]
+PUBLIC = {name: getattr(asysplat, name).__module__ for name in asysplat.LATER}
 WORD = r"(?<![\w/-])\w+(?![\w/-]|\.zip)"
 SOURCES = (".py", ".yaml", ".json")
 PLACES = r"`((?:asysplat|conf|sweeps|tests|docs|examples|data)/[\w./-]*)`"
@@ -43,6 +48,16 @@ def test_the_architecture_figure_is_up_to_date(repository):
     assert (repository / "docs" / "architecture.svg").read_text() == drawn, (
         "run python docs/architecture.py"
     )
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_warnings(repository, tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path]
+    done = subprocess.run(command, cwd=repository, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "api" / "index.html").read_text()
+    assert all(f'id="{place}.{name}"' in page for name, place in PUBLIC.items())
+    assert "Render every view" in (tmp_path / "search" / "search_index.json").read_text()
 
 
 def test_the_scaling_tables_match_their_results(repository):
