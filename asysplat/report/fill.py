@@ -24,6 +24,7 @@ from asysplat.report.paper import (
     stage_hours,
 )
 from asysplat.report.systems import system_rows
+from asysplat.runs.run_config import plain_options
 from asysplat.runs.runs import Run, config_hash, data_of, differences, find_runs
 from asysplat.runs.stages import describe_stage, stage_configs
 from asysplat.training.tensorboard import CHOICES
@@ -230,7 +231,7 @@ def _costs(compose: Compose, run: tuple[str, ...], views: int, size: tuple[int, 
 
 def _head(config: DictConfig) -> str:
     """Write the head of a model and its options, as `ResidualHead(sh_degree=3)`."""
-    head = OmegaConf.to_container(config.model, resolve=True).get("head")
+    head = plain_options(config.model).get("head")
     if head is None:
         return "the model's own"
     options = (f"{key}={value}" for key, value in head.items() if not key.startswith("_"))
@@ -295,7 +296,7 @@ def _folders(runs: Sequence[Run]) -> str:
 def _untested(sets: dict[str, str], config: DictConfig, rows: Sequence[PaperRow]) -> str:
     """List the paper's test sets that the sweep names without a path, and no row has numbers of."""
     tested = {key.partition("/")[0] for row in rows for key in row.values}
-    data = OmegaConf.to_container(config.data, resolve=True)
+    data = plain_options(config.data)
     if "root" not in data:  # synthetic data has no test sets on disk
         return ""
     no_path = [name for name, how in data["test_sets"].items() if how.get("root", "") is None]

@@ -70,7 +70,7 @@ RESULTS = {  # parts of the keys of metrics.json, as regular expressions
 CALLBACKS = {old.rpartition(".")[2]: new.rpartition(".")[2] for old, new in CLASSES.items()}
 
 
-def upgrade_config(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def upgrade_config(config: Mapping[Any, Any], prefix: str = "") -> dict[Any, Any]:
     """Return a resolved configuration under today's names; `prefix`: its path within the whole."""
     upgraded = {}
     for key, value in config.items():

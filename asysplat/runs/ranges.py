@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from typing import TypeGuard
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
@@ -14,7 +15,7 @@ def is_whole(value: object, low: int | float = 0, below: int | float = math.inf)
     return isinstance(value, int) and not isinstance(value, bool) and low <= value < below
 
 
-def is_number(value: object) -> bool:
+def is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -91,6 +91,12 @@ def _known_targets() -> set[str]:
     """Return every `_target_` of conf/."""
     files = CONF.rglob("*.yaml")
     return {name for file in files for name in re.findall(r"_target_: *(\S+)", file.read_text())}
+
+
+def plain_options(config: DictConfig) -> dict[str, Any]:
+    """Return a configuration as nested dictionaries and lists, with resolved interpolations."""
+    # OmegaConf's types are those of any node: a DictConfig gives a dict.
+    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
 
 
 def flat_options(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

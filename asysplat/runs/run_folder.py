@@ -4,7 +4,7 @@ import fcntl
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -58,7 +58,7 @@ def job_name(overrides: Sequence[str], params: Mapping[str, str] | None) -> str:
 
 
 @contextmanager
-def unused_removed(folder: Path) -> Iterator[None]:
+def unused_removed(folder: Path) -> Generator[None]:
     """Remove a run's folder if the body fails before the run has written to it.
 
     So does a mistyped option; Hydra has written its configuration there. An empty folder around it
@@ -75,9 +75,10 @@ def unused_removed(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Generator[None]:
     """Lock a run's folder for this process and those that it trains with, or raise InputError."""
-    if rank_zero_only.rank != 0:
+    # Attribute that Lightning adds to its function.
+    if rank_zero_only.rank != 0:  # ty: ignore[missing-attribute]
         yield
         return
     make_folder(folder, "paths.logs")

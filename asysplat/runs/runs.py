@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
+from omegaconf import MISSING, DictConfig, open_dict
 
 from asysplat.data.build import tested_sets
 from asysplat.errors import InputError
 from asysplat.runs.checkpoints import weights_file
 from asysplat.runs.old_names import FORMAT, upgrade_results
 from asysplat.runs.revision import revision
-from asysplat.runs.run_config import flat_options, read_config
+from asysplat.runs.run_config import flat_options, plain_options, read_config
 from asysplat.runs.stages import stage_configs
 
 RESULTS = "metrics.json"
@@ -87,7 +87,7 @@ def hashed_options(
             config.data.seed = None
         config.paths = dict.fromkeys(config.paths, "")
         config.seed = config.data.num_workers = config.data.test_sets = None
-    resolved = OmegaConf.to_container(config, resolve=True)
+    resolved = plain_options(config)
     resolved["init_path"] = resolved["init_path"] is not None
     for key in ("test_root", "disparities"):
         resolved["data"][key] = resolved["data"].get(key) is not None
@@ -117,7 +117,7 @@ def data_of(config: DictConfig) -> dict[str, str]:
     run/init_path are hashes of these files' content. run/test_sets/<name> is a hash of a further
     test set's options, with its root by name and its index by content. Absent options are left out.
     """
-    data = OmegaConf.to_container(config.data, resolve=True)
+    data = plain_options(config.data)
     described = {
         "run/data/root": name_of(data.get("root")),
         "run/data/test_root": name_of(data.get("test_root")),

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -13,7 +14,7 @@ from asysplat.evaluation.metrics import METRICS
 from asysplat.files import atomic_write
 from asysplat.terminal import print_table
 
-Results = dict[str, float | int | str]  # flat, as in metrics.json
+Results = dict[str, Any]  # numbers and texts, flat, as in metrics.json
 
 # Title of a row: prefix of its keys, with a place for the test set.
 BASELINE_ROWS = {title: f"baseline/{{}}/{name}" for name, (title, _) in BASELINES.items()}

@@ -46,8 +46,8 @@ def read_jobs(folder: Path, logs: Path) -> list[Job]:
     """Read the jobs of the sweep in `folder`, in their order, and find their runs below `logs`."""
     jobs = []
     for path in sorted(folder.glob("*/.hydra"), key=_number):
-        words = [word.partition("=") for word in OmegaConf.load(path / "overrides.yaml")]
-        config = OmegaConf.load(path / "config.yaml")
+        words = [str(word).partition("=") for word in OmegaConf.load(path / "overrides.yaml")]
+        config = DictConfig(OmegaConf.load(path / "config.yaml"))
         jobs.append(({key: value for key, _, value in words}, config, find_run(logs, config)))
     return jobs
 

@@ -8,9 +8,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig
 
 from asysplat.runs.old_names import upgrade_results
+from asysplat.runs.run_config import plain_options
 from asysplat.runs.runs import EVALUATION, Run, content_of, hash_of, name_of
 
 SYSTEM = "evaluation/system"
@@ -48,7 +49,7 @@ def options_of_test(config: DictConfig, test_set: str) -> dict[str, Any]:
 
     They are the data, its images and their size, and the metrics; missing values are left out.
     """
-    data = OmegaConf.to_container(config.data, resolve=True)
+    data = plain_options(config.data)
     changes = (data["test_sets"] or {}).get(test_set) or {}
     if data.get("test_size"):
         data["height"], data["width"] = data["test_size"]
@@ -58,7 +59,7 @@ def options_of_test(config: DictConfig, test_set: str) -> dict[str, Any]:
     options["data"] = test_set if "root" in changes else data["name"]
     options["root"] = name_of(data["root"])
     options["index"] = content_of(data.get("index"))
-    metrics = OmegaConf.to_container(config.metrics, resolve=True)
+    metrics = plain_options(config.metrics)
     options |= {f"metrics.{key}": value for key, value in metrics.items() if key != "_target_"}
     return {key: value for key, value in options.items() if value not in (None, MISSING)}
 

@@ -30,6 +30,7 @@ from asysplat.runs.checkpoints import (
     read_metadata,
 )
 from asysplat.runs.revision import revision
+from asysplat.runs.run_config import plain_options
 from asysplat.runs.run_folder import locked
 from asysplat.runs.runs import RESULTS, describe_run
 from asysplat.runs.stages import (
@@ -89,7 +90,7 @@ class TrainingStage:
         load_weights(self.weights, module)
         print(f"{self.config.stage}: {describe_stage(self.config)}")
         print(f"model: {module.net.describe()}")
-        options = OmegaConf.to_container(self.config, resolve=True)
+        options = plain_options(self.config)
         module.save_hyperparameters(options, logger=False)
         metadata = {} if self.checkpoint is None else read_metadata(self.checkpoint)
         for difference in config_diff(metadata, options, revision()):
