@@ -23,6 +23,7 @@ MAX_FIELD_OF_VIEW = 20  # image side over focal length: 169 degrees
 Record = TypeVar("Record", bound="TensorRecord")
 
 
+@dataclass(frozen=True)
 class TensorRecord:
     """A frozen dataclass of tensors, and of other such records, that moves and stacks as one."""
 
@@ -130,10 +131,10 @@ class Cameras(TensorRecord):
 
     def pixel_directions(self) -> Float[Tensor, "*batch V H W 3"]:
         """Compute the camera-space directions through every pixel center, with z = 1."""
-        options = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
+        dtype, device = self.intrinsics.dtype, self.intrinsics.device
         y, x = torch.meshgrid(
-            torch.arange(self.height, **options) + 0.5,
-            torch.arange(self.width, **options) + 0.5,
+            torch.arange(self.height, dtype=dtype, device=device) + 0.5,
+            torch.arange(self.width, dtype=dtype, device=device) + 0.5,
             indexing="ij",
         )
         fx, fy = self.intrinsics[..., 0, 0, None, None], self.intrinsics[..., 1, 1, None, None]
@@ -289,8 +290,13 @@ class Views(TensorRecord):
             inverse = F.adaptive_max_pool2d((depths > 0) / depths.clamp_min(TINY), size)
             return (inverse > 0) / inverse.clamp_min(TINY)
 
-        methods = {"images": area, "masks": lambda masks: whole_pixels(masks, size)}
-        methods |= {"depths": nearest, "disparities": nearest, "point_depths": nearest_point}
+        methods: dict[str, Callable[[Tensor], Tensor]] = {
+            "images": area,
+            "masks": lambda masks: whole_pixels(masks, size),
+            "depths": nearest,
+            "disparities": nearest,
+            "point_depths": nearest_point,
+        }
         resized = {}
         for name, method in methods.items():
             values = getattr(self, name)

@@ -1,6 +1,6 @@
 """AsySplat: posed images to Gaussians through two asymmetric branches (paper, Sec. 3.2)."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 import torch
 from jaxtyping import Float
@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.models.geometry_ratio import solve_widths
+from asysplat.models.head import GaussianHead
 from asysplat.models.layers import Layers
 from asysplat.models.network import TokenNetwork
 from asysplat.models.shapes import StageShape, Widths
@@ -15,6 +16,17 @@ from asysplat.models.stage import Component, Stage
 from asysplat.models.tokenizer import Tokenizer
 
 APPEARANCE_MLP_RATIO = 4
+
+
+class Branch(nn.Module):
+    """The parts of a branch: its tokenizer, its stages, and after each its link to the other."""
+
+    def __init__(
+        self, tokenizer: Tokenizer, stages: Iterable[nn.Module], links: Iterable[nn.Module]
+    ):
+        super().__init__()
+        self.tokenizer = tokenizer
+        self.stages, self.links = nn.ModuleList(stages), nn.ModuleList(links)
 
 
 class AsySplat(TokenNetwork):
@@ -50,7 +62,7 @@ class AsySplat(TokenNetwork):
         fine_to_coarse: Component,
         coarse_to_fine: Component,
         fusion: Component,
-        head: Component,
+        head: Callable[..., GaussianHead],
         patch_coarse: int = 16,
         patch_fine: int = 8,
         prior: nn.Module | None = None,
@@ -64,25 +76,20 @@ class AsySplat(TokenNetwork):
         self.appearance_layers = appearance_layers
         shapes = widths.stage_shapes(stage_ratios)
         fine = StageShape(widths.fine, widths.head_dim, APPEARANCE_MLP_RATIO)
-        self.geometry = nn.ModuleDict(
-            {
-                "tokenizer": Tokenizer(patch_coarse, widths.stages[0], self.pixel_channels),
-                "stages": nn.ModuleList(
-                    Stage(previous.width, shape, layers, blocks)
-                    for previous, shape in zip([shapes[0], *shapes], shapes, strict=False)
-                ),
-                "links": nn.ModuleList(fine_to_coarse(shape, fine) for shape in shapes),
-            }
+        self.geometry = Branch(
+            Tokenizer(patch_coarse, widths.stages[0], self.pixel_channels),
+            stages=(
+                Stage(previous.width, shape, layers, blocks)
+                for previous, shape in zip([shapes[0], *shapes], shapes, strict=False)
+            ),
+            links=(fine_to_coarse(shape, fine) for shape in shapes),
         )
-        self.appearance = nn.ModuleDict(
-            {
-                "tokenizer": Tokenizer(patch_fine, widths.fine, self.pixel_channels),
-                "stages": nn.ModuleList(
-                    Layers(*(appearance_block(fine) for _ in range(appearance_layers)))
-                    for _ in shapes
-                ),
-                "links": nn.ModuleList(coarse_to_fine(shape, fine) for shape in shapes),
-            }
+        self.appearance = Branch(
+            Tokenizer(patch_fine, widths.fine, self.pixel_channels),
+            stages=(
+                Layers(appearance_block(fine) for _ in range(appearance_layers)) for _ in shapes
+            ),
+            links=(coarse_to_fine(shape, fine) for shape in shapes),
         )
         # `source`, as the weights in checkpoints are named.
         self.source = fusion(widths.stages[-1], widths.fine, patch_coarse // patch_fine)
@@ -91,13 +98,13 @@ class AsySplat(TokenNetwork):
     def tokens(
         self, pixels: Float[Tensor, "B V H W c"], skip_layers: Collection[nn.Module] = ()
     ) -> Float[Tensor, "B V h w d"]:
-        coarse = self.geometry["tokenizer"](pixels)  # [B, V, H / p_c, W / p_c, d_1]
-        fine = self.appearance["tokenizer"](pixels)  # [B, V, H / p_f, W / p_f, d_v]
+        coarse = self.geometry.tokenizer(pixels)  # [B, V, H / p_c, W / p_c, d_1]
+        fine = self.appearance.tokenizer(pixels)  # [B, V, H / p_f, W / p_f, d_v]
         branches = zip(
-            self.geometry["stages"],
-            self.appearance["stages"],
-            self.geometry["links"],
-            self.appearance["links"],
+            self.geometry.stages,
+            self.appearance.stages,
+            self.geometry.links,
+            self.appearance.links,
             strict=True,
         )
         for geometry, appearance, fine_to_coarse, coarse_to_fine in branches:
@@ -113,8 +120,9 @@ class AsySplat(TokenNetwork):
 
         Without them the shipped model loses at most 0.06 dB (docs/results/pareto.md).
         """
-        geometry = (layer for stage in self.geometry["stages"][1:] for layer in stage.layers)
-        return {*geometry, *(layer for stage in self.appearance["stages"][1:] for layer in stage)}
+        stages = nn.ModuleList([*self.geometry.stages[1:], *self.appearance.stages[1:]])
+        groups = [module for module in stages.modules() if isinstance(module, Layers)]
+        return {layer for layers in groups for layer in layers}
 
     def geometry_ratio(self) -> float:
         """Return the fraction of parameters outside the appearance branch (paper: about 0.9)."""

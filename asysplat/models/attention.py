@@ -96,10 +96,10 @@ class ConvBlocks(nn.Module):
 
     def __init__(self, width: int, group_width: int):
         super().__init__()
-        options = {"padding": 1, "groups": width // group_width, "bias": False}
+        groups = width // group_width
         self.blocks = nn.Sequential()
         for _ in range(2):
-            conv = nn.Conv2d(width, width, 3, **options)
+            conv = nn.Conv2d(width, width, 3, padding=1, groups=groups, bias=False)
             self.blocks.extend((conv, nn.BatchNorm2d(width), nn.GELU()))
 
     def forward(self, tokens: Float[Tensor, "B V h w d"]) -> Float[Tensor, "B V h w d"]:

@@ -1,19 +1,20 @@
 """Find widths that give the geometry branch a fraction of the parameters, the geometry_ratio."""
 
 from collections.abc import Callable
+from functools import cache
 from itertools import combinations_with_replacement
 
 import numpy as np
-from torch import nn
 
 from asysplat.errors import InputError
+from asysplat.models.network import Network
 from asysplat.models.shapes import Widths
 
 RATIO_TOLERANCE = 0.015
 TOTAL_TOLERANCE = 0.0095  # any two totals are then within 2 %
 ATTEMPTS = 10  # models built and counted, for each number of layers
 
-Build = Callable[[Widths, int], nn.Module]
+Build = Callable[[Widths, int], Network]
 
 
 def solve_widths(
@@ -44,23 +45,26 @@ def solve_widths(
     samples = _samples(len(base.stages) + 1)
     counts = _counts(build, base, layers, samples)
     predicted = _quadratic_fit(samples, counts, heads)
-    added = None  # by another layer
     fine_alone = (samples[:, :-1] == samples[0, :-1]).all(axis=1)  # three samples: a quadratic
     # Of all widths within the tolerances, prefer those with the proportions of the stages.
     shape_error = np.log(candidates[:, :-1] / np.array(base.stages)).std(axis=1)
 
-    def errors(total: np.ndarray | int, geometry: np.ndarray | float) -> np.ndarray | float:
-        """Return the larger error, in units of its tolerance."""
+    @cache
+    def added() -> np.ndarray:
+        """Return the parameters of another layer, for each candidate."""
+        more = _counts(build, base, layers + 1, samples[fine_alone]) - counts[fine_alone]
+        return _quadratic_fit(samples[fine_alone, -1:], more, heads[:, -1:])
+
+    def errors(parameters: np.ndarray) -> np.ndarray:
+        """Return the larger error of parameters [n, 2], in units of its tolerance."""
+        total, geometry = parameters.T
         ratio_error = np.abs(geometry / total - ratio) / RATIO_TOLERANCE
         return np.maximum(ratio_error, np.abs(total / target - 1) / TOTAL_TOLERANCE)
 
     closest, description = np.inf, ""
     for count in sorted(range(1, 3 * layers + 1), key=lambda n: (abs(n - layers), -n)):
-        if count != layers and added is None:
-            more = _counts(build, base, layers + 1, samples[fine_alone]) - counts[fine_alone]
-            added = _quadratic_fit(samples[fine_alone, -1:], more, heads[:, -1:])
-        parameters = predicted if count == layers else predicted + (count - layers) * added
-        error = errors(*parameters.T)
+        more_layers = count - layers
+        error = errors(predicted + more_layers * added() if more_layers else predicted)
         rank = np.where(error < 1, error / 2 + shape_error, 1e3 + error)
         order = np.argsort(rank, kind="stable")  # the same widths on every machine
         # The polynomial ignores rounding and stages of equal width, so build and count the best
@@ -70,7 +74,7 @@ def solve_widths(
             *stages, fine = (int(width) for width in row)
             widths = Widths(tuple(stages), fine, base.head_dim)
             total, geometry = _count(build(widths, count))
-            exact = float(errors(total, geometry))
+            exact = float(errors(np.array([[total, geometry]]))[0])
             if exact < 1:
                 return widths, count
             if exact < closest:
@@ -127,7 +131,7 @@ def _samples(columns: int) -> np.ndarray:
     return np.stack([base, *single, *pairs])
 
 
-def _count(model: nn.Module) -> tuple[int, float]:
+def _count(model: Network) -> tuple[int, float]:
     """Return the parameters of the model and of its geometry branch."""
     total = sum(p.numel() for p in model.parameters())
     return total, total * model.geometry_ratio()

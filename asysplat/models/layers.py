@@ -1,6 +1,6 @@
 """A sequence of layers, optionally with activation checkpointing."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Generator
 from contextlib import contextmanager, nullcontext
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 
-class Layers(nn.Sequential):
+class Layers(nn.ModuleList):
     """Layers in sequence.
 
     With `checkpointing`, the backward pass computes each layer again, and only the tokens between
@@ -36,13 +36,14 @@ class Layers(nn.Sequential):
 
 
 @contextmanager
-def _without_running_means(layer: nn.Module) -> Iterator[None]:
+def _without_running_means(layer: nn.Module) -> Generator[None]:
     """Freeze the running means of BatchNorm: the layer has counted this batch already."""
     norms = [m for m in layer.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)]
     momenta = [norm.momentum for norm in norms]
     for norm in norms:
         norm.momentum = 0.0
-        norm.num_batches_tracked -= int(norm.training)
+        if norm.num_batches_tracked is not None:
+            norm.num_batches_tracked -= int(norm.training)
     try:
         yield
     finally:

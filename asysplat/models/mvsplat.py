@@ -41,6 +41,7 @@ class MVSplat(Network):
     """
 
     view_counts = (2, 8)
+    inverse: Float[Tensor, "planes"]
 
     def __init__(
         self,
@@ -194,18 +195,18 @@ class CrossViewLayer(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "B V h w c"]) -> Float[Tensor, "B V h w c"]:
-        shift = [side // WINDOWS // 2 if self.shifted else 0 for side in x.shape[2:4]]
+        _, count, height, width, _ = x.shape
+        shift = [side // WINDOWS // 2 if self.shifted else 0 for side in (height, width)]
         back = [-s for s in shift]
-        visible = same_region(x.shape[2:4], shift, x.device)
+        visible = same_region((height, width), shift, x.device)
         x = torch.roll(x, back, (2, 3))
         tokens = windows(x)
         tokens = tokens + self.within(tokens, tokens, visible)
-        count = x.shape[1]
         other_views = (torch.arange(count)[:, None] + torch.arange(1, count)) % count
         context = rearrange(tokens[:, other_views], "b v k n l c -> b v n (k l) c")
         message = self.across(tokens, context, visible.repeat(1, 1, count - 1))
         tokens = tokens + self.mlp(torch.cat((tokens, message), dim=-1))
-        size = {"p": WINDOWS, "i": x.shape[2] // WINDOWS}
+        size = {"p": WINDOWS, "i": height // WINDOWS}
         x = rearrange(tokens, "b v (p q) (i j) c -> b v (p i) (q j) c", **size)
         return torch.roll(x, shift, (2, 3))
 
@@ -329,7 +330,7 @@ class UNet(nn.Module):
                 kept.append(x)
         x = self.middle[1](self.attention[1](self.middle[0](x), views))
         for level, blocks in enumerate(self.up):
-            for index, block in enumerate(blocks):
+            for index, block in enumerate(blocks.children()):
                 x = block(torch.cat((x, kept.pop()), dim=1))
                 if level == 0:
                     x = self.attention[2 + index](x, views)

@@ -75,12 +75,6 @@ class Network(nn.Module, ABC):
         """The number of input channels of a tokenizer, for each pixel."""
         return PIXEL_CHANNELS + (0 if self.prior is None else PRIOR_CHANNELS)
 
-    def run_prior(self, views: Views) -> Prior:
-        """Run the prior, on the head's grid."""
-        height, width = (s // self.head.stride for s in (views.cameras.height, views.cameras.width))
-        with torch.no_grad(), without_autocast(views.images):
-            return self.prior(views, (height, width))
-
     def describe(self) -> str:
         """Return the number of parameters, in a line."""
         return f"{sum(p.numel() for p in self.parameters()) / 1e6:.2f}M parameters"
@@ -142,7 +136,6 @@ class TokenNetwork(Network):
     """
 
     head: GaussianHead
-    skippable_layers: Collection[nn.Module] = ()  # layers that early exit may skip
 
     def __init__(
         self, widths: Widths, patch: int, prior: nn.Module | None, prune: Prune | None = None
@@ -150,11 +143,24 @@ class TokenNetwork(Network):
         super().__init__(patch, prior, prune)
         self.widths = widths
 
+    @property
+    def skippable_layers(self) -> Collection[nn.Module]:
+        """The layers that early exit may skip."""
+        return ()
+
+    def run_prior(self, views: Views) -> Prior | None:
+        """Run the prior, on the head's grid; None without one."""
+        if self.prior is None:
+            return None
+        height, width = (s // self.head.stride for s in (views.cameras.height, views.cameras.width))
+        with torch.no_grad(), without_autocast(views.images):
+            return self.prior(views, (height, width))
+
     def predict(self, views: Views) -> Gaussians:
         """Predict Gaussians [B, N] from views [B, V]; N = V h w, of the head's grid."""
         if not (self.training or self.early_exit == EXACT):
             return self.predict_with_early_exit(views)
-        prior = None if self.prior is None else self.run_prior(views)
+        prior = self.run_prior(views)
         return self.head(self.tokens(pixel_features(views, prior)), views, prior)
 
     def predict_with_early_exit(self, views: Views) -> Gaussians:
@@ -165,6 +171,7 @@ class TokenNetwork(Network):
                 "decides for one: give one scene at a time, or set speed=exact."
             )
         prior = self.run_prior(views)
+        assert prior is not None  # see `check_early_exit`
         confidence, speed = prior.confidence.mean().item(), self.early_exit
         thresholds = (speed.skip_network_above, speed.skip_layers_above)
         skip_network, skip_layers = (limit and confidence >= limit for limit in thresholds)

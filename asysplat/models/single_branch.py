@@ -1,6 +1,6 @@
 """Models of one branch: the paper's single-branch ablation, and Long-LRM, its baseline."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import torch
 from jaxtyping import Float
@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from asysplat.errors import InputError
 from asysplat.models.attention import SparseAttention
+from asysplat.models.head import GaussianHead
 from asysplat.models.network import TokenNetwork
 from asysplat.models.prune import Prune
 from asysplat.models.shapes import Widths
@@ -41,7 +42,7 @@ class SingleBranch(TokenNetwork):
         stage_layers: Sequence[str],
         merges: Sequence[bool],
         blocks: Mapping[str, Component],
-        head: Component,
+        head: Callable[..., GaussianHead],
         patch: int = 8,
         global_tokens: int = 0,
         prior: nn.Module | None = None,

@@ -44,12 +44,11 @@ class Stage(nn.Module):
     ):
         super().__init__()
         self.merge = TokenMerge(previous_width, shape.width) if merge else None
-        self.project = None
-        if has_global or not merge:  # after a merge only global tokens are left to project
-            same = previous_width == shape.width
-            self.project = nn.Identity() if same else nn.Linear(previous_width, shape.width)
+        same = previous_width == shape.width
+        unused = merge and not has_global  # after a merge only global tokens are left to project
+        self.project = nn.Identity() if same or unused else nn.Linear(previous_width, shape.width)
         letters = parse_layer_mix(layers, set(blocks))
-        self.layers = Layers(*(blocks[letter](shape) for letter in letters))
+        self.layers = Layers(blocks[letter](shape) for letter in letters)
 
     def forward(
         self,

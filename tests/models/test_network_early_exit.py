@@ -68,7 +68,7 @@ def test_training_skips_nothing(net):
 
 def test_skipped_layers_are_those_after_the_first_stage(net):
     called = []
-    branches = net.geometry["stages"], net.appearance["stages"]
+    branches = net.geometry.stages, net.appearance.stages
     for layer in [
         layer for stages in branches for stage in stages[1:] for layer in layers_of(stage)
     ]:

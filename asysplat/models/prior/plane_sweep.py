@@ -71,8 +71,14 @@ class PlaneSweepPrior(nn.Module):
         masks = views.masks
         if masks is not None:
             masks = whole_pixels(masks, (small.height, small.width))
-        options = {"planes": self.planes, "neighbors": self.neighbors}
-        estimate = plane_sweep(images, small, ranges=ranges, masks=masks, **options)
+        estimate = plane_sweep(
+            images,
+            small,
+            planes=self.planes,
+            neighbors=self.neighbors,
+            ranges=ranges,
+            masks=masks,
+        )
         return Prior.from_estimate(estimate, views, size)
 
 

@@ -86,14 +86,15 @@ class Prior(TensorRecord):
         views: Views,
     ) -> "Prior":
         """Compute the prior of known inverse depths, filled where their weight is less than 1."""
-        scenes, count, *size = inverse.shape
+        scenes, count, height, width = inverse.shape
+        size = (height, width)
         inverse = fill_unknown(inverse, weight)
         others = other_views(count, scenes, inverse.device)
         projections = PairwiseProjections.from_cameras(views.cameras).matrices(others, *size)
         if views.masks is not None:
-            confidence = confidence * whole_pixels(views.masks, tuple(size))
+            confidence = confidence * whole_pixels(views.masks, size)
         votes = count_votes(inverse, confidence, others, projections)
-        return cls.from_estimate(DepthEstimate(inverse, confidence, votes), views, tuple(size))
+        return cls.from_estimate(DepthEstimate(inverse, confidence, votes), views, size)
 
     def features(self, height: int, width: int) -> Float[Tensor, "B V H W 2"]:
         """Return the log distance relative to the scene's median, and the confidence.
