@@ -77,8 +77,8 @@ class SelectiveAdam:
             rate = torch.as_tensor(rate, dtype=parameter.dtype, device=parameter.device)
             row_rates = rate.expand(parameter.shape[1:]).reshape(-1)
             if row_rates.any():
-                _expect(f"gradient of {name}", gradients.get(name), parameter.shape)
-                gradient = gradients[name].to(parameter).contiguous()
+                gradient = _expect(f"gradient of {name}", gradients.get(name), parameter.shape)
+                gradient = gradient.to(parameter).contiguous()
                 numbers = (parameter, gradient, state["mean"], state["square"])
                 flat = (tensor.view(self.num_rows, len(row_rates)) for tensor in numbers)
                 tensors.append(Rows(*flat, state["steps"], row_rates))
@@ -108,11 +108,12 @@ class SelectiveAdam:
             }
 
 
-def _expect(name: str, tensor: Tensor | None, shape: tuple[int, ...]) -> None:
-    """Raise InputError for another shape: the kernels have no bounds checks."""
+def _expect(name: str, tensor: Tensor | None, shape: tuple[int, ...]) -> Tensor:
+    """Return a tensor of the shape, or raise InputError: the kernels have no bounds checks."""
     if tensor is None or tensor.shape != shape:
         problem = "is missing" if tensor is None else f"has shape {tuple(tensor.shape)}"
         raise InputError(f"SelectiveAdam's {name} {problem}: expected {tuple(shape)}.")
+    return tensor
 
 
 def _zero_state(parameter: Tensor) -> dict[str, Tensor]:

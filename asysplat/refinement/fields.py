@@ -73,8 +73,13 @@ class Fields:
         bands = torch.full((self.count, 1), rates.sh * rates.sh_rest)
         bands[0] = rates.sh
         bands[(sh_degree + 1) ** 2 :] = 0
-        by_name = {"offsets": rates.means, "quats": rates.quats, "log_scales": rates.scales}
-        by_name |= {"logits": rates.opacities, "sh": bands}
+        by_name: dict[str, float | Tensor] = {
+            "offsets": rates.means,
+            "quats": rates.quats,
+            "log_scales": rates.scales,
+            "logits": rates.opacities,
+            "sh": bands,
+        }
         scaled = {
             name: rate * (factor if name == "offsets" or not means_alone else 1)
             for name, rate in by_name.items()
@@ -102,8 +107,11 @@ class Fields:
 
     def _unconstrained(self, gaussians: Gaussians) -> tuple[Float[Tensor, "N 3"], Parameters]:
         """Return the origins of the offsets, and the parameters: copies in float32."""
-        options = {"dtype": torch.float32, "memory_format": torch.contiguous_format, "copy": True}
-        gaussians = gaussians.map(lambda field: field.detach().to(**options))
+        gaussians = gaussians.map(
+            lambda field: field.detach().to(
+                torch.float32, copy=True, memory_format=torch.contiguous_format
+            )
+        )
         sh = gaussians.sh[:, : self.count]
         missing = sh.new_zeros(len(sh), self.count - sh.shape[1], 3)
         return gaussians.means, {

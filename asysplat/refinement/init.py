@@ -3,7 +3,7 @@
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from asysplat.data.photographs import Photographs
@@ -39,7 +39,8 @@ def initial_gaussians(
     larger ones: `RefinementSettings.initial_limit`.
 
     Raises:
-        InputError: `init` is none of INITS, or needs points or depths that the photographs lack.
+        InputError: `init` is none of INITS, or needs points or depths that the photographs lack, or
+            a network that is not given.
     """
     inputs, pixels = photographs.inputs, 1.0
     views = inputs.select(
@@ -54,6 +55,8 @@ def initial_gaussians(
             )
         gaussians = gaussians_from_points(photographs.points, inputs)
     elif init == "network":
+        if network is None:
+            raise InputError("init=network needs a network: give one, or choose plane_sweep.")
         small = _shrink(views, NETWORK_MAX_SIDE, network.patch)
         gaussians = without_invisible(network.eval()(small))
         pixels = longest / max(small.cameras.height, small.cameras.width)
@@ -117,7 +120,7 @@ def gaussians_from_points(points: Float[Tensor, "P 3"], views: Views) -> Gaussia
     sizes = footprints(points, views.cameras)  # the minimum: for lone or coincident points
     if len(points) > 1:
         ranks = range(2, min(NEIGHBORS + 1, len(points)) + 1)  # the first is the point itself
-        distances = cKDTree(points.numpy()).query(points.numpy(), k=list(ranks))[0]
+        distances = KDTree(points.numpy()).query(points.numpy(), k=list(ranks))[0]
         sizes = torch.maximum(sizes, torch.as_tensor(distances.mean(-1)).to(points))
     opacities = torch.full_like(sizes, POINT_OPACITY)
     return isotropic_gaussians(points, sizes, opacities, sample_colors(points, views))

@@ -91,13 +91,13 @@ class Refinement:
         # The factor of the rates: 1, then down to `final_lr_factor` over the cool-down.
         cooled = max(0.0, (progress - 1 + cool_down) / cool_down) if cool_down else 0
         factor = settings.final_lr_factor**cooled
-        error, gradients = 0.0, None
+        error, sums = 0.0, ()
         for view in chosen:
             mse, of_view = self._gradients(views.select([view]), view, leaves, factor)
             self._densifier.observe_view(of_view[0], views.cameras.select([view]))
-            gradients = of_view if gradients is None else list(map(torch.add, gradients, of_view))
+            sums = list(map(torch.add, sums, of_view)) if sums else of_view
             error += mse / len(chosen)
-        gradients = dict(zip(leaves, gradients, strict=True))
+        gradients = dict(zip(leaves, sums, strict=True))
         degree = (
             MAX_SH_DEGREE if settings.every is None else self._steps // settings.every.sh_degree
         )
@@ -202,7 +202,8 @@ def refine(
         >>> views = open_photographs("my_scene", height=64, views=4).inputs
         >>> gaussians = refine(load("shipped")(views), views, steps=5)
     """
-    if (seconds is None) == (steps is None) or not (steps if seconds is None else seconds) > 0:
+    budgets = [budget for budget in (seconds, steps) if budget is not None]
+    if len(budgets) != 1 or not budgets[0] > 0:
         raise InputError(f"refine got seconds={seconds} and steps={steps}: give one, above 0.")
     refinement = Refinement(gaussians, views, background, settings, seed)
     if seconds is not None:  # a step with few Gaussians compiles the kernels before the time runs
@@ -226,7 +227,7 @@ def refine(
         errors.append(refinement.step(progress))
         step += 1
         passed = time.perf_counter() - clock
-        used = step / steps if seconds is None else passed / seconds
+        used = (step if seconds is None else passed) / budgets[0]
         progress = min(1.0, max(used, step / max_steps))
         psnr = -10 * math.log10(max(sum(errors) / len(errors), 1e-10))
         status = RefinementProgress(step, progress, passed, psnr, len(refinement.fields))

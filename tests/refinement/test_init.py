@@ -294,9 +294,10 @@ def test_merging_gives_the_same_bits_on_any_number_of_threads(threads):
         ("swep", "init=swep: choose network, plane_sweep, points, depth, or a"),
         ("points", "init=points: scene has no sparse points; choose plane_sweep"),
         ("depth", "init=depth: scene has no depth maps; choose plane_sweep or points"),
+        ("network", "init=network needs a network: give one"),
     ],
 )
-def test_a_start_from_what_photographs_lack_is_refused(init, message):
+def test_a_start_from_what_is_lacking_is_refused(init, message):
     views, frame = front_views(), Normalization(torch.eye(4, dtype=torch.float64), 1.0)
     photographs = Photographs("scene", views, None, ["a.png"], [], frame, None)
     with pytest.raises(InputError, match=message):

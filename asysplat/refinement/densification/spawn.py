@@ -63,7 +63,8 @@ class ErrorDensifier(Densifier):
             outs = [
                 render(gaussians, camera, self.background, depth="median") for camera in cameras
             ]
-            images, depths = torch.cat([o.image for o in outs]), torch.cat([o.depth for o in outs])
+            images = torch.cat([out.image for out in outs])
+            depths = torch.cat([out.depth for out in outs if out.depth is not None])
             new = spawn_at_errors(views, images, depths, count, self.generator)
             self.fields.append(new, self.units(new.means))
             visible = self._last_visible.new_full((new.num_gaussians,), self._steps)
