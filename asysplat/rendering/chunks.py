@@ -108,7 +108,8 @@ class _Deferred(torch.autograd.Function):
                 for image, grad in zip(images, grads, strict=True)
                 if grad is not None and image is not None and image.requires_grad
             ]
-            torch.autograd.backward(*map(list, zip(*outputs, strict=True)))
+            drawn, drawn_grads = map(list, zip(*outputs, strict=True))
+            torch.autograd.backward(drawn, drawn_grads)
             for name, total, tensor in zip(NAMES, totals, inputs, strict=True):
                 if total is not None and tensor.grad is not None:
                     (total[:, views] if name in PER_VIEW else total).add_(tensor.grad)

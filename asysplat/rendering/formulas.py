@@ -8,7 +8,7 @@ import inspect
 import math
 from collections.abc import Callable
 from types import FunctionType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -40,12 +40,12 @@ class KernelInputs(NamedTuple):
     scenes; cameras [B * V, 20], rows from `camera_rows`.
     """
 
-    means: object
-    quats: object
-    scales: object
-    opacities: object
-    sh: object
-    cameras: object
+    means: Any
+    quats: Any
+    scales: Any
+    opacities: Any
+    sh: Any
+    cameras: Any
 
 
 def apply_passes(

@@ -1,6 +1,6 @@
 """The arguments and results of a rendering backend."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -86,7 +86,7 @@ _culling = Culling()
 
 
 @contextmanager
-def without_culling(*kinds: str) -> Iterator[None]:
+def without_culling(*kinds: str) -> Generator[None]:
     """Switch kinds of culling off while the block runs, to test and to time what they save."""
     global _culling
     before, _culling = _culling, replace(_culling, **dict.fromkeys(kinds, False))

@@ -70,7 +70,7 @@ def draw(
             f"render's backend is 'cpu' and its Gaussians are on {gaussians.means.device}: choose "
             "'auto', or move them with .to('cpu')."
         )
-    images = cameras.intrinsics.shape[:2].numel()
+    images = math.prod(cameras.intrinsics.shape[:2])
     if images * gaussians.num_gaussians > MAX_SPLATS and cameras.num_views > 1:
         raise MemoryError(f"{images} images of {gaussians.num_gaussians} Gaussians")
     return apply_passes(_Passes, gaussians, cameras, settings, masks)
@@ -88,7 +88,7 @@ class _Passes(torch.autograd.Function):
         _, _, transmittance, _, origins = images
         ctx.save_for_backward(*tensors, transmittance)  # an output must be saved here
         ctx.settings, ctx.size, ctx.frame, ctx.lists = settings, size, frame, lists
-        ctx.saved, ctx.auxiliary = saved._replace(transmittance=None), auxiliary
+        ctx.saved, ctx.auxiliary = saved[1:], auxiliary  # without the transmittance
         ctx.set_materialize_grads(False)
         if origins is not None:
             ctx.mark_non_differentiable(origins)
@@ -107,7 +107,7 @@ class _Passes(torch.autograd.Function):
             transmittance=grad_transmittance.numpy(),
             pairs=np.empty((len(lists.entries), GRADIENT), np.float32),
         )
-        saved = ctx.saved._replace(transmittance=transmittance.numpy())
+        saved = SavedForBackward(transmittance.numpy(), *ctx.saved)
         depths = _depths(ctx.settings.depth, grad_depth, ctx.auxiliary)
         tiles = weighted_bounds(lists.first_entry)
         run_blocks(rasterize_backward, tiles, lists, frame, saved, grads, *depths)
@@ -267,13 +267,12 @@ def _project_backward(
     flat = inputs._replace(quats=inputs.quats.reshape(-1), scales=inputs.scales.reshape(-1))
     blocks = even_bounds(frame.images // frame.views * frame.blocks)
     run_blocks(project_backward, blocks, flat, frame, *pairs, needs, grads)
-    if not needs[0]:
-        field_grads[-1] = None
+    *others, sh = field_grads
     poses = (None, None)
     if needs[1]:
         rows = torch.from_numpy(camera_grads.sum(1))
         poses = camera_gradients(rows, cam_to_world, intrinsics)
-    return (*field_grads, *poses)
+    return (*others, sh if needs[0] else None, *poses)
 
 
 def _depths(
@@ -283,7 +282,7 @@ def _depths(
 
     `auxiliary` holds the origins of a blended depth, or the ranks of a median depth.
     """
-    if depth is None:
+    if depth is None or auxiliary is None:
         return None, None
     array = depth.contiguous().numpy()
     if kind == "median":

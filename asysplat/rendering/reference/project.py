@@ -146,10 +146,10 @@ def project_footprints(
     focal = torch.stack((intrinsics[..., 0, 0], intrinsics[..., 1, 1]), -1)
     principal = intrinsics[..., :2, 2]
 
-    size = focal.new_tensor(size)
-    margin = settings.limits.frustum_margin * size
+    sides = focal.new_tensor(size)
+    margin = settings.limits.frustum_margin * sides
     clamped = torch.clamp(
-        tangents, (-principal - margin) / focal, (size - principal + margin) / focal
+        tangents, (-principal - margin) / focal, (sides - principal + margin) / focal
     )
     # Rows of J R^T, in world axes.
     jacobian = (focal / z[..., None])[..., None] * (
@@ -167,10 +167,10 @@ def _pixel_range(
     """Compute the first and last pixel (x, y) whose center is in the box of alpha >= alpha_min."""
     distance = (2 * (opacities / settings.limits.alpha_min).log().clamp_min(0)).sqrt()
     extent = footprint.deviations * distance[..., None] + BOUNDS_MARGIN
-    size = extent.new_tensor(size)
-    zero = torch.zeros_like(size)
-    first = (footprint.xy - extent - 0.5).ceil().clamp(zero, size)
-    last = (footprint.xy + extent - 0.5).floor().clamp(zero - 1, size - 1)
+    sides = extent.new_tensor(size)
+    zero = torch.zeros_like(sides)
+    first = (footprint.xy - extent - 0.5).ceil().clamp(zero, sides)
+    last = (footprint.xy + extent - 0.5).floor().clamp(zero - 1, sides - 1)
     return first, last
 
 
