@@ -21,9 +21,8 @@ def reconstruct(folder: Path, scene: Path, figure: Path) -> None:
     with torch.no_grad():
         start = load("shipped")(photographs.inputs)
     gaussians = refine(start, photographs.inputs, seconds=10.0)
-    write_gaussians(
-        scene, photographs.normalization.to_world(gaussians)
-    )  # in the world of the files
+    world = photographs.normalization.to_world(gaussians)  # the world of the files
+    write_gaussians(scene, world)
 
     background = photographs.inputs.mean_color()
     rendering = render(gaussians, photographs.held_out.cameras, background)

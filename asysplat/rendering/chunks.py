@@ -12,7 +12,7 @@ from asysplat.errors import InputError
 from asysplat.rendering.interface import RenderOutputs, RenderSettings
 from asysplat.scene import Cameras, Gaussians
 
-Draw = Callable[[Gaussians, Cameras, RenderSettings, Tensor | None], RenderOutputs]
+Draw = Callable[..., RenderOutputs]  # a backend's `draw`
 PER_VIEW = ("cam_to_world", "intrinsics")
 NAMES = (*(field.name for field in dataclasses.fields(Gaussians)), *PER_VIEW)
 NOT_SUMMED = ("tile_size",)  # statistics that are the same for all chunks
@@ -25,16 +25,24 @@ def draw_in_chunks(
     settings: RenderSettings,
     masks: Tensor | None,
     views_at_once: int | None,
+    centers: Tensor | None = None,
 ) -> RenderOutputs:
     """Draw all views at once, or `views_at_once` of every scene at a time.
 
-    If memory is too small, try half as many, with a warning.
+    If memory is too small, try half as many, with a warning. With `centers`, which receives the
+    gradients of the splats' centers, all are drawn at once.
 
     Raises:
-        InputError: views_at_once below 1.
+        InputError: views_at_once below 1, or with centers.
     """
     if views_at_once is not None and views_at_once < 1:
         raise InputError(f"render's views_at_once is {views_at_once}: give at least 1, or None.")
+    if centers is not None:
+        if views_at_once is not None:
+            raise InputError(
+                f"render's views_at_once is {views_at_once} and projections=True: leave out one."
+            )
+        return draw(gaussians, cameras, settings, masks, centers)
     num_views = min(views_at_once or cameras.num_views, cameras.num_views)
 
     def draw_views(

@@ -54,14 +54,18 @@ def apply_passes(
     cameras: Cameras,
     settings: RenderSettings,
     masks: Bool[Tensor, "B V H W"] | None,
+    centers: Float[Tensor, "B V N 2"] | None,
 ) -> RenderOutputs:
-    """Run a backend's forward passes as one operation of torch."""
+    """Run a backend's forward passes as one operation of torch.
+
+    `centers` is not read: it receives the gradients of the splats' centers.
+    """
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     poses = (cameras.cam_to_world, cameras.intrinsics)
     size = (cameras.height, cameras.width)
     stats: dict[str, int] = {}
     masks = masks if settings.culling.masks else None
-    *images, origins = passes.apply(settings, size, masks, stats, *fields, *poses)
+    *images, origins = passes.apply(settings, size, masks, stats, centers, *fields, *poses)
     return RenderOutputs(*images, stats, origins)
 
 

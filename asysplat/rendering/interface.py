@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.scene import TensorRecord
 
 DEPTHS = ("accumulated", "expected", "median")
 MAX_MAGNITUDE = 1e18  # limit of depths and SH coefficients: more is culled, as squares overflow
@@ -121,6 +122,23 @@ class RenderSettings:
                 f"render's depth is {self.depth!r}: choose True, False or one of "
                 f"{', '.join(DEPTHS)}."
             )
+
+
+@dataclass(frozen=True)
+class Projections(TensorRecord):
+    """Every Gaussian in every view as a 2D Gaussian, as densification needs it.
+
+    Args:
+        means2d: [..., V, N, 2] centers in pixels; a leaf whose .grad a backward pass of the image
+            fills, where gradients are enabled.
+        conics: [..., V, N, 3] inverse covariances, as (xx, xy, yy), in 1 / pixels^2.
+        radii: [..., V, N] three standard deviations along the longer axis, in pixels; 0 where the
+            Gaussian is culled.
+    """
+
+    means2d: Float[Tensor, "*batch V N 2"]
+    conics: Float[Tensor, "*batch V N 3"]
+    radii: Float[Tensor, "*batch V N"]
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,11 @@ from asysplat.rendering.chunks import draw_in_chunks
 from asysplat.rendering.interface import (
     INRIA,
     BlendingLimits,
+    Projections,
     RenderOutputs,
     RenderSettings,
 )
+from asysplat.rendering.reference.project import project_centers
 from asysplat.scene import Cameras, Gaussians, TensorRecord
 
 DEPTH_SWITCH = {True: "expected", False: None}  # meanings of depth=True and depth=False
@@ -25,14 +27,18 @@ MIN_ALPHA = 1e-6  # avoids division by 0; an alpha below 1/255 is exactly 0
 
 
 def _draw_by_cuda(
-    gaussians: Gaussians, cameras: Cameras, settings: RenderSettings, masks: Tensor | None = None
+    gaussians: Gaussians,
+    cameras: Cameras,
+    settings: RenderSettings,
+    masks: Bool[Tensor, "B V H W"] | None = None,
+    centers: Float[Tensor, "B V N 2"] | None = None,
 ) -> RenderOutputs:
     """Import Triton at the first call: a machine without a GPU may lack it."""
     try:
         from asysplat.rendering.cuda.draw import draw
     except ImportError as error:
         raise InputError("render's backend 'cuda' needs triton: pip install triton.") from error
-    return draw(gaussians, cameras, settings, masks)
+    return draw(gaussians, cameras, settings, masks, centers)
 
 
 BACKENDS = {"reference": reference.draw, "cpu": cpu.draw, "cuda": _draw_by_cuda}
@@ -48,12 +54,14 @@ class Rendering(TensorRecord):
         depth: [..., V, H, W] in scene units, 0 without a visible Gaussian; None if not requested.
         stats: visible (pairs of Gaussian and view), pairs (of these with tiles), tile_size, and
             what the backend culled.
+        projections: the Gaussians as 2D Gaussians; None if not requested.
     """
 
     image: Float[Tensor, "*batch V 3 H W"]
     alpha: Float[Tensor, "*batch V H W"]
     depth: Float[Tensor, "*batch V H W"] | None
-    stats: dict[str, float | int]
+    stats: dict[str, int]
+    projections: Projections | None = None
 
 
 def render(
@@ -68,6 +76,7 @@ def render(
     limits: BlendingLimits = INRIA,
     masks: Bool[Tensor, "*batch V H W"] | None = None,
     views_at_once: int | None = None,
+    projections: bool = False,
     validate: bool = False,
 ) -> Rendering:
     """Render every view, by alpha compositing in depth order (Kerbl et al. 2023).
@@ -93,11 +102,13 @@ def render(
         views_at_once: draw this many views of each scene at a time, keep only the inputs, and draw
             again in the backward pass (deferred backpropagation, Zhang et al. 2022): the same
             gradient with the memory of these views. None draws all at once.
+        projections: also return every Gaussian as a 2D Gaussian, whose centers get a gradient.
         validate: check every number of `gaussians` and `cameras` first.
 
     Raises:
         InputError: an unknown backend or depth; incompatible shapes, devices or types; more pairs
-            of Gaussian and tile than a list can number; with `validate`, everything that
+            of Gaussian and tile than a list can number; `projections` with `views_at_once`; with
+            `validate`, everything that
             `Gaussians.validate` and `Cameras.validate` refuse.
 
     Example:
@@ -117,7 +128,8 @@ def render(
     batch = _check(gaussians, cameras, background, masks)
     dtype = torch.promote_types(gaussians.means.dtype, cameras.cam_to_world.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    settings = RenderSettings(limits, antialiased, DEPTH_SWITCH.get(depth, depth))
+    kind = DEPTH_SWITCH[depth] if isinstance(depth, bool) else depth
+    settings = RenderSettings(limits, antialiased, kind)
     with without_autocast(gaussians.means):
         scenes = gaussians.map(lambda t: _one_batch(t.to(dtype), batch))
         if sh_degree is not None:
@@ -126,30 +138,37 @@ def render(
         auto = BACKENDS[fast_backend(scenes.means, "reference")]
         draw = pick_backend("render", {"auto": auto, **BACKENDS}, backend)
         view_masks = None if masks is None else _one_batch(masks, batch)
-        out = draw_in_chunks(draw, scenes, views, settings, view_masks, views_at_once)
+        projected = centers = None
+        if projections:
+            projected = project_centers(scenes, views, settings)
+            projected = projected.map(lambda t: t.reshape(*batch, *t.shape[1:]))
+            # A leaf: the means get their gradients from the passes.
+            projected.means2d.requires_grad_(torch.is_grad_enabled())
+            centers = _one_batch(projected.means2d, batch)
+        out = draw_in_chunks(draw, scenes, views, settings, view_masks, views_at_once, centers)
 
         def shaped(images: Tensor) -> Tensor:
             return images.to(dtype).unflatten(0, (*batch, cameras.num_views))
 
         image, alpha, transmittance = map(shaped, (out.image, out.alpha, out.transmittance))
-        distance = None if out.depth is None else shaped(_depth(out, settings))
+        distance = None if out.depth is None else shaped(_depth(out.depth, out, settings.depth))
         if masks is not None:
             image = image.where(masks[..., None, :, :], 0)
             alpha, transmittance = alpha.where(masks, 0), transmittance.where(masks, 1)
             distance = None if distance is None else distance.where(masks, 0)
         if background is not None:
             image = image + transmittance[..., None, :, :] * background.to(dtype)[..., None, None]
-        return Rendering(image, alpha, distance, out.stats)
+        return Rendering(image, alpha, distance, out.stats, projected)
 
 
-def _depth(out: RenderOutputs, settings: RenderSettings) -> Tensor:
+def _depth(depth: Tensor, out: RenderOutputs, kind: str | None) -> Tensor:
     """Compute the depth [I, H, W] of the requested kind."""
-    if settings.depth == "median":
-        return out.depth
+    if kind == "median":
+        return depth
     origin = 0 if out.depth_origin is None else out.depth_origin
-    if settings.depth == "accumulated":
-        return out.depth + origin * out.alpha
-    return out.depth / out.alpha.clamp_min(MIN_ALPHA) + origin * (out.alpha > 0)
+    if kind == "accumulated":
+        return depth + origin * out.alpha
+    return depth / out.alpha.clamp_min(MIN_ALPHA) + origin * (out.alpha > 0)
 
 
 def _one_batch(tensor: Tensor, batch: tuple[int, ...]) -> Tensor:

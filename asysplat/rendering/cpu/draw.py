@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -14,7 +14,7 @@ from asysplat.kernels.simd.threads import even_bounds, run_blocks, weighted_boun
 from asysplat.rendering.cpu import project as projection
 from asysplat.rendering.cpu import rasterize as raster
 from asysplat.rendering.cpu.project import Projected, project
-from asysplat.rendering.cpu.project_backward import project_backward
+from asysplat.rendering.cpu.project_backward import LOG_2, project_backward
 from asysplat.rendering.cpu.rasterize import (
     BlendedDepth,
     Gradients,
@@ -25,6 +25,8 @@ from asysplat.rendering.cpu.rasterize import (
     rasterize_backward,
 )
 from asysplat.rendering.cpu.splat import (
+    G_X,
+    G_Y,
     GRADIENT,
     SPLAT,
     TILE,
@@ -55,10 +57,12 @@ def draw(
     cameras: Cameras,
     settings: RenderSettings,
     masks: Bool[Tensor, "B V H W"] | None = None,
+    centers: Float[Tensor, "B V N 2"] | None = None,
 ) -> RenderOutputs:
     """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
 
-    The values of pixels where `masks` is False are arbitrary.
+    The values of pixels where `masks` is False are arbitrary. `centers` receives the gradients of
+    the centers.
 
     Raises:
         MemoryError: too many splats at once.
@@ -73,14 +77,14 @@ def draw(
     images = math.prod(cameras.intrinsics.shape[:2])
     if images * gaussians.num_gaussians > MAX_SPLATS and cameras.num_views > 1:
         raise MemoryError(f"{images} images of {gaussians.num_gaussians} Gaussians")
-    return apply_passes(_Passes, gaussians, cameras, settings, masks)
+    return apply_passes(_Passes, gaussians, cameras, settings, masks, centers)
 
 
 class _Passes(torch.autograd.Function):
     """The forward and backward passes; the forward pass fills `stats`."""
 
     @staticmethod
-    def forward(ctx, settings, size, masks, stats, *tensors):
+    def forward(ctx, settings, size, masks, stats, centers, *tensors):
         frame = _frame(tensors, size, settings)
         inputs = _inputs(tensors, size, settings)
         lists = _list_tiles(frame, *_project(frame, inputs), masks, stats)
@@ -112,9 +116,11 @@ class _Passes(torch.autograd.Function):
         tiles = weighted_bounds(lists.first_entry)
         run_blocks(rasterize_backward, tiles, lists, frame, saved, grads, *depths)
         inputs = _inputs(tensors, ctx.size, ctx.settings)
-        needs = (ctx.needs_input_grad[8], any(ctx.needs_input_grad[9:]))
+        needs = (ctx.needs_input_grad[9], any(ctx.needs_input_grad[10:]))
         pairs = (lists.first_pair, grads.pairs)
-        return (None,) * 4 + _project_backward(frame, inputs, needs, pairs, tensors)
+        centers = _center_gradients(frame, *pairs) if ctx.needs_input_grad[4] else None
+        fields = _project_backward(frame, inputs, needs, pairs, tensors)
+        return (None,) * 4 + (centers, *fields)
 
 
 def _frame(tensors: Sequence[Tensor], size: tuple[int, int], settings: RenderSettings) -> Frame:
@@ -273,6 +279,17 @@ def _project_backward(
         rows = torch.from_numpy(camera_grads.sum(1))
         poses = camera_gradients(rows, cam_to_world, intrinsics)
     return (*others, sh if needs[0] else None, *poses)
+
+
+def _center_gradients(
+    frame: Frame, first_pair: np.ndarray, pair_grads: np.ndarray
+) -> Float[Tensor, "B V N 2"]:
+    """Sum the gradients of each splat's center over its tiles."""
+    counts = torch.from_numpy(first_pair).diff()
+    owners = torch.arange(len(counts)).repeat_interleave(counts)
+    sums = torch.zeros(len(counts), 2, dtype=torch.float64)
+    sums.index_add_(0, owners, LOG_2 * torch.from_numpy(pair_grads[:, [G_X, G_Y]]).double())
+    return sums.float().view(-1, frame.views, frame.num, 2)
 
 
 def _depths(

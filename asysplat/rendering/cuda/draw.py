@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -37,9 +38,15 @@ PROJECT_OPTIONS = {"enable_fp_fusion": False}
 
 
 def draw(
-    gaussians: Gaussians, cameras: Cameras, settings: RenderSettings, masks: Tensor | None = None
+    gaussians: Gaussians,
+    cameras: Cameras,
+    settings: RenderSettings,
+    masks: Bool[Tensor, "B V H W"] | None = None,
+    centers: Float[Tensor, "B V N 2"] | None = None,
 ) -> RenderOutputs:
     """Draw Gaussians [B, N] for cameras [B, V]: B V images, float32.
+
+    `centers` receives the gradients of the centers.
 
     The values of pixels where `masks` is False are arbitrary. Uses all of `settings.culling` but
     rows.
@@ -53,14 +60,14 @@ def draw(
             f"render's backend is 'cuda' and its Gaussians are on {gaussians.means.device}: choose "
             "'auto', or move them with .to('cuda')."
         )
-    return apply_passes(_Passes, gaussians, cameras, settings, masks)
+    return apply_passes(_Passes, gaussians, cameras, settings, masks, centers)
 
 
 class _Passes(torch.autograd.Function):
     """The forward and backward passes; the forward pass fills `stats`."""
 
     @staticmethod
-    def forward(ctx, settings, size, masks, stats, *tensors):
+    def forward(ctx, settings, size, masks, stats, centers, *tensors):
         frame = _frame(tensors, size)
         inputs = _inputs(tensors, size, settings)
         with torch.cuda.device_of(inputs.means):
@@ -108,16 +115,19 @@ class _Passes(torch.autograd.Function):
             )
             inputs = _inputs(tensors, ctx.size, settings)
             needs = {
-                "SH_NEEDED": ctx.needs_input_grad[8],
-                "CAMERAS_NEEDED": any(ctx.needs_input_grad[9:]),
+                "SH_NEEDED": ctx.needs_input_grad[9],
+                "CAMERAS_NEEDED": any(ctx.needs_input_grad[10:]),
             }
             grads = _project_backward(frame, inputs, lists, pair_grads, settings, needs)
+        centers = None
+        if ctx.needs_input_grad[4]:
+            centers = _center_gradients(frame, lists, pair_grads)
         poses = (None, None)
         if grads.cameras is not None:
             poses = camera_gradients(grads.cameras.sum(1), *tensors[5:])
         fields = zip(grads[:5], tensors[:5], strict=True)
         fields = (None if grad is None else grad.view(field.shape) for grad, field in fields)
-        return (None,) * 4 + (*fields, *poses)
+        return (None,) * 4 + (centers, *fields, *poses)
 
 
 def _frame(tensors: Sequence[Tensor], size: tuple[int, int]) -> Frame:
@@ -343,3 +353,13 @@ def _project_backward(
             **PROJECT_OPTIONS,
         )
     return grads
+
+
+def _center_gradients(
+    frame: Frame, lists: TileLists, pair_grads: Float[Tensor, "P 10"]
+) -> Float[Tensor, "B V N 2"]:
+    """Read the gradients of the splats' centers, from what `sum_pairs` has left."""
+    drawn = lists.counts > 0
+    grads = lists.splats.new_zeros(len(drawn), 2)
+    grads[drawn] = math.log(2) * pair_grads[lists.first_pair[drawn].long(), :2]
+    return grads.view(-1, frame.views, frame.num, 2)

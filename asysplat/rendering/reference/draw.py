@@ -1,6 +1,7 @@
 """Run the passes of the reference renderer: project, list tiles, rasterize."""
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asysplat.rendering.interface import RenderOutputs, RenderSettings
@@ -12,13 +13,18 @@ from asysplat.scene import Cameras, Gaussians
 
 
 def draw(
-    gaussians: Gaussians, cameras: Cameras, settings: RenderSettings, masks: Tensor | None = None
+    gaussians: Gaussians,
+    cameras: Cameras,
+    settings: RenderSettings,
+    masks: Bool[Tensor, "B V H W"] | None = None,
+    centers: Float[Tensor, "B V N 2"] | None = None,
 ) -> RenderOutputs:
     """Draw Gaussians [B, N] for cameras [B, V]: B V images, all of one float type.
 
     Ignores `settings.culling`, and so draws masked pixels too.
+    `centers` receives the gradients of the centers.
     """
-    splats = project(gaussians, cameras, settings)
+    splats = project(gaussians, cameras, settings, centers)
     images = cameras.intrinsics.shape[0] * cameras.num_views
     size = (cameras.height, cameras.width)
     lists = list_tiles(splats, images, *size, raster.TILE)

@@ -4,14 +4,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from asysplat.geometry.rotations import rotations
 from asysplat.geometry.spherical_harmonics import sh_colors
-from asysplat.rendering.interface import MAX_MAGNITUDE, RenderSettings
+from asysplat.rendering.interface import MAX_MAGNITUDE, Projections, RenderSettings
 from asysplat.scene import Cameras, Gaussians
 
+RADIUS = 3.0  # standard deviations (Kerbl et al. 2023)
 BOUNDS_MARGIN = 1e-3  # pixels, more than the rounding error of an extent
 
 
@@ -51,13 +52,19 @@ class Footprint(NamedTuple):
     compensation: Tensor  # [...] of the opacity, for antialiasing
 
 
-def project(gaussians: Gaussians, cameras: Cameras, settings: RenderSettings) -> Splats:
+def project(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    settings: RenderSettings,
+    centers: Float[Tensor, "B V N 2"] | None = None,
+) -> Splats:
     """Project the Gaussians of every scene to every view.
 
     Args:
         gaussians: with one batch dimension, [B, N].
         cameras: [B, V], zero skew; image b * V + v is view v of scene b.
         settings: limits and antialiasing.
+        centers: receives the gradients of the centers.
 
     Culled, with gradient 0: depth <= near, opacity < alpha_min, no pixel center within the extent,
     and Gaussians that do not project to finite numbers (NaN, infinity, a zero quaternion).
@@ -78,9 +85,18 @@ def project(gaussians: Gaussians, cameras: Cameras, settings: RenderSettings) ->
     opacities = gaussians.opacities.flatten().index_select(0, indices) * footprint.compensation
     first, last = _pixel_range(footprint, opacities, size, settings)
     sh = gaussians.sh.flatten(0, 1).index_select(0, indices)
+    xy = footprint.xy
+    if centers is not None:
+        xy = (
+            xy
+            + (centers - centers.detach())[
+                *(images // cameras.num_views, images % cameras.num_views),
+                indices % gaussians.num_gaussians,
+            ]
+        )
     return Splats(
         images=images,
-        xy=footprint.xy,
+        xy=xy,
         whitening=footprint.whitening,
         opacities=opacities,
         colors=sh_colors(sh, footprint.offsets),
@@ -95,6 +111,42 @@ def select_visible(
     gaussians: Gaussians, cameras: Cameras, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
     """Return image and flat Gaussian index of every visible pair, in the order of `Splats`."""
+    footprint, visible = _project_all(gaussians, cameras, settings)
+    visible = visible.flatten(0, 1)
+    depths = footprint.depths.flatten(0, 1).where(visible, torch.inf)
+    order = torch.argsort(depths, dim=-1, stable=True)
+    images, ranks = torch.nonzero(
+        torch.arange(depths.shape[1], device=depths.device) < visible.sum(-1, keepdim=True),
+        as_tuple=True,
+    )
+    scenes = images // cameras.num_views
+    return images, order[images, ranks] + scenes * gaussians.num_gaussians
+
+
+@torch.no_grad()
+def project_centers(
+    gaussians: Gaussians, cameras: Cameras, settings: RenderSettings
+) -> Projections:
+    """Project Gaussians [B, N] to views [B, V], without gradients; 0 where one is culled."""
+    footprint, visible = _project_all(gaussians, cameras, settings)
+    a, b, c = footprint.whitening.unbind(-1)
+    trace, root = a * a + b * b + c * c, a * c
+    # The larger eigenvalue of the inverse covariance; the smaller is root^2 over it.
+    half = trace / 2
+    largest = half + ((half - root) * (half + root)).clamp_min(0).sqrt()
+    radii = RADIUS * largest.sqrt() / root
+    conics = torch.stack((a * a, a * b, b * b + c * c), -1)
+    return Projections(
+        means2d=footprint.xy.where(visible[..., None], 0),
+        conics=conics.where(visible[..., None], 0),
+        radii=radii.where(visible, 0),
+    )
+
+
+def _project_all(
+    gaussians: Gaussians, cameras: Cameras, settings: RenderSettings
+) -> tuple[Footprint, Bool[Tensor, "B V N"]]:
+    """Project every Gaussian to every view, and return which of them are visible."""
     size = (cameras.width, cameras.height)
     footprint = project_footprints(
         gaussians.means[:, None],
@@ -117,15 +169,8 @@ def select_visible(
         & footprint.whitening.isfinite().all(-1)
         & (footprint.whitening[..., 0] > 0)
         & (gaussians.sh.abs() < MAX_MAGNITUDE).flatten(2).all(-1)[:, None]
-    ).flatten(0, 1)
-    depths = footprint.depths.flatten(0, 1).where(visible, torch.inf)
-    order = torch.argsort(depths, dim=-1, stable=True)
-    images, ranks = torch.nonzero(
-        torch.arange(depths.shape[1], device=depths.device) < visible.sum(-1, keepdim=True),
-        as_tuple=True,
     )
-    scenes = images // cameras.num_views
-    return images, order[images, ranks] + scenes * gaussians.num_gaussians
+    return footprint, visible
 
 
 def project_footprints(
