@@ -1,15 +1,17 @@
 """Images that cannot be used: all are collected and reported together, before anything starts."""
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Literal, TypeVar, TypeVarTuple
 
 from asysplat.errors import InputError
 
 Policy = Literal["fail", "skip"]
 MIN_IMAGES = 2  # in a scene
 MAX_LISTED = 50  # errors in a message
+Item = TypeVarTuple("Item")
+Result = TypeVar("Result")
 
 
 class BadImages:
@@ -29,14 +31,16 @@ class BadImages:
         self.errors: list[str] = []
 
     @contextmanager
-    def collect(self) -> Iterator[None]:
+    def collect(self) -> Generator[None]:
         """Collect an InputError that is raised inside, and go on after the block."""
         try:
             yield
         except InputError as error:
             self.errors.append(str(error))
 
-    def read_each(self, read: Callable[..., Any], items: Iterable[tuple]) -> list[Any]:
+    def read_each(
+        self, read: Callable[[*Item], Result], items: Iterable[tuple[*Item]]
+    ) -> list[Result]:
         """Return `read(*item)` of every item that can be read, and collect the other errors."""
         results = []
         for item in items:

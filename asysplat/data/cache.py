@@ -59,7 +59,7 @@ class ImageCache:
 
     def _store(self, file: Path, array: ndarray) -> None:
         if self._on_disk is None:
-            self._on_disk = sum(size for _, size, _ in self._files())
+            self._on_disk = sum(size for _, size, _ in _files(file.parents[1]))
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             # Atomic, since another process may be reading.
@@ -82,7 +82,7 @@ class ImageCache:
             return
         if self._on_disk <= self.disk_bytes:
             return
-        entries = sorted(self._files())
+        entries = sorted(_files(file.parents[1]))
         self._on_disk = sum(size for _, size, _ in entries)
         for _, size, file in entries:
             if self._on_disk <= FILL_AFTER_CLEARING * self.disk_bytes:
@@ -90,16 +90,17 @@ class ImageCache:
             file.unlink(missing_ok=True)
             self._on_disk -= size
 
-    def _files(self) -> list[tuple[float, int, Path]]:
-        """List the last use, the bytes and the path of every array on disk."""
-        entries = []
-        for file in self.folder.glob("*/*.npy"):
-            if not KEY.fullmatch(file.stem) or file.parent.name != file.stem[:2]:
-                continue  # it is not the cache's to remove
-            with suppress(OSError):  # another process has cleared it
-                stat = file.stat()
-                entries.append((stat.st_mtime, stat.st_size, file))
-        return entries
+
+def _files(folder: Path) -> list[tuple[float, int, Path]]:
+    """List the last use, the bytes and the path of every array on disk."""
+    entries = []
+    for file in folder.glob("*/*.npy"):
+        if not KEY.fullmatch(file.stem) or file.parent.name != file.stem[:2]:
+            continue  # it is not the cache's to remove
+        with suppress(OSError):  # another process has cleared it
+            stat = file.stat()
+            entries.append((stat.st_mtime, stat.st_size, file))
+    return entries
 
 
 def _read(file: Path) -> ndarray | None:

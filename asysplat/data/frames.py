@@ -1,6 +1,6 @@
 """Select the sharp frames of a video."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,7 @@ def save_sharp_frames(video: Path, folder: Path, count: int, progress: Progress)
 
 
 @contextmanager
-def _video(path: Path) -> Iterator[tuple[Any, Any]]:
+def _video(path: Path) -> Generator[tuple[Any, Any]]:  # of PyAV, an optional dependency
     """Open a video, and yield it and its stream of images."""
     try:
         import av  # optional dependency

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ import pycolmap
 from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 from numpy import ndarray
 from PIL import Image
+from PIL.ImageFile import ImageFile as OpenedImage
 
 from asysplat.errors import InputError
 
@@ -54,6 +55,7 @@ class EncodedImage:
 
 
 ImageFile = Path | EncodedImage
+Content = TypeVar("Content")
 
 
 @dataclass(frozen=True)
@@ -197,13 +199,13 @@ def resize_and_crop(
     Antialiased (Lanczos), or the pixel under each new center with `nearest`; of booleans, True
     where all pixels are that the new one covers.
     """
-    _, *box = _centered_box(pixels.shape[1], pixels.shape[0], height, width)
+    box = _centered_box(pixels.shape[1], pixels.shape[0], height, width)[1:]
     if pixels.dtype == bool:
         coverage = Image.fromarray(pixels.astype(np.float32))
-        coverage = coverage.resize((width, height), Image.Resampling.BOX, tuple(box))
+        coverage = coverage.resize((width, height), Image.Resampling.BOX, box)
         return np.asarray(coverage) > WHOLE
     method = Image.Resampling.NEAREST if nearest else Image.Resampling.LANCZOS
-    return np.asarray(Image.fromarray(pixels).resize((width, height), method, tuple(box)))
+    return np.asarray(Image.fromarray(pixels).resize((width, height), method, box))
 
 
 def resized_intrinsics(lens: Lens, height: int, width: int) -> Float[ndarray, "3 3"]:
@@ -270,20 +272,20 @@ def _hash_file(path: Path, size: int, modified: int) -> str:
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 
-def _checked_size(image: Image.Image) -> tuple[int, int]:
+def _checked_size(image: OpenedImage) -> tuple[int, int]:
     """Return the size; decode a file without an end marker, which fails if it is cut short."""
-    marker = END_MARKERS.get(image.format or "")
-    if marker:
-        position = image.fp.tell()
-        image.fp.seek(max(0, image.fp.seek(0, 2) - TAIL_BYTES))
-        complete = marker in image.fp.read()
-        image.fp.seek(position)
+    marker, stream = END_MARKERS.get(image.format or ""), image.fp
+    if marker and stream:
+        position = stream.tell()
+        stream.seek(max(0, stream.seek(0, 2) - TAIL_BYTES))
+        complete = marker in stream.read()
+        stream.seek(position)
         if not complete:
             image.load()
     return image.size
 
 
-def _read(file: ImageFile, extract: Callable[[Image.Image], Any]) -> Any:
+def _read(file: ImageFile, extract: Callable[[OpenedImage], Content]) -> Content:
     """Return `extract` of the opened image; every failure becomes an InputError."""
     formats = FORMATS
     if isinstance(file, Path):

@@ -53,9 +53,10 @@ class Photographs:
     def all_views(self) -> Views:
         """Return the inputs and the held-out views as one, without depths."""
         parts = [views for views in (self.inputs, self.held_out) if views is not None]
-        masks = [views.masks for views in parts]
+        masks = [views.masks for views in parts if views.masks is not None]
         images = torch.cat([views.images for views in parts])
-        return Views(self.cameras, images, masks=None if None in masks else torch.cat(masks))
+        all_masks = torch.cat(masks) if len(masks) == len(parts) else None
+        return Views(self.cameras, images, masks=all_masks)
 
 
 def open_photographs(
@@ -162,8 +163,8 @@ def _warn_of_wrong_cameras(scene: PosedScene, say: Callable[[str], None]) -> Non
     """
     lens = scene.images[0].lens
     scale = min(1.0, MATCHED_SIDE / min(lens.height, lens.width))
-    size = (max(1, round(scale * side)) for side in (lens.height, lens.width))
-    matched = FileSequence(scene, SceneOptions(*size))
+    height, width = (max(1, round(scale * side)) for side in (lens.height, lens.width))
+    matched = FileSequence(scene, SceneOptions(height, width))
     files = [str(image.file) for image in scene.images]
     verdict = diagnose_cameras(matched.cameras, find_matches(matched), files)
     if not verdict.fits and verdict.fit is not None:  # else too few points match to tell

@@ -22,11 +22,10 @@ def depths_of_points(points: Points, cameras: Cameras) -> Float[Tensor, "V H W"]
         points: in the world of the cameras.
         cameras: one scene's cameras, [V].
     """
-    points = torch.as_tensor(points, dtype=torch.float64)
-    exact = cameras.to(torch.float64)
+    exact_points, exact = torch.as_tensor(points, dtype=torch.float64), cameras.to(torch.float64)
     inverse = torch.zeros(cameras.num_views, cameras.height, cameras.width)
     for view, nearest in enumerate(inverse):  # every pixel's greatest inverse depth
-        (pixels,), (depth,), (inside,) = exact.select([view]).project(points)
+        (pixels,), (depth,), (inside,) = exact.select([view]).project(exact_points)
         x, y = pixels[inside].long().unbind(-1)
         index, values = y * cameras.width + x, (1 / depth[inside]).float()
         nearest.view(-1).scatter_reduce_(0, index, values, "amax")

@@ -35,7 +35,15 @@ FAR = 100.0
 MIN_EXTENT = 1e-9  # cameras' extent over their distance from the origin: less is rounding
 MAX_DISTANCE = 1e8  # distance up to which cameras within MIN_EXTENT may be in one place
 Points = Float[ndarray, "P 3"]
-Load = Callable[[ImageFile], ndarray]
+
+
+@runtime_checkable
+class Load(Protocol):
+    """A function that reads the pixels of a file."""
+
+    __name__: str
+
+    def __call__(self, path: ImageFile, /) -> ndarray: ...
 
 
 @runtime_checkable
@@ -86,10 +94,10 @@ class PosedImage:
     file: ImageFile
     lens: Lens
     cam_to_world: Float[ndarray, "4 4"]
-    depth: ImageFile | None = None
+    depth: Path | None = None
     depth_unit: float = 1.0
-    mask: ImageFile | None = None
-    disparity: ImageFile | None = None
+    mask: Path | None = None
+    disparity: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -186,7 +194,7 @@ class FileSequence:
 
         return Views(
             cameras=self.cameras.select(indices),
-            images=stack(True, self._image),
+            images=torch.stack([self._image(image) for image in images]),
             depths=stack(self._has_depths, self._depth),
             masks=stack(self._has_masks, self._mask),
             disparities=stack(self._has_disparities, self._disparity),
@@ -235,7 +243,7 @@ class FileSequence:
             return torch.tensor(self._fit(np.ones((lens.height, lens.width), dtype=bool), lens))
         return self._pixels(image.mask, load_mask, lens)
 
-    def _map(self, file: ImageFile | None, load: Load, lens: Lens) -> Float[Tensor, "H W"]:
+    def _map(self, file: Path | None, load: Load, lens: Lens) -> Float[Tensor, "H W"]:
         """Return unmixed values at this sequence's size; 0 without a file."""
         if file is None:
             return torch.zeros(self.options.height, self.options.width)
