@@ -4,7 +4,7 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import pycolmap
 from rich.progress import Progress
@@ -14,6 +14,8 @@ FOLLOWING = 10  # next photographs that each is matched with, besides those 16, 
 ANCHORS = 40  # evenly spread photographs that are all matched: a sequence may return to a place
 CHUNK = 8  # photographs, or that squared of pairs, between two updates of the progress bar
 SEED = 0
+AnyLens = TypeVar("AnyLens", bound=Hashable)
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -41,10 +43,10 @@ HARD = Effort(3200, 8192, 0.002, guided=True, pair=10)
 
 def match_photographs(
     work: Path,
-    lenses: Mapping[str, Hashable],
+    lenses: Mapping[str, AnyLens],
     effort: Effort,
     progress: Progress,
-    cameras: Mapping[Hashable, pycolmap.Camera] | None = None,
+    cameras: Mapping[AnyLens, pycolmap.Camera] | None = None,
 ) -> Path:
     """Write a database of features and verified matches; return its path.
 
@@ -112,5 +114,5 @@ def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
     return [(names[i], names[j]) for i, j in sorted(near | set(combinations(anchors, 2)))]
 
 
-def _chunks(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
+def _chunks(items: Sequence[Item], size: int) -> Iterator[Sequence[Item]]:
     return (items[start : start + size] for start in range(0, len(items), size))

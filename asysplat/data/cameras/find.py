@@ -108,7 +108,7 @@ def find_cameras(
             save_mask(images / name if mask == file else mask, images / name)
         kinds = {names[file]: lens for file, lens in lenses.items()}
         model = _best_model(work, kinds, progress)
-        if _registered(model) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * len(kinds)):
+        if model is None or _registered(model) < max(LEAST_PHOTOGRAPHS, MIN_FOUND * len(kinds)):
             raise InputError(
                 f"{photographs}: found cameras for {_registered(model)} of {len(kinds)} "
                 "photographs: too few show the same place; photograph it with more overlap, from "
@@ -123,8 +123,9 @@ def _photographs(source: Path, on_bad_image: Policy) -> list[Path]:
     if files := photographs_in(source):
         return files
     images = open_scene(source, SceneOptions(1, 1, on_bad_image=on_bad_image)).scene.images
-    files = list(dict.fromkeys(image.file for image in images))
-    if not all(isinstance(file, Path) for file in files):
+    stored = dict.fromkeys(image.file for image in images)
+    files = [file for file in stored if isinstance(file, Path)]
+    if len(files) < len(stored):
         raise InputError(f"{source} has its images inside other files: cameras=given uses it.")
     return files
 

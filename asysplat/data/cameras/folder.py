@@ -1,7 +1,7 @@
 """Folders of COLMAP: photographs, their masks, and a model of their cameras."""
 
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,7 +27,7 @@ ONLY_FATAL = 3  # the least severe messages that are printed
 @contextmanager
 def work_folder(
     where: Path, photographs: int, console: Console | None
-) -> Iterator[tuple[Path, Progress]]:
+) -> Generator[tuple[Path, Progress]]:
     """Yield a temporary folder in `where` with an empty images/, and progress bars; quiet COLMAP.
 
     Raises:

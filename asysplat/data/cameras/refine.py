@@ -29,7 +29,7 @@ from asysplat.data.cameras.folder import (
 )
 from asysplat.data.readers import colmap
 from asysplat.data.readers.common import invert_pose
-from asysplat.data.sequence import PosedImage, PosedScene
+from asysplat.data.sequence import Points, PosedImage, PosedScene
 
 ROUNDS = 2  # rounds of triangulation and bundle adjustment
 LEAST_POINTS = 20  # points that a photograph must see for its pose to be refined
@@ -71,7 +71,8 @@ def refine_cameras(
         InputError: `where` cannot be written to or is too full.
     """
     where = Path(where).absolute()
-    images = {image.file: image for image in scene.images}
+    images = {image.file: image for image in scene.images if isinstance(image.file, Path)}
+    assert len(images) == len(scene.images)  # files, each once
     names = colmap_names(images)
     cameras = [(image.lens, image.cam_to_world.tolist()) for image in scene.images]
     masks = [image.mask for image in scene.images if image.mask not in (None, image.file)]
@@ -95,8 +96,12 @@ def refine_cameras(
         changed.append(
             replace(image, lens=refined_image.lens, cam_to_world=refined_image.cam_to_world)
         )
-    new = replace(scene, images=changed, read_points=lambda: refined_scene.points + scene.origin)
-    return RefinedCameras(new, **errors)
+
+    def read_points() -> Points | None:
+        points = refined_scene.points
+        return None if points is None else points + scene.origin
+
+    return RefinedCameras(replace(scene, images=changed, read_points=read_points), **errors)
 
 
 def _refine(
