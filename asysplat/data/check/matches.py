@@ -75,8 +75,10 @@ def find_matches(sequence: ImageSequence, console: Console | None = None) -> Mat
 
     gap, pairs = FIRST_GAP, []
     starts = np.linspace(0, sequence.num_images - 1, MAX_PAIRS, endpoint=False).astype(int)
-    bar = {"console": console, "transient": True, "disable": console is None}
-    for first in track(starts.tolist(), "matching", **bar):
+    bar = track(
+        starts.tolist(), "matching", console=console, transient=True, disable=console is None
+    )
+    for first in bar:
         pair = match_with_gap(first, gap)
         while len(pair) < MIN_MATCHES and gap > 1:
             gap //= 2
@@ -114,11 +116,11 @@ def _detect(sequence: ImageSequence, index: int) -> Keypoints:
     low, high = np.quantile(gray, (0.01, 0.99))
     gray = np.clip((gray - low) / max(high - low, 1e-3) * 255, 0, 255).astype(np.uint8)
     mask = None if views.masks is None else views.masks[0].numpy().astype(np.uint8)
-    points, descriptors = cv2.SIFT_create(MAX_KEYPOINTS).detectAndCompute(gray, mask)
+    points, descriptors = cv2.SIFT.create(MAX_KEYPOINTS).detectAndCompute(gray, mask)
     if not points:
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
     # OpenCV puts the first pixel's center at 0.
-    return cv2.KeyPoint_convert(points) + np.float32(0.5), descriptors
+    return np.asarray(cv2.KeyPoint.convert(points), np.float32) + 0.5, descriptors
 
 
 def _match(first: Keypoints, second: Keypoints) -> Float[ndarray, "M 2 2"]:
@@ -140,7 +142,7 @@ def _match(first: Keypoints, second: Keypoints) -> Float[ndarray, "M 2 2"]:
     index, other_index = np.array(mutual).T
     matched = np.stack((points[index], other_points[other_index]), 1).astype(np.float64)
     _, inliers = cv2.findFundamentalMat(
-        *matched.swapaxes(0, 1), cv2.FM_RANSAC, RANSAC_THRESHOLD, 0.9999
+        matched[:, 0], matched[:, 1], cv2.FM_RANSAC, RANSAC_THRESHOLD, 0.9999
     )
     return nothing if inliers is None else matched[inliers[:, 0] > 0]
 

@@ -24,8 +24,9 @@ def read_pixels(
         under "depths", and of those that masks keep under "masks", where there are such files.
     """
     intact, fractions = [], {}
-    bar = {"console": console, "transient": True, "disable": console is None}
-    for index, image in enumerate(track(sequence.scene.images, "decoding", **bar)):
+    images = sequence.scene.images
+    bar = track(images, "decoding", console=console, transient=True, disable=console is None)
+    for index, image in enumerate(bar):
         with bad.collect():
             views = sequence.views([index])
             intact.append(image)
@@ -53,9 +54,10 @@ def compare_depths(sequence: ImageSequence, matches: Matches) -> tuple[float, in
     ratios = [torch.empty(0, dtype=torch.float64)]
     for index in indices.unique().tolist():
         in_image = indices == index
-        stored = sequence.views([index]).depths[0].double()
+        stored = sequence.views([index]).depths
+        assert stored is not None
         column, row = points[in_image].long().unbind(-1)
-        ratios.append(stored[row, column] / depths[in_image])
+        ratios.append(stored[0].double()[row, column] / depths[in_image])
     known = torch.cat(ratios)
     known = known[known > 0]
     return float(known.median()), len(known)

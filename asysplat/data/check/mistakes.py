@@ -15,7 +15,7 @@ from asysplat.scene import Cameras
 EXPECTED = ("right", "down", "forward")
 OPPOSITES = ("left", "up", "backward")
 # Directions of the columns of a camera-to-world rotation in other conventions.
-CONVENTIONS = {
+CONVENTIONS: dict[tuple[str, ...], str] = {
     ("right", "up", "backward"): "OpenGL",
     ("down", "right", "backward"): "LLFF",
     ("left", "up", "forward"): "PyTorch3D",

@@ -50,7 +50,8 @@ def draw_report(report: Report, title: str) -> Figure:
     pair_height = 2 * (image_height + TITLE_HEIGHT)
     figure = Figure(figsize=(WIDTH, PATH_HEIGHT + pair_height), layout="constrained")
     figure.suptitle(f"{title}: {report.verdict.summary}", wrap=True)
-    paths, images = figure.subfigures(2, 1, height_ratios=(PATH_HEIGHT, pair_height))
+    heights = (PATH_HEIGHT, pair_height)
+    paths, images = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
     _draw_path(report, *paths.subplots(1, 2))
     all_pairs = report.matches.pairs
     shown = evenly_spaced(range(len(all_pairs)), min(MAX_PAIRS, len(all_pairs)))
