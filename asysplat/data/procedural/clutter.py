@@ -34,8 +34,8 @@ def polish(plan: FloorPlan, rng: Generator) -> None:
         if rng.random() <= GLOSSY_PROBABILITY:
             gloss, shininess = rng.uniform(0.2, 1.2), np.exp(rng.uniform(2, 5))
             polished[material] = replace(material, gloss=gloss, shininess=shininess)
-    plan.boxes = [(*box, polished[material]) for *box, material in plan.boxes]
-    plan.spheres = [(*sphere, polished[material]) for *sphere, material in plan.spheres]
+    plan.boxes = [(center, half, yaw, polished[m]) for center, half, yaw, m in plan.boxes]
+    plan.spheres = [(center, radius, polished[m]) for center, radius, m in plan.spheres]
     plan.shell = [polished[material] for material in plan.shell]
 
 

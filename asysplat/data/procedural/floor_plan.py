@@ -3,7 +3,7 @@
 All in meters, z up, the floor at about 0, the path around the origin.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -72,6 +72,10 @@ class FloorPlan:
         return spots[free.argmax()]
 
 
+# Adds an object at x, y, of a size in meters.
+AddObject = Callable[[FloorPlan, Generator, float, float, float], None]
+
+
 def any_material(rng: Generator) -> Material:
     kinds = (textures.cloth, textures.planks, textures.tiles, textures.plaster, textures.cloth)
     return kinds[rng.integers(len(kinds))](rng)
@@ -137,7 +141,7 @@ def house(plan: FloorPlan, rng: Generator, x: float, y: float, size: float) -> N
 def scatter(
     plan: FloorPlan,
     rng: Generator,
-    kinds: list[tuple[Callable, float, float]],
+    kinds: Sequence[tuple[AddObject, float, float]],
     spots: Callable[[], Float[np.ndarray, "K 2"]],
 ) -> None:
     """Add one object of each (kind, smallest size, largest size), if there is a free spot."""

@@ -4,7 +4,9 @@ Points and directions are component-major, [3, R], so that every operation runs 
 Directions need no unit length: a hit at t lies at origin + t * direction. A miss is infinity.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -21,6 +23,7 @@ Points = Float[Tensor, "3 R"]  # or directions
 Origins = Float[Tensor, "3 #R"]  # origins of rays, or one for all
 PerRay = Float[Tensor, " R"]
 Index = Int[Tensor, "_"]  # any number of indices
+SomeSolids = TypeVar("SomeSolids", bound="Solids")
 
 
 @dataclass(frozen=True)
@@ -55,14 +58,21 @@ class Cone:
         return (gap <= gap.min().clamp(min=ANGLE_ROUNDING)).nonzero()[:, 0]
 
 
-class Solids(TensorRecord):
-    """Convex objects with `centers` and bounding radii."""
+@dataclass(frozen=True)
+class Solids(TensorRecord, ABC):
+    """Convex objects."""
+
+    centers: Float[Tensor, "S 3"]
+
+    @abstractmethod
+    def bounding_radii(self) -> Float[Tensor, " S"]:
+        """Return the radius of a sphere around each center that holds the object."""
 
     def within(self, cone: Cone, margin: float = 0.0) -> Index:
         """Return the objects nearer to the cone than `margin`, as `Cone.meets` does."""
         return cone.meets(self.centers, self.bounding_radii() + margin)
 
-    def select(self, index: Index) -> "Solids":
+    def select(self: SomeSolids, index: Index) -> SomeSolids:
         return self.map(lambda values: values[index])
 
 

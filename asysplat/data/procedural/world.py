@@ -48,12 +48,13 @@ class World:
         centers, radii, _ = zip(*plan.spheres, strict=True)
         self._spheres = Spheres(tensor(centers), tensor(radii))
         self._dome = Spheres(tensor(np.zeros((1, 3))), tensor([SKY_RADIUS]))
-        self._room = None if plan.room is None else Room(*map(tensor, plan.room))
-        self._terrain = None
-        if plan.heights is not None:
+        if plan.room is not None:
+            self._enclosure = Room(*map(tensor, plan.room))
+        else:
+            assert plan.heights is not None  # outdoors
             spacing = 2 * SKY_RADIUS / (len(plan.heights) - 1)
             slopes = np.gradient(plan.heights, spacing)[::-1]
-            self._terrain = Terrain(tensor([plan.heights, *slopes]), SKY_RADIUS)
+            self._enclosure = Terrain(tensor([plan.heights, *slopes]), SKY_RADIUS)
         self._glossy = any(material.gloss for material in plan.materials())
         self._surfaces = tensor(_surface_rows(plan, axes, rng)).T.contiguous()
         # Surfaces are numbered: three pairs of faces a box, spheres, walls or ground.
@@ -95,8 +96,8 @@ class World:
         rows = self._surfaces.index_select(1, surface)
         along_u, along_v, offset, flat, curvature, material = rows.split((3, 3, 2, 3, 1, 16))
         normals = torch.where(curvature > 0, (points - flat) * curvature, flat)
-        if self._terrain is not None:
-            normals = torch.where(surface < self._shell, normals, self._terrain.normals(points))
+        if isinstance(self._enclosure, Terrain):
+            normals = torch.where(surface < self._shell, normals, self._enclosure.normals(points))
         cosine = (normals * directions).sum(0)
         normals = normals * -cosine.sign()
         uv = torch.stack(((along_u * points).sum(0), (along_v * points).sum(0))) + offset
@@ -143,11 +144,11 @@ class World:
         surface = torch.where(box_t <= sphere_t, 3 * box + face, self._first_sphere + sphere)
         t = torch.minimum(box_t, sphere_t)
         sky_t = self._dome.leave(origins, directions)[0]
-        if self._room is not None:
-            shell_t, wall = self._room.hit(origins, directions)
+        if isinstance(self._enclosure, Room):
+            shell_t, wall = self._enclosure.hit(origins, directions)
         else:
             t = torch.minimum(t, sky_t)
-            shell_t, wall = self._terrain.hit(origins, directions, t, refine_steps), 0
+            shell_t, wall = self._enclosure.hit(origins, directions, t, refine_steps), 0
         surface = torch.where(shell_t < t, self._shell + wall, surface)
         t = torch.minimum(t, shell_t)
         return t, torch.where(t >= sky_t, SKY, surface)
@@ -171,17 +172,16 @@ class World:
         return direct
 
     def _near(self, cone: Cone, margin: float = 0.0) -> tuple[Boxes, Spheres]:
-        return tuple(
-            objects.select(objects.within(cone, margin)) for objects in (self._boxes, self._spheres)
-        )
+        boxes, spheres = self._boxes.within(cone, margin), self._spheres.within(cone, margin)
+        return self._boxes.select(boxes), self._spheres.select(spheres)
 
     def _openness(self, points: Points, normals: Points, cone: Cone) -> PerRay:
         """Compute the fraction of the ambient light that arrives: less near other objects."""
         points = points + OCCLUSION_DISTANCE * normals
-        if self._room is not None:
-            shell = self._room.distance(points)
+        if isinstance(self._enclosure, Room):
+            shell = self._enclosure.distance(points)
         else:
-            shell = self._terrain.above(points[:, None])[0]
+            shell = self._enclosure.above(points[:, None])[0]
         # Once from the cone's surface hits to the points, and once from there to the objects.
         boxes, spheres = self._near(cone, 2 * OCCLUSION_DISTANCE)
         gap = torch.minimum(shell, torch.minimum(boxes.distance(points), spheres.distance(points)))
