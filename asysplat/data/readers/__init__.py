@@ -14,7 +14,7 @@ conf/data/mipnerf360.yaml.
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -51,7 +51,7 @@ LAYOUTS: dict[str, ModuleType] = {reader.__name__.rpartition(".")[2]: reader for
 
 
 @contextmanager
-def _file_errors(path: Path) -> Iterator[None]:
+def _file_errors(path: Path) -> Generator[None]:
     """Raise an InputError for a path that the system refuses: too long, unreadable, a loop."""
     try:
         yield

@@ -123,7 +123,7 @@ def _images_folder(scene: Path, model: Path, names: Sequence[str]) -> Path:
     counts = {
         folder: sum((scene / folder / name).is_file() for name in names) for folder in FOLDERS
     }
-    best = max(counts, key=counts.get)
+    best = max(counts, key=lambda folder: counts[folder])
     if counts[best] == 0:
         named = f"names {len(names)} images, such as {names[0]}" if names else "registers no image"
         raise InputError(

@@ -6,7 +6,6 @@ https://colmap.github.io/format.html
 import re
 import struct
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -105,15 +104,15 @@ def _entries(file: Path) -> list[tuple[int, int]]:
         return end, end
 
     kinds = {"images.bin": image, "points3D.bin": point, "rigs.bin": rig, "frames.bin": frame}
-    kind: Callable[[int], tuple[int, int]] | None = kinds.get(file.name)
     try:
         count = number("<Q", 0)
         if 8 * count > len(stored):
             raise ValueError(f"its header gives {count} entries")
-        for _ in range(count if kind else 0):
-            start = end
-            fixed, end = kind(start)
-            entries.append((start, fixed))
+        if kind := kinds.get(file.name):
+            for _ in range(count):
+                start = end
+                fixed, end = kind(start)
+                entries.append((start, fixed))
         if end > len(stored):
             raise ValueError(f"its entries take {end} bytes")
     except (struct.error, ValueError, OverflowError) as error:

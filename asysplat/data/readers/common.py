@@ -78,7 +78,7 @@ def read_frames(file: Path) -> dict[str, Any]:
     return content
 
 
-def has_path(entry: Any) -> bool:
+def has_path(entry: object) -> bool:
     """Check whether an entry of "frames" names an image file."""
     return isinstance(entry, dict) and isinstance(entry.get("file_path"), str)
 
@@ -112,7 +112,7 @@ def scale_lens(lens: Lens, size: tuple[int, int], where: str) -> Lens:
         InputError: intrinsics of no lens, or an image of other proportions.
     """
     # Integers from JSON may be too large for a float.
-    (width, height), lens_size = size, tuple(min(side, 10**9) for side in (lens.width, lens.height))
+    (width, height), lens_size = size, (min(lens.width, 10**9), min(lens.height, 10**9))
     numbers, longest = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion), max(lens_size)
     usable = 0 < min(lens.fx, lens.fy) <= max(lens.fx, lens.fy) < MAX_FOCAL * longest
     usable &= max(abs(lens.cx), abs(lens.cy)) < MAX_CENTER * longest
@@ -160,7 +160,7 @@ def check_map_size(path: Path, size: tuple[int, int], where: str) -> Path:
     return path
 
 
-def to_array(stored: Any) -> Float[ndarray, "..."]:
+def to_array(stored: object) -> Float[ndarray, "..."]:
     """Convert nested lists to float64; empty where they are no numbers or ragged."""
     try:
         return np.array(stored, dtype=np.float64)
@@ -168,7 +168,7 @@ def to_array(stored: Any) -> Float[ndarray, "..."]:
         return np.empty(0)
 
 
-def check_rigid(stored: Any, where: str) -> Float[ndarray, "4 4"]:
+def check_rigid(stored: object, where: str) -> Float[ndarray, "4 4"]:
     """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal."""
     matrix = to_array(stored)
     if matrix.shape != (4, 4):

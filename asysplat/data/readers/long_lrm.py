@@ -46,13 +46,14 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         size = image_size(image)
         pose = common.invert_pose(common.check_rigid(entry.get("w2c"), f"{where}: w2c"))
         try:
-            lens_size = (round(entry["w"]), round(entry["h"]))
-            lens = Lens(*lens_size, *(float(entry[name]) for name in ("fx", "fy", "cx", "cy")))
+            width, height = round(entry["w"]), round(entry["h"])
+            fx, fy, cx, cy = (float(entry[name]) for name in ("fx", "fy", "cx", "cy"))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(
                 f"{where} needs the numbers w, h, fx, fy, cx and cy in pixels: one is missing or "
                 f"not a number ({error!r})."
             ) from error
+        lens = Lens(width, height, fx, fy, cx, cy)
         return PosedImage(image, common.scale_lens(lens, size, where), pose)
 
     images = bad.read_each(read, enumerate(common.read_frames(file)["frames"]))

@@ -27,8 +27,8 @@ def panorama(width: int, height: int, where: str) -> Lens:
             f"{where} is {PANORAMA} and {width} x {height}: give panoramas of all directions, "
             "twice as wide as high."
         )
-    focal = {"fx": width / (2 * math.pi), "fy": height / math.pi}
-    return Lens(width, height, **focal, cx=width / 2, cy=height / 2, model=PANORAMA)
+    fx, fy = width / (2 * math.pi), height / math.pi
+    return Lens(width, height, fx, fy, cx=width / 2, cy=height / 2, model=PANORAMA)
 
 
 def with_faces(scene: PosedScene, bad: BadImages) -> PosedScene:

@@ -13,7 +13,6 @@ https://google.github.io/realestate10k/download.html
 import zipfile
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -61,7 +60,7 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
         )
     cameras = cameras.double().numpy()
 
-    def read(index: int, image: Any) -> PosedImage:
+    def read(index: int, image: object) -> PosedImage:
         where, camera = f"{scene}, frame {index}", cameras[index]
         if not isinstance(image, Tensor) or image.dtype != torch.uint8 or image.ndim != 1:
             raise InputError(f"{where}: its image is no uint8 tensor [bytes]: give a JPEG's bytes.")
@@ -106,14 +105,14 @@ def _in_folder(folder: Path) -> list[Path]:
     return [folder / name / key for key, name in content.items()]
 
 
-def _load(chunk: Path) -> dict[str, dict[str, Any]]:
+def _load(chunk: Path) -> dict[str, dict[str, object]]:
     if not chunk.is_file():
         raise InputError(f"{chunk} does not exist: copy it there, or name another chunk.")
     return _load_once(chunk, chunk.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=1)  # scenes are mostly opened chunk by chunk
-def _load_once(chunk: Path, modified: int) -> dict[str, dict[str, Any]]:
+def _load_once(chunk: Path, modified: int) -> dict[str, dict[str, object]]:
     try:
         # Only zip files can be mapped; older versions of torch wrote another format.
         scenes = torch.load(

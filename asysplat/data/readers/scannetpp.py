@@ -37,10 +37,10 @@ EXTRACT = (
     "ffmpeg -i rgb.mkv -start_number 0 -q:v 1 rgb/frame_%06d.jpg"
 )
 ARKIT = "iphone/pose_intrinsic_imu.json"
-# For each file of poses: its folders of images, masks and depths, and how to get the images.
+# For each file of poses: its folders of images, masks and depths, or "", and how to get the images.
 PARTS = {
     "dslr/nerfstudio/transforms_undistorted.json": (
-        *("resized_undistorted_images", "resized_undistorted_masks", None),
+        *("resized_undistorted_images", "resized_undistorted_masks", ""),
         "download it, or run the toolkit's dslr.undistort",
     ),
     "dslr/nerfstudio/transforms.json": (
@@ -108,7 +108,7 @@ def _first(scene: Path, camera: str = "") -> list[Path]:
 
 
 def _transforms(
-    file: Path, folder: Path, images: str, masks: str, depths: str | None, bad: BadImages
+    file: Path, folder: Path, images: str, masks: str, depths: str, bad: BadImages
 ) -> list[PosedImage]:
     content = common.read_frames(file)
     downloaded = (folder / masks).is_dir()
@@ -154,11 +154,11 @@ def _arkit(
     content = common.read_json(file)
     if not isinstance(content, dict):
         raise InputError(f"{file} is no object of frames by name: download it again.")
-    masks, depths = (
+    mask_folder, depth_folder = (
         folder / name if (folder / name).is_dir() else None for name in (masks, depths)
     )
 
-    def read(name: str, entry: Any) -> PosedImage:
+    def read(name: str, entry: object) -> PosedImage:
         where = f"{file}, {name}"
         if not isinstance(entry, dict):
             raise InputError(f"{where} is {entry!r}: give its intrinsic and aligned_pose.")
@@ -174,9 +174,9 @@ def _arkit(
             file=image,
             lens=Lens(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
             cam_to_world=common.check_rigid(entry.get("aligned_pose"), f"{where}: aligned_pose"),
-            depth=depths and common.check_map_size(depths / f"{name}.png", size, where),
+            depth=depth_folder and common.check_map_size(depth_folder / f"{name}.png", size, where),
             depth_unit=common.MILLIMETERS,
-            mask=masks and common.check_map_size(masks / f"{name}.png", size, where),
+            mask=mask_folder and common.check_map_size(mask_folder / f"{name}.png", size, where),
         )
 
     return bad.read_each(read, sorted(content.items()))

@@ -107,8 +107,8 @@ def read_images(
         )
 
     images = bad.read_each(read, enumerate(content["frames"]))
-    if all(re.search(r"\d", image.file.stem) for image in images):
-        images.sort(key=lambda image: common.natural_order(image.file))
+    if all(re.search(r"\d", Path(str(image.file)).stem) for image in images):
+        images.sort(key=lambda image: common.natural_order(Path(str(image.file))))
     return images
 
 
@@ -134,14 +134,16 @@ def read_cameras(file: Path) -> Cameras:
     content, poses = common.read_frames(file), [pose for _, pose in read_poses(file)]
     if not poses:
         raise InputError(f"{file} has no frames: give at least one.")
-    lenses, size = [], None
-    for index, entry in enumerate(content["frames"]):
-        fields, where = {**content, **entry}, common.frame_label(file, index, entry)
-        size = size or tuple(round(number(fields, side, where)) for side in ("w", "h"))
-        lenses.append(_lens(fields, size, True, where))
+    frames = content["frames"]
+    first, where = {**content, **frames[0]}, common.frame_label(file, 0, frames[0])
+    width, height = (round(number(first, side, where)) for side in ("w", "h"))
+    lenses = [
+        _lens({**content, **entry}, (width, height), True, common.frame_label(file, index, entry))
+        for index, entry in enumerate(frames)
+    ]
     matrices = [[[o.fx, 0, o.cx], [0, o.fy, o.cy], [0, 0, 1]] for o in lenses]
     intrinsics, poses = torch.tensor(matrices), torch.tensor(np.stack(poses)).float()
-    return Cameras(intrinsics, poses, size[1], size[0]).validate(str(file))
+    return Cameras(intrinsics, poses, height, width).validate(str(file))
 
 
 def _lens(fields: dict[str, Any], size: tuple[int, int], resized: bool, where: str) -> Lens:
@@ -195,7 +197,7 @@ def _focal(fields: dict[str, Any], width: int, height: int, where: str) -> tuple
             focal[axis] = 0.5 * pixels / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
     if not focal:
         raise InputError(f"{where} has no intrinsics: give fl_x in pixels, or camera_angle_x.")
-    fx = focal.get("x", focal.get("y"))
+    fx = focal["x"] if "x" in focal else focal["y"]
     fy = focal.get("y", fx)
     if fx <= 0 or fy <= 0:
         raise InputError(
