@@ -1,6 +1,6 @@
 """Sources of tasks: which sequences train, validate and test, and which of their images."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -92,7 +92,7 @@ class ProceduralSource:
         return ProceduralScene(split_seed(split, index), *size, places=self.places, varied=varied)
 
 
-class SceneFolder(Sequence):
+class SceneFolder:
     """The scenes that a folder is or holds, each opened at its first use.
 
     The MAX_OPEN last used stay open.
@@ -116,6 +116,9 @@ class SceneFolder(Sequence):
         if len(self._open) > MAX_OPEN:
             del self._open[next(iter(self._open))]
         return sequence
+
+    def __iter__(self) -> Iterator[FileSequence]:
+        return (self[index] for index in range(len(self)))
 
     def folders(self, index: int) -> set[str]:
         """Return the folder names between the root and a scene, and its own, without opening it."""
@@ -200,8 +203,8 @@ class FilesSource:
         return Task(sequence, chosen)
 
     def evaluation(self, split: Split, inputs: int, targets: int) -> list[Task]:
-        if split == "test" and self.selection == "index":
-            return self._index_tasks(inputs)
+        if split == "test" and self.index is not None:
+            return self._index_tasks(self.index, inputs)
         selection = "every_8th" if self.selection == "index" else self.selection
         validated = (self.training_folder[scene] for scene in self._validation)
         return [
@@ -254,25 +257,25 @@ class FilesSource:
             )
         return training_scenes
 
-    def _index_tasks(self, inputs: int) -> list[Task]:
-        index = read_index(self.index, inputs)
+    def _index_tasks(self, file: str, inputs: int) -> list[Task]:
+        index = read_index(file, inputs)
         tasks = [
             Task(
                 sequence,
-                select_from_index(index, self.index, sequence.name, sequence.num_images, inputs),
+                select_from_index(index, file, sequence.name, sequence.num_images, inputs),
             )
             for sequence in self._tests
             if sequence.name in index
         ]
         if not tasks:
             raise InputError(
-                f"data.index={self.index} names none of the scenes of {self.test_folder.root}, "
+                f"data.index={file} names none of the scenes of {self.test_folder.root}, "
                 f"such as {self._tests[0].name}: give the index of this data set."
             )
         missing = set(index) - {task.sequence.name for task in tasks}
         if missing:
             raise InputError(
-                f"data.index={self.index} names {len(missing)} scenes that do not exist, such as "
+                f"data.index={file} names {len(missing)} scenes that do not exist, such as "
                 f"{min(missing)}: add them, or write an index of the scenes that you have with "
                 "python -m asysplat.data.selection."
             )

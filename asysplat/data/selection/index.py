@@ -82,10 +82,10 @@ def select_from_index(
             f"{where} has {len(entry.inputs)} inputs and data.inputs is {num_inputs}: set one "
             "to the other."
         )
-    step = entry.targets if isinstance(entry.targets, int) else None
-    selection = Selection(
-        entry.inputs, entry.targets if step is None else list(range(0, num_images, step))
-    )
+    targets = entry.targets
+    if isinstance(targets, int):
+        targets = list(range(0, num_images, targets))
+    selection = Selection(entry.inputs, targets)
     last = max(selection.inputs + selection.targets)
     if last >= num_images:
         raise InputError(

@@ -81,9 +81,12 @@ def grown_window(
     first: Sequence[int] | None, last: Sequence[int] | None, grown: float
 ) -> tuple[int, int] | None:
     """Return the window at a fraction of its growth from `first` to `last`; without one, `last`."""
-    if first is None or last is None:
-        return None if last is None else tuple(last)
-    return tuple(round(a + grown * (b - a)) for a, b in zip(first, last, strict=True))
+    if last is None:
+        return None
+    shortest, longest = last
+    if first is not None:
+        shortest, longest = (round(a + grown * (b - a)) for a, b in zip(first, last, strict=True))
+    return shortest, longest
 
 
 def held_out(num_images: int, split: Split) -> list[int]:
