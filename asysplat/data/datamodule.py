@@ -1,12 +1,12 @@
 """Batches of tasks: the same for the same seed, wherever a run is resumed."""
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import current_process, get_all_start_methods
-from typing import Any
+from typing import NotRequired, TypedDict
 
 import lightning
 import numpy as np
@@ -19,7 +19,7 @@ from asysplat.data.augment import Augmentation, center_crop
 from asysplat.data.bad_images import Policy
 from asysplat.data.batches import BatchSplit, split_batch
 from asysplat.data.loader import EpochLoader, batches_done, ignore_first_sigterm
-from asysplat.data.normalize import normalize
+from asysplat.data.normalize import Normalization, normalize
 from asysplat.data.points import depths_of_points
 from asysplat.data.selection.views import Selection
 from asysplat.data.sources import Source, Task
@@ -28,8 +28,27 @@ from asysplat.scene import Views
 
 MAX_DRAWS = 10  # scenes drawn for one task, with on_bad_scene=skip
 MAX_LOADED_BYTES = 2**30  # size of the images that a set of fixed tasks keeps in memory
-# scene: name, inputs: Views, targets: Views, prune: bool; a batch has lists of names
-Sample = dict[str, Any]
+
+
+class Sample(TypedDict):
+    """The views of one task; see `load` and `TrainingTasks`."""
+
+    scene: str
+    inputs: Views
+    targets: Views
+    prune: NotRequired[bool]
+    frame: NotRequired[Normalization]
+    bad_scenes: NotRequired[list[str]]
+
+
+class Batch(TypedDict):
+    """Samples of several scenes, stacked."""
+
+    scene: list[str]
+    inputs: Views
+    targets: Views
+    prune: bool
+    bad_scenes: list[str]
 
 
 @dataclass(eq=False, repr=False)
@@ -63,7 +82,8 @@ class SceneDataModule(lightning.LightningDataModule):
             fixed ones that are kept in memory.
     """
 
-    name: str = field()  # without the default of Lightning
+    # Without Lightning's default, which is None.
+    name: str = field()  # ty: ignore[incompatible-mutable-override]
     source: Source
     inputs: int
     targets: int
@@ -82,7 +102,6 @@ class SceneDataModule(lightning.LightningDataModule):
 
     def __post_init__(self):
         super().__init__()
-        self.augmentation = self.augmentation or Augmentation()
         self.evaluation: dict[str, FixedTasks] = {}  # val and test of this data set
         self.tests: dict[str, FixedTasks] = {}  # by test set, this data set first
 
@@ -91,9 +110,9 @@ class SceneDataModule(lightning.LightningDataModule):
         if not self.evaluation:
             counts = (self.inputs, self.targets)
             # All images are selected before any is read, since an index may not fit the scenes.
-            main_set = {self.name: partial(self.source.evaluation, "test", *counts)}
+            main_set = partial(self.source.evaluation, "test", *counts)
             tests: dict[str, list[Task]] = {}
-            for name, make_tasks in (main_set | self.test_sets).items():
+            for name, make_tasks in {self.name: main_set, **self.test_sets}.items():
                 with self._naming(name):
                     tests[name] = make_tasks()
             validation = self.source.evaluation("val", *counts)
@@ -118,7 +137,7 @@ class SceneDataModule(lightning.LightningDataModule):
                 )
 
     @contextmanager
-    def _naming(self, test_set: str) -> Iterator[None]:
+    def _naming(self, test_set: str) -> Generator[None]:
         """Name a further test set in the InputErrors of the body."""
         try:
             yield
@@ -157,8 +176,9 @@ class SceneDataModule(lightning.LightningDataModule):
         return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
 
     def train_dataloader(self) -> DataLoader:
-        count = self.steps_per_epoch * self.batch_size
-        return self.tasks(self.trainer.current_epoch * count, count, batches_done(self.trainer))
+        trainer, count = self.trainer, self.steps_per_epoch * self.batch_size
+        assert trainer is not None  # it is the caller
+        return self.tasks(trainer.current_epoch * count, count, batches_done(trainer))
 
     def tasks(self, start: int, count: int, done: int = 0) -> DataLoader:
         """Return this process's micro-batches of the tasks `start` to `start + count`.
@@ -209,7 +229,8 @@ class TrainingTasks(Dataset):
     """
 
     def __init__(self, data: SceneDataModule):
-        self.source, self.seed, self.augmentation = data.source, data.seed, data.augmentation
+        self.source, self.seed = data.source, data.seed
+        self.augmentation = data.augmentation or Augmentation()
         self.inputs, self.targets, self.points = data.inputs, data.targets, data.points
         self.draws = MAX_DRAWS if data.on_bad_scene == "skip" else 1
         self.growing_tasks = data.growth_steps * data.batch_size
@@ -220,7 +241,7 @@ class TrainingTasks(Dataset):
             # (seed, index, 0) gives what (seed, index) gives.
             rng = np.random.default_rng((self.seed, index, len(errors)))
             try:
-                return self._sample(rng, index) | {"bad_scenes": errors}
+                return {**self._sample(rng, index), "bad_scenes": errors}
             except (InputError, OSError) as error:
                 errors.append(str(error).partition("\n")[0])
                 if len(errors) == self.draws:
@@ -248,8 +269,9 @@ class FixedTasks(Dataset):
         self.tasks, self.points = tasks, points
         self._loaded: list[Sample] = []
         size = 0
-        # Processes side by side would draw over each other.
-        alone = rank_zero_only.rank == 0 and current_process().name == "MainProcess"
+        # Processes side by side would draw over each other; `rank` is set by Lightning.
+        rank = rank_zero_only.rank  # ty: ignore[missing-attribute]
+        alone = rank == 0 and current_process().name == "MainProcess"
         shown = track(tasks, f"loading {name}", transient=True, disable=not alone)
         for task in shown:
             self._loaded.append(load(task, points=points))
@@ -283,11 +305,16 @@ def load(task: Task, crop: float = 1.0, points: bool = False) -> Sample:
     if sparse is not None:
         inputs = replace(inputs, point_depths=depths_of_points(sparse, inputs.cameras))
     inputs, targets, frame = normalize(inputs, targets)
-    views = {"inputs": inputs, "targets": targets, "frame": frame}
-    return {"scene": task.sequence.name, "prune": task.prune, **views}
+    return {
+        "scene": task.sequence.name,
+        "prune": task.prune,
+        "inputs": inputs,
+        "targets": targets,
+        "frame": frame,
+    }
 
 
-def collate(samples: list[Sample]) -> Sample:
+def collate(samples: list[Sample]) -> Batch:
     return {
         "scene": [sample["scene"] for sample in samples],
         "inputs": Views.stack([sample["inputs"] for sample in samples]),

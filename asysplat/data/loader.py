@@ -21,7 +21,9 @@ class EpochLoader(DataLoader):
 def batches_done(trainer: lightning.Trainer) -> int:
     """Return the number of batches of the current epoch before the checkpoint that is resumed."""
     loop = trainer.fit_loop
-    began = loop.epoch_progress.current.ready > loop.epoch_progress.current.processed
+    epochs = loop.epoch_progress.current
+    # Annotation of Lightning: the class that has it inherits from the annotated one.
+    began = epochs.ready > epochs.processed  # ty: ignore[missing-attribute]
     return loop.epoch_loop.batch_progress.current.completed if began else 0
 
 
