@@ -1,5 +1,7 @@
 """The monocular network Depth Anything (Yang et al. 2024), loaded with transformers."""
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
@@ -23,6 +25,8 @@ class DepthAnything:
 
     def __init__(self, network: nn.Module, device: torch.device):
         self.network, self.device = network.to(device).eval(), device
+        config: Any = network.config  # of transformers
+        self.patch_size: int = config.patch_size
         self.mean, self.std = (
             torch.tensor(rgb, device=device)[:, None, None] for rgb in (MEAN, STD)
         )
@@ -32,7 +36,7 @@ class DepthAnything:
         """Return the disparity of the whole image, at the network's own size."""
         # A copy, since arrays from Pillow are read-only.
         pixels = torch.tensor(image, device=self.device).permute(2, 0, 1)[None] / 255
-        size = network_size(*image.shape[:2], self.network.config.patch_size)
+        size = network_size(*image.shape[:2], self.patch_size)
         pixels = F.interpolate(pixels, size, mode="bicubic", antialias=True)
         output = self.network(pixel_values=(pixels - self.mean) / self.std)
         return output.predicted_depth[0].float().cpu().numpy()
@@ -41,7 +45,8 @@ class DepthAnything:
 def network_size(height: int, width: int, patch: int) -> tuple[int, int]:
     """Return the size in whole patches that is nearest to the image's proportions."""
     scale = SHORT_SIDE / min(height, width)
-    return tuple(max(1, round(scale * side / patch)) * patch for side in (height, width))
+    rows, columns = (max(1, round(scale * side / patch)) for side in (height, width))
+    return rows * patch, columns * patch
 
 
 def load_depth_anything(model: str, download: bool) -> DepthAnything:
@@ -56,7 +61,8 @@ def load_depth_anything(model: str, download: bool) -> DepthAnything:
             depth.
     """
     try:
-        from transformers import AutoModelForDepthEstimation
+        # Extra that is missing where types are checked.
+        from transformers import AutoModelForDepthEstimation  # ty: ignore[import-not-found]
     except ImportError as error:
         raise InputError(
             "python -m asysplat.data.disparity needs transformers: "
