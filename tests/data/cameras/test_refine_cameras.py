@@ -1,6 +1,7 @@
 """Refined cameras are nearer to those that rendered the photographs than the given ones."""
 
 from dataclasses import replace
+from shutil import copytree
 
 import numpy as np
 import pycolmap
@@ -110,6 +111,17 @@ def test_a_scene_far_from_the_origin(folder, refined, tmp_path):
     new = refine_cameras(scene, tmp_path).scene
     assert new.origin == OFFSET
     np.testing.assert_allclose(new.points, refined[1].scene.points, atol=1e-9)
+
+
+@pytest.mark.medium
+def test_a_scene_whose_model_has_lost_its_points_has_none(folder, refined, tmp_path):
+    where = copytree(refined[0], tmp_path / "logs", symlinks=True)
+    (path,) = where.glob("*/sparse/0")
+    model = pycolmap.Reconstruction(path)
+    for point in list(model.points3D):
+        model.delete_point3D(point)
+    model.write(path)
+    assert refine_cameras(read(folder), where).scene.points is None
 
 
 @pytest.mark.medium
