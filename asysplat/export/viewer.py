@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -40,6 +40,9 @@ from asysplat.export.gaussians import read_gaussians
 from asysplat.interrupts import handle_signals
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
+
+if TYPE_CHECKING:
+    import viser  # an optional dependency
 
 OWN_PAGES = re.compile(r"https?://(127\.0\.0\.1|localhost)(:\d+)?")
 LAYERS = ("color", "depth", "alpha")
@@ -189,7 +192,7 @@ class Viewer:
             frustum.on_click(self._click)
         self._show_cameras.on_update(lambda _: setattr(parent, "visible", self._show_cameras.value))
 
-    def _click(self, event: Any) -> None:
+    def _click(self, event: "viser.SceneNodePointerEvent") -> None:
         # The browser also reports clicks on frustums before its near plane, which are invisible.
         camera, _ = viewer_cameras.client_camera(event.client.camera, MAX_PIXELS)
         start, ray = (torch.tensor(v).float() for v in (event.ray_origin, event.ray_direction))
@@ -238,7 +241,7 @@ class Viewer:
                 if not in_full:  # the pause leaves the machine at least half of its time
                     page.due = start + seconds + max(REST_SECONDS, page.seconds)
 
-    def _draw(self, client: Any, max_pixels: int) -> bool:
+    def _draw(self, client: "viser.ClientHandle", max_pixels: int) -> bool:
         """Render a page's camera and send the image; return whether at full resolution."""
         start = time.perf_counter()
         gaussians, text = self._scene
