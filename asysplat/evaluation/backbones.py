@@ -92,7 +92,7 @@ def _download(name: str) -> dict[str, Tensor]:
         ) from error
 
 
-def _features(name: str, state: Any, source: Path) -> dict[str, Tensor]:
+def _features(name: str, state: object, source: Path) -> dict[str, Tensor]:
     with torch.device("meta"):
         expected = BUILDERS[name]().features.state_dict(prefix="features.")
     for key, tensor in expected.items():

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from rich.progress import (
@@ -17,6 +17,7 @@ from rich.progress import (
 )
 from torch.utils.data import Dataset
 
+from asysplat.data.datamodule import Sample
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.measured_cost import mean_but_longest
 from asysplat.evaluation.post_optimization import PostOptimization, Predict, SceneResult
@@ -29,7 +30,7 @@ Scenes = Mapping[str, Sequence[SceneResult]]  # by test set, the data set's own 
 
 def measure_scenes(
     tests: Mapping[str, Dataset],
-    predictor: Callable[[dict[str, Any]], Predict],
+    predictor: Callable[[Sample], Predict],
     measure: PostOptimization,
     device: torch.device,
     folder: Path,

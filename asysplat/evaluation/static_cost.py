@@ -22,7 +22,7 @@ def count_parameters(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-def module_flops(net: nn.Module, inputs: Any) -> tuple[int, Any]:
+def module_flops(net: nn.Module, inputs: object) -> tuple[int, Any]:
     """Count the FLOPs of `net(inputs)` as the paper counts them; return them and the output.
 
     2 x multiply-adds of Linear, Conv1d and Conv2d modules, 4 operations an element for LayerNorm

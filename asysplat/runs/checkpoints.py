@@ -207,7 +207,7 @@ def existing_weights(path: str, option: str = "init_path") -> Path:
     return file
 
 
-def atomic_save(values: Any, path: Path) -> None:
+def atomic_save(values: object, path: Path) -> None:
     """Write values atomically with torch.save.
 
     Raises:

@@ -71,7 +71,7 @@ def _without_caches(node: Any) -> Any:
     return {key: fixed[key] if key in fixed else _without_caches(node[key]) for key in node}
 
 
-def _check_targets(path: Path, node: Any, key: str = "") -> None:
+def _check_targets(path: Path, node: object, key: str = "") -> None:
     if isinstance(node, str) and "${" in node:
         raise InputError(f"{path}: {key} is {node!r}: a run's configuration has no interpolations.")
     if isinstance(node, list):

@@ -148,7 +148,7 @@ def content_of(path: str | Path | None) -> str | None:
         return name_of(path)
 
 
-def hash_of(values: Any) -> str:
+def hash_of(values: object) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 

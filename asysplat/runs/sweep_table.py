@@ -3,7 +3,6 @@
 import atexit
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
@@ -27,11 +26,11 @@ class SweepTable(Callback):
     def __init__(self):
         self.complete = False
 
-    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+    def on_multirun_start(self, config: DictConfig, **_: object) -> None:
         # on_multirun_end is not called if a job fails
         atexit.register(self._print, config)
 
-    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+    def on_multirun_end(self, config: DictConfig, **_: object) -> None:
         self.complete = True
 
     def _print(self, config: DictConfig) -> None:

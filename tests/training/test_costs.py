@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader
 from asysplat.evaluation import measured_cost
 from asysplat.evaluation.measured_cost import CostMeter, reset_peak_memory
 from asysplat.training.callbacks import Costs, costs
+from asysplat.training.module import SplattingModule
 
 MB = 1_000_000
 # The process's other work was under 1 MB; the tolerance is far below a buffer.
@@ -30,9 +31,9 @@ class Net(nn.Module):
         allocate(megabytes)
 
 
-class Module(lightning.LightningModule):
+class Module(SplattingModule):
     def __init__(self, rendering):
-        super().__init__()
+        super(SplattingModule, self).__init__()
         self.net, self.rendering = Net(), rendering
 
     def test_step(self, batch, batch_idx, dataloader_idx=0):

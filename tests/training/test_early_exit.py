@@ -10,12 +10,15 @@ from omegaconf import OmegaConf, open_dict
 from asysplat.evaluation.protocol import Protocol
 from asysplat.runs.runs import config_hash
 from asysplat.training.callbacks import Metrics
+from asysplat.training.module import SplattingModule
+from asysplat.training.prediction import Prediction
 
 
 def logged(tests):
     """Results and log of the callback after a test with these fractions for each scene."""
     log = {}
-    module = SimpleNamespace(net=SimpleNamespace(early_exit_fractions={}), log_dict=log.update)
+    net = SimpleNamespace(early_exit_fractions={})
+    module = Mock(SplattingModule, net=net, log_dict=log.update)
     data = SimpleNamespace(tests=tests)
     trainer = Mock(lightning.Trainer, datamodule=data, world_size=1, is_global_zero=False)
     callback = Metrics(
@@ -25,9 +28,9 @@ def logged(tests):
     callback.on_test_epoch_start()
     for index, scenes in enumerate(tests.values()):
         for number, fractions in enumerate(scenes):
-            module.net.early_exit_fractions = fractions
+            net.early_exit_fractions = fractions
             batch = {"scene": [f"scene {number}"]}
-            callback.on_test_batch_end(trainer, module, None, batch, number, index)
+            callback.on_test_batch_end(trainer, module, Mock(Prediction), batch, number, index)
     callback.on_test_epoch_end(trainer, module)
     return callback.results, log
 

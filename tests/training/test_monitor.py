@@ -3,7 +3,9 @@
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier, local
 from types import SimpleNamespace
+from unittest.mock import Mock
 
+import lightning
 import pytest
 import torch
 from hydra.errors import InstantiationException
@@ -11,12 +13,14 @@ from hydra.utils import instantiate
 from lightning.pytorch.loggers import wandb
 from lightning_utilities.core.imports import RequirementCache
 from torch import nn
+from torch.optim import Optimizer
 
 from asysplat.evaluation import measured_cost
 from asysplat.evaluation.measured_cost import peak_flops
 from asysplat.training import step_timer
 from asysplat.training.callbacks import TrainingMonitor, monitor
 from asysplat.training.callbacks.monitor import gradient_norms, summary
+from asysplat.training.module import SplattingModule
 from asysplat.training.step_timer import StepTimer
 
 CPU = torch.device("cpu")
@@ -51,8 +55,8 @@ class Run:
         self.monitor.flops, self.monitor.peak = 6e9, None
         self.monitor.first_step, self.monitor.begin_step = 0, None
         logger = SimpleNamespace(log_metrics=self.log)
-        self.trainer = SimpleNamespace(global_step=0, world_size=2, loggers=[logger])
-        self.module = SimpleNamespace(timer=StepTimer(), device=CPU, net=nn.ModuleDict())
+        self.trainer = Mock(lightning.Trainer, global_step=0, world_size=2, loggers=[logger])
+        self.module = Mock(SplattingModule, timer=StepTimer(), device=CPU, net=nn.ModuleDict())
         views = [SimpleNamespace(num_views=count) for count in (3, 2)]
         self.batch = {"scene": ["a", "b"], "inputs": views[0], "targets": views[1]}
         self.monitor.on_train_epoch_start()
@@ -72,7 +76,7 @@ class Run:
             self.clock.wait(backward)
             self.monitor.on_after_backward(*hooks)
             if batch == self.accumulate - 1:
-                self.monitor.on_before_optimizer_step(*hooks, None)
+                self.monitor.on_before_optimizer_step(*hooks, Mock(Optimizer))
                 self.clock.wait(optimizer)
                 self.trainer.global_step += 1
             self.monitor.on_train_batch_end(*hooks, None, self.batch, batch)

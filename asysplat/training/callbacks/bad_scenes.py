@@ -2,12 +2,14 @@
 
 from typing import Any
 
-import lightning
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.utilities.types import STEP_OUTPUT
 
 from asysplat.errors import InputError
+from asysplat.training.parallel_scenes import Batch
 
 
-class BadScenes(lightning.Callback):
+class BadScenes(Callback):
     """Prints each error of a training scene once; logs how many scenes were replaced.
 
     Used with data.on_bad_scene=skip.
@@ -31,7 +33,12 @@ class BadScenes(lightning.Callback):
         self.count, self.errors = state_dict["count"], list(state_dict["errors"])
 
     def on_train_batch_end(
-        self, trainer: Any, module: Any, outputs: Any, batch: Any, index: int
+        self,
+        trainer: Trainer,
+        module: LightningModule,
+        outputs: STEP_OUTPUT,
+        batch: Batch,
+        index: int,
     ) -> None:
         self.count += len(batch["bad_scenes"])
         for error in dict.fromkeys(batch["bad_scenes"]):
@@ -45,5 +52,5 @@ class BadScenes(lightning.Callback):
                 f"out of data.root, or raise callbacks.bad_scenes.budget:{listed}"
             )
 
-    def on_train_epoch_end(self, trainer: Any, module: Any) -> None:
+    def on_train_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
         module.log("train/bad_scenes", float(self.count), sync_dist=True, reduce_fx="sum")

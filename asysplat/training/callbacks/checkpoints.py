@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
@@ -52,7 +53,9 @@ class Checkpoints(ModelCheckpoint):
     def last(self) -> Path:
         return Path(self.dirpath) / LAST
 
-    def on_save_checkpoint(self, trainer: Any, module: Any, checkpoint: dict) -> None:
+    def on_save_checkpoint(
+        self, trainer: Trainer, module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
         _begin_at_next_batch(checkpoint["loops"]["fit_loop"])
         states = [random_states()]
         if trainer.world_size > 1:
@@ -62,14 +65,16 @@ class Checkpoints(ModelCheckpoint):
         checkpoint["revision"] = revision()
         checkpoint["event_files"] = event_files(trainer.loggers)
 
-    def on_load_checkpoint(self, trainer: Any, module: Any, checkpoint: dict) -> None:
+    def on_load_checkpoint(
+        self, trainer: Trainer, module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
         self.loaded_states = checkpoint.get("random_states", [])
 
-    def on_fit_start(self, *_: Any) -> None:
+    def on_fit_start(self, *_: object) -> None:
         # Before Lightning sets its own handlers, which stop in the middle of a validation.
         self.handlers = {number: signal.getsignal(number) for number in PREEMPTION_SIGNALS}
 
-    def on_train_start(self, trainer: Any, module: Any) -> None:
+    def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
         for number, handler in self.handlers.items():
             if handler not in (signal.SIG_IGN, None):
                 signal.signal(number, self._on_preemption)
@@ -77,10 +82,12 @@ class Checkpoints(ModelCheckpoint):
         if len(self.loaded_states) == trainer.world_size:
             set_random_states(self.loaded_states[trainer.global_rank])
 
-    def _on_preemption(self, number: int, _: Any) -> None:
+    def _on_preemption(self, number: int, _: object) -> None:
         self.preempted_by = number
 
-    def on_train_batch_start(self, trainer: Any, module: Any, _: Any, index: int) -> None:
+    def on_train_batch_start(
+        self, trainer: Trainer, module: LightningModule, _: object, index: int
+    ) -> None:
         """Save here, where the previous step, its validation and its log are complete."""
         if index % trainer.accumulate_grad_batches:
             return
@@ -92,20 +99,20 @@ class Checkpoints(ModelCheckpoint):
             self._save_last(trainer)
         self._forward_preemption(trainer)
 
-    def on_train_epoch_end(self, trainer: Any, module: Any) -> None:
+    def on_train_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
         if self.monitor in trainer.callback_metrics:
             super().on_train_epoch_end(trainer, module)
         self.save_due = True
 
-    def on_train_end(self, trainer: Any, module: Any) -> None:
+    def on_train_end(self, trainer: Trainer, module: LightningModule) -> None:
         self._save_last(trainer)
 
-    def on_fit_end(self, trainer: Any, module: Any) -> None:
+    def on_fit_end(self, trainer: Trainer, module: LightningModule) -> None:
         # The test is logged at this step. Lightning's count is one lower if it resumed from the
         # end of a training: see `_begin_at_next_batch`.
         trainer.fit_loop.epoch_loop._batches_that_stepped = trainer.global_step
 
-    def _save_last(self, trainer: Any) -> None:
+    def _save_last(self, trainer: Trainer) -> None:
         if trainer.global_step == self.saved_step:
             return
         fresh = self.last.with_name("next.ckpt")
@@ -116,7 +123,7 @@ class Checkpoints(ModelCheckpoint):
             os.replace(fresh, self.last)
         self.saved_step, self.saved_at, self.save_due = trainer.global_step, time.monotonic(), False
 
-    def _forward_preemption(self, trainer: Any) -> None:
+    def _forward_preemption(self, trainer: Trainer) -> None:
         """Run the handler of the scheduler's signal, now that there is a checkpoint."""
         if not trainer.strategy.reduce_boolean_decision(self.preempted_by is not None, all=False):
             return
@@ -130,7 +137,7 @@ class Checkpoints(ModelCheckpoint):
         else:
             raise SystemExit(128 + number)
 
-    def on_exception(self, trainer: Any, module: Any, error: BaseException) -> None:
+    def on_exception(self, trainer: Trainer, module: LightningModule, error: BaseException) -> None:
         if not trainer.is_global_zero:
             return
         if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -167,7 +174,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """
 
     def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: object = None
     ) -> None:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         atomic_save(checkpoint, Path(path))

@@ -3,10 +3,9 @@
 import math
 import statistics
 from datetime import timedelta
-from typing import Any
 
-import lightning
 import torch
+from lightning import Callback, Trainer
 
 from asysplat.data.datamodule import TrainingTasks, collate
 from asysplat.errors import InputError
@@ -15,7 +14,7 @@ from asysplat.evaluation.static_cost import count_parameters, static_costs
 from asysplat.training.module import SplattingModule
 
 
-class Costs(lightning.Callback):
+class Costs(Callback):
     """Collects the costs of a run in `values`, "cost/..." -> number.
 
     Before the first step, it counts the `static_costs` of one scene at the run's views and
@@ -29,7 +28,7 @@ class Costs(lightning.Callback):
     def __init__(self):
         self.values: dict[str, float | int] = {}
 
-    def setup(self, trainer: Any, module: Any, stage: str) -> None:
+    def setup(self, trainer: Trainer, module: SplattingModule, stage: str) -> None:
         """Count costs and plan here, where every process still has all weights."""
         if stage != "fit":
             return
@@ -41,21 +40,21 @@ class Costs(lightning.Callback):
             print(plan, flush=True)
         self.values = {f"cost/{name}": value for name, value in costs.items()}
 
-    def on_fit_start(self, trainer: Any, module: Any) -> None:
+    def on_fit_start(self, trainer: Trainer, module: SplattingModule) -> None:
         self.step = CostMeter(module.device)
 
-    def on_train_start(self, trainer: Any, module: Any) -> None:
+    def on_train_start(self, trainer: Trainer, module: SplattingModule) -> None:
         if trainer.global_step == 0:  # a resumed run has logged them
             for logger in trainer.loggers:
                 logger.log_metrics(self.values, step=0)
 
-    def on_train_batch_start(self, *_: Any) -> None:
+    def on_train_batch_start(self, *_: object) -> None:
         self.step.start()
 
-    def on_train_batch_end(self, *_: Any) -> None:
+    def on_train_batch_end(self, *_: object) -> None:
         self.step.stop()
 
-    def on_fit_end(self, trainer: Any, module: Any) -> None:
+    def on_fit_end(self, trainer: Trainer, module: SplattingModule) -> None:
         if self.step.seconds:
             seconds = trainer.accumulate_grad_batches * statistics.fmean(self.step.seconds)
             self.values["cost/seconds_per_step"] = seconds
@@ -64,7 +63,7 @@ class Costs(lightning.Callback):
         for logger in trainer.loggers:
             logger.log_metrics(self.values, step=trainer.global_step)
 
-    def on_test_start(self, trainer: Any, module: Any) -> None:
+    def on_test_start(self, trainer: Trainer, module: SplattingModule) -> None:
         self.tests = [CostMeter(module.device) for _ in trainer.datamodule.tests]
         self.hooks = [
             module.net.register_forward_pre_hook(lambda *_: self.inference.start()),
@@ -72,11 +71,16 @@ class Costs(lightning.Callback):
         ]
 
     def on_test_batch_start(
-        self, trainer: Any, module: Any, batch: Any, index: int, set_index: int = 0
+        self,
+        trainer: Trainer,
+        module: SplattingModule,
+        batch: object,
+        index: int,
+        set_index: int = 0,
     ) -> None:
         self.inference = self.tests[set_index]
 
-    def on_test_end(self, trainer: Any, module: Any) -> None:
+    def on_test_end(self, trainer: Trainer, module: SplattingModule) -> None:
         for hook in self.hooks:
             hook.remove()
         for test_set, meter in zip(trainer.datamodule.tests, self.tests, strict=True):
@@ -87,7 +91,7 @@ class Costs(lightning.Callback):
                 self.values[f"{prefix}/inference_gb"] = max(meter.gb)
 
 
-def make_plan(trainer: lightning.Trainer, module: SplattingModule) -> str:
+def make_plan(trainer: Trainer, module: SplattingModule) -> str:
     """Try a micro-batch and describe the training: parameters, steps, memory in 1e9 bytes, time.
 
     The network is left as it was. The memory is without the optimizer's moments.
@@ -117,7 +121,7 @@ def make_plan(trainer: lightning.Trainer, module: SplattingModule) -> str:
     )
 
 
-def _try(trainer: lightning.Trainer, module: SplattingModule) -> tuple[float, float]:
+def _try(trainer: Trainer, module: SplattingModule) -> tuple[float, float]:
     """Return the seconds of a step's micro-batches, and the peak memory of one in 1e9 bytes."""
     split = trainer.datamodule.split(trainer.world_size)
     batch = collate([TrainingTasks(trainer.datamodule)[0]] * split.micro_batch)

@@ -1,16 +1,16 @@
 """Draw figures of every validation and of the test: for the loggers and as PNG files."""
 
 from pathlib import Path
-from typing import Any
 
-import lightning
+from lightning import Callback, LightningModule, Trainer
 
 from asysplat.evaluation.figures import comparison_figure
 from asysplat.training.loggers import log_figure
+from asysplat.training.parallel_scenes import Batch
 from asysplat.training.prediction import Prediction
 
 
-class Figures(lightning.Callback):
+class Figures(Callback):
     """Draws a `comparison_figure` of the first scenes of each validation and first test set.
 
     Args:
@@ -22,17 +22,31 @@ class Figures(lightning.Callback):
         self.folder, self.scenes = Path(folder) / "figures", scenes
 
     def on_validation_batch_end(
-        self, trainer: Any, module: Any, outputs: Prediction, batch: Any, index: int, *_: Any
+        self,
+        trainer: Trainer,
+        module: LightningModule,
+        outputs: Prediction,
+        batch: Batch,
+        index: int,
+        *_: object,
     ) -> None:
         self._draw(trainer, "val", outputs, batch, index)
 
     def on_test_batch_end(
-        self, trainer: Any, module: Any, outputs: Any, batch: Any, index: int, test_set: int = 0
+        self,
+        trainer: Trainer,
+        module: LightningModule,
+        outputs: Prediction,
+        batch: Batch,
+        index: int,
+        test_set: int = 0,
     ) -> None:
         if test_set == 0:
             self._draw(trainer, "test", outputs, batch, index)
 
-    def _draw(self, trainer: Any, split: str, outputs: Prediction, batch: Any, index: int) -> None:
+    def _draw(
+        self, trainer: Trainer, split: str, outputs: Prediction, batch: Batch, index: int
+    ) -> None:
         if index >= self.scenes or not trainer.is_global_zero:
             return
         first = (

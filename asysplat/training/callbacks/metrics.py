@@ -3,20 +3,21 @@
 import warnings
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
-import lightning
 import torch
+from lightning import Callback, Trainer
 
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.protocol import Protocol
 from asysplat.evaluation.rows import ImageRow, average, write_csv
+from asysplat.training.module import SplattingModule
+from asysplat.training.parallel_scenes import Batch
 from asysplat.training.prediction import Prediction
 
 IMAGE = ("set", "scene", "view")  # the columns that identify a row
 
 
-class Metrics(lightning.Callback):
+class Metrics(Callback):
     """Computes PSNR, SSIM, LPIPS, AbsRel and delta < 1.25 of each image, for loggers and a CSV.
 
     `results` holds the means of every test set, the protocol's descriptions, and the fractions that
@@ -37,14 +38,14 @@ class Metrics(lightning.Callback):
         descriptions = protocol.describe()
         self.results: dict[str, float | str] = {f"protocol/{k}": v for k, v in descriptions.items()}
 
-    def setup(self, trainer: Any, module: Any, stage: str) -> None:
+    def setup(self, trainer: Trainer, module: SplattingModule, stage: str) -> None:
         if hasattr(self, "lpips"):
             return
         self.lpips = load_lpips(self.protocol.lpips_net, self.backbone_dir, self.download)
         if self.lpips is None and trainer.is_global_zero:
             warnings.warn(self.protocol.without_lpips(), stacklevel=1)
 
-    def _add(self, test_set: str, batch: Any, prediction: Prediction, validation: bool) -> None:
+    def _add(self, test_set: str, batch: Batch, prediction: Prediction, validation: bool) -> None:
         lpips = None if self.lpips is None else self.lpips.to(prediction.rendering.image.device)
         parts = batch["inputs"], batch["targets"], prediction.rendering
         for index, scene in enumerate(batch["scene"]):
@@ -58,19 +59,30 @@ class Metrics(lightning.Callback):
                     row |= {f"{name}/{metric}": value for metric, value in numbers[view].items()}
                 self.rows.append({"set": test_set, "scene": scene, "view": view} | row)
 
-    def on_validation_epoch_start(self, *_: Any) -> None:
+    def on_validation_epoch_start(self, *_: object) -> None:
         self.rows = []
 
-    def on_test_epoch_start(self, *_: Any) -> None:
+    def on_test_epoch_start(self, *_: object) -> None:
         self.rows, self.early_exit_rows = [], []
 
     def on_validation_batch_end(
-        self, trainer: Any, module: Any, outputs: Prediction, batch: Any, *_: Any
+        self,
+        trainer: Trainer,
+        module: SplattingModule,
+        outputs: Prediction,
+        batch: Batch,
+        *_: object,
     ) -> None:
         self._add(trainer.datamodule.name, batch, outputs, validation=True)
 
     def on_test_batch_end(
-        self, trainer: Any, module: Any, outputs: Any, batch: Any, index: int, set_index: int = 0
+        self,
+        trainer: Trainer,
+        module: SplattingModule,
+        outputs: Prediction,
+        batch: Batch,
+        index: int,
+        set_index: int = 0,
     ) -> None:
         test_set = list(trainer.datamodule.tests)[set_index]
         self._add(test_set, batch, outputs, validation=False)
@@ -78,11 +90,11 @@ class Metrics(lightning.Callback):
             row: ImageRow = {"set": test_set, "scene": batch["scene"][0], "view": 0}
             self.early_exit_rows.append(row | module.net.early_exit_fractions)
 
-    def on_validation_epoch_end(self, trainer: Any, module: Any) -> None:
+    def on_validation_epoch_end(self, trainer: Trainer, module: SplattingModule) -> None:
         means = average(gather(trainer, self.rows), self.protocol.mean_over)
         module.log_dict({f"val/{name}": value for name, value in means.items()})
 
-    def on_test_epoch_end(self, trainer: Any, module: Any) -> None:
+    def on_test_epoch_end(self, trainer: Trainer, module: SplattingModule) -> None:
         rows, early_exit_rows = gather(trainer, self.rows), gather(trainer, self.early_exit_rows)
         results = {}
         for test_set in trainer.datamodule.tests:
@@ -99,7 +111,7 @@ class Metrics(lightning.Callback):
             write_csv(self.folder / "metrics.csv", rows)
 
 
-def gather(trainer: Any, rows: list[ImageRow]) -> list[ImageRow]:
+def gather(trainer: Trainer, rows: list[ImageRow]) -> list[ImageRow]:
     """Gather the rows of all processes; every process must call this."""
     if trainer.world_size == 1:
         return rows

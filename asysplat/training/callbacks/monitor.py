@@ -3,15 +3,18 @@
 import statistics
 import time
 from collections import defaultdict
-from typing import Any
 
 import torch
-from lightning import Callback
+from lightning import Callback, Trainer
+from lightning.pytorch.utilities.types import STEP_OUTPUT
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from asysplat.evaluation.measured_cost import memory_gb, peak_flops, peak_memory_gb, wait_for
 from asysplat.evaluation.static_cost import true_flops
 from asysplat.training.loggers import log_histogram
+from asysplat.training.module import SplattingModule
+from asysplat.training.parallel_scenes import Batch
 from asysplat.training.prediction import Prediction
 from asysplat.training.step_timer import PARTS
 
@@ -44,16 +47,16 @@ class TrainingMonitor(Callback):
         self.every = every
         self.measurements: list[dict[str, float]] = []
 
-    def on_fit_start(self, trainer: Any, module: Any) -> None:
+    def on_fit_start(self, trainer: Trainer, module: SplattingModule) -> None:
         self.flops: int | None = None  # FLOPs of a training scene, counted when first needed
         self.peak = peak_flops(module.device, trainer.precision)
         # The first step compiles kernels and is not counted.
         self.first_step, self.begin_step = trainer.global_step, None
 
-    def on_train_epoch_start(self, *_: Any) -> None:
+    def on_train_epoch_start(self, *_: object) -> None:
         self.waiting_since = time.perf_counter()
 
-    def on_train_batch_start(self, trainer: Any, module: Any, *_: Any) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplattingModule, *_: object) -> None:
         due = self.begin_step is not None and (trainer.global_step + 1) % self.every == 0
         if due and not module.timer.measuring:  # at the first micro-batch of the step
             self.step, self.started = trainer.global_step, self.waiting_since
@@ -61,21 +64,23 @@ class TrainingMonitor(Callback):
         if module.timer.measuring:
             module.timer.add("data", time.perf_counter() - self.waiting_since)
 
-    def on_before_backward(self, trainer: Any, module: Any, *_: Any) -> None:
+    def on_before_backward(self, trainer: Trainer, module: SplattingModule, *_: object) -> None:
         self.backward = module.timer("backward")
         self.backward.__enter__()
 
-    def on_after_backward(self, *_: Any) -> None:
+    def on_after_backward(self, *_: object) -> None:
         self.backward.__exit__(None, None, None)
 
-    def on_before_optimizer_step(self, trainer: Any, module: Any, _: Any) -> None:
+    def on_before_optimizer_step(
+        self, trainer: Trainer, module: SplattingModule, _: Optimizer
+    ) -> None:
         if module.timer.measuring:
             log(trainer, gradient_norms(module.net), self.step)
             wait_for(module.device)
             self.optimizer_since = time.perf_counter()
 
     def on_train_batch_end(
-        self, trainer: Any, module: Any, outputs: Any, batch: Any, _: int
+        self, trainer: Trainer, module: SplattingModule, outputs: STEP_OUTPUT, batch: Batch, _: int
     ) -> None:
         if self.begin_step is not None:
             self._count(trainer, batch)
@@ -102,15 +107,17 @@ class TrainingMonitor(Callback):
             self._begin(trainer)
         self.waiting_since = time.perf_counter()
 
-    def on_fit_end(self, trainer: Any, module: Any) -> None:
+    def on_fit_end(self, trainer: Trainer, module: SplattingModule) -> None:
         if self.measurements and trainer.is_global_zero:
             names = self.measurements[-1]
             print(summary({n: statistics.fmean(m[n] for m in self.measurements) for n in names}))
 
-    def on_validation_epoch_start(self, trainer: Any, module: Any) -> None:
+    def on_validation_epoch_start(self, trainer: Trainer, module: SplattingModule) -> None:
         self.samples: dict[str, list[Tensor]] = defaultdict(list)
 
-    def on_validation_batch_end(self, _: Any, __: Any, outputs: Prediction, *___: Any) -> None:
+    def on_validation_batch_end(
+        self, _: Trainer, __: SplattingModule, outputs: Prediction, *___: object
+    ) -> None:
         gaussians, rendering = outputs.gaussians, outputs.rendering
         values = {
             "opacity": gaussians.opacities.flatten(),
@@ -121,7 +128,7 @@ class TrainingMonitor(Callback):
             sample = numbers[:: max(1, len(numbers) // SAMPLES)].float()
             self.samples[name].append(sample[sample.isfinite()].cpu())
 
-    def on_validation_epoch_end(self, trainer: Any, module: Any) -> None:
+    def on_validation_epoch_end(self, trainer: Trainer, module: SplattingModule) -> None:
         for name, samples in self.samples.items():
             values = torch.cat(samples)
             if not len(values):
@@ -130,10 +137,10 @@ class TrainingMonitor(Callback):
             for logger in trainer.loggers:
                 log_histogram(logger, f"gaussians/{name}", values, trainer.global_step)
 
-    def _begin(self, trainer: Any) -> None:
+    def _begin(self, trainer: Trainer) -> None:
         self.begin_step, self.seconds, self.scenes, self.views = trainer.global_step, 0.0, 0, 0
 
-    def _count(self, trainer: Any, batch: Any) -> None:
+    def _count(self, trainer: Trainer, batch: Batch) -> None:
         """Count the seconds since `waiting_since`, and the scenes and views of a batch."""
         scenes = len(batch["scene"])
         views = batch["inputs"].num_views + batch["targets"].num_views
@@ -141,7 +148,7 @@ class TrainingMonitor(Callback):
         self.scenes += scenes
         self.views += scenes * views * trainer.world_size
 
-    def _rates(self, trainer: Any) -> dict[str, float]:
+    def _rates(self, trainer: Trainer) -> dict[str, float]:
         flops = self.flops * self.scenes / self.seconds
         rates = {
             "time/views_per_second": self.views / self.seconds,
@@ -151,7 +158,7 @@ class TrainingMonitor(Callback):
         return rates if self.peak is None else rates | {"time/mfu": flops / self.peak}
 
 
-def log(trainer: Any, numbers: dict[str, float], step: int) -> None:
+def log(trainer: Trainer, numbers: dict[str, float], step: int) -> None:
     """Log numbers at once, whatever `log_every_n_steps` is."""
     for logger in trainer.loggers:
         logger.log_metrics(numbers, step=step)

@@ -5,9 +5,9 @@ from dataclasses import fields, is_dataclass
 from functools import partial
 from typing import Any
 
-import lightning
 import torch
-from torch import Tensor
+from lightning import Callback, LightningModule, Trainer
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from asysplat.errors import InputError
@@ -15,7 +15,7 @@ from asysplat.training.parallel_scenes import Batch, split
 from asysplat.training.random_states import RandomStates, random_states, set_random_states
 
 
-class NonFiniteSteps(lightning.Callback):
+class NonFiniteSteps(Callback):
     """Drops a step with a NaN or infinite gradient, and restores the buffers that it changed.
 
     The step is then computed again, scene by scene, to report the scene and the first tensor that
@@ -31,7 +31,7 @@ class NonFiniteSteps(lightning.Callback):
     def __init__(self, budget: int = 10):
         self.budget = budget
         self.count, self.in_a_row = 0, 0
-        self.batches: list[tuple[dict[str, Any], RandomStates]] = []  # the step's micro-batches
+        self.batches: list[tuple[Batch, RandomStates]] = []  # the step's micro-batches
         self.buffers: list[Tensor] = []  # copies from before the step
 
     def state_dict(self) -> dict[str, Any]:
@@ -40,13 +40,17 @@ class NonFiniteSteps(lightning.Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.count, self.in_a_row = state_dict["count"], state_dict["in_a_row"]
 
-    def on_train_batch_start(self, trainer: Any, module: Any, batch: Any, index: int) -> None:
+    def on_train_batch_start(
+        self, trainer: Trainer, module: LightningModule, batch: Batch, index: int
+    ) -> None:
         if index % trainer.accumulate_grad_batches == 0:
             self.batches = []
             self.buffers = [buffer.clone() for buffer in module.buffers()]
         self.batches.append((batch, random_states()))
 
-    def on_before_optimizer_step(self, trainer: Any, module: Any, optimizer: Optimizer) -> None:
+    def on_before_optimizer_step(
+        self, trainer: Trainer, module: LightningModule, optimizer: Optimizer
+    ) -> None:
         named = [(name, p.grad) for name, p in module.named_parameters() if p.grad is not None]
         norm = torch.nn.utils.get_total_norm([grad for _, grad in named])
         module.log("train/grad_norm", norm)
@@ -74,7 +78,7 @@ class NonFiniteSteps(lightning.Callback):
                 "lower learning_rate or set trainer.precision=32-true."
             )
 
-    def _recompute(self, trainer: Any, module: Any) -> tuple[str, list[str]] | None:
+    def _recompute(self, trainer: Trainer, module: LightningModule) -> tuple[str, list[str]] | None:
         """Return the tensor and the scene; None if all is finite now."""
         current_states = random_states()
         try:
@@ -89,11 +93,11 @@ class NonFiniteSteps(lightning.Callback):
             set_random_states(current_states)
         return None
 
-    def on_train_epoch_end(self, trainer: Any, module: Any) -> None:
+    def on_train_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
         module.log("train/non_finite_steps", float(self.count))
 
 
-def first_non_finite(module: lightning.LightningModule, batch: Batch) -> str | None:
+def first_non_finite(module: LightningModule, batch: Batch) -> str | None:
     """Compute a batch's loss and gradients; name the first tensor that is NaN or infinite.
 
     The order is: inputs, outputs of modules (inner before outer ones), terms of the loss, gradients
@@ -102,11 +106,11 @@ def first_non_finite(module: lightning.LightningModule, batch: Batch) -> str | N
     """
     names: list[str] = []
 
-    def check(name: str, value: Any) -> None:
+    def check(name: str, value: object) -> None:
         bad = (part for part, tensor in tensors(value) if not tensor.isfinite().all())
         names.extend(f"{name}{part}" for part in bad)
 
-    def check_output(name: str, _: Any, __: Any, output: Any) -> None:
+    def check_output(name: str, _: nn.Module, __: object, output: object) -> None:
         check(f"the output of {name}", output)
         for part, tensor in tensors(output):
             if tensor.requires_grad:
@@ -137,7 +141,7 @@ def first_non_finite(module: lightning.LightningModule, batch: Batch) -> str | N
     return names[0] if names else None
 
 
-def tensors(value: Any, part: str = "") -> Iterator[tuple[str, Tensor]]:
+def tensors(value: object, part: str = "") -> Iterator[tuple[str, Tensor]]:
     """Yield the path, as ".cameras.intrinsics" or "[0]", and value of each nested float tensor."""
     if isinstance(value, Tensor):
         if value.is_floating_point():

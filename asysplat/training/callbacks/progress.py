@@ -3,8 +3,8 @@
 import time
 from datetime import timedelta
 from multiprocessing import current_process
-from typing import Any
 
+from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from rich import progress
 from rich.console import Console
@@ -29,17 +29,17 @@ class TrainingProgressBar(ProgressBar):
     def disable(self) -> None:
         self.enabled = False
 
-    def on_fit_start(self, trainer: Any, module: Any) -> None:
+    def on_fit_start(self, trainer: Trainer, module: LightningModule) -> None:
         self._open()  # a validation may precede the training
         self.training = self._add("training", total=trainer.max_steps)
 
-    def on_train_start(self, trainer: Any, module: Any) -> None:
+    def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
         step = trainer.global_step
         self.bars.reset(self.training, completed=step)
         self._draw(trainer, force=True)
         self.printed_step, self.printed_at = step, time.monotonic()
 
-    def on_train_batch_end(self, trainer: Any, module: Any, *_: Any) -> None:
+    def on_train_batch_end(self, trainer: Trainer, module: LightningModule, *_: object) -> None:
         step, total = trainer.global_step, trainer.max_steps
         self.bars.update(self.training, completed=step)
         self._draw(trainer)
@@ -47,33 +47,35 @@ class TrainingProgressBar(ProgressBar):
         if waited > LINE_SECONDS and step - self.printed_step >= LINE_FRACTION * total:
             self._print_line(trainer)
 
-    def on_validation_start(self, trainer: Any, module: Any) -> None:
+    def on_validation_start(self, trainer: Trainer, module: LightningModule) -> None:
         self.validation = self._add("validation", total=sum(trainer.num_val_batches))
 
-    def on_validation_batch_end(self, trainer: Any, module: Any, *_: Any) -> None:
+    def on_validation_batch_end(
+        self, trainer: Trainer, module: LightningModule, *_: object
+    ) -> None:
         self.bars.advance(self.validation)
         self._draw(trainer)
 
-    def on_validation_end(self, trainer: Any, module: Any) -> None:
+    def on_validation_end(self, trainer: Trainer, module: LightningModule) -> None:
         self.bars.remove_task(self.validation)
         self._print_line(trainer)
 
-    def on_train_end(self, trainer: Any, module: Any) -> None:
+    def on_train_end(self, trainer: Trainer, module: LightningModule) -> None:
         self._close(trainer)
 
-    def on_test_start(self, trainer: Any, module: Any) -> None:
+    def on_test_start(self, trainer: Trainer, module: LightningModule) -> None:
         self._open()
         self.testing = self._add("test", total=sum(trainer.num_test_batches))
         self._draw(trainer, force=True)
 
-    def on_test_batch_end(self, trainer: Any, module: Any, *_: Any) -> None:
+    def on_test_batch_end(self, trainer: Trainer, module: LightningModule, *_: object) -> None:
         self.bars.advance(self.testing)
         self._draw(trainer)
 
-    def on_test_end(self, trainer: Any, module: Any) -> None:
+    def on_test_end(self, trainer: Trainer, module: LightningModule) -> None:
         self._close(trainer)
 
-    def on_exception(self, trainer: Any, *_: Any) -> None:
+    def on_exception(self, trainer: Trainer, *_: object) -> None:
         if self.bars is not None:
             self._close(trainer)
 
@@ -96,14 +98,14 @@ class TrainingProgressBar(ProgressBar):
         self.bars.start()
         self.drawn_at = time.monotonic()
 
-    def _close(self, trainer: Any) -> None:
+    def _close(self, trainer: Trainer) -> None:
         self._draw(trainer, force=True)
         self.bars.stop()
 
     def _add(self, name: str, **counts: int) -> progress.TaskID:
         return self.bars.add_task(name, quality="", **counts)
 
-    def _draw(self, trainer: Any, force: bool = False) -> None:
+    def _draw(self, trainer: Trainer, force: bool = False) -> None:
         due = force or time.monotonic() - self.drawn_at > REFRESH_SECONDS
         if self.bars.disable or not due:
             return
@@ -113,7 +115,7 @@ class TrainingProgressBar(ProgressBar):
         self.bars.refresh()
         self.drawn_at = time.monotonic()
 
-    def _print_line(self, trainer: Any) -> None:
+    def _print_line(self, trainer: Trainer) -> None:
         if not self.enabled or self.on_terminal:
             return
         self.printed_step, self.printed_at = trainer.global_step, time.monotonic()
@@ -123,7 +125,7 @@ class TrainingProgressBar(ProgressBar):
         print(line.removesuffix(": "), flush=True)
 
 
-def quality(trainer: Any) -> str:
+def quality(trainer: Trainer) -> str:
     """Format the PSNR in dB of the last step and the last validation, where they are measured."""
     values = trainer.callback_metrics
     names = {"train/psnr": "PSNR {:.1f}", "val/psnr": "validation {:.1f}"}

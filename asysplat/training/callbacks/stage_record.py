@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import lightning
+from lightning import Callback, LightningModule, Trainer
 
 from asysplat.runs.summary import Results
 
 
-class StageRecord(lightning.Callback):
+class StageRecord(Callback):
     """Saves the name of the stage and the results of the stages before it in each checkpoint.
 
     A later stage writes its first checkpoint before its first step, which saves the results of the
@@ -20,6 +20,6 @@ class StageRecord(lightning.Callback):
     def state_dict(self) -> dict[str, Any]:
         return {"stage": self.stage, "earlier": self.earlier}
 
-    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
         if self.earlier and trainer.global_step == 0:
             trainer.save_checkpoint(trainer.checkpoint_callback.last)
