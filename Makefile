@@ -32,6 +32,7 @@ docs: $(ENV) ## the pages of docs/ and the API, searchable, in logs/docs
 style: $(ENV)
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
+	.venv/bin/ty check --output-format concise
 
 format: $(ENV)
 	.venv/bin/ruff check --fix .
