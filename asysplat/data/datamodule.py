@@ -147,7 +147,11 @@ class SceneDataModule(lightning.LightningDataModule):
             raise InputError(f"data.test_sets.{test_set}: {error}") from error
 
     def check_sizes(self, check: Callable[[int, int], None]) -> None:
-        """Call `check(height, width)` for every set; its InputError names the set."""
+        """Call `check(height, width)` for every set; its InputError names the set.
+
+        Raises:
+            InputError: what `check` raises, with the name of the set.
+        """
         check(self.height, self.width)
         for name, tasks in self.tests.items():
             try:
@@ -157,7 +161,11 @@ class SceneDataModule(lightning.LightningDataModule):
                 raise InputError(f"{where}: {error}") from error
 
     def check_views(self, check: Callable[[int], None]) -> None:
-        """Call `check(inputs)` for every set; its InputError names the set."""
+        """Call `check(inputs)` for every set; its InputError names the set.
+
+        Raises:
+            InputError: what `check` raises, with the name of the set.
+        """
         check(self.inputs)
         for name, tasks in self.tests.items():
             try:

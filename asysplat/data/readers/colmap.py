@@ -41,6 +41,9 @@ def read_scene(scene: Path, bad: BadImages) -> PosedScene:
     The names are relative to the first of FOLDERS that holds the most of them. Reads the registered
     images, ordered by the numbers in their names (2 before 10); a warning lists images that are not
     registered. Where images are smaller than their cameras' size, the intrinsics are scaled.
+
+    Raises:
+        InputError: a model that cannot be used, or images that are not there.
     """
     model = _find_model(scene)
     if model is None:

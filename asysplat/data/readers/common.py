@@ -57,7 +57,11 @@ def read_text(file: Path) -> str:
 
 
 def read_json(file: Path) -> Any:
-    """Read a JSON file."""
+    """Read a JSON file.
+
+    Raises:
+        InputError: the file is missing, empty or no JSON.
+    """
     if not file.is_file():
         raise InputError(f"{file} does not exist: put it there, or name another file.")
     text = read_text(file)
@@ -71,7 +75,11 @@ def read_json(file: Path) -> Any:
 
 
 def read_frames(file: Path) -> dict[str, Any]:
-    """Read a JSON object with a list "frames"."""
+    """Read a JSON object with a list "frames".
+
+    Raises:
+        InputError: no JSON, or no list "frames".
+    """
     content = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise InputError(f'{file} has no list "frames": give one entry for each image.')
@@ -84,14 +92,22 @@ def has_path(entry: object) -> bool:
 
 
 def frame_label(file: Path, index: int, entry: Any) -> str:
-    """Return the name of an entry of "frames" for messages."""
+    """Return the name of an entry of "frames" for messages.
+
+    Raises:
+        InputError: the entry has no file_path.
+    """
     if not has_path(entry):
         raise InputError(f"{file}, frame {index} has no file_path: name its image.")
     return f"{file}, frame {index} ({entry['file_path']})"
 
 
 def number(settings: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """Return the number under `key`, or `default` where there is none."""
+    """Return the number under `key`, or `default` where there is none.
+
+    Raises:
+        InputError: it is no finite number.
+    """
     value = settings.get(key, default)
     if not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
         raise InputError(f"{where}: {key} is {repr(value)[:80]}: give a finite number.")
@@ -150,7 +166,11 @@ def refuse_turned(size: tuple[int, int], lens_size: tuple[int | float, int | flo
 
 
 def check_map_size(path: Path, size: tuple[int, int], where: str) -> Path:
-    """Return the path of a depth map or mask, after checking that it shows the whole image."""
+    """Return the path of a depth map or mask, after checking that it shows the whole image.
+
+    Raises:
+        InputError: its proportions are not the image's.
+    """
     width, height = image_size(path)
     if not same_proportions((width, height), size):
         raise InputError(
@@ -169,7 +189,11 @@ def to_array(stored: object) -> Float[ndarray, "..."]:
 
 
 def check_rigid(stored: object, where: str) -> Float[ndarray, "4 4"]:
-    """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal."""
+    """Check a rigid transform, 4 rows of 4 numbers, and make its rotation exactly orthonormal.
+
+    Raises:
+        InputError: another shape, numbers that are not finite, or scale, shear or mirroring.
+    """
     matrix = to_array(stored)
     if matrix.shape != (4, 4):
         raise InputError(f"{where} is not 4x4: give four rows of four numbers.")

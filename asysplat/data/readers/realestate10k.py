@@ -41,7 +41,11 @@ def find_scenes(root: Path) -> list[Path]:
 
 
 def read_scene(scene: Path, bad: BadImages) -> PosedScene:
-    """Read one scene, named chunk.torch/key; its images stay in the file until they are decoded."""
+    """Read one scene, named chunk.torch/key; its images stay in the file until they are decoded.
+
+    Raises:
+        InputError: a name outside of a chunk, or no such scene in it.
+    """
     chunk = next((parent for parent in scene.parents if parent.suffix == CHUNK), None)
     if chunk is None:
         raise InputError(f"{scene} is no scene in a chunk: name one as 000000{CHUNK}/key.")

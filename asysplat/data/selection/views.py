@@ -144,7 +144,11 @@ def evenly_spaced(images: Sequence[int], count: int) -> list[int]:
 
 
 def check_held_out(num_images: int, num_candidates: int, num_inputs: int, split: Split) -> None:
-    """Check that there are targets, and enough candidates for the inputs."""
+    """Check that there are targets, and enough candidates for the inputs.
+
+    Raises:
+        InputError: there are too few.
+    """
     if num_candidates < num_inputs or not held_out(num_images, split):
         raise InputError(
             f"The sequence has {num_images} images, of which {num_candidates} are not held out for "

@@ -103,7 +103,11 @@ class SplattingLoss(nn.Module):
 
 
 def report_missing(reason: str, allowed: bool) -> None:
-    """Warn that the training goes on without a term of the loss, or refuse to."""
+    """Warn that the training continues without a term of the loss.
+
+    Raises:
+        InputError: the term may not be missing.
+    """
     if not allowed:
         raise InputError(f"{reason}, and allow_missing_losses=true trains without this term.")
-    warnings.warn(f"{reason}. Training goes on without this term.", stacklevel=4)
+    warnings.warn(f"{reason}. Training continues without this term.", stacklevel=4)
