@@ -1,4 +1,4 @@
-.PHONY: install demo quick test bench slow docs style format
+.PHONY: install demo quick test bench slow oldest docs style format
 PYTHON ?= python3
 ENV := .venv/.ready
 # Two worker processes of one thread each; a file's tests share a process, and so their fixtures.
@@ -24,6 +24,11 @@ bench: $(ENV) ## check for slowdowns: ratios within one process, against docs/re
 
 slow: $(ENV) ## tests of an hour or two: long runs on real scenes, two processes for every model
 	$(PYTEST) -m slow
+
+oldest: ## the fast tests with the oldest packages that pyproject.toml allows: needs uv, and downloads them
+	uv venv --quiet --clear --python 3.11 logs/oldest
+	uv pip install --quiet --python logs/oldest --resolution lowest-direct -e ".[dev]"
+	OMP_NUM_THREADS=1 logs/oldest/bin/python -m pytest -n 2 --dist loadfile -m "not medium and not slow"
 
 docs: $(ENV) ## the pages of docs/ and the API, searchable, in logs/docs
 	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict
