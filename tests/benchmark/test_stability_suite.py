@@ -138,7 +138,7 @@ def test_a_box_short_of_a_tile_is_red(measured, monkeypatch):
 
 
 def nan_gradient(values, bound):
-    """`head.bounded` with correct values and NaN gradients."""
+    """`head.squash` with correct values and NaN gradients."""
     return bound * (values / bound).tanh() + 0 * (values - values.detach()).sqrt()
 
 
@@ -146,7 +146,7 @@ def nan_gradient(values, bound):
 def test_a_nan_gradient_is_red(measured, monkeypatch):
     cases = [("network", "noise photographs"), ("training", "3 steps on hostile batches")]
     assert all(measured(*case)[0]["green"] for case in [*cases, ("network", "white photographs")])
-    monkeypatch.setattr(head, "bounded", nan_gradient)
+    monkeypatch.setattr(head, "squash", nan_gradient)
     for case in cases:
         (row,) = measured(*case)
         assert not row["green"] and row["nan"] > 0, case
