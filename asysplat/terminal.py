@@ -8,7 +8,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-NAMES_SHARE = 1 / 3  # greatest share of the terminal's width for the names of the rows
+NAMES_FRACTION = 1 / 3  # greatest fraction of the terminal's width for the names of the rows
 UNLIMITED = 10_000  # characters
 
 
@@ -47,7 +47,7 @@ def print_table(
         options = console.options.update(max_width=UNLIMITED)
         return Measurement.get(console, options, part(numbers)).maximum
 
-    names_width = int(NAMES_SHARE * console.width)
+    names_width = int(NAMES_FRACTION * console.width)
     starts = sorted(first or range(1, len(headings)))
     numbers = [0]
     for start, end in zip(starts, [*starts[1:], len(headings)], strict=True):

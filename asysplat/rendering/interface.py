@@ -37,7 +37,7 @@ class BlendingLimits:
             dropped, with all behind it.
         eps2d: variance added to every projected Gaussian, in pixels squared.
         near: Gaussians whose mean has a depth <= near are culled, in scene units.
-        frustum_margin: the Jacobian is taken inside the view widened by this share on each side.
+        frustum_margin: the Jacobian is taken inside the view widened by this fraction on each side.
         compensation_min: minimum of the squared factor of the opacity for antialiasing.
     """
 

@@ -239,5 +239,5 @@ def whiten(row_x: Tensor, row_y: Tensor, settings: RenderSettings) -> tuple[Tens
     if not settings.antialiased:
         return whitening, deviations, torch.ones_like(a)
     # sqrt(det(M M^T) / det(M M^T + eps I)), Yu et al. 2024, Eq. 10.
-    share = (minors / det).clamp_min(settings.limits.compensation_min)
-    return whitening, deviations, share.sqrt()
+    ratio = (minors / det).clamp_min(settings.limits.compensation_min)
+    return whitening, deviations, ratio.sqrt()
