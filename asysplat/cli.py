@@ -34,7 +34,10 @@ def check_command(script: str) -> None:
     words = sys.argv[1:]
     args, unknown = get_args_parser().parse_known_args(words)
     hydra_option = args.config_dir or args.config_name or args.config_path or args.shell_completion
-    if args.help or args.hydra_help or args.shell_completion:
+    if args.help:  # what Hydra prints, without the second that composing takes
+        print(OmegaConf.load(CONF / f"{script}.yaml").hydra.help.template)
+        sys.exit()
+    if args.hydra_help or args.shell_completion:
         hydra.main(config_path=str(CONF), config_name=script, version_base="1.3")(lambda _: None)()
         sys.exit()
     try:
