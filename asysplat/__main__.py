@@ -67,17 +67,16 @@ def start(name: str, words: Sequence[str]) -> None:
 
 def complete(words: Sequence[str]) -> None:
     """Complete the first word by the commands, and the others by Hydra's own completion."""
-    import hydra
-
     line = os.environ.get("COMP_LINE", "")
     typed = shlex.split(line) + [""] * line.endswith(" ")
     if len(typed) > 2 and typed[1] in COMMANDS and COMMANDS[typed[1]][0].endswith(".py"):
         # Hydra's completion knows lines without the command.
         rest = line.split(typed[1], 1)[1].lstrip()
-        os.environ["COMP_LINE"] = line = f"asysplat {rest}"
-        os.environ["COMP_POINT"] = str(len(line))
+        os.environ["COMP_LINE"] = f"asysplat {rest}"
         start(typed[1], [COMPLETION[0], *words])
     if not line:  # install=bash
+        import hydra
+
         hydra.main(version_base="1.3")(lambda _: None)()
     elif len(typed) == 2:
         print(" ".join(name for name in COMMANDS if name.startswith(typed[1])))

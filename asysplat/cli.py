@@ -33,7 +33,7 @@ def check_command(script: str) -> None:
     os.environ.setdefault("ASYSPLAT_SHARED", str(ROOT.parent / "shared"))
     words = sys.argv[1:]
     args, unknown = get_args_parser().parse_known_args(words)
-    hydra_option = args.config_dir or args.config_name or args.config_path or args.shell_completion
+    other_files = args.config_dir or args.config_name or args.config_path
     if args.help:  # what Hydra prints, without the second that composing takes
         print(OmegaConf.load(CONF / f"{script}.yaml").hydra.help.template)
         sys.exit()
@@ -42,7 +42,7 @@ def check_command(script: str) -> None:
         sys.exit()
     try:
         _check_dashes(words, unknown)
-        if not hydra_option:  # configuration files, and a run
+        if not other_files:
             check_overrides(args.overrides, script)
     except InputError as error:
         sys.exit(f"error: {error}")

@@ -42,19 +42,21 @@ def main() -> None:
 
 def describe() -> dict[str, str]:
     """Describe the project's copy, Python, torch, the processor, the memory and the GPUs."""
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     cache, home = Path.home() / ".cache" / "asysplat", shutil.disk_usage(Path.home())
     lines = {
         "asysplat": f"{__version__}, {revision()}, in {ROOT}",
         "python": f"{platform.python_version()}, {sys.executable}",
         "system": platform.platform(),
-        "processor": f"{processor()}, {os.cpu_count()} cores, {memory:.0f} GB",
+        "processor": f"{processor()}, {os.cpu_count()} cores",
         "disk": f"{home.free / 1e9:.0f} GB free at home; compiled kernels are in {cache}",
     }
     if find_spec("torch") is None:
         return lines
     import torch
 
+    from asysplat.evaluation.measured_cost import memory_gb
+
+    lines["memory"] = f"{memory_gb('cpu'):.0f} GB"
     lines["torch"] = f"{torch.__version__}, {torch.get_num_threads()} threads"
     lines["kernels"] = ", ".join(
         f"{name} {version(name)}" for name in ("numba", "triton") if find_spec(name)
@@ -63,7 +65,7 @@ def describe() -> dict[str, str]:
     for index in range(torch.cuda.device_count()):
         card = torch.cuda.get_device_properties(index)
         lines["gpu" if not index else f"gpu {index}"] = (
-            f"{card.name}, {card.total_memory / 1e9:.0f} GB, compute capability "
+            f"{card.name}, {memory_gb(f'cuda:{index}'):.0f} GB, compute capability "
             f"{card.major}.{card.minor}, CUDA {torch.version.cuda}"
         )
     return lines

@@ -109,8 +109,9 @@ def open_photographs(
         width = max(1, round(height * lens.width / lens.height))
     if views is None:
         views = max(2, MAX_BYTES // (height * width * BYTES_PER_PIXEL))
-    held_out = list(range(len(scene.images)))[::held_out_every] if held_out_every else []
-    rest = sorted(set(range(len(scene.images))) - set(held_out))
+    indices = range(len(scene.images))
+    held_out = list(indices[::held_out_every]) if held_out_every else []
+    rest = sorted(set(indices) - set(held_out))
     if len(rest) < 2:
         raise InputError(
             f"{path} has {len(scene.images)} photographs, of which held_out_every={held_out_every} "
@@ -120,9 +121,8 @@ def open_photographs(
     held_out = evenly_spaced(held_out, min(max_held_out, len(held_out))) if held_out else []
     if not found:
         selected = sorted((*inputs, *held_out))
-        part = refine_given(
-            replace(scene, images=[scene.images[i] for i in selected]), cameras, say
-        )
+        part = replace(scene, images=[scene.images[index] for index in selected])
+        part = refine_given(part, cameras, say)
         images = dict(enumerate(scene.images)) | dict(zip(selected, part.images, strict=True))
         scene = replace(part, images=list(images.values()))
     _warn_of_wrong_cameras(scene, say)

@@ -85,10 +85,8 @@ class Results:
         Raises:
             InputError: a file cannot be written; the scene is elsewhere then, see `save_ply`.
         """
-        world, origin = (
-            self._photographs.normalization.to_world(gaussians),
-            self._photographs.origin,
-        )
+        origin = self._photographs.origin
+        world = self._photographs.normalization.to_world(gaussians)
         background = self._background.tolist()
         save_ply(self.folder / "scene.ply", world, origin, background)
         numbers = {"background": background, "offset": origin}

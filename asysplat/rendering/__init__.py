@@ -1,6 +1,12 @@
 """Render Gaussians to images: project, sort into tiles, rasterize."""
 
-from asysplat.rendering.interface import BLENDING_LIMITS, GSPLAT_1_5, INRIA, BlendingLimits
+from asysplat.rendering.interface import (
+    BLENDING_LIMITS,
+    GSPLAT_1_5,
+    INRIA,
+    BlendingLimits,
+    Projections,
+)
 from asysplat.rendering.render import Rendering, render
 
 __all__ = [
@@ -8,6 +14,7 @@ __all__ = [
     "GSPLAT_1_5",
     "INRIA",
     "BlendingLimits",
+    "Projections",
     "Rendering",
     "render",
 ]

@@ -316,9 +316,9 @@ def test_3dgs_has_no_limit_and_its_schedule_needs_densification_by_gradients():
 
 def test_watch_may_end_a_refinement():
     settings, records = RefinementSettings(densify="none"), []
-    stop = lambda now, _: records.append(now) or now.step == 3  # noqa: E731
+    stop = lambda record, _: records.append(record) or record.step == 3  # noqa: E731
     refine(small_scene(), small_views(), settings, steps=10, watch=stop)
-    found = [(now.step, now.fraction, now.gaussians) for now in records]
+    found = [(record.step, record.fraction, record.gaussians) for record in records]
     assert found == [(1, 0.1, 20), (2, 0.2, 20), (3, 0.3, 20)]
 
 

@@ -26,7 +26,7 @@ def damage(path):
     content = bytearray(path.read_bytes())
     with zipfile.ZipFile(path) as parts:
         (part,) = (each for each in parts.infolist() if each.filename.endswith("/data/0"))
-    lengths = struct.unpack_from("<HH", content, part.header_offset + 26)  # of its name and more
+    lengths = struct.unpack_from("<HH", content, part.header_offset + 26)  # name, extra field
     content[part.header_offset + 30 + sum(lengths)] ^= 1
     path.write_bytes(content)
 

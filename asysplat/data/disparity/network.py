@@ -25,7 +25,7 @@ class DepthAnything:
 
     def __init__(self, network: nn.Module, device: torch.device):
         self.network, self.device = network.to(device).eval(), device
-        config: Any = network.config  # of transformers
+        config: Any = network.config  # transformers' own type
         self.patch_size: int = config.patch_size
         self.mean, self.std = (
             torch.tensor(rgb, device=device)[:, None, None] for rgb in (MEAN, STD)
