@@ -5,13 +5,13 @@ from asysplat.later import import_later
 LATER = {
     "orbit": "asysplat.export.camera_paths",
     "read_gaussians": "asysplat.export.gaussians",
-    "read_ply": "asysplat.export.ply",
-    "read_safetensors": "asysplat.export.tensors",
-    "read_splat": "asysplat.export.splat",
+    "read_ply": "asysplat.export.formats.ply",
+    "read_safetensors": "asysplat.export.formats.safetensors",
+    "read_splat": "asysplat.export.formats.splat",
     "smoothed_path": "asysplat.export.camera_paths",
     "write_gaussians": "asysplat.export.gaussians",
-    "write_ply": "asysplat.export.ply",
-    "write_safetensors": "asysplat.export.tensors",
+    "write_ply": "asysplat.export.formats.ply",
+    "write_safetensors": "asysplat.export.formats.safetensors",
     "write_video": "asysplat.export.video",
 }
 

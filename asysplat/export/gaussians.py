@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
-from asysplat.export.ply import read_comment, read_ply, write_ply
-from asysplat.export.splat import read_splat
-from asysplat.export.tensors import read_safetensors, write_safetensors
+from asysplat.export.formats.ply import read_comment, read_ply, write_ply
+from asysplat.export.formats.safetensors import read_safetensors, write_safetensors
+from asysplat.export.formats.splat import read_splat
 from asysplat.scene import Gaussians
 
 MAX_TEXT = 80  # characters of a file in a message

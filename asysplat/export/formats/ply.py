@@ -12,8 +12,8 @@ import torch
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from asysplat.errors import InputError
-from asysplat.export.checks import TINY, prepare_for_export, require_file
-from asysplat.export.ply_table import read_vertices
+from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
+from asysplat.export.formats.ply_table import read_vertices
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 

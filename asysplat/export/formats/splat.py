@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from asysplat.errors import InputError
-from asysplat.export.checks import TINY, require_file
+from asysplat.export.formats.checks import TINY, require_file
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians
 

@@ -1,0 +1,1 @@
+"""File formats of Gaussians, one module each; `asysplat.export.gaussians` picks by suffix."""

@@ -1,0 +1,271 @@
+"""Gaussians as SPZ, of Niantic's tools and many viewers: about 20 bytes each, then compressed.
+
+Format: https://github.com/nianticlabs/spz. Its axes are OpenGL's: right, up, backward.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from asysplat.errors import InputError
+from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
+from asysplat.export.formats.packing import half_turn, join_largest, morton_order, split_largest
+from asysplat.files import atomic_write
+from asysplat.scene import Gaussians
+
+MAGIC = b"NGSP"
+HEADER = struct.Struct(
+    "<4sIIBBBB"
+)  # magic, version, count, SH degree, fraction bits, flags, streams
+TABLE = struct.Struct("<QQ")  # of a stream in version 4: compressed and full size
+HEADER_4 = 32  # bytes of the header in version 4
+ANTIALIASED, EXTENSIONS = 1, 2  # flags
+SH_SIZES = (0, 9, 24, 45, 72)  # numbers per Gaussian, by degree; of degree 4, 45 are read
+MAX_FRACTION_BITS = 23
+COLOR_FACTOR = 0.15  # a byte of color is 255 (0.5 + 0.15 sh)
+SH_BITS = (5, 4)  # of degree 1, and of the others: what the format's own writer keeps
+GZIP = 16 + zlib.MAX_WBITS
+PIECE = 1 << 20  # bytes that are decompressed at once: a damaged count allocates nothing
+
+
+class Header(NamedTuple):
+    """What a file says of its Gaussians."""
+
+    version: int
+    count: int
+    degree: int
+    fraction_bits: int
+
+    def sizes(self) -> list[int]:
+        """Return the bytes of positions, alphas, colors, scales, rotations and SH."""
+        rotation = 3 if self.version == 2 else 4
+        return [self.count * size for size in (9, 1, 3, 3, rotation, SH_SIZES[self.degree])]
+
+
+def write_spz(path: str | Path, gaussians: Gaussians, version: int = 3) -> None:
+    """Write one scene, without batch dimension, as SPZ.
+
+    Means are rounded to the finest of 2^-n units that 24 bits allow, scales to 3 %, opacities and
+    colors to 1/255, SH to 5 bits of [-1, 1] in degree 1 and 4 above, rotations to 0.1 degrees.
+    Gaussians are ordered along a Z-order curve.
+
+    Args:
+        path: the file.
+        gaussians: [N].
+        version: 2 or 3, gzip, which most programs read; 4, Zstandard, needs the package zstandard.
+
+    Raises:
+        InputError: invalid Gaussians, another version, a file that cannot be written, or
+            zstandard is missing.
+    """
+    content = encode_spz(gaussians, version)
+    with atomic_write(path) as partial:
+        partial.write_bytes(content)
+
+
+def encode_spz(gaussians: Gaussians, version: int = 3) -> bytes:
+    """Return the content of an SPZ file; see `write_spz`."""
+    if version not in (2, 3, 4):
+        raise InputError(f"write_spz's version is {version!r}: choose 2, 3 or 4.")
+    scene = half_turn(prepare_for_export(gaussians), 0)
+    scene = scene.map(lambda field: field[morton_order(scene.means)])
+    largest = scene.means.abs().max().item()
+    # Rounding may reach 2^23 only from below.
+    fraction_bits = 12 if largest == 0 else int(np.floor(23 - np.log2(largest * (1 + 1e-6))))
+    fraction_bits = min(max(fraction_bits, 0), MAX_FRACTION_BITS)
+    if largest * 2.0**fraction_bits >= 2**23:
+        raise InputError(
+            f"Gaussians.means reach {largest:g}: SPZ holds up to {2**23}; scale the scene, or "
+            "write another format."
+        )
+    degree = int(scene.sh.shape[1] ** 0.5) - 1
+    streams = [stream.tobytes() for stream in _streams(scene, fraction_bits, version)]
+    header = [MAGIC, version, len(scene.opacities), degree, fraction_bits, 0]
+    if version < 4:
+        packer = zlib.compressobj(6, wbits=GZIP)
+        return packer.compress(b"".join([HEADER.pack(*header, 0), *streams])) + packer.flush()
+    zstandard = _zstandard()
+    streams = [stream for stream in streams if stream]
+    packed = [zstandard.ZstdCompressor(12).compress(stream) for stream in streams]
+    start = HEADER.pack(*header, len(packed)) + struct.pack("<I12x", HEADER_4)
+    sizes = [TABLE.pack(len(p), len(s)) for p, s in zip(packed, streams, strict=True)]
+    return b"".join([start, *sizes, *packed])
+
+
+def _streams(scene: Gaussians, fraction_bits: int, version: int) -> Iterator[UInt8[ndarray, "..."]]:
+    """Return positions, alphas, colors, scales, rotations and SH as bytes."""
+    fixed = (scene.means.double() * 2.0**fraction_bits).round().to(torch.int32).numpy()
+    yield fixed.astype("<i4")[..., None].view(np.uint8)[..., :3]
+    yield _byte(255 * scene.opacities.double())
+    yield _byte(255 * (COLOR_FACTOR * scene.sh[:, 0].double() + 0.5))
+    yield _byte(16 * (scene.scales.double().log() + 10))
+    quats = scene.quats.roll(-1, 1)  # xyzw
+    if version == 2:
+        quats = torch.nn.functional.normalize(quats.double(), dim=-1)
+        quats = torch.where(quats[:, 3:] < 0, -quats, quats)
+        yield _byte(127.5 * (quats[:, :3] + 1))
+    else:
+        index, rest = (part.numpy() for part in split_largest(quats))
+        sizes = (511 * np.sqrt(2) * np.abs(rest) + 0.5).astype(np.uint32)
+        ten_bits = sizes | (rest < 0).astype(np.uint32) << 9
+        packed = index.astype(np.uint32)
+        for column in ten_bits.T:
+            packed = packed << 10 | column
+        yield packed.astype("<u4")[:, None].view(np.uint8)
+    sh = 128 * scene.sh[:, 1:].double().numpy() + 128
+    step = np.where(np.arange(sh.shape[1]) < 3, 2.0 ** (8 - SH_BITS[0]), 2.0 ** (8 - SH_BITS[1]))
+    step = step[:, None]
+    yield (step * np.floor(sh / step + 0.5)).clip(0, 255).astype(np.uint8)
+
+
+def read_spz(path: str | Path) -> Gaussians:
+    """Read one scene from SPZ, version 2, 3 or 4; SH of degree 4 are left out.
+
+    Raises:
+        InputError: not an SPZ file, a damaged one, another version, invalid Gaussians, or
+            zstandard is missing.
+    """
+    path = require_file(path)
+    content = path.read_bytes()
+    header, streams = (_read_4 if content[:4] == MAGIC else _read_gzip)(path, content)
+    positions, alphas, colors, scales, rotations, sh = (
+        np.frombuffer(stream, np.uint8).reshape(header.count, -1)
+        if stream
+        else np.zeros((header.count, 0), np.uint8)
+        for stream in streams
+    )
+    fixed = np.zeros((header.count, 3, 4), np.uint8)
+    fixed[..., 1:] = positions.reshape(-1, 3, 3)  # the sign stands in the highest byte
+    means = (fixed.view("<i4")[..., 0] >> 8) * 2.0**-header.fraction_bits
+    rest_count = min(header.degree + 1, 4) ** 2 - 1
+    rest = (sh.reshape(header.count, -1, 3)[:, :rest_count].astype(np.float32) - 128) / 128
+    color = (colors[:, None] / np.float32(255) - 0.5) / COLOR_FACTOR
+    gaussians = Gaussians(
+        means=torch.from_numpy(means).float(),
+        quats=_quats(rotations).roll(1, 1).float(),
+        scales=torch.from_numpy(np.exp(scales / np.float32(16) - 10)),
+        opacities=torch.from_numpy(alphas[:, 0] / np.float32(255)).clamp_min(TINY),
+        sh=torch.from_numpy(np.concatenate((color, rest), 1)),
+    )
+    return half_turn(gaussians, 0).validate(f"{path}: Gaussians")
+
+
+def _quats(rotations: UInt8[ndarray, "N size"]) -> torch.Tensor:
+    """Unpack rotations of 3 or 4 bytes to quaternions, xyzw."""
+    if rotations.shape[1] == 3:
+        xyz = rotations / 127.5 - 1
+        w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(1, keepdims=True)))
+        return torch.nn.functional.normalize(torch.from_numpy(np.concatenate((xyz, w), 1)), dim=-1)
+    packed = np.ascontiguousarray(rotations).view("<u4")
+    ten_bits = packed >> np.array([20, 10, 0], np.uint32) & 1023
+    rest = (ten_bits & 511) / (511 * np.sqrt(2)) * np.where(ten_bits >> 9, -1, 1)
+    return join_largest((packed[:, 0] >> 30).astype(np.int64), rest)
+
+
+def _read_gzip(path: Path, content: bytes) -> tuple[Header, list[bytes]]:
+    """Read versions 2 and 3: header and all streams in one gzip stream."""
+    unpacker = zlib.decompressobj(GZIP)
+    header = None
+    data, end = bytearray(), HEADER.size
+    try:
+        while len(data) < end and not unpacker.eof:
+            piece = unpacker.decompress(
+                content if header is None and not data else unpacker.unconsumed_tail,
+                min(PIECE, end - len(data)),
+            )
+            if not piece and not unpacker.unconsumed_tail:
+                break
+            data += piece
+            if header is None and len(data) >= HEADER.size:
+                header, _ = _header(path, bytes(data[: HEADER.size]))
+                end += sum(header.sizes())
+    except zlib.error as error:
+        raise InputError(
+            f"{path} cannot be unpacked ({error}): it is damaged or no SPZ file; copy it again."
+        ) from error
+    if header is None or len(data) < end:
+        raise _cut_off(path)
+    streams, start = [], HEADER.size
+    for size in header.sizes():
+        streams.append(bytes(data[start : start + size]))
+        start += size
+    return header, streams
+
+
+def _read_4(path: Path, content: bytes) -> tuple[Header, list[bytes]]:
+    """Read version 4: a header, a table of streams, and each stream in Zstandard."""
+    if len(content) < HEADER_4:
+        raise _cut_off(path)
+    header, count = _header(path, content[: HEADER.size])
+    sizes = header.sizes()
+    stored = [size for size in sizes if size]
+    (start,) = struct.unpack_from("<I", content, HEADER.size)
+    if count != len(stored) or start < HEADER_4:
+        raise InputError(
+            f"{path} has {count} streams after {start} bytes: expected {len(stored)} after "
+            f"{HEADER_4} or more; copy it again."
+        )
+    if start + count * TABLE.size > len(content):
+        raise _cut_off(path)
+    table = [TABLE.unpack_from(content, start + i * TABLE.size) for i in range(count)]
+    start += count * TABLE.size
+    zstandard, streams = _zstandard(), []
+    for (packed, full), size in zip(table, stored, strict=True):
+        if full != size or start + packed > len(content):
+            raise _cut_off(path)
+        unpacker = zstandard.ZstdDecompressor().stream_reader(content[start : start + packed])
+        data = bytearray()
+        try:
+            while len(data) <= size and (piece := unpacker.read(min(PIECE, size + 1 - len(data)))):
+                data += piece
+        except zstandard.ZstdError as error:
+            raise InputError(
+                f"{path} cannot be unpacked ({error}): it is damaged; copy it again."
+            ) from error
+        if len(data) != size:
+            raise _cut_off(path)
+        streams.append(bytes(data))
+        start += packed
+    return header, streams + [b""] * (len(sizes) - count)
+
+
+def _header(path: Path, content: bytes) -> tuple[Header, int]:
+    """Read a header, and the number of streams, which versions 2 and 3 do not use."""
+    magic, version, count, degree, fraction_bits, flags, streams = HEADER.unpack(content)
+    if magic != MAGIC:
+        raise InputError(f"{path} is not an SPZ file: expected {MAGIC.decode()} at its beginning.")
+    for name, value, low, high in (
+        ("version", version, 2, 4),
+        ("SH degree", degree, 0, len(SH_SIZES) - 1),
+        ("number of fraction bits", fraction_bits, 0, MAX_FRACTION_BITS),
+    ):
+        if not low <= value <= high:
+            raise InputError(f"{path} has the {name} {value}: expected {low} to {high}.")
+    if count == 0:
+        raise InputError(f"{path} has no Gaussians: expected one or more.")
+    return Header(version, count, degree, fraction_bits), streams
+
+
+def _zstandard():
+    try:
+        import zstandard
+    except ImportError as error:
+        raise InputError(
+            "SPZ of version 4 needs zstandard: pip install 'asysplat[spz]'."
+        ) from error
+    return zstandard
+
+
+def _byte(values: torch.Tensor) -> UInt8[ndarray, "..."]:
+    return values.round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+def _cut_off(path: Path) -> InputError:
+    return InputError(f"{path} is cut off or damaged: its streams have other sizes; copy it again.")
