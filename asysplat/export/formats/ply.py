@@ -12,8 +12,9 @@ import torch
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from asysplat.errors import InputError
+from asysplat.export.formats import compressed_ply
 from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
-from asysplat.export.formats.ply_table import read_vertices
+from asysplat.export.formats.ply_table import read_elements
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 
@@ -69,7 +70,7 @@ def write_ply(
 
 
 def read_ply(path: str | Path) -> Gaussians:
-    """Read one scene from PLY, little-endian, big-endian or ASCII, in float32.
+    """Read one scene from PLY, little-endian, big-endian, ASCII or compressed, in float32.
 
     Properties may have any order; unknown ones are ignored.
 
@@ -77,8 +78,11 @@ def read_ply(path: str | Path) -> Gaussians:
         InputError: not a PLY file, a truncated one, a missing property, or invalid Gaussians.
     """
     path = require_file(path)
-    vertices = read_vertices(path)
+    elements = read_elements(path, compressed_ply.ELEMENTS)
+    vertices = elements["vertex"]
     properties = vertices.dtype.names
+    if compressed_ply.PACKED[0] in properties:
+        return compressed_ply.unpack(path, elements)
     count = sum(name.startswith("f_rest_") for name in properties)
     if count not in REST_COUNTS:
         raise InputError(

@@ -1,9 +1,10 @@
-"""The vertices of a PLY file, ASCII, little-endian or big-endian, as a structured array.
+"""The elements of a PLY file, ASCII, little-endian or big-endian, as structured arrays.
 
 Format: http://paulbourke.net/dataformats/ply
 """
 
 import warnings
+from collections.abc import Collection
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
@@ -23,52 +24,65 @@ MAX_LINE = 4096  # bytes of a header's line: other files may have no lines
 Element = tuple[str, int, dict[str, str | None]]
 
 
-def read_vertices(path: Path) -> ndarray:
-    """Read all vertices: [N], with a field for each property.
+def read_elements(path: Path, names: Collection[str]) -> dict[str, ndarray]:
+    """Read the elements with these names, among them the vertices: rows [N] of fields.
+
+    An element that the file does not have is left out.
 
     Raises:
         InputError: not a PLY file, a truncated one, or one without vertices or with lists before or
-            in them.
+            in what is read.
     """
     with open(path, "rb") as file:
         byte_order, elements = _read_header(file, path)
-        for name, count, types in elements:
+        declared = [name for name, _, _ in elements]
+        if "vertex" not in declared:
+            raise InputError(f"{path} has no element vertex in its header: expected one.")
+        last = max(index for index, name in enumerate(declared) if name in names)
+        tables = {}
+        for name, count, types in elements[: last + 1]:
             if None in types.values():
                 raise InputError(
                     f"{path} has a list in its element {name}: expected vertices of single "
                     "numbers, and no lists before them."
                 )
             row = np.dtype([(key, byte_order + kind) for key, kind in types.items()])
-            if name == "vertex":
-                break
-            if count > path.stat().st_size:
-                raise _truncated(path, count, "fewer bytes", f"rows of {name}")
-            if byte_order:
+            if name in names:
+                tables[name] = _read_rows(file, path, name, count, row, text=not byte_order)
+            elif count > path.stat().st_size:
+                raise _cut_off(path, count, name, "fewer bytes")
+            elif byte_order:
                 file.seek(count * row.itemsize, 1)
             else:
                 next(islice(file, count, count), None)
-        else:
-            raise InputError(f"{path} has no element vertex in its header: expected one.")
-        if count == 0 or not types:
-            raise InputError(f"{path} has no vertices: expected one or more, with properties.")
-        # Before allocating: a damaged header may declare any number.
-        remaining = path.stat().st_size - file.tell()
-        smallest = row.itemsize if byte_order else 2 * len(row)
-        if count * smallest > remaining + (not byte_order):
-            raise _truncated(path, count, f"{remaining} bytes")
-        if byte_order:
-            return np.fromfile(file, row, count)
-        try:
-            with warnings.catch_warnings():  # loadtxt warns if no line is left
-                warnings.simplefilter("ignore", UserWarning)
-                rows = np.loadtxt(file, row, comments=None, max_rows=count, ndmin=1)
-        except ValueError as error:
-            raise InputError(
-                f"{path} has a vertex that cannot be read ({error}): expected {len(row)} numbers "
-                "a line."
-            ) from error
+    return tables
+
+
+def _read_rows(
+    file: BinaryIO, path: Path, name: str, count: int, row: np.dtype, text: bool
+) -> ndarray:
+    """Read the rows of one element, which begin where the file stands."""
+    if count == 0 or not row.names:
+        raise InputError(f"{path} has no {_plural(name)}: expected one or more, with properties.")
+    # Before allocating: a damaged header may declare any number.
+    remaining = path.stat().st_size - file.tell()
+    smallest = 2 * len(row) if text else row.itemsize
+    if count * smallest > remaining + text:
+        raise _cut_off(path, count, name, f"{remaining} bytes")
+    if not text:
+        return np.fromfile(file, row, count)
+    lines = islice(file, count)
+    try:
+        with warnings.catch_warnings():  # loadtxt warns if no line is left
+            warnings.simplefilter("ignore", UserWarning)
+            rows = np.loadtxt(lines, row, comments=None, ndmin=1)
+    except ValueError as error:
+        raise InputError(
+            f"{path} has a {name} that cannot be read ({error}): expected {len(row)} "
+            "numbers a line."
+        ) from error
     if len(rows) < count:
-        raise _truncated(path, count, f"{len(rows)} lines")
+        raise _cut_off(path, count, name, f"{len(rows)} lines")
     return rows
 
 
@@ -101,7 +115,12 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
     return byte_order, elements
 
 
-def _truncated(path: Path, count: int, rest: str, kind: str = "vertices") -> InputError:
+def _plural(name: str) -> str:
+    return "vertices" if name == "vertex" else f"rows of {name}"
+
+
+def _cut_off(path: Path, count: int, name: str, rest: str) -> InputError:
     return InputError(
-        f"{path} is cut off: its header declares {count} {kind}, but {rest} follow; copy it again."
+        f"{path} is cut off: its header declares {count} {_plural(name)}, but {rest} follow; copy "
+        "it again."
     )

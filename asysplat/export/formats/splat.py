@@ -1,4 +1,4 @@
-"""Gaussians from .splat files, 32 bytes each, of antimatter15's viewer and many phone apps."""
+"""Gaussians as .splat, 32 bytes each, of antimatter15's viewer and many phone apps."""
 
 from pathlib import Path
 
@@ -6,7 +6,8 @@ import numpy as np
 import torch
 
 from asysplat.errors import InputError
-from asysplat.export.formats.checks import TINY, require_file
+from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
+from asysplat.files import atomic_write
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians
 
@@ -41,3 +42,24 @@ def read_splat(path: str | Path) -> Gaussians:
         sh=(rgba[:, None, :3] - 0.5) / SH_C0,
     )
     return gaussians.validate(f"{path}: Gaussians")
+
+
+def write_splat(path: str | Path, gaussians: Gaussians) -> None:
+    """Write one scene, without batch dimension, as a .splat file, which holds no SH above degree 0.
+
+    The most visible Gaussians come first, as viewers show a file while it loads.
+
+    Raises:
+        InputError: invalid Gaussians, or a file that cannot be written.
+    """
+    scene = prepare_for_export(gaussians)
+    order = (scene.opacities.log() + scene.scales.log().sum(1)).argsort(descending=True)
+    scene = scene.map(lambda field: field[order])
+    colors = torch.cat((0.5 + SH_C0 * scene.sh[:, 0], scene.opacities[:, None]), 1)
+    quats = torch.nn.functional.normalize(scene.quats.double(), dim=-1)
+    rows = np.zeros(scene.num_gaussians, ROW)
+    rows["mean"], rows["scale"] = scene.means.numpy(), scene.scales.numpy()
+    rows["rgba"] = (255 * colors.double()).round().clamp(0, 255).numpy()
+    rows["quat"] = (128 * quats + 128).round().clamp(0, 255).numpy()
+    with atomic_write(path) as partial:
+        rows.tofile(partial)

@@ -1,0 +1,181 @@
+"""Gaussians as PlayCanvas's compressed PLY: 16 bytes each, and one for each number of SH above 0.
+
+256 Gaussians share a range of positions, of log scales and of colors, in which their numbers are
+stored with 8 to 11 bits.
+Format: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/ply
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped, UInt32
+from numpy import ndarray
+from numpy.lib.recfunctions import structured_to_unstructured
+from torch import Tensor
+
+from asysplat.errors import InputError
+from asysplat.export.formats.checks import TINY, prepare_for_export
+from asysplat.export.formats.packing import join_largest, morton_order, split_largest
+from asysplat.files import atomic_write
+from asysplat.geometry.spherical_harmonics import SH_C0
+from asysplat.scene import Gaussians
+
+SUFFIX = ".compressed.ply"
+CHUNK = 256  # Gaussians that share their ranges
+RANGES = [
+    f"{end}_{axis}"
+    for axes in (["x", "y", "z"], ["scale_x", "scale_y", "scale_z"], ["r", "g", "b"])
+    for end in ("min", "max")
+    for axis in axes
+]
+PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+XYZ_BITS, COLOR_BITS, ROTATION_BITS = (11, 10, 11), (8, 8, 8, 8), (2, 10, 10, 10)
+MAX_LOG_SCALE = 20
+SH_RANGE = 8  # from -4 to 4, in 256 steps
+REST_COUNTS = (9, 24, 45)  # numbers of SH above degree 0, for degrees 1 to 3
+ELEMENTS = ("chunk", "vertex", "sh")
+
+
+def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
+    """Write one scene, without batch dimension, as compressed PLY.
+
+    Gaussians are ordered along a Z-order curve, so that those of a range are near each other.
+
+    Raises:
+        InputError: invalid Gaussians, or a file that cannot be written.
+    """
+    scene = prepare_for_export(gaussians)
+    scene = scene.map(lambda field: field[morton_order(scene.means)])
+    count, chunks = scene.num_gaussians, -(-scene.num_gaussians // CHUNK)
+    values = np.stack(
+        (
+            scene.means.numpy(),
+            scene.scales.log().clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).numpy(),
+            (0.5 + SH_C0 * scene.sh[:, 0]).numpy(),
+        ),
+        1,
+    )
+    # The last Gaussian fills the last chunk, which widens no range.
+    filled = np.concatenate((values, values[-1:].repeat(chunks * CHUNK - count, 0)))
+    filled = filled.reshape(chunks, CHUNK, 3, 3)
+    ranges = np.stack((filled.min(1), filled.max(1)), 2).astype("<f4")
+    low, extent = ranges[:, None, :, 0], ranges[:, None, :, 1] - ranges[:, None, :, 0]
+    places = (filled - low) / np.where(extent > 0, extent, 1)
+    position, scale, color = places.reshape(-1, 3, 3)[:count].transpose(1, 0, 2)
+    largest, rest = (part.numpy() for part in split_largest(scene.quats))
+    rotation = np.concatenate((largest[:, None] / 3, rest * 0.5**0.5 + 0.5), 1)
+    color = np.concatenate((color, scene.opacities[:, None].numpy()), 1)
+    packed = [
+        _pack(numbers, bits)
+        for numbers, bits in (
+            (position, XYZ_BITS),
+            (rotation, ROTATION_BITS),
+            (scale, XYZ_BITS),
+            (color, COLOR_BITS),
+        )
+    ]
+    sh = scene.sh[:, 1:].mT.flatten(1).numpy()
+    steps = np.floor((sh / SH_RANGE + 0.5) * 256).clip(0, 255).astype(np.uint8)
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"element chunk {chunks}", *(f"property float {name}" for name in RANGES)]
+    header += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
+    if steps.size:
+        names = [f"f_rest_{i}" for i in range(steps.shape[1])]
+        header += [f"element sh {count}", *(f"property uchar {name}" for name in names)]
+    with atomic_write(path) as partial, open(partial, "wb") as file:
+        file.write("\n".join([*header, "end_header\n"]).encode())
+        file.write(ranges.tobytes())
+        file.write(np.stack(packed, 1).astype("<u4").tobytes())
+        file.write(steps.tobytes())
+
+
+def unpack(path: Path, elements: dict[str, ndarray]) -> Gaussians:
+    """Compute the Gaussians of a compressed PLY file from its elements chunk, vertex and sh.
+
+    Raises:
+        InputError: a missing element or property, too few rows, or invalid Gaussians.
+    """
+    vertices, chunks = elements["vertex"], elements.get("chunk")
+    if chunks is None or len(chunks) * CHUNK < len(vertices):
+        raise InputError(
+            f"{path} has {0 if chunks is None else len(chunks)} ranges for {len(vertices)} "
+            f"Gaussians: expected an element chunk with one for {CHUNK}; copy it again."
+        )
+    names = RANGES if "min_r" in chunks.dtype.names else RANGES[:12]
+    ranges = _columns(path, "chunk", chunks, names, np.float32).reshape(len(chunks), -1, 2, 3)
+    ranges = ranges[np.arange(len(vertices)) // CHUNK]
+    packed = _columns(path, "vertex", vertices, PACKED, np.uint32).T
+    (position, rotation, scale, color) = (
+        _unpack(numbers, bits)
+        for numbers, bits in zip(
+            packed, (XYZ_BITS, ROTATION_BITS, XYZ_BITS, COLOR_BITS), strict=True
+        )
+    )
+    rgb = _within(ranges[:, 2], color[:, :3]) if len(names) == len(RANGES) else color[:, :3]
+    largest = (3 * rotation[:, 0]).round().astype(np.int64)
+    gaussians = Gaussians(
+        means=torch.from_numpy(_within(ranges[:, 0], position)).float(),
+        quats=join_largest(largest, (rotation[:, 1:] - 0.5) * 2**0.5).float(),
+        scales=torch.from_numpy(_within(ranges[:, 1], scale)).exp().float().clamp_min(TINY),
+        opacities=torch.from_numpy(color[:, 3]).float().clamp_min(TINY),
+        sh=torch.cat(((torch.from_numpy(rgb)[:, None] - 0.5) / SH_C0, _rest(path, elements)), 1),
+    )
+    return gaussians.map(torch.Tensor.float).validate(f"{path}: Gaussians")
+
+
+def _rest(path: Path, elements: dict[str, ndarray]) -> Float[Tensor, "N K 3"]:
+    """Compute SH above degree 0 from the element sh."""
+    count, rows = len(elements["vertex"]), elements.get("sh")
+    if rows is None:
+        return torch.zeros(count, 0, 3, dtype=torch.float64)
+    names = [f"f_rest_{i}" for i in range(len(rows.dtype.names))]
+    if len(rows) != count or len(names) not in REST_COUNTS:
+        raise InputError(
+            f"{path} has {len(rows)} rows of {len(names)} properties in its element sh: expected "
+            f"{count} rows of {' or '.join(map(str, REST_COUNTS))}; copy it again."
+        )
+    steps = torch.from_numpy(_columns(path, "sh", rows, names, np.uint8)).double()
+    # The first and the last step reach the ends of the range, the others stand for their middle.
+    places = torch.where(steps == 0, 0, torch.where(steps == 255, 1, (steps + 0.5) / 256))
+    return (SH_RANGE * (places - 0.5)).unflatten(1, (3, -1)).mT
+
+
+def _columns(
+    path: Path, element: str, rows: ndarray, names: Sequence[str], dtype: type
+) -> Shaped[ndarray, "N columns"]:
+    """Return properties as columns; other types are refused as the format fixes them."""
+    types = dict(rows.dtype.fields)
+    for name in names:
+        if name not in types or types[name][0].newbyteorder("=") != np.dtype(dtype):
+            found = types[name][0].name if name in types else "none"
+            raise InputError(
+                f"{path} has the property {name} of its element {element} as {found}: expected "
+                f"{np.dtype(dtype).name}; write it again."
+            )
+    return structured_to_unstructured(rows[list(names)], dtype)
+
+
+def _pack(places: Float[ndarray, "N k"], bits: Sequence[int]) -> UInt32[ndarray, "N"]:
+    """Pack numbers in [0, 1] into 32 bits, the first in the highest."""
+    packed = np.zeros(len(places), np.uint32)
+    for column, count in zip(places.T, bits, strict=True):
+        steps = (column * (2**count - 1) + 0.5).clip(0, 2**count - 1).astype(np.uint32)
+        packed = packed << count | steps
+    return packed
+
+
+def _unpack(packed: UInt32[ndarray, "N"], bits: Sequence[int]) -> Float[ndarray, "N k"]:
+    """Unpack numbers in [0, 1] from 32 bits."""
+    columns, shift = [], 32
+    for count in bits:
+        shift -= count
+        columns.append((packed >> shift & 2**count - 1) / (2**count - 1))
+    return np.stack(columns, 1)
+
+
+def _within(
+    ranges: Float[ndarray, "N 2 3"], places: Float[ndarray, "N 3"]
+) -> Float[ndarray, "N 3"]:
+    return ranges[:, 0] * (1 - places) + ranges[:, 1] * places
