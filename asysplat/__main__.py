@@ -16,6 +16,7 @@ from asysplat.root import ROOT, __version__
 COMMANDS = {
     "reconstruct": ("reconstruct.py", "photographs, or a video, to a scene of Gaussians"),
     "view": ("asysplat.export.viewer", "a scene of Gaussians in the browser"),
+    "export": ("asysplat.export", "a scene of Gaussians in another format, or smaller"),
     "check": ("asysplat.data.check", "do the cameras of a scene fit its images?"),
     "cameras": ("asysplat.data.cameras", "find the cameras of photographs"),
     "train": ("train.py", "train and test a model, or all models of a table"),

@@ -23,6 +23,7 @@ EXTRAS = {
     "viewer": "asysplat view, --view",
     "video": "videos, in and out",
     "heif": "photographs as phones save them",
+    "spz": "SPZ of version 4",
     "sweeps": "sweeps on several processes, or on SLURM",
     "disparity": "python -m asysplat.data.disparity",
     "wandb": "logger=wandb",

@@ -1,7 +1,7 @@
 """Read and write Gaussians in the format of the file's suffix."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,18 +10,30 @@ from jaxtyping import Float
 from torch import Tensor
 
 from asysplat.errors import InputError
+from asysplat.export.formats.compressed_ply import SUFFIX, write_compressed_ply
 from asysplat.export.formats.ply import read_comment, read_ply, write_ply
 from asysplat.export.formats.safetensors import read_safetensors, write_safetensors
-from asysplat.export.formats.splat import read_splat
+from asysplat.export.formats.splat import read_splat, write_splat
+from asysplat.export.formats.spz import read_spz, write_spz
 from asysplat.scene import Gaussians
 
 MAX_TEXT = 80  # characters of a file in a message
 READERS = {
     ".ply": lambda path, dtype: read_ply(path).to(dtype),
+    ".spz": lambda path, dtype: read_spz(path).to(dtype),
     ".splat": lambda path, dtype: read_splat(path).to(dtype),
     ".safetensors": lambda path, dtype: read_safetensors(path, dtype)[0],
 }
-WRITERS = {".ply": write_ply, ".safetensors": write_safetensors}
+# The other formats have no place for an offset and a background.
+WRITERS = {
+    SUFFIX: lambda path, gaussians, *_: write_compressed_ply(path, gaussians),
+    ".ply": write_ply,
+    ".spz": lambda path, gaussians, *_: write_spz(path, gaussians),
+    ".splat": lambda path, gaussians, *_: write_splat(path, gaussians),
+    ".safetensors": lambda path, gaussians, *numbers: write_safetensors(
+        path, gaussians, _metadata(*numbers)
+    ),
+}
 
 
 def read_gaussians(
@@ -29,7 +41,7 @@ def read_gaussians(
     origin: Sequence[float] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Gaussians:
-    """Read a scene from a .ply, .splat or .safetensors file.
+    """Read a scene from a .ply, .spz, .splat or .safetensors file.
 
     Args:
         path: the file.
@@ -46,12 +58,21 @@ def read_gaussians(
         >>> gaussians.means.shape
         torch.Size([1000, 3])
     """
-    gaussians = _by_suffix(READERS, path, "read")(path, dtype)
+    gaussians = READERS[suffix_of(path, READERS, "read")](path, dtype)
     if origin is None:
         return gaussians
-    offset = _numbers(Path(path), "offset") or (0.0, 0.0, 0.0)
-    shift = torch.tensor(offset, dtype=torch.float64) - torch.tensor(origin, dtype=torch.float64)
+    offset = torch.tensor(read_offset(Path(path)), dtype=torch.float64)
+    shift = offset - torch.tensor(origin, dtype=torch.float64)
     return replace(gaussians, means=(gaussians.means.double() + shift).to(dtype))
+
+
+def read_offset(path: Path) -> list[float]:
+    """Read what is to be added to the means of a file for the coordinates of its photographs.
+
+    Raises:
+        InputError: numbers that are not finite.
+    """
+    return _numbers(path, "offset") or [0.0, 0.0, 0.0]
 
 
 def read_background(path: Path) -> Float[Tensor, "3"] | None:
@@ -83,26 +104,50 @@ def _numbers(path: Path, name: str) -> list[float] | None:
     return [x, y, z]
 
 
-def write_gaussians(path: str | Path, gaussians: Gaussians) -> None:
-    """Write one scene, without batch dimension, to a .ply or .safetensors file.
+def write_gaussians(
+    path: str | Path,
+    gaussians: Gaussians,
+    offset: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Sequence[float] = (),
+) -> None:
+    """Write one scene, without batch dimension, in the format of the file's suffix.
 
     An existing file is replaced once the new one is complete.
+
+    Args:
+        path: a .ply, .compressed.ply, .spz, .splat or .safetensors file.
+        gaussians: [N].
+        offset: to be added to the means; kept by .ply and .safetensors.
+        background: RGB in [0, 1] behind the Gaussians, if known; kept likewise.
 
     Raises:
         InputError: another suffix, or see the format's writer.
 
     Example:
         >>> from asysplat import read_gaussians, write_gaussians
-        >>> write_gaussians("scene.safetensors", read_gaussians("scene.ply"))
+        >>> write_gaussians("scene.spz", read_gaussians("scene.ply"))
     """
-    _by_suffix(WRITERS, path, "written")(path, gaussians)
+    WRITERS[suffix_of(path, WRITERS, "written")](path, gaussians, offset, background)
 
 
-def _by_suffix(functions: dict[str, Callable], path: str | Path, verb: str) -> Callable:
-    suffix = Path(path).suffix.lower()
-    if suffix not in functions:
-        raise InputError(
-            f"{path} cannot be {verb}: its suffix is {suffix or 'missing'}, expected "
-            f"{' or '.join(functions)}."
-        )
-    return functions[suffix]
+def _metadata(offset: Sequence[float], background: Sequence[float]) -> dict[str, str]:
+    """Write an offset that is not 0, and a background that is known, as metadata."""
+    numbers = {"offset": offset if any(offset) else (), "background": background}
+    return {name: " ".join(map(repr, values)) for name, values in numbers.items() if values}
+
+
+def suffix_of(path: str | Path, suffixes: Collection[str], verb: str) -> str:
+    """Return which of the suffixes a file has; `verb` says what for, in the message.
+
+    Raises:
+        InputError: none of them.
+    """
+    name = Path(path).name.lower()
+    for suffix in suffixes:
+        if name.endswith(suffix):
+            return suffix
+    found = Path(path).suffix or "missing"
+    *others, last = suffixes
+    raise InputError(
+        f"{path} cannot be {verb}: its suffix is {found}, expected {', '.join(others)} or {last}."
+    )

@@ -7,7 +7,7 @@ from argparse import ArgumentParser
 
 if __name__ == "__main__":  # now, since torch takes seconds
     parser = ArgumentParser("asysplat view", description=__doc__.split("\n")[0])
-    parser.add_argument("scene", help="a file of Gaussians: .ply, .splat or .safetensors")
+    parser.add_argument("scene", help="a file of Gaussians")
     parser.add_argument("photographs", nargs="?", help="a folder to show the scene among")
     arguments = parser.parse_args()
 
@@ -32,11 +32,11 @@ from torch import Tensor
 
 from asysplat.data.normalize import normalize
 from asysplat.data.photographs import open_photographs
-from asysplat.data.readers.transforms import read_cameras
 from asysplat.errors import InputError
 from asysplat.evaluation.figures import disparity
 from asysplat.export import viewer_cameras
 from asysplat.export.gaussians import read_gaussians
+from asysplat.export.scene_cameras import camera_before, cameras_beside
 from asysplat.interrupts import handle_signals
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians, Views
@@ -48,8 +48,6 @@ OWN_PAGES = re.compile(r"https?://(127\.0\.0\.1|localhost)(:\d+)?")
 LAYERS = ("color", "depth", "alpha")
 FRUSTUM_LENGTH = 0.1  # in the page's unit
 FRUSTUM_HEIGHT = 128  # pixels of its image, in the command
-CAMERAS = "transforms.json"  # beside a file of Gaussians
-MIN_IN_VIEW = 0.5  # fraction of the Gaussians that its cameras see, if they are the scene's
 MAX_SAMPLES = 10_000  # pixels from which the range of disparities is computed
 WAITING = "Waiting for the first rendering; kernels may have to compile, for minutes."
 POLL_SECONDS = 0.01  # between two checks for changes
@@ -330,45 +328,13 @@ def main(scene: str, folder: str | None) -> None:
             views, gaussians = photographs.inputs, photographs.normalization.to_network(gaussians)
         else:
             gaussians = read_gaussians(scene)
-            cameras = cameras_beside(Path(scene), gaussians) or _camera_before(gaussians)
+            cameras = cameras_beside(Path(scene), gaussians) or camera_before(gaussians)
             views = Views(cameras.resized(1, 1), torch.zeros(cameras.num_views, 3, 1, 1))
         with Viewer(views, gaussians) as viewer:
             print(f"viewer: {viewer.url}, until Ctrl-C")
             viewer.wait()
     except InputError as error:
         sys.exit(f"error: {error}")
-
-
-def cameras_beside(scene: Path, gaussians: Gaussians) -> Cameras | None:
-    """Read the cameras beside a file of Gaussians; None where there are none of this scene.
-
-    A line says why a file is not used.
-    """
-    file = scene.with_name(CAMERAS)
-    if not file.exists():
-        return None
-    try:
-        cameras = read_cameras(file)
-    except (InputError, OSError) as error:
-        print(f"without cameras: {error}")
-        return None
-    seen = torch.zeros(gaussians.num_gaussians, dtype=torch.bool)
-    for view in range(cameras.num_views):
-        seen |= cameras.select([view]).project(gaussians.means)[2][0]
-    if (visible := seen.float().mean().item()) < MIN_IN_VIEW:
-        print(f"without cameras: those of {file} have {visible:.0%} of the Gaussians in view.")
-        return None
-    return cameras
-
-
-def _camera_before(gaussians: Gaussians) -> Cameras:
-    """Make a camera that has most Gaussians in view, with y down as COLMAP's worlds often have."""
-    center = gaussians.means.median(0).values
-    radius = (gaussians.means - center).norm(dim=-1).median()
-    pose = torch.eye(4)
-    pose[:3, 3] = center - torch.tensor([0.0, 0.0, 3.0]) * radius
-    intrinsics = torch.tensor([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
-    return Cameras(intrinsics[None], pose[None], 1, 1)
 
 
 if __name__ == "__main__":

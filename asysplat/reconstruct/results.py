@@ -23,7 +23,7 @@ from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.metrics import METRICS
 from asysplat.evaluation.rows import average, write_csv
 from asysplat.export import write_ply, write_safetensors, write_video
-from asysplat.export.viewer import CAMERAS
+from asysplat.export.scene_cameras import CAMERAS
 from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.reconstruct.video import check_video, video_cameras
 from asysplat.refinement.refine import RefinementProgress

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from asysplat import read_gaussians, write_gaussians
 from asysplat.errors import InputError
 from asysplat.export import read_safetensors, write_ply, write_safetensors
-from asysplat.export.gaussians import read_background
+from asysplat.export.gaussians import WRITERS, read_background, read_offset
 from asysplat.scene import Gaussians
 
 
@@ -29,15 +29,30 @@ def test_the_suffix_names_the_format(make_scene, tmp_path, name):
             torch.testing.assert_close(getattr(read, field), getattr(scene, field), msg=field)
 
 
-def test_other_suffixes_are_refused_and_splat_is_only_read(scene, tmp_path):
-    (tmp_path / "scene.splat").write_bytes(bytes(24) + bytes([255] * 8))
-    assert read_gaussians(tmp_path / "scene.splat").num_gaussians == 1
-    for name in ("scene.splat", "scene.obj", "scene"):
-        with pytest.raises(InputError, match=rf"{name} cannot be written.*\.ply or \.safeten"):
-            write_gaussians(tmp_path / name, scene)
+def test_other_suffixes_are_refused(scene, tmp_path):
     for name in ("scene.obj", "scene"):
-        with pytest.raises(InputError, match=rf"{name} cannot be read.*expected \.ply or \.splat"):
+        with pytest.raises(InputError, match=rf"{name} cannot be written.*\.spz, .* or \.safeten"):
+            write_gaussians(tmp_path / name, scene)
+        with pytest.raises(InputError, match=rf"{name} cannot be read.*expected \.ply, \.spz"):
             read_gaussians(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_every_format_that_is_written_is_read(scene, tmp_path, suffix):
+    write_gaussians(tmp_path / f"a scene{suffix}", scene)
+    assert read_gaussians(tmp_path / f"a scene{suffix}").num_gaussians == scene.num_gaussians
+
+
+def test_offset_and_background_are_kept_where_there_is_a_place(scene, tmp_path):
+    offset, background = (1e7, -2.5, 0.1), (0.25, 0.5, 1.0)
+    for suffix in WRITERS:
+        file = tmp_path / f"scene{suffix}"
+        write_gaussians(file, scene, offset, background)
+        if suffix in (".ply", ".safetensors"):
+            assert read_offset(file) == list(offset)
+            assert read_background(file).tolist() == list(background)
+        else:
+            assert read_offset(file) == [0, 0, 0] and read_background(file) is None
 
 
 @pytest.mark.parametrize("name", ["scene.ply", "scene.safetensors"])

@@ -103,8 +103,10 @@ def test_ply_files_have_inrias_properties_in_their_order(written, scene):
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(45)] + ["opacity", "scale_0", "scale_1", "scale_2"]
     names += ["rot_0", "rot_1", "rot_2", "rot_3"]
-    assert header[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 12"]
-    assert header[3:] == [f"property float {name}" for name in names]
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    # What a renderer needs to know, in the words that splat-transform reads.
+    assert header[2:4] == ["comment antialiased 0", "comment sh_degree 3"]
+    assert header[4:] == ["element vertex 12", *(f"property float {name}" for name in names)]
     vertex = PlyData.read(written)["vertex"]
     # All of red, then all of green, then all of blue.
     assert vertex["f_rest_0"][5] == scene.sh[5, 1, 0]

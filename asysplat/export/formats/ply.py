@@ -4,6 +4,7 @@ A vertex is a Gaussian with float32 properties: the mean, an unused normal, SH (
 other degrees of red, of green and of blue), the opacity's logit, log scales, a quaternion wxyz.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,7 +34,8 @@ def write_ply(
 ) -> None:
     """Write one scene, without batch dimension, as binary little-endian PLY.
 
-    Quaternions are normalized, and an opacity of 1 is written as 1 - 1e-7.
+    Quaternions are normalized, and an opacity of 1 is written as 1 - 1e-7. Comments say what a
+    renderer needs to know: `antialiased 0`, as `render` draws by default, and `sh_degree`.
 
     Args:
         path: the file.
@@ -60,7 +62,9 @@ def write_ply(
     rest = _rest(3 * (gaussians.sh.shape[1] - 1))
     names = [*MEAN, *NORMAL, *COLOR, *rest, "opacity", *SCALE, *ROTATION]
     header = ["ply", "format binary_little_endian 1.0"]
-    comments = {"offset": offset if any(offset) else (), "background": background}
+    degree = math.isqrt(gaussians.sh.shape[1]) - 1
+    comments = {"antialiased": (0,), "sh_degree": (degree,), "background": background}
+    comments |= {"offset": offset} if any(offset) else {}
     header += [f"comment {k} {' '.join(map(repr, v))}" for k, v in comments.items() if v]
     header += [f"element vertex {len(table)}"]
     header += [*(f"property float {name}" for name in names), "end_header\n"]

@@ -5,13 +5,14 @@ Format: https://github.com/nianticlabs/spz. Its axes are OpenGL's: right, up, ba
 
 import gzip
 import io
+import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -31,7 +32,8 @@ HEADER = struct.Struct(
 TABLE = struct.Struct("<QQ")  # of a stream in version 4: compressed and full size
 HEADER_4 = 32  # bytes of the header in version 4
 SH_SIZES = (0, 9, 24, 45, 72)  # numbers per Gaussian, by degree; of degree 4, 45 are read
-MAX_FRACTION_BITS = 23
+MAX_FRACTION_BITS = 23  # of a position's 24, one of which is the sign
+SMALL_QUANTILE, STEPS_PER_SIZE = 0.01, 16  # Gaussians' size that sets the precision of positions
 COLOR_FACTOR = 0.15  # a byte of color is 255 (0.5 + 0.15 sh)
 SH_BITS = (5, 4)  # of degree 1, and of the others: what the format's own writer keeps
 GZIP_LEVEL, ZSTANDARD_LEVEL = 6, 12  # higher ones save 2 to 5 % in 5 times the time
@@ -56,8 +58,8 @@ class Header(NamedTuple):
 def write_spz(path: str | Path, gaussians: Gaussians, version: int = 3) -> None:
     """Write one scene, without batch dimension, as SPZ.
 
-    Means are rounded to the finest of 2^-n units that 24 bits allow, scales to 3 %, opacities and
-    colors to 1/255, SH to 5 bits of [-1, 1] in degree 1 and 4 above, rotations to 0.1 degrees.
+    Positions are rounded to a 16th of the small Gaussians' size if 24 bits allow, scales to 3 %,
+    opacities to 1/255, SH to 5 bits of [-1, 1] in degree 1 and 4 above, rotations to 0.1 degrees.
     Gaussians are ordered along a Z-order curve.
 
     Args:
@@ -75,20 +77,16 @@ def write_spz(path: str | Path, gaussians: Gaussians, version: int = 3) -> None:
 
 
 def encode_spz(gaussians: Gaussians, version: int = 3) -> bytes:
-    """Return the content of an SPZ file; see `write_spz`."""
+    """Return the content of an SPZ file; see `write_spz`.
+
+    Raises:
+        InputError: as `write_spz` raises it.
+    """
     if version not in (2, 3, 4):
         raise InputError(f"write_spz's version is {version!r}: choose 2, 3 or 4.")
     scene = half_turn(prepare_for_export(gaussians), 0)
     scene = scene.map(lambda field: field[morton_order(scene.means)])
-    largest = scene.means.abs().max().item()
-    # Rounding may reach 2^23 only from below.
-    fraction_bits = 12 if largest == 0 else int(np.floor(23 - np.log2(largest * (1 + 1e-6))))
-    fraction_bits = min(max(fraction_bits, 0), MAX_FRACTION_BITS)
-    if largest * 2.0**fraction_bits >= 2**23:
-        raise InputError(
-            f"Gaussians.means reach {largest:g}: SPZ holds up to {2**23}; scale the scene, or "
-            "write another format."
-        )
+    fraction_bits = _fraction_bits(scene)
     degree = int(scene.sh.shape[1] ** 0.5) - 1
     streams = [stream.tobytes() for stream in _streams(scene, fraction_bits, version)]
     header = [MAGIC, version, len(scene.opacities), degree, fraction_bits, 0]
@@ -102,9 +100,28 @@ def encode_spz(gaussians: Gaussians, version: int = 3) -> bytes:
     return b"".join([start, *sizes, *packed])
 
 
+def _fraction_bits(scene: Gaussians) -> int:
+    """Choose the precision of positions: a fraction of the small Gaussians' size.
+
+    Finer bits would be noise, which does not compress.
+    """
+    largest, size = scene.means.abs().max().item(), scene.scales.amax(1)
+    small = size.kthvalue(1 + int(SMALL_QUANTILE * (len(size) - 1))).values.item()
+    wanted = math.ceil(math.log2(STEPS_PER_SIZE / small))
+    possible = MAX_FRACTION_BITS - math.ceil(math.log2(max(largest, 2.0**-MAX_FRACTION_BITS)))
+    if possible < 0:
+        raise InputError(
+            f"Gaussians.means reach {largest:g}: SPZ holds numbers up to {2**MAX_FRACTION_BITS}; "
+            "scale the scene, or write another format."
+        )
+    return min(max(wanted, 0), possible, MAX_FRACTION_BITS)
+
+
 def _streams(scene: Gaussians, fraction_bits: int, version: int) -> Iterator[UInt8[ndarray, "..."]]:
     """Return positions, alphas, colors, scales, rotations and SH as bytes."""
-    fixed = (scene.means.double() * 2.0**fraction_bits).round().to(torch.int32).numpy()
+    limit = 2**MAX_FRACTION_BITS - 1
+    fixed = (scene.means.double() * 2.0**fraction_bits).round().clamp(-limit, limit)
+    fixed = fixed.to(torch.int32).numpy()
     yield fixed.astype("<i4")[..., None].view(np.uint8)[..., :3]
     yield _byte(255 * scene.opacities.double())
     yield _byte(255 * (COLOR_FACTOR * scene.sh[:, 0].double() + 0.5))
@@ -175,39 +192,42 @@ def _quats(rotations: UInt8[ndarray, "N size"]) -> torch.Tensor:
 def _read_gzip(path: Path, content: bytes) -> tuple[Header, list[bytearray]]:
     """Read versions 2 and 3: header and all streams in one gzip stream."""
     unpacked = gzip.GzipFile(fileobj=io.BytesIO(content))
-    header, _ = _header(path, _take(path, unpacked, HEADER.size))
-    return header, [_take(path, unpacked, size) for size in header.sizes()]
+    header, _ = _header(path, _take(path, unpacked.read, HEADER.size))
+    return header, [_take(path, unpacked.read, size) for size in header.sizes()]
 
 
 def _read_4(path: Path, content: bytes) -> tuple[Header, list[bytearray]]:
     """Read version 4: a header, a table of streams, and each stream in Zstandard."""
     file = io.BytesIO(content)
-    header, count = _header(path, _take(path, file, HEADER.size))
+    header, count = _header(path, _take(path, file.read, HEADER.size))
     sizes = header.sizes()
     stored = len(sizes) if sizes[-1] else len(sizes) - 1
-    (start,) = struct.unpack("<I", _take(path, file, 4))
+    (start,) = struct.unpack("<I", _take(path, file.read, 4))
     if count != stored or start < HEADER_4:
         raise InputError(
             f"{path} has {count} streams, the table of which begins at {start}: expected {stored} "
             f"and {HEADER_4} or more; copy it again."
         )
     file.seek(start)
-    table = [TABLE.unpack(_take(path, file, TABLE.size)) for _ in range(count)]
+    table = [TABLE.unpack(_take(path, file.read, TABLE.size)) for _ in range(count)]
     zstandard, streams = _zstandard(), []
     for (packed, _), size in zip(table, sizes, strict=False):
-        unpacked = zstandard.ZstdDecompressor().stream_reader(_take(path, file, packed))
-        streams.append(_take(path, unpacked, size, (zstandard.ZstdError,)))
+        unpacked = zstandard.ZstdDecompressor().stream_reader(_take(path, file.read, packed))
+        streams.append(_take(path, unpacked.read, size, (zstandard.ZstdError,)))
     return header, streams + [bytearray()] * (len(sizes) - count)
 
 
 def _take(
-    path: Path, stream: BinaryIO, size: int, errors: tuple[type[Exception], ...] = GZIP_ERRORS
+    path: Path,
+    read: Callable[[int], bytes],
+    size: int,
+    errors: tuple[type[Exception], ...] = GZIP_ERRORS,
 ) -> bytearray:
     """Read exactly `size` bytes, in pieces, as a damaged file may declare any size."""
     data = bytearray()
     while len(data) < size:
         try:
-            piece = stream.read(min(PIECE, size - len(data)))
+            piece = read(min(PIECE, size - len(data)))
         except errors as error:
             raise InputError(
                 f"{path} cannot be unpacked ({error}): it is damaged or no SPZ file; copy it again."
@@ -221,7 +241,7 @@ def _take(
     return data
 
 
-def _header(path: Path, content: bytes) -> tuple[Header, int]:
+def _header(path: Path, content: bytearray) -> tuple[Header, int]:
     """Read a header, and the number of streams, which versions 2 and 3 do not use."""
     magic, version, count, degree, fraction_bits, _, streams = HEADER.unpack(content)
     if magic != MAGIC:

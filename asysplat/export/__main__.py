@@ -1,0 +1,100 @@
+"""A scene in another format, smaller on request.
+
+asysplat export scene.ply scene.spz
+"""
+
+from argparse import ArgumentParser
+
+if __name__ == "__main__":  # now, since torch takes seconds
+    parser = ArgumentParser("asysplat export", description=__doc__.split("\n")[0])
+    parser.add_argument("scene", help="a file of Gaussians")
+    parser.add_argument("output", help="the new file; its suffix names the format")
+    parser.add_argument(
+        "--keep", type=float, default=1.0, metavar="F", help="keep this fraction, by importance"
+    )
+    parser.add_argument("--sh", type=int, choices=range(4), help="highest degree of SH to keep")
+    arguments = parser.parse_args()
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from asysplat.errors import InputError
+from asysplat.evaluation.metrics import psnr
+from asysplat.export.gaussians import (
+    WRITERS,
+    read_background,
+    read_gaussians,
+    read_offset,
+    suffix_of,
+    write_gaussians,
+)
+from asysplat.export.importance import most_important
+from asysplat.export.scene_cameras import cameras_beside
+from asysplat.interrupts import handle_signals
+from asysplat.rendering import render
+from asysplat.scene import Cameras, Gaussians
+
+COMPARED_VIEWS = 8
+
+
+def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None = None) -> None:
+    """Write a scene to another file, and print what it took: bytes, Gaussians and likeness.
+
+    Args:
+        scene: a file of Gaussians; the cameras beside it, transforms.json, tell what is important.
+        output: the new file.
+        keep: fraction of the Gaussians, by importance, in (0, 1].
+        sh_degree: highest degree of SH; None: the scene's.
+
+    Raises:
+        InputError: see `read_gaussians` and `write_gaussians`; `keep` is out of range, or `output`
+            exists.
+    """
+    suffix_of(output, WRITERS, "written")
+    if not 0 < keep <= 1:
+        raise InputError(f"--keep is {keep:g}: give a fraction above 0, at most 1.")
+    if output.exists():
+        raise InputError(f"{output} exists: remove it, or name another file.")
+    gaussians = read_gaussians(scene)
+    offset, background = read_offset(scene), read_background(scene)
+    cameras = cameras_beside(scene, gaussians)
+    written = gaussians
+    if keep < 1:
+        written = most_important(written, keep, cameras)
+    if sh_degree is not None:
+        written = replace(written, sh=written.sh[:, : (sh_degree + 1) ** 2])
+    write_gaussians(output, written, offset, () if background is None else background.tolist())
+    size = output.stat().st_size / 1e6
+    print(f"{output}: {written.num_gaussians:,} Gaussians, {size:.2f} MB")
+    if any(offset) and read_offset(output) != offset:
+        print(f"{output.suffix} has no place for the offset {' '.join(map(repr, offset))}")
+    if cameras is not None:
+        likeness = compare(gaussians, read_gaussians(output), cameras, background)
+        print(f"{likeness:.1f} dB against the pictures of {scene}")
+
+
+@torch.no_grad()
+def compare(
+    before: Gaussians, after: Gaussians, cameras: Cameras, background: Float[Tensor, "3"] | None
+) -> float:
+    """Compute the mean PSNR of one scene's pictures against another's, at up to 8 cameras."""
+    count = min(COMPARED_VIEWS, cameras.num_views)
+    values = []
+    for view in torch.linspace(0, cameras.num_views - 1, count).round().long().tolist():
+        camera = cameras.select([view])
+        images = [render(g, camera, background, depth=False).image for g in (after, before)]
+        values.append(psnr(*(image.clamp(0, 1) for image in images)).mean().item())
+    return sum(values) / count
+
+
+if __name__ == "__main__":
+    handle_signals()
+    try:
+        export(Path(arguments.scene), Path(arguments.output), arguments.keep, arguments.sh)
+    except InputError as error:
+        sys.exit(f"error: {error}")
