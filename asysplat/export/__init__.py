@@ -10,6 +10,7 @@ LATER = {
     "read_splat": "asysplat.export.formats.splat",
     "smoothed_path": "asysplat.export.camera_paths",
     "write_gaussians": "asysplat.export.gaussians",
+    "write_page": "asysplat.export.page",
     "write_ply": "asysplat.export.formats.ply",
     "write_safetensors": "asysplat.export.formats.safetensors",
     "write_video": "asysplat.export.video",
