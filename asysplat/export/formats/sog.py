@@ -1,0 +1,342 @@
+"""Gaussians as SOG, PlayCanvas's: a zip file of lossless WebP images, about 15 bytes a Gaussian.
+
+Format: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog, version 2, in
+PLY's axes. Pixel i of each image belongs to Gaussian i.
+"""
+
+import json
+import math
+import reprlib
+import struct
+import warnings
+import zipfile
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+from PIL import Image
+from torch import Tensor
+
+from asysplat.errors import InputError
+from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
+from asysplat.export.formats.json_record import JsonRecord, parse_record
+from asysplat.export.formats.packing import join_largest, morton_order, split_largest
+from asysplat.files import atomic_write
+from asysplat.scene import Gaussians
+
+VERSION = 2
+CODES = 256  # numbers of a codebook
+MAX_SIDE = 16380  # pixels of a side of a WebP image, as a multiple of 4
+MAX_PALETTE = 65536  # SH that 16 bits distinguish
+PALETTE_WIDTH = 64  # SH in a row of their image
+PALETTE_SHARE = 16  # Gaussians for each of the palette
+MIN_PALETTE = 1024
+PALETTE_ITERATIONS = 4
+CODEBOOK_ITERATIONS = 50
+METHOD, QUALITY = 3, 75  # of WebP: 1 % larger than the most takes 20 times as long
+FIRST_TAG = 252  # alpha of a rotation whose w is the largest; then x, y, z
+SLACK = 1 << 20  # bytes or pixels that a small file may have beyond what it needs
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, ValueError)
+ZIP_ERRORS += (RuntimeError, OverflowError)  # encrypted; offsets beyond 64 bits
+IMAGE_ERRORS = (OSError, ValueError, EOFError, SyntaxError, RuntimeError, MemoryError)
+IMAGE_ERRORS += (Image.DecompressionBombWarning, Image.DecompressionBombError)
+
+
+def write_sog(path: str | Path, gaussians: Gaussians) -> None:
+    """Write one scene, without batch dimension, as a SOG bundle.
+
+    Means keep 16 bits of sign(x) log(1 + |x|) between the scene's bounds, opacities and three
+    components of rotations 8 bits; log scales and colors become the nearest of 256 values that are
+    fitted to the scene, the other SH the nearest of a palette. Gaussians are ordered along a
+    Z-order curve.
+
+    Args:
+        path: the file.
+        gaussians: [N].
+
+    Raises:
+        InputError: invalid Gaussians, too many, or a file that cannot be written.
+    """
+    content = encode_sog(gaussians)
+    with atomic_write(path) as partial:
+        partial.write_bytes(content)
+
+
+def encode_sog(gaussians: Gaussians) -> bytes:
+    """Return the content of a SOG bundle; see `write_sog`."""
+    scene = prepare_for_export(gaussians)
+    scene = scene.map(lambda field: field[morton_order(scene.means)])
+    count = len(scene.opacities)
+    if count > MAX_SIDE**2:
+        raise InputError(
+            f"Gaussians.opacities has {count:,} Gaussians: SOG holds up to {MAX_SIDE**2:,}; write "
+            "parts, or another format."
+        )
+    logs = scene.means.double().sign() * scene.means.double().abs().log1p()
+    low, high = logs.amin(0), logs.amax(0)
+    fixed = (65535 * (logs - low) / (high - low).clamp_min(TINY)).round().int()
+    largest, rest = split_largest(scene.quats)
+    rest = (255 * (0.5 + rest / math.sqrt(2))).round()
+    scale_codes, scales = _codebook(scene.scales.double().log())
+    color_codes, colors = _codebook(scene.sh[:, 0])
+    alphas = (255 * scene.opacities).round()
+    images = {
+        "means_l": fixed & 255,
+        "means_u": fixed >> 8,
+        "quats": torch.cat((rest, FIRST_TAG + largest[:, None]), 1),
+        "scales": scales,
+        "sh0": torch.cat((colors, alphas[:, None]), 1),
+    }
+    meta = {
+        "version": VERSION,
+        "count": count,
+        "antialias": False,
+        "means": {
+            "mins": low.tolist(),
+            "maxs": high.tolist(),
+            "files": ["means_l.webp", "means_u.webp"],
+        },
+        "scales": {"codebook": scale_codes, "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": color_codes, "files": ["sh0.webp"]},
+    }
+    width = 4 * math.ceil(math.sqrt(count) / 4)
+    widths = dict.fromkeys(images, width)
+    terms = scene.sh.shape[1] - 1
+    if terms:
+        palette, labels = _palette(scene.sh[:, 1:].flatten(1))
+        codes, centroids = _codebook(palette)
+        images["shN_centroids"] = centroids.reshape(-1, 3)
+        images["shN_labels"] = torch.stack((labels & 255, labels >> 8, 0 * labels), 1)
+        widths |= {"shN_centroids": PALETTE_WIDTH * terms, "shN_labels": width}
+        meta["shN"] = {
+            "count": len(palette),
+            "bands": math.isqrt(terms),
+            "codebook": codes,
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
+    with ThreadPoolExecutor() as threads:
+        jobs = {
+            name: threads.submit(_webp, pixels.byte().numpy(), widths[name])
+            for name, pixels in images.items()
+        }
+        files = {f"{name}.webp": job.result() for name, job in jobs.items()}
+    files["meta.json"] = json.dumps(meta, separators=(",", ":")).encode()
+    bundle = BytesIO()
+    with zipfile.ZipFile(bundle, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name), content)  # its date is always 1980
+    return bundle.getvalue()
+
+
+def _webp(pixels: UInt8[ndarray, "N channels"], width: int) -> bytes:
+    height = math.ceil(len(pixels) / width)
+    image = np.zeros((height * width, pixels.shape[1]), np.uint8)
+    image[: len(pixels)] = pixels
+    file = BytesIO()
+    Image.fromarray(image.reshape(height, width, -1)).save(
+        file, "WEBP", lossless=True, exact=True, quality=QUALITY, method=METHOD
+    )
+    return file.getvalue()
+
+
+def _codebook(values: Float[Tensor, "*shape"]) -> tuple[list[float], Int[Tensor, "*shape"]]:
+    """Fit 256 numbers, ascending, and compute the index of the nearest one of each value.
+
+    Lloyd's iterations of k-means, whose clusters in one dimension are intervals of sorted values.
+    """
+    ordered = values.double().flatten().sort().values
+    codes = ordered.unique()
+    if len(codes) > CODES:
+        # Half of them where the values are, half over all of their range.
+        share = torch.linspace(0, 1, CODES // 2, dtype=torch.float64)
+        quantiles = ordered[(share * (len(ordered) - 1)).round().long()]
+        codes = torch.cat((quantiles, ordered[0] + share * (ordered[-1] - ordered[0])))
+        codes = codes.sort().values
+        sums = torch.cat((torch.zeros(1), ordered.cumsum(0)))
+        for _ in range(CODEBOOK_ITERATIONS):
+            inner = torch.searchsorted(ordered, _middles(codes))
+            bounds = torch.cat((torch.tensor([0]), inner, torch.tensor([len(ordered)])))
+            counts = bounds.diff()
+            codes = torch.where(counts > 0, sums[bounds].diff() / counts.clamp_min(1), codes)
+    codes = torch.cat((codes, codes[-1:].expand(CODES - len(codes))))
+    numbers = [float(f"{code:.7g}") for code in codes.tolist()]  # what float32 resolves
+    return numbers, torch.searchsorted(_middles(codes), values.double().contiguous())
+
+
+def _middles(codes: Float[Tensor, "codes"]) -> Float[Tensor, "codes-1"]:
+    return (codes[1:] + codes[:-1]) / 2
+
+
+def _palette(
+    values: Float[Tensor, "N terms"],
+) -> tuple[Float[Tensor, "colors terms"], Int[Tensor, "N"]]:
+    """Fit vectors by k-means, and compute the index of one near to each value.
+
+    Values are split into cells and each cell among its part of the vectors: distances to all
+    vectors would take a hundred times as long.
+    """
+    size = min(max(len(values) // PALETTE_SHARE, MIN_PALETTE), MAX_PALETTE)
+    if len(values) <= size:
+        return values, torch.arange(len(values))
+    generator = torch.Generator().manual_seed(0)
+    _, cells = _k_means(values, math.isqrt(size), generator)
+    vectors, labels, total = [], torch.zeros_like(cells), 0
+    for cell in range(int(cells.max()) + 1):
+        (members,) = torch.where(cells == cell)
+        if len(members):
+            count = max(size * len(members) // len(values), 1)
+            part, own = _k_means(values[members], count, generator)
+            labels[members] = own + total
+            vectors.append(part)
+            total += len(part)
+    return torch.cat(vectors), labels
+
+
+def _k_means(
+    values: Float[Tensor, "N terms"], count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "{count} terms"], Int[Tensor, "N"]]:
+    """Compute centers by Lloyd's iterations from random values, and the nearest of each value."""
+    centers = values[torch.randperm(len(values), generator=generator)[:count]]
+    for iteration in range(PALETTE_ITERATIONS + 1):
+        distances = centers.square().sum(1) / 2 - values @ centers.mT
+        # NumPy's argmin takes a tenth of the time of PyTorch's.
+        labels = torch.from_numpy(distances.numpy().argmin(1))
+        if iteration == PALETTE_ITERATIONS:
+            break
+        counts = labels.bincount(minlength=count)[:, None]
+        sums = torch.zeros_like(centers).index_add_(0, labels, values)
+        centers = torch.where(counts > 0, sums / counts.clamp_min(1), centers)
+    return centers, labels
+
+
+def read_sog(path: str | Path) -> Gaussians:
+    """Read one scene from a SOG bundle of version 2.
+
+    Raises:
+        InputError: not a SOG bundle, a damaged one, another version, or invalid Gaussians.
+    """
+    path = require_file(path)
+    try:
+        archive = zipfile.ZipFile(path)
+    except ZIP_ERRORS as error:
+        raise InputError(
+            f"{path} cannot be read as a zip file ({error}): it is damaged or no SOG bundle; copy "
+            "it again."
+        ) from error
+    with archive:
+        meta = parse_record(path, "meta.json", _content(archive, path, "meta.json"))
+        meta.integer("version", VERSION, VERSION)
+        count = meta.integer("count", 1, MAX_SIDE**2)
+        means, scales, quats, colors = map(meta.record, ("means", "scales", "quats", "sh0"))
+        low, high = (torch.tensor(means.numbers(key, (3,))).double() for key in ("mins", "maxs"))
+        fine, coarse = (image[:, :3].int() for image in _images(archive, means, (count, count)))
+        logs = low + (high - low) * (coarse << 8 | fine) / 65535
+        (rotations,) = _images(archive, quats, (count,))
+        (sizes,) = _images(archive, scales, (count,))
+        (rgba,) = _images(archive, colors, (count,))
+        sh = [_decode(colors, rgba[:, None, :3])]
+        if "shN" in meta.values:
+            sh.append(_read_palette(archive, meta.record("shN"), count))
+    gaussians = Gaussians(
+        means=(logs.sign() * logs.abs().expm1()).float(),
+        quats=_quats(path, rotations),
+        scales=_decode(scales, sizes[:, :3]).exp().clamp_min(TINY),
+        opacities=(rgba[:, 3] / 255).clamp_min(TINY),
+        sh=torch.cat(sh, 1),
+    )
+    return gaussians.validate(f"{path}: Gaussians")
+
+
+def _decode(record: JsonRecord, codes: UInt8[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Look up numbers in a record's codebook."""
+    return torch.tensor(record.numbers("codebook", (CODES,)))[codes.int()]
+
+
+def _quats(path: Path, rotations: UInt8[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
+    tags = rotations[:, 3].numpy().astype(np.int64) - FIRST_TAG
+    if (tags < 0).any():
+        index = int(np.argmin(tags))
+        raise InputError(
+            f"{path} has the alpha {rotations[index, 3]} in rotation {index}: expected {FIRST_TAG} "
+            "to 255; copy it again."
+        )
+    rest = (rotations[:, :3].numpy() / 127.5 - 1) / math.sqrt(2)
+    return join_largest(tags, rest).float()
+
+
+def _read_palette(
+    archive: zipfile.ZipFile, record: JsonRecord, count: int
+) -> Float[Tensor, "N terms 3"]:
+    """Read the SH of degree 1 and above."""
+    degree, size = record.integer("bands", 1, 3), record.integer("count", 1, MAX_PALETTE)
+    terms = degree * (degree + 2)
+    # The palette's last row may be incomplete, so all of its image is read.
+    pixels = math.ceil(size / PALETTE_WIDTH) * PALETTE_WIDTH * terms
+    centroids, labels = _images(archive, record, (pixels, count))
+    indices = labels[:, 0].long() | labels[:, 1].long() << 8
+    if int(indices.max()) >= size:
+        raise InputError(
+            f"{record.path} has the SH {indices.max()} in its labels: expected 0 to {size - 1}; "
+            "copy it again."
+        )
+    palette = centroids.unflatten(0, (-1, terms))[:size, :, :3]
+    return _decode(record, palette)[indices]
+
+
+def _images(
+    archive: zipfile.ZipFile, record: JsonRecord, counts: tuple[int, ...]
+) -> list[UInt8[Tensor, "pixels 4"]]:
+    """Read the first pixels, row by row, of each of a record's images, in RGBA."""
+    names = record.texts("files", len(counts))
+    return [_image(archive, record.path, *item) for item in zip(names, counts, strict=True)]
+
+
+def _image(
+    archive: zipfile.ZipFile, path: Path, name: str, count: int
+) -> UInt8[Tensor, "{count} 4"]:
+    content, title = _content(archive, path, name), reprlib.repr(name)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            image = Image.open(BytesIO(content), formats=("WEBP",))
+        # Before decoding: a small file may declare an image that fills the memory.
+        fits = count <= image.width * image.height <= 4 * count + SLACK
+        decoded = np.array(image.convert("RGBA")) if fits else None
+    except IMAGE_ERRORS as error:
+        raise InputError(
+            f"{path} has {title}, which cannot be read as WebP ({error}): it is damaged; copy it "
+            "again."
+        ) from error
+    if decoded is None:
+        raise InputError(
+            f"{path} has {image.width} x {image.height} pixels in {title}: expected about {count} "
+            "in all; write it again."
+        )
+    return torch.from_numpy(decoded).flatten(0, 1)[:count]
+
+
+def _content(archive: zipfile.ZipFile, path: Path, name: str) -> bytes:
+    """Read a member of a zip file, no larger than the file itself but for little ones."""
+    title, limit = reprlib.repr(name), path.stat().st_size + SLACK
+    try:
+        info = archive.getinfo(name)
+        if info.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            if info.file_size <= limit:
+                return archive.read(info)
+            reason = f"its size of {info.file_size} bytes is none of images"
+        else:
+            reason = "it is neither stored nor deflated"
+    except KeyError:
+        reason = "it is absent"
+    except ZIP_ERRORS as error:
+        reason = str(error)
+    raise InputError(
+        f"{path} has no {title} that can be read ({reason}): expected meta.json and its images; "
+        "copy it again."
+    )
