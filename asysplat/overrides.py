@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 from asysplat.errors import InputError
 from asysplat.root import CONF, typed
 
+SWITCHES = ("--view", "--open")  # of reconstruct.py, each for an option that is true
 MIN_SIMILARITY = 0.8  # difflib's ratio of widht and width
 
 
@@ -55,14 +56,14 @@ def check_overrides(overrides: Iterable[str], script: str = "train") -> None:
 
 
 def as_overrides(words: list[str]) -> list[str]:
-    """Rewrite the first word as path=..., and --view as view=true."""
-    view = ["view=true"] if "--view" in words else []
-    words = [word for word in words if word != "--view"]
+    """Rewrite the first word as path=..., --view as view=true and --open as open=true."""
+    switches = [f"{word[2:]}=true" for word in words if word in SWITCHES]
+    words = [word for word in words if word not in SWITCHES]
     if words and not words[0].startswith("-") and ("=" not in words[0] or Path(words[0]).exists()):
         # Hydra unescapes a backslash only before a quote.
         quoted = re.sub(r"(\\+)(?='|$)", r"\1\1", words[0]).replace("'", "\\'")
         words[0] = f"path='{quoted}'"
-    return words + view
+    return words + switches
 
 
 def _parse(override: str) -> Override:

@@ -32,14 +32,14 @@ from asysplat.data.write import write_transforms
 from asysplat.errors import InputError
 from asysplat.export import write_ply
 from asysplat.reconstruct.continuation import continue_run
-from asysplat.reconstruct.results import save_ply
+from asysplat.reconstruct.results import save_gaussians
 from asysplat.root import CONF
 
 SIZE = 48
 LAYOUTS = Path(__file__).parent / "data" / "readers"  # writers of them
 TINY = (f"height={SIZE}", "steps=60", "refinement.max_gaussians=3000", "views=12")
 TINY += ("init=plane_sweep", "video.seconds=0.2", "paths.weights=none", "cameras=given")
-FILES = {"scene.ply", "scene.safetensors", "path.mp4", "contact.png", "start.png"}
+FILES = {"scene.ply", "scene.html", "scene.safetensors", "path.mp4", "contact.png", "start.png"}
 FILES |= {"metrics.json", "metrics.csv", "config.yaml", "transforms.json"}
 
 
@@ -469,12 +469,12 @@ def test_a_scene_is_kept_where_the_disk_is_full(make_scene, tmp_path, monkeypatc
     path = tmp_path / "run" / "scene.ply"
     lost = tmp_path / "lost" / "scene.ply"
     with pytest.raises(InputError, match=r"written to \S+home/lost-scene\.ply\."):
-        save_ply(lost, scene, (0.0, 0.0, 0.0))
+        save_gaussians(lost, scene, (0.0, 0.0, 0.0))
     assert read_gaussians(tmp_path / "home" / "lost-scene.ply").num_gaussians == 40
     with largest_file(5000), pytest.raises(InputError, match=r"^(?!.*written to)"):
-        save_ply(path, scene, (0.0, 0.0, 0.0))
+        save_gaussians(path, scene, (0.0, 0.0, 0.0))
     assert not list((tmp_path / "run").iterdir())
-    save_ply(path, scene, (0.0, 0.0, 0.0))
+    save_gaussians(path, scene, (0.0, 0.0, 0.0))
     assert read_gaussians(path).num_gaussians == 40
 
 

@@ -26,6 +26,8 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.evaluation.metrics import psnr
 from asysplat.export.gaussians import (
+    BLACK,
+    READERS,
     WRITERS,
     read_background,
     read_gaussians,
@@ -34,7 +36,8 @@ from asysplat.export.gaussians import (
     write_gaussians,
 )
 from asysplat.export.importance import most_important
-from asysplat.export.scene_cameras import cameras_beside
+from asysplat.export.page import PAGE, write_page
+from asysplat.export.scene_cameras import cameras_beside, names_beside
 from asysplat.interrupts import handle_signals
 from asysplat.rendering import render
 from asysplat.scene import Cameras, Gaussians
@@ -68,12 +71,15 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
         written = most_important(written, keep, cameras)
     if sh_degree is not None:
         written = replace(written, sh=written.sh[:, : (sh_degree + 1) ** 2])
-    write_gaussians(output, written, offset, () if background is None else background.tolist())
-    size = output.stat().st_size / 1e6
-    print(f"{output}: {written.num_gaussians:,} Gaussians, {size:.2f} MB")
+    color = () if background is None else background.tolist()
+    if cameras is not None and output.suffix.lower() == PAGE:
+        write_page(output, written, cameras, names_beside(scene), background=color or BLACK)
+    else:
+        write_gaussians(output, written, offset, color)
+    print(f"{output}: {written.num_gaussians:,} Gaussians, {output.stat().st_size / 1e6:.2f} MB")
     if any(offset) and read_offset(output) != offset:
         print(f"{output.suffix} has no place for the offset {' '.join(map(repr, offset))}")
-    if cameras is not None:
+    if cameras is not None and output.suffix.lower() in READERS:
         likeness = compare(gaussians, read_gaussians(output), cameras, background)
         print(f"{likeness:.1f} dB against the pictures of {scene}")
 

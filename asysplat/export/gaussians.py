@@ -13,14 +13,19 @@ from asysplat.errors import InputError
 from asysplat.export.formats.compressed_ply import SUFFIX, write_compressed_ply
 from asysplat.export.formats.ply import read_comment, read_ply, write_ply
 from asysplat.export.formats.safetensors import read_safetensors, write_safetensors
+from asysplat.export.formats.sog import read_sog, write_sog
 from asysplat.export.formats.splat import read_splat, write_splat
 from asysplat.export.formats.spz import read_spz, write_spz
+from asysplat.export.page import PAGE, write_page
+from asysplat.export.scene_cameras import camera_before
 from asysplat.scene import Gaussians
 
+BLACK = (0.0, 0.0, 0.0)
 MAX_TEXT = 80  # characters of a file in a message
 READERS = {
     ".ply": lambda path, dtype: read_ply(path).to(dtype),
     ".spz": lambda path, dtype: read_spz(path).to(dtype),
+    ".sog": lambda path, dtype: read_sog(path).to(dtype),
     ".splat": lambda path, dtype: read_splat(path).to(dtype),
     ".safetensors": lambda path, dtype: read_safetensors(path, dtype)[0],
 }
@@ -29,9 +34,13 @@ WRITERS = {
     SUFFIX: lambda path, gaussians, *_: write_compressed_ply(path, gaussians),
     ".ply": write_ply,
     ".spz": lambda path, gaussians, *_: write_spz(path, gaussians),
+    ".sog": lambda path, gaussians, *_: write_sog(path, gaussians),
     ".splat": lambda path, gaussians, *_: write_splat(path, gaussians),
     ".safetensors": lambda path, gaussians, *numbers: write_safetensors(
         path, gaussians, _metadata(*numbers)
+    ),
+    PAGE: lambda path, gaussians, _, background: write_page(
+        path, gaussians, camera_before(gaussians), background=background or BLACK
     ),
 }
 
@@ -41,7 +50,7 @@ def read_gaussians(
     origin: Sequence[float] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Gaussians:
-    """Read a scene from a .ply, .spz, .splat or .safetensors file.
+    """Read a scene from a .ply, .spz, .sog, .splat or .safetensors file.
 
     Args:
         path: the file.
@@ -115,7 +124,8 @@ def write_gaussians(
     An existing file is replaced once the new one is complete.
 
     Args:
-        path: a .ply, .compressed.ply, .spz, .splat or .safetensors file.
+        path: a .ply, .compressed.ply, .spz, .sog, .splat, .safetensors or .html file; see
+            `write_page` for a page with cameras.
         gaussians: [N].
         offset: to be added to the means; kept by .ply and .safetensors.
         background: RGB in [0, 1] behind the Gaussians, if known; kept likewise.

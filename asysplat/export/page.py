@@ -20,6 +20,7 @@ from asysplat.geometry import spherical_harmonics
 from asysplat.rendering.interface import INRIA
 from asysplat.scene import Cameras, Gaussians
 
+PAGE = ".html"
 FILES = Path(__file__).parent / "page_files"
 SCRIPTS = ("scene.js", "camera.js", "renderer.js", "viewer.js")  # one module, in this order
 SH_FACTORS = ("SH_C0", "Y1", "Y2", "Y2_0", "Y3_3", "Y3_2", "Y3_1", "Y3_0")
@@ -62,8 +63,8 @@ def write_page(
         >>> write_page("scene.html", read_gaussians("scene.ply"), cameras)
     """
     path = Path(path)
-    if path.suffix.lower() != ".html":
-        raise InputError(f"{path} is not the name of a page: give one that ends in .html.")
+    if path.suffix.lower() != PAGE:
+        raise InputError(f"{path} is not the name of a page: give one that ends in {PAGE}.")
     if cameras.intrinsics.ndim != 3 or cameras.num_views == 0:
         raise InputError(
             f"write_page's cameras have the shape {tuple(cameras.intrinsics.shape)}: expected "

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from asysplat.data.readers.transforms import read_cameras
+from asysplat.data.readers.transforms import read_cameras, read_poses
 from asysplat.errors import InputError
 from asysplat.scene import Cameras, Gaussians
 
@@ -32,6 +32,11 @@ def cameras_beside(scene: Path, gaussians: Gaussians) -> Cameras | None:
         print(f"without cameras: those of {file} have {visible:.0%} of the Gaussians in view.")
         return None
     return cameras
+
+
+def names_beside(scene: Path) -> list[str]:
+    """Return the photographs' names of the cameras beside a file of Gaussians."""
+    return [Path(name).name for name, _ in read_poses(scene.with_name(CAMERAS))]
 
 
 def camera_before(gaussians: Gaussians) -> Cameras:

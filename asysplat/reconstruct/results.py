@@ -3,6 +3,7 @@
 import json
 import os
 import tempfile
+import webbrowser
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,7 +23,9 @@ from asysplat.evaluation.figures import comparison_figure
 from asysplat.evaluation.lpips import load_lpips
 from asysplat.evaluation.metrics import METRICS
 from asysplat.evaluation.rows import average, write_csv
-from asysplat.export import write_ply, write_safetensors, write_video
+from asysplat.export import write_gaussians, write_page, write_video
+from asysplat.export.gaussians import WRITERS
+from asysplat.export.page import PAGE
 from asysplat.export.scene_cameras import CAMERAS
 from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.reconstruct.video import check_video, video_cameras
@@ -32,8 +35,9 @@ from asysplat.runs.summary import metric_cells, write_json
 from asysplat.scene import Gaussians, Views
 from asysplat.terminal import print_table
 
-SCENE = "scene.safetensors"
-BYTES_PER_GAUSSIAN = 2 * 4 * 62  # size in scene.ply and scene.safetensors together, at most
+SCENE_SUFFIX = ".safetensors"
+SCENE = f"scene{SCENE_SUFFIX}"  # always written: run= goes on from it
+BYTES_PER_GAUSSIAN = 4 * 62  # size in one of the files, at most
 OTHER_BYTES = 20_000_000  # space for the figures and the video
 SHEET_ROWS = 4  # views in a contact sheet
 
@@ -52,6 +56,9 @@ class Results:
         self._lpips = load_lpips(
             self._protocol.lpips_net, Path(config.paths.weights), config.paths.download
         )
+        self._suffixes = [*read_outputs(config.output), SCENE_SUFFIX]
+        if config.open and PAGE not in self._suffixes:
+            raise InputError("open=true opens the page, which output= leaves out: add html to it.")
         check_video(config.video)
         has_path = config.video.path != "none"
         self._has_video = has_path and find_spec("av") is not None
@@ -74,7 +81,9 @@ class Results:
         cameras = photographs.inputs.cameras
         self._protocol.check_size(cameras.height, cameras.width)
         count = max(gaussians.num_gaussians, self._config.refinement.max_gaussians or 0)
-        self.folder = new_folder(self.folder, OTHER_BYTES + count * BYTES_PER_GAUSSIAN)
+        self.folder = new_folder(
+            self.folder, OTHER_BYTES + len(self._suffixes) * count * BYTES_PER_GAUSSIAN
+        )
         self._photographs, self._background = photographs, background
         self._save_contact_sheet("start.png", gaussians)
         print(f"figure: {self.folder / 'start.png'}")
@@ -83,15 +92,18 @@ class Results:
         """Write the scene files.
 
         Raises:
-            InputError: a file cannot be written; the scene is elsewhere then, see `save_ply`.
+            InputError: a file cannot be written; the scene is elsewhere then, see `save_gaussians`.
         """
-        origin = self._photographs.origin
-        world = self._photographs.normalization.to_world(gaussians)
-        background = self._background.tolist()
-        save_ply(self.folder / "scene.ply", world, origin, background)
-        numbers = {"background": background, "offset": origin}
-        metadata = {name: " ".join(map(repr, values)) for name, values in numbers.items()}
-        write_safetensors(self.folder / SCENE, world, metadata)
+        photographs, background = self._photographs, self._background.tolist()
+        world = photographs.normalization.to_world(gaussians)
+        for suffix in self._suffixes:
+            path = self.folder / f"scene{suffix}"
+            if suffix != PAGE:
+                save_gaussians(path, world, photographs.origin, background)
+                continue
+            cameras = photographs.normalization.cameras_to_world(photographs.inputs.cameras)
+            names = [Path(file).name for file in photographs.input_files]
+            write_page(path, world, cameras, names, str(self._config.path), background)
 
     def save(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
         """Write the scene files, then cameras, the configuration, a contact sheet and metrics.
@@ -106,7 +118,7 @@ class Results:
         self._save_metrics(gaussians, progress)
 
     def save_video(self, gaussians: Gaussians) -> None:
-        """Write the video, and print where the results are."""
+        """Write the video, print where the results are, and open the page on request."""
         photographs, background = self._photographs, self._background
         if self._has_video:
             path = video_cameras(self._config.video, photographs, gaussians)
@@ -121,8 +133,14 @@ class Results:
         print(f"figure: {self.folder / 'contact.png'}")
         if self._has_video:
             print(f"video: {self.folder / 'path.mp4'}")
-        print(f"viewer: asysplat view {self.folder / 'scene.ply'}")
-        print(f"scene: {self.folder / 'scene.ply'}")
+        files = [self.folder / f"scene{suffix}" for suffix in self._suffixes]
+        scene = next(file for file in files if file.suffix != PAGE)
+        print(f"viewer: asysplat view {scene}")
+        print(f"scene: {scene}")
+        for page in (file for file in files if file.suffix == PAGE):
+            print(f"page: {page}")
+            if self._config.open:
+                webbrowser.open(page.absolute().as_uri())
 
     def _save_cameras(self) -> None:
         """Write the cameras of inputs and held-out views in the world of the scene files."""
@@ -181,7 +199,21 @@ class Results:
             figure.savefig(path, dpi=110)
 
 
-def save_ply(
+def read_outputs(output: str | Sequence[str]) -> list[str]:
+    """Return the suffixes of the files of a scene that `output` names.
+
+    Raises:
+        InputError: a format that is not written.
+    """
+    names = [output] if isinstance(output, str) else output
+    for name in names:
+        if f".{name}" not in WRITERS:
+            known = ", ".join(suffix[1:] for suffix in WRITERS)
+            raise InputError(f"output has {name!r}: choose from {known}.")
+    return [f".{name}" for name in names if f".{name}" != SCENE_SUFFIX]
+
+
+def save_gaussians(
     path: Path, gaussians: Gaussians, offset: Sequence[float], background: Sequence[float] = ()
 ) -> None:
     """Write a scene; where that fails, write it elsewhere, as the refinement took long.
@@ -191,12 +223,12 @@ def save_ply(
             for temporary files, or else the user's.
     """
     try:
-        write_ply(path, gaussians, offset, background)
+        write_gaussians(path, gaussians, offset, background)
     except InputError as failure:
         for folder in (Path(tempfile.gettempdir()), Path.home()):
             rescued = folder / f"{path.parent.name}-{path.name}"
             try:
-                write_ply(rescued, gaussians, offset, background)
+                write_gaussians(rescued, gaussians, offset, background)
             except InputError:
                 continue
             raise InputError(f"{failure} The scene was written to {rescued}.") from None

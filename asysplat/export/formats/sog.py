@@ -68,7 +68,11 @@ def write_sog(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def encode_sog(gaussians: Gaussians) -> bytes:
-    """Return the content of a SOG bundle; see `write_sog`."""
+    """Return the content of a SOG bundle; see `write_sog`.
+
+    Raises:
+        InputError: as `write_sog` raises it.
+    """
     scene = prepare_for_export(gaussians)
     scene = scene.map(lambda field: field[morton_order(scene.means)])
     count = len(scene.opacities)
