@@ -36,7 +36,7 @@ def write_page(
     cameras: Cameras,
     names: Sequence[str] = (),
     title: str = "",
-    background: Sequence[float] = (0, 0, 0),
+    background: Sequence[int | float] = (0, 0, 0),
     antialiased: bool = False,
 ) -> None:
     """Write one scene and its viewer as one HTML file, which needs no server and no network.

@@ -65,8 +65,8 @@ class Browser:
                 return answer["result"]
             self.events.append(answer)
 
-    def open(self, path: Path, width: int = 640, height: int = 480) -> "Tab":
-        """Open a file in a new tab, of a size in pixels."""
+    def open(self, path: Path, width: int = 640, height: int = 480, script: str = "") -> "Tab":
+        """Open a file in a new tab, of a size in pixels, after a script."""
         target = self.send("Target.createTarget", url="about:blank")["targetId"]
         attached = self.send("Target.attachToTarget", targetId=target, flatten=True)
         tab = Tab(self, attached["sessionId"])
@@ -74,6 +74,7 @@ class Browser:
             tab.send(f"{domain}.enable")
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         tab.send("Emulation.setDeviceMetricsOverride", **size)
+        tab.send("Page.addScriptToEvaluateOnNewDocument", source=script)
         tab.send("Page.navigate", url=path.absolute().as_uri())
         tab.evaluate(LOADED)
         return tab
@@ -97,6 +98,11 @@ class Tab:
         answer = self.send("Runtime.evaluate", expression=expression, **options)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
+
+    def wait(self, condition: str) -> None:
+        """Wait until an expression is true."""
+        check = f"check = () => {{ if ({condition}) done(); else setTimeout(check, 20); }}"
+        self.evaluate(f"new Promise((done) => {{ const {check}; check(); }})")
 
     def events(self, *methods: str) -> list[dict]:
         """Return the parameters of the tab's events of these kinds."""

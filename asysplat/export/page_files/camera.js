@@ -6,18 +6,16 @@ const dot = (a, b) => a.reduce((sum, value, k) => sum + value * b[k], 0);
 const cross = (a, b) =>
   [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 
-/** Return the camera at a place on the path; place i is camera i, and in between is a smooth curve.
- *
- * A Catmull-Rom spline through the numbers of a camera: position, quaternion wxyz, intrinsics.
- */
+/** Return the camera at a place on the path: at place i camera i, in between on a smooth curve,
+ * a Catmull-Rom spline through the cameras' numbers (position, quaternion wxyz, intrinsics). */
 function cameraAt(path, place) {
   const first = Math.min(Math.floor(place), Math.max(path.length - 2, 0)), t = place - first;
   const [before, from, to, after] =
     [-1, 0, 1, 2].map((k) => path[Math.min(Math.max(first + k, 0), path.length - 1)]);
   const numbers = from.map((value, k) => {
     const slope = (to[k] - before[k]) / 2, endSlope = (after[k] - value) / 2, rise = to[k] - value;
-    return value + t * (slope + t * (3 * rise - 2 * slope - endSlope
-      + t * (slope + endSlope - 2 * rise)));
+    const [square, cube] = [3 * rise - 2 * slope - endSlope, slope + endSlope - 2 * rise];
+    return value + t * (slope + t * (square + t * cube));
   });
   const norm = Math.hypot(...numbers.slice(3, 7));
   const [w, x, y, z] = numbers.slice(3, 7).map((value) => value / norm);
@@ -32,24 +30,22 @@ function cameraAt(path, place) {
 /** Return the intrinsics of a canvas that shows at least the camera's image, in its middle. */
 function fit([fx, fy, cx, cy], image, canvas) {
   const scale = Math.min(canvas[0] / image[0], canvas[1] / image[1]);
-  return {
-    focal: [scale * fx, scale * fy],
-    principal: [cx, cy].map((c, k) => canvas[k] / 2 + scale * (c - image[k] / 2)),
-  };
+  const principal = [cx, cy].map((c, k) => canvas[k] / 2 + scale * (c - image[k] / 2));
+  return { focal: [scale * fx, scale * fy], principal };
 }
 
-/** Turn a camera by an angle, in radians, around an axis through a point. */
+/** Return a camera that is turned by an angle, in radians, around an axis through a point. */
 function turn(camera, axis, angle, point) {
   const [sin, cos] = [Math.sin(angle), Math.cos(angle)];
-  const rotated = (v) => {
+  const turned = (v) => {
     const along = axis.map((value) => value * dot(axis, v) * (1 - cos));
     return add(add(along, v, cos), cross(axis, v), sin);
   };
-  const offset = rotated(add(camera.position, point, -1));
-  return { ...camera, position: add(point, offset), axes: camera.axes.map(rotated) };
+  const position = add(point, turned(add(camera.position, point, -1)));
+  return { ...camera, position, axes: camera.axes.map(turned) };
 }
 
-/** Turn around the world's up, and up or down, but not over the pole. */
+/** Turn a camera around the world's up, and then up or down, but not over the pole. */
 function orbit(camera, up, [yaw, pitch], point) {
   const turned = turn(camera, up, yaw, point);
   const tilted = turn(turned, turned.axes[0], pitch, point);
@@ -59,7 +55,6 @@ function orbit(camera, up, [yaw, pitch], point) {
 
 /** Move a camera by distances along its axes. */
 function move(camera, distances) {
-  const position = distances.reduce(
-    (sum, distance, k) => add(sum, camera.axes[k], distance), camera.position);
-  return { ...camera, position };
+  const steps = distances.map((distance, k) => camera.axes[k].map((value) => distance * value));
+  return { ...camera, position: steps.reduce((sum, step) => add(sum, step), camera.position) };
 }

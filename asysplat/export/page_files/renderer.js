@@ -4,12 +4,11 @@
 
 const VERTEX_SHADER = `
 uniform highp sampler2D positions;
-uniform highp usampler2D alphas, colors, scales, rotations, sh;
+uniform highp usampler2D alphas, colors, scales, rotations, sh, order;
 uniform mat3 axes; // columns right, down, forward
 uniform vec3 position;
 uniform vec2 focal, principal, size;
 uniform bool drawDepth;
-layout(location = 0) in uint index;
 out vec2 whitened;
 flat out vec4 color;
 
@@ -28,8 +27,7 @@ mat3 rotation(uint bits) {
   }
   q[largest] = sqrt(max(1.0 - dot(q, q), 0.0));
   q = normalize(q);
-  vec3 a = 2.0 * q.x * q.xyz, b = 2.0 * q.y * q.xyz;
-  vec3 w = 2.0 * q.w * q.xyz;
+  vec3 a = 2.0 * q.x * q.xyz, b = 2.0 * q.y * q.xyz, w = 2.0 * q.w * q.xyz;
   float zz = 2.0 * q.z * q.z;
   return mat3(
     1.0 - b.y - zz, a.y + w.z, a.z - w.y,
@@ -56,7 +54,7 @@ vec3 shColor(int i, vec3 d) {
 
 void main() {
   gl_Position = vec4(0, 0, 2, 1); // outside: culled
-  int i = int(index);
+  int i = int(fetch(order, gl_VertexID / 3).r);
   vec3 offset = texelFetch(positions, place(i), 0).rgb - position;
   vec3 local = offset * axes;
   if (!(local.z > NEAR)) return;
@@ -78,9 +76,10 @@ void main() {
   if (ANTIALIASED == 1) opacity *= sqrt(max(minors / determinant, COMPENSATION_MIN));
   if (!(opacity >= ALPHA_MIN && a > 0.0)) return;
 
-  // A parallelogram around the ellipse where alpha >= ALPHA_MIN, and a margin for rounding.
-  float reach = sqrt(2.0 * log(opacity / ALPHA_MIN)) + 0.01;
-  whitened = reach * (2.0 * vec2(gl_VertexID & 1, gl_VertexID >> 1) - 1.0);
+  // A triangle around the ellipse where alpha >= ALPHA_MIN, with a margin for rounding.
+  float radius = sqrt(2.0 * log(opacity / ALPHA_MIN)) + 0.01;
+  const float SIDE = sqrt(3.0);
+  whitened = radius * vec2[](vec2(0, 2), vec2(-SIDE, -1), vec2(SIDE, -1))[gl_VertexID % 3];
   float y = whitened.y / c, x = (whitened.x - b * y) / a;
   vec2 pixel = tangents * focal + principal + vec2(x, y);
   gl_Position = vec4((2.0 * pixel / size - 1.0) * vec2(1, -1), 0, 1);
@@ -101,72 +100,85 @@ void main() {
 const WIDTH = 2048; // texels in a row, which every WebGL 2 allows
 const DEPTH_MAP = 128; // pixels along the longer side
 
-/** Draw a scene on a canvas. */
 class Renderer {
+  /** Prepare a canvas: compile the shaders and write the Gaussians to textures. */
   constructor(canvas, scene, { constants, antialiased, background, image }) {
-    const gl = this.gl = canvas.getContext("webgl2", { antialias: false, depth: false });
+    const gl = canvas.getContext("webgl2", { antialias: false, depth: false });
     if (!gl) throw Error("this browser has no WebGL 2, or it is switched off");
-    Object.assign(this, { canvas, background, image });
+    Object.assign(this, { gl, canvas, background, image });
     // In 8 bits, most of what faint splats contribute would be lost, and depths end at 1.
     this.float = gl.getExtension("EXT_color_buffer_float")
       || gl.getExtension("EXT_color_buffer_half_float");
 
-    const define = ([name, value]) => `#define ${name.toUpperCase()} ${value}\n`;
-    const exponents = Object.entries(constants).map(([name, x]) => [name, x.toExponential()]);
-    const integers = { width: WIDTH, degree: scene.degree, antialiased: Number(antialiased) };
-    const header = ["#version 300 es\nprecision highp float;\n",
-      ...[...exponents, ...Object.entries(integers)].map(define)].join("");
-    this.program = link(gl, header + VERTEX_SHADER, header + FRAGMENT_SHADER);
-    gl.useProgram(this.program);
+    const floats = Object.entries(constants).map(([name, x]) => [name, x.toExponential()]);
+    const integers = { WIDTH, DEGREE: scene.degree, ANTIALIASED: Number(antialiased) };
+    const lines = [...floats, ...Object.entries(integers)].map(
+      ([name, value]) => `#define ${name.toUpperCase()} ${value}\n`);
+    this.compile(`#version 300 es\nprecision highp float;\n${lines.join("")}`);
 
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    const bytes = [gl.RGB8UI, gl.RGB_INTEGER, gl.UNSIGNED_BYTE, 3];
-    const formats = {
-      positions: [gl.RGB32F, gl.RGB, gl.FLOAT, 3],
-      alphas: [gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, 1],
-      colors: bytes, scales: bytes, sh: bytes,
-      rotations: [gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, 1],
+    const bytes = [3, gl.UNSIGNED_BYTE, gl.RGB_INTEGER, gl.RGB8UI];
+    const integer = [1, gl.UNSIGNED_INT, gl.RED_INTEGER, gl.R32UI];
+    this.formats = {
+      positions: [3, gl.FLOAT, gl.RGB, gl.RGB32F],
+      alphas: [1, gl.UNSIGNED_BYTE, gl.RED_INTEGER, gl.R8UI],
+      colors: bytes, scales: bytes, sh: bytes, rotations: integer, order: integer,
     };
-    Object.entries(formats).forEach(([name, format], unit) => {
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    Object.keys(this.formats).forEach((name, unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
-      this.upload(scene[name], ...format);
+      gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
       gl.uniform1i(this.uniform(name), unit);
+      if (name in scene) this.write(name, scene[name]);
     });
 
     this.framebuffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
-    gl.bindRenderbuffer(gl.RENDERBUFFER, gl.createRenderbuffer());
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
+    const target = gl.createRenderbuffer();
+    gl.bindRenderbuffer(gl.RENDERBUFFER, target);
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, target);
     gl.enable(gl.BLEND);
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
+  compile(header) {
+    const gl = this.gl;
+    this.program = gl.createProgram();
+    const shaders = [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]];
+    const logs = shaders.map(([type, source]) => {
+      const shader = gl.createShader(type);
+      gl.shaderSource(shader, header + source);
+      gl.compileShader(shader);
+      gl.attachShader(this.program, shader);
+      return gl.getShaderInfoLog(shader);
+    });
+    gl.linkProgram(this.program);
+    if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) {
+      throw Error(`the graphics driver refuses the shaders (${logs.join("")})`);
+    }
+    gl.useProgram(this.program);
+  }
+
   uniform(name) { return this.gl.getUniformLocation(this.program, name); }
 
-  /** Write data to a new texture, row by row. */
-  upload(data, internalFormat, format, type, channels) {
-    const gl = this.gl, texels = data.length / channels, rows = Math.floor(texels / WIDTH);
-    if (rows >= gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+  /** Write data to the texture of this name, row by row. */
+  write(name, data) {
+    const gl = this.gl, [channels, type, format, internalFormat] = this.formats[name];
+    const rows = Math.ceil(data.length / channels / WIDTH);
+    if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
       throw Error("it has more Gaussians than this device can hold");
     }
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texStorage2D(gl.TEXTURE_2D, 1, internalFormat, WIDTH, rows + 1);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-    const write = (row, width, height, part) =>
-      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, width, height, format, type, part);
-    const full = rows * WIDTH;
-    if (rows) write(0, WIDTH, rows, data.subarray(0, full * channels));
-    if (texels > full) write(rows, texels - full, 1, data.subarray(full * channels));
+    const padded = new data.constructor(rows * WIDTH * channels);
+    padded.set(data);
+    gl.activeTexture(gl.TEXTURE0 + Object.keys(this.formats).indexOf(name));
+    gl.texImage2D(gl.TEXTURE_2D, 0, internalFormat, WIDTH, rows, 0, format, type, padded);
   }
 
   /** Set the Gaussians to draw, farthest first. */
   setOrder(order) {
     this.count = order.length;
-    this.gl.bufferData(this.gl.ARRAY_BUFFER, order, this.gl.DYNAMIC_DRAW);
+    this.write("order", order);
   }
 
   /** Draw a camera's image in the size of the canvas. */
@@ -175,7 +187,7 @@ class Renderer {
     this.composite(camera, size, [...this.background, 1], false);
     gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
     gl.blitFramebuffer(0, 0, ...size, 0, 0, ...size, gl.COLOR_BUFFER_BIT, gl.NEAREST);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, this.framebuffer);
   }
 
   /** Compute a small image of depths, bottom row first; NaN where there is nothing. */
@@ -192,13 +204,9 @@ class Renderer {
 
   /** Composite all splats, back to front, in the framebuffer. */
   composite({ position, axes, intrinsics }, size, background, drawDepth) {
-    const gl = this.gl, vectors = { ...fit(intrinsics, this.image, size), size };
+    const gl = this.gl, pairs = { ...fit(intrinsics, this.image, size), size };
     if (String(size) !== this.allocated) {
-      const format = this.float ? gl.RGBA16F : gl.RGBA8;
-      gl.renderbufferStorage(gl.RENDERBUFFER, format, ...size);
-      gl.framebufferRenderbuffer(
-        gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER,
-        gl.getParameter(gl.RENDERBUFFER_BINDING));
+      gl.renderbufferStorage(gl.RENDERBUFFER, this.float ? gl.RGBA16F : gl.RGBA8, ...size);
       this.allocated = String(size);
     }
     gl.viewport(0, 0, ...size);
@@ -206,24 +214,8 @@ class Renderer {
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.uniformMatrix3fv(this.uniform("axes"), false, axes.flat());
     gl.uniform3fv(this.uniform("position"), position);
-    for (const name in vectors) gl.uniform2fv(this.uniform(name), vectors[name]);
+    for (const name in pairs) gl.uniform2fv(this.uniform(name), pairs[name]);
     gl.uniform1i(this.uniform("drawDepth"), Number(drawDepth));
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    gl.drawArrays(gl.TRIANGLES, 0, 3 * this.count);
   }
-}
-
-function link(gl, ...sources) {
-  const program = gl.createProgram();
-  [gl.VERTEX_SHADER, gl.FRAGMENT_SHADER].forEach((type, k) => {
-    const shader = gl.createShader(type);
-    gl.shaderSource(shader, sources[k]);
-    gl.compileShader(shader);
-    gl.attachShader(program, shader);
-  });
-  gl.linkProgram(program);
-  if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
-    const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
-    throw Error(`the graphics driver refuses the shaders (${logs.join("")})`);
-  }
-  return program;
 }

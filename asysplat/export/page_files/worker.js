@@ -1,14 +1,14 @@
 
-// Sort the Gaussians in front of a camera, from far to near.
+// Sort the Gaussians in front of a camera, from far to near, in a thread of its own.
 //
 // Two stable counting sorts, by the lower and then the upper half of the depth's 32 bits, give the
-// exact order of the depths: positive floats compare as their bits do.
+// exact order: positive floats compare as their bits do.
 
 const DIGITS = 1 << 16;
 const starts = new Uint32Array(DIGITS);
 let positions, near, depths, bits, indices, partly;
 
-onmessage = ({ data }) => {
+onmessage = ({ data, ports }) => {
   if (data.positions) {
     ({ positions, near } = data);
     depths = new Float32Array(positions.length / 3);
@@ -16,8 +16,7 @@ onmessage = ({ data }) => {
     indices = new Uint32Array(depths.length);
     partly = new Uint32Array(depths.length);
   } else {
-    const order = sort(data.position, data.forward);
-    postMessage(order, [order.buffer]);
+    ports[0].postMessage(sort(data.position, data.axes[2]));
   }
 };
 
@@ -40,10 +39,8 @@ function sort([x, y, z], [forwardX, forwardY, forwardZ]) {
 function countingSort(source, target, count, shift) {
   starts.fill(0);
   for (let i = 0; i < count; i++) starts[(bits[source[i]] >>> shift) % DIGITS]++;
-  for (let digit = DIGITS - 1, start = 0; digit >= 0; digit--) {
-    const size = starts[digit];
-    starts[digit] = start;
-    start += size;
+  for (let digit = DIGITS - 1, end = 0; digit >= 0; digit--) {
+    [starts[digit], end] = [end, end + starts[digit]];
   }
   for (let i = 0; i < count; i++) {
     target[starts[(bits[source[i]] >>> shift) % DIGITS]++] = source[i];
