@@ -86,12 +86,7 @@ def write_page(
         "names": [str(name) for name in names],
         "up": (HALF_TURN * mean_up(cameras).numpy()).tolist(),
         "background": [float(value) for value in background],
-        "antialiased": antialiased,
-        "constants": {
-            **asdict(INRIA),
-            "color_factor": spz.COLOR_FACTOR,
-            **{name: getattr(spherical_harmonics, name) for name in SH_FACTORS},
-        },
+        "defines": _defines(gaussians, antialiased),
     }
     style, script = _read("style.css"), "".join(map(_read, SCRIPTS))
     page = Template(_read("page.html")).substitute(
@@ -109,6 +104,15 @@ def write_page(
 
 def _read(name: str) -> str:
     return (FILES / name).read_text(encoding="utf-8")
+
+
+def _defines(gaussians: Gaussians, antialiased: bool) -> str:
+    """Return the numbers of the renderer and of the formats as the shaders' constants."""
+    floats = asdict(INRIA) | {"color_factor": spz.COLOR_FACTOR}
+    floats |= {name: getattr(spherical_harmonics, name) for name in SH_FACTORS}
+    integers = {"sh_count": gaussians.sh.shape[-2] - 1, "antialiased": int(antialiased)}
+    pairs = [*((name, float(value)) for name, value in floats.items()), *integers.items()]
+    return "".join(f"#define {name.upper()} {value}\n" for name, value in pairs)
 
 
 def _path(cameras: Cameras) -> list[list[float]]:

@@ -9,14 +9,12 @@ const cross = (a, b) =>
 /** Return the camera at a place on the path: at place i camera i, in between on a smooth curve,
  * a Catmull-Rom spline through the cameras' numbers (position, quaternion wxyz, intrinsics). */
 function cameraAt(path, place) {
-  const first = Math.min(Math.floor(place), Math.max(path.length - 2, 0)), t = place - first;
-  const [before, from, to, after] =
-    [-1, 0, 1, 2].map((k) => path[Math.min(Math.max(first + k, 0), path.length - 1)]);
-  const numbers = from.map((value, k) => {
-    const slope = (to[k] - before[k]) / 2, endSlope = (after[k] - value) / 2, rise = to[k] - value;
-    const [square, cube] = [3 * rise - 2 * slope - endSlope, slope + endSlope - 2 * rise];
-    return value + t * (slope + t * (square + t * cube));
-  });
+  const first = Math.min(Math.floor(place), path.length - 1), t = place - first;
+  const near = [-1, 0, 1, 2].map((k) => path[Math.min(Math.max(first + k, 0), path.length - 1)]);
+  const weights = [
+    -t + 2 * t ** 2 - t ** 3, 2 - 5 * t ** 2 + 3 * t ** 3, t + 4 * t ** 2 - 3 * t ** 3, t ** 3 - t ** 2,
+  ];
+  const numbers = path[0].map((_, k) => dot(weights, near.map((camera) => camera[k] / 2)));
   const norm = Math.hypot(...numbers.slice(3, 7));
   const [w, x, y, z] = numbers.slice(3, 7).map((value) => value / norm);
   const axes = [

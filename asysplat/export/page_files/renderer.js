@@ -1,18 +1,21 @@
 
-// The formulas of asysplat.render (asysplat/rendering/reference/project.py), in WebGL 2. Names in
-// capitals are numbers from Python, and those of `integers` below.
+// The formulas of asysplat.render (asysplat/rendering/reference/project.py), in WebGL 2. Python
+// defines the names in capitals.
+
+const WIDTH = 2048; // texels in a row, which every WebGL 2 allows
+const DEPTH_MAP = 128; // pixels along the longer side
 
 const VERTEX_SHADER = `
 uniform highp sampler2D positions;
 uniform highp usampler2D alphas, colors, scales, rotations, sh, order;
-uniform mat3 axes; // columns right, down, forward
+uniform mat3 axes; // columns: right, down, forward
 uniform vec3 position;
 uniform vec2 focal, principal, size;
 uniform bool drawDepth;
 out vec2 whitened;
 flat out vec4 color;
 
-ivec2 place(int i) { return ivec2(i % WIDTH, i / WIDTH); }
+ivec2 place(int i) { return ivec2(i % ${WIDTH}, i / ${WIDTH}); }
 uvec3 fetch(highp usampler2D data, int i) { return texelFetch(data, place(i), 0).rgb; }
 
 // The smallest three components have 9 bits and a sign each, the largest has its index.
@@ -45,9 +48,8 @@ vec3 shColor(int i, vec3 d) {
     Y3_0 * d.z * (2.0 * zz - 3.0 * xx - 3.0 * yy), -Y3_1 * d.x * (4.0 * zz - xx - yy),
     0.5 * Y3_2 * d.z * (xx - yy), -Y3_3 * d.x * (xx - 3.0 * yy));
   vec3 sum = 0.5 + SH_C0 / COLOR_FACTOR * (vec3(fetch(colors, i)) / 255.0 - 0.5);
-  int count = (DEGREE + 1) * (DEGREE + 1) - 1;
-  for (int k = 0; k < count; k++) {
-    sum += basis[k] * (vec3(fetch(sh, count * i + k)) / 128.0 - 1.0);
+  for (int k = 0; k < SH_COUNT; k++) {
+    sum += basis[k] * (vec3(fetch(sh, SH_COUNT * i + k)) / 128.0 - 1.0);
   }
   return max(sum, 0.0);
 }
@@ -97,31 +99,23 @@ void main() {
   result = vec4(color.rgb, alpha);
 }`;
 
-const WIDTH = 2048; // texels in a row, which every WebGL 2 allows
-const DEPTH_MAP = 128; // pixels along the longer side
-
 class Renderer {
-  /** Prepare a canvas: compile the shaders and write the Gaussians to textures. */
-  constructor(canvas, scene, { constants, antialiased, background, image }) {
+  /** Prepare a canvas: compile the shaders, write the Gaussians to textures. */
+  constructor(canvas, scene, { defines, background, image }) {
     const gl = canvas.getContext("webgl2", { antialias: false, depth: false });
     if (!gl) throw Error("this browser has no WebGL 2, or it is switched off");
-    Object.assign(this, { gl, canvas, background, image });
     // In 8 bits, most of what faint splats contribute would be lost, and depths end at 1.
-    this.float = gl.getExtension("EXT_color_buffer_float")
-      || gl.getExtension("EXT_color_buffer_half_float");
+    const float = gl.getExtension("EXT_color_buffer_float")
+      ?? gl.getExtension("EXT_color_buffer_half_float");
+    Object.assign(this, { gl, canvas, background, image, float });
+    this.compile(`#version 300 es\nprecision highp float;\n${defines}`);
 
-    const floats = Object.entries(constants).map(([name, x]) => [name, x.toExponential()]);
-    const integers = { WIDTH, DEGREE: scene.degree, ANTIALIASED: Number(antialiased) };
-    const lines = [...floats, ...Object.entries(integers)].map(
-      ([name, value]) => `#define ${name.toUpperCase()} ${value}\n`);
-    this.compile(`#version 300 es\nprecision highp float;\n${lines.join("")}`);
-
-    const bytes = [3, gl.UNSIGNED_BYTE, gl.RGB_INTEGER, gl.RGB8UI];
-    const integer = [1, gl.UNSIGNED_INT, gl.RED_INTEGER, gl.R32UI];
+    const [byte, integer] = [gl.UNSIGNED_BYTE, gl.UNSIGNED_INT];
+    const bytes = [3, gl.RGB8UI, gl.RGB_INTEGER, byte];
+    const integers = [1, gl.R32UI, gl.RED_INTEGER, integer];
     this.formats = {
-      positions: [3, gl.FLOAT, gl.RGB, gl.RGB32F],
-      alphas: [1, gl.UNSIGNED_BYTE, gl.RED_INTEGER, gl.R8UI],
-      colors: bytes, scales: bytes, sh: bytes, rotations: integer, order: integer,
+      positions: [3, gl.RGB32F, gl.RGB, gl.FLOAT], alphas: [1, gl.R8UI, gl.RED_INTEGER, byte],
+      colors: bytes, scales: bytes, sh: bytes, rotations: integers, order: integers,
     };
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     Object.keys(this.formats).forEach((name, unit) => {
@@ -133,9 +127,9 @@ class Renderer {
       if (name in scene) this.write(name, scene[name]);
     });
 
+    const target = gl.createRenderbuffer();
     this.framebuffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
-    const target = gl.createRenderbuffer();
     gl.bindRenderbuffer(gl.RENDERBUFFER, target);
     gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, target);
     gl.enable(gl.BLEND);
@@ -143,28 +137,26 @@ class Renderer {
   }
 
   compile(header) {
-    const gl = this.gl;
-    this.program = gl.createProgram();
-    const shaders = [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]];
-    const logs = shaders.map(([type, source]) => {
-      const shader = gl.createShader(type);
+    const gl = this.gl, program = this.program = gl.createProgram();
+    for (const [type, source] of [["VERTEX", VERTEX_SHADER], ["FRAGMENT", FRAGMENT_SHADER]]) {
+      const shader = gl.createShader(gl[`${type}_SHADER`]);
       gl.shaderSource(shader, header + source);
       gl.compileShader(shader);
-      gl.attachShader(this.program, shader);
-      return gl.getShaderInfoLog(shader);
-    });
-    gl.linkProgram(this.program);
-    if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) {
+      gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
+      const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
       throw Error(`the graphics driver refuses the shaders (${logs.join("")})`);
     }
-    gl.useProgram(this.program);
+    gl.useProgram(program);
   }
 
   uniform(name) { return this.gl.getUniformLocation(this.program, name); }
 
   /** Write data to the texture of this name, row by row. */
   write(name, data) {
-    const gl = this.gl, [channels, type, format, internalFormat] = this.formats[name];
+    const gl = this.gl, [channels, ...format] = this.formats[name];
     const rows = Math.ceil(data.length / channels / WIDTH);
     if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
       throw Error("it has more Gaussians than this device can hold");
@@ -172,7 +164,7 @@ class Renderer {
     const padded = new data.constructor(rows * WIDTH * channels);
     padded.set(data);
     gl.activeTexture(gl.TEXTURE0 + Object.keys(this.formats).indexOf(name));
-    gl.texImage2D(gl.TEXTURE_2D, 0, internalFormat, WIDTH, rows, 0, format, type, padded);
+    gl.texImage2D(gl.TEXTURE_2D, 0, format[0], WIDTH, rows, 0, format[1], format[2], padded);
   }
 
   /** Set the Gaussians to draw, farthest first. */

@@ -25,5 +25,5 @@ async function unpack(base64) {
     positions[i] = (integer >> 8) / 2 ** fractionBits;
   }
   const aligned = new Uint32Array(rotations.slice().buffer);
-  return { degree, positions, alphas, colors, scales, rotations: aligned, sh };
+  return { positions, alphas, colors, scales, rotations: aligned, sh };
 }

@@ -23,7 +23,7 @@ let playing = false, sorting = false, requested = false, lastTime = 0;
 async function start() {
   scene = await unpack(element("spz").textContent);
   renderer = new Renderer(canvas, scene, settings);
-  worker.postMessage({ positions: scene.positions, near: settings.constants.near });
+  worker.postMessage({ positions: scene.positions });
   slider.max = path.length - 1;
   element("controls").hidden = path.length < 2;
   show(0);
