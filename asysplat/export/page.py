@@ -1,7 +1,6 @@
 """A scene as one HTML page, which opens from disk in any browser."""
 
 import json
-import math
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -75,7 +74,7 @@ def write_page(
             f"write_page has {len(names)} names and {cameras.num_views} cameras: give one name "
             "for each, or none."
         )
-    if len(background) != 3 or not all(math.isfinite(value) for value in background):
+    if len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise InputError(
             f"write_page's background is {background!r}: give red, green and blue, from 0 to 1."
         )

@@ -268,6 +268,25 @@ def test_pointers_and_keys_move_the_camera(tab):
 
 
 @pytest.mark.medium
+def test_a_double_click_sets_the_point_to_orbit(browser, make_scene, tmp_path):
+    gaussians, cameras = make_scene(1, 1, HEIGHT, WIDTH, dtype=torch.float32)
+    gaussians = replace(gaussians, means=torch.tensor([[0.4, 0.2, 2.0]]))
+    write_page(tmp_path / "scene.html", gaussians, cameras)
+    tab = browser.open(tmp_path / "scene.html", WIDTH, HEIGHT)
+    tab.evaluate("asysplat.ready")
+    (x, y), *_ = cameras.project(gaussians.means)[0][0].tolist()
+    for clicks in (1, 2):
+        click = {"button": "left", "clickCount": clicks}
+        tab.mouse("mousePressed", x, y, **click)
+        tab.mouse("mouseReleased", x, y, **click)
+    before, axes = camera(tab)
+    tab.mouse("mouseWheel", x, y, deltaX=0, deltaY=-300)
+    offset = axes @ (camera(tab)[0] - before)
+    ray = cameras.cam_to_world[0, :3, :3].T @ (gaussians.means[0] - cameras.centers[0])
+    np.testing.assert_allclose(offset / offset[2], ray / ray[2], atol=0.02)
+
+
+@pytest.mark.medium
 def test_two_fingers_zoom(tab):
     before, axes = camera(tab)
 
@@ -280,6 +299,22 @@ def test_two_fingers_zoom(tab):
     touch("touchEnd")
     offset = axes @ (camera(tab)[0] - before)
     assert offset[2] > 0.1
+
+
+@pytest.mark.medium
+def test_the_picture_comes_back_after_a_lost_context(tab):
+    picture = tab.evaluate("asysplat.picture(1)")
+    tab.evaluate(
+        "context = document.getElementById('canvas').getContext('webgl2')"
+        ".getExtension('WEBGL_lose_context'); null"
+    )
+    for verb in ("lost", "restored"):
+        tab.evaluate(
+            "new Promise((done) => { document.getElementById('canvas')"
+            f".addEventListener('webglcontext{verb}', () => setTimeout(done, 0));"
+            f"context.{verb.replace('lost', 'lose').removesuffix('d')}Context(); }})"
+        )
+    assert tab.evaluate("asysplat.picture(1)") == picture
 
 
 @pytest.mark.medium

@@ -9,11 +9,9 @@ const cross = (a, b) =>
 /** Return the camera at a place on the path: at place i camera i, in between on a smooth curve,
  * a Catmull-Rom spline through the cameras' numbers (position, quaternion wxyz, intrinsics). */
 function cameraAt(path, place) {
-  const first = Math.min(Math.floor(place), path.length - 1), t = place - first;
+  const first = Math.floor(place), t = place - first, t2 = t * t, t3 = t * t2;
   const near = [-1, 0, 1, 2].map((k) => path[Math.min(Math.max(first + k, 0), path.length - 1)]);
-  const weights = [
-    -t + 2 * t ** 2 - t ** 3, 2 - 5 * t ** 2 + 3 * t ** 3, t + 4 * t ** 2 - 3 * t ** 3, t ** 3 - t ** 2,
-  ];
+  const weights = [2 * t2 - t - t3, 2 - 5 * t2 + 3 * t3, t + 4 * t2 - 3 * t3, t3 - t2];
   const numbers = path[0].map((_, k) => dot(weights, near.map((camera) => camera[k] / 2)));
   const norm = Math.hypot(...numbers.slice(3, 7));
   const [w, x, y, z] = numbers.slice(3, 7).map((value) => value / norm);

@@ -62,8 +62,8 @@ void main() {
   if (!(local.z > NEAR)) return;
 
   vec2 tangents = local.xy / local.z, margin = FRUSTUM_MARGIN * size;
-  vec2 clamped = clamp(
-    tangents, (-principal - margin) / focal, (size - principal + margin) / focal);
+  vec2 low = (-principal - margin) / focal, high = (size - principal + margin) / focal;
+  vec2 clamped = clamp(tangents, low, high);
   mat3 turn = rotation(fetch(rotations, i).r);
   vec3 scale = exp(vec3(fetch(scales, i)) / 16.0 - 10.0);
   vec3 rowX = focal.x / local.z * (axes[0] - clamped.x * axes[2]) * turn * scale;
@@ -110,11 +110,11 @@ class Renderer {
     Object.assign(this, { gl, canvas, background, image, float });
     this.compile(`#version 300 es\nprecision highp float;\n${defines}`);
 
-    const [byte, integer] = [gl.UNSIGNED_BYTE, gl.UNSIGNED_INT];
-    const bytes = [3, gl.RGB8UI, gl.RGB_INTEGER, byte];
-    const integers = [1, gl.R32UI, gl.RED_INTEGER, integer];
+    const bytes = [3, gl.RGB8UI, gl.RGB_INTEGER, gl.UNSIGNED_BYTE];
+    const integers = [1, gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT];
     this.formats = {
-      positions: [3, gl.RGB32F, gl.RGB, gl.FLOAT], alphas: [1, gl.R8UI, gl.RED_INTEGER, byte],
+      positions: [3, gl.RGB32F, gl.RGB, gl.FLOAT],
+      alphas: [1, gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE],
       colors: bytes, scales: bytes, sh: bytes, rotations: integers, order: integers,
     };
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);

@@ -11,9 +11,8 @@ async function unpack(base64) {
   for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
   const buffer = await new Response(stream).arrayBuffer();
-  const header = new DataView(buffer, 0, HEADER);
-  const count = header.getUint32(8, true);
-  const [degree, fractionBits] = [header.getUint8(12), header.getUint8(13)];
+  const count = new DataView(buffer).getUint32(8, true);
+  const [degree, fractionBits] = new Uint8Array(buffer, 12, 2);
   let end = HEADER;
   const next = (size) => new Uint8Array(buffer, end, (end += count * size) && count * size);
   const [fixed, alphas, colors, scales, rotations, sh] =

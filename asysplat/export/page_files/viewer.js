@@ -20,7 +20,12 @@ let camera, sorted; // the shown one, and that of the order; replaced, never cha
 let place = 0, center = null; // on the path; the point to orbit, once one is needed
 let playing = false, sorting = false, requested = false, lastTime = 0;
 
+function report({ message }) {
+  element("message").textContent = `The scene cannot be shown: ${message}.`;
+}
+
 async function start() {
+  worker.onerror = () => report({ message: "this browser refuses its worker" });
   scene = await unpack(element("spz").textContent);
   renderer = new Renderer(canvas, scene, settings);
   worker.postMessage({ positions: scene.positions });
@@ -62,17 +67,19 @@ function frame(time) {
   requested = false;
   const seconds = Math.min((time - lastTime) / 1000, 0.1), last = path.length - 1;
   lastTime = time;
-  if (playing) show(Math.min(place + seconds * Math.max(PLAY_SPEED, last / MAX_PLAY_SECONDS), last));
+  if (playing) show(place + seconds * Math.max(PLAY_SPEED, last / MAX_PLAY_SECONDS));
   if (playing && place === last) play(false);
   for (const key of held) travel(KEYS[key].map((value) => value * seconds * distance()));
   sort();
   renderer.draw(camera);
 }
 
+const shownSize = () => [canvas.clientWidth, canvas.clientHeight];
+
 function resize() {
-  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  const [width, height] = shownSize();
   const ratio = Math.min(devicePixelRatio, 2, Math.sqrt(MAX_PIXELS / (width * height)));
-  [canvas.width, canvas.height] = [width, height].map((side) => Math.ceil(ratio * side) || 1);
+  [canvas.width, canvas.height] = [width, height].map((side) => Math.round(ratio * side) || 1);
   renderer.draw(camera); // at once, as it is empty
 }
 
@@ -93,6 +100,7 @@ function show(next) {
 function play(on) {
   playing = on;
   element("play").textContent = playing ? "❚❚" : "▶";
+  if (playing && place === path.length - 1) show(0);
   request();
 }
 
@@ -130,7 +138,7 @@ canvas.onpointerdown = (event) => {
 };
 canvas.onpointermove = (event) => {
   if (!pointers.has(event.pointerId)) return;
-  const before = spread(), size = [canvas.clientWidth, canvas.clientHeight];
+  const before = spread(), size = shownSize();
   pointers.set(event.pointerId, event);
   const after = spread(), [x, y] = add(after.middle, before.middle, -1);
   if (pointers.size > 1 || event.buttons & 2 || event.shiftKey) {
@@ -152,7 +160,7 @@ canvas.onwheel = (event) => {
 };
 canvas.ondblclick = ({ offsetX, offsetY }) => {
   const { depths, size } = renderer.depthMap(camera);
-  const [x, y] = [offsetX / canvas.clientWidth * size[0], offsetY / canvas.clientHeight * size[1]];
+  const [x, y] = [offsetX, offsetY].map((value, k) => value / shownSize()[k] * size[k]);
   const depth = depths[(size[1] - 1 - Math.floor(y)) * size[0] + Math.floor(x)];
   const { focal, principal } = fit(camera.intrinsics, image, size);
   const ray = [(x - principal[0]) / focal[0], (y - principal[1]) / focal[1], 1];
@@ -161,7 +169,7 @@ canvas.ondblclick = ({ offsetX, offsetY }) => {
 canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
 canvas.addEventListener("webglcontextrestored", () => {
   renderer = new Renderer(canvas, scene, settings);
-  show(place);
+  setCamera({ ...camera });
 });
 
 onkeydown = (event) => {
@@ -179,10 +187,7 @@ const jump = (next) => { play(false); show(next); };
 element("previous").onclick = () => jump(Math.ceil(place) - 1);
 element("next").onclick = () => jump(Math.floor(place) + 1);
 slider.oninput = () => jump(Number(slider.value));
-element("play").onclick = () => {
-  if (place === path.length - 1) show(0);
-  play(!playing);
-};
+element("play").onclick = () => play(!playing);
 
 /** For other scripts, and tests. */
 window.asysplat = {
@@ -202,6 +207,4 @@ window.asysplat = {
     return url;
   },
 };
-window.asysplat.ready.catch(({ message }) => {
-  element("message").textContent = `The scene cannot be shown: ${message}.`;
-});
+window.asysplat.ready.catch(report);

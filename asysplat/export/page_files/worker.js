@@ -35,9 +35,7 @@ function countingSort(indices, shift) {
   const starts = new Uint32Array(DIGITS), sorted = new Uint32Array(indices.length);
   for (const i of indices) starts[(bits[i] >>> shift) % DIGITS]++;
   for (let digit = DIGITS - 1, end = 0; digit >= 0; digit--) {
-    const size = starts[digit];
-    starts[digit] = end;
-    end += size;
+    [starts[digit], end] = [end, end + starts[digit]];
   }
   for (const i of indices) sorted[starts[(bits[i] >>> shift) % DIGITS]++] = i;
   return sorted;
