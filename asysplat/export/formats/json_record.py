@@ -50,37 +50,44 @@ class JsonRecord(NamedTuple):
             default,
         )
 
-    def numbers(
-        self, key: str, counts: tuple[int, ...], default: list[float] | None = None
-    ) -> list[float]:
-        """Return finite numbers, of one of these counts."""
-        found = self.value(
-            key,
-            lambda found: (
-                isinstance(found, list)
-                and len(found) in counts
-                and all(type(x) in (int, float) and abs(x) < MAX_NUMBER for x in found)
-            ),
-            f"{' or '.join(map(str, counts))} finite numbers",
-            default,
-        )
-        return [float(number) for number in found]
-
-    def texts(self, key: str, count: int) -> list[str]:
-        """Return `count` strings."""
+    def integers(self, key: str, count: int) -> list[int]:
+        """Return a list of integers in [0, count), empty where it is absent."""
         return self.value(
             key,
             lambda found: (
                 isinstance(found, list)
-                and len(found) == count
-                and all(isinstance(text, str) for text in found)
+                and all(type(index) is int and 0 <= index < count for index in found)
             ),
-            f"a list of {count} names",
+            f"a list of integers below {count}",
+            [],
         )
 
-    def record(self, key: str) -> "JsonRecord":
+    def numbers(self, key: str, count: int, default: list[float] | None = None) -> list[float]:
+        """Return `count` finite numbers."""
+        found = self.value(
+            key,
+            lambda found: (
+                isinstance(found, list)
+                and len(found) == count
+                and all(type(x) in (int, float) and abs(x) < MAX_NUMBER for x in found)
+            ),
+            f"{count} finite numbers",
+            default,
+        )
+        return [float(number) for number in found]
+
+    def texts(self, key: str, default: list[str] | None = None) -> list[str]:
+        """Return a list of strings."""
+        return self.value(
+            key,
+            lambda found: isinstance(found, list) and all(isinstance(text, str) for text in found),
+            "a list of names",
+            default,
+        )
+
+    def record(self, key: str, default: dict | None = None) -> "JsonRecord":
         """Return an object."""
-        found = self.value(key, lambda found: isinstance(found, dict), "an object")
+        found = self.value(key, lambda found: isinstance(found, dict), "an object", default)
         return JsonRecord(self.path, key, found)
 
     def records(self, key: str, default: list | None = None) -> list["JsonRecord"]:

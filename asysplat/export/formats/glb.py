@@ -1,0 +1,286 @@
+"""Gaussians as binary glTF with the extension KHR_gaussian_splatting, in float32.
+
+Format: https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting.
+glTF's axes are left, up, forward.
+"""
+
+import json
+import math
+import reprlib
+import struct
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from asysplat.errors import InputError
+from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
+from asysplat.export.formats.json_record import JsonRecord, parse_record
+from asysplat.export.formats.packing import half_turn
+from asysplat.files import atomic_write
+from asysplat.geometry.motion import transform
+from asysplat.geometry.rotations import rotations
+from asysplat.geometry.spherical_harmonics import SH_C0
+from asysplat.scene import Gaussians
+
+MAGIC, VERSION = b"glTF", 2
+HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+JSON, BINARY = b"JSON", b"BIN\0"  # kinds of chunks
+EXTENSION = "KHR_gaussian_splatting"
+KERNEL = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+ROTATION, SCALE, OPACITY = (f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))
+POINTS, ARRAY_BUFFER = 0, 34962  # glTF's numbers for a mode and a target
+TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}  # of components
+COMPONENTS = {
+    "float32": {"componentType": 5126},
+    "uint8": {"componentType": 5121, "normalized": True},
+}
+KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # of accessors, by their number of components
+MAX_STRIDE = 252  # bytes from one element to the next
+TOLERANCE = 1e-4  # of rotations that others wrote in float32
+
+
+def write_glb(path: str | Path, gaussians: Gaussians) -> None:
+    """Write one scene, without batch dimension, as binary glTF.
+
+    Quaternions are normalized; all else keeps its bits. Programs that lack the extension show
+    colored points.
+
+    Raises:
+        InputError: invalid Gaussians, too many, or a file that cannot be written.
+    """
+    scene = half_turn(prepare_for_export(gaussians), 2)
+    quats = torch.nn.functional.normalize(scene.quats.double(), dim=-1).float().roll(-1, 1)
+    diffuse = (0.5 + SH_C0 * scene.sh[:, 0]).clamp(0, 1)
+    linear = torch.where(diffuse <= 0.04045, diffuse / 12.92, ((diffuse + 0.055) / 1.055) ** 2.4)
+    colors = (255 * torch.cat((linear, scene.opacities[:, None]), 1)).round().byte()
+    attributes = {"POSITION": scene.means, "COLOR_0": colors, ROTATION: quats, SCALE: scene.scales}
+    attributes[OPACITY] = scene.opacities[:, None]
+    attributes |= dict(zip(_sh_names(scene.sh.shape[1]), scene.sh.unbind(1), strict=True))
+    arrays = [tensor.numpy() for tensor in attributes.values()]
+    views, accessors, size = [], [], 0
+    for index, array in enumerate(arrays):
+        accessor = {"bufferView": index, "count": len(array), "type": KINDS[array.shape[1]]}
+        accessors.append(accessor | COMPONENTS[array.dtype.name])
+        view = {"buffer": 0, "byteOffset": size, "byteLength": array.nbytes}
+        views.append(view | {"target": ARRAY_BUFFER})
+        size += array.nbytes
+    accessors[0] |= {"min": scene.means.amin(0).tolist(), "max": scene.means.amax(0).tolist()}
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(attributes)},
+        "mode": POINTS,
+        "extensions": {EXTENSION: KERNEL},
+    }
+    document = {
+        "asset": {"version": "2.0", "generator": "asysplat"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": size}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    total = HEADER.size + CHUNK.size + len(text) + CHUNK.size + size
+    if total >= 2**32:
+        raise InputError(
+            f"Gaussians.opacities has {len(colors):,} Gaussians, {total} bytes: glTF holds up to "
+            f"{2**32 - 1}; write parts, or another format."
+        )
+    with atomic_write(path) as partial, open(partial, "wb") as file:
+        file.write(HEADER.pack(MAGIC, VERSION, total))
+        file.write(CHUNK.pack(len(text), JSON) + text)
+        file.write(CHUNK.pack(size, BINARY))
+        for array in arrays:
+            file.write(np.ascontiguousarray(array).data)
+
+
+def _sh_names(count: int) -> list[str]:
+    """Return the names of the first `count` SH coefficients, by degree and order."""
+    places = [(math.isqrt(index), index - math.isqrt(index) ** 2) for index in range(count)]
+    return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}" for degree, order in places]
+
+
+def read_glb(path: str | Path) -> Gaussians:
+    """Read the Gaussians of a binary glTF file, in the scene's coordinates.
+
+    The file may hold other meshes. Nodes may move, turn and scale the Gaussians, by the same factor
+    along all axes.
+
+    Raises:
+        InputError: not a binary glTF file, a damaged one, one without Gaussians or with several
+            sets of them, compressed or sparse ones, or invalid Gaussians.
+    """
+    path = require_file(path)
+    root, buffer = _read_chunks(path)
+    required = root.texts("extensionsRequired", default=[])
+    if others := [name for name in required if name != EXTENSION]:
+        raise InputError(
+            f"{path} needs the extension {reprlib.repr(others[0])}: expected no other than "
+            f"{EXTENSION}; write it without compression."
+        )
+    primitive, motion = _find(root)
+    _check_kernel(primitive)
+    attributes = primitive.record("attributes")
+
+    def read(name: str, size: int) -> Float[Tensor, "N size"]:
+        return torch.from_numpy(_read_accessor(root, buffer, attributes, name, size))
+
+    degree = max(d for d in range(4) if d == 0 or _sh_names(16)[d * d] in attributes.values)
+    names = {"POSITION": 3, ROTATION: 4, SCALE: 3, OPACITY: 1}
+    names |= dict.fromkeys(_sh_names((degree + 1) ** 2), 3)
+    columns = {name: read(name, size) for name, size in names.items()}
+    counts = {name: len(column) for name, column in columns.items()}
+    if odd := [name for name in counts if counts[name] != counts["POSITION"]]:
+        raise InputError(
+            f"{path} has {counts['POSITION']} of POSITION and {counts[odd[0]]} of {odd[0]}: "
+            "expected as many; write it again."
+        )
+    means, quats, scales, opacities, *sh = columns.values()
+    if not (quats != 0).any(1).all():
+        raise InputError(f"{path} has a rotation of 0: repair or remove that Gaussian.")
+    gaussians = Gaussians(
+        means=means,
+        quats=torch.nn.functional.normalize(quats.double(), dim=-1).float().roll(1, 1),
+        scales=torch.where(scales == 0, TINY, scales),
+        opacities=torch.where(opacities == 0, TINY, opacities)[:, 0],
+        sh=torch.stack(sh, 1),
+    )
+    gaussians = _move(path, gaussians, motion)
+    return half_turn(gaussians, 2).validate(f"{path}: Gaussians")
+
+
+def _read_chunks(path: Path) -> tuple[JsonRecord, memoryview]:
+    """Read the JSON of a file and the bytes of its buffer."""
+    content = memoryview(path.read_bytes())
+    if len(content) < HEADER.size or bytes(content[:4]) != MAGIC:
+        raise InputError(
+            f"{path} is not binary glTF: expected {MAGIC.decode()} at its beginning; write .glb."
+        )
+    _, version, total = HEADER.unpack_from(content)
+    if version != VERSION:
+        raise InputError(f"{path} has glTF's version {version}: expected {VERSION}.")
+    chunks, start = {}, HEADER.size
+    while start < total:
+        if total > len(content) or start + CHUNK.size > total:
+            raise _cut_off(path)
+        size, kind = CHUNK.unpack_from(content, start)
+        start += CHUNK.size
+        if start + size > total:
+            raise _cut_off(path)
+        chunks.setdefault(kind, content[start : start + size])
+        start += size
+    if JSON not in chunks:
+        raise _cut_off(path)
+    return parse_record(path, "JSON", bytes(chunks[JSON])), chunks.get(BINARY, content[:0])
+
+
+def _find(root: JsonRecord) -> tuple[JsonRecord, Float[Tensor, "4 4"]]:
+    """Find the one primitive of Gaussians, and compute its transform to the scene."""
+    nodes, meshes = root.records("nodes", []), root.records("meshes", [])
+    parents, found = {}, []
+    for index, node in enumerate(nodes):
+        for child in node.integers("children", len(nodes)):
+            parents[child] = index
+        if "mesh" in node.values:
+            mesh = meshes[node.integer("mesh", 0, len(meshes) - 1)]
+            found += [
+                (index, primitive)
+                for primitive in mesh.records("primitives")
+                if EXTENSION in primitive.record("extensions", {}).values
+            ]
+    if len(found) != 1:
+        raise InputError(
+            f"{root.path} has {len(found)} primitives with {EXTENSION} in its nodes: expected one; "
+            "join them in the program that wrote it."
+        )
+    ((index, primitive),) = found
+    motion = torch.eye(4, dtype=torch.float64)
+    for _ in nodes:
+        motion = _local_transform(nodes[index]) @ motion
+        if index not in parents:
+            return primitive, motion
+        index = parents[index]
+    raise InputError(f"{root.path} has a node within itself: expected a tree; write it again.")
+
+
+def _local_transform(node: JsonRecord) -> Float[Tensor, "4 4"]:
+    matrix = torch.eye(4, dtype=torch.float64)
+    if "matrix" in node.values:
+        return matrix.new_tensor(node.numbers("matrix", 16)).view(4, 4).mT
+    x, y, z, w = node.numbers("rotation", 4, [0, 0, 0, 1])
+    scale = matrix.new_tensor(node.numbers("scale", 3, [1, 1, 1]))
+    matrix[:3, :3] = rotations(matrix.new_tensor([w, x, y, z])) * scale
+    matrix[:3, 3] = matrix.new_tensor(node.numbers("translation", 3, [0, 0, 0]))
+    return matrix
+
+
+def _move(path: Path, gaussians: Gaussians, motion: Float[Tensor, "4 4"]) -> Gaussians:
+    identity = torch.eye(4, dtype=torch.float64)
+    if torch.equal(motion, identity):
+        return gaussians  # with all bits
+    scale = motion[:3, :3].det().clamp_min(0) ** (1 / 3)
+    rigid = motion.clone()
+    rigid[:3, :3] /= scale
+    rotation_error = rigid[:3, :3] @ rigid[:3, :3].mT - identity[:3, :3]
+    rigid_error = torch.cat((rotation_error.flatten(), motion[3] - identity[3])).abs().max()
+    if not (rigid_error < TOLERANCE and rigid.isfinite().all()):
+        raise InputError(
+            f"{path} has nodes that stretch, shear or mirror its Gaussians: expected a rotation, a "
+            "translation and one scale; apply the others in the program that wrote it."
+        )
+    return transform(gaussians.scale_by(scale.item()), rigid)
+
+
+def _check_kernel(primitive: JsonRecord) -> None:
+    """Check that the Gaussians are of the kind that the renderer draws, and not compressed."""
+    primitive.integer("mode", POINTS, POINTS)
+    splats = primitive.record("extensions").record(EXTENSION)
+    for key, value in KERNEL.items():
+        splats.value(key, lambda found, value=value: found == value, f"{value!r}", value)
+    splats.value("extensions", lambda found: found == {}, "no extensions, such as compression", {})
+
+
+def _read_accessor(
+    root: JsonRecord, buffer: memoryview, attributes: JsonRecord, name: str, size: int
+) -> Float[ndarray, "N size"]:
+    """Read the numbers of an attribute."""
+    accessors, views = root.records("accessors"), root.records("bufferViews")
+    accessor = accessors[attributes.integer(name, 0, len(accessors) - 1)]
+    kind = KINDS[size]
+    accessor.value("type", lambda found: found == kind, f"{kind} for {name}")
+    accessor.value("sparse", lambda found: found is None, "none")
+    component = accessor.value(
+        "componentType",
+        lambda found: type(found) is int and found in TYPES,
+        f"one of {', '.join(map(str, TYPES))}",
+    )
+    view = views[accessor.integer("bufferView", 0, len(views) - 1)]
+    view.value("extensions", lambda found: found is None, "none, such as compression")
+    view.integer("buffer", 0, 0)
+    dtype = np.dtype(TYPES[component])
+    start = view.integer("byteOffset", 0, len(buffer), 0)
+    length = view.integer("byteLength", 1, len(buffer) - start)
+    offset = accessor.integer("byteOffset", 0, length, 0)
+    element = dtype.itemsize * size
+    stride = view.integer("byteStride", element, MAX_STRIDE, element)
+    # The last element may end with the view, before a whole stride.
+    count = accessor.integer("count", 1, (length - offset - element) // stride + 1)
+    array = np.ndarray((count, size), dtype, buffer, start + offset, (stride, dtype.itemsize))
+    values = array.astype(np.float32)
+    normalized = accessor.value(
+        "normalized", lambda found: isinstance(found, bool), "true or false", False
+    )
+    if normalized and dtype.kind != "f":
+        values = np.maximum(values / np.float32(np.iinfo(dtype).max), -1)
+    return values
+
+
+def _cut_off(path: Path) -> InputError:
+    return InputError(f"{path} is cut off or damaged: its chunks have other sizes; copy it again.")
