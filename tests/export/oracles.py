@@ -1,4 +1,4 @@
-"""Other programs that read and write our formats, where they are installed."""
+"""Other programs that read and write Gaussians, where Node.js and their packages are present."""
 
 import json
 import os
@@ -8,28 +8,43 @@ from pathlib import Path
 
 import pytest
 
-NODE_MODULES = "ASYSPLAT_NODE_MODULES"  # a folder in which npm installed the programs
+VALIDATE = """
+const [folder, file] = process.argv.slice(1);
+const content = new Uint8Array(require("fs").readFileSync(file));
+require(folder).validateBytes(content, {maxIssues: 0}).then(
+  report => console.log(JSON.stringify(report.issues.messages)));
+"""
+SPLAT_TRANSFORM = "@playcanvas/splat-transform"
 
 
-def node_module(name: str) -> Path:
-    """Return the folder of a package of npm; skip the test where there is none."""
-    folder = Path(os.environ.get(NODE_MODULES, "node_modules")) / name
-    if shutil.which("node") is None or not folder.is_dir():
-        pytest.skip(f"{NODE_MODULES} names no folder with {name}: npm install {name}")
-    return folder.resolve()
+def package(name: str) -> Path:
+    """The folder of a package of Node.js; a test that asks for it is skipped without."""
+    modules = os.environ.get("ASYSPLAT_NODE_MODULES")
+    if modules is None or shutil.which("node") is None:
+        pytest.skip("needs Node.js, and ASYSPLAT_NODE_MODULES: a folder node_modules")
+    folder = Path(modules) / name
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent: npm install {name}")
+    return folder
 
 
-def _splat_transform_command() -> list[str | Path]:
-    folder = node_module("@playcanvas/splat-transform")
-    version = json.loads((folder / "package.json").read_text())["version"]
-    if not version.startswith("2."):
-        pytest.skip(f"splat-transform is {version}: npm install @playcanvas/splat-transform@2")
-    return ["node", folder / "bin" / "cli.mjs"]
+def run_node(*words: str | Path) -> str:
+    command = ["node", *map(str, words)]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=300).stdout
 
 
 def splat_transform(source: Path, target: Path, *options: str) -> Path:
-    """Convert a file with PlayCanvas's splat-transform, and return the new one."""
-    words = [*_splat_transform_command(), "-w", "-q", *options, source, target]
-    result = subprocess.run(words, capture_output=True, text=True, timeout=120)
-    assert result.returncode == 0 and target.exists(), result.stdout + result.stderr
+    """Convert a file by PlayCanvas's program, which picks formats by suffix; return the new one."""
+    folder = package(SPLAT_TRANSFORM)
+    version = json.loads((folder / "package.json").read_text())["version"]
+    if not version.startswith("2."):  # the next one reads SPZ in other axes than its format's
+        pytest.skip(f"splat-transform is {version}: npm install {SPLAT_TRANSFORM}@2")
+    words = (folder / "bin" / "cli.mjs", "--quiet", "--overwrite", "--gpu", "cpu")
+    run_node(*words, *options, source, target)
     return target
+
+
+def gltf_errors(file: Path) -> list[str]:
+    """Return what Khronos's validator finds wrong, with the places."""
+    found = json.loads(run_node("-e", VALIDATE, package("gltf-validator"), file))
+    return [f"{issue['message']} {issue['pointer']}" for issue in found if issue["severity"] == 0]

@@ -214,10 +214,10 @@ def _local_transform(node: JsonRecord) -> Float[Tensor, "4 4"]:
     matrix = torch.eye(4, dtype=torch.float64)
     if "matrix" in node.values:
         return matrix.new_tensor(node.numbers("matrix", 16)).view(4, 4).mT
-    x, y, z, w = node.numbers("rotation", 4, [0, 0, 0, 1])
-    scale = matrix.new_tensor(node.numbers("scale", 3, [1, 1, 1]))
+    x, y, z, w = node.numbers("rotation", 4, [0.0, 0.0, 0.0, 1.0])
+    scale = matrix.new_tensor(node.numbers("scale", 3, [1.0, 1.0, 1.0]))
     matrix[:3, :3] = rotations(matrix.new_tensor([w, x, y, z])) * scale
-    matrix[:3, 3] = matrix.new_tensor(node.numbers("translation", 3, [0, 0, 0]))
+    matrix[:3, 3] = matrix.new_tensor(node.numbers("translation", 3, [0.0, 0.0, 0.0]))
     return matrix
 
 

@@ -39,6 +39,7 @@ PALETTE_ITERATIONS = 4
 CODEBOOK_ITERATIONS = 50
 METHOD, QUALITY = 2, 50  # of WebP: what takes ten times as long saves 0.1 %
 FIRST_TAG = 252  # alpha of a rotation whose w is the largest; then x, y, z
+MAX_TEXT = 80  # characters of a library's message
 SLACK = 1 << 20  # bytes or pixels that a small file may have beyond what it needs
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, ValueError)
 ZIP_ERRORS += (RuntimeError, OverflowError)  # encrypted; offsets beyond 64 bits
@@ -343,7 +344,7 @@ def _content(archive: zipfile.ZipFile, path: Path, name: str) -> bytes:
     except KeyError:
         reason = "it is absent"
     except ZIP_ERRORS as error:
-        reason = str(error)
+        reason = str(error)[:MAX_TEXT]
     raise InputError(
         f"{path} has no {title} that can be read ({reason}): expected meta.json and its images; "
         "copy it again."

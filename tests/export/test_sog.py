@@ -1,0 +1,251 @@
+import json
+import struct
+import warnings
+import zipfile
+from dataclasses import replace
+from io import BytesIO
+
+import numpy as np
+import pytest
+import torch
+from damage import check_reader, damaged, damaged_zip, read_zip, variants, write_zip
+from oracles import splat_transform
+from PIL import Image
+
+from asysplat import render
+from asysplat.errors import InputError
+from asysplat.export import read_ply, write_ply
+from asysplat.export.formats import sog
+from asysplat.export.formats.packing import morton_order
+from asysplat.export.formats.sog import read_sog, write_sog
+from asysplat.geometry.rotations import rotations
+from asysplat.scene import Gaussians
+
+
+def check_close(read, scene):
+    """Check that all fields are as close as the format's numbers are to each other."""
+    order = morton_order(scene.means)
+    scene = scene.map(lambda field: field[order].float())
+    logs, read_logs = (g.means.sign() * g.means.abs().log1p() for g in (scene, read))
+    step = (logs.amax(0) - logs.amin(0)) / 65535
+    assert ((read_logs - logs).abs() <= 0.51 * step + 1e-6 * (1 + logs.abs())).all()
+    product = rotations(read.quats).mT @ rotations(scene.quats)
+    angles = ((product.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2).clamp(-1, 1).acos()
+    assert angles.max() < 0.02
+    torch.testing.assert_close(read.quats.norm(dim=-1), torch.ones(len(angles)))
+    logs = scene.scales.log()
+    assert (read.scales.log() - logs).abs().max() <= 0.006 * (logs.max() - logs.min()) + 1e-5
+    assert (read.opacities - scene.opacities).abs().max() <= 0.5 / 255 + 1e-6
+    assert (read.sh[:, 0] - scene.sh[:, 0]).abs().max() <= 0.006 * spread(scene.sh[:, 0]) + 1e-6
+    if scene.sh.shape[1] > 1:
+        rest, read_rest = scene.sh[:, 1:], read.sh[:, 1:]
+        assert (read_rest - rest).abs().max() <= 0.006 * spread(rest) + 1e-6
+
+
+def spread(values):
+    return values.max() - values.min()
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("count", [1, 2, 257])
+def test_a_scene_comes_back_within_the_format_s_precision(make_scene, tmp_path, degree, count):
+    scene, _ = make_scene(count, degree=degree)
+    write_sog(tmp_path / "scene.sog", scene)
+    check_close(read_sog(tmp_path / "scene.sog"), scene)
+    content = (tmp_path / "scene.sog").read_bytes()
+    write_sog(tmp_path / "scene.sog", scene)
+    assert (tmp_path / "scene.sog").read_bytes() == content
+
+
+def test_extreme_values_come_back(make_scene, tmp_path):
+    scene, _ = make_scene(300, dtype=torch.float32)
+    generator = torch.Generator().manual_seed(0)
+    scene = replace(
+        scene,
+        means=torch.cat((1e6 * scene.means[:, :2], torch.full((300, 1), 7.0)), 1),
+        scales=10 ** (13 * torch.rand(300, 3, generator=generator) - 10),
+        opacities=torch.linspace(1e-7, 1, 300),
+        sh=scene.sh * torch.tensor([1.0, 1e-3, 1e-5, 0])[:, None],
+    )
+    write_sog(tmp_path / "scene.sog", scene)
+    read = read_sog(tmp_path / "scene.sog")
+    check_close(read, scene)
+    torch.testing.assert_close(read.means[:, 2], torch.full((300,), 7.0))
+    assert 0 < read.opacities.min() < 1e-30 and read.opacities.max() == 1
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_splat_transform_reads_the_same_numbers(make_scene, tmp_path, degree):
+    scene, _ = make_scene(257, degree=degree)
+    write_sog(tmp_path / "scene.sog", scene)
+    splat_transform(tmp_path / "scene.sog", tmp_path / "scene.ply")
+    check_same(read_sog(tmp_path / "scene.sog"), read_ply(tmp_path / "scene.ply"))
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("degree", range(4))
+def test_files_of_splat_transform_are_read(make_scene, tmp_path, degree):
+    scene, _ = make_scene(257, degree=degree)
+    write_ply(tmp_path / "scene.ply", scene)
+    splat_transform(tmp_path / "scene.ply", tmp_path / "scene.sog")
+    splat_transform(tmp_path / "scene.sog", tmp_path / "again.ply")
+    check_same(read_sog(tmp_path / "scene.sog"), read_ply(tmp_path / "again.ply"))
+
+
+def check_same(read, other):
+    for name in ("means", "scales", "sh"):
+        torch.testing.assert_close(getattr(read, name), getattr(other, name), rtol=1e-5, atol=1e-6)
+    # Its logits end at 1e-6 and 1 - 1e-6.
+    torch.testing.assert_close(read.opacities, other.opacities, rtol=1e-5, atol=1e-5)
+    product = rotations(read.quats).mT @ rotations(other.quats)
+    torch.testing.assert_close(product, torch.eye(3).expand_as(product), rtol=0, atol=1e-4)
+
+
+def test_images_hardly_change(make_scene, tmp_path):
+    scene, cameras = make_scene(20_000, height=64, width=64, dtype=torch.float32)
+    scene = replace(scene, scales=0.2 * scene.scales, sh=0.3 * scene.sh)
+    write_sog(tmp_path / "scene.sog", scene)
+    read = read_sog(tmp_path / "scene.sog")
+    error = (render(read, cameras).image - render(scene, cameras).image).square().mean()
+    assert -10 * error.log10() > 40
+    assert (tmp_path / "scene.sog").stat().st_size < 25 * scene.num_gaussians
+
+
+def test_the_palette_is_nearly_the_best(monkeypatch):
+    centers = torch.randn(64, 9)
+    values = centers[torch.randint(64, (5000,))] + 0.01 * torch.randn(5000, 9)
+    monkeypatch.setattr(sog, "MIN_PALETTE", 256)
+    palette, labels = sog._palette(values)
+    assert len(palette) <= 312 and labels.max() == len(palette) - 1
+    assert (palette[labels] - values).square().mean().sqrt() < 0.02
+    codes, indices = sog._codebook(values)
+    codes = torch.tensor(codes, dtype=torch.float64)
+    assert len(codes) == 256 and (codes.diff() >= 0).all()
+    nearest = (codes - values.double()[..., None]).abs().amin(-1)
+    torch.testing.assert_close((codes[indices] - values.double()).abs(), nearest)
+
+
+@pytest.fixture
+def written(make_scene, tmp_path):
+    write_sog(tmp_path / "scene.sog", make_scene()[0])
+    return tmp_path / "scene.sog"
+
+
+def change(file, edit=None, **members):
+    """Edit the meta.json of a bundle, and replace other members; None removes them."""
+    content = read_zip(file.read_bytes())
+    meta = json.loads(content["meta.json"])
+    if edit:
+        edit(meta)
+    content["meta.json"] = json.dumps(meta).encode()
+    content |= {f"{name}.webp": member for name, member in members.items()}
+    file.write_bytes(write_zip({k: v for k, v in content.items() if v is not None}))
+
+
+def webp(*shape, value=0):
+    file = BytesIO()
+    Image.fromarray(np.full(shape, value, np.uint8)).save(file, "WEBP", lossless=True, exact=True)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("place", "key", "value", "message"),
+    [
+        ((), "version", 1, r"the value 1 as version in its meta\.json: .* from 2 to 2"),
+        ((), "count", 0, "the value 0 as count"),
+        ((), "count", 17, "has 4 x 3 pixels in 'means_l.webp': expected about 17"),
+        ((), "count", True, "the value True as count"),
+        ((), "means", None, r"has no means in its meta\.json: expected an object"),
+        (("means",), "mins", [0, 0], "as mins in its means: expected 3 finite numbers"),
+        (("means",), "maxs", [0, 0, float("nan")], "expected 3 finite numbers"),
+        (("means",), "maxs", [0, 0, 1e9], r"Gaussians.means\[1\] holds NaN or infinity"),
+        (("means",), "files", ["means_l.webp"], "has 1 files in its means: expected 2"),
+        (("quats",), "files", [1], "as files in its quats: expected a list of names"),
+        (("quats",), "files", ["../x"], r"has no '\.\./x' that can be read \(it is absent\)"),
+        (("scales",), "codebook", [1] * 255, "as codebook in its scales: expected 256 finite"),
+        (("scales",), "codebook", [99] * 256, r"Gaussians.scales\[0\] holds NaN or infinity"),
+        (("shN",), "bands", 4, "the value 4 as bands in its shN: .* from 1 to 3"),
+        (("shN",), "bands", 3, "pixels in 'shN_centroids.webp': expected about 960"),
+        (("shN",), "count", 70_000, "the value 70000 as count in its shN"),
+        (("shN",), "count", 5, "has the SH 11 in its labels: expected 0 to 4"),
+    ],
+)
+def test_what_meta_json_may_not_say_is_refused(written, place, key, value, message):
+    def edit(meta):
+        for step in place:
+            meta = meta[step]
+        meta[key] = value
+
+    change(written, edit)
+    with pytest.raises(InputError, match=rf"scene\.sog.*{message}"):
+        read_sog(written)
+
+
+def test_damaged_members_are_refused(written):
+    original = written.read_bytes()
+    # A header that declares 16383 x 16383 pixels, which would take a gigabyte.
+    huge = (
+        b"RIFF" + struct.pack("<I4s4sIBI", 34, b"WEBP", b"VP8L", 22, 0x2F, 0x0FFFBFFE) + bytes(17)
+    )
+    for members, message in (
+        ({"quats": None}, r"has no 'quats\.webp' that can be read \(it is absent\)"),
+        ({"quats": b""}, "which cannot be read as WebP"),
+        ({"quats": webp(4, 4, 4)[:-4]}, "which cannot be read as WebP"),
+        ({"quats": webp(4, 4, 4, value=251)}, "has the alpha 251 in rotation 0"),
+        ({"quats": webp(3, 3, 4)}, "has 3 x 3 pixels in 'quats.webp'"),
+        ({"quats": webp(2048, 2048, 4)}, "has 2048 x 2048 pixels in 'quats.webp'"),
+        ({"quats": huge}, "cannot be read as WebP|has 16383 x 16383 pixels"),
+        ({"sh0": webp(4, 4, 3)[:20]}, "which cannot be read as WebP"),
+    ):
+        written.write_bytes(original)
+        change(written, **members)
+        with warnings.catch_warnings(), pytest.raises(InputError, match=f"scene.*({message})"):
+            warnings.simplefilter("error")
+            read_sog(written)
+
+
+def test_members_that_unpack_to_more_than_images_are_refused(written):
+    content = read_zip(written.read_bytes()) | {"means_l.webp": bytes(1 << 24)}
+    written.write_bytes(write_zip(content, zipfile.ZIP_DEFLATED))
+    with pytest.raises(InputError, match=r"'means_l\.webp' .* 16777216 bytes is none of images"):
+        read_sog(written)
+    written.write_bytes(write_zip(content, zipfile.ZIP_LZMA))
+    with pytest.raises(InputError, match="neither stored nor deflated"):
+        read_sog(written)
+
+
+def test_deflated_bundles_are_read(written):
+    scene = read_sog(written)
+    written.write_bytes(write_zip(read_zip(written.read_bytes()), zipfile.ZIP_DEFLATED))
+    assert torch.equal(read_sog(written).means, scene.means)
+
+
+def test_what_is_no_bundle_is_refused(tmp_path):
+    for content, message in (
+        (b"", "cannot be read as a zip file"),
+        (b"ply\n", "cannot be read as a zip file"),
+        (write_zip({}), r"has no 'meta\.json' that can be read"),
+        (write_zip({"meta.json": b"[" * 100_000}), r"has a meta\.json that is not JSON"),
+        (write_zip({"meta.json": b"[]"}), r"has a meta\.json that is no JSON object"),
+    ):
+        (tmp_path / "scene.sog").write_bytes(content)
+        with pytest.raises(InputError, match=rf"scene\.sog {message}"):
+            read_sog(tmp_path / "scene.sog")
+
+
+def test_scenes_that_cannot_be_written_are_refused(make_scene, tmp_path):
+    scene, _ = make_scene()
+    for bad, message in (
+        (replace(scene, opacities=scene.opacities + 1), r"opacities\[0\] lies outside"),
+        (scene.keep(scene.opacities > 2), "no Gaussians"),
+        (Gaussians.stack([scene, scene]), "one by one"),
+    ):
+        with pytest.raises(InputError, match=message):
+            write_sog(tmp_path / "scene.sog", bad)
+
+
+@pytest.mark.parametrize("count", [400, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_damaged_files_are_read_or_refused_in_one_sentence(written, count):
+    contents = variants(written.read_bytes(), count, damaged, damaged_zip)
+    read, refused = check_reader(read_sog, written.with_name("bad.sog"), contents)
+    assert read and refused and read + refused == count
