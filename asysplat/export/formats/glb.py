@@ -255,14 +255,14 @@ def _read_accessor(
     accessor = accessors[attributes.integer(name, 0, len(accessors) - 1)]
     kind = KINDS[size]
     accessor.value("type", lambda found: found == kind, f"{kind} for {name}")
-    accessor.value("sparse", lambda found: found is None, "none")
+    accessor.value("sparse", lambda found: found is None, "none: its numbers one by one")
     component = accessor.value(
         "componentType",
         lambda found: type(found) is int and found in TYPES,
         f"one of {', '.join(map(str, TYPES))}",
     )
     view = views[accessor.integer("bufferView", 0, len(views) - 1)]
-    view.value("extensions", lambda found: found is None, "none, such as compression")
+    view.value("extensions", lambda found: not found, "none, such as compression")
     view.integer("buffer", 0, 0)
     dtype = np.dtype(TYPES[component])
     start = view.integer("byteOffset", 0, len(buffer), 0)

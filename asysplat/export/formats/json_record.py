@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from asysplat.errors import InputError
 
+MAX_TEXT = 80  # characters of a value in a message
 MAX_NUMBER = 1e30  # what is larger overflows float32 in products
 
 
@@ -34,7 +35,7 @@ class JsonRecord(NamedTuple):
         """
         found = self.values.get(key, default)
         if not valid(found):
-            text = "no" if found is None else f"the value {reprlib.repr(found)} as"
+            text = "no" if found is None else f"the value {reprlib.repr(found)[:MAX_TEXT]} as"
             raise InputError(
                 f"{self.path} has {text} {key} in its {self.name}: expected {expected}; write it "
                 "again."

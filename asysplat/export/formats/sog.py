@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
@@ -82,53 +81,17 @@ def encode_sog(gaussians: Gaussians) -> bytes:
             f"Gaussians.opacities has {count:,} Gaussians: SOG holds up to {MAX_SIDE**2:,}; write "
             "parts, or another format."
         )
-    logs = scene.means.double().sign() * scene.means.double().abs().log1p()
-    low, high = logs.amin(0), logs.amax(0)
-    fixed = (65535 * (logs - low) / (high - low).clamp_min(TINY)).round().int()
-    largest, rest = split_largest(scene.quats)
-    rest = (255 * (0.5 + rest / math.sqrt(2))).round()
-    scale_codes, scales = _codebook(scene.scales.double().log())
-    color_codes, colors = _codebook(scene.sh[:, 0])
-    alphas = (255 * scene.opacities).round()
-    images = {
-        "means_l": fixed & 255,
-        "means_u": fixed >> 8,
-        "quats": torch.cat((rest, FIRST_TAG + largest[:, None]), 1),
-        "scales": scales,
-        "sh0": torch.cat((colors, alphas[:, None]), 1),
-    }
-    meta = {
-        "version": VERSION,
-        "count": count,
-        "antialias": False,
-        "means": {
-            "mins": low.tolist(),
-            "maxs": high.tolist(),
-            "files": ["means_l.webp", "means_u.webp"],
-        },
-        "scales": {"codebook": scale_codes, "files": ["scales.webp"]},
-        "quats": {"files": ["quats.webp"]},
-        "sh0": {"codebook": color_codes, "files": ["sh0.webp"]},
-    }
     width = 4 * math.ceil(math.sqrt(count) / 4)
-    widths = dict.fromkeys(images, width)
-    terms = scene.sh.shape[1] - 1
-    if terms:
-        palette, labels = _palette(scene.sh[:, 1:].flatten(1))
-        codes, centroids = _codebook(palette)
-        images["shN_centroids"] = centroids.reshape(-1, 3)
-        images["shN_labels"] = torch.stack((labels & 255, labels >> 8, 0 * labels), 1)
-        widths |= {"shN_centroids": PALETTE_WIDTH * terms, "shN_labels": width}
-        meta["shN"] = {
-            "count": len(palette),
-            "bands": math.isqrt(terms),
-            "codebook": codes,
-            "files": ["shN_centroids.webp", "shN_labels.webp"],
+    records, images = _quantize(scene)
+    files = {name: _webp(pixels, width) for name, pixels in images.items()}
+    if scene.sh.shape[1] > 1:
+        records["shN"], centroids, labels = _quantize_sh(scene.sh[:, 1:])
+        row = PALETTE_WIDTH * (scene.sh.shape[1] - 1)
+        files |= {
+            "shN_centroids.webp": _webp(centroids, row),
+            "shN_labels.webp": _webp(labels, width),
         }
-    files = {
-        f"{name}.webp": _webp(pixels.byte().numpy(), widths[name])
-        for name, pixels in images.items()
-    }
+    meta = {"version": VERSION, "count": count, "antialias": False, **records}
     files["meta.json"] = json.dumps(meta, separators=(",", ":")).encode()
     bundle = BytesIO()
     with zipfile.ZipFile(bundle, "w") as archive:
@@ -137,10 +100,54 @@ def encode_sog(gaussians: Gaussians) -> bytes:
     return bundle.getvalue()
 
 
-def _webp(pixels: UInt8[ndarray, "N channels"], width: int) -> bytes:
+def _quantize(scene: Gaussians) -> tuple[dict[str, dict], dict[str, Int[Tensor, "N channels"]]]:
+    """Compute the records of meta.json and the pixels of the images, of all but shN."""
+    logs = scene.means.double().sign() * scene.means.double().abs().log1p()
+    low, high = logs.amin(0), logs.amax(0)
+    fixed = (65535 * (logs - low) / (high - low).clamp_min(TINY)).round().int()
+    largest, rest = split_largest(scene.quats)
+    rest = (255 * (0.5 + rest / math.sqrt(2))).round().int()
+    scale_codes, scales = _codebook(scene.scales.double().log())
+    color_codes, colors = _codebook(scene.sh[:, 0])
+    alphas = (255 * scene.opacities).round().int()
+    means = {"mins": low.tolist(), "maxs": high.tolist()}
+    records = {
+        "means": means | {"files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scale_codes, "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": color_codes, "files": ["sh0.webp"]},
+    }
+    images = {
+        "means_l.webp": fixed & 255,
+        "means_u.webp": fixed >> 8,
+        "quats.webp": torch.cat((rest, FIRST_TAG + largest[:, None]), 1),
+        "scales.webp": scales,
+        "sh0.webp": torch.cat((colors, alphas[:, None]), 1),
+    }
+    return records, images
+
+
+def _quantize_sh(
+    sh: Float[Tensor, "N terms 3"],
+) -> tuple[dict, Int[Tensor, "pixels 3"], Int[Tensor, "N 3"]]:
+    """Compute the record of shN, the pixels of the palette and those of its indices."""
+    palette, labels = _palette(sh.flatten(1))
+    codes, centroids = _codebook(palette)
+    record = {
+        "count": len(palette),
+        "bands": math.isqrt(sh.shape[1]),
+        "codebook": codes,
+        "files": ["shN_centroids.webp", "shN_labels.webp"],
+    }
+    bytes_of_labels = torch.stack((labels & 255, labels >> 8, torch.zeros_like(labels)), 1)
+    return record, centroids.reshape(-1, 3), bytes_of_labels
+
+
+def _webp(pixels: Int[Tensor, "N channels"], width: int) -> bytes:
+    """Write pixels as an image, whose last row ends with zeros."""
     height = math.ceil(len(pixels) / width)
     image = np.zeros((height * width, pixels.shape[1]), np.uint8)
-    image[: len(pixels)] = pixels
+    image[: len(pixels)] = pixels.numpy()
     file = BytesIO()
     Image.fromarray(image.reshape(height, width, -1)).save(
         file, "WEBP", lossless=True, exact=True, quality=QUALITY, method=METHOD
@@ -187,13 +194,13 @@ def _palette(
     size = min(max(len(values) // PALETTE_SHARE, MIN_PALETTE), MAX_PALETTE)
     if len(values) <= size:
         return values, torch.arange(len(values))
-    generator = torch.Generator().manual_seed(0)
-    _, cells = _k_means(values, math.isqrt(size), generator)
+    generator, cell_count = torch.Generator().manual_seed(0), math.isqrt(size)
+    _, cells = _k_means(values, cell_count, generator)
     vectors, labels, total = [], torch.zeros_like(cells), 0
-    for cell in range(int(cells.max()) + 1):
+    for cell in range(cell_count):
         (members,) = torch.where(cells == cell)
         if len(members):
-            count = max(size * len(members) // len(values), 1)
+            count = 1 + (size - cell_count) * len(members) // len(values)
             part, own = _k_means(values[members], count, generator)
             labels[members] = own + total
             vectors.append(part)
@@ -239,14 +246,18 @@ def read_sog(path: str | Path) -> Gaussians:
         count = meta.integer("count", 1, MAX_SIDE**2)
         means, scales, quats, colors = map(meta.record, ("means", "scales", "quats", "sh0"))
         low, high = (torch.tensor(means.numbers(key, 3)).double() for key in ("mins", "maxs"))
-        fine, coarse = (image[:, :3].int() for image in _images(archive, means, (count, count)))
-        logs = low + (high - low) * (coarse << 8 | fine) / 65535
-        (rotations,) = _images(archive, quats, (count,))
-        (sizes,) = _images(archive, scales, (count,))
-        (rgba,) = _images(archive, colors, (count,))
+        fine, coarse = _images(archive, means, count, count)
+        (rotations,) = _images(archive, quats, count)
+        (sizes,) = _images(archive, scales, count)
+        (rgba,) = _images(archive, colors, count)
+        fine, coarse, rotations, sizes, rgba = (
+            image.flatten(0, 1)[:count] for image in (fine, coarse, rotations, sizes, rgba)
+        )
         sh = [_decode(colors, rgba[:, None, :3])]
         if "shN" in meta.values:
             sh.append(_read_palette(archive, meta.record("shN"), count))
+    fixed = coarse[:, :3].int() << 8 | fine[:, :3]
+    logs = low + (high - low) * fixed / 65535
     gaussians = Gaussians(
         means=(logs.sign() * logs.abs().expm1()).float(),
         quats=_quats(path, rotations),
@@ -280,23 +291,27 @@ def _read_palette(
     """Read the SH of degree 1 and above."""
     degree, size = record.integer("bands", 1, 3), record.integer("count", 1, MAX_PALETTE)
     terms = degree * (degree + 2)
-    # The palette's last row may be incomplete, so all of its image is read.
-    pixels = math.ceil(size / PALETTE_WIDTH) * PALETTE_WIDTH * terms
-    centroids, labels = _images(archive, record, (pixels, count))
-    indices = labels[:, 0].long() | labels[:, 1].long() << 8
+    centroids, labels = _images(archive, record, size * terms, count)
+    if centroids.shape[1] != PALETTE_WIDTH * terms:
+        raise InputError(
+            f"{record.path} has an image of SH that is {centroids.shape[1]} pixels wide: expected "
+            f"{PALETTE_WIDTH * terms}; write it again."
+        )
+    low, high = labels.flatten(0, 1)[:count, :2].long().unbind(1)
+    indices = low | high << 8
     if int(indices.max()) >= size:
         raise InputError(
             f"{record.path} has the SH {indices.max()} in its labels: expected 0 to {size - 1}; "
             "copy it again."
         )
-    palette = centroids.unflatten(0, (-1, terms))[:size, :, :3]
+    palette = centroids[..., :3].reshape(-1, terms, 3)[:size]
     return _decode(record, palette)[indices]
 
 
 def _images(
-    archive: zipfile.ZipFile, record: JsonRecord, counts: tuple[int, ...]
-) -> list[UInt8[Tensor, "pixels 4"]]:
-    """Read the first pixels, row by row, of each of a record's images, in RGBA."""
+    archive: zipfile.ZipFile, record: JsonRecord, *counts: int
+) -> list[UInt8[Tensor, "height width 4"]]:
+    """Read a record's images, of these numbers of pixels or some more, in RGBA."""
     names = record.texts("files")
     if len(names) != len(counts):
         raise InputError(
@@ -308,7 +323,7 @@ def _images(
 
 def _image(
     archive: zipfile.ZipFile, path: Path, name: str, count: int
-) -> UInt8[Tensor, "{count} 4"]:
+) -> UInt8[Tensor, "height width 4"]:
     content, title = _content(archive, path, name), reprlib.repr(name)
     try:
         with warnings.catch_warnings():
@@ -327,7 +342,7 @@ def _image(
             f"{path} has {image.width} x {image.height} pixels in {title}: expected about {count} "
             "in all; write it again."
         )
-    return torch.from_numpy(decoded).flatten(0, 1)[:count]
+    return torch.from_numpy(decoded)
 
 
 def _content(archive: zipfile.ZipFile, path: Path, name: str) -> bytes:
