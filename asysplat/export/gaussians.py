@@ -11,6 +11,7 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.export.formats.compressed_ply import SUFFIX, write_compressed_ply
+from asysplat.export.formats.glb import read_glb, write_glb
 from asysplat.export.formats.ply import read_comment, read_ply, write_ply
 from asysplat.export.formats.safetensors import read_safetensors, write_safetensors
 from asysplat.export.formats.sog import read_sog, write_sog
@@ -26,6 +27,7 @@ READERS = {
     ".ply": lambda path, dtype: read_ply(path).to(dtype),
     ".spz": lambda path, dtype: read_spz(path).to(dtype),
     ".sog": lambda path, dtype: read_sog(path).to(dtype),
+    ".glb": lambda path, dtype: read_glb(path).to(dtype),
     ".splat": lambda path, dtype: read_splat(path).to(dtype),
     ".safetensors": lambda path, dtype: read_safetensors(path, dtype)[0],
 }
@@ -35,6 +37,7 @@ WRITERS = {
     ".ply": write_ply,
     ".spz": lambda path, gaussians, *_: write_spz(path, gaussians),
     ".sog": lambda path, gaussians, *_: write_sog(path, gaussians),
+    ".glb": lambda path, gaussians, *_: write_glb(path, gaussians),
     ".splat": lambda path, gaussians, *_: write_splat(path, gaussians),
     ".safetensors": lambda path, gaussians, *numbers: write_safetensors(
         path, gaussians, _metadata(*numbers)
@@ -50,7 +53,7 @@ def read_gaussians(
     origin: Sequence[float] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Gaussians:
-    """Read a scene from a .ply, .spz, .sog, .splat or .safetensors file.
+    """Read a scene from a .ply, .spz, .sog, .glb, .splat or .safetensors file.
 
     Args:
         path: the file.
@@ -124,7 +127,7 @@ def write_gaussians(
     An existing file is replaced once the new one is complete.
 
     Args:
-        path: a .ply, .compressed.ply, .spz, .sog, .splat, .safetensors or .html file; see
+        path: a .ply, .compressed.ply, .spz, .sog, .glb, .splat, .safetensors or .html file; see
             `write_page` for a page with cameras.
         gaussians: [N].
         offset: to be added to the means; kept by .ply and .safetensors.
