@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from websockets.sync.client import connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
@@ -32,6 +31,7 @@ def open_browser(folder: Path):
     program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
         pytest.skip("no browser is installed: name one in the environment variable CHROMIUM")
+    connect = pytest.importorskip("websockets.sync.client").connect
     port = folder / "DevToolsActivePort"
     command = [program, *FLAGS, f"--user-data-dir={folder}", "about:blank"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}

@@ -323,6 +323,7 @@ def test_the_picture_comes_back_after_a_lost_context(tab):
     [
         ("HTMLCanvasElement.prototype.getContext = () => null", "has no WebGL 2"),
         ("delete window.DecompressionStream", "too old"),
+        ("Worker = class { constructor() { throw Error('no threads'); } }", "no threads"),
     ],
 )
 def test_a_browser_that_lacks_something_says_what(browser, scene, tmp_path, script, message):

@@ -13,9 +13,8 @@ const element = (id) => document.getElementById(id);
 const [canvas, slider] = [element("canvas"), element("slider")];
 const settings = JSON.parse(element("settings").textContent);
 const { path, names, up, image } = settings;
-const worker = new Worker(URL.createObjectURL(new Blob([element("worker").textContent])));
 const held = new Set(), pointers = new Map(); // keys; the last event of each finger or mouse
-let scene, renderer;
+let scene, renderer, worker;
 let camera, sorted; // the shown one, and that of the order; replaced, never changed
 let place = 0, center = null; // on the path; the point to orbit, once one is needed
 let playing = false, sorting = false, requested = false, lastTime = 0;
@@ -24,7 +23,9 @@ function report({ message }) {
   element("message").textContent = `The scene cannot be shown: ${message}.`;
 }
 
+/** Unpack the scene and show its first camera. */
 async function start() {
+  worker = new Worker(URL.createObjectURL(new Blob([element("worker").textContent])));
   worker.onerror = () => report({ message: "this browser refuses its worker" });
   scene = await unpack(element("spz").textContent);
   renderer = new Renderer(canvas, scene, settings);
