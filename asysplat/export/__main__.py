@@ -19,12 +19,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from asysplat.errors import InputError
-from asysplat.evaluation.metrics import psnr
 from asysplat.export.gaussians import (
     BLACK,
     READERS,
@@ -36,13 +31,10 @@ from asysplat.export.gaussians import (
     write_gaussians,
 )
 from asysplat.export.importance import most_important
+from asysplat.export.likeness import picture_psnr
 from asysplat.export.page import PAGE, write_page
 from asysplat.export.scene_cameras import cameras_beside, names_beside
 from asysplat.interrupts import handle_signals
-from asysplat.rendering import render
-from asysplat.scene import Cameras, Gaussians
-
-COMPARED_VIEWS = 8
 
 
 def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None = None) -> None:
@@ -80,22 +72,8 @@ def export(scene: Path, output: Path, keep: float = 1.0, sh_degree: int | None =
     if any(offset) and read_offset(output) != offset:
         print(f"{output.suffix} has no place for the offset {' '.join(map(repr, offset))}")
     if cameras is not None and output.suffix.lower() in READERS:
-        likeness = compare(gaussians, read_gaussians(output), cameras, background)
+        likeness = picture_psnr(gaussians, read_gaussians(output), cameras, background)
         print(f"{likeness:.1f} dB against the pictures of {scene}")
-
-
-@torch.no_grad()
-def compare(
-    before: Gaussians, after: Gaussians, cameras: Cameras, background: Float[Tensor, "3"] | None
-) -> float:
-    """Compute the mean PSNR of one scene's pictures against another's, at up to 8 cameras."""
-    count = min(COMPARED_VIEWS, cameras.num_views)
-    values = []
-    for view in torch.linspace(0, cameras.num_views - 1, count).round().long().tolist():
-        camera = cameras.select([view])
-        images = [render(g, camera, background, depth=False).image for g in (after, before)]
-        values.append(psnr(*(image.clamp(0, 1) for image in images)).mean().item())
-    return sum(values) / count
 
 
 if __name__ == "__main__":
