@@ -115,8 +115,9 @@ def test_the_palette_is_nearly_the_best(monkeypatch):
     centers = torch.randn(64, 9)
     values = centers[torch.randint(64, (5000,))] + 0.01 * torch.randn(5000, 9)
     monkeypatch.setattr(sog, "MIN_PALETTE", 256)
+    monkeypatch.setattr(sog, "PALETTE_SHARE", 20)
     palette, labels = sog._palette(values)
-    assert len(palette) <= 5000 // 16 and labels.max() == len(palette) - 1
+    assert len(palette) <= 256 and labels.max() == len(palette) - 1
     assert (palette[labels] - values).square().mean().sqrt() < 0.02
     codes, indices = sog._codebook(values)
     codes = torch.tensor(codes, dtype=torch.float64)

@@ -32,7 +32,7 @@ CODES = 256  # numbers of a codebook
 MAX_SIDE = 16380  # pixels of a side of a WebP image, as a multiple of 4
 MAX_PALETTE = 65536  # SH that 16 bits distinguish
 PALETTE_WIDTH = 64  # SH in a row of their image
-PALETTE_SHARE = 16  # Gaussians for each of the palette
+PALETTE_SHARE = 4  # Gaussians for each of the palette
 MIN_PALETTE = 1024
 PALETTE_ITERATIONS = 4
 CODEBOOK_ITERATIONS = 50
@@ -67,11 +67,7 @@ def write_sog(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def encode_sog(gaussians: Gaussians) -> bytes:
-    """Return the content of a SOG bundle; see `write_sog`.
-
-    Raises:
-        InputError: as `write_sog` raises it.
-    """
+    """Return the content of a SOG bundle, or raise InputError; see `write_sog`."""
     scene = prepare_for_export(gaussians)
     order = morton_order(scene.means)
     scene = scene.map(lambda field: field[order])
