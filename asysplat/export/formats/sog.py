@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from asysplat.errors import InputError
@@ -127,7 +128,8 @@ def _quantize_sh(
     sh: Float[Tensor, "N terms 3"],
 ) -> tuple[dict, Int[Tensor, "pixels 3"], Int[Tensor, "N 3"]]:
     """Compute the record of shN, the pixels of the palette and those of its indices."""
-    palette, labels = _palette(sh.flatten(1))
+    with threadpool_limits(1):  # threads wait for each other longer than small products take
+        palette, labels = _palette(sh.flatten(1))
     codes, centroids = _codebook(palette)
     record = {
         "count": len(palette),
