@@ -17,7 +17,7 @@ from torch import Tensor
 
 from asysplat.errors import InputError
 from asysplat.export.formats.checks import TINY, prepare_for_export
-from asysplat.export.formats.packing import join_largest, morton_order, split_largest
+from asysplat.export.formats.packing import in_morton_order, join_largest, split_largest
 from asysplat.files import atomic_write
 from asysplat.geometry.spherical_harmonics import SH_C0
 from asysplat.scene import Gaussians
@@ -46,8 +46,7 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     Raises:
         InputError: invalid Gaussians, or a file that cannot be written.
     """
-    scene = prepare_for_export(gaussians)
-    scene = scene.map(lambda field: field[morton_order(scene.means)])
+    scene = in_morton_order(prepare_for_export(gaussians))
     count, chunks = scene.num_gaussians, -(-scene.num_gaussians // CHUNK)
     values = np.stack(
         (

@@ -33,6 +33,12 @@ def morton_order(means: Float[Tensor, "N 3"]) -> Int[Tensor, "N"]:
     return (cells[:, 0] | cells[:, 1] << 1 | cells[:, 2] << 2).argsort(stable=True)
 
 
+def in_morton_order(gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians along a Z-order curve."""
+    order = morton_order(gaussians.means)
+    return gaussians.map(lambda field: field[order])
+
+
 def split_largest(
     quats: Float[Tensor, "N 4"],
 ) -> tuple[Int[Tensor, "N"], Float[Tensor, "N 3"]]:

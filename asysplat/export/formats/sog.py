@@ -24,7 +24,7 @@ from torch import Tensor
 from asysplat.errors import InputError
 from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
 from asysplat.export.formats.json_record import JsonRecord, parse_record
-from asysplat.export.formats.packing import join_largest, morton_order, split_largest
+from asysplat.export.formats.packing import in_morton_order, join_largest, split_largest
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 
@@ -69,9 +69,7 @@ def write_sog(path: str | Path, gaussians: Gaussians) -> None:
 
 def encode_sog(gaussians: Gaussians) -> bytes:
     """Return the content of a SOG bundle, or raise InputError; see `write_sog`."""
-    scene = prepare_for_export(gaussians)
-    order = morton_order(scene.means)
-    scene = scene.map(lambda field: field[order])
+    scene = in_morton_order(prepare_for_export(gaussians))
     count = len(scene.opacities)
     if count > MAX_SIDE**2:
         raise InputError(

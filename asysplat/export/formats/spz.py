@@ -21,7 +21,7 @@ from numpy import ndarray
 
 from asysplat.errors import InputError
 from asysplat.export.formats.checks import TINY, prepare_for_export, require_file
-from asysplat.export.formats.packing import half_turn, join_largest, morton_order, split_largest
+from asysplat.export.formats.packing import half_turn, in_morton_order, join_largest, split_largest
 from asysplat.files import atomic_write
 from asysplat.scene import Gaussians
 
@@ -84,8 +84,7 @@ def encode_spz(gaussians: Gaussians, version: int = 3) -> bytes:
     """
     if version not in (2, 3, 4):
         raise InputError(f"write_spz's version is {version!r}: choose 2, 3 or 4.")
-    scene = half_turn(prepare_for_export(gaussians), 0)
-    scene = scene.map(lambda field: field[morton_order(scene.means)])
+    scene = in_morton_order(half_turn(prepare_for_export(gaussians), 0))
     fraction_bits = _fraction_bits(scene)
     degree = int(scene.sh.shape[1] ** 0.5) - 1
     streams = [stream.tobytes() for stream in _streams(scene, fraction_bits, version)]
