@@ -171,7 +171,7 @@ def sequences():
 NAMES = [f"procedural-{seed}" for seed in range(7)]
 PLY = [f"{name}.ply" for name in NAMES]
 WRONG = [
-    (["notes.txt"], r"has no scene \(\.ply, \.splat, \.safetensors\): write one for"),
+    (["notes.txt"], r"has no scene \(\.ply, .*, \.safetensors\): write one for"),
     ([*PLY, "lego.ply"], r"lego\.ply is named as no scene of the data: .* procedural-4, \.\.\.\."),
     (PLY[2:], "has no file of 2 of the 7 scenes, procedural-0, procedural-1: add them"),
     (
