@@ -104,5 +104,5 @@ def flat_options(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
     flat = {}
     for key, value in options.items():
         nested = isinstance(value, Mapping)
-        flat |= flat_options(value, f"{prefix}{key}.") if nested else {prefix + key: value}
+        flat |= flat_options(value, f"{prefix}{key}.") if nested else {f"{prefix}{key}": value}
     return flat
