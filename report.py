@@ -1,6 +1,7 @@
-"""Write finished sweeps beside the paper's tables.
+"""Write finished sweeps beside the paper's tables, or finished reconstructions as one page.
 
 python report.py table=layers costs=true
+python report.py runs=logs/reconstruct
 """
 
 from collections.abc import Sequence
@@ -23,20 +24,24 @@ from asysplat.report.fill import fill_table, finished_runs, with_costs
 from asysplat.report.html import render_html
 from asysplat.report.markdown import render_markdown
 from asysplat.report.paper import find_tables
+from asysplat.report.runs import report_runs
 from asysplat.report.terminal import render_terminal
 from asysplat.runs.systems import find_systems
 
-OWN_OPTIONS = ("table", "costs", "overrides", "logs", "output")
+OWN_OPTIONS = ("table", "costs", "overrides", "logs", "runs", "output")
 
 
 @command("report")
 def report(options: DictConfig) -> None:
-    """Fill the tables, print them, write report.md and report.html."""
-    tables, folder = find_tables(options.table), Path(options.output)
+    """Fill the tables, print them, write report.md and report.html; or the page of `runs`."""
+    output = None if options.output is None else Path(str(options.output))
+    if options.runs is not None:
+        return report_runs(Path(str(options.runs)), output)
+    tables, logs = find_tables(options.table), Path(options.logs)
+    folder = output or logs / "report"
     make_folder(folder, "output")
     overrides = [*sweep_overrides(HydraConfig.get().overrides.task), *options.overrides]
     check_overrides(overrides)
-    logs = Path(options.logs)
     runs, systems = finished_runs(logs), list(find_systems(logs))
     filled = [fill_table(table, overrides, compose_train, runs, systems) for table in tables]
     if options.costs:

@@ -20,11 +20,11 @@ def render_terminal(tables: Sequence[PaperTable], console: Console) -> None:
         console.print(Text(section.title, style="bold underline"))
         _print_notes(section.above, console)
         for grid in section.grids:
-            _print_grid(grid, console)
+            print_grid(grid, console)
         _print_notes(section.notes, console)
         console.print()
     if len(tables) > 1:
-        _print_grid(make_overview(tables), console)
+        print_grid(make_overview(tables), console)
 
 
 def _print_notes(notes: Sequence[Note], console: Console) -> None:
@@ -33,11 +33,12 @@ def _print_notes(notes: Sequence[Note], console: Console) -> None:
         console.print(Text.assemble((f"{note.label}: ", "bold"), note.text, fold))
 
 
-def _print_grid(grid: Grid, console: Console) -> None:
+def print_grid(grid: Grid, console: Console) -> None:
+    """Print a grid, its caption above; our numbers stay beside the paper's."""
     console.print(Text(grid.caption, style="italic"))
     words = [(*heading.title.split(" "), heading.part) for heading in grid.headings]  # a line each
     headings = [Text("\n".join(filter(None, lines))) for lines in words]
     rows = [[Text(cell.text, style=STYLES[cell.style]) for cell in row] for row in grid.rows]
-    # Ours stays beside the paper's.
-    first = [n for n, heading in enumerate(grid.headings) if n and heading.part in ("", "paper")]
+    beside = ("ours", "error")
+    first = [n for n, heading in enumerate(grid.headings) if n and heading.part not in beside]
     print_table(console, headings, rows, box=ROUNDED, first=first)

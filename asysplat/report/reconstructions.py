@@ -1,0 +1,111 @@
+"""Read the finished reconstructions below a folder, which may come from strangers."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from omegaconf import OmegaConf
+
+from asysplat.errors import InputError
+from asysplat.evaluation.baselines import BASELINES
+from asysplat.runs.run_config import flat_options, read_config
+from asysplat.runs.runs import RESULTS
+
+CONFIG = "config.yaml"
+PICTURE = "contact.png"
+MARKS = {"start.png", PICTURE, "scene.safetensors"}  # a folder with one of them is a run's
+MAX_BYTES = 2**20  # of metrics.json, which has 2 KB
+MAX_NUMBER = 1e12  # in metrics.json
+MAX_TEXT = 60  # characters of a value
+COUNTS = ("gaussians", "steps", "seconds")
+SHOWN = ("psnr", "ssim", "lpips")
+ROWS = {"held out": "held_out", "inputs": "inputs"}  # title: prefix of the keys in metrics.json
+ROWS |= {title: f"baseline/{name}" for name, (title, _) in BASELINES.items()}
+
+
+class Reconstruction(NamedTuple):
+    """A finished reconstruction."""
+
+    folder: Path
+    finished: float  # time
+    results: dict[str, int | float | None]  # of metrics.json, what is shown
+    options: dict[str, Any]  # of config.yaml, by dotted keys
+    sizes: dict[str, int]  # bytes of its files, by name
+
+
+def read_reconstructions(folder: Path) -> tuple[list[Reconstruction], list[str]]:
+    """Read the finished reconstructions below a folder.
+
+    Returns:
+        The reconstructions by photographs, the newest first, and a sentence for each that is
+        damaged or unfinished.
+    """
+    runs, left_out = [], []
+    for place, _, files in os.walk(folder):  # goes through no link
+        if MARKS.isdisjoint(files):
+            continue
+        try:
+            runs.append(_read_run(Path(place)))
+        except (InputError, OSError) as error:
+            left_out.append(plain(str(error).replace(f"{folder}{os.sep}", "")))
+
+    def order(run: Reconstruction) -> tuple:
+        path = run.options["path"]
+        return Path(path).name.casefold(), path, -run.finished, run.folder
+
+    return sorted(runs, key=order), sorted(left_out)
+
+
+def _read_run(folder: Path) -> Reconstruction:
+    """Read a folder that a stranger may have made: nothing in it is resolved, built or run."""
+    with os.scandir(folder) as entries:
+        stats = {
+            entry.name: entry.stat(follow_symlinks=False)
+            for entry in entries
+            if entry.is_file(follow_symlinks=False)
+        }
+    for name in (CONFIG, RESULTS):
+        if name not in stats:
+            raise InputError(f"{folder} is unfinished: it has no {name} of its own.")
+    results = _read_results(folder / RESULTS)
+    options = flat_options(OmegaConf.to_container(read_config(folder / CONFIG)))
+    if not isinstance(options.get("path"), str):
+        raise InputError(f"{folder / CONFIG} has no path of photographs: copy the run again.")
+    sizes = {name: stat.st_size for name, stat in stats.items()}
+    return Reconstruction(folder, stats[RESULTS].st_mtime, results, options, sizes)
+
+
+def _read_results(path: Path) -> dict[str, int | float | None]:
+    def refuse(constant: str) -> None:
+        raise ValueError(f"it has the number {constant}")
+
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
+            raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
+        results = json.loads(content, parse_constant=refuse)
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} cannot be read ({error}): copy the run again.") from error
+    if not isinstance(results, dict):
+        raise InputError(f"{path} is not the results of a run: copy the run again.")
+    measured = {f"{row}/{metric}": None for row in ROWS.values() for metric in SHOWN}
+    results = {key: results.get(key) for key in (*COUNTS, *measured)}
+    for key, value in results.items():
+        absent = value is None and key in measured  # not measured, or not finite
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not absent and not (number and abs(value) < MAX_NUMBER):
+            found = "nothing" if value is None else cut(repr(value))
+            raise InputError(f"{path} has {found} as {key}: copy the run again.")
+    return results
+
+
+def cut(text: str) -> str:
+    """Return a text, or its beginning if it is long."""
+    return text if len(text) <= MAX_TEXT else f"{text[: MAX_TEXT - 3]}..."
+
+
+def plain(text: str) -> str:
+    """Replace characters that a terminal obeys, or that UTF-8 does not have."""
+    return "".join(letter if letter.isprintable() else "\ufffd" for letter in text)
