@@ -6,9 +6,8 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from asysplat.errors import InputError
-from asysplat.reconstruct.results import SCENE
 from asysplat.runs.run_config import read_config
-from asysplat.runs.runs import RESULTS, find_reconstructions, folder_of
+from asysplat.runs.runs import RESULTS, SCENE, find_reconstructions, folder_of
 
 OF_PHOTOGRAPHS = ("path", "layout", "cameras", "frames", "on_bad_image", "height", "width")
 OF_PHOTOGRAPHS += ("views", "held_out_every", "max_held_out")

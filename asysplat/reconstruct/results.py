@@ -31,12 +31,11 @@ from asysplat.files import atomic_write, check_writable, new_folder
 from asysplat.reconstruct.video import check_video, video_cameras
 from asysplat.refinement.refine import RefinementProgress
 from asysplat.rendering import Rendering, render
+from asysplat.runs.runs import SCENE
 from asysplat.runs.summary import metric_cells, write_json
 from asysplat.scene import Gaussians, Views
 from asysplat.terminal import print_table
 
-SCENE_SUFFIX = ".safetensors"
-SCENE = f"scene{SCENE_SUFFIX}"  # always written: run= goes on from it
 BYTES_PER_GAUSSIAN = 4 * 62  # size in one of the files, at most
 OTHER_BYTES = 20_000_000  # space for the figures and the video
 SHEET_ROWS = 4  # views in a contact sheet
@@ -56,7 +55,7 @@ class Results:
         self._lpips = load_lpips(
             self._protocol.lpips_net, Path(config.paths.weights), config.paths.download
         )
-        self._suffixes = [*read_outputs(config.output), SCENE_SUFFIX]
+        self._suffixes = [*read_outputs(config.output), Path(SCENE).suffix]
         if config.open and PAGE not in self._suffixes:
             raise InputError("open=true opens the page, which output= leaves out: add html to it.")
         check_video(config.video)
@@ -210,7 +209,7 @@ def read_outputs(output: str | Sequence[str]) -> list[str]:
         if f".{name}" not in WRITERS:
             known = ", ".join(suffix[1:] for suffix in WRITERS)
             raise InputError(f"output has {name!r}: choose from {known}.")
-    return [f".{name}" for name in names if f".{name}" != SCENE_SUFFIX]
+    return [f".{name}" for name in names if f".{name}" != Path(SCENE).suffix]
 
 
 def save_gaussians(

@@ -24,6 +24,7 @@ from asysplat.runs.run_config import flat_options, plain_options, read_config
 from asysplat.runs.stages import stage_configs
 
 RESULTS = "metrics.json"
+SCENE = "scene.safetensors"  # in the folder of a reconstruction, from which run= goes on
 EVALUATION = "evaluation.json"  # added to a run by evaluate.py
 # Names, paths, callbacks, keys that are only interpolated into others, and keys that only split the
 # batch.
@@ -197,7 +198,7 @@ def _results_below(logs: Path) -> list[Path]:
 
 
 def _is_reconstruction(folder: Path) -> bool:
-    return (folder / "scene.ply").exists()
+    return (folder / SCENE).exists()
 
 
 def folder_of(
