@@ -34,6 +34,7 @@ from asysplat.export import write_ply
 from asysplat.reconstruct.continuation import continue_run
 from asysplat.reconstruct.results import save_gaussians
 from asysplat.root import CONF
+from asysplat.runs.runs import find_reconstructions
 
 SIZE = 48
 LAYOUTS = Path(__file__).parent / "data" / "readers"  # writers of them
@@ -232,6 +233,23 @@ def test_each_init_beats_its_baseline(command, views, photographs, tmp_path, mon
 
 
 @pytest.mark.medium
+def test_a_scene_is_written_in_the_formats_of_output(command, photographs, tmp_path, monkeypatch):
+    opened, folder = [], tmp_path / "run"
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    options = ("steps=5", "held_out_every=null", "video.path=none")
+    said = finished(command(photographs, *options, "output=[spz,html,compressed.ply]", "open=true"))
+    files = {f"scene.{suffix}" for suffix in ("spz", "html", "compressed.ply", "safetensors")}
+    assert {file.name for file in folder.glob("scene.*")} == files
+    assert opened == [(folder / "scene.html").as_uri()]
+    assert f"page: {folder / 'scene.html'}" in said and f"scene: {folder / 'scene.spz'}" in said
+    page = (folder / "scene.html").read_text()
+    assert str(photographs.parent) not in page  # nothing of the disk goes to who gets the page
+    assert find_reconstructions(tmp_path) == [folder]
+    finished(command(photographs, *options, "output=splat"))
+    assert {file.name for file in folder.glob("scene.*")} == {"scene.splat", "scene.safetensors"}
+
+
+@pytest.mark.medium
 def test_a_run_goes_on_from_a_finished_one(command, run_script, photographs, tmp_path):
     small = ("height=40", "views=5", "held_out_every=4", "video.path=none")
     finished(command(photographs, *small))
@@ -346,6 +364,7 @@ def test_as_overrides_names_the_path_and_reads_view_flags(script):
         ("scene", "path='scene'"),
         ("scene seconds=5 --view", "path='scene' seconds=5 view=true"),
         ("--view scene", "path='scene' view=true"),
+        ("scene --open --view", "path='scene' open=true view=true"),
         ("path=scene view=true", "path=scene view=true"),
         ("--cfg job", "--cfg job"),
         ("", ""),
@@ -361,6 +380,8 @@ REFUSED = {
     "video.height=0": "video.height=0: give a whole number from 2 to 4320, or null for the",
     "video.path=[00001.png,x.png]": "video.path: x.png is the name of none of the 14 photographs",
     "refinement.densify_until=2.5": "refinement.densify_until=2.5: give 0 to 1",
+    "output=[ply,obj]": "output has 'obj': choose from compressed.ply, ply, spz, sog, glb, splat,",
+    "output=[ply] open=true": "open=true opens the page, which output= leaves out: add html to it",
     "run=nowhere": "run=nowhere has no metrics.json: name the folder of a finished run",
 }
 

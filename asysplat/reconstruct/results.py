@@ -102,7 +102,7 @@ class Results:
                 continue
             cameras = photographs.normalization.cameras_to_world(photographs.inputs.cameras)
             names = [Path(file).name for file in photographs.input_files]
-            write_page(path, world, cameras, names, str(self._config.path), background)
+            write_page(path, world, cameras, names, Path(self._config.path).name, background)
 
     def save(self, gaussians: Gaussians, progress: RefinementProgress) -> None:
         """Write the scene files, then cameras, the configuration, a contact sheet and metrics.
